@@ -1,0 +1,109 @@
+"""What a scene is: textured meshes, a sun, a sky and the places to look from.
+
+A scene builder returns a ``Scene`` in the *scene frame*: right-handed, z up, metres, ground near z = 0.
+``Scene.seen_from`` moves it into the *world frame* of the conventions (x right, y down, z forward, the rig's
+body at time 0), which is the only frame that renderers see.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.errors import RsbenchError
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """A diffuse surface, visible from both sides."""
+
+    name: str
+    colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    """sRGB reflectance in [0, 1]; multiplies nothing when ``texture`` is given."""
+    texture: NDArray[np.uint8] | None = None
+    """(h, w, 3) sRGB, repeated in both directions; row 0 is the top, uv v points up."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneMesh:
+    """Triangles of one material."""
+
+    name: str
+    vertices: FloatArray
+    """(n, 3) metres."""
+    faces: NDArray[np.int32]
+    """(m, 3) vertex indices."""
+    material: Material
+    uv: FloatArray | None = None
+    """(n, 2) texture coordinates, v up; one unit is one repeat of the texture."""
+    normals: FloatArray | None = None
+    """(n, 3) unit shading normals; absent = flat shading."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Light:
+    """A directional sun and a two-colour sky, linear RGB."""
+
+    sun_direction: tuple[float, float, float]
+    """Unit vector towards the sun."""
+    sun_irradiance: tuple[float, float, float] = (2.6, 2.4, 2.1)
+    sky_zenith: tuple[float, float, float] = (0.25, 0.45, 0.85)
+    sky_horizon: tuple[float, float, float] = (0.75, 0.85, 0.95)
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Unit vector to the zenith, in the frame of the scene."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Viewpoint:
+    """Where the rig's body stands at time 0: at ``eye``, looking at ``target``, the horizon level."""
+
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float]
+
+    def world_from_scene(self) -> tuple[FloatArray, FloatArray]:
+        """Rotation (3, 3) and translation (3,) with ``X_world = R @ X_scene + t``.
+
+        Raises:
+            RsbenchError: the view is vertical or ``eye`` equals ``target``, so the horizon is undefined.
+        """
+        eye = np.asarray(self.eye, dtype=np.float64)
+        forward = np.asarray(self.target, dtype=np.float64) - eye
+        right = np.cross(forward, (0.0, 0.0, 1.0))
+        if np.linalg.norm(right) <= 1e-9 * max(1.0, float(np.linalg.norm(forward))):
+            raise RsbenchError(f"viewpoint looks along the vertical: eye = {self.eye}, target = {self.target}")
+        z = forward / np.linalg.norm(forward)
+        x = right / np.linalg.norm(right)
+        rotation = np.stack([x, np.cross(z, x), z])
+        return rotation, -rotation @ eye
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """Meshes and light in one frame, and named viewpoints in the scene frame."""
+
+    name: str
+    meshes: tuple[SceneMesh, ...]
+    light: Light
+    viewpoints: dict[str, Viewpoint] = field(default_factory=dict)
+
+    def seen_from(self, viewpoint: Viewpoint) -> Scene:
+        """The same scene in the world frame whose origin and axes are the body at time 0."""
+        rotation, translation = viewpoint.world_from_scene()
+        meshes = tuple(
+            replace(
+                mesh,
+                vertices=mesh.vertices @ rotation.T + translation,
+                normals=None if mesh.normals is None else mesh.normals @ rotation.T,
+            )
+            for mesh in self.meshes
+        )
+        light = replace(
+            self.light,
+            sun_direction=tuple(rotation @ np.asarray(self.light.sun_direction)),
+            up=tuple(rotation @ np.asarray(self.light.up)),
+        )
+        return replace(self, meshes=meshes, light=light, viewpoints={})
