@@ -1,0 +1,53 @@
+"""What solvers are given: point correspondences of a stereo rig over two frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rsbench.core.so3 import FloatArray
+
+_COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8}
+
+
+def _none(columns: int) -> FloatArray:
+    return np.zeros((0, columns))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Correspondences:
+    """Matches in pixels, one row each; sets that do not exist are empty.
+
+    The sets may hold the same points: ``tracks`` are seen in all four images, and their halves may be
+    repeated in the pairwise sets.
+    """
+
+    left: FloatArray = field(default_factory=lambda: _none(4))
+    """(n, 4) x0, y0, x1, y1: left image, frame 0 to frame 1 (the paper's I1-I3)."""
+    right: FloatArray = field(default_factory=lambda: _none(4))
+    """(n, 4) x0, y0, x1, y1: right image, frame 0 to frame 1 (the paper's I2-I4)."""
+    stereo_0: FloatArray = field(default_factory=lambda: _none(4))
+    """(n, 4) xl, yl, xr, yr: left to right in frame 0."""
+    stereo_1: FloatArray = field(default_factory=lambda: _none(4))
+    """(n, 4) xl, yl, xr, yr: left to right in frame 1."""
+    tracks: FloatArray = field(default_factory=lambda: _none(8))
+    """(n, 8) xl0, yl0, xr0, yr0, xl1, yl1, xr1, yr1: one point in all four images."""
+
+    def __post_init__(self) -> None:
+        for name, columns in _COLUMNS.items():
+            object.__setattr__(self, name, _matches(getattr(self, name), name, columns))
+
+
+def _matches(value: ArrayLike, name: str, columns: int) -> FloatArray:
+    rows = np.array(value, dtype=np.float64)
+    if rows.size == 0:
+        return _none(columns)
+    if rows.ndim != 2 or rows.shape[1] != columns:
+        raise ValueError(f"{name} must have {columns} numbers per match, got shape {rows.shape}")
+    bad = np.flatnonzero(~np.all(np.isfinite(rows), axis=1))
+    if len(bad):
+        raise ValueError(f"{name}[{bad[0]}] must be finite pixels, got {rows[bad[0]].tolist()}")
+    rows.setflags(write=False)
+    return rows

@@ -1,0 +1,54 @@
+"""The stereo rig: two equal cameras, rows aligned with the baseline, read at the same times."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.motion import Motion
+from rsbench.core.se3 import Pose
+from rsbench.core.so3 import FloatArray
+
+Side = Literal["left", "right"]
+SIDES: tuple[Side, Side] = ("left", "right")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StereoRig:
+    """A rectified stereo pair that moves about the centre of its baseline."""
+
+    camera: PinholeCamera
+    baseline: float
+    """Full distance between the two cameras, metres (the paper's 2b)."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.baseline) and self.baseline > 0):
+            raise ValueError(f"baseline must be a positive number of metres, got {self.baseline}")
+
+    def offset(self, side: Side) -> FloatArray:
+        """``x_in_cam = x_in_body + offset`` (3,): the camera stands at minus the offset."""
+        return np.array([self.baseline / 2 if side == "left" else -self.baseline / 2, 0.0, 0.0])
+
+    def cam_from_world(self, motion: Motion, tau: ArrayLike, side: Side) -> Pose:
+        """Camera pose (..., 3, 3), (..., 3) at times ``tau`` (...)."""
+        R, t = motion.body_from_world(tau)
+        return Pose(R, t + self.offset(side))
+
+    def depth(self, disparity: ArrayLike) -> FloatArray:
+        """Depth z (metres) of ``disparity = x_left - x_right`` (px); NaN where it is not positive.
+
+        Exact for a rolling shutter too: both cameras read the same row at the same time, so the pair of a row
+        is an ordinary rectified pair.
+        """
+        disparity = np.asarray(disparity, dtype=np.float64)
+        return self.camera.fx * self.baseline / np.where(disparity > 0.0, disparity, np.nan)
+
+    def disparity(self, depth: ArrayLike) -> FloatArray:
+        """Disparity (px) of depth z (metres); NaN where the depth is not positive."""
+        depth = np.asarray(depth, dtype=np.float64)
+        return self.camera.fx * self.baseline / np.where(depth > 0.0, depth, np.nan)
