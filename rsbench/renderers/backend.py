@@ -1,0 +1,187 @@
+"""Starting Mitsuba: which variant this process renders with, chosen once and never at the cost of a crash."""
+
+from __future__ import annotations
+
+import glob
+import os
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from rsbench.errors import RsbenchError
+from rsbench.renderers import llvm, verdicts
+
+Preference = Literal["auto", "llvm", "cuda", "scalar"]
+
+VARIANTS = {"llvm": "llvm_ad_rgb", "cuda": "cuda_ad_rgb", "scalar": "scalar_rgb"}
+
+_REMEDY = (
+    "install LLVM 17 or newer (`pip install karellen-llvm-core`, or your system's libLLVM); "
+    "`rsbench doctor` shows what was tried"
+)
+
+_DRIVER_GLOBS = (
+    "/usr/lib/*-linux-gnu/libcuda.so*",
+    "/usr/lib64/libcuda.so*",
+    "/usr/lib/libcuda.so*",
+    "/usr/lib/wsl/lib/libcuda.so*",
+    "/usr/local/nvidia/lib64/libcuda.so*",
+    "/usr/local/cuda*/compat/libcuda.so*",
+    "/run/opengl-driver/lib/libcuda.so*",
+)
+
+_CUDA_PROBE = """
+import mitsuba as mi
+mi.set_variant("cuda_ad_rgb")
+scene = mi.load_dict({"type": "scene", "shape": {"type": "sphere"}})
+ray = mi.Ray3f(mi.Point3f(0, 0, mi.Float([-3, -4])), mi.Vector3f(0, 0, 1))
+t = list(scene.ray_intersect(ray).t)
+assert abs(t[0] - 2) < 1e-4 and abs(t[1] - 3) < 1e-4, t
+import drjit as dr
+print("version", *dr.detail.cuda_version())
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Backend:
+    """How this process renders."""
+
+    variant: str
+    """Mitsuba variant: ``llvm_ad_rgb``, ``cuda_ad_rgb`` or ``scalar_rgb``."""
+    llvm_path: Path | None = None
+    llvm_version: str | None = None
+    message: str | None = None
+    """One line for the user when the choice needs one (a slow fallback and its remedy), else None."""
+
+
+_started: Backend | None = None
+_lock = threading.RLock()
+
+
+def start_backend(preference: Preference = "auto") -> Backend:
+    """Choose the Mitsuba variant of this process and start it; later calls return the same answer.
+
+    ``auto`` takes LLVM (the same bits on every machine of a kind), then CUDA, then the slow scalar variant. The
+    environment variable ``RSBENCH_VARIANT`` overrides ``preference``; ``DRJIT_LIBLLVM_PATH`` names the one libLLVM
+    to try. Every library is tried in a child process first, so an unsuitable one cannot end this process.
+
+    Raises:
+        RsbenchError: unknown preference; a backend asked for by name does not work here; another backend has
+            already been started in this process.
+    """
+    global _started
+    wanted = _wanted(preference)
+    with _lock:
+        if _started is None:
+            chosen, candidate = _adopted() or _choose(wanted)
+            if candidate is not None:
+                llvm.load(candidate)
+            _set_variant(chosen.variant)
+            _started = chosen
+        if wanted != "auto" and _started.variant != VARIANTS[wanted]:
+            raise RsbenchError(
+                f"renderer backend {wanted!r} cannot start: this process already renders with {_started.variant}"
+            )
+        return _started
+
+
+def _wanted(preference: str) -> Preference:
+    field = "RSBENCH_VARIANT" if os.environ.get("RSBENCH_VARIANT") else "renderer backend"
+    name = os.environ.get("RSBENCH_VARIANT") or preference
+    short = {variant: key for key, variant in VARIANTS.items()}.get(name, name)
+    for known in get_args(Preference):
+        if short == known:
+            return known  # type: ignore[no-any-return]
+    raise RsbenchError(f"{field} = {name!r}: allowed are {', '.join(get_args(Preference))}")
+
+
+def _choose(wanted: Preference) -> tuple[Backend, llvm.Candidate | None]:
+    refusals: list[str] = []
+    if wanted in ("auto", "llvm"):
+        for candidate in llvm.candidates():
+            verdict = llvm.probe(candidate)
+            if verdict.ok:
+                backend = Backend(variant=VARIANTS["llvm"], llvm_path=candidate.path, llvm_version=verdict.version)
+                return backend, candidate
+            refusals.append(f"{candidate.path}: {verdict.reason}")
+    tried = f" ({'; '.join(refusals)})" if refusals else ""
+    if wanted == "llvm":
+        raise RsbenchError(f"renderer backend 'llvm' found no usable libLLVM{tried}; {_REMEDY}")
+    if wanted in ("auto", "cuda"):
+        verdict = probe_cuda()
+        if verdict.ok:
+            return Backend(variant=VARIANTS["cuda"]), None
+        if wanted == "cuda":
+            raise RsbenchError(f"renderer backend 'cuda' does not work here: {verdict.reason}")
+    if wanted == "scalar":
+        return Backend(variant=VARIANTS["scalar"]), None
+    message = f"no usable libLLVM{tried}: rendering with scalar_rgb, hundreds of times slower; {_REMEDY}"
+    return Backend(variant=VARIANTS["scalar"], message=message), None
+
+
+def _adopted() -> tuple[Backend, None] | None:
+    """The variant that the user's own program set before us, if it did."""
+    mitsuba = sys.modules.get("mitsuba")
+    variant = mitsuba.variant() if mitsuba is not None else None
+    if variant is None:
+        return None
+    if variant not in VARIANTS.values():
+        raise RsbenchError(
+            f"Mitsuba variant {variant!r} is already set in this process: rsbench renders with "
+            f"{', '.join(VARIANTS.values())}"
+        )
+    path = os.environ.get("DRJIT_LIBLLVM_PATH")
+    return Backend(variant=variant, llvm_path=Path(path) if path else None), None
+
+
+def _set_variant(variant: str) -> None:
+    import mitsuba
+
+    if mitsuba.variant() != variant:
+        mitsuba.set_variant(variant)
+
+
+def set_threads(count: int) -> None:
+    """Let the started backend use ``count`` CPU threads (a worker of several on one machine uses a share).
+
+    Raises:
+        RsbenchError: ``count`` is below 1.
+    """
+    if count < 1:
+        raise RsbenchError(f"threads = {count}: at least 1 is needed")
+    start_backend()
+    import drjit
+
+    drjit.set_thread_count(count)
+
+
+def driver_library() -> Path | None:
+    """The NVIDIA driver's library, looked for by name alone: nothing is loaded or started."""
+    folders = [part for part in os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep) if part]
+    patterns = [*_DRIVER_GLOBS, *(f"{glob.escape(folder)}/libcuda.so*" for folder in folders)]
+    if sys.platform == "win32":
+        patterns = [str(Path(os.environ.get("SYSTEMROOT", "C:/Windows"), "System32", "nvcuda.dll"))]
+    return next((Path(name) for pattern in patterns for name in sorted(glob.glob(pattern))), None)
+
+
+def probe_cuda(timeout: float = 120.0) -> llvm.Verdict:
+    """Whether ``cuda_ad_rgb`` can trace a ray here; costs nothing on a machine without an NVIDIA driver."""
+    driver = driver_library()
+    if driver is None:
+        return llvm.Verdict(ok=False, reason="no NVIDIA driver on this machine")
+    try:
+        status = driver.stat()
+    except OSError as error:
+        return llvm.Verdict(ok=False, reason=f"{driver} cannot be read ({error.strerror})")
+    devices = ",".join(sorted(glob.glob("/dev/nvidia[0-9]*")))
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "all")
+    key = f"cuda|{driver}|{status.st_mtime_ns}|{status.st_size}|{devices}|{visible}"
+    known = verdicts.recall(key)
+    if known is not None:
+        return llvm.Verdict(ok=True, version=known)
+    verdict = llvm.run_child(_CUDA_PROBE, [], {}, timeout)
+    if verdict.ok:
+        verdicts.remember(key, verdict.version)
+    return verdict

@@ -1,0 +1,14 @@
+"""From linear radiance to the 8-bit images of a dataset."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def to_srgb8(image: ArrayLike, exposure: float) -> NDArray[np.uint8]:
+    """8-bit sRGB (IEC 61966-2-1) of linear radiance (..., 3) times ``exposure``, clipped to [0, 1], rounded."""
+    linear = np.clip(np.asarray(image, dtype=np.float32) * np.float32(exposure), 0.0, 1.0)
+    curve = 1.055 * np.power(np.maximum(linear, 0.0031308), 1 / 2.4) - 0.055
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, curve)
+    return np.round(encoded * 255.0).astype(np.uint8)

@@ -1,0 +1,77 @@
+"""What a ray brings back: ``sunsky``, free of noise, and Mitsuba's ``path`` with its own random numbers."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from rsbench.renderers.scene import MitsubaScene
+
+
+def sunsky_radiance(scene: MitsubaScene, ray: Any, active: Any = True) -> Any:
+    """Radiance (RGB) along unit rays: a sun with hard shadows and a hemisphere sky on diffuse surfaces.
+
+    L = albedo (E_sun / pi max(n.s, 0) visible + S (0.6 + 0.4 n.up)), with S the cosine-weighted mean of the sky,
+    so that level ground in the open has its exact sky irradiance and a wall three fifths of it. It draws no random
+    number: the same ray has the same radiance, in every renderer, process and number of threads.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    sky = scene.sky
+    flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
+    hit = scene.scene.ray_intersect(ray, ray_flags=flags, coherent=True, active=active)
+    on_surface = hit.is_valid() & active
+    if not dr.is_jit_v(on_surface) and not on_surface:
+        return sky.seen_along(ray.d)
+    albedo = hit.bsdf().eval_diffuse_reflectance(hit, on_surface)
+    normal = hit.sh_frame.n
+    normal = dr.select(dr.dot(normal, ray.d) > 0, -normal, normal)
+    facing = dr.maximum(dr.dot(normal, sky.sun_direction), 0)
+    lit = on_surface & (facing > 0)
+    hidden = scene.scene.ray_test(hit.spawn_ray(sky.sun_direction), coherent=True, active=lit)
+    sun = sky.sun_radiance * dr.select(lit & ~hidden, facing, 0)
+    ambient = sky.overhead * dr.fma(dr.dot(normal, sky.up), 0.4, 0.6)
+    return dr.select(on_surface, albedo * (sun + ambient), sky.seen_along(ray.d))
+
+
+@cache
+def path_integrator(max_depth: int) -> Any:
+    """Mitsuba's path tracer, paths of at most ``max_depth`` segments."""
+    import mitsuba as mi
+
+    return mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000})
+
+
+@cache
+def lane_sampler() -> Any:
+    """A Mitsuba sampler whose numbers depend on seed, pixel and sample alone, not on the place in the wavefront.
+
+    Mitsuba's own samplers number the lanes of a launch, so a row rendered by itself would draw other numbers than
+    the same row of a whole image.
+    """
+    import mitsuba as mi
+
+    class LaneSampler(mi.Sampler):  # type: ignore[misc,name-defined,unused-ignore]
+        def __init__(self, properties: Any) -> None:
+            super().__init__(properties)
+            self.rng = mi.PCG32()
+
+        def seed_lanes(self, seed: Any, pixel: Any, sample: Any) -> None:
+            """Start the sequences of (pixel, sample) pairs; ``pixel`` is the index in the full frame."""
+            high, low = mi.sample_tea_32(seed, pixel)
+            state, sequence = mi.sample_tea_32(high, (low + sample) & 0xFFFFFFFF)
+            self.rng.seed(mi.UInt64(state), mi.UInt64(sequence))
+
+        def next_1d(self, active: Any = True) -> Any:
+            return self.rng.next_float32()
+
+        def next_2d(self, active: Any = True) -> Any:
+            first = self.rng.next_float32()
+            return mi.Point2f(first, self.rng.next_float32())
+
+        def to_string(self) -> str:
+            return "LaneSampler[]"
+
+    mi.register_sampler("rsbench_lanes", LaneSampler)
+    return mi.load_dict({"type": "rsbench_lanes"})

@@ -1,0 +1,211 @@
+"""Finding a libLLVM that Dr.Jit can use, without ever risking the user's process.
+
+Dr.Jit loads libLLVM at run time. Its own search takes the first one it finds, and LLVM 15 and 16 (still the
+default of common systems) abort the whole process at the first kernel. So every candidate is first loaded by a
+child process that compiles a small kernel; only a library that survives that reaches the user's process.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import glob
+import importlib.metadata
+import os
+import platform
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rsbench.renderers import verdicts
+
+MINIMUM_VERSION = 17
+"""15 and 16 abort on CPUs with AVX-512 ("Cannot select ... fminimum"); 14 lacks opaque pointers."""
+
+_WHEELS = {
+    "karellen-llvm-core": re.compile(r"^libLLVM.*\.so"),
+    "llvm-nanobind": re.compile(r"^(libLLVM.*\.so|LLVM\.dll$|l[0-9a-f]+\.dylib$)"),
+}
+_MINIMUM_BYTES = 20_000_000  # a whole LLVM; smaller files of that name are link stubs
+
+_SYSTEM_GLOBS = (
+    "/usr/lib/*-linux-gnu/libLLVM*.so*",
+    "/usr/lib/llvm-*/lib/libLLVM*.so*",
+    "/usr/lib64/libLLVM*.so*",
+    "/usr/lib64/llvm*/lib/libLLVM*.so*",
+    "/usr/lib/libLLVM*.so*",
+    "/opt/homebrew/Cellar/llvm*/*/lib/libLLVM.dylib",
+    "/usr/local/Cellar/llvm*/*/lib/libLLVM.dylib",
+)
+_VERSION_IN_PATH = re.compile(r"libLLVM-(\d+)|libLLVM\.so\.(\d+)|llvm-(\d+)/|Cellar/llvm[^/]*/(\d+)")
+
+# The kernel holds the operations that abort with unsuitable versions. The child has no kernel cache: a kernel
+# taken from the cache would never reach the library under test.
+_PROBE = """
+import ctypes, sys
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+except (ImportError, OSError, ValueError):
+    pass
+for library in sys.argv[1:]:
+    ctypes.CDLL(library, mode=ctypes.RTLD_GLOBAL)
+import drjit as dr
+from drjit.llvm import Float, UInt32
+version = dr.detail.llvm_version()
+x = dr.arange(Float, 64) / 8
+y = dr.minimum(x, 2) + dr.maximum(x, 1) + dr.fma(x, x, 1) + dr.sqrt(x)
+z = dr.gather(Float, y, 63 - dr.arange(UInt32, 64))
+assert abs(float(dr.sum(z)[0]) - float(sum(list(y)))) < 1e-2
+print("version", *version)
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """A libLLVM file that may or may not work."""
+
+    path: Path
+    source: str
+    """Where it was found: ``DRJIT_LIBLLVM_PATH``, the name of a wheel, or ``system``."""
+    preload: tuple[Path, ...] = ()
+    """Libraries to load before it, in this order."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What became of a probe; ``version`` is empty unless the library is usable."""
+
+    ok: bool
+    version: str = ""
+    reason: str = ""
+
+
+def candidates(environ: Mapping[str, str] | None = None) -> Iterator[Candidate]:
+    """Yield the libraries to try, best first; a path that the user set is the only one tried."""
+    environ = os.environ if environ is None else environ
+    chosen = environ.get("DRJIT_LIBLLVM_PATH", "")
+    if chosen:
+        path = Path(chosen)
+        yield Candidate(path=path, source="DRJIT_LIBLLVM_PATH", preload=_missing_links(path))
+        return
+    seen: set[Path] = set()
+    for path, source in (*_wheel_libraries(), *_system_libraries()):
+        if path not in seen:
+            seen.add(path)
+            yield Candidate(path=path, source=source, preload=_missing_links(path))
+
+
+def _wheel_libraries() -> Iterator[tuple[Path, str]]:
+    for name, pattern in _WHEELS.items():
+        try:
+            files = importlib.metadata.distribution(name).files or []
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        for file in files:
+            path = Path(str(file.locate())).resolve()
+            if pattern.match(file.name) and path.is_file() and path.stat().st_size > _MINIMUM_BYTES:
+                yield path, name
+
+
+def _system_libraries() -> list[tuple[Path, str]]:
+    patterns = (*_SYSTEM_GLOBS, f"{sys.prefix}/lib/libLLVM*.so*")
+    found: dict[Path, int] = {}
+    for name in (name for pattern in patterns for name in glob.glob(pattern)):
+        path = Path(name).resolve()
+        version = version_in_path(f"{name} {path}")
+        if version >= MINIMUM_VERSION and path.is_file() and path.stat().st_size > _MINIMUM_BYTES:
+            found[path] = max(version, found.get(path, 0))
+    newest_first = sorted(found, key=lambda path: (-found[path], str(path)))
+    windows = Path(os.environ.get("PROGRAMFILES", "C:/Program Files"), "LLVM", "bin", "LLVM-C.dll")
+    if sys.platform == "win32" and windows.is_file():
+        newest_first.append(windows)  # its name has no version: the probe reads it
+    return [(path, "system") for path in newest_first]
+
+
+def version_in_path(text: str) -> int:
+    """The LLVM major version that a file name or path spells, 0 when it spells none."""
+    versions = [int(part) for match in _VERSION_IN_PATH.findall(text) for part in match if part]
+    return max(versions, default=0)
+
+
+def _missing_links(library: Path) -> tuple[Path, ...]:
+    """The C++ runtime to load by hand when the wheel's symbolic links to it were never made.
+
+    karellen-llvm-core makes its links at the first start of the Python it was installed with, so they are missing
+    after an installation by another tool or user. Once a library of the same soname is loaded the loader is content.
+    """
+    for folder in library.parent.glob("*-linux-gnu*"):
+        if (folder / "libc++.so.1.0").is_file() and not (folder / "libc++.so.1").exists():
+            names = ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")
+            return tuple(folder / name for name in names if (folder / name).is_file())
+    return ()
+
+
+def probe(candidate: Candidate, timeout: float = 60.0) -> Verdict:
+    """Whether Dr.Jit works with the library, found out in a child process; good news is remembered on disk."""
+    path = candidate.path
+    try:
+        status = path.stat()
+    except OSError as error:
+        return Verdict(ok=False, reason=f"cannot be opened ({error.strerror})")
+    drjit = importlib.metadata.version("drjit")
+    key = f"llvm|{path}|{status.st_mtime_ns}|{status.st_size}|{drjit}|{verdicts.cpu_key()}"
+    known = verdicts.recall(key)
+    if known is not None:
+        return Verdict(ok=True, version=known)
+    with tempfile.TemporaryDirectory(prefix="rsbench-probe-") as scratch:
+        environ = {"DRJIT_LIBLLVM_PATH": str(path), "DRJIT_CACHE_DIR": scratch}
+        verdict = run_child(_PROBE, [str(library) for library in candidate.preload], environ, timeout)
+    if verdict.ok and int(verdict.version.split(".")[0]) < MINIMUM_VERSION:
+        return Verdict(ok=False, reason=f"is LLVM {verdict.version}; {MINIMUM_VERSION} or newer is needed")
+    if verdict.ok:
+        verdicts.remember(key, verdict.version)
+    return verdict
+
+
+def run_child(code: str, arguments: Sequence[str], environ: Mapping[str, str], timeout: float) -> Verdict:
+    """Run Python code in a child process; it passes by printing ``version ...`` as its last line, exit code 0."""
+    command = [sys.executable, "-P", "-c", code, *arguments]
+    try:
+        done = subprocess.run(
+            command,
+            env={**os.environ, **environ},
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=timeout,
+            stdin=subprocess.DEVNULL,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return Verdict(ok=False, reason=f"gave no answer within {timeout:g} s")
+    except OSError as error:
+        return Verdict(ok=False, reason=f"child process did not start ({error})")
+    lines = done.stdout.strip().splitlines()
+    if done.returncode == 0 and lines and lines[-1].startswith("version"):
+        return Verdict(ok=True, version=".".join(lines[-1].split()[1:]))
+    if done.returncode < 0:
+        return Verdict(ok=False, reason=f"killed its process (signal {-done.returncode})")
+    said = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+    return Verdict(ok=False, reason=said[-1][:200] if said else f"exit code {done.returncode}")
+
+
+def load(candidate: Candidate) -> None:
+    """Make Dr.Jit use a probed library in this process; must come before Dr.Jit's first use of LLVM."""
+    os.environ["DRJIT_LIBLLVM_PATH"] = str(candidate.path)
+    for library in candidate.preload:
+        ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
+
+
+def cpu_features() -> str:
+    """The instruction sets that decide Dr.Jit's vector width, for people: ``x86_64 avx512f avx2``."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        text = ""
+    flags = set(text.split())
+    return " ".join([platform.machine(), *(flag for flag in ("avx512f", "avx2", "sve") if flag in flags)])

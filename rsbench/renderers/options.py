@@ -1,0 +1,56 @@
+"""What a renderer card says."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from rsbench.errors import RsbenchError
+
+Method = Literal["single-pass", "stitched"]
+Integrator = Literal["sunsky", "path"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RendererOptions:
+    """How images are made; depth does not depend on any of it.
+
+    Raises:
+        RsbenchError: a value is out of its range.
+    """
+
+    description: str = ""
+    method: Method = "single-pass"
+    """``single-pass``: every ray takes its row's pose; ``stitched``: one global-shutter image per row, one row kept."""
+    integrator: Integrator = "sunsky"
+    """``sunsky``: sun with shadows and a hemisphere sky, free of noise; ``path``: global illumination."""
+    samples: int = 16
+    """Per pixel, a perfect square: they lie on a stratified grid inside the pixel."""
+    max_depth: int = 4
+    """Longest light path of ``path``: 2 = direct light only."""
+    exposure: float = 0.8
+    """Multiplies the linear image before it becomes 8-bit sRGB; the same for every frame."""
+    seed: int = 0
+    """Of the random numbers that ``path`` draws."""
+    full_frames: bool = False
+    """``stitched`` renders every row of every global-shutter image, as a camera would, and not only the kept one."""
+
+    def __post_init__(self) -> None:
+        _one_of("method", self.method, get_args(Method))
+        _one_of("integrator", self.integrator, get_args(Integrator))
+        if self.samples < 1 or math.isqrt(self.samples) ** 2 != self.samples:
+            raise RsbenchError(
+                f"renderer samples = {self.samples}: a perfect square is needed (1, 4, 9, 16, 25, ...)"
+            )
+        if self.max_depth < 1:
+            raise RsbenchError(f"renderer max_depth = {self.max_depth}: at least 1 is needed")
+        if not (math.isfinite(self.exposure) and self.exposure > 0):
+            raise RsbenchError(f"renderer exposure = {self.exposure}: a positive number is needed")
+        if not 0 <= self.seed < 2**32:
+            raise RsbenchError(f"renderer seed = {self.seed}: allowed is 0 to 4294967295")
+
+
+def _one_of(field: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise RsbenchError(f"renderer {field} = {value!r}: allowed are {', '.join(allowed)}")

@@ -1,0 +1,160 @@
+"""A scene as Mitsuba holds it: built once, rendered from any number of poses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.errors import RsbenchError
+from rsbench.renderers.backend import start_backend
+from rsbench.scenes.model import Light, Material, Scene, SceneMesh
+
+_SKY_ROWS = 64  # of the sky map that `path` samples; the sky is linear in the sine of the elevation
+
+
+class MitsubaScene:
+    """Meshes, materials, sun and sky of a ``Scene`` in the world frame.
+
+    Starts the renderer backend when the program has not done so.
+
+    Raises:
+        RsbenchError: a textured mesh has no uv; the sun or the zenith has no direction; no backend.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        start_backend()
+        import mitsuba as mi
+
+        self.name = scene.name
+        self.light = scene.light
+        content: dict[str, Any] = {"type": "scene", "sun": _sun(scene.light), "sky": _sky(scene.light)}
+        materials: dict[int, Any] = {}
+        for number, mesh in enumerate(scene.meshes):
+            key = id(mesh.material)
+            if key not in materials:
+                materials[key] = mi.load_dict(_bsdf(mesh.material))
+            content[f"mesh{number:05d}"] = _mesh(mesh, materials[key])
+        # Merging shapes of equal material, the default, depends on the order of a parallel loader.
+        self.scene = mi.load_dict(content, optimize=False)
+        self.sky = Sky(scene.light)
+
+
+class Sky:
+    """Sun and sky in the form that the kernels read: data, so another sun compiles nothing."""
+
+    def __init__(self, light: Light) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        def opaque(values: Any) -> Any:
+            return [dr.opaque(mi.Float, float(value)) for value in values]
+
+        self.sun_direction = mi.Vector3f(*opaque(_unit(light.sun_direction, "sun_direction")))
+        self.up = mi.Vector3f(*opaque(_unit(light.up, "up")))
+        self.sun_radiance = mi.Color3f(*opaque(np.asarray(light.sun_irradiance) / np.pi))
+        self.horizon = mi.Color3f(*opaque(light.sky_horizon))
+        self.zenith = mi.Color3f(*opaque(light.sky_zenith))
+        self.overhead = mi.Color3f(*opaque(mean_sky(light)))
+
+    def seen_along(self, direction: Any) -> Any:
+        """Radiance of the sky along unit directions: the horizon's colour below, towards the zenith's above."""
+        import drjit as dr
+
+        return self.horizon + (self.zenith - self.horizon) * dr.maximum(dr.dot(direction, self.up), 0)
+
+
+def mean_sky(light: Light) -> NDArray[np.float64]:
+    """Cosine-weighted mean radiance (3,) of the sky over the upper hemisphere: E / pi of level ground.
+
+    The integral of (horizon + (zenith - horizon) cos) cos over the hemisphere is pi horizon / 3 + 2 pi zenith / 3.
+    """
+    return np.asarray(light.sky_horizon) / 3.0 + 2.0 * np.asarray(light.sky_zenith) / 3.0
+
+
+def srgb_to_linear(value: Any) -> NDArray[np.float64]:
+    """Linear intensity of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    value = np.asarray(value, dtype=np.float64)
+    return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.0) + 0.055) / 1.055) ** 2.4)
+
+
+def _unit(vector: Any, field: str) -> NDArray[np.float64]:
+    vector = np.asarray(vector, dtype=np.float64)
+    norm = float(np.linalg.norm(vector))
+    if not (np.isfinite(norm) and norm > 0.0):
+        raise RsbenchError(f"light {field} = {tuple(vector.tolist())}: a direction is needed")
+    return vector / norm
+
+
+def _sun(light: Light) -> dict[str, Any]:
+    direction = -_unit(light.sun_direction, "sun_direction")
+    irradiance = {"type": "rgb", "value": [float(value) for value in light.sun_irradiance]}
+    return {"type": "directional", "direction": direction.tolist(), "irradiance": irradiance}
+
+
+def _sky(light: Light) -> dict[str, Any]:
+    """The sky as an environment map, whose pole (row 0 of the map) is the zenith."""
+    import mitsuba as mi
+
+    up = _unit(light.up, "up")
+    side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    side /= np.linalg.norm(side)
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2] = side, up, np.cross(side, up)
+    height = np.cos(np.pi * (np.arange(_SKY_ROWS) + 0.5) / _SKY_ROWS).clip(0.0)[:, None]
+    horizon, zenith = np.asarray(light.sky_horizon), np.asarray(light.sky_zenith)
+    colours = (horizon + (zenith - horizon) * height).astype(np.float32)
+    bitmap = mi.Bitmap(np.repeat(colours[:, None], 2 * _SKY_ROWS, axis=1).copy())
+    return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(pose)}
+
+
+def _bsdf(material: Material) -> dict[str, Any]:
+    import mitsuba as mi
+
+    reflectance: dict[str, Any]
+    if material.texture is None:
+        reflectance = {"type": "rgb", "value": srgb_to_linear(material.colour).tolist()}
+    else:
+        reflectance = {
+            "type": "bitmap",
+            "bitmap": mi.Bitmap(np.array(material.texture, dtype=np.uint8, order="C")),
+            "raw": False,
+            "filter_type": "bilinear",
+            "wrap_mode": "repeat",
+            "format": "variant",
+            "accel": False,  # graphics hardware interpolates with 8-bit weights
+        }
+    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
+
+
+def _mesh(mesh: SceneMesh, bsdf: Any) -> Any:
+    import mitsuba as mi
+
+    if mesh.material.texture is not None and mesh.uv is None:
+        raise RsbenchError(
+            f"mesh {mesh.name!r}: its material {mesh.material.name!r} has a texture but it has no uv"
+        )
+    properties = mi.Properties()
+    properties["bsdf"] = bsdf
+    shape = mi.Mesh(
+        mesh.name,
+        len(mesh.vertices),
+        len(mesh.faces),
+        properties,
+        has_vertex_normals=mesh.normals is not None,
+        has_vertex_texcoords=mesh.uv is not None,
+    )
+    parameters = mi.traverse(shape)
+    parameters["vertex_positions"] = np.ravel(mesh.vertices).astype(np.float32)
+    parameters["faces"] = np.ravel(mesh.faces).astype(np.uint32)
+    if mesh.uv is not None:
+        # Mitsuba's v points down the texture.
+        uv = np.stack([mesh.uv[:, 0], 1.0 - mesh.uv[:, 1]], axis=-1)
+        parameters["vertex_texcoords"] = np.ravel(uv).astype(np.float32)
+    parameters.update()
+    if mesh.normals is not None:
+        # New positions make Mitsuba recompute the normals, so ours come after them.
+        parameters["vertex_normals"] = np.ravel(mesh.normals).astype(np.float32)
+        parameters.update()
+    return shape

@@ -1,0 +1,131 @@
+"""The rolling-shutter pinhole camera: every ray leaves from the pose of its image row.
+
+``rs_pinhole`` is an ordinary Mitsuba sensor, so any Mitsuba integrator can render through it; rsbench's own
+renderers call its ``row_ray`` directly. Poses and intrinsics are data of the compiled kernel, never constants.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.errors import RsbenchError
+
+PLUGIN = "rs_pinhole"
+
+
+def pose_table(camera: PinholeCamera, rotations: ArrayLike, translations: ArrayLike) -> NDArray[np.float32]:
+    """Row poses as the kernels read them, (height, 12): ``R^T`` row-major, then the camera centre ``-R^T t``.
+
+    Args:
+        camera: its height is the number of poses.
+        rotations: (height, 3, 3) world-to-camera rotations, one per row.
+        translations: (height, 3) metres, with ``X_cam = R @ X_world + t``.
+
+    Raises:
+        RsbenchError: wrong shapes, or values that are not finite.
+    """
+    R = np.asarray(rotations, dtype=np.float64)
+    t = np.asarray(translations, dtype=np.float64)
+    if R.shape != (camera.height, 3, 3) or t.shape != (camera.height, 3):
+        raise RsbenchError(
+            f"row poses have shapes {R.shape} and {t.shape}: a camera of {camera.height} rows needs "
+            f"({camera.height}, 3, 3) and ({camera.height}, 3)"
+        )
+    if not (np.isfinite(R).all() and np.isfinite(t).all()):
+        raise RsbenchError("row poses are not finite numbers")
+    axes = np.swapaxes(R, -1, -2)
+    centre = -np.einsum("hij,hj->hi", axes, t)
+    return np.concatenate([axes.reshape(-1, 9), centre], axis=-1).astype(np.float32)
+
+
+def make_sensor(camera: PinholeCamera, rotations: ArrayLike, translations: ArrayLike) -> Any:
+    """A Mitsuba sensor ``rs_pinhole`` with a box filter, of ``camera``'s size, at these row poses.
+
+    Args and errors: see ``pose_table``. ``rotations`` (height, 3, 3) and ``translations`` (height, 3) that are
+    equal in all rows make a global shutter.
+    """
+    import mitsuba as mi
+
+    sensor_class()
+    film = {
+        "type": "hdrfilm",
+        "width": camera.width,
+        "height": camera.height,
+        "pixel_format": "rgb",
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
+    sensor = mi.load_dict({"type": PLUGIN, "film": film, "sampler": {"type": "independent"}})
+    sensor.set_intrinsics(camera)
+    sensor.set_poses(pose_table(camera, rotations, translations))
+    return sensor
+
+
+@cache
+def sensor_class() -> Any:
+    """The class behind the plugin ``rs_pinhole``, registered with the Mitsuba variant that is set."""
+    import drjit as dr
+    import mitsuba as mi
+
+    scalar = not dr.is_jit_v(mi.Float)
+
+    class RSPinhole(mi.Sensor):  # type: ignore[misc,name-defined,unused-ignore]
+        def __init__(self, properties: Any) -> None:
+            super().__init__(properties)
+            self.intrinsics = [mi.Float(1.0), mi.Float(1.0), mi.Float(0.0), mi.Float(0.0)]
+            self.poses: Any = None
+
+        def set_intrinsics(self, camera: PinholeCamera) -> None:
+            values = (camera.fx, camera.fy, camera.cx, camera.cy)
+            self.intrinsics = [dr.opaque(mi.Float, value) for value in values]
+
+        def set_poses(self, table: NDArray[np.float32]) -> None:
+            """Table (height, 12) of ``pose_table``."""
+            self.poses = table.ravel().tolist() if scalar else mi.Float(table.ravel())
+
+        def row_ray(self, x: Any, y: Any, row: Any, active: Any = True) -> tuple[Any, Any]:
+            """World origin and direction of the ray through pixel coordinates (x, y), at the pose of ``row``.
+
+            The direction has camera z = 1, so the distance to a hit in units of it is the depth z.
+            """
+            fx, fy, cx, cy = self.intrinsics
+            u, v = (x - cx) / fx, (y - cy) / fy
+            p = [self._entry(row, k, active) for k in range(12)]
+            direction = [dr.fma(p[3 * i], u, dr.fma(p[3 * i + 1], v, p[3 * i + 2])) for i in range(3)]
+            return mi.Point3f(p[9], p[10], p[11]), mi.Vector3f(*direction)
+
+        def _entry(self, row: Any, k: int, active: Any) -> Any:
+            if scalar:
+                return self.poses[12 * int(row) + k]
+            return dr.gather(mi.Float, self.poses, row * 12 + k, active)
+
+        def sample_ray(self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True) -> Any:
+            """Mitsuba's interface: film position in [0, 1]^2, whose pixel coordinate is half a pixel less."""
+            film = self.film()
+            size, crop, offset = film.size(), film.crop_size(), film.crop_offset()
+            x = position.x * crop[0] + offset[0]
+            y = position.y * crop[1] + offset[1]
+            row = mi.UInt32(dr.clip(dr.floor(y), 0, size[1] - 1))
+            origin, direction = self.row_ray(x - 0.5, y - 0.5, row, active)
+            wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), wavelength, active)
+            return mi.Ray3f(origin, dr.normalize(direction), time, wavelengths), weight
+
+        def sample_ray_differential(
+            self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
+        ) -> Any:
+            ray, weight = self.sample_ray(time, wavelength, position, aperture, active)
+            return mi.RayDifferential3f(ray), weight
+
+        def bbox(self) -> Any:
+            return mi.ScalarBoundingBox3f()
+
+        def to_string(self) -> str:
+            return f"RSPinhole[{self.film().size()}]"
+
+    mi.register_sensor(PLUGIN, RSPinhole)
+    return RSPinhole

@@ -1,0 +1,151 @@
+"""Tracing whole blocks of pixels at once with Dr.Jit (the variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``).
+
+A lane is one pixel. The lanes of a row are padded to whole packets: Embree traces neighbouring lanes together,
+and its rounding may depend on a lane's neighbours. As packets never straddle rows, a pixel has the same
+neighbours, and so the same bits, in a whole frame and in a row rendered by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
+from rsbench.renderers.options import RendererOptions
+from rsbench.renderers.scene import MitsubaScene
+from rsbench.renderers.subpixel import subpixel_grid
+
+PACKET = 16
+"""Lanes that are traced together at most (AVX-512)."""
+LANES_PER_LAUNCH = 1 << 22
+"""Bounds the memory of a launch; larger work is split, which changes no bit of the result."""
+
+Float32Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class _Lanes:
+    """Pixels of a block of rows, repeated ``copies`` times."""
+
+    row: Any
+    column: Any
+    active: Any
+    shape: tuple[int, int, int]  # copies, rows, padded width
+
+    @classmethod
+    def of(cls, rows: Sequence[int], width: int, copies: int = 1) -> _Lanes:
+        import drjit as dr
+        import mitsuba as mi
+
+        shape = (copies, len(rows), _padded(width))
+        row = np.broadcast_to(np.asarray(rows, dtype=np.uint32)[:, None], shape)
+        column = np.broadcast_to(np.arange(shape[2], dtype=np.uint32), shape)
+        columns = mi.UInt32(column.ravel())
+        return cls(mi.UInt32(row.ravel()), columns, columns < dr.opaque(mi.UInt32, width), shape)
+
+    def image(self, values: Any, width: int) -> Float32Array:
+        """Host array (copies, rows, width, channels) of a Dr.Jit array with one entry per lane."""
+        host = np.atleast_2d(np.array(values))
+        return host.reshape(-1, *self.shape).transpose(1, 2, 3, 0)[:, :, :width]
+
+
+def _padded(width: int) -> int:
+    return -(-width // PACKET) * PACKET
+
+
+def _bands(rows: Sequence[int], width: int) -> Iterator[Sequence[int]]:
+    step = max(1, LANES_PER_LAUNCH // _padded(width))
+    for start in range(0, len(rows), step):
+        yield rows[start : start + step]
+
+
+def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]) -> Float32Array:
+    """Depth z (rows, width) along the rays through pixel centres, metres; 0 = no surface."""
+    import drjit as dr
+    import mitsuba as mi
+
+    result = np.zeros((len(rows), camera.width), dtype=np.float32)
+    done = 0
+    for band in _bands(rows, camera.width):
+        lanes = _Lanes.of(band, camera.width)
+        ray = mi.Ray3f(*sensor.row_ray(mi.Float(lanes.column), mi.Float(lanes.row), lanes.row, lanes.active))
+        hit = scene.scene.ray_intersect_preliminary(ray, coherent=True, active=lanes.active)
+        depth = dr.select(hit.is_valid(), hit.t, 0)
+        result[done : done + len(band)] = lanes.image(depth, camera.width)[0, :, :, 0]
+        done += len(band)
+    return result
+
+
+def radiance_rows(
+    scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
+) -> Float32Array:
+    """Linear RGB (rows, width, 3): the mean over the sub-pixel grid (a box filter)."""
+    trace = _sunsky_band if options.integrator == "sunsky" else _path_band
+    result = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
+    done = 0
+    for band in _bands(rows, camera.width):
+        result[done : done + len(band)] = trace(scene, sensor, camera, band, options)
+        done += len(band)
+    return result
+
+
+def _sunsky_band(
+    scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
+) -> Float32Array:
+    """The loop over samples runs inside the kernel, so memory does not grow with them."""
+    import drjit as dr
+    import mitsuba as mi
+
+    lanes = _Lanes.of(rows, camera.width)
+    grid = mi.Float(subpixel_grid(options.samples).ravel())
+    count = dr.opaque(mi.UInt32, options.samples)
+    x, y = mi.Float(lanes.column), mi.Float(lanes.row)
+
+    def add_sample(k: Any, total: Any) -> tuple[Any, Any]:
+        dx, dy = dr.gather(mi.Float, grid, 2 * k), dr.gather(mi.Float, grid, 2 * k + 1)
+        origin, direction = sensor.row_ray(x + dx, y + dy, lanes.row, lanes.active)
+        ray = mi.Ray3f(origin, dr.normalize(direction))
+        return k + 1, total + sunsky_radiance(scene, ray, lanes.active)
+
+    _, total = dr.while_loop(
+        state=(dr.zeros(mi.UInt32, dr.width(lanes.row)), dr.zeros(mi.Color3f, dr.width(lanes.row))),
+        cond=lambda k, total: k < count,
+        body=add_sample,
+        labels=("sample", "total"),
+    )
+    return lanes.image(total / mi.Float(count), camera.width)[0]
+
+
+def _path_band(
+    scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
+) -> Float32Array:
+    """One lane per pixel and sample, in passes; samples are added one after another whatever the passes."""
+    import drjit as dr
+    import mitsuba as mi
+
+    grid = subpixel_grid(options.samples)
+    integrator, sampler = path_integrator(options.max_depth), lane_sampler()
+    per_pass = max(1, LANES_PER_LAUNCH // (len(rows) * _padded(camera.width)))
+    total = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
+    for first in range(0, options.samples, per_pass):
+        copies = min(per_pass, options.samples - first)
+        lanes = _Lanes.of(rows, camera.width, copies)
+        lanes_per_copy = lanes.shape[1] * lanes.shape[2]
+        numbers = np.arange(first, first + copies, dtype=np.uint32)
+        sample = mi.UInt32(np.repeat(numbers, lanes_per_copy))
+        offsets = mi.Float(grid.ravel())
+        x = mi.Float(lanes.column) + dr.gather(mi.Float, offsets, 2 * sample)
+        y = mi.Float(lanes.row) + dr.gather(mi.Float, offsets, 2 * sample + 1)
+        origin, direction = sensor.row_ray(x, y, lanes.row, lanes.active)
+        pixel = lanes.row * dr.opaque(mi.UInt32, camera.width) + lanes.column
+        sampler.seed_lanes(dr.opaque(mi.UInt32, options.seed), pixel, sample)
+        ray = mi.RayDifferential3f(origin, dr.normalize(direction))
+        radiance, _, _ = integrator.sample(scene.scene, sampler, ray, active=lanes.active)
+        for one in lanes.image(radiance, camera.width):
+            total += one
+    return total / np.float32(options.samples)
