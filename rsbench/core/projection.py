@@ -21,7 +21,7 @@ from rsbench.core.so3 import FloatArray
 
 ROW_TOLERANCE_PX = 1e-9
 """Accepted residual of the row equation."""
-_COARSE_ROWS, _FINE_ROWS, _MAX_ITERATIONS = 17, 513, 60
+_COARSE_ROWS, _FINE_ROWS, _MAX_ITERATIONS, _MAX_NEWTON_STEPS = 17, 513, 60, 12
 
 
 class ProjectionStatus(IntEnum):
@@ -137,6 +137,40 @@ def rs_project(
         depth=depth.reshape(shape),
         tau=tau.reshape(shape),
         status=status.reshape(shape),
+    )
+
+
+def rs_project_near(
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    side: Side,
+    frame: int,
+    points: ArrayLike,
+    start_rows: ArrayLike,
+) -> RSProjection:
+    """Like ``rs_project`` from a row guess (...) per point: Newton only, for dense maps.
+
+    Finds one crossing and does not look for others, so the status is never TWICE.
+    """
+    X = np.asarray(points, dtype=np.float64)
+    y = np.broadcast_to(np.asarray(start_rows, dtype=np.float64), X.shape[:-1]).copy()
+    for _ in range(_MAX_NEWTON_STEPS):
+        value, slope, x_in_cam = _row_residual(rig, shutter, motion, side, frame, X, y)
+        converged = np.abs(value) <= ROW_TOLERANCE_PX
+        # Points behind the camera have no residual and need no further steps.
+        if np.all(converged | np.isnan(value)):
+            break
+        y = np.where(converged | np.isnan(value), y, y - value / np.where(slope == 0.0, np.nan, slope))
+    pixels = rig.camera.project(x_in_cam)
+    inside = converged & rig.camera.contains(pixels)
+    lost = np.isfinite(value) & ~converged
+    status = np.where(inside, ProjectionStatus.SEEN, ProjectionStatus.NEVER)
+    return RSProjection(
+        pixels=np.where(inside[..., None], pixels, np.nan),
+        depth=np.where(inside, x_in_cam[..., 2], np.nan),
+        tau=np.where(inside, shutter.row_time(y, frame), np.nan),
+        status=np.where(lost, ProjectionStatus.NOT_CONVERGED, status).astype(np.uint8),
     )
 
 

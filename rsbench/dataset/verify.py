@@ -1,0 +1,202 @@
+"""Verification of a dataset: every file is what the manifest says, and every channel agrees with the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core import so3
+from rsbench.core.projection import ProjectionStatus, back_project, row_poses, rs_project_near
+from rsbench.core.rig import SIDES, Side
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.files import read_json, sha256
+from rsbench.dataset.sequence import FRAMES, RELATIVE_FILES, Sequence, read_sequence
+from rsbench.errors import RsbenchError
+
+DEPTH_TOLERANCE = 1e-4
+"""Relative difference of two depths of one surface point that still agree."""
+_FLATNESS = 2e-6
+"""Relative second difference of inverse depth (linear on planes) below which bilinear interpolation is exact
+to well under the tolerance; the motion between rows bends it by about 1e-7."""
+_NEAR_MISS = 1e-2
+"""A surface hidden by less than this is a disagreement, not an occlusion."""
+_AGREEING_SHARE = 0.995
+"""Needles thinner than a pixel may be seen in one frame and missed by the pixel centres of another."""
+_CHUNK_ROWS = 100
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthAgreement:
+    """How the depth of one frame agrees with that of another."""
+
+    source: str
+    target: str
+    compared: int
+    """Surface pixels that land inside the target on a locally flat surface and are not plainly hidden."""
+    agreeing: int
+    """Of these, within ``DEPTH_TOLERANCE``."""
+    p99: float
+    """99th percentile of the relative difference of the agreeing and near pixels."""
+
+    @property
+    def share(self) -> float:
+        return self.agreeing / self.compared if self.compared else 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceReport:
+    """What verification found in one sequence."""
+
+    name: str
+    faults: tuple[str, ...]
+    agreements: tuple[DepthAgreement, ...] = ()
+
+
+def verify_dataset(folder: Path, stride: int = 1, progress: Progress | None = None) -> list[SequenceReport]:
+    """Check every sequence of a dataset; faults are values, only an unreadable dataset raises.
+
+    Args:
+        folder: holds dataset.json.
+        stride: compare every ``stride``-th pixel in both directions.
+        progress: called with steps done and steps in all.
+
+    Raises:
+        RsbenchError: no dataset.json, or one that is not of format 1.
+    """
+    manifest = read_json(folder / "dataset.json")
+    names, files = manifest.get("sequences"), manifest.get("files")
+    if not isinstance(names, list) or not isinstance(files, dict):
+        raise RsbenchError(f"{folder / 'dataset.json'}: must name its 'sequences' and 'files'")
+    total, steps = 13 * len(names), 0
+
+    def step() -> None:
+        nonlocal steps
+        steps += 1
+        if progress:
+            progress(steps, total)
+
+    reports = []
+    for name in names:
+        faults = list(_file_faults(folder, name, files))
+        step()
+        agreements: list[DepthAgreement] = []
+        if not faults:
+            try:
+                sequence = read_sequence(folder / name)
+                faults += _pose_faults(sequence)
+                for agreement in depth_agreements(sequence, stride):
+                    agreements.append(agreement)
+                    step()
+                faults += _agreement_faults(agreements)
+            except RsbenchError as error:
+                faults.append(str(error))
+        reports.append(SequenceReport(name=name, faults=tuple(faults), agreements=tuple(agreements)))
+    return reports
+
+
+def _file_faults(folder: Path, name: str, files: dict[str, dict[str, object]]) -> Iterator[str]:
+    expected = {f"{name}/{relative}" for relative in ("sequence.json", *RELATIVE_FILES)}
+    for relative in sorted(expected):
+        path = folder / relative
+        if relative not in files:
+            yield f"{relative}: not listed in dataset.json"
+        elif not path.is_file():
+            yield f"{relative}: missing"
+        elif path.stat().st_size != files[relative]["size"] or sha256(path) != files[relative]["sha256"]:
+            yield f"{relative}: content differs from its checksum in dataset.json"
+
+
+def _pose_faults(sequence: Sequence) -> Iterator[str]:
+    """Stored row poses must be the motion at the row times, to the last digits of a quaternion."""
+    for side, frame in product(SIDES, FRAMES):
+        tau, poses = sequence.poses(side, frame)
+        expected = row_poses(sequence.rig, sequence.shutter, sequence.motion, side, frame)
+        rows = np.arange(sequence.shutter.height)
+        wrong_time = np.max(np.abs(tau - sequence.shutter.row_time(rows, frame)))
+        wrong_angle = np.max(so3.angle(poses.R @ np.swapaxes(expected.R, -1, -2)))
+        wrong_place = np.max(np.abs(poses.t - expected.t))
+        if max(wrong_time, wrong_angle, wrong_place) > 1e-12:
+            yield (
+                f"{sequence.name}/poses/{side}_{frame}.csv: differs from the motion by {wrong_time:.1e} periods, "
+                f"{wrong_angle:.1e} rad, {wrong_place:.1e} m"
+            )
+
+
+def _agreement_faults(agreements: list[DepthAgreement]) -> Iterator[str]:
+    for agreement in agreements:
+        if agreement.compared and agreement.share < _AGREEING_SHARE:
+            yield (
+                f"depth of {agreement.source} and {agreement.target} agree to {DEPTH_TOLERANCE:g} on only "
+                f"{100 * agreement.share:.2f} % of {agreement.compared} visible pixels"
+            )
+    if not any(agreement.compared for agreement in agreements):
+        yield "no pixel of any frame could be compared with another frame"
+
+
+def depth_agreements(sequence: Sequence, stride: int = 1) -> Iterator[DepthAgreement]:
+    """Compare the rolling-shutter depth of each of the four frames with the other three."""
+    frames = list(product(SIDES, FRAMES))
+    depths = {frame: sequence.depth("rs", *frame) for frame in frames}
+    for source, target in product(frames, frames):
+        if source != target:
+            yield _agreement(sequence, source, target, depths[source], depths[target], stride)
+
+
+def _agreement(
+    sequence: Sequence,
+    source: tuple[Side, int],
+    target: tuple[Side, int],
+    source_depth: NDArray[np.float32],
+    target_depth: NDArray[np.float32],
+    stride: int,
+) -> DepthAgreement:
+    geometry = sequence.rig, sequence.shutter, sequence.motion
+    grid = sequence.rig.camera.pixel_grid()[::stride, ::stride]
+    depth = source_depth[::stride, ::stride].astype(np.float64)
+    differences = []
+    for first in range(0, len(grid), _CHUNK_ROWS):
+        surface = depth[first : first + _CHUNK_ROWS] > 0
+        pixels = grid[first : first + _CHUNK_ROWS][surface]
+        X = back_project(*geometry, *source, pixels, depth[first : first + _CHUNK_ROWS][surface])
+        seen = rs_project_near(*geometry, *target, X, pixels[:, 1])
+        inside = seen.status == ProjectionStatus.SEEN
+        differences.append(_compare(target_depth, seen.pixels[inside], seen.depth[inside]))
+    relative = np.concatenate(differences)
+    near = np.abs(relative[relative < _NEAR_MISS])
+    return DepthAgreement(
+        source=f"{source[0]}_{source[1]}",
+        target=f"{target[0]}_{target[1]}",
+        compared=near.size,
+        agreeing=int(np.sum(near <= DEPTH_TOLERANCE)),
+        p99=float(np.percentile(near, 99)) if near.size else float("nan"),
+    )
+
+
+def _compare(depth: NDArray[np.float32], pixels: FloatArray, z: FloatArray) -> FloatArray:
+    """Relative depth of points behind (+) or before (-) the surface, where that is locally flat."""
+    height, width = depth.shape
+    x0, y0 = np.floor(pixels).astype(np.int64).T
+    inner = (x0 >= 1) & (x0 < width - 2) & (y0 >= 1) & (y0 < height - 2)
+    x0, y0, pixels, z = x0[inner], y0[inner], pixels[inner], z[inner]
+    offsets = np.arange(-1, 3)
+    block = depth[y0[:, None, None] + offsets[:, None], x0[:, None, None] + offsets].astype(np.float64)
+    solid = np.all(block > 0, axis=(1, 2))
+    inverse = 1.0 / np.where(block > 0, block, 1.0)
+    bend = np.maximum(
+        np.max(np.abs(np.diff(inverse, 2, axis=1)), axis=(1, 2)),
+        np.max(np.abs(np.diff(inverse, 2, axis=2)), axis=(1, 2)),
+    )
+    twist = np.max(np.abs(np.diff(np.diff(inverse, axis=1), axis=2)), axis=(1, 2))
+    flat = solid & (np.maximum(bend, twist) <= _FLATNESS * inverse[:, 1, 1])
+    fx, fy = (pixels - np.stack([x0, y0], axis=-1)).T
+    top = (1 - fx) * inverse[:, 1, 1] + fx * inverse[:, 1, 2]
+    bottom = (1 - fx) * inverse[:, 2, 1] + fx * inverse[:, 2, 2]
+    relative = z * ((1 - fy) * top + fy * bottom) - 1.0
+    return relative[flat]
