@@ -1,0 +1,51 @@
+# make demo    render, solve, correct and score one sequence; ends with the path of its report
+# make test    format, lint, types, layers and every test
+# make lock    renew constraints.txt from pyproject.toml (needs uv)
+# make clean   remove .venv and caches
+# Needs Python >= 3.11 with pip and venv. `make demo PYTHON=/path/to/python` chooses one.
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+CANDIDATES = $(or $(PYTHON),python3 python3.14 python3.13 python3.12 python3.11)
+SUITABLE := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
+
+.PHONY: demo test lock clean
+.DELETE_ON_ERROR:
+
+demo: $(STAMP)
+	@$(BIN)/rsbench demo
+
+test: $(STAMP)
+	@echo "== format"; $(BIN)/ruff format --check .
+	@echo "== lint";   $(BIN)/ruff check .
+	@echo "== types";  $(BIN)/mypy
+	@echo "== layers"; $(BIN)/lint-imports
+	@echo "== tests";  $(BIN)/python -m pytest
+
+# A venv without a working pip is what a killed `python -m venv` leaves: it is made anew.
+$(STAMP): constraints.txt pyproject.toml
+	@if ! $(PIP) --version >/dev/null 2>&1; then \
+	  for python in $(CANDIDATES); do \
+	    if "$$python" -c '$(SUITABLE)' 2>/dev/null; then found=$$python; break; fi; \
+	  done; \
+	  if [ -z "$$found" ]; then \
+	    echo "make: no Python >= 3.11 with pip and venv among: $(CANDIDATES) (PYTHON=/path/to/python chooses)" >&2; exit 1; \
+	  fi; \
+	  echo "Creating $(VENV) with $$("$$found" --version)"; \
+	  "$$found" -m venv --clear $(VENV); \
+	fi
+	@echo "Installing the locked dependencies into $(VENV) (a few minutes the first time)"
+	@$(PIP) install --quiet --require-hashes -r constraints.txt
+	@$(PIP) install --quiet --no-deps --no-build-isolation -e .
+	@touch $@
+
+lock:
+	@command -v uv >/dev/null || { echo "make: 'make lock' needs uv, which is not installed" >&2; exit 1; }
+	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 \
+	  --generate-hashes --no-annotate --no-header --quiet --output-file constraints.txt
+
+clean:
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache dist build
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
