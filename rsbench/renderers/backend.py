@@ -17,11 +17,6 @@ Preference = Literal["auto", "llvm", "cuda", "scalar"]
 
 VARIANTS = {"llvm": "llvm_ad_rgb", "cuda": "cuda_ad_rgb", "scalar": "scalar_rgb"}
 
-_REMEDY = (
-    "install LLVM 17 or newer (`pip install karellen-llvm-core`, or your system's libLLVM); "
-    "`rsbench doctor` shows what was tried"
-)
-
 _DRIVER_GLOBS = (
     "/usr/lib/*-linux-gnu/libcuda.so*",
     "/usr/lib64/libcuda.so*",
@@ -93,7 +88,7 @@ def _wanted(preference: str) -> Preference:
     short = {variant: key for key, variant in VARIANTS.items()}.get(name, name)
     for known in get_args(Preference):
         if short == known:
-            return known  # type: ignore[no-any-return]
+            return known
     raise RsbenchError(f"{field} = {name!r}: allowed are {', '.join(get_args(Preference))}")
 
 
@@ -108,7 +103,7 @@ def _choose(wanted: Preference) -> tuple[Backend, llvm.Candidate | None]:
             refusals.append(f"{candidate.path}: {verdict.reason}")
     tried = f" ({'; '.join(refusals)})" if refusals else ""
     if wanted == "llvm":
-        raise RsbenchError(f"renderer backend 'llvm' found no usable libLLVM{tried}; {_REMEDY}")
+        raise RsbenchError(f"renderer backend 'llvm' found no usable libLLVM{tried}; {llvm.REMEDY}")
     if wanted in ("auto", "cuda"):
         verdict = probe_cuda()
         if verdict.ok:
@@ -117,7 +112,7 @@ def _choose(wanted: Preference) -> tuple[Backend, llvm.Candidate | None]:
             raise RsbenchError(f"renderer backend 'cuda' does not work here: {verdict.reason}")
     if wanted == "scalar":
         return Backend(variant=VARIANTS["scalar"]), None
-    message = f"no usable libLLVM{tried}: rendering with scalar_rgb, hundreds of times slower; {_REMEDY}"
+    message = f"no usable libLLVM{tried}: rendering with scalar_rgb, tens of times slower; {llvm.REMEDY}"
     return Backend(variant=VARIANTS["scalar"], message=message), None
 
 

@@ -30,7 +30,7 @@ def sunsky_radiance(scene: MitsubaScene, ray: Any, active: Any = True) -> Any:
     facing = dr.maximum(dr.dot(normal, sky.sun_direction), 0)
     lit = on_surface & (facing > 0)
     hidden = scene.scene.ray_test(hit.spawn_ray(sky.sun_direction), coherent=True, active=lit)
-    sun = sky.sun_radiance * dr.select(lit & ~hidden, facing, 0)
+    sun = sky.sun_radiance * dr.select(lit, dr.select(hidden, 0, facing), 0)
     ambient = sky.overhead * dr.fma(dr.dot(normal, sky.up), 0.4, 0.6)
     return dr.select(on_surface, albedo * (sun + ambient), sky.seen_along(ray.d))
 
@@ -55,7 +55,7 @@ def lane_sampler() -> Any:
     class LaneSampler(mi.Sampler):  # type: ignore[misc,name-defined,unused-ignore]
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
-            self.rng = mi.PCG32()
+            self.rng: Any = mi.PCG32()
 
         def seed_lanes(self, seed: Any, pixel: Any, sample: Any) -> None:
             """Start the sequences of (pixel, sample) pairs; ``pixel`` is the index in the full frame."""

@@ -25,6 +25,11 @@ from rsbench.renderers import verdicts
 MINIMUM_VERSION = 17
 """15 and 16 abort on CPUs with AVX-512 ("Cannot select ... fminimum"); 14 lacks opaque pointers."""
 
+REMEDY = (
+    "install LLVM 17 or newer (`pip install karellen-llvm-core`, or your system's libLLVM); "
+    "`rsbench doctor` shows what was tried"
+)
+
 _WHEELS = {
     "karellen-llvm-core": re.compile(r"^libLLVM.*\.so"),
     "llvm-nanobind": re.compile(r"^(libLLVM.*\.so|LLVM\.dll$|l[0-9a-f]+\.dylib$)"),
@@ -112,18 +117,28 @@ def _wheel_libraries() -> Iterator[tuple[Path, str]]:
 
 
 def _system_libraries() -> list[tuple[Path, str]]:
-    patterns = (*_SYSTEM_GLOBS, f"{sys.prefix}/lib/libLLVM*.so*")
-    found: dict[Path, int] = {}
-    for name in (name for pattern in patterns for name in glob.glob(pattern)):
-        path = Path(name).resolve()
-        version = version_in_path(f"{name} {path}")
-        if version >= MINIMUM_VERSION and path.is_file() and path.stat().st_size > _MINIMUM_BYTES:
-            found[path] = max(version, found.get(path, 0))
+    found = {path: version for path, version in _installed().items() if version >= MINIMUM_VERSION}
     newest_first = sorted(found, key=lambda path: (-found[path], str(path)))
     windows = Path(os.environ.get("PROGRAMFILES", "C:/Program Files"), "LLVM", "bin", "LLVM-C.dll")
     if sys.platform == "win32" and windows.is_file():
         newest_first.append(windows)  # its name has no version: the probe reads it
     return [(path, "system") for path in newest_first]
+
+
+def outdated_libraries() -> list[Path]:
+    """System libraries that are never tried because their name spells an unsuitable version."""
+    return sorted(path for path, version in _installed().items() if 0 < version < MINIMUM_VERSION)
+
+
+def _installed() -> dict[Path, int]:
+    """System libraries and the versions that their names spell."""
+    found: dict[Path, int] = {}
+    for pattern in (*_SYSTEM_GLOBS, f"{sys.prefix}/lib/libLLVM*.so*"):
+        for name in glob.glob(pattern):
+            path = Path(name).resolve()
+            if path.is_file() and path.stat().st_size > _MINIMUM_BYTES:
+                found[path] = max(version_in_path(f"{name} {path}"), found.get(path, 0))
+    return found
 
 
 def version_in_path(text: str) -> int:
@@ -135,8 +150,8 @@ def version_in_path(text: str) -> int:
 def _missing_links(library: Path) -> tuple[Path, ...]:
     """The C++ runtime to load by hand when the wheel's symbolic links to it were never made.
 
-    karellen-llvm-core makes its links at the first start of the Python it was installed with, so they are missing
-    after an installation by another tool or user. Once a library of the same soname is loaded the loader is content.
+    karellen-llvm-core makes its links at the first start of the Python it was installed with, so they are
+    missing after an installation by another tool or user. A loaded library of the same soname stands in.
     """
     for folder in library.parent.glob("*-linux-gnu*"):
         if (folder / "libc++.so.1.0").is_file() and not (folder / "libc++.so.1").exists():
@@ -168,12 +183,16 @@ def probe(candidate: Candidate, timeout: float = 60.0) -> Verdict:
 
 
 def run_child(code: str, arguments: Sequence[str], environ: Mapping[str, str], timeout: float) -> Verdict:
-    """Run Python code in a child process; it passes by printing ``version ...`` as its last line, exit code 0."""
+    """Run Python code in a child process; it passes by printing ``version ...`` as its last line, exit code 0.
+
+    ``-P`` keeps the working directory out of the child's path; it finds modules where this process does.
+    """
+    path = os.pathsep.join(folder for folder in sys.path if folder)
     command = [sys.executable, "-P", "-c", code, *arguments]
     try:
         done = subprocess.run(
             command,
-            env={**os.environ, **environ},
+            env={**os.environ, "PYTHONPATH": path, **environ},
             capture_output=True,
             text=True,
             errors="replace",

@@ -22,7 +22,7 @@ class RendererOptions:
 
     description: str = ""
     method: Method = "single-pass"
-    """``single-pass``: every ray takes its row's pose; ``stitched``: one global-shutter image per row, one row kept."""
+    """``single-pass``: every ray takes its row's pose; ``stitched``: one global-shutter image per row."""
     integrator: Integrator = "sunsky"
     """``sunsky``: sun with shadows and a hemisphere sky, free of noise; ``path``: global illumination."""
     samples: int = 16
@@ -34,7 +34,7 @@ class RendererOptions:
     seed: int = 0
     """Of the random numbers that ``path`` draws."""
     full_frames: bool = False
-    """``stitched`` renders every row of every global-shutter image, as a camera would, and not only the kept one."""
+    """``stitched`` renders every row of every global-shutter image, and not only the kept one."""
 
     def __post_init__(self) -> None:
         _one_of("method", self.method, get_args(Method))

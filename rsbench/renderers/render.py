@@ -58,7 +58,7 @@ def render(
             (height, width, 3), so that the stack can be kept as the paper keeps it.
 
     Raises:
-        RsbenchError: shapes or values of the poses, rows outside the image, or ``on_gs_frame`` without whole frames.
+        RsbenchError: shapes or values of the poses, rows outside the image, ``on_gs_frame`` without whole frames.
     """
     options = RendererOptions() if options is None else options
     if on_gs_frame is not None and not (options.method == "stitched" and options.full_frames):

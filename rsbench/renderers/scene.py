@@ -106,7 +106,7 @@ def _sky(light: Light) -> dict[str, Any]:
     horizon, zenith = np.asarray(light.sky_horizon), np.asarray(light.sky_zenith)
     colours = (horizon + (zenith - horizon) * height).astype(np.float32)
     bitmap = mi.Bitmap(np.repeat(colours[:, None], 2 * _SKY_ROWS, axis=1).copy())
-    return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(pose)}
+    return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(pose.tolist())}
 
 
 def _bsdf(material: Material) -> dict[str, Any]:

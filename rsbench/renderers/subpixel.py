@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def subpixel_grid(samples: int) -> NDArray[np.float32]:
-    """Offsets (samples, 2) from the pixel centre, in (-0.5, 0.5): the same in every pixel, drawn from no generator.
+    """Offsets (samples, 2) from the pixel centre, in (-0.5, 0.5), px: the same in every pixel, never random.
 
     Cell (i, j) of a k x k grid holds one sample, shifted inside its cell by (j, i) / k of the cell: the canonical
     arrangement of multi-jittered sampling (Chiu, Shirley, Wang 1994; Kensler 2013) without the jitter. All x are

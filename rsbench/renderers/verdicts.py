@@ -1,6 +1,6 @@
 """What the probes of earlier processes found, kept in the user's cache folder so that start-up costs nothing.
 
-Only good news is kept: a failure may be cured by the next start, and probing it again costs a fraction of a second.
+Only good news is kept: a failure may be cured by the next start, and probing again costs a fraction of a second.
 Nothing here may fail: without a home folder or with a read-only one there is simply no memory.
 """
 

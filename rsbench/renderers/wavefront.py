@@ -118,7 +118,7 @@ def _sunsky_band(
         body=add_sample,
         labels=("sample", "total"),
     )
-    return lanes.image(total / mi.Float(count), camera.width)[0]
+    return lanes.image(total, camera.width)[0] / np.float32(options.samples)
 
 
 def _path_band(

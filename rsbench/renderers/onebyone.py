@@ -1,0 +1,73 @@
+"""Tracing ray by ray with ``scalar_rgb``, where no LLVM works: slow, and free of any compiler.
+
+The same formulas as the wavefront, sample for sample; only rounding differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
+from rsbench.renderers.options import RendererOptions
+from rsbench.renderers.scene import MitsubaScene
+from rsbench.renderers.subpixel import subpixel_grid
+
+Float32Array = NDArray[np.float32]
+
+
+def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]) -> Float32Array:
+    """Depth z (rows, width) along the rays through pixel centres, metres; 0 = no surface."""
+    import mitsuba as mi
+
+    result = np.zeros((len(rows), camera.width), dtype=np.float32)
+    for place, row in enumerate(rows):
+        for column in range(camera.width):
+            ray = mi.Ray3f(*sensor.row_ray(float(column), float(row), row))
+            hit = scene.scene.ray_intersect_preliminary(ray)
+            result[place, column] = hit.t if hit.is_valid() else 0.0
+    return result
+
+
+def radiance_rows(
+    scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
+) -> Float32Array:
+    """Linear RGB (rows, width, 3): the mean over the sub-pixel grid (a box filter)."""
+    trace = _sunsky if options.integrator == "sunsky" else _path
+    grid = subpixel_grid(options.samples).tolist()
+    result = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
+    for place, row in enumerate(rows):
+        for column in range(camera.width):
+            total = np.zeros(3, dtype=np.float32)
+            for number, (dx, dy) in enumerate(grid):
+                origin, direction = sensor.row_ray(column + dx, row + dy, row)
+                pixel = row * camera.width + column
+                total += np.asarray(trace(scene, origin, direction, options, pixel, number), dtype=np.float32)
+            result[place, column] = total / np.float32(options.samples)
+    return result
+
+
+def _sunsky(
+    scene: MitsubaScene, origin: Any, direction: Any, options: RendererOptions, pixel: int, sample: int
+) -> Any:
+    import drjit as dr
+    import mitsuba as mi
+
+    return sunsky_radiance(scene, mi.Ray3f(origin, dr.normalize(direction)))
+
+
+def _path(
+    scene: MitsubaScene, origin: Any, direction: Any, options: RendererOptions, pixel: int, sample: int
+) -> Any:
+    import drjit as dr
+    import mitsuba as mi
+
+    sampler = lane_sampler()
+    sampler.seed_lanes(options.seed, pixel, sample)
+    ray = mi.RayDifferential3f(origin, dr.normalize(direction))
+    radiance, _, _ = path_integrator(options.max_depth).sample(scene.scene, sampler, ray)
+    return radiance
