@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -68,6 +68,8 @@ class SequenceCard:
     viewpoint: str = "default"
     motion: MotionCard | None = None
     """Replaces the dataset's motion."""
+    baseline: float | None = None
+    """Replaces the dataset's baseline, metres."""
     seed: int | None = None
     """Replaces the dataset's seed."""
 
@@ -94,7 +96,9 @@ class DatasetCard:
     sequence: tuple[SequenceCard, ...] = field(default=())
 
     def __post_init__(self) -> None:
-        self.rig(), self.shutter()
+        self.shutter()
+        for sequence in self.sequence:
+            self.rig_of(sequence)
         if not self.frame_period_s > 0:
             raise ValueError(f"frame_period_s must be positive, got {self.frame_period_s}")
         names = [sequence.name for sequence in self.sequence]
@@ -104,9 +108,10 @@ class DatasetCard:
             if names.count(name) > 1:
                 raise ValueError(f"two sequences are named {name!r}")
 
-    def rig(self) -> StereoRig:
+    def rig_of(self, sequence: SequenceCard) -> StereoRig:
         camera = PinholeCamera.centred(self.camera.width, self.camera.height, self.camera.focal)
-        return StereoRig(camera=camera, baseline=self.baseline)
+        baseline = self.baseline if sequence.baseline is None else sequence.baseline
+        return StereoRig(camera=camera, baseline=baseline)
 
     def shutter(self) -> RollingShutter:
         return RollingShutter(height=self.camera.height, readout_ratio=self.readout_ratio)
@@ -123,8 +128,6 @@ class DatasetCard:
         Raises:
             RsbenchError: a name that the card does not have.
         """
-        from dataclasses import replace
-
         known = {sequence.name: sequence for sequence in self.sequence}
         for name in names:
             if name not in known:

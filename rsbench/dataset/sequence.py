@@ -21,6 +21,7 @@ from rsbench.errors import RsbenchError
 FORMAT = 1
 FRAMES = (0, 1)
 Shutter = Literal["rs", "gs"]
+SHUTTERS: tuple[Shutter, Shutter] = ("rs", "gs")
 
 RELATIVE_FILES = tuple(
     f"{folder}/{side}_{frame}.{suffix}"

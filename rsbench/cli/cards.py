@@ -1,0 +1,37 @@
+"""``rsbench list``: the cards that exist."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+
+class Kind(StrEnum):
+    """Kinds of cards."""
+
+    scenes = "scenes"
+    renderers = "renderers"
+    solvers = "solvers"
+    datasets = "datasets"
+
+
+def list_(kind: Annotated[Kind, typer.Argument(help="What to list.")]) -> None:
+    """List scenes, renderers, solvers or datasets, with the files to copy and edit."""
+    import pandas as pd
+
+    from rsbench.cards import list_cards, read_toml
+    from rsbench.cli.console import print_table
+
+    rows = [
+        {"name": name, "description": read_toml(path).get("description", ""), "card": str(path)}
+        for name, path in list_cards(kind.value).items()
+    ]
+    print_table(
+        f"{kind.value} (a name, or a path ending in .toml, is accepted wherever a card is)", pd.DataFrame(rows)
+    )
+
+
+def register(app: typer.Typer) -> None:
+    app.command("list", epilog="[bold]Example[/bold]  rsbench list solvers")(list_)

@@ -1,0 +1,67 @@
+"""What the commands share: the console, progress bars and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import pandas as pd
+
+
+@contextmanager
+def progress_bar(label: str, total: int) -> Iterator[Callable[[str], None]]:
+    """A bar with time left; the yielded function advances it by one step and shows a word."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[word]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task(label, total=total, word="")
+
+        def advance(word: str) -> None:
+            progress.update(task, advance=1, word=word)
+
+        yield advance
+
+
+def print_table(title: str, frame: pd.DataFrame, digits: dict[str, int] | None = None) -> None:
+    """A data frame as a terminal table; ``digits`` gives decimals per column."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    for column in frame.columns:
+        numeric = frame[column].dtype.kind in "fiu"
+        table.add_column(str(column), justify="right" if numeric else "left", overflow="fold")
+    for row in frame.itertuples(index=False):
+        table.add_row(
+            *(_cell(value, (digits or {}).get(name)) for name, value in zip(frame.columns, row, strict=True))
+        )
+    Console().print(table)
+
+
+def _cell(value: Any, digits: int | None) -> str:
+    if value is None or value != value:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.{3 if digits is None else digits}f}"
+    return str(value)

@@ -1,0 +1,43 @@
+"""``rsbench generate``: make a dataset from a card."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+EPILOG = """[bold]Examples[/bold]
+
+  rsbench generate paper --out data/paper
+
+  rsbench generate datasets/smoke.toml --out data/smoke --sequence castle"""
+
+
+def generate(
+    card: Annotated[
+        str, typer.Argument(help="Name of a dataset card (see: rsbench list datasets) or path to one.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder of the dataset; an interrupted run resumes there.")],
+    sequence: Annotated[list[str] | None, typer.Option(help="Only this sequence of the card; repeatable.")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes; each renders whole sequences.")] = 1,
+) -> None:
+    """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
+    from rsbench.cli.console import progress_bar
+    from rsbench.dataset.card import load_dataset_card
+    from rsbench.dataset.generate import STEPS, generate_dataset
+    from rsbench.renderers.backend import start_backend
+
+    dataset = load_dataset_card(card)
+    if sequence:
+        dataset = dataset.only(sequence)
+    backend = start_backend()
+    if backend.message:
+        typer.echo(backend.message, err=True)
+    with progress_bar(f"rendering {dataset.name}", STEPS * len(dataset.sequence)) as advance:
+        rendered = generate_dataset(dataset, out, workers=workers, progress=advance)
+    typer.echo(f"{out}: {len(dataset.sequence)} sequences, {len(rendered)} rendered now")
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog=EPILOG)(generate)

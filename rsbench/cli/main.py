@@ -1,0 +1,60 @@
+"""The ``rsbench`` command. Modules of commands import nothing heavy until they run, so that help is instant."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated
+
+import typer
+
+from rsbench import __version__
+from rsbench.cli import cards, demo, doctor, evaluate, generate, reproduce, solve, verify
+from rsbench.errors import RsbenchError
+
+app = typer.Typer(
+    name="rsbench",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Rolling-shutter stereo: render data with exact ground truth, solve, correct and score.",
+    epilog="Start with: [bold]rsbench demo[/bold]   Exit codes: 0 done, 1 ran but failed, 2 bad input.",
+)
+
+
+def _version(show: bool) -> None:
+    if show:
+        typer.echo(f"rsbench {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+for module in (demo, cards, doctor, generate, verify, solve, evaluate, reproduce):
+    module.register(app)
+
+
+def run() -> None:
+    """Entry point: known errors become one line on stderr and exit code 2."""
+    try:
+        app()
+    except RsbenchError as error:
+        _fail(str(error))
+    except OSError as error:  # a full disk or a folder without permission, wherever it is met
+        _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted; the same command resumes where it stopped\n")
+        os._exit(130)
+
+
+def _fail(message: str) -> None:
+    sys.stderr.write(f"rsbench: error: {' '.join(message.split())}\n")
+    sys.exit(2)

@@ -1,0 +1,70 @@
+"""A dataset of one sequence whose depth is known in closed form: a slanted floor and a wall behind it."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.motion import Motion
+from rsbench.core.projection import row_poses
+from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.files import sha256, write_depth, write_json, write_png, write_poses
+from rsbench.dataset.sequence import FRAMES, RELATIVE_FILES, sequence_manifest
+
+PLANES = ((np.array([0.05, 1.0, -0.15]), 1.2), (np.array([0.1, 0.05, 1.0]), 9.0))
+"""Normal n and offset c of n . X = c, world frame."""
+
+
+def plane_depth(camera: PinholeCamera, poses: Pose) -> NDArray[np.float32]:
+    """z along each pixel's ray to the nearest plane, from the row's own pose."""
+    rays = camera.unproject(camera.pixel_grid())
+    directions = np.einsum("hji,hwj->hwi", poses.R, rays)
+    centres = -np.einsum("hji,hj->hi", poses.R, poses.t)
+    depths = []
+    for normal, offset in PLANES:
+        z = (offset - centres @ normal)[:, None] / (directions @ normal)
+        depths.append(np.where(z > 0, z, np.inf))
+    return np.min(depths, axis=0).astype(np.float32)
+
+
+def write_analytic_dataset(
+    out: Path, rig: StereoRig, shutter: RollingShutter, motion: Motion, *, true_motion: Motion | None = None
+) -> None:
+    """Write a dataset of format 1; ``true_motion`` makes the depth while ``motion`` is what the manifest says."""
+    folder = out / "planes"
+    for name in RELATIVE_FILES:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    camera = rig.camera
+    for side, frame in product(SIDES, FRAMES):
+        stated = row_poses(rig, shutter, motion, side, frame)
+        write_poses(
+            folder / f"poses/{side}_{frame}.csv", shutter.row_time(np.arange(shutter.height), frame), stated
+        )
+        rolling = row_poses(rig, shutter, true_motion or motion, side, frame)
+        first = Pose(
+            np.broadcast_to(rolling.R[0], rolling.R.shape), np.broadcast_to(rolling.t[0], rolling.t.shape)
+        )
+        for kind, poses in (("rs", rolling), ("gs", first)):
+            write_png(folder / f"{kind}/{side}_{frame}.png", np.zeros((camera.height, camera.width, 3), np.uint8))
+            write_depth(folder / f"{kind}_depth/{side}_{frame}.exr", plane_depth(camera, poses))
+    manifest = sequence_manifest(name="planes", rig=rig, shutter=shutter, motion=motion, frame_period_s=0.1)
+    files = {name: sha256(folder / name) for name in RELATIVE_FILES}
+    write_json(folder / "sequence.json", manifest | {"files": files})
+    names = ["sequence.json", *RELATIVE_FILES]
+    write_json(
+        out / "dataset.json",
+        {
+            "format": 1,
+            "sequences": ["planes"],
+            "files": {
+                f"planes/{name}": {"sha256": sha256(folder / name), "size": (folder / name).stat().st_size}
+                for name in names
+            },
+        },
+    )
