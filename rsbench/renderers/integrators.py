@@ -55,7 +55,7 @@ def lane_sampler() -> Any:
     class LaneSampler(mi.Sampler):  # type: ignore[misc,name-defined,unused-ignore]
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
-            self.rng: Any = mi.PCG32()
+            self.rng = mi.PCG32()  # type: ignore[operator,unused-ignore]
 
         def seed_lanes(self, seed: Any, pixel: Any, sample: Any) -> None:
             """Start the sequences of (pixel, sample) pairs; ``pixel`` is the index in the full frame."""

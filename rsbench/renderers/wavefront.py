@@ -30,10 +30,15 @@ Float32Array = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class _Lanes:
-    """Pixels of a block of rows, repeated ``copies`` times."""
+    """Pixels of a block of rows, repeated ``copies`` times.
+
+    Sizes are data of the kernel and the numbers are counted inside it, so that neither another size nor the
+    alignment of host memory compiles a new kernel: a row by itself runs the very code of the whole frame.
+    """
 
     row: Any
     column: Any
+    copy: Any
     active: Any
     shape: tuple[int, int, int]  # copies, rows, padded width
 
@@ -43,15 +48,21 @@ class _Lanes:
         import mitsuba as mi
 
         shape = (copies, len(rows), _padded(width))
-        row = np.broadcast_to(np.asarray(rows, dtype=np.uint32)[:, None], shape)
-        column = np.broadcast_to(np.arange(shape[2], dtype=np.uint32), shape)
-        columns = mi.UInt32(column.ravel())
-        return cls(mi.UInt32(row.ravel()), columns, columns < dr.opaque(mi.UInt32, width), shape)
+        lane = dr.arange(mi.UInt32, shape[0] * shape[1] * shape[2])
+        padded, count = dr.opaque(mi.UInt32, shape[2]), dr.opaque(mi.UInt32, len(rows))
+        place, column = lane // padded, lane % padded
+        # Dr.Jit turns a table of one entry into other code, hence the second one.
+        table = mi.UInt32(np.asarray([*rows, rows[-1]], dtype=np.uint32))
+        row = dr.gather(mi.UInt32, table, place % count)
+        return cls(row, column, place // count, column < dr.opaque(mi.UInt32, width), shape)
 
-    def image(self, values: Any, width: int) -> Float32Array:
-        """Host array (copies, rows, width, channels) of a Dr.Jit array with one entry per lane."""
-        host = np.atleast_2d(np.array(values))
-        return host.reshape(-1, *self.shape).transpose(1, 2, 3, 0)[:, :, :width]
+    def image(self, channels: Sequence[Any], width: int) -> Float32Array:
+        """Host array (copies, rows, width, channels) of Dr.Jit arrays with one entry per lane."""
+        import drjit as dr
+
+        dr.eval(channels)
+        host = np.stack([np.array(channel).reshape(self.shape)[:, :, :width] for channel in channels], axis=-1)
+        return host.astype(np.float32, copy=False)
 
 
 def _padded(width: int) -> int:
@@ -76,7 +87,7 @@ def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Se
         ray = mi.Ray3f(*sensor.row_ray(mi.Float(lanes.column), mi.Float(lanes.row), lanes.row, lanes.active))
         hit = scene.scene.ray_intersect_preliminary(ray, coherent=True, active=lanes.active)
         depth = dr.select(hit.is_valid(), hit.t, 0)
-        result[done : done + len(band)] = lanes.image(depth, camera.width)[0, :, :, 0]
+        result[done : done + len(band)] = lanes.image([depth], camera.width)[0, :, :, 0]
         done += len(band)
     return result
 
@@ -118,7 +129,7 @@ def _sunsky_band(
         body=add_sample,
         labels=("sample", "total"),
     )
-    return lanes.image(total, camera.width)[0] / np.float32(options.samples)
+    return lanes.image([*total], camera.width)[0] / np.float32(options.samples)
 
 
 def _path_band(
@@ -128,17 +139,14 @@ def _path_band(
     import drjit as dr
     import mitsuba as mi
 
-    grid = subpixel_grid(options.samples)
+    offsets = mi.Float(subpixel_grid(options.samples).ravel())
     integrator, sampler = path_integrator(options.max_depth), lane_sampler()
     per_pass = max(1, LANES_PER_LAUNCH // (len(rows) * _padded(camera.width)))
     total = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
     for first in range(0, options.samples, per_pass):
         copies = min(per_pass, options.samples - first)
         lanes = _Lanes.of(rows, camera.width, copies)
-        lanes_per_copy = lanes.shape[1] * lanes.shape[2]
-        numbers = np.arange(first, first + copies, dtype=np.uint32)
-        sample = mi.UInt32(np.repeat(numbers, lanes_per_copy))
-        offsets = mi.Float(grid.ravel())
+        sample = lanes.copy + dr.opaque(mi.UInt32, first)
         x = mi.Float(lanes.column) + dr.gather(mi.Float, offsets, 2 * sample)
         y = mi.Float(lanes.row) + dr.gather(mi.Float, offsets, 2 * sample + 1)
         origin, direction = sensor.row_ray(x, y, lanes.row, lanes.active)
@@ -146,6 +154,6 @@ def _path_band(
         sampler.seed_lanes(dr.opaque(mi.UInt32, options.seed), pixel, sample)
         ray = mi.RayDifferential3f(origin, dr.normalize(direction))
         radiance, _, _ = integrator.sample(scene.scene, sampler, ray, active=lanes.active)
-        for one in lanes.image(radiance, camera.width):
+        for one in lanes.image([*radiance], camera.width):
             total += one
     return total / np.float32(options.samples)
