@@ -81,17 +81,17 @@ def test_velocity_is_the_derivative_of_the_pose(
 
 
 def test_models_agree_without_rotation_and_differ_with_it() -> None:
-    d, tau = [0.1, 0.2, 0.3], np.linspace(0, 1, 5)
-    still = [model([0, 0, 0], d).body_from_world(tau).t for model in (LinearMotion, TwistMotion)]
+    d, tau = np.array([0.1, 0.2, 0.3]), np.linspace(0, 1, 5)
+    still = [model(np.array([0, 0, 0]), d).body_from_world(tau).t for model in (LinearMotion, TwistMotion)]
     np.testing.assert_allclose(still[0], still[1], rtol=0, atol=1e-15)
-    turning = [model([0.2, 0, 0], d).body_from_world(tau).t for model in (LinearMotion, TwistMotion)]
+    turning = [model(np.array([0.2, 0, 0]), d).body_from_world(tau).t for model in (LinearMotion, TwistMotion)]
     assert np.max(np.abs(turning[0][2] - turning[1][2])) > 1e-3
 
 
 @pytest.mark.parametrize("model", MOTION_MODELS.values())
 @pytest.mark.parametrize("shape", [(), (1,), (4,), (2, 3)])
 def test_times_of_any_shape(model: type[LinearMotion] | type[TwistMotion], shape: tuple[int, ...]) -> None:
-    motion = model([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])
+    motion = model(np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0]))
     tau = np.linspace(0, 1, int(np.prod(shape))).reshape(shape)
     R, t = motion.body_from_world(tau)
     w_rate, t_rate = motion.velocity(tau)

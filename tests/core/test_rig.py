@@ -23,7 +23,7 @@ def test_the_left_camera_stands_half_a_baseline_to_the_left() -> None:
 
 @pytest.mark.parametrize("model", [LinearMotion, TwistMotion])
 def test_cameras_of_one_time_are_a_rectified_pair(model: type[LinearMotion] | type[TwistMotion]) -> None:
-    motion = model([0.02, -0.05, 0.03], [0.1, 0.2, -0.1])
+    motion = model(np.array([0.02, -0.05, 0.03]), np.array([0.1, 0.2, -0.1]))
     points = np.random.default_rng(0).uniform([-1, -1, 4], [1, 1, 9], size=(30, 3))
     left, right = (project_at(RIG, motion, side, 0.7, points) for side in SIDES)
     np.testing.assert_allclose(left[:, 1], right[:, 1], rtol=0, atol=1e-11)  # the same row
@@ -35,7 +35,7 @@ def test_cameras_of_one_time_are_a_rectified_pair(model: type[LinearMotion] | ty
 
 
 def test_rotations_are_shared_and_centres_stay_a_baseline_apart() -> None:
-    motion = LinearMotion([0.3, -0.2, 0.1], [0.5, 0.1, 0.2])
+    motion = LinearMotion(np.array([0.3, -0.2, 0.1]), np.array([0.5, 0.1, 0.2]))
     left, right = (RIG.cam_from_world(motion, [0.0, 0.4, 1.3], side) for side in SIDES)
     np.testing.assert_array_equal(left.R, right.R)
     np.testing.assert_allclose(left.t - right.t, np.tile([0.2, 0, 0], (3, 1)), rtol=0, atol=1e-15)
