@@ -1,0 +1,13 @@
+"""Randomness by name: every draw has its own generator, so results do not depend on order or on workers."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+
+
+def generator(suite_seed: int, *names: str | int) -> np.random.Generator:
+    """Generator of (suite seed, track, sequence, solver, repetition, ...); equal names give equal draws."""
+    text = "\x1f".join(str(part) for part in (suite_seed, *names))
+    return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little"))

@@ -1,0 +1,76 @@
+"""Pictures of a report: overlays, depth and error maps, matches; all 8-bit RGB arrays or PNG bytes."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rsbench.core.so3 import FloatArray
+
+Image = NDArray[np.uint8]
+
+INLIER, OUTLIER, INVALID = (40, 200, 90), (230, 60, 40), (60, 60, 66)
+
+
+def overlay(first: Image, second: Image, mask: NDArray[np.bool_] | None = None) -> Image:
+    """Two images in one: ``first`` in red, ``second`` in cyan, so that agreement is grey and shifts are coloured.
+
+    Pixels outside ``mask`` are dark.
+    """
+    a, b = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (first, second))
+    out = np.stack([a, b, b], axis=-1)
+    if mask is not None:
+        out[~mask] = INVALID
+    return out
+
+
+def masked(image: Image, mask: NDArray[np.bool_]) -> Image:
+    """``image`` with the pixels outside ``mask`` dark."""
+    return np.where(mask[..., None], image, np.array(INVALID, dtype=np.uint8))
+
+
+def colour_map(values: ArrayLike, low: float, high: float, name: str = "viridis") -> Image:
+    """Values (H, W) in a matplotlib colour map between ``low`` and ``high``; NaN is dark grey."""
+    from matplotlib import colormaps
+
+    v = np.asarray(values, dtype=np.float64)
+    coloured = colormaps[name](np.clip((v - low) / max(high - low, 1e-12), 0.0, 1.0))[..., :3]
+    return np.where(np.isfinite(v)[..., None], np.round(255 * coloured), INVALID).astype(np.uint8)
+
+
+def draw_matches(image: Image, matches: FloatArray, inliers: NDArray[np.bool_], most: int = 400) -> Image:
+    """Arrows of matches (n, 4) from frame 0 to frame 1 on the image of frame 0: inliers green, outliers red."""
+    grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) // 2 + 64
+    out = np.ascontiguousarray(grey.astype(np.uint8))
+    chosen = np.linspace(0, len(matches) - 1, min(most, len(matches))).astype(int)
+    for k in chosen:
+        start, end = np.round(matches[k, :2]).astype(int), np.round(matches[k, 2:]).astype(int)
+        colour = INLIER if inliers[k] else OUTLIER
+        cv2.arrowedLine(out, start.tolist(), end.tolist(), colour, 1, cv2.LINE_AA, tipLength=0.25)
+    return out
+
+
+def shrink(image: Image, longest: int) -> Image:
+    """Image no larger than ``longest`` pixels on a side, area-averaged."""
+    scale = longest / max(image.shape[:2])
+    if scale >= 1.0:
+        return image
+    size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def encode_jpeg(image: Image, quality: int = 88) -> bytes:
+    ok, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not ok:
+        raise ValueError(f"cannot encode an image of shape {image.shape}")
+    return data.tobytes()
+
+
+def data_uri(path: Path) -> str:
+    """Picture file as a URI that needs no network and no second file."""
+    kind = "jpeg" if path.suffix in (".jpg", ".jpeg") else path.suffix[1:]
+    return f"data:image/{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"

@@ -1,0 +1,18 @@
+"""Fixtures that several parts share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rsbench.dataset.card import load_dataset_card
+from rsbench.dataset.generate import generate_dataset
+
+
+@pytest.fixture(scope="session")
+def smoke_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset of datasets/smoke.toml, rendered once per test run."""
+    folder = tmp_path_factory.mktemp("smoke") / "smoke"
+    generate_dataset(load_dataset_card("smoke"), folder)
+    return folder
