@@ -29,7 +29,12 @@ class MitsubaScene:
 
         self.name = scene.name
         self.light = scene.light
-        content: dict[str, Any] = {"type": "scene", "sun": _sun(scene.light), "sky": _sky(scene.light)}
+        content: dict[str, Any] = {"type": "scene"}
+        # `path` picks one emitter at random for each shadow ray: black ones would only add noise.
+        if any(scene.light.sun_irradiance):
+            content["sun"] = _sun(scene.light)
+        if any((*scene.light.sky_zenith, *scene.light.sky_horizon)):
+            content["sky"] = _sky(scene.light)
         materials: dict[int, Any] = {}
         for number, mesh in enumerate(scene.meshes):
             key = id(mesh.material)

@@ -1,0 +1,294 @@
+"""Start-up: no library, however bad, may end the process; every fallback says what to do."""
+
+from __future__ import annotations
+
+import ctypes.util
+import importlib.metadata
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rsbench.errors import RsbenchError
+from rsbench.renderers import backend, doctor, llvm, verdicts
+from rsbench.renderers.backend import Backend, start_backend
+from rsbench.renderers.llvm import Candidate, Verdict
+
+RENDER = """
+import sys, time
+import numpy as np
+from rsbench.core.camera import PinholeCamera
+from rsbench.renderers.backend import start_backend
+from rsbench.renderers.options import RendererOptions
+from rsbench.renderers.render import render
+from rsbench.renderers.scene import MitsubaScene
+from rsbench.scenes.model import Light, Material, Scene, SceneMesh
+
+started = start_backend()
+texture = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+meshes = []
+for x, y, z, size in ((-3, -3, 9, 6), (-1, -1, 4, 1.5), (0.2, 0.1, 3, 0.8)):
+    meshes.append(SceneMesh(
+        name="quad",
+        vertices=np.array([[x, y, z], [x + size, y, z], [x + size, y + size, z + 1], [x, y + size, z + 1.0]]),
+        faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32),
+        material=Material(name="t", texture=texture),
+        uv=np.array([[0, 1], [1, 1], [1, 0], [0, 0.0]]),
+    ))
+light = Light(sun_direction=(0.3, -0.5, -0.8), up=(0.0, -1.0, 0.0))
+scene = MitsubaScene(Scene(name="quads", meshes=tuple(meshes), light=light))
+width, height = int(sys.argv[2]), int(sys.argv[3])
+camera = PinholeCamera.centred(width, height, 0.8 * width)
+tau = np.arange(height) / height
+R = np.tile(np.eye(3), (height, 1, 1))
+t = np.stack([0.2 * tau, 0 * tau, -0.3 * tau], axis=-1)
+begin = time.perf_counter()
+sunsky = render(scene, camera, R, t, RendererOptions(samples=4))
+seconds = time.perf_counter() - begin
+path = render(scene, camera, R, t, RendererOptions(samples=4, integrator="path", seed=3))
+stitched = render(scene, camera, R, t, RendererOptions(samples=4, method="stitched"))
+assert (stitched.image == sunsky.image).all() and (stitched.depth == sunsky.depth).all()
+np.savez(sys.argv[1], sunsky=sunsky.image, depth=sunsky.depth, path=path.image, seconds=seconds,
+         variant=started.variant, message=started.message or "")
+"""
+
+
+def child(tmp_path: Path, name: str, size: tuple[int, int], **environ: str) -> Any:
+    out = tmp_path / f"{name}.npz"
+    command = [sys.executable, "-c", RENDER, str(out), str(size[0]), str(size[1])]
+    done = subprocess.run(
+        command, env={**os.environ, **environ}, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return np.load(out)
+
+
+def needs_llvm() -> None:
+    if not any(llvm.probe(candidate).ok for candidate in llvm.candidates()):
+        pytest.skip("no usable LLVM on this machine")
+
+
+def test_scalar_fallback_renders_the_same_frame_and_says_how_to_be_faster(tmp_path: Path) -> None:
+    slow = child(tmp_path, "slow", (128, 96), DRJIT_LIBLLVM_PATH="/nonexistent/libLLVM.so")
+    message = str(slow["message"])
+    assert str(slow["variant"]) == "scalar_rgb"
+    assert "/nonexistent/libLLVM.so" in message and "install" in message and "\n" not in message
+    assert float(slow["seconds"]) < 60
+    needs_llvm()
+    fast = child(tmp_path, "fast", (128, 96))
+    assert str(fast["variant"]) == "llvm_ad_rgb" and str(fast["message"]) == ""
+    # Rounding differs (fused multiply-add, other vector widths), and flips whole samples at a few edges only.
+    for channel, ulp in (("sunsky", 1e-3), ("path", 1e-3), ("depth", 1e-4)):
+        difference = np.abs(slow[channel] - fast[channel])
+        assert np.mean(difference > ulp) < 2e-3, channel
+    assert (slow["depth"] > 0).mean() > 0.2
+
+
+def test_same_bits_in_another_process(tmp_path: Path) -> None:
+    needs_llvm()
+    first = child(tmp_path, "a", (70, 40))
+    second = child(tmp_path, "b", (70, 40))
+    for channel in ("sunsky", "path", "depth"):
+        np.testing.assert_array_equal(first[channel], second[channel])
+
+
+def test_threads_change_no_bit(town: Any, row_poses: Any) -> None:
+    from rsbench.core.camera import PinholeCamera
+    from rsbench.renderers.options import RendererOptions
+    from rsbench.renderers.render import render
+    from rsbench.renderers.scene import MitsubaScene
+
+    camera = PinholeCamera.centred(300, 200, 200.0)
+    R, t = row_poses(200, w=(0.1, 0.1, 0.2), d=(0.1, 0.2, 0.3))
+    scene = MitsubaScene(town)
+    options = RendererOptions(samples=4, integrator="path")
+    frames = []
+    for threads in (1, 3, os.cpu_count() or 1):
+        backend.set_threads(threads)
+        frames.append(render(scene, camera, R, t, options))
+    for frame in frames[1:]:
+        np.testing.assert_array_equal(frame.image, frames[0].image)
+        np.testing.assert_array_equal(frame.depth, frames[0].depth)
+    with pytest.raises(RsbenchError, match="threads = 0"):
+        backend.set_threads(0)
+
+
+def test_start_is_idempotent_and_refuses_a_second_variant(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RSBENCH_VARIANT", raising=False)
+    first = start_backend()
+    assert start_backend("auto") is first
+    other: backend.Preference = "llvm" if first.variant == "scalar_rgb" else "scalar"
+    with pytest.raises(RsbenchError, match=f"already renders with {first.variant}"):
+        start_backend(other)
+
+
+def test_preferences_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(llvm, "candidates", lambda: iter([Candidate(path=Path("/x/libLLVM.so"), source="system")]))
+    monkeypatch.setattr(llvm, "probe", lambda candidate: Verdict(ok=False, reason="is LLVM 14"))
+    monkeypatch.setattr(backend, "probe_cuda", lambda: Verdict(ok=True, version="12.4"))
+    assert backend._choose("auto")[0] == Backend(variant="cuda_ad_rgb")
+    assert backend._choose("scalar")[0] == Backend(variant="scalar_rgb")
+    with pytest.raises(RsbenchError, match=r"/x/libLLVM.so: is LLVM 14.*install LLVM 17"):
+        backend._choose("llvm")
+    monkeypatch.setattr(backend, "probe_cuda", lambda: Verdict(ok=False, reason="no NVIDIA driver"))
+    with pytest.raises(RsbenchError, match="no NVIDIA driver"):
+        backend._choose("cuda")
+    assert backend._choose("auto")[0].variant == "scalar_rgb"
+    monkeypatch.setattr(llvm, "probe", lambda candidate: Verdict(ok=True, version="21.1.8"))
+    chosen = backend._choose("auto")[0]
+    assert (chosen.variant, chosen.llvm_version, chosen.message) == ("llvm_ad_rgb", "21.1.8", None)
+
+
+def test_environment_variable_overrides_and_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RSBENCH_VARIANT", "scalar_rgb")
+    assert backend._wanted("llvm") == "scalar"
+    monkeypatch.setenv("RSBENCH_VARIANT", "turbo")
+    with pytest.raises(RsbenchError, match=r"RSBENCH_VARIANT = 'turbo': allowed are auto, llvm, cuda, scalar"):
+        backend._wanted("auto")
+
+
+def test_a_file_that_is_no_library_is_refused(tmp_path: Path) -> None:
+    junk = tmp_path / "libLLVM.so.23.1"
+    junk.write_bytes(b"not a library" * 100)
+    verdict = llvm.probe(Candidate(path=junk, source="DRJIT_LIBLLVM_PATH"))
+    assert not verdict.ok and verdict.reason
+    assert not llvm.probe(Candidate(path=tmp_path / "absent.so", source="system")).ok
+
+
+@pytest.mark.parametrize("version", [14, 15, 16])
+def test_unsuitable_system_llvm_ends_only_the_child(version: int) -> None:
+    old = [path for path in llvm.outdated_libraries() if llvm.version_in_path(str(path)) == version]
+    if not old:
+        pytest.skip(f"no LLVM {version} on this machine")
+    verdict = llvm.probe(Candidate(path=old[0], source="system"))
+    assert not verdict.ok and verdict.reason
+
+
+def test_a_child_that_hangs_is_given_up() -> None:
+    begin = time.perf_counter()
+    verdict = llvm.run_child("import time; time.sleep(60)", [], {}, 0.5)
+    assert not verdict.ok and "0.5 s" in verdict.reason and time.perf_counter() - begin < 20
+
+
+def test_wheel_without_its_symbolic_links_still_loads(tmp_path: Path) -> None:
+    """As left by installers that do not run the wheel's start-up hook."""
+    wheels = [c for c in llvm.candidates({}) if c.source == "karellen-llvm-core"]
+    if not wheels:
+        pytest.skip("karellen-llvm-core is not installed")
+    runtime = wheels[0].path.parent / "x86_64-unknown-linux-gnu"
+    (tmp_path / "lib" / runtime.name).mkdir(parents=True)
+    library = Path(shutil.copy(wheels[0].path, tmp_path / "lib"))
+    for file in runtime.glob("*.so.1.0"):
+        shutil.copy(file, tmp_path / "lib" / runtime.name)
+    [candidate] = llvm.candidates({"DRJIT_LIBLLVM_PATH": str(library)})
+    assert [path.name for path in candidate.preload] == ["libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0"]
+    assert llvm.probe(candidate).ok
+    if ctypes.util.find_library("c++") is None:
+        library.touch()  # another key, so that the good news about it is not recalled
+        assert not llvm.probe(Candidate(path=library, source="DRJIT_LIBLLVM_PATH")).ok
+
+
+def test_candidates_come_in_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(llvm, "_MINIMUM_BYTES", 0)
+    for name in ("libLLVM-18.so.1", "libLLVM.so.20.1", "libLLVM-15.so", "libLLVM.so.9"):
+        (tmp_path / name).write_bytes(b"x")
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "elsewhere"))
+    monkeypatch.setattr(llvm, "_SYSTEM_GLOBS", (f"{tmp_path}/libLLVM*.so*",))
+    monkeypatch.setattr(llvm, "_wheel_libraries", lambda: iter([(Path("/wheel/libLLVM.so"), "wheel")]))
+    names = [candidate.path.name for candidate in llvm.candidates({})]
+    assert names[:3] == ["libLLVM.so", "libLLVM.so.20.1", "libLLVM-18.so.1"]
+    assert not {"libLLVM-15.so", "libLLVM.so.9"} & set(names)
+    only = list(llvm.candidates({"DRJIT_LIBLLVM_PATH": "/mine.so"}))
+    assert [candidate.path for candidate in only] == [Path("/mine.so")]
+
+
+@pytest.mark.parametrize(
+    ("path", "version"),
+    [
+        ("/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1", 15),
+        ("/usr/lib/x86_64-linux-gnu/libLLVM.so.19.1", 19),
+        ("/usr/lib/llvm-18/lib/libLLVM.so.1", 18),
+        ("/opt/homebrew/Cellar/llvm@17/17.0.6/lib/libLLVM.dylib", 17),
+        ("/opt/somewhere/libLLVM.so", 0),
+    ],
+)
+def test_version_in_path(path: str, version: int) -> None:
+    assert llvm.version_in_path(path) == version
+
+
+def test_good_news_is_remembered_and_bad_news_is_not(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    library = tmp_path / "libLLVM.so.22.1"
+    library.write_bytes(b"x")
+    candidate = Candidate(path=library, source="system")
+    answers = [
+        Verdict(ok=False, reason="busy"),
+        Verdict(ok=True, version="22.1.8"),
+        Verdict(ok=True, version="16.0.6"),
+    ]
+    monkeypatch.setattr(llvm, "run_child", lambda *arguments: answers.pop(0))
+    assert not llvm.probe(candidate).ok
+    assert llvm.probe(candidate).version == "22.1.8"
+    assert llvm.probe(candidate).version == "22.1.8" and len(answers) == 1
+    library.write_bytes(b"another")
+    assert "is LLVM 16.0.6; 17 or newer" in llvm.probe(candidate).reason
+
+
+@pytest.mark.parametrize("content", ["", "{", "[1]", '{"k": 3}'])
+def test_a_damaged_or_unwritable_cache_is_no_cache(
+    content: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    (tmp_path / "rsbench").mkdir()
+    (tmp_path / "rsbench" / "probes.json").write_text(content)
+    assert verdicts.recall("k") is None
+    verdicts.remember("k", "21")
+    assert verdicts.recall("k") == "21"
+    assert json.loads((tmp_path / "rsbench" / "probes.json").read_text())["k"] == "21"
+    file = tmp_path / "file"
+    file.write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(file))
+    verdicts.remember("k", "21")
+    assert verdicts.recall("k") is None
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", classmethod(lambda cls: (_ for _ in ()).throw(RuntimeError("no home"))))
+    verdicts.remember("k", "21")
+    assert verdicts.recall("k") is None
+
+
+def test_without_a_driver_cuda_costs_no_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backend, "driver_library", lambda: None)
+    monkeypatch.setattr(llvm, "run_child", lambda *arguments: pytest.fail("started a process"))
+    assert not backend.probe_cuda().ok
+
+
+def test_doctor_reports_and_outlives_everything_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = {row.component: row for row in doctor.doctor_report()}
+    assert rows["scalar_rgb"].status == "ok" and rows["OpenEXR works"].status == "ok"
+    assert {"python", "mitsuba", "processor", "threads", "llvm_ad_rgb", "cuda_ad_rgb"} <= set(rows)
+
+    def broken(*arguments: Any, **options: Any) -> Any:
+        raise OSError("everything is broken")
+
+    monkeypatch.setattr(llvm, "run_child", broken)
+    monkeypatch.setattr(llvm, "candidates", broken)
+    monkeypatch.setattr(doctor, "probe_cuda", broken)
+    monkeypatch.setattr(importlib.metadata, "version", broken)
+    broken_rows = doctor.doctor_report()
+    assert sum(row.status == "fail" for row in broken_rows) >= 4
+    assert any("everything is broken" in row.detail for row in broken_rows)
+
+
+def test_importing_options_and_render_is_cheap() -> None:
+    code = (
+        "import sys, rsbench.renderers.options, rsbench.renderers.render\n"
+        "assert not {'mitsuba', 'drjit', 'trimesh'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
