@@ -20,7 +20,8 @@ class MitsubaScene:
     Starts the renderer backend when the program has not done so.
 
     Raises:
-        RsbenchError: a textured mesh has no uv; the sun or the zenith has no direction; no backend.
+        RsbenchError: a mesh or texture has the wrong shape, is not finite or points at vertices that it does not
+            have; a textured mesh has no uv; the sun or the zenith has no direction; no backend.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -36,7 +37,7 @@ class MitsubaScene:
         if any((*scene.light.sky_zenith, *scene.light.sky_horizon)):
             content["sky"] = _sky(scene.light)
         materials: dict[int, Any] = {}
-        for number, mesh in enumerate(scene.meshes):
+        for number, mesh in enumerate(mesh for mesh in scene.meshes if mesh.faces.size):
             key = id(mesh.material)
             if key not in materials:
                 materials[key] = mi.load_dict(_bsdf(mesh.material))
@@ -121,9 +122,15 @@ def _bsdf(material: Material) -> dict[str, Any]:
     if material.texture is None:
         reflectance = {"type": "rgb", "value": srgb_to_linear(material.colour).tolist()}
     else:
+        texture = np.array(material.texture, order="C")  # Mitsuba refuses read-only arrays
+        if texture.dtype != np.uint8 or texture.ndim != 3 or texture.shape[2] != 3 or texture.size == 0:
+            raise RsbenchError(
+                f"material {material.name!r}: texture of shape {texture.shape}, {texture.dtype}: "
+                "(h, w, 3) uint8 is needed"
+            )
         reflectance = {
             "type": "bitmap",
-            "bitmap": mi.Bitmap(np.array(material.texture, dtype=np.uint8, order="C")),
+            "bitmap": mi.Bitmap(texture),
             "raw": False,
             "filter_type": "bilinear",
             "wrap_mode": "repeat",
@@ -133,13 +140,29 @@ def _bsdf(material: Material) -> dict[str, Any]:
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
 
 
+def _check(mesh: SceneMesh) -> None:
+    """Refuse what would crash the ray tracer or poison its images."""
+    count, texture = len(mesh.vertices), mesh.material.texture
+    for field, values, width in (("vertices", mesh.vertices, 3), ("uv", mesh.uv, 2), ("normals", mesh.normals, 3)):
+        if values is not None and (values.shape != (count, width) or not np.isfinite(values).all()):
+            raise RsbenchError(
+                f"mesh {mesh.name!r}: {field} of shape {values.shape}: ({count}, {width}), all finite, is needed"
+            )
+    faces = mesh.faces
+    if faces.ndim != 2 or faces.shape[1] != 3 or (faces.size and not 0 <= faces.min() <= faces.max() < count):
+        raise RsbenchError(
+            f"mesh {mesh.name!r}: faces of shape {faces.shape}: (m, 3) indices of its {count} vertices are needed"
+        )
+    if texture is not None and mesh.uv is None:
+        raise RsbenchError(
+            f"mesh {mesh.name!r}: its material {mesh.material.name!r} has a texture, but it has no uv"
+        )
+
+
 def _mesh(mesh: SceneMesh, bsdf: Any) -> Any:
     import mitsuba as mi
 
-    if mesh.material.texture is not None and mesh.uv is None:
-        raise RsbenchError(
-            f"mesh {mesh.name!r}: its material {mesh.material.name!r} has a texture but it has no uv"
-        )
+    _check(mesh)
     properties = mi.Properties()
     properties["bsdf"] = bsdf
     shape = mi.Mesh(

@@ -1,8 +1,8 @@
 """Tracing whole blocks of pixels at once with Dr.Jit (the variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``).
 
-A lane is one pixel. The lanes of a row are padded to whole packets: Embree traces neighbouring lanes together,
-and its rounding may depend on a lane's neighbours. As packets never straddle rows, a pixel has the same
-neighbours, and so the same bits, in a whole frame and in a row rendered by itself.
+A lane is one pixel. Embree traces neighbouring lanes together and does not promise that a lane's rounding is free
+of its neighbours. So the lanes of a row are padded to whole packets: as no packet straddles rows, a pixel has the
+same neighbours, and so the same bits, in a whole frame and in a row rendered by itself.
 """
 
 from __future__ import annotations

@@ -162,13 +162,13 @@ def test_a_file_that_is_no_library_is_refused(tmp_path: Path) -> None:
     assert not llvm.probe(Candidate(path=tmp_path / "absent.so", source="system")).ok
 
 
-@pytest.mark.parametrize("version", [14, 15, 16])
-def test_unsuitable_system_llvm_ends_only_the_child(version: int) -> None:
-    old = [path for path in llvm.outdated_libraries() if llvm.version_in_path(str(path)) == version]
+def test_unsuitable_system_llvm_ends_only_the_child() -> None:
+    old = llvm.outdated_libraries()
     if not old:
-        pytest.skip(f"no LLVM {version} on this machine")
-    verdict = llvm.probe(Candidate(path=old[0], source="system"))
-    assert not verdict.ok and verdict.reason
+        pytest.skip(f"no LLVM older than {llvm.MINIMUM_VERSION} on this machine")
+    for path in old:
+        verdict = llvm.probe(Candidate(path=path, source="system"))
+        assert not verdict.ok and verdict.reason
 
 
 def test_a_child_that_hangs_is_given_up() -> None:

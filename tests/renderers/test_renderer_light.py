@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -175,10 +176,29 @@ def test_srgb_encoding() -> None:
     np.testing.assert_array_equal(to_srgb8([-1.0, 0.0, 7.0], 1.0), [0, 0, 255])
 
 
+def test_a_mesh_without_faces_is_nothing(quad: Any) -> None:
+    empty = replace(wall(quad), faces=np.zeros((0, 3), dtype=np.int32))
+    np.testing.assert_array_equal(picture(WHITE_SKY, empty), 1.0)
+
+
 def test_bad_scenes_are_refused_in_one_line(quad: Any) -> None:
     texture = np.zeros((4, 4, 3), dtype=np.uint8)
     with pytest.raises(RsbenchError, match=r"'quad'.*no uv"):
         picture(WHITE_SKY, wall(quad, material=Material(name="t", texture=texture), uv=None))
+    with pytest.raises(RsbenchError, match=r"texture of shape \(4, 4\), uint8"):
+        picture(WHITE_SKY, wall(quad, material=Material(name="t", texture=texture[..., 0])))
+    good = wall(quad)
+    bad: tuple[tuple[str, Any], ...] = (
+        ("vertices", np.where(good.vertices > 5, np.nan, good.vertices)),
+        ("uv", np.zeros((3, 2))),
+        ("normals", np.zeros((4, 2))),
+        ("faces", good.faces + 1),
+        ("faces", good.faces - 1),
+        ("faces", good.faces.ravel()),
+    )
+    for field, value in bad:
+        with pytest.raises(RsbenchError, match=f"mesh 'quad': {field} of shape"):
+            picture(WHITE_SKY, replace(good, **{field: value}))
     with pytest.raises(RsbenchError, match="sun_direction"):
         picture(Light(sun_direction=(0.0, 0.0, 0.0)))
     with pytest.raises(RsbenchError, match="up"):
