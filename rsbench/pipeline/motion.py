@@ -1,0 +1,207 @@
+"""Motion from matches with outliers: any solver inside one and the same robust loop."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import chi2
+
+from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.epipolar import essential_matrix, sampson_error
+from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.robust.ransac import BoolArray, IntArray, RansacOptions, RansacReport, ransac
+from rsbench.solvers.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.packed import pack, track_pairs, unlinked_pairs
+
+_TRACK_FREEDOM = 5
+_GROUPS: tuple[MatchSet, ...] = ("left", "right", "tracks")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustOptions:
+    """The robust loop, equal for every solver unless its card says otherwise."""
+
+    threshold_px: float = 1.25
+    """Largest Sampson error of an inlier: 2.5 standard deviations of a match's noise of 0.5 px."""
+    confidence: float = 0.999
+    min_iterations: int = 10
+    max_iterations: int = 1000
+    lo_steps: int = 3
+    final_steps: int = 3
+
+    def ransac(self) -> RansacOptions:
+        """As the loop wants it; checks the values."""
+        return RansacOptions(
+            threshold=self.threshold_px,
+            confidence=self.confidence,
+            min_iterations=self.min_iterations,
+            max_iterations=self.max_iterations,
+            lo_steps=self.lo_steps,
+            final_steps=self.final_steps,
+        )
+
+    def __post_init__(self) -> None:
+        self.ransac()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RobustEstimate:
+    """A motion, and the matches that it explains."""
+
+    estimate: MotionEstimate
+    inliers: dict[MatchSet, BoolArray] = field(default_factory=dict)
+    """Masks over ``left``, ``right`` and ``tracks``; all False after a failure."""
+    iterations: int
+    seconds: float
+
+
+def estimate_motion(
+    correspondences: Correspondences,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    solver: Solver,
+    options: RobustOptions,
+    rng: np.random.Generator,
+) -> RobustEstimate:
+    """Robust motion from matches with outliers.
+
+    A rolling-shutter solver's inliers have a small exact rolling-shutter Sampson error, a global-shutter one's a
+    small ordinary one (of the camera that it describes). A track's error counts all it says about the motion,
+    scaled so that one threshold rejects as many good tracks as good pairs. Too few matches or no consensus is a
+    failed estimate with the reason.
+    """
+    start = time.perf_counter()
+    problem = _RobustProblem(correspondences, rig, shutter, solver)
+    report = ransac(problem, options.ransac(), rng)
+    estimate, inliers = _conclude(problem, report, options.threshold_px)
+    return RobustEstimate(
+        estimate=estimate,
+        inliers=inliers,
+        iterations=report.iterations,
+        seconds=time.perf_counter() - start,
+    )
+
+
+def _conclude(
+    problem: _RobustProblem, report: RansacReport[MotionEstimate], threshold: float
+) -> tuple[MotionEstimate, dict[MatchSet, BoolArray]]:
+    """The solver on all inliers, and the matches that this final motion explains."""
+    if not report.success or report.model is None:
+        return MotionEstimate.failed(report.reason), problem.masks(report.inliers)
+    final = problem.refine(report.model, report.inliers)
+    if final is None:
+        return report.model, problem.masks(report.inliers)
+    return final, problem.masks(np.abs(problem.residuals(final)) <= threshold)
+
+
+class _RobustProblem:
+    """Correspondences and a solver as the estimator of the robust loop.
+
+    The data are the tracks that the solver uses as such, then the left, then the right pairs.
+    """
+
+    def __init__(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter, solver: Solver
+    ) -> None:
+        self.given, self.rig, self.shutter, self.solver = correspondences, rig, shutter, solver
+        sizes = solver.sample_sizes(correspondences)
+        self.linked = sizes.get("tracks", 0) > 0
+        self.data = self._data()
+        self.packed = pack(self.data, rig, shutter, solver.motion_model)
+        self._sizes = (sizes.get("left", 0), sizes.get("right", 0), sizes.get("tracks", 0))
+
+    def _data(self) -> Correspondences:
+        """Each measurement once: tracks as tracks or as pairs, and the pairs that no track repeats."""
+        given = self.given
+        pairs = {}
+        for side in SIDES:
+            own = getattr(given, side)[unlinked_pairs(given, side)]
+            halves = track_pairs(given.tracks, side)
+            pairs[side] = own if self.linked else np.concatenate([own, halves])
+        if self.solver.needs == {"left"}:
+            pairs["right"] = pairs["right"][:0]
+        return Correspondences(
+            left=pairs["left"], right=pairs["right"], tracks=given.tracks if self.linked else given.tracks[:0]
+        )
+
+    @property
+    def num_data(self) -> tuple[int, ...]:
+        return len(self.data.left), len(self.data.right), len(self.data.tracks)
+
+    @property
+    def sample_size(self) -> tuple[int, ...]:
+        return self._sizes
+
+    def generate(self, sample: IntArray, rng: np.random.Generator) -> list[MotionEstimate]:
+        return self.solver.propose(self._subset(sample), self.rig, self.shutter)
+
+    def residuals(self, model: MotionEstimate) -> FloatArray:
+        if self.solver.shutter == "global":
+            return self._global_residuals(model)
+        theta = self.packed.theta(model.w, model.d)
+        tracks = np.sqrt(self.packed.track_squares(theta)) * _track_scale()
+        return np.concatenate([self.packed.pair_residuals(theta), tracks])
+
+    def _global_residuals(self, model: MotionEstimate) -> FloatArray:
+        errors = []
+        R = so3.exp(model.w)
+        for side in SIDES:
+            matches = getattr(self.data, side)
+            t = model.d
+            if self.solver.reference_point == "body":
+                offset = self.rig.offset(side)
+                t = model.d + offset - R @ offset
+            x0 = self.rig.camera.unproject(matches[:, :2])
+            x1 = self.rig.camera.unproject(matches[:, 2:])
+            errors.append(sampson_error(essential_matrix(Pose(R, t)), x0, x1, self.rig.camera))
+        return np.concatenate(errors)
+
+    def refine(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate | None:
+        subset = self._subset(np.flatnonzero(inliers))
+        estimate = self.solver.improve(model, subset, self.rig, self.shutter)
+        return estimate if estimate.success else None
+
+    def _subset(self, indices: IntArray) -> Correspondences:
+        left, right, _ = self.num_data
+        return Correspondences(
+            left=self.data.left[indices[indices < left]],
+            right=self.data.right[indices[(indices >= left) & (indices < left + right)] - left],
+            tracks=self.data.tracks[indices[indices >= left + right] - left - right],
+        )
+
+    def masks(self, inliers: BoolArray) -> dict[MatchSet, BoolArray]:
+        """Inliers over the sets as they were given."""
+        split = np.split(inliers, np.cumsum(self.num_data)[:-1])
+        data = {"left": self.data.left, "right": self.data.right}
+        good: dict[str, set[bytes]] = {}
+        for side, mask in zip(SIDES, split, strict=False):
+            halves = track_pairs(self.data.tracks, side)[split[2]]
+            good[side] = _keys(data[side][mask]) | _keys(halves)
+        out: dict[MatchSet, BoolArray] = {side: _found(getattr(self.given, side), good[side]) for side in SIDES}
+        out["tracks"] = split[2]
+        if not self.linked:
+            sides = [side for side in SIDES if side in self.solver.needs]
+            halves_good = [_found(track_pairs(self.given.tracks, side), good[side]) for side in sides]
+            out["tracks"] = (
+                np.all(halves_good, axis=0) if sides else np.zeros(len(self.given.tracks), dtype=np.bool_)
+            )
+        return out
+
+
+def _keys(rows: FloatArray) -> set[bytes]:
+    return {row.tobytes() for row in np.ascontiguousarray(rows)}
+
+
+def _found(rows: FloatArray, keys: set[bytes]) -> BoolArray:
+    return np.array([row.tobytes() in keys for row in np.ascontiguousarray(rows)], dtype=np.bool_)
+
+
+def _track_scale() -> float:
+    """Factor that gives the root of a track's squared error the quantile of a pair's error at 2.5 sigma."""
+    return 2.5 / float(np.sqrt(chi2.ppf(chi2.cdf(2.5**2, 1), _TRACK_FREEDOM)))

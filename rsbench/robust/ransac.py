@@ -1,0 +1,209 @@
+"""LO-RANSAC that knows no geometry: uniform minimal samples, MSAC score, local optimisation, exact stopping rule.
+
+M. Fischler, R. Bolles, CACM 1981; P. Torr, A. Zisserman, MLESAC, CVIU 2000 (MSAC); O. Chum, J. Matas, J. Kittler,
+Locally Optimized RANSAC, DAGM 2003.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.so3 import FloatArray
+
+Model = TypeVar("Model")
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+
+class Estimator(Protocol[Model]):
+    """What is to be estimated. Data are indices 0 ... sum(num_data) - 1, in groups that are sampled separately."""
+
+    @property
+    def num_data(self) -> tuple[int, ...]:
+        """Data per group; a plain problem has one group."""
+
+    @property
+    def sample_size(self) -> tuple[int, ...]:
+        """Data that a minimal sample takes from each group; 0 where a group is only scored."""
+
+    def generate(self, sample: IntArray, rng: np.random.Generator) -> list[Model]:
+        """Models of a minimal sample (indices); may be empty."""
+
+    def residuals(self, model: Model) -> FloatArray:
+        """Errors of all data, (sum(num_data),), in the unit of the threshold; infinite where there is none."""
+
+    def refine(self, model: Model, inliers: BoolArray) -> Model | None:
+        """A better model from all inliers, or None."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RansacOptions:
+    """How long to search and what counts as an inlier."""
+
+    threshold: float
+    """Largest absolute residual of an inlier."""
+    confidence: float = 0.999
+    """Probability of having drawn a sample without outliers before stopping."""
+    min_iterations: int = 10
+    max_iterations: int = 1000
+    lo_steps: int = 3
+    """Refinements of each new best model, at thresholds that shrink from twice the threshold to it."""
+    final_steps: int = 3
+    """Refinements at the end, until the inliers stay the same."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.threshold) and self.threshold > 0.0):
+            raise ValueError(f"threshold must be positive, got {self.threshold}")
+        if not 0.0 < self.confidence < 1.0:
+            raise ValueError(f"confidence must lie between 0 and 1, got {self.confidence}")
+        if not 1 <= self.min_iterations <= self.max_iterations:
+            raise ValueError(
+                "min_iterations must lie between 1 and max_iterations, got "
+                f"{self.min_iterations} and {self.max_iterations}"
+            )
+        if self.lo_steps < 0 or self.final_steps < 0:
+            raise ValueError(f"steps cannot be negative, got {self.lo_steps} and {self.final_steps}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RansacReport(Generic[Model]):
+    """The outcome; every field speaks about the final model."""
+
+    success: bool
+    reason: str
+    model: Model | None
+    inliers: BoolArray
+    """(sum(num_data),); all False after a failure."""
+    iterations: int
+    score: float
+    """MSAC cost in units of the squared threshold: at most one per datum."""
+
+
+def msac_score(residuals: FloatArray, threshold: float) -> float:
+    """Sum of squared residuals over the squared threshold, each at most 1."""
+    return float(np.sum(np.minimum((residuals / threshold) ** 2, 1.0)))
+
+
+def all_inlier_probability(
+    inliers: tuple[int, ...], num_data: tuple[int, ...], sample_size: tuple[int, ...]
+) -> float:
+    """Probability that a sample drawn without replacement holds inliers only (hypergeometric)."""
+    probability = 1.0
+    for good, total, size in zip(inliers, num_data, sample_size, strict=True):
+        if good < size:
+            return 0.0
+        probability *= math.comb(good, size) / math.comb(total, size)
+    return probability
+
+
+def required_iterations(probability: float, confidence: float) -> float:
+    """Independent samples after which one was all inliers with the given confidence; infinite when none can be."""
+    if probability <= 0.0:
+        return math.inf
+    if probability >= 1.0:
+        return 1.0
+    return max(1.0, math.log1p(-confidence) / math.log1p(-probability))
+
+
+class _Best(Generic[Model]):
+    """The best model so far, with what follows from it."""
+
+    def __init__(self, estimator: Estimator[Model], options: RansacOptions) -> None:
+        self.estimator, self.threshold = estimator, options.threshold
+        self.model: Model | None = None
+        self.residuals = np.full(sum(estimator.num_data), np.inf)
+        self.score = math.inf
+
+    def offer(self, model: Model | None) -> bool:
+        """Take the model if it scores better."""
+        if model is None:
+            return False
+        residuals = np.abs(self.estimator.residuals(model))
+        residuals = np.where(np.isnan(residuals), np.inf, residuals)
+        score = msac_score(residuals, self.threshold)
+        if score >= self.score:
+            return False
+        self.model, self.residuals, self.score = model, residuals, score
+        return True
+
+    def inliers(self, factor: float = 1.0) -> BoolArray:
+        return self.residuals <= factor * self.threshold
+
+
+def ransac(estimator: Estimator[Model], options: RansacOptions, rng: np.random.Generator) -> RansacReport[Model]:
+    """Search for the model with the lowest MSAC cost."""
+    sizes, counts = estimator.sample_size, estimator.num_data
+    best = _Best(estimator, options)
+    if any(count < size for count, size in zip(counts, sizes, strict=True)):
+        return _report(best, 0, f"{counts} data, a minimal sample needs {sizes}")
+    starts = np.cumsum([0, *counts[:-1]])
+    needed: float = options.max_iterations
+    iterations = 0
+    while iterations < max(min(needed, options.max_iterations), options.min_iterations):
+        iterations += 1
+        sample = np.concatenate(
+            [
+                start + rng.choice(count, size, replace=False)
+                for start, count, size in zip(starts, counts, sizes, strict=True)
+            ]
+        ).astype(np.int64)
+        improved = False
+        for model in estimator.generate(sample, rng):
+            improved |= best.offer(model)
+        if improved:
+            _optimise(best, options.lo_steps)
+            needed = required_iterations(_sample_probability(best, starts), options.confidence)
+    for _ in range(options.final_steps):
+        if not _step(best, 1.0):
+            break
+    return _report(best, iterations, "")
+
+
+def _sample_probability(best: _Best[Model], starts: NDArray[np.int64]) -> float:
+    inliers = best.inliers()
+    counts, sizes = best.estimator.num_data, best.estimator.sample_size
+    good = tuple(int(np.count_nonzero(inliers[s : s + n])) for s, n in zip(starts, counts, strict=True))
+    return all_inlier_probability(good, counts, sizes)
+
+
+def _optimise(best: _Best[Model], steps: int) -> None:
+    """Refine on inliers of a threshold that shrinks from twice the final one."""
+    for k in range(steps):
+        factor = 2.0 - k / max(steps - 1, 1)
+        if not _step(best, factor) and factor <= 1.0:
+            break
+
+
+def _step(best: _Best[Model], factor: float) -> bool:
+    if best.model is None:
+        return False
+    inliers = best.inliers(factor)
+    if np.count_nonzero(inliers) < sum(best.estimator.sample_size):
+        return False
+    return best.offer(best.estimator.refine(best.model, inliers))
+
+
+def _report(best: _Best[Model], iterations: int, reason: str) -> RansacReport[Model]:
+    inliers = best.inliers() if best.model is not None else np.zeros(len(best.residuals), dtype=np.bool_)
+    least = sum(best.estimator.sample_size)
+    if not reason and best.model is None:
+        reason = "no sample gave a model"
+    elif not reason and np.count_nonzero(inliers) <= least:
+        reason = f"no consensus: {np.count_nonzero(inliers)} inliers, a minimal sample alone has {least}"
+    if reason:
+        return RansacReport(
+            success=False,
+            reason=reason,
+            model=None,
+            inliers=np.zeros(len(best.residuals), dtype=np.bool_),
+            iterations=iterations,
+            score=math.inf,
+        )
+    return RansacReport(
+        success=True, reason="", model=best.model, inliers=inliers, iterations=iterations, score=best.score
+    )

@@ -1,0 +1,101 @@
+"""The solver contract: correspondences in, one motion estimate out; no sampling, no files.
+
+A solver is a final, frozen dataclass below ``Solver``; its fields are the parameters that its card may set.
+A solver that finds nothing says so in the value it returns: failure is never an exception and never an
+identity motion.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+
+MatchSet = Literal["left", "right", "stereo", "tracks"]
+MotionModel = Literal["linear", "twist"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MotionEstimate:
+    """Motion over one frame period: ``X_body = exp([w]x) X_world + d`` at tau = 1."""
+
+    w: FloatArray
+    """(3,) rotation vector, radians; NaN after a failure."""
+    d: FloatArray
+    """(3,) translation of the solver's reference point; metres when ``metric``, else of arbitrary length."""
+    success: bool
+    reason: str = ""
+    """Why there is no estimate, or what the data leave open in a successful one; empty when nothing is."""
+    metric: bool = False
+    """Whether the length of ``d`` is known, in metres."""
+    direction_known: bool = True
+    """False when the data do not determine the direction of ``d`` (no parallax)."""
+    covariance: FloatArray | None = None
+    """(6, 6) of (w, d), rad and metres, from the residuals; None when the solver does not estimate it."""
+    noise_px: float | None = None
+    """Standard deviation of one pixel coordinate that the residuals show."""
+
+    def __post_init__(self) -> None:
+        for name in ("w", "d"):
+            value = np.array(getattr(self, name), dtype=np.float64)
+            if value.shape != (3,) or (self.success and not np.all(np.isfinite(value))):
+                raise ValueError(f"{name} of a motion estimate must be 3 finite numbers, got {value}")
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def failed(cls, reason: str) -> MotionEstimate:
+        """The value that says there is no estimate, and why."""
+        nowhere = np.full(3, np.nan)
+        return cls(w=nowhere, d=nowhere, success=False, reason=reason, direction_known=False)
+
+
+class Solver(ABC):
+    """Relative pose of a stereo rig over one frame period."""
+
+    name: str
+    """Name of the card it was loaded from, or the class's own."""
+    needs: ClassVar[frozenset[MatchSet]]
+    """Sets without which it cannot work; it may use others when they are there."""
+    minimum: ClassVar[Mapping[MatchSet, int]]
+    """Fewest matches in each set that it needs."""
+    metric: bool
+    """Whether it can give the length of d in metres."""
+    motion_model: str
+    """Interpolation it assumes between the rows: a key of ``rsbench.core.motion.MOTION_MODELS``."""
+    shutter: Literal["rolling", "global"]
+    reference_point: Literal["body", "left"]
+    """The point of the rig whose translation ``d`` is."""
+    reference: str
+    """Where it was published: paper and equation."""
+    assumes: str
+    """What must hold for it to work, in words."""
+
+    @abstractmethod
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        """Motion from all the given matches, which must be free of outliers."""
+
+    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
+        """Matches per set that ``propose`` wants in a minimal sample of these correspondences."""
+        return self.minimum
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        """Motions that may explain a minimal sample; failures are left out."""
+        estimate = self.estimate(sample, rig, shutter)
+        return [estimate] if estimate.success else []
+
+    def improve(
+        self, motion: MotionEstimate, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        """Like ``estimate``, for a solver that gains from starting at a nearby motion."""
+        return self.estimate(correspondences, rig, shutter)

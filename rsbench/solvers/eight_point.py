@@ -1,0 +1,90 @@
+"""The normalised eight-point algorithm on the left camera: what the paper compares with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar, final
+
+import numpy as np
+
+from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.epipolar import in_front
+from rsbench.core.rig import StereoRig
+from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.packed import temporal_pairs
+
+_ROUNDING = 1e-10
+
+
+def normalising_transform(x: FloatArray) -> FloatArray:
+    """Similarity (3, 3) that centres points (n, 2) and gives them a mean distance of sqrt(2)."""
+    centre = np.mean(x, axis=0)
+    distance = float(np.mean(np.linalg.norm(x - centre, axis=1)))
+    scale = np.sqrt(2.0) / distance if distance > 0.0 else 1.0
+    return np.array([[scale, 0.0, -scale * centre[0]], [0.0, scale, -scale * centre[1]], [0.0, 0.0, 1.0]])
+
+
+def eight_point(x0: FloatArray, x1: FloatArray) -> FloatArray | None:
+    """Essential matrix (3, 3) with ``x1^T E x0 = 0`` of rays (n, 3) with z = 1; None when they are degenerate.
+
+    Hartley, In Defense of the Eight-Point Algorithm, PAMI 1997.
+    """
+    T0, T1 = normalising_transform(x0[:, :2]), normalising_transform(x1[:, :2])
+    rows = (x1 @ T1.T)[:, :, None] * (x0 @ T0.T)[:, None, :]
+    _, s, Vt = np.linalg.svd(rows.reshape(-1, 9), full_matrices=True)
+    if not s[7] > _ROUNDING * s[0]:
+        return None
+    return T1.T @ Vt[-1].reshape(3, 3) @ T0
+
+
+def decompose_essential(E: FloatArray, x0: FloatArray, x1: FloatArray) -> tuple[Pose, int]:
+    """Of the four ``cam1_from_cam0`` of E the one with most points (n, 3) in front, with unit t; how many."""
+    U, _, Vt = np.linalg.svd(E)
+    U, Vt = U * np.linalg.det(U), Vt * np.linalg.det(Vt)
+    W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    best, most = Pose(np.eye(3), U[:, 2]), -1
+    for R in (U @ W @ Vt, U @ W.T @ Vt):
+        for t in (U[:, 2], -U[:, 2]):
+            count = int(np.count_nonzero(in_front(Pose(R, t), x0, x1)))
+            if count > most:
+                best, most = Pose(R, t), count
+    return best, most
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class EightPointSolver(Solver):
+    """Ignores the rolling shutter; gives the left camera's motion, its translation without length."""
+
+    name = "gs-8pt"
+    needs = frozenset[MatchSet]({"left"})
+    minimum: ClassVar[Mapping[MatchSet, int]] = MappingProxyType({"left": 8})
+    metric = False
+    motion_model = "linear"
+    shutter = "global"
+    reference_point = "left"
+    reference = "Hartley: In Defense of the Eight-Point Algorithm, PAMI 1997"
+    assumes = "global shutter; a scene that is not planar; translation"
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        matches = temporal_pairs(correspondences, "left")
+        if len(matches) < self.minimum["left"]:
+            return MotionEstimate.failed(f"{len(matches)} left matches, need {self.minimum['left']}")
+        x0, x1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
+        E = eight_point(x0, x1)
+        if E is None:
+            return MotionEstimate.failed(
+                "the matches fit more than one essential matrix: degenerate scene or motion"
+            )
+        pose, front = decompose_essential(E, x0, x1)
+        if front == 0:
+            return MotionEstimate.failed("no match lies in front of both cameras")
+        return MotionEstimate(w=so3.log(pose.R), d=pose.t, success=True, reason="length of d unknown")
