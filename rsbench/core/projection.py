@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -55,52 +57,68 @@ def project_at(rig: StereoRig, motion: Motion, side: Side, tau: ArrayLike, point
     return np.concatenate([rig.camera.project(x_in_cam), x_in_cam[..., 2:]], axis=-1)
 
 
-def _row_residual(
-    rig: StereoRig,
-    shutter: RollingShutter,
-    motion: Motion,
-    side: Side,
-    frame: int,
-    X: FloatArray,
-    y: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """f(y), f'(y) and the point in the camera of row y."""
-    tau = shutter.row_time(y, frame)
-    R, t = rig.cam_from_world(motion, tau, side)
-    rotated = (R @ X[..., None])[..., 0]
-    x = rotated + t
-    w_rate, t_rate = motion.velocity(tau)
-    x_rate = np.cross(w_rate, rotated) + t_rate
-    z = np.where(x[..., 2] > 0.0, x[..., 2], np.nan)
-    fy = rig.camera.fy
-    value = fy * x[..., 1] / z + rig.camera.cy - y
-    slope = shutter.h * fy * (x_rate[..., 1] - x[..., 1] / z * x_rate[..., 2]) / z - 1.0
-    return value, slope, x
+class _RowEquation(NamedTuple):
+    """f(y) of points in one frame: zero where a row sees a point at its own time."""
+
+    rig: StereoRig
+    shutter: RollingShutter
+    motion: Motion
+    side: Side
+    frame: int
+
+    def __call__(self, X: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """f (n,) in px and f' (n,) of points (n, 3) at rows (n,) or (1,); NaN behind the camera."""
+        tau = self.shutter.row_time(y, self.frame)
+        R, t = self.rig.cam_from_world(self.motion, tau, self.side)
+        rotated = (R @ X[..., None])[..., 0]
+        x = rotated + t
+        w_rate, t_rate = self.motion.velocity(tau)
+        x_rate = np.cross(w_rate, rotated) + t_rate
+        z = np.where(x[..., 2] > 0.0, x[..., 2], np.nan)
+        fy = self.rig.camera.fy
+        value = fy * x[..., 1] / z + self.rig.camera.cy - y
+        slope = self.shutter.h * fy * (x_rate[..., 1] - x[..., 1] / z * x_rate[..., 2]) / z - 1.0
+        return value, slope
 
 
-def _brackets(
-    rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int, X: FloatArray, rows: int
-) -> tuple[NDArray[np.int64], FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Crossings per point, first bracket (low, high), and points whose samples may hide a double crossing."""
-    n = len(X)
-    count = np.zeros(n, dtype=np.int64)
-    low, high = np.full(n, np.nan), np.full(n, np.nan)
-    suspicious = np.zeros(n, dtype=np.bool_)
-    grid = np.linspace(-0.5, shutter.height - 0.5, rows)
-    previous: tuple[FloatArray, FloatArray] | None = None
-    for k, y in enumerate(grid):
-        value, slope, _ = _row_residual(rig, shutter, motion, side, frame, X, np.full(1, y))
-        if previous is not None:
-            value0, slope0 = previous
-            crosses = ((value0 >= 0.0) & (value < 0.0)) | ((value0 < 0.0) & (value >= 0.0))
-            first = crosses & (count == 0)
-            low[first], high[first] = grid[k - 1], y
-            count += crosses
-            # Same sign at both ends while the slopes point at zero: two crossings may hide in between.
-            same_sign = np.sign(value0) * np.sign(value) > 0
-            suspicious |= same_sign & (slope0 * np.sign(value0) < 0) & (slope * np.sign(value) > 0)
-        previous = value, slope
-    return count, low, high, suspicious
+class _Brackets(NamedTuple):
+    """Intervals of rows (low, high), each around one root of the equation of one point; all (m,)."""
+
+    point: NDArray[np.int64]
+    """Number of the point."""
+    low: FloatArray
+    high: FloatArray
+
+
+def _brackets(equation: _RowEquation, X: FloatArray) -> _Brackets:
+    """Every crossing of points (n, 3), the pairs that hide between two samples of one sign included."""
+    grid = np.linspace(-0.5, equation.shutter.height - 0.5, _COARSE_ROWS)
+    samples = [equation(X, np.full(1, y)) for y in grid]
+    found = []
+    for (low, high), (at_low, at_high) in zip(pairwise(grid), pairwise(samples), strict=True):
+        (value0, slope0), (value1, slope1) = at_low, at_high
+        crosses = ((value0 >= 0.0) & (value1 < 0.0)) | ((value0 < 0.0) & (value1 >= 0.0))
+        index = np.flatnonzero(crosses)
+        found.append(_Brackets(index, np.full(len(index), low), np.full(len(index), high)))
+        # Same sign at both ends while the slopes point at zero: the extremum between may lie beyond zero.
+        sign = np.sign(value0)
+        dips = np.flatnonzero((sign * np.sign(value1) > 0) & (slope0 * sign < 0) & (slope1 * sign > 0))
+        turn = _extremum(equation, X[dips], low, high, sign[dips])
+        hidden = equation(X[dips], turn)[0] * sign[dips] < 0
+        index, turn = dips[hidden], turn[hidden]
+        found.append(_Brackets(index, np.full(len(index), low), turn))
+        found.append(_Brackets(index, turn, np.full(len(index), high)))
+    return _Brackets(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+
+
+def _extremum(equation: _RowEquation, X: FloatArray, low: float, high: float, sign: FloatArray) -> FloatArray:
+    """Row (n,) in (low, high) nearest to zero, where the slope changes from towards zero to away from it."""
+    a, b = np.full(len(X), low), np.full(len(X), high)
+    for _ in range(_MAX_ITERATIONS if len(X) else 0):
+        middle = 0.5 * (a + b)
+        towards = equation(X, middle)[1] * sign < 0
+        a, b = np.where(towards, middle, a), np.where(towards, b, middle)
+    return 0.5 * (a + b)
 
 
 def rs_project(
@@ -110,96 +128,52 @@ def rs_project(
 
     Solves the implicit row equation to ``ROW_TOLERANCE_PX`` by bracketing and safeguarded Newton steps.
     """
-    X_all = np.asarray(points, dtype=np.float64)
-    X = X_all.reshape(-1, 3)
-    count, low, high, suspicious = _brackets(rig, shutter, motion, side, frame, X, _COARSE_ROWS)
-    if np.any(suspicious):
-        fine = _brackets(rig, shutter, motion, side, frame, X[suspicious], _FINE_ROWS)
-        count[suspicious], low[suspicious], high[suspicious] = fine[:3]
-    pixels, depth = np.full((len(X), 2), np.nan), np.full(len(X), np.nan)
-    tau = np.full(len(X), np.nan)
-    status = np.full(len(X), ProjectionStatus.NEVER, dtype=np.uint8)
-    hit = np.flatnonzero(count > 0)
-    if len(hit):
-        y, converged = _solve_rows(rig, shutter, motion, side, frame, X[hit], low[hit], high[hit])
-        times = shutter.row_time(y, frame)
-        seen = project_at(rig, motion, side, times, X[hit])
-        inside = rig.camera.contains(seen[:, :2])
-        found = np.where(count[hit] > 1, ProjectionStatus.TWICE, ProjectionStatus.SEEN)
-        found = np.where(inside, found, ProjectionStatus.NEVER)
-        status[hit] = np.where(converged, found, ProjectionStatus.NOT_CONVERGED)
-        keep = converged & inside
-        pixels[hit[keep]], depth[hit[keep]] = seen[keep, :2], seen[keep, 2]
-        tau[hit[keep]] = times[keep]
-    shape = X_all.shape[:-1]
+    given = np.asarray(points, dtype=np.float64)
+    X = given.reshape(-1, 3)
+    equation = _RowEquation(rig, shutter, motion, side, frame)
+    index, low, high = _brackets(equation, X)
+    y, converged = _solve_rows(equation, X[index], low, high)
+    times = shutter.row_time(y, frame)
+    seen = project_at(rig, motion, side, times, X[index])
+    inside = converged & rig.camera.contains(seen[:, :2])
+    rows_that_see = np.bincount(index[inside], minlength=len(X))
+    status = np.select(
+        [rows_that_see > 1, rows_that_see == 1, np.bincount(index[~converged], minlength=len(X)) > 0],
+        [ProjectionStatus.TWICE, ProjectionStatus.SEEN, ProjectionStatus.NOT_CONVERGED],
+        ProjectionStatus.NEVER,
+    )
+    # The first row of each point: unique() keeps the first of equal indices, which the sort puts in order.
+    order = np.lexsort((y, index))
+    order = order[inside[order]]
+    hit, first = np.unique(index[order], return_index=True)
+    chosen = order[first]
+    pixels, depth, tau = np.full((len(X), 2), np.nan), np.full(len(X), np.nan), np.full(len(X), np.nan)
+    pixels[hit], depth[hit], tau[hit] = seen[chosen, :2], seen[chosen, 2], times[chosen]
+    shape = given.shape[:-1]
     return RSProjection(
         pixels=pixels.reshape(*shape, 2),
         depth=depth.reshape(shape),
         tau=tau.reshape(shape),
-        status=status.reshape(shape),
-    )
-
-
-def rs_project_near(
-    rig: StereoRig,
-    shutter: RollingShutter,
-    motion: Motion,
-    side: Side,
-    frame: int,
-    points: ArrayLike,
-    start_rows: ArrayLike,
-) -> RSProjection:
-    """Like ``rs_project`` from a row guess (...) per point: Newton only, for dense maps.
-
-    Finds one crossing and does not look for others, so the status is never TWICE.
-    """
-    X = np.asarray(points, dtype=np.float64)
-    y = np.broadcast_to(np.asarray(start_rows, dtype=np.float64), X.shape[:-1]).copy()
-    for _ in range(_MAX_NEWTON_STEPS):
-        value, slope, x_in_cam = _row_residual(rig, shutter, motion, side, frame, X, y)
-        converged = np.abs(value) <= ROW_TOLERANCE_PX
-        # Points behind the camera have no residual and need no further steps.
-        if np.all(converged | np.isnan(value)):
-            break
-        y = np.where(converged | np.isnan(value), y, y - value / np.where(slope == 0.0, np.nan, slope))
-    pixels = rig.camera.project(x_in_cam)
-    inside = converged & rig.camera.contains(pixels)
-    lost = np.isfinite(value) & ~converged
-    status = np.where(inside, ProjectionStatus.SEEN, ProjectionStatus.NEVER)
-    return RSProjection(
-        pixels=np.where(inside[..., None], pixels, np.nan),
-        depth=np.where(inside, x_in_cam[..., 2], np.nan),
-        tau=np.where(inside, shutter.row_time(y, frame), np.nan),
-        status=np.where(lost, ProjectionStatus.NOT_CONVERGED, status).astype(np.uint8),
+        status=status.astype(np.uint8).reshape(shape),
     )
 
 
 def _solve_rows(
-    rig: StereoRig,
-    shutter: RollingShutter,
-    motion: Motion,
-    side: Side,
-    frame: int,
-    X: FloatArray,
-    low: FloatArray,
-    high: FloatArray,
+    equation: _RowEquation, X: FloatArray, low: FloatArray, high: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Root of the row equation inside (low, high): Newton, replaced by bisection when a step leaves it."""
-    low, high = low.copy(), high.copy()
-    sign_low = np.sign(_row_residual(rig, shutter, motion, side, frame, X, low)[0])
+    sign_low = np.sign(equation(X, low)[0])
     y = 0.5 * (low + high)
-    value = np.full(len(y), np.nan)
+    value, slope = equation(X, y)
     for _ in range(_MAX_ITERATIONS):
-        value, slope, _ = _row_residual(rig, shutter, motion, side, frame, X, y)
-        if np.all(np.abs(value) <= ROW_TOLERANCE_PX):
+        done = np.abs(value) <= ROW_TOLERANCE_PX
+        if np.all(done):
             break
         below = np.sign(value) == sign_low
         low, high = np.where(below, y, low), np.where(below, high, y)
         step = y - value / np.where(slope == 0.0, np.nan, slope)
-        y = np.where((step > low) & (step < high), step, 0.5 * (low + high))
-        # np.where keeps finished points where they are instead of bisecting away from the root.
-        done = np.abs(value) <= ROW_TOLERANCE_PX
-        y = np.where(done, np.where(below, low, high), y)
+        y = np.where(done, y, np.where((step > low) & (step < high), step, 0.5 * (low + high)))
+        value, slope = equation(X, y)
     return y, np.abs(value) <= ROW_TOLERANCE_PX
 
 

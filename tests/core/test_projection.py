@@ -1,0 +1,233 @@
+"""Rolling-shutter projection against closed forms, the row equation itself and a brute-force scan."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.motion import LinearMotion, Motion, TwistMotion
+from rsbench.core.projection import (
+    ROW_TOLERANCE_PX,
+    ProjectionStatus,
+    back_project,
+    project_at,
+    row_poses,
+    rs_project,
+)
+from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.se3 import transform
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+
+few = settings(max_examples=25, deadline=None, derandomize=True)
+vectors = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
+seeds = st.integers(0, 2**32 - 1)
+models = st.sampled_from([LinearMotion, TwistMotion])
+
+RIG = StereoRig(camera=PinholeCamera.centred(100, 80, 100.0), baseline=0.2)
+SHUTTER = RollingShutter(height=80, readout_ratio=0.8)
+STILL = LinearMotion(np.zeros(3), np.zeros(3))
+
+
+def _points(seed: int, n: int = 50) -> FloatArray:
+    return np.random.default_rng(seed).uniform([-2, -2, 2], [2, 2, 8], size=(n, 3))
+
+
+def _scan(motion: Motion, side: Side, frame: int, X: FloatArray, rows: int = 20_000) -> list[FloatArray]:
+    """Rows (per point) at which a dense scan of the image sees the point, and the x there lies inside."""
+    y = np.linspace(-0.5, 79.5, rows)
+    pose = RIG.cam_from_world(motion, frame + 0.8 * y / 80, side)
+    found = []
+    for point in X:
+        x, v, z = (pose.R @ point + pose.t).T
+        ahead = z > 0
+        f = np.where(ahead, 100 * v / np.where(ahead, z, 1) + 39.5, np.nan) - y
+        k = np.flatnonzero(f[:-1] * f[1:] < 0)
+        column = 100 * x[k] / z[k] + 49.5
+        found.append(y[k][(column > -0.5) & (column < 99.5)])
+    return found
+
+
+@few
+@given(models, vectors, vectors, seeds, st.sampled_from(SIDES), st.integers(0, 1))
+def test_a_seen_point_satisfies_the_row_equation(
+    model: type[LinearMotion] | type[TwistMotion], w: FloatArray, d: FloatArray, seed: int, side: Side, frame: int
+) -> None:
+    motion, X = model(0.3 * w, d), _points(seed)
+    seen = rs_project(RIG, SHUTTER, motion, side, frame, X)
+    ok = seen.status == ProjectionStatus.SEEN
+    np.testing.assert_array_equal(np.isfinite(seen.pixels[:, 0]), ok | (seen.status == ProjectionStatus.TWICE))
+    tau = frame + 0.8 * seen.pixels[ok, 1] / 80
+    again = project_at(RIG, motion, side, tau, X[ok])
+    np.testing.assert_allclose(again[:, 1], seen.pixels[ok, 1], rtol=0, atol=10 * ROW_TOLERANCE_PX)
+    np.testing.assert_allclose(seen.tau[ok], tau, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(seen.depth[ok], again[:, 2], rtol=1e-9)
+    assert not np.any(seen.status == ProjectionStatus.NOT_CONVERGED)
+
+
+@few
+@given(models, vectors, vectors, seeds, st.sampled_from(SIDES), st.integers(0, 1))
+def test_projecting_a_back_projected_pixel_returns_it(
+    model: type[LinearMotion] | type[TwistMotion], w: FloatArray, d: FloatArray, seed: int, side: Side, frame: int
+) -> None:
+    motion, rng = model(0.05 * w, 0.1 * d), np.random.default_rng(seed)
+    pixels, depth = rng.uniform(0, [99, 79], size=(30, 2)), rng.uniform(2, 9, size=30)
+    X = back_project(RIG, SHUTTER, motion, side, frame, pixels, depth)
+    seen = rs_project(RIG, SHUTTER, motion, side, frame, X)
+    np.testing.assert_allclose(seen.pixels, pixels, rtol=0, atol=2 * ROW_TOLERANCE_PX)
+    np.testing.assert_allclose(seen.depth, depth, rtol=1e-10)
+
+
+@pytest.mark.parametrize("frame", [0, 1])
+@pytest.mark.parametrize("side", SIDES)
+def test_a_global_shutter_projects_at_the_time_of_its_frame_bit_for_bit(side: Side, frame: int) -> None:
+    shutter = RollingShutter(height=80, readout_ratio=0.0)
+    motion, X = TwistMotion(np.array([0.1, -0.2, 0.3]), np.array([0.4, 0.1, -0.2])), _points(3)
+    seen = rs_project(RIG, shutter, motion, side, frame, X)
+    x_in_cam = transform(RIG.cam_from_world(motion, float(frame), side), X)
+    pixels = RIG.camera.project(x_in_cam)
+    inside = RIG.camera.contains(pixels)
+    assert 5 < np.count_nonzero(inside) < len(X)
+    np.testing.assert_array_equal(seen.pixels, np.where(inside[:, None], pixels, np.nan))
+    np.testing.assert_array_equal(seen.depth[inside], x_in_cam[inside, 2])
+    np.testing.assert_array_equal(seen.status == ProjectionStatus.SEEN, inside)
+
+
+def test_without_motion_the_shutter_does_not_matter() -> None:
+    X = _points(4)
+    slow, instant = (
+        rs_project(RIG, RollingShutter(height=80, readout_ratio=ratio), STILL, "left", 1, X)
+        for ratio in (1.0, 0.0)
+    )
+    np.testing.assert_array_equal(slow.pixels, instant.pixels)
+
+
+def _moving_down(speed: float) -> LinearMotion:
+    """Points at depth 5 move down the image by ``speed`` rows per row time."""
+    return LinearMotion(np.zeros(3), np.array([0.0, speed * 5.0 / (100.0 * SHUTTER.h), 0.0]))
+
+
+@pytest.mark.parametrize("speed", [-2.0, -0.5, 0.3, 0.9, 1.5, 3.0])
+def test_constant_speed_down_the_image_in_closed_form(speed: float) -> None:
+    # y = y_start + speed * y, so y = y_start / (1 - speed): a point faster than the scan is met from below.
+    y_start = 40.0 * (1 - speed)
+    X = np.array([0.1, (y_start - 39.5) / 100 * 5.0, 5.0])
+    seen = rs_project(RIG, SHUTTER, _moving_down(speed), "left", 0, X)
+    assert seen.status == ProjectionStatus.SEEN
+    np.testing.assert_allclose(seen.pixels, [49.5 + 100 * 0.2 / 5, 40.0], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("start", [-30.0, -1.0, 3.0, 60.0])
+def test_a_point_that_keeps_pace_with_the_readout_is_never_seen(start: float) -> None:
+    X = np.array([0.0, (start - 39.5) / 100 * 5.0, 5.0])
+    assert rs_project(RIG, SHUTTER, _moving_down(1.0), "left", 0, X).status == ProjectionStatus.NEVER
+
+
+def _with_roots(total: float, product: float, dz: float, depth: float) -> tuple[LinearMotion, FloatArray]:
+    """A motion and a point whose row equation is y^2 - total y + product = 0.
+
+    With d = (0, dy, dz), f(y) = 0 is h dz y^2 + (Z - cy h dz - fy h dy) y - (cy Z + fy Y) = 0.
+    """
+    fy, cy, h = RIG.camera.fy, RIG.camera.cy, SHUTTER.h
+    dy = (depth - cy * h * dz + total * h * dz) / (fy * h)
+    Y = -(product * h * dz + cy * depth) / fy
+    return LinearMotion(np.zeros(3), np.array([0.0, dy, dz])), np.array([0.0, Y, depth])
+
+
+@pytest.mark.parametrize("dz", [-1.0, 1.0])
+@pytest.mark.parametrize("roots", [(10.0, 60.0), (31.0, 33.0), (40.0, 40.05), (1.0, 78.0)])
+def test_a_point_seen_twice_reports_its_first_row(roots: tuple[float, float], dz: float) -> None:
+    motion, X = _with_roots(sum(roots), roots[0] * roots[1], dz, 5.0)
+    seen = rs_project(RIG, SHUTTER, motion, "right", 0, X)
+    assert seen.status == ProjectionStatus.TWICE
+    # A residual of 1e-9 px moves a root by 1e-9 / f', and f' = h dz (y1 - y2) / Z is 1e-4 at the closest pair.
+    assert seen.pixels[1] == pytest.approx(roots[0], abs=1e-4)
+
+
+@pytest.mark.parametrize("dz", [-1.0, 1.0])
+@pytest.mark.parametrize(("inside", "outside"), [(20.0, 95.0), (20.0, -9.0), (70.0, 400.0)])
+def test_a_second_row_outside_the_image_does_not_count(inside: float, outside: float, dz: float) -> None:
+    motion, X = _with_roots(inside + outside, inside * outside, dz, 5.0)
+    seen = rs_project(RIG, SHUTTER, motion, "right", 0, X)
+    assert seen.status == ProjectionStatus.SEEN
+    assert seen.pixels[1] == pytest.approx(inside, abs=1e-6)
+
+
+@pytest.mark.parametrize("dz", [-1.0, 1.0])
+def test_complex_roots_are_never_seen(dz: float) -> None:
+    motion, X = _with_roots(80.0, 40.0**2 + 0.01, dz, 5.0)
+    assert rs_project(RIG, SHUTTER, motion, "left", 0, X).status == ProjectionStatus.NEVER
+
+
+@pytest.mark.parametrize(
+    ("x_at_10", "x_at_60", "rows"), [(0.5, -0.5, [10.0, 60.0]), (0.0, -4.0, [10.0]), (-4.0, 0.0, [60.0])]
+)
+def test_of_two_rows_only_those_inside_the_width_count(x_at_10: float, x_at_60: float, rows: list[float]) -> None:
+    down, X = _with_roots(70.0, 600.0, -1.0, 5.0)
+    # Rows 10 and 60 are read at 0.1 and 0.6; the given x are in the left camera, 0.1 m from the body.
+    speed = (x_at_60 - x_at_10) / 0.5
+    motion = LinearMotion(np.zeros(3), down.d + np.array([speed, 0.0, 0.0]))
+    X = X + np.array([x_at_10 - 0.1 * speed - 0.1, 0.0, 0.0])
+    seen = rs_project(RIG, SHUTTER, motion, "left", 0, X)
+    assert seen.status == (ProjectionStatus.TWICE if len(rows) == 2 else ProjectionStatus.SEEN)
+    assert seen.pixels[1] == pytest.approx(rows[0], abs=1e-6)
+
+
+@few
+@given(models, vectors, vectors, seeds, st.sampled_from(SIDES), st.integers(0, 1))
+def test_the_number_of_rows_agrees_with_a_dense_scan(
+    model: type[LinearMotion] | type[TwistMotion], w: FloatArray, d: FloatArray, seed: int, side: Side, frame: int
+) -> None:
+    motion = model(0.6 * w, np.array([1.0, 6.0, 2.0]) * d)  # violent: many points are met twice or never
+    X = _points(seed, 40)
+    seen = rs_project(RIG, SHUTTER, motion, side, frame, X)
+    for k, rows in enumerate(_scan(motion, side, frame, X)):
+        expected = (ProjectionStatus.NEVER, ProjectionStatus.SEEN, ProjectionStatus.TWICE)[min(len(rows), 2)]
+        assert seen.status[k] == expected, (k, rows)
+        if len(rows):
+            assert seen.pixels[k, 1] == pytest.approx(rows[0], abs=80 / 20_000 + 1e-6)
+
+
+def test_points_behind_the_camera_are_never_seen() -> None:
+    X = np.array([[0.0, 0.0, -5.0], [0.0, 0.0, 0.0], [0.0, 0.0, 5.0]])
+    seen = rs_project(RIG, SHUTTER, STILL, "left", 0, X)
+    never, one = ProjectionStatus.NEVER, ProjectionStatus.SEEN
+    np.testing.assert_array_equal(seen.status, [never, never, one])
+    assert (
+        np.all(np.isnan(seen.pixels[:2])) and np.all(np.isnan(seen.depth[:2])) and np.all(np.isnan(seen.tau[:2]))
+    )
+
+
+def test_a_point_that_passes_behind_the_camera_during_the_readout() -> None:
+    # Depth 0.1 - tau: the point is ahead while the first rows are read, on the axis, where row 39.5 comes late.
+    motion = LinearMotion(np.zeros(3), np.array([0.0, 0.0, -1.0]))
+    late = rs_project(RIG, SHUTTER, motion, "left", 0, [-0.1, 0.0, 0.1])
+    early = rs_project(RIG, SHUTTER, motion, "left", 0, [-0.1, 0.0, 0.5])
+    assert late.status == ProjectionStatus.NEVER
+    assert early.status == ProjectionStatus.SEEN
+    assert early.pixels[1] == pytest.approx(39.5, abs=1e-8)
+
+
+def test_batch_axes_are_kept_and_no_points_are_fine() -> None:
+    X = _points(5, 6)
+    flat = rs_project(RIG, SHUTTER, _moving_down(0.2), "left", 1, X)
+    shaped = rs_project(RIG, SHUTTER, _moving_down(0.2), "left", 1, X.reshape(2, 3, 3))
+    np.testing.assert_array_equal(shaped.pixels.reshape(-1, 2), flat.pixels)
+    np.testing.assert_array_equal(shaped.status.ravel(), flat.status)
+    single = rs_project(RIG, SHUTTER, _moving_down(0.2), "left", 1, X[0])
+    assert single.pixels.shape == (2,) and single.status.shape == ()
+    nothing = rs_project(RIG, SHUTTER, STILL, "left", 0, np.zeros((0, 3)))
+    assert nothing.pixels.shape == (0, 2)
+
+
+def test_row_poses_are_the_poses_of_integer_rows() -> None:
+    motion = TwistMotion(np.array([0.1, 0.2, -0.1]), np.array([0.3, 0.0, 0.1]))
+    R, t = row_poses(RIG, SHUTTER, motion, "right", 1)
+    assert R.shape == (80, 3, 3) and t.shape == (80, 3)
+    # R X + t at row 7 is the body's pose at 1 + 0.8 * 7 / 80, shifted by half a baseline to the left.
+    body = motion.body_from_world(1.07)
+    np.testing.assert_allclose(R[7], body.R, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(t[7], body.t - [0.1, 0, 0], rtol=0, atol=1e-15)
