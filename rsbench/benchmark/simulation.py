@@ -12,8 +12,8 @@ import numpy as np
 
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import MOTION_MODELS, Motion
-from rsbench.core.projection import ProjectionStatus, back_project, rs_project
-from rsbench.core.rig import StereoRig
+from rsbench.core.projection import ROW_TOLERANCE_PX, ProjectionStatus, back_project, project_at, rs_project
+from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
@@ -74,29 +74,23 @@ def simulate(
 ) -> Simulation:
     """Matches of points that the moving rig sees in all images that their set needs.
 
+    Equal generators give common random numbers: the candidates for points, the standardised noise and the
+    outliers are the same whatever the motion, the shutter, the rig and the size of the noise, and fewer matches
+    are the first of more. ``rng`` must be freshly made (it is spawned from).
+
     Raises:
         ValueError: the motion leaves too few points in view.
     """
-    left = _exact(rig, shutter, motion, options, rng, options.pairs, ("left",))
-    right = _exact(rig, shutter, motion, options, rng, options.pairs, ("right",))
-    both = _exact(rig, shutter, motion, options, rng, options.tracks, ("left", "right"))
-    # (n, views, frames, 2) -> xl0, yl0, xr0, yr0, xl1, ...
-    exact = {
-        "left": left.reshape(-1, 4),
-        "right": right.reshape(-1, 4),
-        "tracks": np.swapaxes(both, 1, 2).reshape(-1, 8),
-    }
+    scenes, noises, wrongs = rng.spawn(3), rng.spawn(3), rng.spawn(3)
+    counts = {"left": options.pairs, "right": options.pairs, "tracks": options.tracks}
+    views: dict[str, tuple[Side, ...]] = {"left": ("left",), "right": ("right",), "tracks": ("left", "right")}
     noisy, outliers = {}, {}
-    for name, matches in exact.items():
-        count = round(options.outlier_ratio * len(matches))
-        mask = np.zeros(len(matches), dtype=np.bool_)
-        mask[rng.permutation(len(matches))[:count]] = True
-        shift = rng.uniform(-options.outlier_px, options.outlier_px, (len(matches), 2))
-        noisy[name] = matches + options.noise_px * rng.standard_normal(matches.shape)
-        half = matches.shape[1] // 2
-        for k in range(half, 2 * half, 2):
-            noisy[name][mask, k : k + 2] += shift[mask]
-        outliers[name] = mask
+    for (name, count), scene, noise, wrong in zip(counts.items(), scenes, noises, wrongs, strict=True):
+        exact = _exact(rig, shutter, motion, options, scene, count, views[name])
+        # (n, views, frames, 2) -> xl0, yl0, xr0, yr0, xl1, ...
+        matches = np.swapaxes(exact, 1, 2).reshape(len(exact), 4 * len(views[name]))
+        noisy[name] = matches + options.noise_px * noise.standard_normal(matches.shape)
+        outliers[name] = _displace(noisy[name], options, wrong)
     return Simulation(
         correspondences=Correspondences(**noisy),
         rig=rig,
@@ -106,6 +100,18 @@ def simulate(
     )
 
 
+def _displace(matches: FloatArray, options: SimulationOptions, rng: np.random.Generator) -> np.ndarray:
+    """Move the frame-1 pixels of some matches, in place; returns which."""
+    draws = rng.uniform(-1.0, 1.0, (len(matches), 3))
+    chosen = np.argsort(draws[:, 2], kind="stable")[: round(options.outlier_ratio * len(matches))]
+    mask = np.zeros(len(matches), dtype=np.bool_)
+    mask[chosen] = True
+    half = matches.shape[1] // 2
+    for k in range(half, 2 * half, 2):
+        matches[mask, k : k + 2] += options.outlier_px * draws[mask, :2]
+    return mask
+
+
 def _exact(
     rig: StereoRig,
     shutter: RollingShutter,
@@ -113,7 +119,7 @@ def _exact(
     options: SimulationOptions,
     rng: np.random.Generator,
     count: int,
-    sides: tuple[Literal["left", "right"], ...],
+    sides: tuple[Side, ...],
 ) -> FloatArray:
     """Noise-free pixels (count, views, 2 frames, 2) of points that every view sees once."""
     camera = rig.camera
@@ -122,14 +128,16 @@ def _exact(
     for _ in range(60):
         if total >= count:
             break
-        size = 2 * (count - total) + 8
-        pixels = rng.uniform((0.0, 0.0), (camera.width - 1, camera.height - 1), (size, 2))
-        points = back_project(
-            rig, shutter, motion, sides[0], 0, pixels, _depths(options, rng, camera.unproject(pixels))
-        )
-        views = [[rs_project(rig, shutter, motion, side, frame, points) for frame in (0, 1)] for side in sides]
-        seen = np.all([view.status == ProjectionStatus.SEEN for row in views for view in row], axis=0)
-        stacked = np.stack([np.stack([view.pixels for view in row], axis=1) for row in views], axis=1)
+        draws = rng.uniform(size=(count - total + count // 4 + 8, 3))
+        pixels = draws[:, :2] * (camera.width - 1, camera.height - 1)
+        depth = _depths(options, draws[:, 2], camera.unproject(pixels))
+        points = back_project(rig, shutter, motion, sides[0], 0, pixels, depth)
+        views = [
+            [_seen_once(rig, shutter, motion, side, frame, points, pixels[:, 1]) for frame in (0, 1)]
+            for side in sides
+        ]
+        stacked = np.stack([np.stack(row, axis=1) for row in views], axis=1)
+        seen = np.all(np.isfinite(stacked), axis=(1, 2, 3))
         found.append(stacked[seen])
         total += int(np.count_nonzero(seen))
     if total < count:
@@ -137,11 +145,66 @@ def _exact(
     return np.concatenate(found)[:count]
 
 
-def _depths(options: SimulationOptions, rng: np.random.Generator, rays: FloatArray) -> FloatArray:
-    """Depth z (n,) of the points on the rays (n, 3)."""
+_SECANT_STEPS = 12
+
+
+def _seen_once(
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    side: Side,
+    frame: int,
+    points: FloatArray,
+    guess: FloatArray,
+) -> FloatArray:
+    """Pixels (n, 2) of points (n, 3) that one frame sees exactly once; NaN for the others.
+
+    The same as ``rs_project``, which searches all rows, but many times as fast for slow motion: where image
+    points are slower than the readout none can be seen twice, and secant steps from a near row suffice.
+    """
+    pixels = np.full((len(points), 2), np.nan)
+    slow = _slower_than_readout(rig, shutter, motion, side, frame, points)
+    X, y0 = points[slow], guess[slow]
+    seen = project_at(rig, motion, side, shutter.row_time(y0, frame), X)
+    f0, y = seen[:, 1] - y0, seen[:, 1]
+    for _ in range(_SECANT_STEPS if np.any(np.abs(f0) > ROW_TOLERANCE_PX) else 0):
+        seen = project_at(rig, motion, side, shutter.row_time(y, frame), X)
+        f = seen[:, 1] - y
+        if np.all(np.abs(f) <= ROW_TOLERANCE_PX):
+            break
+        slope = np.where(f != f0, (f - f0) / np.where(y != y0, y - y0, 1.0), -1.0)
+        y0, f0, y = y, f, np.where(np.abs(f) <= ROW_TOLERANCE_PX, y, y - f / slope)
+    converged = np.abs(seen[:, 1] - y) <= ROW_TOLERANCE_PX
+    pixels[slow] = np.where((converged & rig.camera.contains(seen[:, :2]))[:, None], seen[:, :2], np.nan)
+    if not np.all(slow):
+        rest = rs_project(rig, shutter, motion, side, frame, points[~slow])
+        pixels[~slow] = np.where((rest.status == ProjectionStatus.SEEN)[:, None], rest.pixels, np.nan)
+    return pixels
+
+
+def _slower_than_readout(
+    rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int, points: FloatArray
+) -> np.ndarray:
+    """Mask (n,) of points whose image provably never moves as fast as half the speed of the readout.
+
+    Then the row equation falls at every crossing, so it has at most one. Both motion models have constant
+    rates; half the speed leaves room for others.
+    """
+    camera = rig.camera
+    tau = shutter.row_time(0.5 * shutter.height, frame)
+    w_rate, t_rate = motion.velocity(tau)
+    speed = np.linalg.norm(w_rate) * np.linalg.norm(points, axis=-1) + np.linalg.norm(t_rate)
+    depth = project_at(rig, motion, side, tau, points)[:, 2]
+    nearest = depth - 0.5 * speed * shutter.readout_ratio
+    steepest = np.hypot(1.0, max(camera.cy + 0.5, camera.height - 0.5 - camera.cy) / camera.fy)
+    return (nearest > 0.0) & (shutter.h * camera.fy * speed * steepest < 0.5 * nearest)
+
+
+def _depths(options: SimulationOptions, draws: FloatArray, rays: FloatArray) -> FloatArray:
+    """Depth z (n,) of the points on the rays (n, 3), from uniform draws (n,) in [0, 1)."""
     near, far = options.depth
     if options.shape == "box":
-        return rng.uniform(near, far, len(rays))
+        return near + (far - near) * draws
     # A plane n.X = 1, tilted so that the depth changes over the image.
     middle = 0.5 * (near + far)
     return middle / (1.0 + 0.3 * rays[:, 0] - 0.2 * rays[:, 1])
