@@ -60,12 +60,12 @@ def sampson_error(E: FloatArray, x0: FloatArray, x1: FloatArray, camera: Pinhole
     return np.where(norm > 0.0, value / np.where(norm > 0.0, norm, 1.0), 0.0)
 
 
-def rs_sampson_error(
+def rs_constraint(
     rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, matches: FloatArray
-) -> FloatArray:
-    """Exact rolling-shutter Sampson error in pixels (n,) of matches (n, 4): x0, y0, x1, y1.
+) -> tuple[FloatArray, FloatArray]:
+    """``x1^T E x0`` (n,) of matches (n, 4) x0, y0, x1, y1 and its total derivative (n, 4) by these pixels.
 
-    The gradient counts that a shifted row is also read at another time.
+    The derivative counts that a shifted row is also read at another time.
     """
     x0, x1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
     tau0, tau1 = shutter.row_time(matches[:, 1], 0), shutter.row_time(matches[:, 3], 1)
@@ -83,6 +83,17 @@ def rs_sampson_error(
     for column, T_rate, p_rate in ((1, T_rate0, p_rate0), (3, T_rate1, p_rate1)):
         rate = np.cross(T_rate, p) + np.cross(T, p_rate)
         gradient[:, column] += shutter.h * np.sum(x1 * rate, axis=-1)
+    return value, gradient
+
+
+def rs_sampson_error(
+    rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, matches: FloatArray
+) -> FloatArray:
+    """Exact rolling-shutter Sampson error in pixels (n,) of matches (n, 4): x0, y0, x1, y1.
+
+    The distance to the nearest exact match, to first order; its sign is that of the constraint.
+    """
+    value, gradient = rs_constraint(rig, shutter, motion, side, matches)
     norm = np.linalg.norm(gradient, axis=-1)
     return np.where(norm > 0.0, value / np.where(norm > 0.0, norm, 1.0), 0.0)
 
@@ -97,7 +108,7 @@ def rs_sampson_jacobian(
     """Derivative (n, 6) of ``rs_sampson_error`` by (w, d) for the paper's motion model.
 
     Differentiates the denominator too (frozen weights shrink d towards its trivial zero); only the change of
-    the gradient's row-time terms, below 1e-3 of the rest, is left out.
+    the gradient's row-time terms is left out. Exact where the error is zero and for a global shutter.
     """
     x0, x1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
     tau0, tau1 = shutter.row_time(matches[:, 1], 0), shutter.row_time(matches[:, 3], 1)
@@ -106,7 +117,6 @@ def rs_sampson_jacobian(
     offset = rig.offset(side)
     Rt0 = _apply(R, tau0[:, None] * motion.d + offset)
     T = tau1[:, None] * motion.d + offset - Rt0
-    E = hat(T) @ R
     # dR = [r_j]x R for the columns r_j of a J(a w); dT = -[r_j]x R t0 for w_j and (tau1 - tau0 R) e_j for d_j.
     rotation_rate = np.swapaxes(a[:, None, None] * so3.left_jacobian(a[:, None] * motion.w), -1, -2)
     T_by_w = -np.cross(rotation_rate, Rt0[:, None])
@@ -114,9 +124,9 @@ def rs_sampson_jacobian(
     T_by_d = np.swapaxes(tau1[:, None, None] * np.eye(3) - tau0[:, None, None] * R, -1, -2)
     E_by_d = hat(T_by_d) @ R[:, None]
     dE = np.concatenate([E_by_w, E_by_d], axis=1)
-    gradient = epipolar_gradient(E, x0, x1, rig.camera)
     dgradient = epipolar_gradient(dE, x0[:, None], x1[:, None], rig.camera)
-    value = np.einsum("ni,nij,nj->n", x1, E, x0)[:, None]
+    value, gradient = rs_constraint(rig, shutter, motion, side, matches)
+    value = value[:, None]
     dvalue = np.einsum("ni,nkij,nj->nk", x1, dE, x0)
     norm = np.linalg.norm(gradient, axis=-1, keepdims=True)
     norm = np.where(norm > 0.0, norm, np.inf)

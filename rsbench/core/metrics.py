@@ -32,7 +32,7 @@ def translation_error(d_est: ArrayLike, d_gt: ArrayLike) -> FloatArray:
 
 
 def scale_error(d_est: ArrayLike, d_gt: ArrayLike) -> FloatArray:
-    """e_s = abs(log(norm(d_est) / norm(d_gt))); infinite when one of them is zero, NaN when the truth is."""
+    """e_s = abs(log(norm(d_est) / norm(d_gt))); infinite when the estimate is zero, NaN when the truth is."""
     est = np.linalg.norm(np.asarray(d_est, dtype=np.float64), axis=-1)
     gt = np.linalg.norm(np.asarray(d_gt, dtype=np.float64), axis=-1)
     ratio = est / np.where(gt > 0.0, gt, 1.0)
