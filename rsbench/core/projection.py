@@ -66,8 +66,8 @@ class _RowEquation(NamedTuple):
     side: Side
     frame: int
 
-    def __call__(self, X: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """f (n,) in px and f' (n,) of points (n, 3) at rows (n,) or (1,); NaN behind the camera."""
+    def __call__(self, X: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """f (...) in px, f' (...) and the point (..., 3) in the camera of rows (...); NaN behind the camera."""
         tau = self.shutter.row_time(y, self.frame)
         R, t = self.rig.cam_from_world(self.motion, tau, self.side)
         rotated = (R @ X[..., None])[..., 0]
@@ -78,7 +78,7 @@ class _RowEquation(NamedTuple):
         fy = self.rig.camera.fy
         value = fy * x[..., 1] / z + self.rig.camera.cy - y
         slope = self.shutter.h * fy * (x_rate[..., 1] - x[..., 1] / z * x_rate[..., 2]) / z - 1.0
-        return value, slope
+        return value, slope, x
 
 
 class _Brackets(NamedTuple):
@@ -96,7 +96,7 @@ def _brackets(equation: _RowEquation, X: FloatArray) -> _Brackets:
     samples = [equation(X, np.full(1, y)) for y in grid]
     found = []
     for (low, high), (at_low, at_high) in zip(pairwise(grid), pairwise(samples), strict=True):
-        (value0, slope0), (value1, slope1) = at_low, at_high
+        (value0, slope0, _), (value1, slope1, _) = at_low, at_high
         crosses = ((value0 >= 0.0) & (value1 < 0.0)) | ((value0 < 0.0) & (value1 >= 0.0))
         index = np.flatnonzero(crosses)
         found.append(_Brackets(index, np.full(len(index), low), np.full(len(index), high)))
@@ -158,13 +158,48 @@ def rs_project(
     )
 
 
+def rs_project_near(
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    side: Side,
+    frame: int,
+    points: ArrayLike,
+    start_rows: ArrayLike,
+) -> RSProjection:
+    """Like ``rs_project`` from a row guess (...) per point: Newton only, for dense maps.
+
+    Finds one crossing and does not look for others, so the status is never TWICE.
+    """
+    X = np.asarray(points, dtype=np.float64)
+    y = np.broadcast_to(np.asarray(start_rows, dtype=np.float64), X.shape[:-1]).copy()
+    equation = _RowEquation(rig, shutter, motion, side, frame)
+    for _ in range(_MAX_NEWTON_STEPS):
+        value, slope, x_in_cam = equation(X, y)
+        converged = np.abs(value) <= ROW_TOLERANCE_PX
+        # Points behind the camera have no residual and need no further steps.
+        if np.all(converged | np.isnan(value)):
+            break
+        y = np.where(converged | np.isnan(value), y, y - value / np.where(slope == 0.0, np.nan, slope))
+    pixels = rig.camera.project(x_in_cam)
+    inside = converged & rig.camera.contains(pixels)
+    lost = np.isfinite(value) & ~converged
+    status = np.where(inside, ProjectionStatus.SEEN, ProjectionStatus.NEVER)
+    return RSProjection(
+        pixels=np.where(inside[..., None], pixels, np.nan),
+        depth=np.where(inside, x_in_cam[..., 2], np.nan),
+        tau=np.where(inside, shutter.row_time(y, frame), np.nan),
+        status=np.where(lost, ProjectionStatus.NOT_CONVERGED, status).astype(np.uint8),
+    )
+
+
 def _solve_rows(
     equation: _RowEquation, X: FloatArray, low: FloatArray, high: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Root of the row equation inside (low, high): Newton, replaced by bisection when a step leaves it."""
     sign_low = np.sign(equation(X, low)[0])
     y = 0.5 * (low + high)
-    value, slope = equation(X, y)
+    value, slope, _ = equation(X, y)
     for _ in range(_MAX_ITERATIONS):
         done = np.abs(value) <= ROW_TOLERANCE_PX
         if np.all(done):
@@ -173,7 +208,7 @@ def _solve_rows(
         low, high = np.where(below, y, low), np.where(below, high, y)
         step = y - value / np.where(slope == 0.0, np.nan, slope)
         y = np.where(done, y, np.where((step > low) & (step < high), step, 0.5 * (low + high)))
-        value, slope = equation(X, y)
+        value, slope, _ = equation(X, y)
     return y, np.abs(value) <= ROW_TOLERANCE_PX
 
 

@@ -16,6 +16,7 @@ from rsbench.core.projection import (
     project_at,
     row_poses,
     rs_project,
+    rs_project_near,
 )
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import transform
@@ -79,6 +80,22 @@ def test_projecting_a_back_projected_pixel_returns_it(
     seen = rs_project(RIG, SHUTTER, motion, side, frame, X)
     np.testing.assert_allclose(seen.pixels, pixels, rtol=0, atol=2 * ROW_TOLERANCE_PX)
     np.testing.assert_allclose(seen.depth, depth, rtol=1e-10)
+
+
+@few
+@given(models, vectors, vectors, seeds, st.sampled_from(SIDES), st.integers(0, 1))
+def test_a_nearby_row_finds_what_the_full_search_finds(
+    model: type[LinearMotion] | type[TwistMotion], w: FloatArray, d: FloatArray, seed: int, side: Side, frame: int
+) -> None:
+    motion, X = model(0.05 * w, 0.3 * d), _points(seed)
+    full = rs_project(RIG, SHUTTER, motion, side, frame, X)
+    # From the middle row, or from one that is already right.
+    for start in (np.full(len(X), 40.0), np.nan_to_num(full.pixels[:, 1], nan=40.0)):
+        near = rs_project_near(RIG, SHUTTER, motion, side, frame, X, start)
+        np.testing.assert_array_equal(near.status, full.status)
+        np.testing.assert_allclose(near.pixels, full.pixels, rtol=0, atol=4 * ROW_TOLERANCE_PX)
+        np.testing.assert_allclose(near.depth, full.depth, rtol=1e-10)
+        np.testing.assert_allclose(near.tau, full.tau, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("frame", [0, 1])
