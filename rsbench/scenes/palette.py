@@ -1,0 +1,104 @@
+"""The surfaces that the built-in scenes are painted with, by name."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from rsbench.scenes import surfaces as s
+from rsbench.scenes.model import Material
+from rsbench.scenes.surfaces import Bytes, Painter, Surface
+from rsbench.scenes.textures import Noise
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a surface is painted."""
+
+    paint: Callable[[Painter], Bytes]
+    metres: float | None
+    """What one repeat of the texture covers; None: the texture fits its part exactly."""
+    pixels: int
+
+
+def _recipe(
+    paint: Callable[..., Bytes], metres: float | None = 8.0, pixels: int = 1024, **settings: Any
+) -> Recipe:
+    return Recipe(partial(paint, **settings), metres, pixels)
+
+
+def paint_palette(names: Iterable[str], seed: int) -> dict[str, Surface]:
+    """The named surfaces, painted; the texture of a name depends on the seed alone, not on the other names."""
+    noise = Noise((seed, zlib.crc32(b"noise")))
+
+    def paint(name: str) -> Surface:
+        recipe = RECIPES[name]
+        rng = np.random.default_rng((seed, zlib.crc32(name.encode())))
+        texture = recipe.paint(Painter(rng, noise, recipe.metres or 1.0, recipe.pixels))
+        repeat = None if recipe.metres is None else (recipe.metres, recipe.metres)
+        return Surface(Material(name=name, texture=texture), repeat)
+
+    chosen = sorted(set(names))
+    with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
+        return dict(zip(chosen, pool.map(paint, chosen), strict=True))
+
+
+_GREYS = ((0.56, 0.53, 0.47), (0.68, 0.63, 0.54), (0.52, 0.51, 0.49), (0.62, 0.55, 0.45))
+_WARM = ((0.70, 0.60, 0.45), (0.60, 0.50, 0.38), (0.74, 0.67, 0.54), (0.55, 0.49, 0.42))
+_COLD = ((0.46, 0.47, 0.49), (0.58, 0.57, 0.55), (0.40, 0.41, 0.42), (0.52, 0.49, 0.46))
+_SETTS = ((0.47, 0.45, 0.43), (0.56, 0.51, 0.46), (0.40, 0.40, 0.42), (0.50, 0.44, 0.40))
+_RED_TILES = ((0.58, 0.30, 0.19), (0.48, 0.24, 0.17), (0.66, 0.40, 0.27), (0.42, 0.24, 0.19))
+_SLATES = ((0.33, 0.36, 0.41), (0.42, 0.43, 0.45), (0.27, 0.29, 0.34), (0.40, 0.38, 0.38))
+_OAK = ((0.46, 0.34, 0.22), (0.55, 0.43, 0.29), (0.39, 0.31, 0.23), (0.50, 0.45, 0.38))
+_GRASS = ((0.24, 0.31, 0.12), (0.38, 0.41, 0.19), (0.46, 0.41, 0.25))
+_EARTH = ((0.40, 0.33, 0.24), (0.50, 0.43, 0.32), (0.34, 0.33, 0.18), (0.56, 0.51, 0.43))
+
+RECIPES: dict[str, Recipe] = {
+    "ashlar_0": _recipe(s.ashlar, stones=_GREYS),
+    "ashlar_1": _recipe(s.ashlar, stones=_WARM, moss=0.25),
+    "ashlar_2": _recipe(s.ashlar, stones=_COLD, course=(0.2, 0.34), block=(0.25, 0.6), moss=0.5),
+    "ashlar_3": _recipe(s.ashlar, stones=(*_GREYS, *_WARM), course=(0.3, 0.5), block=(0.4, 1.0)),
+    "stone": _recipe(s.ashlar, 6.0, stones=_GREYS, course=(0.3, 0.6), block=(0.4, 1.3), moss=0.2),
+    "brick": _recipe(s.brick, 6.0, bricks=((0.55, 0.28, 0.2), (0.45, 0.22, 0.17), (0.62, 0.38, 0.27))),
+    "cobbles": _recipe(s.cobbles, 14.0, 2048, stones=_SETTS),
+    "earth": _recipe(s.speckled, 16.0, 2048, colours=_EARTH, contrast=0.26, grit=0.2),
+    "grass": _recipe(s.speckled, 16.0, 2048, colours=_GRASS, contrast=0.3, grit=0.22),
+    "tiles_0": _recipe(s.roof_tiles, tiles=_RED_TILES),
+    "tiles_1": _recipe(s.roof_tiles, tiles=(*_RED_TILES[2:], (0.54, 0.42, 0.33))),
+    "tiles_2": _recipe(s.roof_tiles, tiles=_SLATES, course=(0.16, 0.2), width=(0.14, 0.3)),
+    "plaster_0": _recipe(s.plaster, wall=(0.84, 0.78, 0.66), under=(0.55, 0.42, 0.32)),
+    "plaster_1": _recipe(s.plaster, wall=(0.80, 0.66, 0.46), under=(0.58, 0.36, 0.27), worn=0.3),
+    "plaster_2": _recipe(s.plaster, wall=(0.70, 0.50, 0.40), under=(0.56, 0.50, 0.43)),
+    "plaster_3": _recipe(s.plaster, wall=(0.66, 0.70, 0.66), under=(0.55, 0.42, 0.34), worn=0.35),
+    "plaster_4": _recipe(s.plaster, wall=(0.86, 0.83, 0.77), under=(0.52, 0.38, 0.30), worn=0.32),
+    "planks": _recipe(s.planks, 5.0, woods=_OAK),
+    "door": _recipe(s.planks, 4.0, woods=((0.36, 0.22, 0.14), (0.28, 0.19, 0.13), (0.20, 0.27, 0.24))),
+    "shutter_0": _recipe(s.planks, 4.0, woods=((0.22, 0.36, 0.28), (0.27, 0.40, 0.31)), width=(0.08, 0.11)),
+    "shutter_1": _recipe(s.planks, 4.0, woods=((0.45, 0.20, 0.15), (0.38, 0.18, 0.14)), width=(0.08, 0.11)),
+    "shutter_2": _recipe(s.planks, 4.0, woods=((0.25, 0.34, 0.46), (0.32, 0.40, 0.48)), width=(0.08, 0.11)),
+    "timber": _recipe(s.timber, 4.0, wood=(0.33, 0.23, 0.15)),
+    "bark": _recipe(s.timber, 2.5, wood=(0.36, 0.30, 0.23)),
+    "iron": _recipe(s.speckled, 3.0, 512, colours=((0.16, 0.16, 0.17), (0.30, 0.22, 0.17)), contrast=0.3),
+    "straw": _recipe(s.timber, 3.0, wood=(0.72, 0.60, 0.33)),
+    "sack": _recipe(s.cloth, 2.0, stripes=((0.62, 0.53, 0.40), (0.57, 0.48, 0.36)), width=0.2),
+    "leaves": _recipe(s.leaves, 6.0, greens=((0.20, 0.33, 0.10), (0.36, 0.46, 0.15), (0.50, 0.54, 0.22))),
+    "leaves_dark": _recipe(s.leaves, 6.0, greens=((0.15, 0.27, 0.12), (0.27, 0.38, 0.15), (0.38, 0.42, 0.2))),
+    "flowers": _recipe(
+        s.leaves, 2.0, 512, greens=((0.75, 0.2, 0.25), (0.35, 0.45, 0.2), (0.9, 0.6, 0.5)), size=0.05
+    ),
+    "glass": _recipe(s.glass, 4.0),
+    "water": _recipe(s.speckled, 4.0, 512, colours=((0.16, 0.25, 0.27), (0.40, 0.48, 0.48)), contrast=0.3),
+    "cloth_0": _recipe(s.cloth, 4.0, stripes=((0.66, 0.16, 0.14), (0.86, 0.80, 0.66)), width=0.28),
+    "cloth_1": _recipe(s.cloth, 4.0, stripes=((0.20, 0.36, 0.50), (0.85, 0.82, 0.74)), width=0.24),
+    "cloth_2": _recipe(s.cloth, 4.0, stripes=((0.72, 0.55, 0.20), (0.30, 0.38, 0.22)), width=0.33),
+    "fruit_0": _recipe(s.speckled, 1.0, 512, colours=((0.70, 0.16, 0.12), (0.80, 0.45, 0.2)), contrast=0.2),
+    "fruit_1": _recipe(s.speckled, 1.0, 512, colours=((0.86, 0.56, 0.14), (0.75, 0.42, 0.12)), contrast=0.2),
+    "fruit_2": _recipe(s.speckled, 1.0, 512, colours=((0.42, 0.56, 0.18), (0.62, 0.66, 0.28)), contrast=0.2),
+}
