@@ -1,0 +1,222 @@
+"""Correction of a rolling-shutter frame: the global-shutter image at a chosen time.
+
+Every pixel is back-projected with its row's pose (paper, eq. 11a) and projected at the target pose (eq. 11b). The
+two steps are one map in the pixel and its inverse depth, ``h = M_y (x, y, 1) + rho b_y`` with
+``M_y = K R K^-1``, ``b_y = K t`` and ``R, t`` the target pose from row y's pose, so a surface at infinity
+(rho = 0) needs no special case: it moves by rotation alone and every other surface hides it. The images are
+resampled once, at source coordinates interpolated over the mesh of pixel centres (``forward_warp``).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.motion import Motion
+from rsbench.core.projection import row_poses
+from rsbench.core.rig import Side, StereoRig
+from rsbench.core.se3 import Pose, compose, inverse
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.vision import forward_warp
+
+_INTERPOLATION = {"cubic": cv2.INTER_CUBIC, "linear": cv2.INTER_LINEAR}
+_IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
+
+
+@dataclass(frozen=True, kw_only=True)
+class WarpOptions:
+    """How the source image becomes the target image."""
+
+    interpolation: Literal["cubic", "linear"] = "cubic"
+    tear_px: float = 0.2
+    """Two neighbours are torn apart when a step of depth between them, which neither side's surface explains,
+    moves them apart by more than this many px; so the mesh is at most this wrong between surfaces."""
+
+    def __post_init__(self) -> None:
+        if self.interpolation not in _INTERPOLATION:
+            raise ValueError(f"interpolation must be one of {sorted(_INTERPOLATION)}, got {self.interpolation!r}")
+        if not self.tear_px > 0.0:
+            raise ValueError(f"tear_px must be positive, got {self.tear_px}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Corrected:
+    """A frame as one camera at one time would have seen it."""
+
+    image: NDArray[Any]
+    """(H, W) or (H, W, C), type of the source; 0 where the mask is False."""
+    mask: NDArray[np.bool_]
+    """(H, W) what the source frame saw."""
+    source_map: NDArray[np.float32]
+    """(H, W, 2) source pixel (x, y) of every target pixel; NaN where the mask is False."""
+    depth: NDArray[np.float32]
+    """(H, W) z in the target camera, metres; inf at infinity, NaN where the mask is False."""
+
+
+def relative_row_maps(
+    camera: PinholeCamera, source_poses: Pose, target_pose: Pose
+) -> tuple[FloatArray, FloatArray]:
+    """``M`` (H, 3, 3) and ``b`` (H, 3) px m: homogeneous target pixel = M_y (x, y, 1) + b_y / depth.
+
+    ``source_poses`` are ``cam_from_world`` of every row, ``target_pose`` of the target camera.
+    """
+    R, t = compose(target_pose, inverse(source_poses))
+    return camera.K @ R @ np.linalg.inv(camera.K), t @ camera.K.T
+
+
+def inverse_depth(depth: NDArray[Any], sky_mask: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+    """1 / depth (H, W): 0 at infinity and under ``sky_mask``, NaN where the depth is unknown (not positive)."""
+    known = depth > 0.0
+    rho = np.where(known, 1.0 / np.where(known, depth, np.float32(1.0)), np.float32(np.nan))
+    if sky_mask is not None:
+        rho[sky_mask] = 0.0
+    return np.ascontiguousarray(rho, dtype=np.float32)
+
+
+def warp(
+    image: NDArray[Any],
+    depth: NDArray[Any],
+    camera: PinholeCamera,
+    source_poses: Pose,
+    target_pose: Pose,
+    *,
+    sky_mask: NDArray[np.bool_] | None = None,
+    options: WarpOptions | None = None,
+) -> Corrected:
+    """Warp a frame with one pose per row to any pose of the same camera model; z-buffered.
+
+    ``image`` (H, W) or (H, W, C) of uint8, uint16 or float32; ``depth`` (H, W) is z in each row's own camera,
+    metres: inf is infinitely far, and 0, negative or NaN unknown, unless ``sky_mask`` (H, W) puts the pixel at
+    infinity. Poses are ``cam_from_world``, (H, 3, 3) and (H, 3), and (3, 3) and (3,). Raises ValueError on other
+    shapes or types.
+    """
+    options = options or WarpOptions()
+    _check(image, depth, camera, source_poses, sky_mask)
+    M, b = relative_row_maps(camera, source_poses, target_pose)
+    rho = inverse_depth(depth, sky_mask)
+    # A step of inverse depth moves a pixel by about f |t| of it.
+    gain = max(camera.fx, camera.fy) * np.linalg.norm(compose(target_pose, inverse(source_poses)).t, axis=-1)
+    joined = forward_warp.connect(rho, options.tear_px / np.maximum(gain, np.finfo(np.float64).tiny))
+    source_map = np.full((*rho.shape, 2), np.nan, dtype=np.float32)
+    buffer = np.full(rho.shape, -1.0, dtype=np.float32)
+    forward_warp.draw_mesh(rho, joined, M, b, source_map, buffer)
+    forward_warp.draw_cells(rho, joined, M, b, source_map, buffer)
+    mask = buffer >= 0.0
+    return Corrected(
+        image=sample(image, source_map, mask, options.interpolation),
+        mask=mask,
+        source_map=source_map,
+        depth=_depth(buffer, mask),
+    )
+
+
+def sample(
+    image: NDArray[Any],
+    source_map: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    interpolation: Literal["cubic", "linear"] = "cubic",
+) -> NDArray[Any]:
+    """Image (H, W[, C]) at ``source_map`` (H, W, 2), 0 outside ``mask``; resampled in float32, rounded once."""
+    # remap is exact in the position for float32 only; for uint8 it rounds, and NaN has no address.
+    seen = np.where(mask[..., None], source_map, np.float32(0.0))
+    values = cv2.remap(
+        np.asarray(image, dtype=np.float32),
+        seen,
+        None,
+        _INTERPOLATION[interpolation],
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    values = values.reshape(source_map.shape[:2] + image.shape[2:])
+    values[~mask] = 0.0
+    if image.dtype == np.float32:
+        return values
+    return np.clip(np.rint(values), 0, np.iinfo(image.dtype).max).astype(image.dtype)
+
+
+def correct_frame(
+    image: NDArray[Any],
+    depth: NDArray[Any],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    side: Side,
+    frame: int,
+    *,
+    target_tau: float | None = None,
+    sky_mask: NDArray[np.bool_] | None = None,
+    options: WarpOptions | None = None,
+) -> Corrected:
+    """Rolling-shutter frame (H, W[, C]) to the global-shutter image of the same camera at ``target_tau``.
+
+    ``target_tau`` is in frame periods; by default the time of row 0, ``frame``. ``depth`` (H, W) and the errors
+    are those of ``warp``.
+    """
+    tau = _target_time(frame, target_tau)
+    target = rig.cam_from_world(motion, tau, side)
+    poses = row_poses(rig, shutter, motion, side, frame)
+    return warp(image, depth, rig.camera, poses, target, sky_mask=sky_mask, options=options)
+
+
+def correction_flow(
+    depth: NDArray[Any],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    side: Side,
+    frame: int,
+    *,
+    target_tau: float | None = None,
+    sky_mask: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float32]:
+    """Displacement (H, W, 2), px, that takes each rolling-shutter pixel to its place at ``target_tau``.
+
+    ``x_target - x_source`` on the grid of the source; NaN where the depth is unknown or the point is behind the
+    target camera. Arguments as in ``correct_frame``.
+    """
+    poses = row_poses(rig, shutter, motion, side, frame)
+    _check(None, depth, rig.camera, poses, sky_mask)
+    target = rig.cam_from_world(motion, _target_time(frame, target_tau), side)
+    M, b = relative_row_maps(rig.camera, poses, target)
+    moved = np.zeros((3, *depth.shape))
+    forward_warp.move_rows(inverse_depth(depth, sky_mask), M, b, moved)
+    return np.asarray(np.moveaxis(moved[:2], 0, -1) - rig.camera.pixel_grid(), dtype=np.float32)
+
+
+def _target_time(frame: int, target_tau: float | None) -> float:
+    tau = float(frame) if target_tau is None else float(target_tau)
+    if not math.isfinite(tau):
+        raise ValueError(f"target_tau must be a finite time in frame periods, got {target_tau}")
+    return tau
+
+
+def _depth(buffer: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    with np.errstate(divide="ignore"):
+        return np.where(mask, np.float32(1.0) / np.abs(buffer), np.float32(np.nan))
+
+
+def _check(
+    image: NDArray[Any] | None,
+    depth: NDArray[Any],
+    camera: PinholeCamera,
+    source_poses: Pose,
+    sky_mask: NDArray[np.bool_] | None,
+) -> None:
+    size = (camera.height, camera.width)
+    if image is not None:
+        if image.ndim not in (2, 3) or image.shape[:2] != size:
+            raise ValueError(f"image must have shape {size} or {size} + channels, got {image.shape}")
+        if image.dtype not in _IMAGE_TYPES:
+            raise ValueError(f"image must be uint8, uint16 or float32, got {image.dtype}")
+    if depth.shape != size or not np.issubdtype(depth.dtype, np.floating):
+        raise ValueError(f"depth must be floating point of shape {size}, got {depth.dtype} {depth.shape}")
+    if source_poses.R.shape != (camera.height, 3, 3) or source_poses.t.shape != (camera.height, 3):
+        raise ValueError(f"source_poses must have one pose per row, {camera.height}, got {source_poses.R.shape}")
+    if sky_mask is not None and (sky_mask.shape != size or sky_mask.dtype != np.bool_):
+        raise ValueError(f"sky_mask must be bool of shape {size}, got {sky_mask.dtype} {sky_mask.shape}")

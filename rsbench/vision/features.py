@@ -1,0 +1,181 @@
+"""Sub-pixel point correspondences of a stereo rig over two frames: SIFT, ratio test, mutual check, loops.
+
+SIFT runs with ``enable_precise_upscale``: OpenCV's default enlarges the image by mapping index x to 2x + 0.5 and
+so reports every keypoint a quarter of a pixel too far right and down (measured 0.249, 0.244 px; 0.000 with it).
+Positions then follow this package's convention, centre of the top-left pixel (0, 0).
+
+Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.so3 import FloatArray
+from rsbench.vision.images import grey_u8
+from rsbench.vision.nearest import best_two
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchOptions:
+    """What counts as a feature and what as a match; distances between descriptors are SIFT's, 0 to about 720."""
+
+    max_features: int = 8000
+    """Strongest features kept per image; 0 keeps all."""
+    contrast_threshold: float = 0.04
+    edge_threshold: float = 10.0
+    ratio: float = 0.8
+    """Best over second-best distance, at most."""
+    max_distance: float = 300.0
+    """Largest distance of a match; the ratio says nothing where there is only one candidate."""
+    search_radius: float | None = None
+    """Temporal matches move by at most this many px in x and in y; None searches the whole image."""
+    row_tolerance: float = 1.5
+    """Left-right matches differ by at most this many rows: both cameras read a row at the same time."""
+    max_disparity: float | None = None
+    """Largest disparity of left-right matches, px; None is the image width."""
+    drop_contradicted: bool = True
+    """Drop a temporal match when its loop through the other camera ends elsewhere."""
+
+    def __post_init__(self) -> None:
+        if self.max_features < 0:
+            raise ValueError(f"max_features must be at least 0, got {self.max_features}")
+        if not 0.0 < self.ratio <= 1.0:
+            raise ValueError(f"ratio must lie in (0, 1], got {self.ratio}")
+        for name in ("search_radius", "max_disparity", "max_distance", "row_tolerance"):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise ValueError(f"{name} must be positive, got {value}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Features:
+    """Keypoints of one image, in order of their rows."""
+
+    points: FloatArray
+    """(n, 2) px."""
+    descriptors: NDArray[np.float32]
+    """(n, 128), whole numbers from 0 to 255."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gate:
+    """Where the partner of a keypoint may lie: bounds, px, of partner minus keypoint."""
+
+    dx: tuple[float, float]
+    dy: tuple[float, float]
+
+
+def detect(image: NDArray[Any], options: MatchOptions | None = None) -> Features:
+    """SIFT features of an image (H, W) or (H, W, 3), uint8 or uint16; none in an image without texture."""
+    options = options or MatchOptions()
+    sift = cv2.SIFT.create(
+        nfeatures=options.max_features,
+        contrastThreshold=options.contrast_threshold,
+        edgeThreshold=options.edge_threshold,
+        enable_precise_upscale=True,
+    )
+    keypoints, descriptors = sift.detectAndCompute(grey_u8(image), None)
+    if not keypoints:
+        return Features(points=np.zeros((0, 2)), descriptors=np.zeros((0, 128), dtype=np.float32))
+    points = np.array([k.pt for k in keypoints], dtype=np.float64)
+    order = np.lexsort((points[:, 0], points[:, 1]))
+    return Features(points=points[order], descriptors=descriptors[order])
+
+
+def match(a: Features, b: Features, gate: Gate, options: MatchOptions | None = None) -> Indices:
+    """Mutual nearest neighbours (m, 2), indices into ``a`` and ``b``, each the best of its candidates in the gate.
+
+    The ratio test compares with the second-best candidate in the gate. Points with several orientations give the
+    same match several times; it is kept once.
+    """
+    options = options or MatchOptions()
+    best, nearest, second, back = best_two(a.points, a.descriptors, b.points, b.descriptors, gate.dx, gate.dy)
+    rows = np.flatnonzero(best >= 0)
+    mutual = back[best[rows]] == rows
+    distinct = nearest[rows] <= options.ratio**2 * second[rows]
+    rows = rows[mutual & distinct & (nearest[rows] <= options.max_distance**2)]
+    pairs = np.stack([rows, best[rows]], axis=1)
+    positions = np.concatenate([a.points[pairs[:, 0]], b.points[pairs[:, 1]]], axis=1)
+    _, first = np.unique(positions, axis=0, return_index=True)
+    return pairs[np.sort(first)]
+
+
+def match_stereo_frames(
+    left_0: NDArray[Any],
+    right_0: NDArray[Any],
+    left_1: NDArray[Any],
+    right_1: NDArray[Any],
+    options: MatchOptions | None = None,
+) -> Correspondences:
+    """Correspondences of the four images (H, W[, 3]), uint8 or uint16, of a rig over two frames.
+
+    Tracks are points whose four matches close the loop L0-R0-R1-L1-L0. Sets may come out empty. Raises ValueError
+    when the images differ in size or are of another type.
+    """
+    options = options or MatchOptions()
+    images = {"left_0": left_0, "right_0": right_0, "left_1": left_1, "right_1": right_1}
+    for name, image in images.items():
+        if image.shape[:2] != left_0.shape[:2]:
+            raise ValueError(f"{name} must have the size of left_0, {left_0.shape[:2]}, got {image.shape[:2]}")
+    features = {name: detect(image, options) for name, image in images.items()}
+    reach = float(max(left_0.shape)) if options.search_radius is None else options.search_radius
+    anywhere = Gate(dx=(-reach, reach), dy=(-reach, reach))
+    disparity = float(left_0.shape[1]) if options.max_disparity is None else options.max_disparity
+    tolerance = options.row_tolerance
+    beside = Gate(dx=(-disparity, -np.finfo(np.float64).tiny), dy=(-tolerance, tolerance))
+    left = match(features["left_0"], features["left_1"], anywhere, options)
+    right = match(features["right_0"], features["right_1"], anywhere, options)
+    stereo_0 = match(features["left_0"], features["right_0"], beside, options)
+    stereo_1 = match(features["left_1"], features["right_1"], beside, options)
+    tracks = close_loops(left, right, stereo_0, stereo_1)
+    if options.drop_contradicted:
+        left, right = _agreeing(left, right, stereo_0, stereo_1)
+    l0, r0, l1, r1 = (features[name].points for name in images)
+    return Correspondences(
+        left=_positions((l0, l1), left),
+        right=_positions((r0, r1), right),
+        stereo_0=_positions((l0, r0), stereo_0),
+        stereo_1=_positions((l1, r1), stereo_1),
+        tracks=_positions((l0, r0, l1, r1), tracks),
+    )
+
+
+def close_loops(left: Indices, right: Indices, stereo_0: Indices, stereo_1: Indices) -> Indices:
+    """Tracks (n, 4), indices l0, r0, l1, r1, of pairs (m, 2) whose loop L0-R0-R1-L1-L0 closes."""
+    r0 = _lookup(stereo_0, left[:, 0])
+    r1 = _lookup(stereo_1, left[:, 1])
+    closed = (r0 >= 0) & (r1 >= 0) & (_lookup(right, r0) == r1)
+    return np.stack([left[closed, 0], r0[closed], left[closed, 1], r1[closed]], axis=1)
+
+
+def _agreeing(left: Indices, right: Indices, stereo_0: Indices, stereo_1: Indices) -> tuple[Indices, Indices]:
+    """The temporal matches that no loop contradicts: open loops are kept, closed ones that end elsewhere go."""
+    wanted = _lookup(stereo_1, left[:, 1])
+    found = _lookup(right, _lookup(stereo_0, left[:, 0]))
+    keep_left = (wanted < 0) | (found < 0) | (wanted == found)
+    back_0, back_1 = stereo_0[:, ::-1], stereo_1[:, ::-1]
+    wanted = _lookup(back_1, right[:, 1])
+    found = _lookup(left, _lookup(back_0, right[:, 0]))
+    keep_right = (wanted < 0) | (found < 0) | (wanted == found)
+    return left[keep_left], right[keep_right]
+
+
+def _lookup(pairs: Indices, keys: Indices) -> Indices:
+    """Second entries of the pairs whose first entry is the key, -1 where there is none."""
+    size = 1 + max(int(pairs[:, 0].max(initial=-1)), int(keys.max(initial=-1)), 0)
+    table = np.full(size + 1, -1, dtype=np.int64)
+    table[pairs[:, 0]] = pairs[:, 1]
+    return table[np.where(keys >= 0, keys, size)]
+
+
+def _positions(points: tuple[FloatArray, ...], indices: Indices) -> FloatArray:
+    return np.concatenate([p[i] for p, i in zip(points, indices.T, strict=True)], axis=1)

@@ -1,0 +1,216 @@
+# mypy: disable-error-code="untyped-decorator"
+"""The compiled loops of z-buffered forward warping: a mesh of pixel centres drawn at the target camera.
+
+Every source pixel centre is moved by its row's map, ``h = M_y (x, y, 1) + rho b_y`` with ``rho = 1 / depth``, to
+the target pixel ``h_xy / h_z`` with inverse depth ``rho / h_z``. Four neighbouring centres make two triangles;
+source coordinates and inverse depth are interpolated affinely over each triangle at the target pixel centres it
+covers. Inverse depth is affine in the image of a plane, so that is exact; source coordinates are not (the map is
+projective and curved by the shutter), but over one pixel the deviation is an eighth of the map's second
+derivative, well below 1e-3 px.
+
+Neighbours on different surfaces are not joined (``connect``); there each pixel draws its own cell, half a pixel to
+every side along the surface it belongs to, so that a tear leaves no gap where the camera saw both surfaces.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+RIGHT, BELOW = 1, 2
+"""Bits of ``connect``: joined to the neighbour on the right, below."""
+_SLACK = 1e-7  # px and barycentric; a centre on a shared edge must fall into one triangle at least
+_DEGENERATE = 1e9  # inverse area, px^-2, of a triangle seen edge-on
+_SAME_SURFACE = 1.001  # a cell yields to the mesh unless it is nearer by this factor of inverse depth
+
+
+@njit(cache=True, error_model="numpy")
+def _continues(step: float, before: float, after: float, limit: float) -> bool:
+    """Whether a step between neighbours is small or continues the surface on one side of it.
+
+    ``before`` and ``after`` are the steps on its two sides, NaN where there is none. On a plane all three are
+    equal, at a crease the step equals one of them, at a jump neither. NaN fails every comparison.
+    """
+    return abs(step) <= limit or abs(step - before) <= limit or abs(step - after) <= limit
+
+
+@njit(cache=True, error_model="numpy")
+def connect(rho: F32, limit: F64) -> U8:
+    """(H, W) bits RIGHT and BELOW: the neighbours that lie on the same surface.
+
+    ``rho`` (H, W) is inverse depth, NaN where unknown; ``limit`` (H,) the largest unexplained step of inverse
+    depth between neighbours, per row.
+    """
+    height, width = rho.shape
+    joined = np.zeros((height, width), dtype=np.uint8)
+    for y in range(height):
+        for x in range(width - 1):
+            step = rho[y, x + 1] - rho[y, x]
+            before = rho[y, x] - rho[y, x - 1] if x > 0 else np.nan
+            after = rho[y, x + 2] - rho[y, x + 1] if x + 2 < width else np.nan
+            if _continues(step, before, after, limit[y]):
+                joined[y, x] = RIGHT
+    for y in range(height - 1):
+        tightest = min(limit[y], limit[y + 1])
+        for x in range(width):
+            step = rho[y + 1, x] - rho[y, x]
+            before = rho[y, x] - rho[y - 1, x] if y > 0 else np.nan
+            after = rho[y + 2, x] - rho[y + 1, x] if y + 2 < height else np.nan
+            if _continues(step, before, after, tightest):
+                joined[y, x] |= BELOW
+    return joined
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _move(M: F64, b: F64, x: float, y: float, rho: float) -> tuple[float, float, float]:
+    """Target pixel and inverse depth; NaN behind the target camera or where rho is NaN."""
+    z = M[2, 0] * x + M[2, 1] * y + M[2, 2] + rho * b[2]
+    s = 1.0 / z if z > 0.0 else np.nan
+    u = M[0, 0] * x + M[0, 1] * y + M[0, 2] + rho * b[0]
+    v = M[1, 0] * x + M[1, 1] * y + M[1, 2] + rho * b[1]
+    return u * s, v * s, rho * s
+
+
+@njit(cache=True, error_model="numpy")
+def move_rows(rho: F32, M: F64, b: F64, moved: F64) -> None:
+    """Fill ``moved`` (3, H, W) with target x, y and inverse depth of every source pixel centre."""
+    height, width = rho.shape
+    for y in range(height):
+        for x in range(width):
+            moved[0, y, x], moved[1, y, x], moved[2, y, x] = _move(M[y], b[y], x, y, rho[y, x])
+
+
+@njit(cache=True, error_model="numpy")
+def draw_mesh(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F32) -> None:
+    """Draw the triangles of all joined neighbours into ``source_map`` (H, W, 2) and ``buffer`` (H, W).
+
+    ``buffer`` holds inverse depth at the target, -1 where nothing is drawn yet; the larger one wins.
+    """
+    height, width = rho.shape
+    rows = np.zeros((2, width, 3))
+    for y in range(height):
+        upper, lower = rows[(y + 1) & 1], rows[y & 1]
+        for x in range(width):
+            lower[x, 0], lower[x, 1], lower[x, 2] = _move(M[y], b[y], x, y, rho[y, x])
+        if y == 0:
+            continue
+        for x in range(width - 1):
+            above = joined[y - 1, x] & RIGHT
+            beside = joined[y - 1, x] & BELOW
+            below = joined[y, x] & RIGHT
+            across = joined[y - 1, x + 1] & BELOW
+            if above and beside:
+                _triangle(upper[x], upper[x + 1], lower[x], x, y - 1, 1, 1, source_map, buffer)
+            if below and across:
+                _triangle(lower[x + 1], lower[x], upper[x + 1], x + 1, y, -1, -1, source_map, buffer)
+            # Where the quad is torn, the other diagonal may still join three of its corners.
+            if not (above and beside and below and across):
+                if above and across:
+                    _triangle(upper[x + 1], upper[x], lower[x + 1], x + 1, y - 1, -1, 1, source_map, buffer)
+                if below and beside:
+                    _triangle(lower[x], lower[x + 1], upper[x], x, y, 1, -1, source_map, buffer)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _triangle(
+    corner: F64, first: F64, second: F64, sx: float, sy: float, dx: float, dy: float, source_map: F32, buffer: F32
+) -> None:
+    """Draw one triangle given by (target x, y, inverse depth) of its right-angled corner and the two ends.
+
+    The corner is source pixel (sx, sy); ``first`` is (sx + dx, sy) and ``second`` (sx, sy + dy).
+    """
+    height, width = buffer.shape
+    ax, ay, az = corner[0], corner[1], corner[2]
+    ux, uy, uz = first[0] - ax, first[1] - ay, first[2] - az
+    vx, vy, vz = second[0] - ax, second[1] - ay, second[2] - az
+    left = max(0.0, np.ceil(ax + min(0.0, ux, vx) - _SLACK))
+    right = min(width - 1.0, np.floor(ax + max(0.0, ux, vx) + _SLACK))
+    if not left <= right:
+        return
+    top = max(0.0, np.ceil(ay + min(0.0, uy, vy) - _SLACK))
+    bottom = min(height - 1.0, np.floor(ay + max(0.0, uy, vy) + _SLACK))
+    if not top <= bottom:
+        return
+    scale = 1.0 / (ux * vy - uy * vx)
+    if not abs(scale) < _DEGENERATE:
+        return
+    for row in range(int(top), int(bottom) + 1):
+        for column in range(int(left), int(right) + 1):
+            px, py = column - ax, row - ay
+            s = (px * vy - py * vx) * scale
+            t = (ux * py - uy * px) * scale
+            if s >= -_SLACK and t >= -_SLACK and s + t <= 1.0 + _SLACK:
+                z = np.float32(az + s * uz + t * vz)
+                if z > buffer[row, column]:
+                    buffer[row, column] = z
+                    source_map[row, column, 0] = sx + s * dx
+                    source_map[row, column, 1] = sy + t * dy
+
+
+@njit(cache=True, error_model="numpy")
+def draw_cells(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F32) -> None:
+    """Draw the cells of pixels that are not joined to all their neighbours, behind ``draw_mesh``'s result.
+
+    A cell reaches half a pixel beyond the centre along its own surface: the boundary between two surfaces is
+    taken to lie halfway between the two pixel centres.
+    """
+    height, width = rho.shape
+    for y in range(height):
+        for x in range(width):
+            if not rho[y, x] >= 0.0:
+                continue
+            right, left = joined[y, x] & RIGHT, x > 0 and joined[y, x - 1] & RIGHT
+            below, above = joined[y, x] & BELOW, y > 0 and joined[y - 1, x] & BELOW
+            whole_row = (right or x == width - 1) and (left or x == 0)
+            whole_column = (below or y == height - 1) and (above or y == 0)
+            if whole_row and whole_column:
+                continue
+            # Steps of inverse depth along the surface, 0 where nothing is known of its slope.
+            ahead = x + 1 if right else x
+            behind = x - 1 if left else x
+            along_x = (rho[y, ahead] - rho[y, behind]) / max(ahead - behind, 1)
+            ahead = y + 1 if below else y
+            behind = y - 1 if above else y
+            along_y = (rho[ahead, x] - rho[behind, x]) / max(ahead - behind, 1)
+            _cell(rho, x, y, along_x, along_y, M, b, source_map, buffer)
+
+
+@njit(cache=True, error_model="numpy")
+def _cell(
+    rho: F32, x: int, y: int, along_x: float, along_y: float, M: F64, b: F64, source_map: F32, buffer: F32
+) -> None:
+    """Draw the parallelogram that the square of half a pixel around source pixel (x, y) becomes."""
+    height, width = buffer.shape
+    ax, ay, az = _move(M[y], b[y], x, y, rho[y, x])
+    bx, by, bz = _move(M[y], b[y], x + 1, y, rho[y, x] + along_x)
+    # The next row has another pose, also the cell of the last row, whose lower neighbour does not exist.
+    step = 1 if y + 1 < height else -1
+    cx, cy, cz = _move(M[y + step], b[y + step], x, y + step, rho[y, x] + step * along_y)
+    ux, uy, uz = bx - ax, by - ay, bz - az
+    vx, vy, vz = step * (cx - ax), step * (cy - ay), step * (cz - az)
+    scale = 1.0 / (ux * vy - uy * vx)
+    if not abs(scale) < _DEGENERATE:
+        return
+    reach_x, reach_y = 0.5 * (abs(ux) + abs(vx)) + _SLACK, 0.5 * (abs(uy) + abs(vy)) + _SLACK
+    top, bottom = max(0.0, np.ceil(ay - reach_y)), min(height - 1.0, np.floor(ay + reach_y))
+    left, right = max(0.0, np.ceil(ax - reach_x)), min(width - 1.0, np.floor(ax + reach_x))
+    if not (top <= bottom and left <= right):
+        return
+    half = 0.5 + _SLACK
+    for row in range(int(top), int(bottom) + 1):
+        for column in range(int(left), int(right) + 1):
+            px, py = column - ax, row - ay
+            s = (px * vy - py * vx) * scale
+            t = (ux * py - uy * px) * scale
+            inside = abs(s) <= half and abs(t) <= half
+            if inside and 0.0 <= x + s <= width - 1.0 and 0.0 <= y + t <= height - 1.0:
+                z = np.float32(max(az + s * uz + t * vz, 0.0))
+                if z > buffer[row, column] * _SAME_SURFACE or buffer[row, column] < 0.0:
+                    buffer[row, column] = z
+                    source_map[row, column, 0] = x + s
+                    source_map[row, column, 1] = y + t

@@ -1,0 +1,26 @@
+"""What images may be, and their grey values."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+
+def grey_u8(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Grey (H, W) uint8 of an image (H, W), (H, W, 1) or (H, W, 3) RGB, uint8 or uint16.
+
+    Raises ValueError on other shapes and types.
+    """
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (1, 3)) or image.size == 0:
+        raise ValueError(f"image must have shape (H, W), (H, W, 1) or (H, W, 3), got {image.shape}")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"image must be uint8 or uint16, got {image.dtype}")
+    grey = image if image.ndim == 2 else image[..., 0]
+    if image.ndim == 3 and image.shape[2] == 3:
+        grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+    if grey.dtype == np.uint16:
+        grey = np.rint(grey / 257.0)
+    return np.ascontiguousarray(grey, dtype=np.uint8)

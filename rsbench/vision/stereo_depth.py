@@ -1,0 +1,227 @@
+"""Dense disparity of the rig's two images: semi-global matching, left-right check, sub-pixel refinement.
+
+The rig reads the same row of both cameras at the same time, so the pair of a rolling-shutter frame is rectified
+like a global-shutter one, and ``disparity = x_left - x_right`` needs no knowledge of the motion.
+
+Hirschmueller, "Stereo processing by semi-global matching and mutual information", PAMI 2008 (OpenCV's StereoSGBM).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.rig import Side, StereoRig
+from rsbench.vision.disparity_refinement import refine_disparity
+from rsbench.vision.images import grey_u8
+
+F32 = NDArray[np.float32]
+_MODES = {
+    "sgbm": cv2.StereoSGBM_MODE_SGBM,
+    "hh": cv2.StereoSGBM_MODE_HH,
+    "3way": cv2.StereoSGBM_MODE_SGBM_3WAY,
+    "hh4": cv2.StereoSGBM_MODE_HH4,
+}
+_FRACTION = 16.0  # StereoSGBM counts sixteenths of a pixel
+_COARSE = 4
+_RANGE_MARGIN = 1.1
+_RANGE_QUANTILE = 0.999
+
+
+@dataclass(frozen=True, kw_only=True)
+class SgmOptions:
+    """Parameters of StereoSGBM and of the steps after it."""
+
+    num_disparities: int | None = None
+    """Disparities searched, from 0; None derives them from ``nearest_depth``."""
+    nearest_depth: float | None = None
+    """Metres; None finds the range in the images, by matching them at a quarter of the size."""
+    block_size: int = 5
+    p1: int = 8
+    """Penalty of a disparity step of 1, times block_size squared."""
+    p2: int = 32
+    """Penalty of larger steps, times block_size squared."""
+    mode: Literal["sgbm", "hh", "3way", "hh4"] = "sgbm"
+    uniqueness_percent: int = 5
+    prefilter_cap: int = 31
+    speckle_window: int = 100
+    """Connected pieces of at most this many pixels are dropped; 0 keeps all."""
+    speckle_range: int = 2
+    consistency_px: float = 1.0
+    """Largest difference between a pixel's disparity and that of its partner in the other image."""
+    refine_iterations: int = 2
+    """Rounds of least squares on the images, see ``refine_disparity``; 0 keeps SGM's own interpolation."""
+
+    def __post_init__(self) -> None:
+        if self.mode not in _MODES:
+            raise ValueError(f"mode must be one of {sorted(_MODES)}, got {self.mode!r}")
+        if self.block_size < 1 or self.block_size % 2 == 0:
+            raise ValueError(f"block_size must be odd and positive, got {self.block_size}")
+        if self.num_disparities is not None and self.num_disparities < 1:
+            raise ValueError(f"num_disparities must be at least 1, got {self.num_disparities}")
+        if self.nearest_depth is not None and not self.nearest_depth > 0.0:
+            raise ValueError(f"nearest_depth must be positive metres, got {self.nearest_depth}")
+        if not 0 < self.p1 <= self.p2:
+            raise ValueError(f"p1 and p2 must satisfy 0 < p1 <= p2, got {self.p1} and {self.p2}")
+        if self.refine_iterations < 0:
+            raise ValueError(f"refine_iterations must be at least 0, got {self.refine_iterations}")
+
+
+def stereo_disparity(
+    left: NDArray[Any],
+    right: NDArray[Any],
+    rig: StereoRig,
+    side: Side = "left",
+    options: SgmOptions | None = None,
+) -> F32:
+    """Disparity (H, W), px, on the pixels of one image; NaN where it is unknown. ``rig.depth`` makes it metres.
+
+    Images (H, W[, 3]) are uint8 or uint16. Unknown are pixels without a consistent partner, which includes the
+    band that the other camera does not see. Raises ValueError when the images do not fit each other or the rig.
+    """
+    return stereo_disparities(left, right, rig, options)[0 if side == "left" else 1]
+
+
+def stereo_disparities(
+    left: NDArray[Any], right: NDArray[Any], rig: StereoRig, options: SgmOptions | None = None
+) -> tuple[F32, F32]:
+    """Disparities on the left image's pixels and on the right image's; arguments as in ``stereo_disparity``."""
+    options = options or SgmOptions()
+    grey_left, grey_right = grey_u8(left), grey_u8(right)
+    size = (rig.camera.height, rig.camera.width)
+    for name, grey in (("left", grey_left), ("right", grey_right)):
+        if grey.shape != size:
+            raise ValueError(f"{name} image must have the camera's size {size}, got {grey.shape}")
+    count = disparity_range(grey_left, grey_right, rig, options)
+    # Seen in a mirror the right camera is the left one: the same matcher serves both.
+    mirror_left, mirror_right = _mirrored(grey_left), _mirrored(grey_right)
+    raw_left = _sgm(grey_left, grey_right, count, options)
+    raw_right = _mirrored(_sgm(mirror_right, mirror_left, count, options))
+    consistent_left = _consistent(raw_left, raw_right, options.consistency_px)
+    consistent_right = _mirrored(_consistent(_mirrored(raw_right), _mirrored(raw_left), options.consistency_px))
+    final_left = _finish(grey_left, grey_right, consistent_left, options)
+    final_right = _mirrored(_finish(mirror_right, mirror_left, _mirrored(consistent_right), options))
+    return final_left, final_right
+
+
+def disparity_range(left: NDArray[np.uint8], right: NDArray[np.uint8], rig: StereoRig, options: SgmOptions) -> int:
+    """Number of disparities to search, a multiple of 16, from the options or from grey images (H, W)."""
+    width = left.shape[1]
+    if options.num_disparities is not None:
+        largest = float(options.num_disparities)
+    elif options.nearest_depth is not None:
+        largest = float(rig.disparity(options.nearest_depth))
+    else:
+        largest = _largest_disparity(left, right, options)
+    return 16 * math.ceil(min(max(largest, 1.0), width) / 16)
+
+
+def _largest_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], options: SgmOptions) -> float:
+    small = (max(left.shape[1] // _COARSE, 1), max(left.shape[0] // _COARSE, 1))
+    a, b = (cv2.resize(image, small, interpolation=cv2.INTER_AREA) for image in (left, right))
+    count = 16 * math.ceil(small[0] / 2 / 16)
+    raw_a = _sgm(a, b, count, options)
+    raw_b = _mirrored(_sgm(_mirrored(b), _mirrored(a), count, options))
+    found = _consistent(raw_a, raw_b, options.consistency_px)
+    found = found[np.isfinite(found)]
+    if found.size == 0:
+        return 16.0
+    return _COARSE * (float(np.quantile(found, _RANGE_QUANTILE)) * _RANGE_MARGIN + 1.0)
+
+
+def _sgm(reference: NDArray[np.uint8], other: NDArray[np.uint8], count: int, options: SgmOptions) -> F32:
+    """Raw disparity (H, W) of ``reference`` as the left image, NaN where there is none."""
+    # SGBM leaves the first ``count`` columns out: it gets them as padding instead.
+    a, b = (cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE) for image in (reference, other))
+    area = options.block_size**2
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=0,
+        numDisparities=count,
+        blockSize=options.block_size,
+        P1=options.p1 * area,
+        P2=options.p2 * area,
+        disp12MaxDiff=-1,
+        preFilterCap=options.prefilter_cap,
+        uniquenessRatio=options.uniqueness_percent,
+        speckleWindowSize=0,
+        speckleRange=0,
+        mode=_MODES[options.mode],
+    )
+    disparity = np.asarray(matcher.compute(a, b)[:, count:], dtype=np.float32) / np.float32(_FRACTION)
+    # Beyond the other image's border there is only padding to match.
+    columns = np.arange(disparity.shape[1], dtype=np.float32)
+    return np.where((disparity >= 0.0) & (columns - disparity >= 0.0), disparity, np.float32(np.nan))
+
+
+def _consistent(reference: F32, other: F32, tolerance: float) -> F32:
+    """``reference`` (as the left image) where the partner in ``other`` points back within the tolerance, px."""
+    columns = np.arange(reference.shape[1])
+    partner = np.rint(columns - np.nan_to_num(reference)).astype(np.int64)
+    back = np.take_along_axis(other, np.clip(partner, 0, reference.shape[1] - 1), axis=1)
+    return np.where(np.abs(reference - back) <= tolerance, reference, np.float32(np.nan))
+
+
+def _finish(reference: NDArray[np.uint8], other: NDArray[np.uint8], disparity: F32, options: SgmOptions) -> F32:
+    """Speckles dropped, the rest refined."""
+    kept = _without_speckles(disparity, options)
+    return refine_disparity(reference, other, kept, iterations=options.refine_iterations)
+
+
+def _without_speckles(disparity: F32, options: SgmOptions) -> F32:
+    if options.speckle_window == 0:
+        return disparity
+    fixed = np.where(np.isnan(disparity), -_FRACTION, disparity * _FRACTION).astype(np.int16)
+    cv2.filterSpeckles(fixed, -_FRACTION, options.speckle_window, options.speckle_range * _FRACTION)
+    return np.where(fixed >= 0, disparity, np.float32(np.nan))
+
+
+def _mirrored(image: NDArray[Any]) -> NDArray[Any]:
+    return np.ascontiguousarray(image[:, ::-1])
+
+
+def fill_holes(disparity: F32, max_width: int | None = None) -> F32:
+    """Disparity (H, W) with its holes filled along the rows by the farther of the two neighbours.
+
+    What one camera does not see lies behind what hides it, so the smaller disparity is the better guess; it stays
+    a guess. ``max_width`` limits the width of the holes filled, px; rows without any value stay unknown.
+    """
+    height, width = disparity.shape
+    known = np.isfinite(disparity)
+    columns = np.broadcast_to(np.arange(width), (height, width))
+    before = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
+    after = np.minimum.accumulate(np.where(known, columns, width)[:, ::-1], axis=1)[:, ::-1]
+    left = np.where(before >= 0, np.take_along_axis(disparity, np.maximum(before, 0), axis=1), np.inf)
+    right = np.where(after < width, np.take_along_axis(disparity, np.minimum(after, width - 1), axis=1), np.inf)
+    guess = np.minimum(left, right)
+    fits = np.isfinite(guess) & ((max_width is None) | (after - before - 1 <= (max_width or 0)))
+    return np.where(known, disparity, np.where(fits, guess, np.nan)).astype(np.float32)
+
+
+def depth_metrics(estimate: NDArray[Any], truth: NDArray[Any], rig: StereoRig) -> dict[str, float]:
+    """Errors of a depth map (H, W), metres, over the surface pixels of ``truth`` (finite and positive).
+
+    ``coverage`` is the share of surface pixels with an estimate (finite and positive); the errors are over these:
+    ``median_m`` and ``rmse_m`` of the absolute depth error, ``over_2m`` the share beyond 2 m (the paper's figure),
+    ``bad_1px`` .. ``bad_3px`` the share beyond that disparity error. NaN where no pixel counts. Raises ValueError
+    when the shapes differ.
+    """
+    if estimate.shape != truth.shape:
+        raise ValueError(f"estimate must have the shape of truth, {truth.shape}, got {estimate.shape}")
+    surface = np.isfinite(truth) & (truth > 0.0)
+    known = surface & np.isfinite(estimate) & (estimate > 0.0)
+    depth, true_depth = estimate[known].astype(np.float64), truth[known].astype(np.float64)
+    error = np.abs(depth - true_depth)
+    shift = np.abs(rig.disparity(depth) - rig.disparity(true_depth))
+    some = error.size > 0
+    return {
+        "median_m": float(np.median(error)) if some else math.nan,
+        "rmse_m": float(np.sqrt(np.mean(error * error))) if some else math.nan,
+        "over_2m": float(np.mean(error > 2.0)) if some else math.nan,
+        **{f"bad_{n}px": float(np.mean(shift > n)) if some else math.nan for n in (1, 2, 3)},
+        "coverage": int(np.count_nonzero(known)) / max(int(np.count_nonzero(surface)), 1),
+    }

@@ -1,0 +1,156 @@
+"""An exact rolling-shutter camera in a textured world of planes and spheres: closed forms, no renderer.
+
+A pixel's ray leaves its row's camera, meets the nearest surface, and takes the value of a smooth solid texture at that
+very point: images without sampling noise and depth to float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.motion import LinearMotion, Motion
+from rsbench.core.projection import row_poses
+from rsbench.core.rig import Side, StereoRig
+from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter
+
+FloatArray = np.ndarray
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Points with normal . X = offset, where ``inside(X)`` holds."""
+
+    normal: tuple[float, float, float]
+    offset: float
+    inside: Callable[[FloatArray], FloatArray] = lambda X: np.ones(X.shape[:-1], dtype=bool)
+
+    def distance(self, centre: FloatArray, rays: FloatArray) -> FloatArray:
+        n = np.array(self.normal)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            s = (self.offset - centre @ n) / (rays @ n)
+        s = np.where(np.isfinite(s) & (s > 0), s, np.inf)
+        X = centre + np.where(np.isfinite(s), s, 0.0)[..., None] * rays
+        return np.where(self.inside(X), s, np.inf)
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A ball seen from outside."""
+
+    centre: tuple[float, float, float]
+    radius: float
+
+    def distance(self, centre: FloatArray, rays: FloatArray) -> FloatArray:
+        to = np.array(self.centre) - centre
+        aa, ab = np.sum(rays * rays, -1), np.sum(rays * to, -1)
+        root = ab * ab - aa * (np.sum(to * to, -1) - self.radius**2)
+        s = (ab - np.sqrt(np.maximum(root, 0.0))) / aa
+        return np.where((root > 0) & (s > 0), s, np.inf)
+
+
+@dataclass(frozen=True)
+class Texture:
+    """Sum of plane waves in space, in [0, 1]; wavelengths in metres from ``shortest`` to eight times that."""
+
+    shortest: float
+    seed: int = 0
+    waves: int = 40
+    parts: tuple[FloatArray, FloatArray, FloatArray] = field(init=False)
+
+    def __post_init__(self) -> None:
+        rng = np.random.default_rng(self.seed)
+        direction = rng.normal(size=(self.waves, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        length = self.shortest * 8.0 ** rng.random(self.waves)
+        wave = (2 * np.pi / length)[:, None] * direction
+        object.__setattr__(self, "parts", (wave, rng.uniform(0, 2 * np.pi, (self.waves, 3)), np.ones(self.waves)))
+
+    def __call__(self, X: FloatArray) -> FloatArray:
+        """Colour (..., 3)."""
+        wave, phase, _ = self.parts
+        argument = X @ wave.T
+        total = np.stack([np.sin(argument + phase[:, c]).sum(-1) for c in range(3)], axis=-1)
+        return 0.5 + 0.5 * np.tanh(total / np.sqrt(2.0 * self.waves))
+
+
+@dataclass(frozen=True)
+class World:
+    """Surfaces, texture, rig, shutter and motion; what each camera sees of them."""
+
+    surfaces: tuple[Any, ...]
+    texture: Texture
+    rig: StereoRig
+    shutter: RollingShutter
+    motion: Motion
+    sky: bool = False
+    """Rays that meet nothing see a texture at infinity; otherwise black."""
+
+    def see(self, poses: Pose) -> tuple[FloatArray, FloatArray]:
+        """Image (H, W, 3) in [0, 1] and depth (H, W), inf where nothing is met, through one pose per row."""
+        rays_in_cam = self.rig.camera.unproject(self.rig.camera.pixel_grid())
+        R, t = poses
+        rays = rays_in_cam @ R
+        centre = -(np.swapaxes(R, -1, -2) @ t[..., None])[..., 0][:, None, :]
+        depth = np.min([s.distance(centre, rays) for s in self.surfaces], axis=0)
+        hit = np.isfinite(depth)
+        image = self.texture(centre + np.where(hit, depth, 0.0)[..., None] * rays)
+        far = self.texture(40.0 * self.texture.shortest * rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+        return np.where(hit[..., None], image, far if self.sky else 0.0), depth
+
+    def rolling(self, side: Side, frame: int) -> tuple[FloatArray, FloatArray]:
+        return self.see(row_poses(self.rig, self.shutter, self.motion, side, frame))
+
+    def still(self, side: Side, tau: float) -> tuple[FloatArray, FloatArray]:
+        """The global-shutter image and depth at one time."""
+        rows = np.full(self.rig.camera.height, tau)
+        return self.see(self.rig.cam_from_world(self.motion, rows, side))
+
+
+def build(
+    surfaces: tuple[Any, ...],
+    *,
+    size: tuple[int, int] = (160, 200),
+    focal: float = 260.0,
+    baseline: float = 0.4,
+    readout_ratio: float = 0.8,
+    w_deg: tuple[float, float, float] = (0.6, 1.0, -0.5),
+    d: tuple[float, float, float] = (0.15, -0.1, 0.2),
+    shortest: float = 0.25,
+    sky: bool = False,
+    seed: int = 0,
+) -> World:
+    height, width = size
+    return World(
+        surfaces=surfaces,
+        texture=Texture(shortest, seed),
+        rig=StereoRig(camera=PinholeCamera.centred(width, height, focal), baseline=baseline),
+        shutter=RollingShutter(height=height, readout_ratio=readout_ratio),
+        motion=LinearMotion(np.deg2rad(w_deg), d),
+        sky=sky,
+    )
+
+
+@pytest.fixture(scope="session")
+def world() -> Callable[..., World]:
+    return build
+
+
+def to_u8(image: FloatArray) -> np.ndarray:
+    return np.clip(np.rint(255.0 * image), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="session")
+def shapes() -> tuple[type[Plane], type[Sphere]]:
+    return Plane, Sphere
+
+
+@pytest.fixture(scope="session")
+def u8() -> Callable[[FloatArray], np.ndarray]:
+    return to_u8
