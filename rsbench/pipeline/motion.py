@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from dataclasses import dataclass, field
 
@@ -202,6 +203,7 @@ def _found(rows: FloatArray, keys: set[bytes]) -> BoolArray:
     return np.array([row.tobytes() in keys for row in np.ascontiguousarray(rows)], dtype=np.bool_)
 
 
+@functools.cache
 def _track_scale() -> float:
     """Factor that gives the root of a track's squared error the quantile of a pair's error at 2.5 sigma."""
     return 2.5 / float(np.sqrt(chi2.ppf(chi2.cdf(2.5**2, 1), _TRACK_FREEDOM)))

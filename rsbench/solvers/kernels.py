@@ -23,6 +23,7 @@ from numba import njit
 
 from rsbench.core.so3 import FloatArray
 
+Vector = tuple[float, float, float]
 F = TypeVar("F", bound=Callable[..., object])
 
 BEHIND = 1e12
@@ -36,27 +37,42 @@ def compiled(function: F) -> F:
 
 
 @compiled
-def _cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    out[0] = a[1] * b[2] - a[2] * b[1]
-    out[1] = a[2] * b[0] - a[0] * b[2]
-    out[2] = a[0] * b[1] - a[1] * b[0]
+def cross(a: Vector, b: Vector) -> Vector:
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @compiled
-def _dot(a: FloatArray, b: FloatArray) -> float:
+def dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @compiled
-def _apply(R: FloatArray, a: FloatArray, out: FloatArray) -> None:
-    for i in range(3):
-        out[i] = R[i, 0] * a[0] + R[i, 1] * a[1] + R[i, 2] * a[2]
+def plus(a: Vector, scale: float, b: Vector) -> Vector:
+    """a + scale b."""
+    return (a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2])
 
 
 @compiled
-def _apply_transposed(R: FloatArray, a: FloatArray, out: FloatArray) -> None:
-    for i in range(3):
-        out[i] = R[0, i] * a[0] + R[1, i] * a[1] + R[2, i] * a[2]
+def times(scale: float, a: Vector) -> Vector:
+    return (scale * a[0], scale * a[1], scale * a[2])
+
+
+@compiled
+def apply(R: FloatArray, a: Vector) -> Vector:
+    return (
+        R[0, 0] * a[0] + R[0, 1] * a[1] + R[0, 2] * a[2],
+        R[1, 0] * a[0] + R[1, 1] * a[1] + R[1, 2] * a[2],
+        R[2, 0] * a[0] + R[2, 1] * a[1] + R[2, 2] * a[2],
+    )
+
+
+@compiled
+def apply_transposed(R: FloatArray, a: Vector) -> Vector:
+    return (
+        R[0, 0] * a[0] + R[1, 0] * a[1] + R[2, 0] * a[2],
+        R[0, 1] * a[0] + R[1, 1] * a[1] + R[2, 1] * a[2],
+        R[0, 2] * a[0] + R[1, 2] * a[1] + R[2, 2] * a[2],
+    )
 
 
 @compiled
@@ -77,93 +93,78 @@ def _coefficients(s: float) -> tuple[float, float, float, float, float]:
 
 
 @compiled
-def _skew_add(a: FloatArray, scale: float, out: FloatArray) -> None:
-    """out += scale [a]x."""
-    out[0, 1] -= scale * a[2]
-    out[1, 0] += scale * a[2]
-    out[0, 2] += scale * a[1]
-    out[2, 0] -= scale * a[1]
-    out[1, 2] -= scale * a[0]
-    out[2, 1] += scale * a[0]
-
-
-@compiled
-def _rotate(phi: FloatArray, R: FloatArray, J: FloatArray) -> None:
-    """Fill R = exp([phi]x) and its left Jacobian."""
-    s = _dot(phi, phi)
-    c0, c1, c2, _, _ = _coefficients(s)
+def _fill_rotation(phi: Vector, identity: float, skew: float, outer: float, out: FloatArray) -> None:
+    """out = identity I + skew [phi]x + outer phi phi^T."""
     for i in range(3):
-        for j in range(3):
-            R[i, j] = c1 * phi[i] * phi[j]
-            J[i, j] = c2 * phi[i] * phi[j]
-        R[i, i] += 1 - c1 * s
-        J[i, i] += 1 - c2 * s
-    _skew_add(phi, c0, R)
-    _skew_add(phi, c1, J)
+        for j in range(i, 3):
+            out[i, j] = outer * phi[i] * phi[j]
+            out[j, i] = out[i, j]
+        out[i, i] += identity
+    out[0, 1] -= skew * phi[2]
+    out[1, 0] += skew * phi[2]
+    out[0, 2] += skew * phi[1]
+    out[2, 0] -= skew * phi[1]
+    out[1, 2] -= skew * phi[0]
+    out[2, 1] += skew * phi[0]
 
 
 @compiled
 def move(
+    theta: FloatArray, twist: bool, tau0: float, tau1: float, R: FloatArray, A: FloatArray
+) -> tuple[Vector, Vector, Vector]:
+    """Motion of the body from tau0 to tau1: fills R and A (dR = [A dw]x R); T, dT/dtau0 and dT/dtau1."""
+    a = tau1 - tau0
+    w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
+    phi = times(a, w)
+    s = dot(phi, phi)
+    c0, c1, c2, _, _ = _coefficients(s)
+    _fill_rotation(phi, 1.0 - c1 * s, c0, c1, R)
+    _fill_rotation(phi, a * (1.0 - c2 * s), a * c1, a * c2, A)
+    Rv = apply(R, v)
+    if twist:
+        return apply(A, v), times(-1.0, Rv), Rv
+    turn = cross(w, Rv)
+    return plus(times(tau1, v), -tau0, Rv), plus(times(-1.0, Rv), tau0, turn), plus(v, -tau0, turn)
+
+
+@compiled
+def translation_jacobian(
     theta: FloatArray,
     twist: bool,
     tau0: float,
     tau1: float,
     R: FloatArray,
     A: FloatArray,
-    T: FloatArray,
     T_w: FloatArray,
     T_v: FloatArray,
-    T_rate: FloatArray,
 ) -> None:
-    """Fill the motion of the body from tau0 to tau1 and its derivatives.
-
-    dR = [A dw]x R, T_w = dT/dw, T_v = dT/dv, all (3, 3); T_rate (2, 3) = dT/dtau0, dT/dtau1.
-    """
-    a = tau1 - tau0
-    w, v = theta[:3], theta[3:]
-    phi, Rv, turn = a * w, np.zeros(3), np.zeros(3)
-    _rotate(phi, R, A)
-    for i in range(3):
-        for j in range(3):
-            A[i, j] *= a
-    _apply(R, v, Rv)
+    """Fill T_w = dT/dw and T_v = dT/dv, both (3, 3)."""
+    v = (theta[3], theta[4], theta[5])
     if twist:
-        _apply(A, v, T)
-        _twist_by_w(a, phi, v, T_w)
-        for i in range(3):
-            T_rate[0, i], T_rate[1, i] = -Rv[i], Rv[i]
-            for j in range(3):
-                T_v[i, j] = A[i, j]
+        a = tau1 - tau0
+        _twist_by_w(a, times(a, (theta[0], theta[1], theta[2])), v, T_w)
+        T_v[:] = A
         return
-    _cross(w, Rv, turn)
+    Rv = apply(R, v)
     for j in range(3):
-        T[j] = tau1 * v[j] - tau0 * Rv[j]
-        T_rate[0, j] = -Rv[j] + tau0 * turn[j]
-        T_rate[1, j] = v[j] - tau0 * turn[j]
-        T_w[0, j] = -tau0 * (A[1, j] * Rv[2] - A[2, j] * Rv[1])
-        T_w[1, j] = -tau0 * (A[2, j] * Rv[0] - A[0, j] * Rv[2])
-        T_w[2, j] = -tau0 * (A[0, j] * Rv[1] - A[1, j] * Rv[0])
+        column = cross((A[0, j], A[1, j], A[2, j]), Rv)
         for i in range(3):
+            T_w[i, j] = -tau0 * column[i]
             T_v[i, j] = -tau0 * R[i, j]
         T_v[j, j] += tau1
 
 
 @compiled
-def _twist_by_w(a: float, phi: FloatArray, v: FloatArray, T_w: FloatArray) -> None:
+def _twist_by_w(a: float, phi: Vector, v: Vector, T_w: FloatArray) -> None:
     """dT/dw of T = a (v + b phi x v + c phi x (phi x v)), phi = a w."""
-    _, b, c, db, dc = _coefficients(_dot(phi, phi))
-    once, twice = np.zeros(3), np.zeros(3)
-    _cross(phi, v, once)
-    _cross(phi, once, twice)
-    pv = _dot(phi, v)
+    _, b, c, db, dc = _coefficients(dot(phi, phi))
+    once = cross(phi, v)
+    along = plus(times(db, once), dc, cross(phi, once))
+    pv = dot(phi, v)
+    _fill_rotation(v, a * a * c * pv, -a * a * b, 0.0, T_w)
     for i in range(3):
         for j in range(3):
-            T_w[i, j] = c * (phi[i] * v[j] - 2 * v[i] * phi[j]) + (db * once[i] + dc * twice[i]) * phi[j]
-        T_w[i, i] += c * pv
-    _skew_add(v, -b, T_w)
-    for i in range(3):
-        for j in range(3):
-            T_w[i, j] *= a * a
+            T_w[i, j] += a * a * (c * (phi[i] * v[j] - 2 * v[i] * phi[j]) + along[i] * phi[j])
 
 
 @compiled
@@ -187,26 +188,21 @@ def pair_terms(
         residuals: (n,) filled, in pixels.
         H, gradient: (6, 6), (6,), added to when ``want``.
     """
-    R, A, T_w, T_v = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
-    T, T_rate, x, y, Ro, J = np.zeros(3), np.zeros((2, 3)), np.ones(3), np.ones(3), np.zeros(3), np.zeros(6)
-    q = np.zeros(4)
+    R, A, T_w, T_v, J = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(6)
+    w = (theta[0], theta[1], theta[2])
     for m in range(len(pairs)):
-        x[0], x[1], y[0], y[1] = pairs[m, 0], pairs[m, 1], pairs[m, 2], pairs[m, 3]
-        move(theta, twist, pairs[m, 4], pairs[m, 5], R, A, T, T_w, T_v, T_rate)
-        offset = pairs[m, 6]
-        for i in range(3):
-            Ro[i] = R[i, 0] * offset
-            T[i] -= Ro[i]
-        T[0] += offset
-        value = _pair_gradient(theta, x, y, R, T, T_rate, Ro, focal, h, q)
+        x, y, offset = (pairs[m, 0], pairs[m, 1], 1.0), (pairs[m, 2], pairs[m, 3], 1.0), pairs[m, 6]
+        T, rate0, rate1 = move(theta, twist, pairs[m, 4], pairs[m, 5], R, A)
+        Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
+        T, turn = plus((T[0] + offset, T[1], T[2]), -1.0, Ro), cross(w, Ro)
+        value, q = _pair_gradient(w, x, y, R, T, plus(rate0, 1.0, turn), plus(rate1, -1.0, turn), focal, h)
         qq = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
         residuals[m] = value / math.sqrt(qq) if qq > 0.0 else 0.0
         if not want or qq <= 0.0:
             continue
-        step = value / qq
-        for i in range(2):
-            x[i] -= step * q[i] / focal[i]
-            y[i] -= step * q[2 + i] / focal[i]
+        step0, step1 = value / qq / focal[0], value / qq / focal[1]
+        x, y = (x[0] - step0 * q[0], x[1] - step1 * q[1], 1.0), (y[0] - step0 * q[2], y[1] - step1 * q[3], 1.0)
+        translation_jacobian(theta, twist, pairs[m, 4], pairs[m, 5], R, A, T_w, T_v)
         _pair_jacobian(x, y, R, A, T, T_w, T_v, Ro, J)
         for i in range(6):
             gradient[i] += J[i] / math.sqrt(qq) * residuals[m]
@@ -216,76 +212,60 @@ def pair_terms(
 
 @compiled
 def _pair_gradient(
-    theta: FloatArray,
-    x: FloatArray,
-    y: FloatArray,
+    w: Vector,
+    x: Vector,
+    y: Vector,
     R: FloatArray,
-    T: FloatArray,
-    T_rate: FloatArray,
-    Ro: FloatArray,
+    T: Vector,
+    rate0: Vector,
+    rate1: Vector,
     focal: FloatArray,
     h: float,
-    q: FloatArray,
-) -> float:
-    """Value of y^T [T]x R x; its derivative by the four pixel coordinates goes to q."""
-    w = theta[:3]
-    p, n, G, line, back, turn = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
-    _apply(R, x, p)
-    _cross(p, y, n)
-    _cross(T, p, line)
-    _cross(y, T, G)
-    _apply_transposed(R, G, back)
-    _cross(w, Ro, turn)
-    Tp, yp = _dot(T, p), _dot(y, p)
-    spin = 0.0
-    for i in range(3):
-        spin += w[i] * (y[i] * Tp - T[i] * yp)
-    rate0 = _dot(T_rate[0], n) + _dot(turn, n) - spin
-    rate1 = _dot(T_rate[1], n) - _dot(turn, n) + spin
-    q[0], q[1] = back[0] / focal[0], back[1] / focal[1] + h * rate0
-    q[2], q[3] = line[0] / focal[0], line[1] / focal[1] + h * rate1
-    return _dot(T, n)
+) -> tuple[float, tuple[float, float, float, float]]:
+    """Value of y^T [T]x R x, and its derivative by the four pixel coordinates; rates are T's by the times."""
+    p = apply(R, x)
+    n = cross(p, y)
+    line, back = cross(T, p), apply_transposed(R, cross(y, T))
+    spin = dot(w, y) * dot(T, p) - dot(w, T) * dot(y, p)
+    by_y0 = back[1] / focal[1] + h * (dot(rate0, n) - spin)
+    by_y1 = line[1] / focal[1] + h * (dot(rate1, n) + spin)
+    return dot(T, n), (back[0] / focal[0], by_y0, line[0] / focal[0], by_y1)
 
 
 @compiled
 def _pair_jacobian(
-    x: FloatArray,
-    y: FloatArray,
+    x: Vector,
+    y: Vector,
     R: FloatArray,
     A: FloatArray,
-    T: FloatArray,
+    T: Vector,
     T_w: FloatArray,
     T_v: FloatArray,
-    Ro: FloatArray,
+    Ro: Vector,
     J: FloatArray,
 ) -> None:
     """Derivative (6,) of y^T [T]x R x by theta; T includes the camera's offset, T_w only the body's motion."""
-    p, n, turn = np.zeros(3), np.zeros(3), np.zeros(3)
-    _apply(R, x, p)
-    _cross(p, y, n)
-    _cross(Ro, n, turn)
-    Tp, yp = _dot(T, p), _dot(y, p)
+    p = apply(R, x)
+    n = cross(p, y)
+    turned = plus(plus(times(dot(T, p), y), -dot(y, p), T), -1.0, cross(Ro, n))
+    by_w = apply_transposed(A, turned)
+    by_w = plus(by_w, 1.0, apply_transposed(T_w, n))
+    by_v = apply_transposed(T_v, n)
     for j in range(3):
-        J[j], J[3 + j] = 0.0, 0.0
-        for i in range(3):
-            J[j] += A[i, j] * (y[i] * Tp - T[i] * yp - turn[i]) + T_w[i, j] * n[i]
-            J[3 + j] += T_v[i, j] * n[i]
+        J[j], J[3 + j] = by_w[j], by_v[j]
 
 
 @compiled
 def count_in_front(theta: FloatArray, twist: bool, pairs: FloatArray) -> int:
     """How many pairs (n, 7) have both closest points in front of their cameras; parallel rays do not."""
-    R, A, T_w, T_v = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
-    T, T_rate, x, y, p = np.zeros(3), np.zeros((2, 3)), np.ones(3), np.ones(3), np.zeros(3)
+    R, A = np.zeros((3, 3)), np.zeros((3, 3))
     count = 0
     for m in range(len(pairs)):
-        x[0], x[1], y[0], y[1] = pairs[m, 0], pairs[m, 1], pairs[m, 2], pairs[m, 3]
-        move(theta, twist, pairs[m, 4], pairs[m, 5], R, A, T, T_w, T_v, T_rate)
-        for i in range(3):
-            T[i] -= R[i, 0] * pairs[m, 6]
-        T[0] += pairs[m, 6]
-        _apply(R, x, p)
-        pp, yy, py, pT, yT = _dot(p, p), _dot(y, y), _dot(p, y), _dot(p, T), _dot(y, T)
+        y, offset = (pairs[m, 2], pairs[m, 3], 1.0), pairs[m, 6]
+        T, _, _ = move(theta, twist, pairs[m, 4], pairs[m, 5], R, A)
+        T = plus((T[0] + offset, T[1], T[2]), -offset, (R[0, 0], R[1, 0], R[2, 0]))
+        p = apply(R, (pairs[m, 0], pairs[m, 1], 1.0))
+        pp, yy, py, pT, yT = dot(p, p), dot(y, y), dot(p, y), dot(p, T), dot(y, T)
         if pp * yy - py * py > 1e-15 * pp * yy and py * yT > yy * pT and pp * yT > py * pT:
             count += 1
     return count

@@ -16,11 +16,14 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.base import MatchSet, MotionEstimate, MotionModel, Solver
 from rsbench.solvers.eight_point import decompose_essential, eight_point
+from rsbench.solvers.five_point import five_point
 from rsbench.solvers.iterated import scaled_translation, solve_reduced
 from rsbench.solvers.optimise import Minimum, levenberg_marquardt
 from rsbench.solvers.packed import Packed, pack
 
-_SCREEN_ITERATIONS, _SCREEN_MATCHES = 6, 150
+_SCREEN_ITERATIONS, _SCREEN_MATCHES, _SAMPLE_ITERATIONS = 6, 150, 4
+_LEAST_NOISE_PX = 0.01
+"""Noise assumed at least when judging whether data determine a rotation: exact data fit anything exactly."""
 
 
 @final
@@ -45,6 +48,8 @@ class RefinedSolver(Solver):
     """Relative standard deviation of the length of d above which it does not count as metric."""
     max_direction_sigma: float = 0.5
     """Standard deviation of the direction of d (radians) above which it does not count as known."""
+    max_rotation_sigma: float = 0.2
+    """Standard deviation of the rotation (radians) above which there is no estimate."""
 
     name = "rs-stereo-refined"
     needs = frozenset[MatchSet]({"left", "right"})
@@ -74,15 +79,20 @@ class RefinedSolver(Solver):
         return self.report(packed, best)
 
     def sample_sizes(self, correspondences: Correspondences) -> dict[MatchSet, int]:
+        """Three tracks, else five matches of the camera that has more of them."""
         if self.use_tracks and len(correspondences.tracks) >= 3:
             return {"tracks": 3}
-        return {"left": 4, "right": 4}
+        return {"left": 5} if len(correspondences.left) >= len(correspondences.right) else {"right": 5}
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
         packed = pack(sample, rig, shutter, self.motion_model, self.use_tracks)
-        starts = [np.zeros(6)] if len(packed.tracks) >= 3 else linear_starts(packed, (9,), rig)
-        minima = [self._minimise(packed, start, 5) for start in starts]
-        return [_estimate(packed, minimum.theta) for minimum in minima if np.isfinite(minimum.cost)]
+        if len(packed.tracks) >= 3:
+            found = [self._minimise(packed, np.zeros(6), _SAMPLE_ITERATIONS).theta]
+        else:
+            length = 0.5 * rig.baseline
+            found = [_signed(packed, w, length * d) for w, d in five_point(packed.pairs)]
+        motions = [packed.motion(theta) for theta in found]
+        return [MotionEstimate(w=w, d=d, success=True) for w, d in motions if np.all(np.isfinite(np.append(w, d)))]
 
     def improve(
         self, motion: MotionEstimate, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
@@ -117,48 +127,60 @@ class RefinedSolver(Solver):
     def report(self, packed: Packed, best: Minimum) -> MotionEstimate:
         """Estimate with covariance and what the data leave open."""
         freedom = packed.constraints - 6
-        variance = 2.0 * best.cost / freedom if freedom > 0 else np.nan
+        variance = 2.0 * best.cost / freedom if freedom > 0 else 0.0
+        if rotation_sigma(best.H, max(variance, _LEAST_NOISE_PX**2)) > self.max_rotation_sigma:
+            return MotionEstimate.failed("the rotation is not determined: degenerate matches")
         w, d = packed.motion(best.theta)
-        covariance = _covariance(packed, best, variance)
-        length = float(np.linalg.norm(d))
-        if covariance is None or length == 0.0:
-            scale_sigma, direction_sigma = np.inf, np.inf
-        else:
-            C = covariance[3:, 3:]
-            along = float(d @ C @ d) / length**2
-            scale_sigma = np.sqrt(along) / length
-            direction_sigma = np.sqrt(max(np.trace(C) - along, 0.0)) / length
+        covariance = _covariance(packed, best, variance) if freedom > 0 else None
+        scale_sigma, direction_sigma = _translation_sigmas(d, covariance)
         at_limit = float(np.linalg.norm(best.theta[3:])) >= 0.999 * self.max_translation_m
         # Tracks measure d in metres, however short it is; pairs only the direction of d well.
         linked = len(packed.tracks) >= 3
         metric = linked or (scale_sigma <= self.max_scale_sigma and not at_limit)
-        direction_known = bool(direction_sigma <= self.max_direction_sigma)
+        direction_known = direction_sigma <= self.max_direction_sigma
         reasons = [] if metric else ["the length of d is not determined by these matches"]
         reasons += [] if direction_known else ["the direction of d is not determined: too little translation"]
         return MotionEstimate(
             w=w,
             d=d,
             success=True,
-            metric=bool(metric),
+            metric=metric,
             direction_known=direction_known,
             reason="; ".join(reasons),
             covariance=covariance,
-            noise_px=float(np.sqrt(variance)) if np.isfinite(variance) else None,
+            noise_px=float(np.sqrt(variance)) if freedom > 0 else None,
         )
 
 
-def _estimate(packed: Packed, theta: FloatArray) -> MotionEstimate:
-    w, d = packed.motion(theta)
-    return MotionEstimate(w=w, d=d, success=True, metric=True)
+def rotation_sigma(H: FloatArray, variance: float) -> float:
+    """Standard deviation (radians) of the worst axis of the rotation, whatever the translation is."""
+    H_dd = H[3:, 3:]
+    values, vectors = np.linalg.eigh(H_dd)
+    keep = values > 1e-12 * max(values[-1], 1e-300)
+    coupling = vectors[:, keep].T @ H[3:, :3]
+    S = H[:3, :3] - coupling.T @ (coupling / values[keep, None])
+    least = float(np.linalg.eigvalsh(S)[0])
+    return float(np.sqrt(variance / least)) if least > 1e-12 * float(np.trace(H[:3, :3])) else np.inf
 
 
 def _covariance(packed: Packed, best: Minimum, variance: float) -> FloatArray | None:
+    """Covariance (6, 6) of (w, d); None when it does not exist."""
     scale = np.sqrt(np.maximum(np.diagonal(best.H), 1e-300))
-    A = best.H / np.outer(scale, scale)
-    if not np.isfinite(variance) or np.linalg.cond(A) > 1e14:
+    values, vectors = np.linalg.eigh(best.H / np.outer(scale, scale))
+    if not values[0] > 1e-12 * values[-1]:
         return None
-    J = packed.motion_jacobian(best.theta)
-    return variance * J @ (np.linalg.inv(A) / np.outer(scale, scale)) @ J.T
+    half = packed.motion_jacobian(best.theta) @ (vectors / scale[:, None] / np.sqrt(values))
+    return variance * (half @ half.T)
+
+
+def _translation_sigmas(d: FloatArray, covariance: FloatArray | None) -> tuple[float, float]:
+    """Relative standard deviation of the length of d, and of its direction in radians."""
+    length = float(np.linalg.norm(d))
+    if covariance is None or length == 0.0:
+        return np.inf, np.inf
+    C = covariance[3:, 3:]
+    along = float(d @ C @ d) / length**2
+    return float(np.sqrt(along)) / length, float(np.sqrt(max(np.trace(C) - along, 0.0))) / length
 
 
 def linear_starts(packed: Packed, families: tuple[int, ...], rig: StereoRig) -> list[FloatArray]:
@@ -187,6 +209,10 @@ def _signed_start(packed: Packed, pairs: FloatArray, w: FloatArray, d: FloatArra
     length = 0.5 * rig.baseline
     if scaled is not None:
         length = float(np.clip(np.linalg.norm(scaled), 0.1 * rig.baseline, 2.0 * rig.baseline))
-    d = d / np.linalg.norm(d) * length
-    front, back = (packed.in_front(packed.theta(w, sign * d)) for sign in (1.0, -1.0))
-    return packed.theta(w, d if front >= back else -d)
+    return _signed(packed, w, d / np.linalg.norm(d) * length)
+
+
+def _signed(packed: Packed, w: FloatArray, d: FloatArray) -> FloatArray:
+    """Parameters of (w, d) or (w, -d), whichever has more points in front of the cameras."""
+    front, back = packed.theta(w, d), packed.theta(w, -d)
+    return front if packed.in_front(front) >= packed.in_front(back) else back

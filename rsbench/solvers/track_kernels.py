@@ -17,9 +17,23 @@ from __future__ import annotations
 import numpy as np
 
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.kernels import BEHIND, _apply, compiled, move
+from rsbench.solvers.kernels import (
+    BEHIND,
+    Vector,
+    apply,
+    apply_transposed,
+    compiled,
+    cross,
+    dot,
+    move,
+    plus,
+    times,
+    translation_jacobian,
+)
 
 _VARIANCE = (0.5, 0.5, 2.0)
+NEAREST = 1e-6
+"""Least ratio of a track's depths in frame 1 and frame 0."""
 
 
 @compiled
@@ -37,15 +51,13 @@ def _invert_symmetric(S: FloatArray, out: FloatArray) -> None:
 
 
 @compiled
-def _project_rates(
-    R: FloatArray, p: FloatArray, disparity: float, focal: FloatArray, by_p: FloatArray, m: FloatArray
-) -> None:
-    """Fill the prediction m (3,), relative to the principal point, and its derivative by_p (3, 3) by p."""
+def _predict(p: Vector, disparity: float, focal: FloatArray, by_p: FloatArray) -> Vector:
+    """Prediction, relative to the principal point; fills its derivative by_p (3, 3) by p."""
     iz = 1.0 / p[2]
-    m[0], m[1], m[2] = focal[0] * p[0] * iz, focal[1] * p[1] * iz, disparity * iz
+    m = (focal[0] * p[0] * iz, focal[1] * p[1] * iz, disparity * iz)
     by_p[0, 0], by_p[1, 1] = focal[0] * iz, focal[1] * iz
-    for i in range(3):
-        by_p[i, 2] = -m[i] * iz
+    by_p[0, 2], by_p[1, 2], by_p[2, 2] = -m[0] * iz, -m[1] * iz, -m[2] * iz
+    return m
 
 
 @compiled
@@ -71,46 +83,60 @@ def track_terms(
         squares: (n,) filled, px^2: chi-squared with 3 degrees of freedom at a noise of 1 px.
         H, gradient: (6, 6), (6,), added to when ``want``.
     """
-    R, A, T_w, T_v = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
-    T, T_rate, x, p, c = np.zeros(3), np.zeros((2, 3)), np.ones(3), np.zeros(3), np.zeros(3)
-    by_p, D0, D1, S, W = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
-    m, lam = np.zeros(3), np.zeros(3)
+    R, A, by_p, S, W = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    D0, D1, T_w, T_v = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    C, WC = np.zeros((3, 6)), np.zeros((3, 6))
+    w = (theta[0], theta[1], theta[2])
     for k in range(len(tracks)):
-        x[0], x[1] = tracks[k, 0], tracks[k, 1]
-        disparity = tracks[k, 2]
+        x, disparity, tau0, tau1 = (tracks[k, 0], tracks[k, 1], 1.0), tracks[k, 2], tracks[k, 6], tracks[k, 7]
         rho = disparity / (focal[0] * baseline)
-        move(theta, twist, tracks[k, 6], tracks[k, 7], R, A, T, T_w, T_v, T_rate)
-        _apply(R, x, p)
-        for i in range(3):
-            p[i] += rho * T[i]
-        if p[2] <= 1e-6:
+        T, rate0, rate1 = move(theta, twist, tau0, tau1, R, A)
+        turned = apply(R, x)
+        p = plus(turned, rho, T)
+        if p[2] <= NEAREST:
             squares[k] = BEHIND
             continue
-        _project_rates(R, p, disparity, focal, by_p, m)
-        for i in range(3):
-            c[i] = tracks[k, 3 + i] - m[i]
-        _track_gradients(theta, R, T, T_rate, x, rho, p, by_p, focal, h, baseline, D0, D1)
-        for i in range(3):
-            for j in range(3):
-                S[i, j] = 0.0
-                for n in range(3):
-                    S[i, j] += _VARIANCE[n] * (D0[i, n] * D0[j, n] + D1[i, n] * D1[j, n])
-        _invert_symmetric(S, W)
-        _apply(W, c, lam)
-        squares[k] = c[0] * lam[0] + c[1] * lam[1] + c[2] * lam[2]
-        if want:
-            _track_normal(R, A, T, T_w, T_v, x, disparity, D0, W, lam, focal, baseline, H, gradient)
+        m = _predict(p, disparity, focal, by_p)
+        c = (tracks[k, 3] - m[0], tracks[k, 4] - m[1], tracks[k, 5] - m[2])
+        turn = cross(w, turned)
+        rate0, rate1 = plus(times(rho, rate0), -1.0, turn), plus(times(rho, rate1), 1.0, turn)
+        _track_gradients(R, T, rate0, rate1, p[2], by_p, focal, h, baseline, D0, D1)
+        _whitening(D0, D1, S, W)
+        lam = apply(W, c)
+        squares[k] = dot(c, lam)
+        if not want:
+            continue
+        step = apply_variance(apply_transposed(D0, lam))
+        x, disparity = (x[0] - step[0] / focal[0], x[1] - step[1] / focal[1], 1.0), disparity - step[2]
+        translation_jacobian(theta, twist, tau0, tau1, R, A, T_w, T_v)
+        if _track_jacobian(x, disparity, R, A, T, T_w, T_v, focal, baseline, by_p, C):
+            _add_normal(C, WC, W, lam, H, gradient)
+
+
+@compiled
+def apply_variance(a: Vector) -> Vector:
+    return (_VARIANCE[0] * a[0], _VARIANCE[1] * a[1], _VARIANCE[2] * a[2])
+
+
+@compiled
+def _whitening(D0: FloatArray, D1: FloatArray, S: FloatArray, W: FloatArray) -> None:
+    """Fill the covariance S (3, 3) of the three equations and its inverse W."""
+    for i in range(3):
+        for j in range(i, 3):
+            S[i, j] = 0.0
+            for n in range(3):
+                S[i, j] += _VARIANCE[n] * (D0[i, n] * D0[j, n] + D1[i, n] * D1[j, n])
+            S[j, i] = S[i, j]
+    _invert_symmetric(S, W)
 
 
 @compiled
 def _track_gradients(
-    theta: FloatArray,
     R: FloatArray,
-    T: FloatArray,
-    T_rate: FloatArray,
-    x: FloatArray,
-    rho: float,
-    p: FloatArray,
+    T: Vector,
+    rate0: Vector,
+    rate1: Vector,
+    depth: float,
     by_p: FloatArray,
     focal: FloatArray,
     h: float,
@@ -118,70 +144,65 @@ def _track_gradients(
     D0: FloatArray,
     D1: FloatArray,
 ) -> None:
-    """Derivatives (3, 3) of the three equations by m of frame 0 and of frame 1, row times included."""
-    rate0, rate1, p0 = np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    """Derivatives (3, 3) of the three equations by m of frame 0 and of frame 1; rates are p's by the times."""
+    by_x = (R[0, 0] / focal[0], R[1, 0] / focal[0], R[2, 0] / focal[0])
+    by_y = (
+        R[0, 1] / focal[1] + h * rate0[0],
+        R[1, 1] / focal[1] + h * rate0[1],
+        R[2, 1] / focal[1] + h * rate0[2],
+    )
+    columns = (apply(by_p, by_x), apply(by_p, by_y), apply(by_p, times(1.0 / (focal[0] * baseline), T)))
+    shift = apply(by_p, rate1)
     for i in range(3):
-        j, n = (i + 1) % 3, (i + 2) % 3
-        turn = theta[j] * (p[n] - rho * T[n]) - theta[n] * (p[j] - rho * T[j])
-        rate0[i] = rho * T_rate[0, i] - turn
-        rate1[i] = rho * T_rate[1, i] + turn
-        p0[i, 0] = R[i, 0] / focal[0]
-        p0[i, 1] = R[i, 1] / focal[1] + h * rate0[i]
-        p0[i, 2] = T[i] / (focal[0] * baseline)
-    for i in range(3):
-        shift = 0.0
         for j in range(3):
-            D0[i, j] = -(by_p[i, 0] * p0[0, j] + by_p[i, 1] * p0[1, j] + by_p[i, 2] * p0[2, j])
-            D1[i, j] = 1.0 if i == j else 0.0
-            shift += by_p[i, j] * rate1[j]
-        D1[i, 1] -= h * shift
-    D0[2, 2] -= 1.0 / p[2]
+            D0[i, j] = -columns[j][i]
+            D1[i, j] = 0.0
+        D1[i, i] = 1.0
+    for i in range(3):
+        D1[i, 1] -= h * shift[i]
+    D0[2, 2] -= 1.0 / depth
 
 
 @compiled
-def _track_normal(
+def _track_jacobian(
+    x: Vector,
+    disparity: float,
     R: FloatArray,
     A: FloatArray,
-    T: FloatArray,
+    T: Vector,
     T_w: FloatArray,
     T_v: FloatArray,
-    x: FloatArray,
-    disparity: float,
-    D0: FloatArray,
-    W: FloatArray,
-    lam: FloatArray,
     focal: FloatArray,
     baseline: float,
-    H: FloatArray,
-    gradient: FloatArray,
-) -> None:
-    """Add a track's normal equations, differentiated at its corrected measurement."""
-    step = np.zeros(3)
-    for j in range(3):
-        step[j] = _VARIANCE[j] * (D0[0, j] * lam[0] + D0[1, j] * lam[1] + D0[2, j] * lam[2])
-    x[0] -= step[0] / focal[0]
-    x[1] -= step[1] / focal[1]
-    disparity -= step[2]
+    by_p: FloatArray,
+    C: FloatArray,
+) -> bool:
+    """Fill the derivative C (3, 6) of the three equations by theta; False when the point is behind the camera."""
     rho = disparity / (focal[0] * baseline)
-    turned, p, m, by_p = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros((3, 3))
-    _apply(R, x, turned)
-    for i in range(3):
-        p[i] = turned[i] + rho * T[i]
-    if p[2] <= 1e-6:
-        return
-    _project_rates(R, p, disparity, focal, by_p, m)
-    C, WC = np.zeros((3, 6)), np.zeros((3, 6))
+    turned = apply(R, x)
+    p = plus(turned, rho, T)
+    if p[2] <= NEAREST:
+        return False
+    _predict(p, disparity, focal, by_p)
     for j in range(3):
+        by_w = plus(cross((A[0, j], A[1, j], A[2, j]), turned), rho, (T_w[0, j], T_w[1, j], T_w[2, j]))
+        column_w = apply(by_p, by_w)
+        column_v = apply(by_p, (rho * T_v[0, j], rho * T_v[1, j], rho * T_v[2, j]))
         for i in range(3):
-            k, n = (i + 1) % 3, (i + 2) % 3
-            by_w = A[k, j] * turned[n] - A[n, j] * turned[k] + rho * T_w[i, j]
-            for row in range(3):
-                C[row, j] -= by_p[row, i] * by_w
-                C[row, 3 + j] -= by_p[row, i] * rho * T_v[i, j]
+            C[i, j], C[i, 3 + j] = -column_w[i], -column_v[i]
+    return True
+
+
+@compiled
+def _add_normal(
+    C: FloatArray, WC: FloatArray, W: FloatArray, lam: Vector, H: FloatArray, gradient: FloatArray
+) -> None:
+    """H += C^T W C, gradient += C^T lam."""
     for j in range(6):
-        for i in range(3):
-            WC[i, j] = W[i, 0] * C[0, j] + W[i, 1] * C[1, j] + W[i, 2] * C[2, j]
-            gradient[j] += C[i, j] * lam[i]
+        column = (C[0, j], C[1, j], C[2, j])
+        gradient[j] += dot(column, lam)
+        whitened = apply(W, column)
+        WC[0, j], WC[1, j], WC[2, j] = whitened
     for i in range(6):
         for j in range(6):
             H[i, j] += C[0, i] * WC[0, j] + C[1, i] * WC[1, j] + C[2, i] * WC[2, j]
