@@ -15,10 +15,11 @@ class Kind(StrEnum):
     renderers = "renderers"
     solvers = "solvers"
     datasets = "datasets"
+    sweeps = "sweeps"
 
 
 def list_(kind: Annotated[Kind, typer.Argument(help="What to list.")]) -> None:
-    """List scenes, renderers, solvers or datasets, with the files to copy and edit."""
+    """List scenes, renderers, solvers, datasets or sweeps, with the files to copy and edit."""
     import pandas as pd
 
     from rsbench.cards import list_cards, read_toml
