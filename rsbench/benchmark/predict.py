@@ -6,7 +6,9 @@ Nothing here reads the truth of a sequence: only its rolling-shutter images, its
 from __future__ import annotations
 
 import hashlib
+import io
 import json
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -27,8 +29,8 @@ from rsbench.dataset.sequence import FRAMES, Sequence
 from rsbench.pipeline.motion import RobustOptions, estimate_motion
 from rsbench.solvers.registry import load_solver
 from rsbench.vision.correction import correct_frame
-from rsbench.vision.features import FeatureOptions, match_rig
-from rsbench.vision.stereo_depth import SgmOptions, stereo_depth
+from rsbench.vision.features import MatchOptions, match_stereo_frames
+from rsbench.vision.stereo_depth import SgmOptions, stereo_disparities
 
 Step = Callable[[str], None]
 VIEWS: tuple[tuple[Side, int], ...] = tuple(product(SIDES, FRAMES))
@@ -44,7 +46,7 @@ class EvaluationOptions:
     correction_solver: str = "rs-stereo-refined"
     """Solver whose motion the correction uses; one of ``solvers``."""
     seed: int = 0
-    features: FeatureOptions = field(default_factory=FeatureOptions)
+    matching: MatchOptions = field(default_factory=MatchOptions)
     robust: RobustOptions = field(default_factory=RobustOptions)
     sgm: SgmOptions = field(default_factory=SgmOptions)
 
@@ -61,12 +63,15 @@ def predict_sequence(sequence: Sequence, options: EvaluationOptions, folder: Pat
         for _ in range(options.steps()):
             step(sequence.name)
         return
-    (folder / "motion").mkdir(parents=True, exist_ok=True)
-    (folder / "corrected").mkdir(exist_ok=True)
-    marker.unlink(missing_ok=True)
+    if folder.exists():
+        shutil.rmtree(folder)
+    (folder / "motion").mkdir(parents=True)
+    (folder / "corrected").mkdir()
     images = {view: sequence.image("rs", *view) for view in VIEWS}
     started = time.perf_counter()
-    matches = match_rig(images, options.features)
+    matches = match_stereo_frames(
+        images["left", 0], images["right", 0], images["left", 1], images["right", 1], options.matching
+    )
     matching_s = time.perf_counter() - started
     save_matches(folder / "matches.npz", matches)
     step(sequence.name)
@@ -76,14 +81,15 @@ def predict_sequence(sequence: Sequence, options: EvaluationOptions, folder: Pat
     motion = read_motion(folder, options.correction_solver)
     disparities = {}
     depth_s = 0.0
-    for side, frame in VIEWS:
+    for frame in FRAMES:
         started = time.perf_counter()
-        disparity = stereo_depth(images["left", frame], images["right", frame], sequence.rig, side, options.sgm)
+        both = stereo_disparities(images["left", frame], images["right", frame], sequence.rig, options.sgm)
         depth_s += time.perf_counter() - started
-        disparities[f"{side}_{frame}"] = disparity
-        if motion is not None:
-            _correct(sequence, images[side, frame], disparity, motion, side, frame, folder)
-        step(sequence.name)
+        for side, disparity in zip(SIDES, both, strict=True):
+            disparities[f"{side}_{frame}"] = disparity
+            if motion is not None:
+                _correct(sequence, images[side, frame], disparity, motion, side, frame, folder)
+            step(sequence.name)
     save_arrays(folder / "disparity.npz", disparities)
     write_json(marker, {"identity": identity, "matching_s": matching_s, "depth_s": depth_s})
 
@@ -112,7 +118,9 @@ def _predict_motion(
         "seconds": robust.seconds,
     }
     write_json(folder / "motion" / f"{solver.name}.json", answer)
-    save_arrays(folder / "motion" / f"{solver.name}-inliers.npz", dict(robust.inliers))
+    save_arrays(
+        folder / "motion" / f"{solver.name}-inliers.npz", {str(key): mask for key, mask in robust.inliers.items()}
+    )
 
 
 def _correct(
@@ -151,8 +159,6 @@ def load_matches(path: Path) -> Correspondences:
 
 def save_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     """Compressed npz, written atomically."""
-    import io
-
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     write_bytes(path, buffer.getvalue())

@@ -45,10 +45,11 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[str], None]]:
 
 def print_table(title: str, frame: pd.DataFrame, digits: dict[str, int] | None = None) -> None:
     """A data frame as a terminal table; ``digits`` gives decimals per column."""
+    from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in frame.columns:
         numeric = frame[column].dtype.kind in "fiu"
         table.add_column(str(column), justify="right" if numeric else "left", overflow="fold")

@@ -34,7 +34,8 @@ def evaluate_dataset(
     folder: Path, out: Path, solvers: list[str] | None, correct_with: str, seed: int, command: str | None = None
 ) -> Path:
     """Evaluate with a progress bar, print the tables, and return the path of the report."""
-    from rsbench.benchmark.evaluate import EvaluationOptions, evaluation_steps, run_evaluation
+    from rsbench.benchmark.evaluate import evaluation_steps, run_evaluation
+    from rsbench.benchmark.predict import EvaluationOptions
     from rsbench.cli.console import print_table, progress_bar
     from rsbench.report.evaluation import summary_tables, write_report
     from rsbench.solvers.registry import list_solvers
@@ -45,7 +46,7 @@ def evaluate_dataset(
     with progress_bar(f"evaluating {folder.name}", evaluation_steps(folder, options)) as advance:
         run_evaluation(folder, out, options, command, advance)
     for table in summary_tables(out):
-        print_table(table.title, table.frame)
+        print_table(table.title, table.brief)
     page = write_report(folder, out)
     typer.echo(f"report: {page.resolve()}")
     return page

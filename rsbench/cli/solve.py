@@ -24,9 +24,7 @@ def solve(
     solver: Annotated[str, typer.Option(help="Name of a solver card (rsbench list solvers) or path.")] = (
         "rs-stereo-refined"
     ),
-    robust: Annotated[
-        bool, typer.Option(help="RANSAC around the solver; off when matches hold no outliers.")
-    ] = True,
+    threshold_px: Annotated[float, typer.Option(help="Largest Sampson error of an inlier, px.")] = 1.25,
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
     json: Annotated[bool, typer.Option("--json", help="Answer as one JSON object.")] = False,
 ) -> None:
@@ -35,11 +33,12 @@ def solve(
 
     import numpy as np
 
+    from rsbench.pipeline.motion import RobustOptions
     from rsbench.pipeline.problem import read_problem, solve_problem
     from rsbench.solvers.registry import load_solver
 
     chosen = load_solver(solver)
-    answer = solve_problem(read_problem(problem), chosen, robust=robust, seed=seed)
+    answer = solve_problem(read_problem(problem), chosen, RobustOptions(threshold_px=threshold_px), seed)
     if json:
         typer.echo(json_module.dumps(answer, allow_nan=False))
     elif answer["success"]:

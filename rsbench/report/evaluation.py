@@ -26,11 +26,12 @@ _DEPTH_ERROR_M = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class SummaryTable:
-    """A table for the terminal and the page."""
+    """A table for the page, and its most telling columns for an 80-column terminal."""
 
     title: str
     note: str
     frame: pd.DataFrame
+    brief: pd.DataFrame
 
 
 def summary_tables(out: Path) -> list[SummaryTable]:
@@ -54,17 +55,21 @@ def _pose_table(out: Path) -> SummaryTable:
     }
     note = (
         "e_R and e_T against the true motion of the rig over one frame period (a monocular solver against the "
-        "translation of its own camera); e_s = |log(estimated length / true length)| where a solver claims metres. "
-        "A failure scores 180 degrees. All solvers had the same matches, sampler and budget."
+        "translation of its own camera); e_s = |log(estimated length / true length)| where a solver claims "
+        "metres. A failure scores 180 degrees. All solvers had the same matches, sampler and budget."
     )
-    return SummaryTable(title="Relative pose", note=note, frame=scores[list(columns)].rename(columns=columns))
+    frame = scores[list(columns)].rename(columns=columns)
+    brief = frame[["sequence", "solver", "e_R (deg)", "e_T (deg)", "e_s", "inliers"]]
+    return SummaryTable(title="Relative pose", note=note, frame=frame, brief=brief)
 
 
 def _depth_table(out: Path) -> SummaryTable:
     scores = read_scores(out, "depth")
     mean = scores.drop(columns=["side", "frame"]).groupby("sequence", as_index=False).mean()
     note = "SGM depth of the rolling-shutter pairs against the truth on surface pixels, mean of the four frames."
-    return SummaryTable(title="Depth", note=note, frame=mean)
+    names = {"median_m": "median (m)", "over_2m": "> 2 m", "bad_1px": "> 1 px", "coverage": "coverage"}
+    brief = mean[["sequence", *names]].rename(columns=names)
+    return SummaryTable(title="Depth (SGM)", note=note, frame=mean, brief=brief)
 
 
 def _correction_table(out: Path) -> SummaryTable:
@@ -80,10 +85,12 @@ def _correction_table(out: Path) -> SummaryTable:
     mean = scores.groupby(["sequence", "depth", "motion"], as_index=False)[list(names)].mean()
     note = (
         "Corrected frames against the global-shutter image at row 0's pose, mean of the four frames, on the "
-        "pixels that the method covers; 'uncorrected' is the rolling-shutter frame on the same pixels. Common pixels are "
-        "those that all methods of a frame cover. Rows with true depth or motion are oracles."
+        "pixels that the method covers; 'uncorrected' is the rolling-shutter frame on the same pixels. Common "
+        "pixels are those that all methods of a frame cover. Rows with true depth or motion are oracles."
     )
-    return SummaryTable(title="Correction", note=note, frame=mean.rename(columns=names))
+    frame = mean.rename(columns=names)
+    brief = frame[["sequence", "depth", "motion", "PSNR (dB)", "uncorrected", "SSIM", "coverage"]]
+    return SummaryTable(title="Correction", note=note, frame=frame, brief=brief)
 
 
 def write_report(dataset: Path, out: Path) -> Path:
@@ -188,8 +195,8 @@ def _section(sequence: Sequence, folder: Path, drawn: Drawn) -> dict[str, Any]:
     ]
     text = (
         f"{camera.width} x {camera.height} px, f = {camera.fx:g} px, baseline {sequence.rig.baseline:g} m, "
-        f"readout ratio {sequence.shutter.readout_ratio:g}; true motion per frame: {angle:.3g} deg, {length:.3g} m "
-        f"({sequence.motion.name})."
+        f"readout ratio {sequence.shutter.readout_ratio:g}; true motion per frame: {angle:.3g} deg, "
+        f"{length:.3g} m ({sequence.motion.name})."
     )
     return {"title": sequence.name, "text": text, "pictures": shown}
 
