@@ -111,7 +111,7 @@ def _predict_motion(
         "motion_model": solver.motion_model,
         "reference_point": solver.reference_point,
         "shutter": solver.shutter,
-        "uses": sorted(solver.needs),
+        "uses": sorted(solver.needs | {name for name, size in solver.sample_sizes(matches).items() if size}),
         "inliers": {key: int(np.count_nonzero(mask)) for key, mask in robust.inliers.items()},
         "matches": {key: len(getattr(matches, key)) for key in MATCH_SETS},
         "iterations": robust.iterations,

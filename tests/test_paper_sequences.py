@@ -1,0 +1,87 @@
+"""What the product promises on the paper's own setting, in every built-in scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from rsbench.benchmark.evaluate import read_scores, run_evaluation
+from rsbench.benchmark.predict import EvaluationOptions
+from rsbench.cards import load_card
+from rsbench.core.projection import row_poses
+from rsbench.dataset.card import load_dataset_card
+from rsbench.dataset.generate import generate_dataset
+from rsbench.dataset.verify import verify_dataset
+from rsbench.renderers.options import RendererOptions
+from rsbench.renderers.render import render
+from rsbench.renderers.scene import MitsubaScene
+from rsbench.scenes.load import load_scene
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
+SCENES = ("castle", "old-town", "room")
+
+
+@pytest.fixture(scope="module")
+def paper(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("paper") / "paper"
+    generate_dataset(load_dataset_card("paper"), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scores(paper: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, pd.DataFrame]:
+    out = tmp_path_factory.mktemp("evaluation")
+    options = EvaluationOptions(solvers=("rs-stereo-refined",))
+    run_evaluation(paper, out, options, "test", lambda name: None)
+    return {table: read_scores(out, table).set_index("sequence") for table in ("pose", "correction")}
+
+
+def test_depth_of_all_frames_agrees(paper: Path) -> None:
+    for report in verify_dataset(paper, stride=4):
+        assert report.faults == ()
+        assert all(agreement.p99 < 1e-4 for agreement in report.agreements)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_refined_motion_is_accurate(scores: dict[str, pd.DataFrame], scene: str) -> None:
+    pose = scores["pose"].loc[scene]
+    assert pose.e_R_deg < 0.02
+    assert pose.e_T_deg < 0.5
+    assert pose.e_s < 0.02
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_correction_loses_little_to_true_motion_and_gains_much_over_none(
+    scores: dict[str, pd.DataFrame], scene: str
+) -> None:
+    rows = scores["correction"].loc[scene]
+    sgm = rows[rows.depth == "SGM"].groupby("motion").psnr.mean()
+    assert sgm["estimated"] > sgm["true"] - 0.5
+    estimated = rows[(rows.depth == "SGM") & (rows.motion == "estimated")]
+    assert len(estimated) == 4
+    assert np.all(estimated.psnr > estimated.psnr_uncorrected + 6.0)
+
+
+@pytest.mark.parametrize("scene_name", ["castle", "room"])
+@pytest.mark.parametrize("integrator", ["sunsky", "path"])
+def test_single_pass_equals_stitched_on_the_paper_frame(scene_name: str, integrator: str) -> None:
+    card = load_dataset_card("paper")
+    (sequence,) = card.only([scene_name]).sequence
+    scene = load_scene(sequence.scene)
+    mitsuba_scene = MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint]))
+    rig = card.rig_of(sequence)
+    poses = row_poses(rig, card.shutter(), card.motion_of(sequence), "right", 1)
+    preset = "default" if integrator == "sunsky" else "path"
+    options = replace(load_card(RendererOptions, "renderers", preset), samples=4 if integrator == "path" else 16)
+    rows = np.linspace(0, 899, 20).astype(int).tolist()
+    frames = [
+        render(mitsuba_scene, rig.camera, poses.R, poses.t, replace(options, method=method), rows=chosen)
+        for method, chosen in (("single-pass", None), ("stitched", rows))
+    ]
+    np.testing.assert_array_equal(frames[0].image[rows], frames[1].image)
+    np.testing.assert_array_equal(frames[0].depth[rows], frames[1].depth)
+    assert np.std(frames[1].image) > 0.01, "a black frame proves nothing"
