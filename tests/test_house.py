@@ -1,0 +1,260 @@
+"""The house: sizes, cards, documents and packaging."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+import rsbench
+from rsbench.benchmark.simulation import SimulationOptions, simulate
+from rsbench.cards import CardKind, list_cards, load_card, read_toml
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.metrics import rotation_error, translation_error
+from rsbench.core.motion import LinearMotion
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.card import load_dataset_card
+from rsbench.renderers.options import RendererOptions
+from rsbench.solvers.registry import list_solvers, load_solver, load_solver_card
+
+ROOT = Path(__file__).parents[1]
+SOURCES = sorted((ROOT / "rsbench").rglob("*.py"))
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_REPOSITORY_MB = 400, 45, 30
+
+in_checkout = pytest.mark.skipif(not (ROOT / ".git").exists(), reason="needs a git checkout")
+
+
+def _tracked() -> list[Path]:
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True)
+    paths = [ROOT / name for name in listed.stdout.split("\0") if name]
+    return [path for path in paths if path.is_file()]
+
+
+def _blocks(document: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", document.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+
+
+# Sizes
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_files_and_functions_are_short(path: Path) -> None:
+    text = path.read_text("utf-8")
+    assert text.count("\n") <= MAX_FILE_LINES
+    functions = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
+    long = {f.name: n for f in functions if (n := _own_lines(f)) > MAX_FUNCTION_LINES}
+    assert not long, f"functions above {MAX_FUNCTION_LINES} lines: {long}"
+
+
+def _own_lines(function: ast.FunctionDef) -> int:
+    """Lines of a function without its docstring, which may be long, and what it defines, which counts itself."""
+    lines = set(range(function.lineno, (function.end_lineno or 0) + 1))
+    inner: list[ast.stmt] = [node for node in function.body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
+    if ast.get_docstring(function) is not None:
+        inner.append(function.body[0])
+    for node in inner:
+        lines -= set(range(node.lineno, (node.end_lineno or 0) + 1))
+    return len(lines)
+
+
+@in_checkout
+def test_the_repository_is_small() -> None:
+    total = sum(path.stat().st_size for path in _tracked())
+    assert total < MAX_REPOSITORY_MB * 1e6
+
+
+# What must not be in tracked files: machine paths, addresses of package indexes.
+
+_FORBIDDEN = re.compile(
+    r"(?<![\w.~-])/(home|Users|root|work|mnt)/\w"  # absolute paths of one machine
+    r"|[A-Z]:\\\\?Users"
+    r"|--(extra-)?index-url|--find-links|--trusted-host"
+    r"|https?://(test\.)?(pypi|files\.pythonhosted)\.org"
+)
+
+
+@in_checkout
+def test_nothing_points_at_one_machine_or_one_package_index() -> None:
+    found = []
+    for path in _tracked():
+        if path == Path(__file__):
+            continue
+        data = path.read_bytes()
+        if b"\0" not in data[:4096]:
+            text = data.decode("utf-8", errors="replace")
+            found += [f"{path.relative_to(ROOT)}: {match.group()}" for match in _FORBIDDEN.finditer(text)]
+    assert not found
+
+
+@pytest.mark.parametrize(
+    ("text", "bad"),
+    [
+        ("open('/home/" + "me/x')", True),
+        ("--extra-" + "index-url x", True),
+        ("the network/home/page", False),
+        ("https://github.com/rsbench/rsbench", False),
+    ],
+)
+def test_the_search_for_machine_paths_can_find_them(text: str, bad: bool) -> None:
+    assert bool(_FORBIDDEN.search(text)) == bad
+
+
+def test_constraints_are_exact_and_hashed() -> None:
+    text = (ROOT / "constraints.txt").read_text("utf-8")
+    assert "://" not in text
+    entries = [e.replace("\\\n", " ") for e in re.split(r"\n(?=\S)", text) if e.strip()]
+    assert len(entries) > 20
+    for entry in entries:
+        if not entry.startswith("#"):
+            assert re.match(r"[a-z0-9._-]+(\[[\w,-]+\])?==\S+", entry), entry[:80]
+            assert re.search(r"--hash=sha256:[0-9a-f]{64}", entry), entry[:80]
+
+
+def test_every_dependency_is_locked() -> None:
+    project = read_toml(ROOT / "pyproject.toml")["project"]
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    text = (ROOT / "constraints.txt").read_text("utf-8")
+    locked = {_normal(name) for name in re.findall(r"^([A-Za-z0-9._-]+)==", text, flags=re.MULTILINE)}
+    missing = {name for line in wanted if (name := _normal(re.split(r"[ \[<>=!~;]", line)[0])) not in locked}
+    assert not missing
+
+
+def _normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+# Cards
+
+
+def test_there_are_cards_of_every_kind() -> None:
+    for kind in get_args(CardKind):
+        assert list_cards(kind), f"no {kind} cards"
+
+
+@pytest.mark.parametrize("name", list_cards("renderers"))
+def test_renderer_cards_load(name: str) -> None:
+    assert load_card(RendererOptions, "renderers", name).description
+
+
+@pytest.mark.parametrize("name", list_cards("solvers"))
+def test_solver_cards_load(name: str) -> None:
+    assert load_solver_card(name).summary
+
+
+@pytest.mark.parametrize("name", list_cards("datasets"))
+def test_dataset_cards_load_and_name_cards_that_exist(name: str) -> None:
+    card = load_dataset_card(name)
+    assert card.renderer in list_cards("renderers")
+    assert {sequence.scene for sequence in card.sequence} <= set(list_cards("scenes"))
+
+
+@pytest.mark.parametrize("name", list_cards("scenes"))
+def test_scene_cards_name_themselves(name: str) -> None:
+    assert read_toml(list_cards("scenes")[name])["name"] == name
+
+
+# Documents
+
+
+def test_links_between_documents_lead_somewhere() -> None:
+    broken = []
+    for document in DOCUMENTS:
+        prose = re.sub(r"```.*?```|`[^`]*`", "", document.read_text("utf-8"), flags=re.DOTALL)
+        for target in re.findall(r"\]\(([^)#\s]+)", prose):
+            if "://" not in target and not (document.parent / target).exists():
+                broken.append(f"{document.name}: {target}")
+    assert not broken
+
+
+def test_the_conversion_to_the_papers_axes_holds() -> None:
+    (code,) = _blocks(ROOT / "docs" / "conventions.md", "python")
+    exec(compile(code, "conventions.md", "exec"), {})  # asserts
+
+
+def test_the_dataset_is_read_as_documented(
+    smoke_dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (code,) = _blocks(ROOT / "docs" / "dataset-format.md", "python")
+    monkeypatch.chdir(smoke_dataset.parent)
+    exec(compile(code.replace("data/smoke", str(smoke_dataset)), "dataset-format.md", "exec"), {})
+    assert "(96, 128, 3)" in capsys.readouterr().out
+
+
+def test_every_key_of_a_dataset_is_documented(smoke_dataset: Path) -> None:
+    text = (ROOT / "docs" / "dataset-format.md").read_text("utf-8")
+    documented = set(re.findall(r"`(\w+)`", text))
+    for manifest in (smoke_dataset / "dataset.json", next(smoke_dataset.glob("*/sequence.json"))):
+        keys = set(re.findall(r'^  "(\w+)":', manifest.read_text("utf-8"), flags=re.MULTILINE))
+        assert keys and keys <= documented
+
+
+@pytest.fixture
+def documented_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The files of docs/add-a-solver.md in a folder on the import path."""
+    document = ROOT / "docs" / "add-a-solver.md"
+    for block in [*_blocks(document, "python"), *_blocks(document, "toml")]:
+        name, content = re.fullmatch(r"# (\S+)\n(.*)", block, flags=re.DOTALL).groups()  # type: ignore[union-attr]
+        (tmp_path / name).write_text(content, "utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    sys.modules.pop("scipy_solver", None)
+
+
+def test_the_documented_solver_works(documented_solver: Path) -> None:
+    solver = load_solver(documented_solver / "scipy-huber.toml")
+    assert solver.name == "scipy-huber"
+    rig = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
+    shutter = RollingShutter(height=900, readout_ratio=0.8)
+    motion = LinearMotion(np.array([0.012, -0.02, 0.016]), np.array([0.2, -0.12, 0.18]))
+    data = simulate(rig, shutter, motion, SimulationOptions(pairs=40), np.random.default_rng(0))
+    estimate = solver.estimate(data.correspondences, rig, shutter)
+    assert estimate.success, estimate.reason
+    # Exact data: what remains is SciPy's own stopping rule.
+    assert rotation_error(estimate.w, motion.w) < 1e-7
+    assert translation_error(estimate.d, motion.d) < 1e-6
+
+
+def test_the_documented_entry_point_is_found(documented_solver: Path) -> None:
+    groups = read_toml(documented_solver / "pyproject.toml")["project"]["entry-points"]
+    info = documented_solver / "scipy_solver-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: scipy-solver\nVersion: 1.0\n")
+    lines = [f"[{group}]\n" + "\n".join(f"{k} = {v}" for k, v in table.items()) for group, table in groups.items()]
+    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    assert "scipy" in {entry.name for entry in metadata.entry_points(group="rsbench.solvers")}
+    assert "scipy" in list_solvers()
+    assert load_solver("scipy").name == "scipy"
+
+
+# Packaging
+
+
+def test_the_wheel_carries_cards_and_type_marker(tmp_path: Path) -> None:
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=60)
+    (wheel,) = tmp_path.glob("*.whl")
+    assert rsbench.__version__ in wheel.name
+    names = set(zipfile.ZipFile(wheel).namelist())
+    expected = {
+        f"rsbench/_cards/{kind}/{path.name}" for kind in get_args(CardKind) for path in list_cards(kind).values()
+    }
+    expected |= {str(path.relative_to(ROOT)) for path in SOURCES} | {"rsbench/py.typed"}
+    expected |= {str(path.relative_to(ROOT)) for path in (ROOT / "rsbench").rglob("*.j2")}
+    assert expected <= names
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+    assert not any("__pycache__" in name or name.startswith("tests/") for name in names)
+
+
+def test_the_changelog_knows_this_version() -> None:
+    assert f"## [{rsbench.__version__}]" in (ROOT / "CHANGELOG.md").read_text("utf-8")
