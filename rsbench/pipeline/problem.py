@@ -139,8 +139,11 @@ def solve_problem(problem: Problem, solver: Solver, options: RobustOptions, seed
         problem.correspondences, problem.rig, problem.shutter, solver, options, np.random.default_rng(seed)
     )
     estimate = result.estimate
-    counts = {}
+    counts: dict[str, int] = {}
     for side in SIDES:
+        if not solver.needs & {side, "tracks"}:
+            counts[side] = 0
+            continue
         own = getattr(problem.correspondences, side)[result.inliers[side]]
         halves = track_pairs(problem.correspondences.tracks, side)[result.inliers["tracks"]]
         counts[side] = len({row.tobytes() for row in np.concatenate([own, halves])})

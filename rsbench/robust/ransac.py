@@ -67,7 +67,9 @@ class RansacOptions:
                 f"{self.min_iterations} and {self.max_iterations}"
             )
         if self.lo_steps < 0 or self.final_steps < 0:
-            raise ValueError(f"steps cannot be negative, got {self.lo_steps} and {self.final_steps}")
+            raise ValueError(
+                f"lo_steps and final_steps cannot be negative, got {self.lo_steps} and {self.final_steps}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

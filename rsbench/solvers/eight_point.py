@@ -37,7 +37,7 @@ def eight_point(x0: FloatArray, x1: FloatArray) -> FloatArray | None:
     """
     T0, T1 = normalising_transform(x0[:, :2]), normalising_transform(x1[:, :2])
     rows = (x1 @ T1.T)[:, :, None] * (x0 @ T0.T)[:, None, :]
-    _, s, Vt = np.linalg.svd(rows.reshape(-1, 9), full_matrices=True)
+    _, s, Vt = np.linalg.svd(rows.reshape(-1, 9), full_matrices=len(rows) < 9)
     if not s[7] > _ROUNDING * s[0]:
         return None
     return T1.T @ Vt[-1].reshape(3, 3) @ T0

@@ -89,7 +89,7 @@ def scaled_translation(pairs: FloatArray, w: FloatArray, limit: float) -> FloatA
     norms = np.array([np.linalg.norm(m), np.linalg.norm(beta)])
     if not np.all(norms > 0.0):
         return None
-    _, _, Vt = np.linalg.svd(np.column_stack([m / norms[0], beta / norms[1]]), full_matrices=True)
+    _, _, Vt = np.linalg.svd(np.column_stack([m / norms[0], beta / norms[1]]), full_matrices=n < 4)
     d, factor = Vt[-1, :3] / norms[0], Vt[-1, 3] / norms[1]
     if not abs(factor) * limit > np.linalg.norm(d):
         return None

@@ -55,11 +55,14 @@ def system_rows(matches: FloatArray, side: Side, rig: StereoRig, shutter: Rollin
 
 def null_vector(A: FloatArray) -> tuple[FloatArray | None, str]:
     """X (columns,) with A X = 0, by the SVD of A with unit columns; or None and what makes it ambiguous."""
+    columns = A.shape[1]
+    if len(A) < columns - 1:
+        return None, f"{len(A)} equations for {columns} unknowns"
     norms = np.linalg.norm(A, axis=0)
     if not np.min(norms) > _ROUNDING * np.max(norms):
         return None, "an unknown has no influence on any match: the motion or the scene is degenerate"
-    _, s, Vt = np.linalg.svd(A / norms, full_matrices=True)
-    if not s[A.shape[1] - 2] > _ROUNDING * s[0]:
+    _, s, Vt = np.linalg.svd(A / norms, full_matrices=len(A) < columns)
+    if not s[columns - 2] > _ROUNDING * s[0]:
         return None, "the linear system has more than one solution: degenerate motion, scene or readout ratio"
     return Vt[-1] / norms, ""
 

@@ -22,6 +22,7 @@ from rsbench.solvers.optimise import Minimum, levenberg_marquardt
 from rsbench.solvers.packed import Packed, pack
 
 _SCREEN_ITERATIONS, _SCREEN_MATCHES, _SAMPLE_ITERATIONS = 6, 150, 4
+_LEAST_IN_FRONT = 0.75
 _LEAST_NOISE_PX = 0.01
 """Noise assumed at least when judging whether data determine a rotation: exact data fit anything exactly."""
 
@@ -137,7 +138,9 @@ class RefinedSolver(Solver):
         # Tracks measure d in metres, however short it is; pairs only the direction of d well.
         linked = len(packed.tracks) >= 3
         metric = linked or (scale_sigma <= self.max_scale_sigma and not at_limit)
-        direction_known = direction_sigma <= self.max_direction_sigma
+        # Without parallax, noise looks like translation, but half of the points come out behind the cameras.
+        in_front = linked or packed.in_front(best.theta) >= _LEAST_IN_FRONT * len(packed.pairs)
+        direction_known = in_front and direction_sigma <= self.max_direction_sigma
         reasons = [] if metric else ["the length of d is not determined by these matches"]
         reasons += [] if direction_known else ["the direction of d is not determined: too little translation"]
         return MotionEstimate(

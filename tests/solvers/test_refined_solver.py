@@ -1,0 +1,222 @@
+"""Maximum likelihood: exactness, agreement with an independent exact solver, what it says about itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import poselib
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from rsbench.benchmark.simulation import SimulationOptions, random_motion, simulate
+from rsbench.core import so3
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.metrics import rotation_error, scale_error, translation_error
+from rsbench.core.motion import MOTION_MODELS, LinearMotion, Motion
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.base import MotionEstimate
+from rsbench.solvers.refined import RefinedSolver
+
+RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
+SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
+GLOBAL = RollingShutter(height=900, readout_ratio=0.0)
+W, D = np.array([0.012, -0.02, 0.016]), np.array([0.2, -0.12, 0.18])
+
+
+def solver_of(model: str, use_tracks: bool = True) -> RefinedSolver:
+    return RefinedSolver(motion_model="twist" if model == "twist" else "linear", use_tracks=use_tracks)
+
+
+def data(
+    motion: Motion,
+    pairs: int = 0,
+    tracks: int = 0,
+    noise_px: float = 0.0,
+    shutter: RollingShutter = SHUTTER,
+    seed: int = 0,
+    plane: bool = False,
+) -> Correspondences:
+    options = SimulationOptions(pairs=pairs, tracks=tracks, noise_px=noise_px, shape="plane" if plane else "box")
+    return simulate(RIG, shutter, motion, options, np.random.default_rng(seed)).correspondences
+
+
+def assert_motion(estimate: MotionEstimate, motion: Motion, tolerance: float) -> None:
+    assert estimate.success, estimate.reason
+    np.testing.assert_allclose(estimate.w, motion.w, atol=tolerance)
+    np.testing.assert_allclose(estimate.d, motion.d, atol=tolerance)
+
+
+@pytest.mark.parametrize("model", list(MOTION_MODELS))
+@pytest.mark.parametrize("sets", ["pairs", "tracks", "both"])
+@given(seed=st.integers(0, 10_000), angle=st.floats(0.5, 6.0), distance=st.floats(0.1, 0.5))
+@settings(deadline=None, max_examples=12)
+def test_exact_on_exact_data(model: str, sets: str, seed: int, angle: float, distance: float) -> None:
+    rng = np.random.default_rng(seed)
+    motion = random_motion(rng, np.radians(angle), distance, "twist" if model == "twist" else "linear")
+    # Pairs hold the length of d through w x baseline alone.
+    assume(sets != "pairs" or np.linalg.norm(motion.w[1:]) > 0.3 * np.linalg.norm(motion.w))
+    try:
+        c = data(motion, pairs=0 if sets == "tracks" else 40, tracks=0 if sets == "pairs" else 15, seed=seed)
+    except ValueError:
+        assume(False)
+    estimate = solver_of(model).estimate(c, RIG, SHUTTER)
+    assert_motion(estimate, motion, 1e-6)
+    assert estimate.metric and estimate.direction_known and not estimate.reason
+
+
+@pytest.mark.parametrize("model", list(MOTION_MODELS))
+def test_three_tracks_suffice(model: str) -> None:
+    motion = MOTION_MODELS[model](W, D)
+    for seed in range(10):
+        c = data(motion, tracks=3, seed=seed)
+        assert_motion(solver_of(model).estimate(c, RIG, SHUTTER), motion, 1e-7)
+        (proposal,) = solver_of(model).propose(c, RIG, SHUTTER)
+        assert_motion(proposal, motion, 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("w", "d", "plane"),
+    [
+        ([0.0, 0.0, 0.0], [0.2, 0.1, 0.3], False),
+        ([0.0, 0.0, 0.0], [0.0, 0.0, 0.3], False),
+        ([0.0, 0.0, 0.0], [0.3, 0.0, 0.0], True),
+        ([0.01, -0.03, 0.02], [0.0, 0.0, 0.0], False),
+        ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], False),
+        ([0.01, -0.03, 0.02], [0.2, 0.1, -0.1], True),
+    ],
+)
+def test_tracks_solve_what_pairs_cannot(w: list[float], d: list[float], plane: bool) -> None:
+    motion = LinearMotion(np.array(w), np.array(d))
+    estimate = RefinedSolver().estimate(data(motion, tracks=40, plane=plane), RIG, SHUTTER)
+    assert_motion(estimate, motion, 1e-7)
+    assert estimate.metric
+
+
+@pytest.mark.parametrize("d", [[0.2, 0.1, 0.3], [0.0, 0.0, 0.3], [0.3, 0.0, 0.0], [0.0, 0.3, 0.0]])
+def test_pure_translation_of_pairs_gives_the_direction_without_length(d: list[float]) -> None:
+    motion = LinearMotion(np.zeros(3), np.array(d))
+    estimate = RefinedSolver().estimate(data(motion, pairs=100, noise_px=0.1), RIG, SHUTTER)
+    assert estimate.success and not estimate.metric and "length" in estimate.reason
+    # The bound is 0.05 degrees here.
+    assert np.degrees(translation_error(estimate.d, motion.d)) < 0.5
+    assert np.degrees(rotation_error(estimate.w, motion.w)) < 0.05
+
+
+def test_yaw_and_forward_of_pairs_has_no_length() -> None:
+    """w x baseline is parallel to d: a car in a curve."""
+    motion = LinearMotion(np.array([0.0, 0.03, 0.0]), np.array([0.0, 0.0, 0.3]))
+    estimate = RefinedSolver().estimate(data(motion, pairs=100, noise_px=0.5), RIG, SHUTTER)
+    assert estimate.success and not estimate.metric
+    assert np.linalg.norm(estimate.d) <= RefinedSolver().max_translation_m * 1.001
+
+
+def test_pure_rotation_has_no_direction() -> None:
+    motion = LinearMotion(np.array([0.01, -0.03, 0.02]), np.zeros(3))
+    for use_tracks in (True, False):
+        c = data(motion, tracks=60, noise_px=0.5)
+        estimate = RefinedSolver(use_tracks=use_tracks).estimate(c, RIG, SHUTTER)
+        assert estimate.success and not estimate.direction_known and "direction" in estimate.reason
+        assert np.degrees(rotation_error(estimate.w, motion.w)) < 0.2
+
+
+def poselib_generalised(c: Correspondences) -> tuple[FloatArray, FloatArray]:
+    """(R, t) of the rig from all left-left and right-right matches, started near the answer."""
+    camera = RIG.camera
+    model = {
+        "model": "PINHOLE",
+        "width": camera.width,
+        "height": camera.height,
+        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
+    }
+    matches = [poselib.PairwiseMatches() for _ in range(2)]
+    for k, rows in enumerate((c.left, c.right)):
+        matches[k].cam_id1 = matches[k].cam_id2 = k
+        matches[k].x1, matches[k].x2 = rows[:, :2], rows[:, 2:]
+    extrinsics = [poselib.CameraPose(), poselib.CameraPose()]
+    extrinsics[0].t, extrinsics[1].t = RIG.offset("left"), RIG.offset("right")
+    bundle = {"loss_type": "TRIVIAL", "max_iterations": 200, "gradient_tol": 1e-14, "step_tol": 1e-14}
+    start = poselib.CameraPose()
+    start.R, start.t = so3.exp(W), D
+    pose, _ = poselib.refine_generalized_relative_pose(
+        matches, start, extrinsics, [model, model], extrinsics, [model, model], bundle
+    )
+    return np.array(pose.R), np.array(pose.t)
+
+
+def test_without_readout_it_is_the_global_shutter_optimum_of_poselib() -> None:
+    motion = LinearMotion(W, D)
+    for seed in range(3):
+        c = data(motion, pairs=60, noise_px=0.5, shutter=GLOBAL, seed=seed)
+        estimate = RefinedSolver().estimate(c, RIG, GLOBAL)
+        R, t = poselib_generalised(c)
+        assert np.degrees(rotation_error(estimate.w, so3.log(R))) < 1e-6
+        assert np.degrees(translation_error(estimate.d, t)) < 1e-5
+        assert scale_error(estimate.d, t) < 1e-5
+
+
+def test_sign_is_that_of_points_in_front() -> None:
+    """Cost alone flips d now and then with few noisy matches."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        motion = random_motion(rng, np.radians(2.0), 0.3)
+        estimate = RefinedSolver().estimate(data(motion, pairs=20, noise_px=0.5, seed=seed), RIG, SHUTTER)
+        assert translation_error(estimate.d, motion.d) < np.pi / 2
+
+
+@pytest.mark.parametrize("sets", ["pairs", "tracks"])
+def test_covariance_predicts_the_errors(sets: str) -> None:
+    """Normalised squared errors have mean 6; 150 trials scatter by sqrt(2 6 / 150) = 0.28."""
+    squares, noises = [], []
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        # Rotation about the vertical and the optical axis keeps the length of d observable from pairs.
+        motion = LinearMotion(W + 0.004 * rng.standard_normal(3), D + 0.02 * rng.standard_normal(3))
+        c = data(
+            motion,
+            pairs=80 if sets == "pairs" else 0,
+            tracks=80 if sets == "tracks" else 0,
+            noise_px=0.3,
+            seed=seed,
+        )
+        estimate = RefinedSolver().estimate(c, RIG, SHUTTER)
+        assert estimate.covariance is not None and estimate.noise_px is not None
+        error = np.concatenate([estimate.w - motion.w, estimate.d - motion.d])
+        squares.append(error @ np.linalg.solve(estimate.covariance, error))
+        noises.append(estimate.noise_px)
+    # Plus 6 % for the noise being estimated from about 150 residuals, and the curvature of the scale.
+    assert 5.0 < np.mean(squares) < 7.6
+    assert np.mean(noises) == pytest.approx(0.3, rel=0.02)
+
+
+def test_repeated_matches_do_not_determine_a_rotation() -> None:
+    motion = LinearMotion(W, D)
+    c = data(motion, pairs=20, tracks=20)
+    for repeated in (
+        Correspondences(tracks=c.tracks[[0] * 20]),
+        Correspondences(left=c.left[[0] * 20], right=c.right[[0] * 20]),
+    ):
+        assert not RefinedSolver().estimate(repeated, RIG, SHUTTER).success
+
+
+def test_the_wrong_motion_model_costs_what_is_known() -> None:
+    """Twist data under the paper's model: about 0.036 and 0.75 degrees at 2 degrees per frame."""
+    errors = []
+    for seed in range(20):
+        motion = random_motion(np.random.default_rng(seed), np.radians(2.0), 0.3, "twist")
+        estimate = RefinedSolver().estimate(data(motion, pairs=100, seed=seed), RIG, SHUTTER)
+        errors.append([rotation_error(estimate.w, motion.w), translation_error(estimate.d, motion.d)])
+    e_R, e_T = np.degrees(np.median(errors, axis=0))
+    assert 0.015 < e_R < 0.08 and 0.35 < e_T < 1.5
+
+
+def test_tracks_that_the_pairs_repeat_count_once() -> None:
+    motion = LinearMotion(W, D)
+    c = data(motion, tracks=30, noise_px=0.3)
+    both = Correspondences(left=c.tracks[:, [0, 1, 4, 5]], right=c.tracks[:, [2, 3, 6, 7]], tracks=c.tracks)
+    alone, repeated = (RefinedSolver().estimate(each, RIG, SHUTTER) for each in (c, both))
+    np.testing.assert_allclose(alone.w, repeated.w, atol=1e-10)
+    assert alone.covariance is not None and repeated.covariance is not None
+    np.testing.assert_allclose(alone.covariance, repeated.covariance, rtol=1e-6)
