@@ -29,6 +29,7 @@ class HouseStyle:
     shutters: str = "shutter_0"
     framed: bool = True
     gable_front: bool = True
+    door: bool = True
     jetty: float = 0.25
     pitch: float = 1.1
     """Rise of the roof over half its span."""
@@ -70,7 +71,7 @@ def window(
         rng = np.random.default_rng(flowers)
         pieces.append(box("planks", (-w, -0.34, -0.18), (w, -0.12, 0.02), turned=True))
         for x in np.arange(-w + 0.1, w, 0.16):
-            bloom = lump(str(rng.choice(["leaves", "flowers"])), rng, (0.13, 0.12, 0.14), 0.25, 2)
+            bloom = lump(str(rng.choice(["leaves", "flowers"])), rng, (0.13, 0.12, 0.14), 0.3, 1)
             pieces += placed([bloom], (float(x), -0.23, 0.06 + 0.06 * rng.random()))
     return pieces
 
@@ -193,7 +194,7 @@ def _storey_front(rng: np.random.Generator, style: HouseStyle, storey: int) -> l
     count = max(1, int((w - 0.8) / 1.75))
     middles = (np.arange(count) - (count - 1) / 2) * (w - 0.6) / count
     wall = style.ground if storey == 0 else style.wall
-    door_at = int(rng.integers(count)) if storey == 0 else -1
+    door_at = int(rng.integers(count)) if storey == 0 and style.door else -1
     holes, pieces, openings = [], [], []
     for k, x in enumerate(middles):
         x = float(x)

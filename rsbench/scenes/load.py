@@ -13,6 +13,7 @@ from rsbench.cards import card_path, choices, parse_card, read_toml
 from rsbench.errors import RsbenchError
 from rsbench.scenes.castle import CastleParameters, build_castle
 from rsbench.scenes.model import Light, Scene, SceneMesh, Viewpoint
+from rsbench.scenes.old_town import OldTownParameters, build_old_town
 
 Rgb: TypeAlias = tuple[float, float, float]
 
@@ -77,9 +78,18 @@ class CastleCard(SceneCard):
     parameters: CastleParameters = field(default_factory=CastleParameters)
 
 
+@dataclass(frozen=True, kw_only=True)
+class OldTownCard(SceneCard):
+    builder: Literal["old-town"]
+    parameters: OldTownParameters = field(default_factory=OldTownParameters)
+
+
 Build: TypeAlias = Callable[[Any, int], tuple[SceneMesh, ...]]
 
-BUILDERS: dict[str, tuple[type[Any], Build]] = {"castle": (CastleCard, build_castle)}
+BUILDERS: dict[str, tuple[type[Any], Build]] = {
+    "castle": (CastleCard, build_castle),
+    "old-town": (OldTownCard, build_old_town),
+}
 """Builder name to its card and the function of (parameters, seed) that makes the meshes."""
 
 

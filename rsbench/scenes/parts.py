@@ -98,10 +98,10 @@ def leaned(pieces: Iterable[Piece], pitch_deg: float = 0.0, roll_deg: float = 0.
 
 def joined(pieces: Sequence[Piece]) -> Piece:
     """Pieces of one surface as one, which then shares one texture offset."""
-    fields = ("points", "uv", "normals")
-    return replace(
-        pieces[0], **{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in fields}
+    points, uv, normals = (
+        np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("points", "uv", "normals")
     )
+    return Piece(pieces[0].surface, points, uv, normals)
 
 
 def box(surface: str, low: Sequence[float], high: Sequence[float], *, turned: bool = False) -> Piece:

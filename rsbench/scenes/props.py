@@ -60,9 +60,9 @@ def _sprays(rng: np.random.Generator, leaf: str, radii: FloatArray, count: int) 
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     centre = direction * radii * rng.uniform(0.9, 1.2, (count, 1))
-    a = rng.normal(size=(count, 3)) * 0.13
+    a = rng.normal(size=(count, 3)) * 0.08
     b = np.cross(a, rng.normal(size=(count, 3)))
-    b *= 0.15 / np.linalg.norm(b, axis=1, keepdims=True)
+    b *= 0.12 / np.linalg.norm(b, axis=1, keepdims=True)
     quads = np.stack([centre - a, centre + b, centre + a, centre - a, centre + a, centre - b], axis=1)
     return [flat(leaf, quads.reshape(-1, 3, 3))]
 
@@ -136,7 +136,7 @@ def cart(rng: np.random.Generator, load: str = "straw") -> list[Piece]:
         bed += [beam("timber", (x, side * 1.05, 0.6), (x, side * 1.12, 1.42), 0.08) for x in (-1.1, 0.0, 1.1)]
         bed.append(beam("timber", (-1.2, side * 0.8, 0.6), (3.0, side * 0.62, 0.42), 0.09))
     bed.append(block("planks", (0.05, 1.2, 0.6), (-1.2, 0, 0.75)))
-    bed += placed([lump(load, rng, (1.15, 0.6, 0.55), 0.12)], (0, 0, 1.0))
+    bed += placed([lump(load, rng, (0.95, 0.5, 0.5), 0.1)], (0, 0, 1.0))
     pieces = placed(leaned(bed, 0, 4), (0, 0, 0.08))
     for side in (-0.78, 0.78):
         pieces += placed(wheel(0.62), (-0.1, side, 0))

@@ -197,8 +197,7 @@ def leaves(paint: Painter, greens: Sequence[Colour], size: float = 0.11) -> Byte
 def cloth(paint: Painter, stripes: Sequence[Colour], width: float = 0.3) -> Bytes:
     """Woven cloth with stripes up the texture, folds and stains."""
     cells = cut_courses(paint.rng, paint.pixels, paint.metres, (width * 0.8, width * 1.2), (90.0, 100.0))
-    band = np.minimum(cells.index // (cells.count // len(np.unique(cells.index[:, 0]))), 10**6) % len(stripes)
-    image = np.asarray(stripes, dtype=np.float32).T[:, band.T]
+    image = np.asarray(stripes, dtype=np.float32).T[:, cells.course.T % len(stripes)]
     image = image * (1 + 0.13 * paint.grain() + 0.10 * paint.fine() + 0.10 * paint.broad())
     return to_bytes(blend(image, (0.3, 0.25, 0.2), ramp(paint.smooth() + paint.broad(), 0.8, 2.0) * 0.6))
 

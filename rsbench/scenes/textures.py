@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Field = NDArray[np.float32]
+_FINENESS = 4  # steps per pixel of the look-up tables of borders
+
 Colour = tuple[float, float, float]
 NoiseKind = Literal["broad", "smooth", "fine", "grain"]
 
@@ -85,6 +87,8 @@ class Cells:
 
     index: NDArray[np.intp]
     """Which block."""
+    course: NDArray[np.intp]
+    """Which course, from the top."""
     edge: Field
     """Distance to the block's border, metres."""
     along: Field
@@ -103,7 +107,6 @@ def cut_courses(
     *,
     corner: float = 0.0,
     wobble: tuple[Field, Field] | None = None,
-    bond: bool = False,
 ) -> Cells:
     """Courses of blocks as masons, tilers and joiners lay them, periodic in both directions.
 
@@ -115,33 +118,27 @@ def cut_courses(
         block: least and greatest length of a block, metres.
         corner: radius of the rounding of the blocks, metres.
         wobble: displacements (y, x) of the borders in metres, each (pixels, pixels).
-        bond: every second course is shifted by half a block instead of at random.
     """
     scale = pixels / metres
     grid = np.arange(pixels, dtype=np.float32)
     dy, dx = (0.0, 0.0) if wobble is None else (wobble[0] * np.float32(scale), wobble[1] * np.float32(scale))
-    y = np.mod(grid[:, None] + dy + np.zeros((1, pixels), np.float32), np.float32(pixels))
-    x = grid[None, :] + dx
+    y = _wrapped(grid[:, None] + dy + np.zeros((1, pixels), np.float32), pixels)
     tops = _cuts(rng, metres, course) * np.float32(scale)
-    row = np.searchsorted(tops, y, side="right") - 1
+    row = _lookup([tops], pixels)[0][(y * _FINENESS).astype(np.intp)]
 
     cuts = [_cuts(rng, metres, block) * np.float32(scale) for _ in range(len(tops) - 1)]
-    if bond:
-        cuts = [cuts[0]] * len(cuts)
-        start = (np.arange(len(cuts)) % 2 * (block[0] + block[1]) / 4 * scale).astype(np.float32)
-    else:
-        start = rng.random(len(cuts), dtype=np.float32) * np.float32(pixels)
-    x = np.mod(x - start[row], np.float32(pixels))
-    # One sorted table for all courses: course number times width plus the cut's position in it.
-    table = np.concatenate([k * pixels + cut[:-1] for k, cut in enumerate(cuts)] + [np.array([1e9])])
-    index = np.searchsorted(table, row * np.float64(pixels) + x, side="right") - 1
+    start = rng.random(len(cuts), dtype=np.float32) * np.float32(pixels)
+    x = _wrapped(grid[None, :] + dx - start[row], pixels)
+    index = _lookup(cuts, pixels).ravel()[row * (_FINENESS * pixels + 1) + (x * _FINENESS).astype(np.intp)]
     left = np.concatenate([cut[:-1] for cut in cuts])
     right = np.concatenate([cut[1:] for cut in cuts])
     from_left, to_right = x - left[index], right[index] - x
     from_top, to_bottom = y - tops[row], tops[row + 1] - y
     edge = _rounded(np.minimum(from_left, to_right), np.minimum(from_top, to_bottom), corner * scale)
+    edge = np.maximum(edge, 0)  # a look-up table puts borders up to a quarter of a pixel off
     return Cells(
         index=index,
+        course=row,
         edge=edge * np.float32(1 / scale),
         along=from_left / (from_left + to_right),
         across=from_top / (from_top + to_bottom),
@@ -187,6 +184,20 @@ def _lattice_positions(size: int, cells: int) -> tuple[NDArray[np.intp], Field]:
     index = position.astype(np.intp)
     t = position - index.astype(np.float32)
     return index % cells, (t * t * (np.float32(3) - np.float32(2) * t)).astype(np.float32)
+
+
+def _wrapped(position: Field, size: int) -> Field:
+    """Positions brought into [0, size] by whole periods."""
+    wrapped: Field = position - np.floor(position * np.float32(1 / size)) * np.float32(size)
+    return np.clip(wrapped, 0, size)
+
+
+def _lookup(cuts: Sequence[Field], pixels: int) -> NDArray[np.intp]:
+    """Number of the interval, counted through all lists of cuts, at quarter pixels: (lists, 4 pixels + 1)."""
+    positions = np.arange(_FINENESS * pixels + 1) / _FINENESS
+    first = np.cumsum([0, *(len(cut) - 1 for cut in cuts[:-1])])
+    inside = [np.searchsorted(cut[1:-1], positions, side="right") for cut in cuts]
+    return np.stack(inside) + first[:, None]
 
 
 def _cuts(rng: np.random.Generator, length: float, step: tuple[float, float]) -> Field:
