@@ -20,7 +20,7 @@ demo: $(STAMP)
 test: $(STAMP)
 	@echo "== format"; $(BIN)/ruff format --check .
 	@echo "== lint";   $(BIN)/ruff check .
-	@echo "== types";  $(BIN)/mypy --explicit-package-bases
+	@echo "== types";  $(BIN)/mypy
 	@echo "== layers"; $(BIN)/lint-imports
 	@echo "== tests";  $(BIN)/python -m pytest
 

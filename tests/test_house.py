@@ -149,7 +149,7 @@ def test_renderer_cards_load(name: str) -> None:
 
 @pytest.mark.parametrize("name", list_cards("solvers"))
 def test_solver_cards_load(name: str) -> None:
-    assert load_solver_card(name).summary
+    assert load_solver_card(name).description
 
 
 @pytest.mark.parametrize("name", list_cards("datasets"))

@@ -116,7 +116,7 @@ def statistics(values: FloatArray, seed: int) -> dict[str, float | None]:
     if np.any(np.isnan(values)):
         return dict.fromkeys(names)
     median, mean = bootstrap_interval(values, _median, seed), bootstrap_interval(values, _mean, seed)
-    numbers = [np.median(values), *median, np.mean(values), *mean, np.quantile(values, 0.9)]
+    numbers: list[Any] = [np.median(values), *median, np.mean(values), *mean, np.quantile(values, 0.9)]
     return {name: float(number) for name, number in zip(names, numbers, strict=True)}
 
 

@@ -24,11 +24,18 @@ def list_(kind: Annotated[Kind, typer.Argument(help="What to list.")]) -> None:
 
     from rsbench.cards import list_cards, read_toml
     from rsbench.cli.console import print_table
+    from rsbench.solvers.registry import list_solvers
 
+    cards = list_cards(kind.value)
     rows = [
         {"name": name, "description": read_toml(path).get("description", ""), "card": str(path)}
-        for name, path in list_cards(kind.value).items()
+        for name, path in cards.items()
     ]
+    if kind is Kind.solvers:
+        plugins = [name for name in list_solvers() if name not in cards]
+        rows += [
+            {"name": name, "description": "", "card": "entry point of an installed package"} for name in plugins
+        ]
     print_table(
         f"{kind.value} (a name, or a path ending in .toml, is accepted wherever a card is)", pd.DataFrame(rows)
     )

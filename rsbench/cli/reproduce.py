@@ -4,35 +4,119 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-EPILOG = """[bold]Example[/bold]
+if TYPE_CHECKING:
+    import pandas as pd
 
-  rsbench reproduce images --out results --data data       [dim](what results/images holds)[/dim]"""
+EPILOG = """[bold]Examples[/bold]
+
+  rsbench reproduce images --out results --data data       [dim](what results/images holds)[/dim]
+
+  rsbench reproduce fig3 --out results                     [dim](simulated points: results/fig3)[/dim]
+
+  rsbench reproduce claims --out results                   [dim](results/claims; runs fig3 first)[/dim]"""
 
 
 class Target(StrEnum):
     """What can be reproduced."""
 
     images = "images"
+    fig3 = "fig3"
+    claims = "claims"
 
 
 def reproduce(
     target: Annotated[
-        Target, typer.Argument(help="images: the paper's image experiment in the three built-in scenes.")
+        Target,
+        typer.Argument(
+            help="images: the paper's image experiment in the three built-in scenes. fig3: its Figure 3 on "
+            "simulated points. claims: what became of each claim of its text."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("results"),
-    data: Annotated[Path, typer.Option(help="Folder for the rendered data.")] = Path("data"),
+    data: Annotated[Path, typer.Option(help="Folder for the rendered data and simulated trials.")] = Path("data"),
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes of simulations; default: one per core.")
+    ] = None,
 ) -> None:
-    """Make the committed results again: render what is missing, run, score, draw."""
+    """Make the committed results again: render or simulate what is missing, run, score, draw."""
+    if target is Target.images:
+        _images(out, data)
+    else:
+        _fig3(out, data, workers)
+        if target is Target.claims:
+            _claims(out, data, workers)
+
+
+def _images(out: Path, data: Path) -> None:
     from rsbench.cli.evaluate import evaluate_dataset
     from rsbench.cli.generate import generate
 
     generate("paper", data / "paper", None, workers=1)
-    command = f"rsbench reproduce {target.value}"
-    evaluate_dataset(data / "paper", out / target.value, None, "rs-stereo-refined", 0, command)
+    evaluate_dataset(data / "paper", out / "images", None, "rs-stereo-refined", 0, "rsbench reproduce images")
+
+
+def _simulate(name: str, points: int | None, data: Path, workers: int | None, command: str) -> pd.DataFrame:
+    """Summary of a sweep, with another number of matches per camera if given; its trials stay in ``data``."""
+    from rsbench.benchmark.sweeps import load_sweep
+    from rsbench.cli.simulate import run_and_summarise
+
+    card = load_sweep(name)
+    folder = data / "simulated" / (name if points is None else f"{name}-{points}")
+    return run_and_summarise(
+        card if points is None else card.with_setting(points=points), folder, workers, command
+    )
+
+
+def _fig3(out: Path, data: Path, workers: int | None) -> None:
+    from rsbench.benchmark.provenance import provenance
+    from rsbench.benchmark.run_sweep import write_table
+    from rsbench.benchmark.sweeps import load_sweep
+    from rsbench.dataset.files import write_json
+    from rsbench.report.fig3 import SWEEPS, draw_fig3, setting_table
+
+    folder = out / "fig3"
+    folder.mkdir(parents=True, exist_ok=True)
+    command = "rsbench reproduce fig3"
+    for name in SWEEPS:
+        write_table(folder / f"{name}.csv", _simulate(name, None, data, workers, command))
+    cards = [load_sweep(name) for name in SWEEPS]
+    write_table(folder / "settings.csv", setting_table(cards))
+    seeds = {card.name: card.seed for card in cards}
+    write_json(folder / "provenance.json", provenance(command, sweeps=list(SWEEPS), seeds=seeds))
+    for path in draw_fig3(folder):
+        typer.echo(f"figure: {path}")
+
+
+def _claims(out: Path, data: Path, workers: int | None) -> None:
+    from rsbench.benchmark.claims import judge_claims
+    from rsbench.benchmark.provenance import provenance
+    from rsbench.benchmark.run_sweep import write_table
+    from rsbench.dataset.files import write_bytes, write_json
+    from rsbench.report.claims import claims_page
+    from rsbench.report.fig3 import SWEEPS, read_summaries
+
+    folder = out / "claims"
+    folder.mkdir(parents=True, exist_ok=True)
+    command = "rsbench reproduce claims"
+    for name in SWEEPS:
+        write_table(folder / f"{name}-9.csv", _simulate(name, 9, data, workers, command))
+    write_table(folder / "points.csv", _simulate("points", None, data, workers, command))
+    verdicts = judge_claims(
+        {
+            "100 + 100": read_summaries(out / "fig3", SWEEPS),
+            "9 + 9": read_summaries(folder, SWEEPS, "-9"),
+            "9 + 9 and more": read_summaries(folder, ("points",)),
+        }
+    )
+    write_table(folder / "claims.csv", verdicts)
+    page = folder / "claims.md"
+    write_bytes(page, claims_page(verdicts).encode())
+    write_json(folder / "provenance.json", provenance(command, sweeps=[*SWEEPS, "points"]))
+    typer.echo(f"claims: {page}")
 
 
 def register(app: typer.Typer) -> None:

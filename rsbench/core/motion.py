@@ -8,7 +8,8 @@ rolling shutter itself when data and solver disagree: a dataset names its model.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar, final
 
 import numpy as np
@@ -27,7 +28,7 @@ def _vector(value: ArrayLike, name: str) -> FloatArray:
     return v
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Motion(ABC):
     """Rigid motion of the body (the centre of the baseline)."""
 
@@ -38,9 +39,9 @@ class Motion(ABC):
 
     name: ClassVar[str]
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "w", _vector(self.w, "w"))
-        object.__setattr__(self, "d", _vector(self.d, "d"))
+    def __init__(self, w: ArrayLike, d: ArrayLike) -> None:
+        object.__setattr__(self, "w", _vector(w, "w"))
+        object.__setattr__(self, "d", _vector(d, "d"))
 
     @abstractmethod
     def body_from_world(self, tau: ArrayLike) -> Pose:
@@ -52,7 +53,7 @@ class Motion(ABC):
 
 
 @final
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class LinearMotion(Motion):
     """The paper's model, equations (2)-(5): R(tau) = exp(tau [w]x), t(tau) = tau d."""
 
@@ -68,17 +69,16 @@ class LinearMotion(Motion):
 
 
 @final
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class TwistMotion(Motion):
     """Constant body twist (a screw): the pose is exp(tau xi) with exp(xi) = (exp([w]x), d)."""
 
     name: ClassVar[str] = "twist"
-    v: FloatArray = field(init=False)
-    """Linear part of the twist, metres per frame period."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "v", np.linalg.solve(so3.left_jacobian(self.w), self.d))
+    @cached_property
+    def v(self) -> FloatArray:
+        """Linear part (3,) of the twist, metres per frame period."""
+        return np.asarray(np.linalg.solve(so3.left_jacobian(self.w), self.d), dtype=np.float64)
 
     def body_from_world(self, tau: ArrayLike) -> Pose:
         tau = np.asarray(tau, dtype=np.float64)[..., None]

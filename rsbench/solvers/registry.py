@@ -22,18 +22,15 @@ class SolverCard:
 
     name: str
     path: Path | None
-    summary: str
+    description: str
     solver: Solver
-    robust: dict[str, Any]
-    """The ``[robust]`` table, for ``rsbench.pipeline.motion``."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Content:
     class_: str
-    summary: str = ""
+    description: str = ""
     parameters: dict[str, Any] = field(default_factory=dict)
-    robust: dict[str, Any] = field(default_factory=dict)
 
 
 def list_solvers() -> list[str]:
@@ -65,7 +62,7 @@ def load_solver_card(name_or_path: str | Path) -> SolverCard:
         except Exception as error:
             raise RsbenchError(f"{where}: cannot be loaded: {error}") from error
         solver = _instance(cls, {}, text, where)
-        return SolverCard(name=text, path=None, summary="", solver=solver, robust={})
+        return SolverCard(name=text, path=None, description="", solver=solver)
     if not text.endswith(".toml") and "/" not in text and text not in list_cards("solvers"):
         raise RsbenchError(f"solver {text!r} does not exist{choices(text, list_solvers())}; a path ends in .toml")
     path = card_path("solvers", name_or_path)
@@ -73,7 +70,7 @@ def load_solver_card(name_or_path: str | Path) -> SolverCard:
     content = parse_card(_Content, {("class_" if key == "class" else key): data[key] for key in data}, str(path))
     cls = _import(content.class_, f"{path}: class = {content.class_!r}")
     solver = _instance(cls, content.parameters, path.stem, str(path))
-    return SolverCard(name=path.stem, path=path, summary=content.summary, solver=solver, robust=content.robust)
+    return SolverCard(name=path.stem, path=path, description=content.description, solver=solver)
 
 
 def _entry_points() -> dict[str, metadata.EntryPoint]:

@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, get_args
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,8 +24,8 @@ from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision import forward_warp
+from rsbench.vision.resample import Interpolation, resample
 
-_INTERPOLATION = {"cubic": cv2.INTER_CUBIC, "linear": cv2.INTER_LINEAR}
 _IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
 
 
@@ -34,14 +33,14 @@ _IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
 class WarpOptions:
     """How the source image becomes the target image."""
 
-    interpolation: Literal["cubic", "linear"] = "cubic"
+    interpolation: Interpolation = "cubic"
     tear_px: float = 0.2
     """Two neighbours are torn apart when a step of depth between them, which neither side's surface explains,
     moves them apart by more than this many px; so the mesh is at most this wrong between surfaces."""
 
     def __post_init__(self) -> None:
-        if self.interpolation not in _INTERPOLATION:
-            raise ValueError(f"interpolation must be one of {sorted(_INTERPOLATION)}, got {self.interpolation!r}")
+        if self.interpolation not in get_args(Interpolation):
+            raise ValueError(f"interpolation must be one of {get_args(Interpolation)}, got {self.interpolation!r}")
         if not self.tear_px > 0.0:
             raise ValueError(f"tear_px must be positive, got {self.tear_px}")
 
@@ -73,11 +72,11 @@ def relative_row_maps(
 
 def inverse_depth(depth: NDArray[Any], sky_mask: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
     """1 / depth (H, W): 0 at infinity and under ``sky_mask``, NaN where the depth is unknown (not positive)."""
-    known = depth > 0.0
-    rho = np.where(known, 1.0 / np.where(known, depth, np.float32(1.0)), np.float32(np.nan))
+    rho = np.full(depth.shape, np.nan, dtype=np.float32)
+    np.divide(1.0, depth, out=rho, where=depth > 0.0, casting="same_kind")
     if sky_mask is not None:
         rho[sky_mask] = 0.0
-    return np.ascontiguousarray(rho, dtype=np.float32)
+    return rho
 
 
 def warp(
@@ -110,34 +109,11 @@ def warp(
     forward_warp.draw_cells(rho, joined, M, b, source_map, buffer)
     mask = buffer >= 0.0
     return Corrected(
-        image=sample(image, source_map, mask, options.interpolation),
+        image=resample(image, source_map, options.interpolation),
         mask=mask,
         source_map=source_map,
         depth=_depth(buffer, mask),
     )
-
-
-def sample(
-    image: NDArray[Any],
-    source_map: NDArray[np.float32],
-    mask: NDArray[np.bool_],
-    interpolation: Literal["cubic", "linear"] = "cubic",
-) -> NDArray[Any]:
-    """Image (H, W[, C]) at ``source_map`` (H, W, 2), 0 outside ``mask``; resampled in float32, rounded once."""
-    # remap is exact in the position for float32 only; for uint8 it rounds, and NaN has no address.
-    seen = np.where(mask[..., None], source_map, np.float32(0.0))
-    values = cv2.remap(
-        np.asarray(image, dtype=np.float32),
-        seen,
-        None,
-        _INTERPOLATION[interpolation],
-        borderMode=cv2.BORDER_REPLICATE,
-    )
-    values = values.reshape(source_map.shape[:2] + image.shape[2:])
-    values[~mask] = 0.0
-    if image.dtype == np.float32:
-        return values
-    return np.clip(np.rint(values), 0, np.iinfo(image.dtype).max).astype(image.dtype)
 
 
 def correct_frame(
@@ -197,8 +173,9 @@ def _target_time(frame: int, target_tau: float | None) -> float:
 
 
 def _depth(buffer: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    with np.errstate(divide="ignore"):
-        return np.where(mask, np.float32(1.0) / np.abs(buffer), np.float32(np.nan))
+    depth = np.full(buffer.shape, np.nan, dtype=np.float32)
+    with np.errstate(divide="ignore"):  # at infinity
+        return np.divide(np.float32(1.0), buffer, out=depth, where=mask)
 
 
 def _check(

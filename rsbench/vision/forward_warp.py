@@ -100,56 +100,81 @@ def draw_mesh(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F32
         if y == 0:
             continue
         for x in range(width - 1):
-            above = joined[y - 1, x] & RIGHT
-            beside = joined[y - 1, x] & BELOW
-            below = joined[y, x] & RIGHT
-            across = joined[y - 1, x + 1] & BELOW
-            if above and beside:
-                _triangle(upper[x], upper[x + 1], lower[x], x, y - 1, 1, 1, source_map, buffer)
-            if below and across:
-                _triangle(lower[x + 1], lower[x], upper[x + 1], x + 1, y, -1, -1, source_map, buffer)
-            # Where the quad is torn, the other diagonal may still join three of its corners.
-            if not (above and beside and below and across):
-                if above and across:
-                    _triangle(upper[x + 1], upper[x], lower[x + 1], x + 1, y - 1, -1, 1, source_map, buffer)
-                if below and beside:
-                    _triangle(lower[x], lower[x + 1], upper[x], x, y, 1, -1, source_map, buffer)
+            top, bottom = joined[y - 1, x] & RIGHT != 0, joined[y, x] & RIGHT != 0
+            left, right = joined[y - 1, x] & BELOW != 0, joined[y - 1, x + 1] & BELOW != 0
+            whole = top and bottom and left and right
+            if (top and left) or (bottom and right):
+                # Both triangles of a whole quad in one go; of a torn one those whose two sides are whole.
+                first, second = whole or (top and left), whole or (bottom and right)
+                _quad(
+                    upper[x], upper[x + 1], lower[x], lower[x + 1], x, y - 1, 1, first, second, source_map, buffer
+                )
+            if not whole and ((top and right) or (bottom and left)):
+                # The other diagonal may still join three corners: the same quad, mirrored.
+                first, second = top and right, bottom and left
+                _quad(
+                    upper[x + 1],
+                    upper[x],
+                    lower[x + 1],
+                    lower[x],
+                    x + 1,
+                    y - 1,
+                    -1,
+                    first,
+                    second,
+                    source_map,
+                    buffer,
+                )
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _triangle(
-    corner: F64, first: F64, second: F64, sx: float, sy: float, dx: float, dy: float, source_map: F32, buffer: F32
+def _quad(
+    a: F64,
+    b: F64,
+    c: F64,
+    d: F64,
+    x: int,
+    y: int,
+    side: int,
+    first: bool,
+    second: bool,
+    source_map: F32,
+    buffer: F32,
 ) -> None:
-    """Draw one triangle given by (target x, y, inverse depth) of its right-angled corner and the two ends.
+    """Draw triangles abc (if ``first``) and dcb (if ``second``); corners are (target x, y, inverse depth).
 
-    The corner is source pixel (sx, sy); ``first`` is (sx + dx, sy) and ``second`` (sx, sy + dy).
+    In the source, a is pixel (x, y), b (x + side, y), c (x, y + 1) and d (x + side, y + 1).
     """
     height, width = buffer.shape
-    ax, ay, az = corner[0], corner[1], corner[2]
-    ux, uy, uz = first[0] - ax, first[1] - ay, first[2] - az
-    vx, vy, vz = second[0] - ax, second[1] - ay, second[2] - az
-    left = max(0.0, np.ceil(ax + min(0.0, ux, vx) - _SLACK))
-    right = min(width - 1.0, np.floor(ax + max(0.0, ux, vx) + _SLACK))
-    if not left <= right:
+    start = max(0.0, np.ceil(min(min(a[0], b[0]), min(c[0], d[0])) - _SLACK))
+    stop = min(width - 1.0, np.floor(max(max(a[0], b[0]), max(c[0], d[0])) + _SLACK))
+    top = max(0.0, np.ceil(min(min(a[1], b[1]), min(c[1], d[1])) - _SLACK))
+    bottom = min(height - 1.0, np.floor(max(max(a[1], b[1]), max(c[1], d[1])) + _SLACK))
+    if not (start <= stop and top <= bottom):
         return
-    top = max(0.0, np.ceil(ay + min(0.0, uy, vy) - _SLACK))
-    bottom = min(height - 1.0, np.floor(ay + max(0.0, uy, vy) + _SLACK))
-    if not top <= bottom:
-        return
-    scale = 1.0 / (ux * vy - uy * vx)
-    if not abs(scale) < _DEGENERATE:
-        return
+    ux, uy, vx, vy = b[0] - a[0], b[1] - a[1], c[0] - a[0], c[1] - a[1]
+    wx, wy, zx, zy = c[0] - d[0], c[1] - d[1], b[0] - d[0], b[1] - d[1]
+    scale, scale_2 = 1.0 / (ux * vy - uy * vx), 1.0 / (wx * zy - wy * zx)
+    # Also false for NaN, a corner behind the target camera.
+    first = first and abs(scale) < _DEGENERATE
+    second = second and abs(scale_2) < _DEGENERATE
     for row in range(int(top), int(bottom) + 1):
-        for column in range(int(left), int(right) + 1):
-            px, py = column - ax, row - ay
-            s = (px * vy - py * vx) * scale
-            t = (ux * py - uy * px) * scale
-            if s >= -_SLACK and t >= -_SLACK and s + t <= 1.0 + _SLACK:
-                z = np.float32(az + s * uz + t * vz)
-                if z > buffer[row, column]:
-                    buffer[row, column] = z
-                    source_map[row, column, 0] = sx + s * dx
-                    source_map[row, column, 1] = sy + t * dy
+        for column in range(int(start), int(stop) + 1):
+            px, py = column - a[0], row - a[1]
+            s, t = (px * vy - py * vx) * scale, (ux * py - uy * px) * scale
+            z = a[2] + s * (b[2] - a[2]) + t * (c[2] - a[2])
+            if not (first and s >= -_SLACK and t >= -_SLACK and s + t <= 1.0 + _SLACK):
+                px, py = column - d[0], row - d[1]
+                s, t = (px * zy - py * zx) * scale_2, (wx * py - wy * px) * scale_2
+                if not (second and s >= -_SLACK and t >= -_SLACK and s + t <= 1.0 + _SLACK):
+                    continue
+                z = d[2] + s * (c[2] - d[2]) + t * (b[2] - d[2])
+                s, t = 1.0 - s, 1.0 - t
+            nearness = np.float32(z)
+            if nearness > buffer[row, column]:
+                buffer[row, column] = nearness
+                source_map[row, column, 0] = x + side * s
+                source_map[row, column, 1] = y + t
 
 
 @njit(cache=True, error_model="numpy")

@@ -68,20 +68,18 @@ def test_built_in_solvers_are_listed() -> None:
 def test_parameters_come_from_the_card(tmp_path: Path) -> None:
     path = card(
         tmp_path,
-        'class = "rsbench.solvers.linear:LinearSolver"\nsummary = "mine"\n[parameters]\nextraction = "symmetric"\n'
-        "[robust]\nthreshold_px = 2.0\n",
+        'class = "rsbench.solvers.linear:LinearSolver"\ndescription = "mine"\n[parameters]\nextraction = "symmetric"\n'
     )
     loaded = load_solver_card(path)
     assert isinstance(loaded.solver, LinearSolver) and loaded.solver.extraction == "symmetric"
-    assert loaded.solver.name == loaded.name == "mine" and loaded.summary == "mine"
-    assert loaded.robust == {"threshold_px": 2.0}
+    assert loaded.solver.name == loaded.name == "mine" and loaded.description == "mine"
 
 
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
         ('clas = "a:b"', ["unknown key 'clas'"]),
-        ('summary = "no class"', ["class"]),
+        ('description = "no class"', ["class"]),
         ('class = "rsbench.solvers.linear"', ["package.module:Class"]),
         ('class = "rsbench.solvers.nowhere:X"', ["cannot be imported", "nowhere"]),
         ('class = "rsbench.solvers.linear:Nope"', ["cannot be imported", "Nope"]),
