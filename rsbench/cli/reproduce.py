@@ -54,9 +54,12 @@ def reproduce(
 def _images(out: Path, data: Path) -> None:
     from rsbench.cli.evaluate import evaluate_dataset
     from rsbench.cli.generate import generate
+    from rsbench.report.evaluation import publish
 
     generate("paper", data / "paper", None, workers=1)
-    evaluate_dataset(data / "paper", out / "images", None, "rs-stereo-refined", 0, "rsbench reproduce images")
+    evaluation = data / "paper-evaluation"
+    evaluate_dataset(data / "paper", evaluation, None, "rs-stereo-refined", 0, "rsbench reproduce images")
+    typer.echo(f"published: {publish(evaluation, out / 'images')}")
 
 
 def _simulate(name: str, points: int | None, data: Path, workers: int | None, command: str) -> pd.DataFrame:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from rsbench.report.pictures import Image
 
 _LONGEST = 640
 """Pixels of a picture in the page; enough to see a shift of two pixels at 900."""
+_OVERVIEW = 360
+"""Pixels of a picture in the overview."""
 _DEPTH_ERROR_M = 2.0
 """End of the scale of depth errors: the paper's limit of a good depth."""
 
@@ -123,6 +126,54 @@ def write_report(dataset: Path, out: Path) -> Path:
     path = out / "report.html"
     write_bytes(path, page.encode())
     return path
+
+
+def write_overview(out: Path) -> Path:
+    """One picture of all sequences of a report: frame, frame over the truth, corrected frame over the truth."""
+    columns = ("rolling", "rolling-over-global", "corrected-over-global")
+    rows = []
+    for folder in sorted((out / "pictures").iterdir()):
+        images = [read_png(folder / f"{name}.jpg") for name in columns if (folder / f"{name}.jpg").is_file()]
+        if len(images) == len(columns):
+            rows.append(np.concatenate([pictures.shrink(image, _OVERVIEW) for image in images], axis=1))
+    path = out / "overview.jpg"
+    write_bytes(path, pictures.encode_jpeg(np.concatenate(rows)))
+    return path
+
+
+def publish(evaluation: Path, out: Path) -> Path:
+    """Copy what is small of an evaluation: scores, motions, pictures, an overview and the tables in Markdown."""
+    for name in ("scores", "pictures", "provenance.json", *_motions(evaluation)):
+        source, target = evaluation / name, out / name
+        if target.is_dir():
+            shutil.rmtree(target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copytree(source, target) if source.is_dir() else shutil.copyfile(source, target)
+    write_overview(out)
+    lines = []
+    for table in summary_tables(evaluation):
+        lines += [f"## {table.title}", "", table.note, "", markdown_table(table.brief), ""]
+    path = out / "summary.md"
+    write_bytes(path, "\n".join(lines).encode())
+    return path
+
+
+def _motions(evaluation: Path) -> list[str]:
+    paths = sorted(evaluation.glob("predictions/*/motion/*.json"))
+    return [str(path.relative_to(evaluation)) for path in paths]
+
+
+def markdown_table(frame: pd.DataFrame) -> str:
+    """A data frame as a Markdown table; numbers to four significant digits."""
+
+    def cell(value: Any) -> str:
+        if isinstance(value, float):
+            return "–" if np.isnan(value) else f"{value:.4g}"
+        return str(value)
+
+    rows = [[cell(value) for value in row] for row in frame.itertuples(index=False)]
+    head = [str(column) for column in frame.columns]
+    return "\n".join("| " + " | ".join(row) + " |" for row in [head, ["---"] * len(head), *rows])
 
 
 Drawn = dict[str, tuple[Image, str]]

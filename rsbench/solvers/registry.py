@@ -67,7 +67,12 @@ def load_solver_card(name_or_path: str | Path) -> SolverCard:
         raise RsbenchError(f"solver {text!r} does not exist{choices(text, list_solvers())}; a path ends in .toml")
     path = card_path("solvers", name_or_path)
     data = read_toml(path)
-    content = parse_card(_Content, {("class_" if key == "class" else key): data[key] for key in data}, str(path))
+    try:
+        content = parse_card(
+            _Content, {("class_" if key == "class" else key): data[key] for key in data}, str(path)
+        )
+    except RsbenchError as error:  # `class` cannot be the name of a field
+        raise RsbenchError(str(error).replace("class_", "class")) from None
     cls = _import(content.class_, f"{path}: class = {content.class_!r}")
     solver = _instance(cls, content.parameters, path.stem, str(path))
     return SolverCard(name=path.stem, path=path, description=content.description, solver=solver)
