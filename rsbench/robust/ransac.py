@@ -55,12 +55,16 @@ class RansacOptions:
     """Refinements of each new best model, at thresholds that shrink from twice the threshold to it."""
     final_steps: int = 3
     """Refinements at the end, until the inliers stay the same."""
+    chance: float = 0.02
+    """Probability that a wrong datum is an inlier of a given model: a consensus must be beyond chance."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.threshold) and self.threshold > 0.0):
             raise ValueError(f"threshold must be positive, got {self.threshold}")
         if not 0.0 < self.confidence < 1.0:
             raise ValueError(f"confidence must lie between 0 and 1, got {self.confidence}")
+        if not 0.0 < self.chance < 1.0:
+            raise ValueError(f"chance must lie between 0 and 1, got {self.chance}")
         if not 1 <= self.min_iterations <= self.max_iterations:
             raise ValueError(
                 "min_iterations must lie between 1 and max_iterations, got "
@@ -112,11 +116,21 @@ def required_iterations(probability: float, confidence: float) -> float:
     return max(1.0, math.log1p(-confidence) / math.log1p(-probability))
 
 
+def log10_false_alarms(inliers: int, num_data: int, sample_size: int, samples: int, chance: float) -> float:
+    """log10 of how many models with as many inliers ``samples`` samples of wrong data alone would give.
+
+    L. Moisan, B. Stival, A probabilistic criterion to detect rigid point matches, IJCV 2004: above 0 the
+    consensus proves nothing.
+    """
+    choices = math.lgamma(num_data + 1) - math.lgamma(inliers + 1) - math.lgamma(num_data - inliers + 1)
+    return math.log10(max(samples, 1)) + choices / math.log(10.0) + (inliers - sample_size) * math.log10(chance)
+
+
 class _Best(Generic[Model]):
     """The best model so far, with what follows from it."""
 
     def __init__(self, estimator: Estimator[Model], options: RansacOptions) -> None:
-        self.estimator, self.threshold = estimator, options.threshold
+        self.estimator, self.threshold, self.chance = estimator, options.threshold, options.chance
         self.model: Model | None = None
         self.residuals = np.full(sum(estimator.num_data), np.inf)
         self.score = math.inf
@@ -192,11 +206,11 @@ def _step(best: _Best[Model], factor: float) -> bool:
 
 def _report(best: _Best[Model], iterations: int, reason: str) -> RansacReport[Model]:
     inliers = best.inliers() if best.model is not None else np.zeros(len(best.residuals), dtype=np.bool_)
-    least = sum(best.estimator.sample_size)
+    count, total, least = int(np.count_nonzero(inliers)), len(inliers), sum(best.estimator.sample_size)
     if not reason and best.model is None:
         reason = "no sample gave a model"
-    elif not reason and np.count_nonzero(inliers) <= least:
-        reason = f"no consensus: {np.count_nonzero(inliers)} inliers, a minimal sample alone has {least}"
+    elif not reason and log10_false_alarms(count, total, least, iterations, best.chance) >= 0.0:
+        reason = f"no consensus: {count} inliers of {total}, as chance would give in {iterations} samples"
     if reason:
         return RansacReport(
             success=False,

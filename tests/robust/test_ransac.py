@@ -16,6 +16,7 @@ from rsbench.robust.ransac import (
     IntArray,
     RansacOptions,
     all_inlier_probability,
+    log10_false_alarms,
     msac_score,
     ransac,
     required_iterations,
@@ -195,3 +196,20 @@ def test_msac_score_is_bounded_by_the_number_of_data(residuals: list[float], thr
 def test_options_refuse_nonsense(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad)).split("_")[0]):
         RansacOptions(**{"threshold": 1.0, **bad})  # type: ignore[arg-type]
+
+
+def test_false_alarms_by_hand() -> None:
+    # C(10, 4) = 210 choices, two inliers beyond a sample of 2 at one in a hundred each, 50 samples: 210 * 50 * 1e-4.
+    assert log10_false_alarms(4, 10, 2, 50, 0.01) == pytest.approx(math.log10(210 * 50 * 1e-4), abs=1e-12)
+
+
+def test_consensus_of_pure_noise_is_no_consensus() -> None:
+    points = np.random.default_rng(5).uniform(0.0, 1.0, (100, 2))
+    # A line band of +-0.01 in the unit square holds about 2 % of uniform points.
+    report = ransac(
+        LineEstimator(points, (100,), (2,)),
+        RansacOptions(threshold=0.01, max_iterations=500),
+        np.random.default_rng(0),
+    )
+    assert not report.success
+    assert "chance" in report.reason
