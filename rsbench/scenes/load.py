@@ -14,6 +14,7 @@ from rsbench.errors import RsbenchError
 from rsbench.scenes.castle import CastleParameters, build_castle
 from rsbench.scenes.model import Light, Scene, SceneMesh, Viewpoint
 from rsbench.scenes.old_town import OldTownParameters, build_old_town
+from rsbench.scenes.room import RoomParameters, build_room
 
 Rgb: TypeAlias = tuple[float, float, float]
 
@@ -84,11 +85,18 @@ class OldTownCard(SceneCard):
     parameters: OldTownParameters = field(default_factory=OldTownParameters)
 
 
+@dataclass(frozen=True, kw_only=True)
+class RoomCard(SceneCard):
+    builder: Literal["room"]
+    parameters: RoomParameters = field(default_factory=RoomParameters)
+
+
 Build: TypeAlias = Callable[[Any, int], tuple[SceneMesh, ...]]
 
 BUILDERS: dict[str, tuple[type[Any], Build]] = {
     "castle": (CastleCard, build_castle),
     "old-town": (OldTownCard, build_old_town),
+    "room": (RoomCard, build_room),
 }
 """Builder name to its card and the function of (parameters, seed) that makes the meshes."""
 

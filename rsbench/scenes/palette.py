@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from rsbench.scenes import furnishings as f
 from rsbench.scenes import surfaces as s
 from rsbench.scenes.model import Material
 from rsbench.scenes.surfaces import Bytes, Painter, Surface
@@ -57,6 +58,9 @@ _SETTS = ((0.47, 0.45, 0.43), (0.56, 0.51, 0.46), (0.40, 0.40, 0.42), (0.50, 0.4
 _RED_TILES = ((0.58, 0.30, 0.19), (0.48, 0.24, 0.17), (0.66, 0.40, 0.27), (0.42, 0.24, 0.19))
 _SLATES = ((0.33, 0.36, 0.41), (0.42, 0.43, 0.45), (0.27, 0.29, 0.34), (0.40, 0.38, 0.38))
 _OAK = ((0.46, 0.34, 0.22), (0.55, 0.43, 0.29), (0.39, 0.31, 0.23), (0.50, 0.45, 0.38))
+_REED = ((0.40, 0.48, 0.44), (0.50, 0.56, 0.49), (0.33, 0.40, 0.37))
+_SAGE = ((0.42, 0.50, 0.44), (0.74, 0.72, 0.58), (0.84, 0.78, 0.64), (0.60, 0.62, 0.52))
+_DELFT = ((0.80, 0.81, 0.79), (0.30, 0.40, 0.60), (0.82, 0.82, 0.80))
 _GRASS = ((0.24, 0.31, 0.12), (0.38, 0.41, 0.19), (0.46, 0.41, 0.25))
 _EARTH = ((0.40, 0.33, 0.24), (0.50, 0.43, 0.32), (0.34, 0.33, 0.18), (0.56, 0.51, 0.43))
 
@@ -101,4 +105,30 @@ RECIPES: dict[str, Recipe] = {
     "fruit_0": _recipe(s.speckled, 1.0, 512, colours=((0.70, 0.16, 0.12), (0.80, 0.45, 0.2)), contrast=0.2),
     "fruit_1": _recipe(s.speckled, 1.0, 512, colours=((0.86, 0.56, 0.14), (0.75, 0.42, 0.12)), contrast=0.2),
     "fruit_2": _recipe(s.speckled, 1.0, 512, colours=((0.42, 0.56, 0.18), (0.62, 0.66, 0.28)), contrast=0.2),
+    # Indoors everything is nearer: finer textures of the same kinds.
+    "floorboards": _recipe(s.planks, 3.4, woods=((0.58, 0.43, 0.28), (0.50, 0.37, 0.24), (0.63, 0.49, 0.34))),
+    "oak": _recipe(s.planks, 1.6, woods=((0.64, 0.49, 0.33), (0.56, 0.42, 0.28)), width=(0.1, 0.16)),
+    "walnut": _recipe(s.timber, 1.2, wood=(0.47, 0.33, 0.22)),
+    "limewash": _recipe(s.plaster, 3.0, wall=(0.80, 0.75, 0.66), under=(0.62, 0.52, 0.42), worn=0.2),
+    "wallpaper": _recipe(s.leaves, 2.0, greens=_SAGE, size=0.09, depth=0.85),
+    "brick_fine": _recipe(s.brick, 3.0, bricks=((0.60, 0.33, 0.24), (0.50, 0.26, 0.2), (0.66, 0.43, 0.32))),
+    "stone_fine": _recipe(s.ashlar, 2.5, stones=_GREYS, course=(0.2, 0.35), block=(0.3, 0.6), moss=-0.4),
+    "bark_fine": _recipe(s.timber, 0.8, wood=(0.42, 0.35, 0.28)),
+    "iron_fine": _recipe(s.speckled, 0.8, 512, colours=((0.18, 0.18, 0.19), (0.28, 0.24, 0.2)), contrast=0.3),
+    "brass": _recipe(s.speckled, 0.8, 512, colours=((0.66, 0.52, 0.26), (0.46, 0.36, 0.2)), contrast=0.25),
+    "soot": _recipe(s.speckled, 1.5, 512, colours=((0.16, 0.14, 0.13), (0.34, 0.27, 0.23)), contrast=0.4),
+    "ceramic": _recipe(s.leaves, 0.8, 512, greens=_DELFT, size=0.03, depth=0.9),
+    "leaves_fine": _recipe(s.speckled, 0.7, 512, colours=((0.24, 0.38, 0.15), (0.42, 0.52, 0.23)), contrast=0.3),
+    "wicker": _recipe(s.brick, 0.9, 512, bricks=((0.66, 0.52, 0.32), (0.54, 0.41, 0.25)), mortar=(0.3, 0.2, 0.1)),
+    "paper": _recipe(s.speckled, 1.0, 512, colours=((0.84, 0.80, 0.70), (0.76, 0.70, 0.58)), contrast=0.12),
+    "fabric_0": _recipe(
+        s.cloth, 1.2, stripes=((0.40, 0.48, 0.44), (0.50, 0.56, 0.49), (0.33, 0.40, 0.37)), width=0.05
+    ),
+    "fabric_1": _recipe(s.leaves, 0.9, greens=((0.62, 0.24, 0.18), (0.80, 0.62, 0.40)), size=0.04, depth=0.7),
+    "fabric_2": _recipe(s.cloth, 0.9, stripes=((0.82, 0.74, 0.58), (0.72, 0.62, 0.45)), width=0.025),
+    "fabric_3": _recipe(s.leaves, 1.6, greens=((0.56, 0.34, 0.27), (0.78, 0.64, 0.44)), size=0.06, depth=0.7),
+    "books": _recipe(f.spines, None, 2048),
+    "pictures": _recipe(f.pictures, None, 2048),
+    "rug": _recipe(f.rug, None),
+    "globe": _recipe(f.world_map, 0.5, 512),
 }

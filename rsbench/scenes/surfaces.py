@@ -178,16 +178,18 @@ def speckled(
     return to_bytes(image * (1 + contrast * paint.broad() + grit * paint.fine()))
 
 
-def leaves(paint: Painter, greens: Sequence[Colour], size: float = 0.11) -> Bytes:
-    """Foliage: three layers of leaf-sized patches, the upper ones lighter."""
-    image = plain(greens[0], np.full((paint.pixels, paint.pixels), 0.35, np.float32))
+def leaves(paint: Painter, greens: Sequence[Colour], size: float = 0.11, depth: float = 0.35) -> Bytes:
+    """Foliage or a printed pattern: layers of leaf-sized patches, the lowest at ``depth`` of their brightness."""
+    image = plain(greens[0], np.full((paint.pixels, paint.pixels), depth, np.float32))
     for layer in range(4):
         wobble = (paint.broad() * size * 0.35, paint.broad() * size * 0.35)
         cells = cut_courses(
             paint.rng, paint.pixels, paint.metres, (size * 0.6, size * 1.2), (size * 0.7, size * 1.9),
             corner=size * 0.45, wobble=wobble,
         )  # fmt: skip
-        tones = pick(greens, paint.rng.random(cells.count, dtype=np.float32)) * np.float32(0.5 + 0.17 * layer)
+        tones = pick(greens, paint.rng.random(cells.count, dtype=np.float32)) * np.float32(
+            depth + (1.0 - depth) * (layer + 1) / 4
+        )
         colour = tones[:, cells.index] * (0.7 + 0.5 * cells.across + 0.2 * paint.fine())
         shown = ramp(cells.edge, 0.004, 0.012) * (paint.per_cell(cells) < 0.5)
         image = blend(image, colour, shown)
