@@ -67,12 +67,12 @@ def connect(rho: F32, limit: F64) -> U8:
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _move(M: F64, b: F64, x: float, y: float, rho: float) -> tuple[float, float, float]:
+def _move(M: F64, b: F64, x: int, y: int, rho: float) -> tuple[float, float, float]:
     """Target pixel and inverse depth; NaN behind the target camera or where rho is NaN."""
-    z = M[2, 0] * x + M[2, 1] * y + M[2, 2] + rho * b[2]
+    z = M[y, 2, 0] * x + M[y, 2, 1] * y + M[y, 2, 2] + rho * b[y, 2]
     s = 1.0 / z if z > 0.0 else np.nan
-    u = M[0, 0] * x + M[0, 1] * y + M[0, 2] + rho * b[0]
-    v = M[1, 0] * x + M[1, 1] * y + M[1, 2] + rho * b[1]
+    u = M[y, 0, 0] * x + M[y, 0, 1] * y + M[y, 0, 2] + rho * b[y, 0]
+    v = M[y, 1, 0] * x + M[y, 1, 1] * y + M[y, 1, 2] + rho * b[y, 1]
     return u * s, v * s, rho * s
 
 
@@ -82,7 +82,7 @@ def move_rows(rho: F32, M: F64, b: F64, moved: F64) -> None:
     height, width = rho.shape
     for y in range(height):
         for x in range(width):
-            moved[0, y, x], moved[1, y, x], moved[2, y, x] = _move(M[y], b[y], x, y, rho[y, x])
+            moved[0, y, x], moved[1, y, x], moved[2, y, x] = _move(M, b, x, y, rho[y, x])
 
 
 @njit(cache=True, error_model="numpy")
@@ -96,7 +96,7 @@ def draw_mesh(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F32
     for y in range(height):
         upper, lower = rows[(y + 1) & 1], rows[y & 1]
         for x in range(width):
-            lower[x, 0], lower[x, 1], lower[x, 2] = _move(M[y], b[y], x, y, rho[y, x])
+            lower[x, 0], lower[x, 1], lower[x, 2] = _move(M, b, x, y, rho[y, x])
         if y == 0:
             continue
         for x in range(width - 1):
@@ -104,76 +104,65 @@ def draw_mesh(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F32
             left, right = joined[y - 1, x] & BELOW != 0, joined[y - 1, x + 1] & BELOW != 0
             whole = top and bottom and left and right
             if (top and left) or (bottom and right):
-                # Both triangles of a whole quad in one go; of a torn one those whose two sides are whole.
+                # Both triangles of a whole quad; of a torn one those whose two sides are whole.
                 first, second = whole or (top and left), whole or (bottom and right)
-                _quad(
-                    upper[x], upper[x + 1], lower[x], lower[x + 1], x, y - 1, 1, first, second, source_map, buffer
-                )
+                _quad(upper, lower, x, x + 1, y - 1, first, second, source_map, buffer)
             if not whole and ((top and right) or (bottom and left)):
                 # The other diagonal may still join three corners: the same quad, mirrored.
-                first, second = top and right, bottom and left
-                _quad(
-                    upper[x + 1],
-                    upper[x],
-                    lower[x + 1],
-                    lower[x],
-                    x + 1,
-                    y - 1,
-                    -1,
-                    first,
-                    second,
-                    source_map,
-                    buffer,
-                )
+                _quad(upper, lower, x + 1, x, y - 1, top and right, bottom and left, source_map, buffer)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _quad(
-    a: F64,
-    b: F64,
-    c: F64,
-    d: F64,
-    x: int,
+    upper: F64,
+    lower: F64,
+    near: int,
+    far: int,
     y: int,
-    side: int,
     first: bool,
     second: bool,
     source_map: F32,
     buffer: F32,
 ) -> None:
-    """Draw triangles abc (if ``first``) and dcb (if ``second``); corners are (target x, y, inverse depth).
+    """Draw two triangles of the quad of source columns ``near`` and ``far``, rows y and y + 1.
 
-    In the source, a is pixel (x, y), b (x + side, y), c (x, y + 1) and d (x + side, y + 1).
+    ``first`` has its right angle at (near, y), ``second`` at (far, y + 1). ``upper`` and ``lower`` (W, 3) hold
+    (target x, y, inverse depth) of the two rows.
     """
+    # Scalars, because numba counts the references of every view it makes.
+    ax, ay, az = upper[near, 0], upper[near, 1], upper[near, 2]
+    bx, by, bz = upper[far, 0], upper[far, 1], upper[far, 2]
+    cx, cy, cz = lower[near, 0], lower[near, 1], lower[near, 2]
+    dx, dy, dz = lower[far, 0], lower[far, 1], lower[far, 2]
     height, width = buffer.shape
-    start = max(0.0, np.ceil(min(min(a[0], b[0]), min(c[0], d[0])) - _SLACK))
-    stop = min(width - 1.0, np.floor(max(max(a[0], b[0]), max(c[0], d[0])) + _SLACK))
-    top = max(0.0, np.ceil(min(min(a[1], b[1]), min(c[1], d[1])) - _SLACK))
-    bottom = min(height - 1.0, np.floor(max(max(a[1], b[1]), max(c[1], d[1])) + _SLACK))
+    start = max(0.0, np.ceil(min(min(ax, bx), min(cx, dx)) - _SLACK))
+    stop = min(width - 1.0, np.floor(max(max(ax, bx), max(cx, dx)) + _SLACK))
+    top = max(0.0, np.ceil(min(min(ay, by), min(cy, dy)) - _SLACK))
+    bottom = min(height - 1.0, np.floor(max(max(ay, by), max(cy, dy)) + _SLACK))
     if not (start <= stop and top <= bottom):
         return
-    ux, uy, vx, vy = b[0] - a[0], b[1] - a[1], c[0] - a[0], c[1] - a[1]
-    wx, wy, zx, zy = c[0] - d[0], c[1] - d[1], b[0] - d[0], b[1] - d[1]
+    ux, uy, vx, vy = bx - ax, by - ay, cx - ax, cy - ay
+    wx, wy, zx, zy = cx - dx, cy - dy, bx - dx, by - dy
     scale, scale_2 = 1.0 / (ux * vy - uy * vx), 1.0 / (wx * zy - wy * zx)
     # Also false for NaN, a corner behind the target camera.
     first = first and abs(scale) < _DEGENERATE
     second = second and abs(scale_2) < _DEGENERATE
     for row in range(int(top), int(bottom) + 1):
         for column in range(int(start), int(stop) + 1):
-            px, py = column - a[0], row - a[1]
+            px, py = column - ax, row - ay
             s, t = (px * vy - py * vx) * scale, (ux * py - uy * px) * scale
-            z = a[2] + s * (b[2] - a[2]) + t * (c[2] - a[2])
+            z = az + s * (bz - az) + t * (cz - az)
             if not (first and s >= -_SLACK and t >= -_SLACK and s + t <= 1.0 + _SLACK):
-                px, py = column - d[0], row - d[1]
+                px, py = column - dx, row - dy
                 s, t = (px * zy - py * zx) * scale_2, (wx * py - wy * px) * scale_2
                 if not (second and s >= -_SLACK and t >= -_SLACK and s + t <= 1.0 + _SLACK):
                     continue
-                z = d[2] + s * (c[2] - d[2]) + t * (b[2] - d[2])
+                z = dz + s * (cz - dz) + t * (bz - dz)
                 s, t = 1.0 - s, 1.0 - t
             nearness = np.float32(z)
             if nearness > buffer[row, column]:
                 buffer[row, column] = nearness
-                source_map[row, column, 0] = x + side * s
+                source_map[row, column, 0] = near + (far - near) * s
                 source_map[row, column, 1] = y + t
 
 
@@ -211,11 +200,11 @@ def _cell(
 ) -> None:
     """Draw the parallelogram that the square of half a pixel around source pixel (x, y) becomes."""
     height, width = buffer.shape
-    ax, ay, az = _move(M[y], b[y], x, y, rho[y, x])
-    bx, by, bz = _move(M[y], b[y], x + 1, y, rho[y, x] + along_x)
+    ax, ay, az = _move(M, b, x, y, rho[y, x])
+    bx, by, bz = _move(M, b, x + 1, y, rho[y, x] + along_x)
     # The next row has another pose, also the cell of the last row, whose lower neighbour does not exist.
     step = 1 if y + 1 < height else -1
-    cx, cy, cz = _move(M[y + step], b[y + step], x, y + step, rho[y, x] + step * along_y)
+    cx, cy, cz = _move(M, b, x, y + step, rho[y, x] + step * along_y)
     ux, uy, uz = bx - ax, by - ay, bz - az
     vx, vy, vz = step * (cx - ax), step * (cy - ay), step * (cz - az)
     scale = 1.0 / (ux * vy - uy * vx)
