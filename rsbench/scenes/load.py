@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from rsbench.cards import card_path, choices, parse_card, read_toml
 from rsbench.errors import RsbenchError
 from rsbench.scenes.castle import CastleParameters, build_castle
+from rsbench.scenes.mesh import MeshParameters, build_from_file
 from rsbench.scenes.model import Light, Scene, SceneMesh, Viewpoint
 from rsbench.scenes.old_town import OldTownParameters, build_old_town
 from rsbench.scenes.room import RoomParameters, build_room
@@ -91,14 +91,19 @@ class RoomCard(SceneCard):
     parameters: RoomParameters = field(default_factory=RoomParameters)
 
 
-Build: TypeAlias = Callable[[Any, int], tuple[SceneMesh, ...]]
+@dataclass(frozen=True, kw_only=True)
+class MeshCard(SceneCard):
+    builder: Literal["mesh"]
+    parameters: MeshParameters
 
-BUILDERS: dict[str, tuple[type[Any], Build]] = {
-    "castle": (CastleCard, build_castle),
-    "old-town": (OldTownCard, build_old_town),
-    "room": (RoomCard, build_room),
+
+CARDS: dict[str, type[SceneCard]] = {
+    "castle": CastleCard,
+    "old-town": OldTownCard,
+    "room": RoomCard,
+    "mesh": MeshCard,
 }
-"""Builder name to its card and the function of (parameters, seed) that makes the meshes."""
+"""Builder name to the dataclass of its cards."""
 
 
 def load_scene(name_or_path: str | Path) -> Scene:
@@ -111,12 +116,33 @@ def load_scene(name_or_path: str | Path) -> Scene:
         RsbenchError: the card or a file that it names is missing or wrong, in one line.
     """
     path = card_path("scenes", name_or_path)
+    card = read_scene_card(path)
+    meshes = _build(card, path.parent)
+    return Scene(name=card.name, meshes=meshes, light=card.light.light(), viewpoints=card.viewpoints)
+
+
+def read_scene_card(path: Path) -> SceneCard:
+    """Parse a scene card without building the scene.
+
+    Raises:
+        RsbenchError: the card is wrong, in one line.
+    """
     data = read_toml(path)
     builder = data.get("builder")
-    if builder not in BUILDERS:
+    if not isinstance(builder, str) or builder not in CARDS:
         problem = "'builder' is required" if builder is None else f"builder = {builder!r} does not exist"
-        raise RsbenchError(f"{path}: {problem}{choices(str(builder), BUILDERS)}")
-    card_class, build = BUILDERS[builder]
-    card = parse_card(card_class, data, str(path))
-    meshes = build(card.parameters, card.seed)
-    return Scene(name=card.name, meshes=meshes, light=card.light.light(), viewpoints=card.viewpoints)
+        raise RsbenchError(f"{path}: {problem}{choices(str(builder), CARDS)}")
+    return parse_card(CARDS[builder], data, str(path))
+
+
+def _build(card: SceneCard, folder: Path) -> tuple[SceneMesh, ...]:
+    match card:
+        case CastleCard():
+            return build_castle(card.parameters, card.seed)
+        case OldTownCard():
+            return build_old_town(card.parameters, card.seed)
+        case RoomCard():
+            return build_room(card.parameters, card.seed)
+        case MeshCard():
+            return build_from_file(card.parameters, folder)
+    raise TypeError(f"no builder for {type(card).__name__}")

@@ -1,0 +1,185 @@
+"""A scene from a mesh file of the user: glTF, GLB, OBJ, PLY or whatever else trimesh reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from rsbench.errors import RsbenchError
+from rsbench.scenes.model import FloatArray, Material, SceneMesh
+
+# Rows turn file axes into a right-handed frame with z up.
+_Z_UP = {
+    "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "z": np.eye(3),
+}
+_SHEET = 1024  # columns of the sheet that holds colours of faces
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshParameters:
+    """Which file, and how its axes and units become the scene frame's."""
+
+    file: str
+    """Relative to the card, or absolute."""
+    metres_per_unit: float = 1.0
+    up_axis: Literal["x", "y", "z"] = "y"
+    """The file's upward axis; glTF has y up."""
+    heading_deg: float = 0.0
+    """Turns the model anticlockwise about the vertical."""
+    shading: Literal["flat", "smooth"] = "flat"
+
+    def __post_init__(self) -> None:
+        if not self.metres_per_unit > 0:
+            raise ValueError(f"metres_per_unit = {self.metres_per_unit}: must be positive")
+
+
+def build_from_file(parameters: MeshParameters, folder: Path) -> tuple[SceneMesh, ...]:
+    """Meshes of a file in the scene frame, one for each part of its scene graph, textures and uv kept.
+
+    Args:
+        parameters: of the card.
+        folder: where a relative path starts.
+
+    Raises:
+        RsbenchError: the file or one that it refers to is missing or broken, or holds no triangles.
+    """
+    path = folder / Path(parameters.file).expanduser()
+    model = _read(path)
+    angle = np.deg2rad(parameters.heading_deg)
+    heading = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    axes = parameters.metres_per_unit * heading @ _Z_UP[parameters.up_axis]
+    materials: dict[int, Material] = {}
+    meshes = []
+    for node in sorted(model.graph.nodes_geometry):
+        transform, name = model.graph[node]
+        part = model.geometry[name]
+        if isinstance(part, trimesh.Trimesh) and len(part.faces):
+            meshes.append(_scene_mesh(str(node), part, axes, transform, parameters.shading, materials, path))
+    if not meshes:
+        raise RsbenchError(f"{path}: holds no triangles")
+    return tuple(meshes)
+
+
+class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc,unused-ignore]
+    """Files beside the model; remembers those that were wanted and missing, which trimesh only logs."""
+
+    def __init__(self, source: str) -> None:
+        super().__init__(source)
+        self.missing: list[str] = []
+
+    def get(self, name: str) -> bytes:
+        try:
+            content: bytes = super().get(name)
+        except Exception:
+            self.missing.append(str(name))
+            raise
+        return content
+
+
+def _read(path: Path) -> Any:
+    if not path.is_file():
+        raise RsbenchError(f"mesh file {path}: no such file (parameters.file is relative to the card)")
+    neighbours = _Neighbours(str(path))
+    try:
+        model = trimesh.load_scene(str(path), resolver=neighbours, process=False)
+    except Exception as error:  # the readers raise whatever a broken file makes them stumble over
+        reason = neighbours.missing[0] + " is missing" if neighbours.missing else str(error).splitlines()[:1]
+        raise RsbenchError(f"mesh file {path}: cannot be read: {type(error).__name__}: {reason}") from error
+    if neighbours.missing:
+        raise RsbenchError(f"mesh file {path}: refers to {neighbours.missing[0]}, which is missing")
+    return model
+
+
+def _scene_mesh(
+    name: str,
+    part: Any,
+    axes: FloatArray,
+    transform: FloatArray,
+    shading: str,
+    materials: dict[int, Material],
+    path: Path,
+) -> SceneMesh:
+    linear = axes @ transform[:3, :3]
+    vertices = np.asarray(part.vertices, dtype=np.float64) @ linear.T + axes @ transform[:3, 3]
+    faces = np.asarray(part.faces, dtype=np.int32)
+    if not np.isfinite(vertices).all():
+        raise RsbenchError(f"mesh file {path}: part {name!r} has vertices that are not finite")
+    normals = None
+    if shading == "smooth":
+        normals = np.asarray(part.vertex_normals, dtype=np.float64) @ np.linalg.inv(linear)
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    if part.visual.kind in ("vertex", "face"):
+        return _coloured_faces(name, vertices, faces, normals, np.asarray(part.visual.face_colors)[:, :3])
+    source = getattr(part.visual, "material", None)
+    uv = getattr(part.visual, "uv", None)
+    if id(source) not in materials:
+        materials[id(source)] = _material(source, f"{path}: part {name!r}")
+    material = materials[id(source)]
+    if material.texture is not None and (uv is None or not np.isfinite(uv).all()):
+        raise RsbenchError(f"mesh file {path}: part {name!r} has a texture but no finite texture coordinates")
+    uv = None if uv is None else np.asarray(uv, dtype=np.float64)
+    return SceneMesh(name=name, vertices=vertices, faces=faces, material=material, uv=uv, normals=normals)
+
+
+def _material(source: Any, where: str) -> Material:
+    """Diffuse part of a glTF or MTL material; everything else that a material may say is left out."""
+    if source is None:
+        return Material(name="plain")
+    if isinstance(source, trimesh.visual.material.MultiMaterial):
+        raise RsbenchError(f"mesh file {where} has several materials in one part: export it as glTF instead")
+    name = str(getattr(source, "name", None) or "unnamed")
+    if isinstance(source, trimesh.visual.material.PBRMaterial):
+        image, factor = source.baseColorTexture, source.baseColorFactor
+        # glTF factors are linear reflectances; trimesh keeps them as bytes.
+        linear = np.ones(3) if factor is None else np.asarray(factor, dtype=np.float64)[:3] / 255
+    else:
+        image = getattr(source, "image", None)
+        diffuse = np.asarray(getattr(source, "diffuse", (204, 204, 204)), dtype=np.float64)[:3] / 255
+        linear = np.ones(3) if image is not None else _to_linear(diffuse)
+    if image is None:
+        r, g, b = (float(value) for value in _to_srgb(linear))
+        return Material(name=name, colour=(r, g, b))
+    texture = np.array(image.convert("RGB"), dtype=np.uint8)
+    if not np.all(linear == 1.0):
+        texture = np.rint(_to_srgb(_to_linear(texture / 255.0) * linear) * 255).astype(np.uint8)
+    return Material(name=name, texture=texture)
+
+
+def _coloured_faces(
+    name: str,
+    vertices: FloatArray,
+    faces: NDArray[np.int32],
+    normals: FloatArray | None,
+    colours: NDArray[np.uint8],
+) -> SceneMesh:
+    """A mesh with a colour for each face, which a sheet of one texel for each colour holds."""
+    palette, index = np.unique(colours, axis=0, return_inverse=True)
+    index = np.asarray(index).ravel()
+    rows = -(-len(palette) // _SHEET)
+    sheet = np.zeros((rows * _SHEET, 3), dtype=np.uint8)
+    sheet[: len(palette)] = palette
+    # The centre of a texel, where bilinear interpolation gives its colour alone; v points up from the last row.
+    centre = np.stack([(index % _SHEET + 0.5) / _SHEET, 1 - (index // _SHEET + 0.5) / rows], axis=1)
+    return SceneMesh(
+        name=name,
+        vertices=vertices[faces].reshape(-1, 3),
+        faces=np.arange(3 * len(faces), dtype=np.int32).reshape(-1, 3),
+        material=Material(name="face colours", texture=sheet.reshape(rows, _SHEET, 3)),
+        uv=np.repeat(centre, 3, axis=0),
+        normals=None if normals is None else normals[faces].reshape(-1, 3),
+    )
+
+
+def _to_linear(srgb: FloatArray) -> FloatArray:
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0) + 0.055) / 1.055) ** 2.4)
+
+
+def _to_srgb(linear: FloatArray) -> FloatArray:
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
