@@ -16,11 +16,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.rig import Side, StereoRig
+from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.vision.disparity_refinement import refine_disparity
 from rsbench.vision.images import grey_u8
 
 F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
 _MODES = {
     "sgbm": cv2.StereoSGBM_MODE_SGBM,
     "hh": cv2.StereoSGBM_MODE_HH,
@@ -46,7 +47,7 @@ class SgmOptions:
     """Penalty of a disparity step of 1, times block_size squared."""
     p2: int = 32
     """Penalty of larger steps, times block_size squared."""
-    mode: Literal["sgbm", "hh", "3way", "hh4"] = "sgbm"
+    mode: Literal["sgbm", "hh", "3way", "hh4"] = "3way"
     uniqueness_percent: int = 5
     prefilter_cap: int = 31
     speckle_window: int = 100
@@ -84,7 +85,12 @@ def stereo_disparity(
     Images (H, W[, 3]) are uint8 or uint16. Unknown are pixels without a consistent partner, which includes the
     band that the other camera does not see. Raises ValueError when the images do not fit each other or the rig.
     """
-    return stereo_disparities(left, right, rig, options)[0 if side == "left" else 1]
+    options = options or SgmOptions()
+    grey_left, grey_right = _greys(left, right, rig)
+    raw_left, raw_right = _raw_pair(grey_left, grey_right, rig, options)
+    if side == "left":
+        return _finish(grey_left, grey_right, raw_left, raw_right, options)
+    return _finish_mirrored(grey_left, grey_right, raw_left, raw_right, options)
 
 
 def stereo_disparities(
@@ -92,24 +98,46 @@ def stereo_disparities(
 ) -> tuple[F32, F32]:
     """Disparities on the left image's pixels and on the right image's; arguments as in ``stereo_disparity``."""
     options = options or SgmOptions()
-    grey_left, grey_right = grey_u8(left), grey_u8(right)
+    grey_left, grey_right = _greys(left, right, rig)
+    raw_left, raw_right = _raw_pair(grey_left, grey_right, rig, options)
+    return (
+        _finish(grey_left, grey_right, raw_left, raw_right, options),
+        _finish_mirrored(grey_left, grey_right, raw_left, raw_right, options),
+    )
+
+
+def _greys(left: NDArray[Any], right: NDArray[Any], rig: StereoRig) -> tuple[U8, U8]:
+    greys = grey_u8(left), grey_u8(right)
     size = (rig.camera.height, rig.camera.width)
-    for name, grey in (("left", grey_left), ("right", grey_right)):
+    for name, grey in zip(SIDES, greys, strict=True):
         if grey.shape != size:
             raise ValueError(f"{name} image must have the camera's size {size}, got {grey.shape}")
-    count = disparity_range(grey_left, grey_right, rig, options)
+    return greys
+
+
+def _raw_pair(left: U8, right: U8, rig: StereoRig, options: SgmOptions) -> tuple[F32, F32]:
+    """The matcher's disparities on the left image's pixels and on the right image's."""
+    return _match_both(left, right, disparity_range(left, right, rig, options), options)
+
+
+def _match_both(left: U8, right: U8, count: int, options: SgmOptions) -> tuple[F32, F32]:
     # Seen in a mirror the right camera is the left one: the same matcher serves both.
-    mirror_left, mirror_right = _mirrored(grey_left), _mirrored(grey_right)
-    raw_left = _sgm(grey_left, grey_right, count, options)
-    raw_right = _mirrored(_sgm(mirror_right, mirror_left, count, options))
-    consistent_left = _consistent(raw_left, raw_right, options.consistency_px)
-    consistent_right = _mirrored(_consistent(_mirrored(raw_right), _mirrored(raw_left), options.consistency_px))
-    final_left = _finish(grey_left, grey_right, consistent_left, options)
-    final_right = _mirrored(_finish(mirror_right, mirror_left, _mirrored(consistent_right), options))
-    return final_left, final_right
+    return _sgm(left, right, count, options), _mirrored(_sgm(_mirrored(right), _mirrored(left), count, options))
 
 
-def disparity_range(left: NDArray[np.uint8], right: NDArray[np.uint8], rig: StereoRig, options: SgmOptions) -> int:
+def _finish(reference: U8, other: U8, raw: F32, raw_other: F32, options: SgmOptions) -> F32:
+    """Checked against the other image's disparities, speckles dropped, refined; ``reference`` is the left image."""
+    kept = _without_speckles(_consistent(raw, raw_other, options.consistency_px), options)
+    return refine_disparity(reference, other, kept, iterations=options.refine_iterations)
+
+
+def _finish_mirrored(left: U8, right: U8, raw_left: F32, raw_right: F32, options: SgmOptions) -> F32:
+    """``_finish`` for the right image as the reference."""
+    mirrors = (_mirrored(image) for image in (right, left, raw_right, raw_left))
+    return _mirrored(_finish(*mirrors, options))
+
+
+def disparity_range(left: U8, right: U8, rig: StereoRig, options: SgmOptions) -> int:
     """Number of disparities to search, a multiple of 16, from the options or from grey images (H, W)."""
     width = left.shape[1]
     if options.num_disparities is not None:
@@ -121,20 +149,18 @@ def disparity_range(left: NDArray[np.uint8], right: NDArray[np.uint8], rig: Ster
     return 16 * math.ceil(min(max(largest, 1.0), width) / 16)
 
 
-def _largest_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], options: SgmOptions) -> float:
+def _largest_disparity(left: U8, right: U8, options: SgmOptions) -> float:
     small = (max(left.shape[1] // _COARSE, 1), max(left.shape[0] // _COARSE, 1))
     a, b = (cv2.resize(image, small, interpolation=cv2.INTER_AREA) for image in (left, right))
     count = 16 * math.ceil(small[0] / 2 / 16)
-    raw_a = _sgm(a, b, count, options)
-    raw_b = _mirrored(_sgm(_mirrored(b), _mirrored(a), count, options))
-    found = _consistent(raw_a, raw_b, options.consistency_px)
+    found = _consistent(*_match_both(a, b, count, options), options.consistency_px)
     found = found[np.isfinite(found)]
     if found.size == 0:
         return 16.0
     return _COARSE * (float(np.quantile(found, _RANGE_QUANTILE)) * _RANGE_MARGIN + 1.0)
 
 
-def _sgm(reference: NDArray[np.uint8], other: NDArray[np.uint8], count: int, options: SgmOptions) -> F32:
+def _sgm(reference: U8, other: U8, count: int, options: SgmOptions) -> F32:
     """Raw disparity (H, W) of ``reference`` as the left image, NaN where there is none."""
     # SGBM leaves the first ``count`` columns out: it gets them as padding instead.
     a, b = (cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE) for image in (reference, other))
@@ -164,12 +190,6 @@ def _consistent(reference: F32, other: F32, tolerance: float) -> F32:
     partner = np.rint(columns - np.nan_to_num(reference)).astype(np.int64)
     back = np.take_along_axis(other, np.clip(partner, 0, reference.shape[1] - 1), axis=1)
     return np.where(np.abs(reference - back) <= tolerance, reference, np.float32(np.nan))
-
-
-def _finish(reference: NDArray[np.uint8], other: NDArray[np.uint8], disparity: F32, options: SgmOptions) -> F32:
-    """Speckles dropped, the rest refined."""
-    kept = _without_speckles(disparity, options)
-    return refine_disparity(reference, other, kept, iterations=options.refine_iterations)
 
 
 def _without_speckles(disparity: F32, options: SgmOptions) -> F32:

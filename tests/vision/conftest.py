@@ -1,7 +1,7 @@
 """An exact rolling-shutter camera in a textured world of planes and spheres: closed forms, no renderer.
 
-A pixel's ray leaves its row's camera, meets the nearest surface, and takes the value of a smooth solid texture at that
-very point: images without sampling noise and depth to float64.
+A pixel's ray leaves its row's camera, meets the nearest surface, and takes the value of a smooth solid texture at
+that very point: images without sampling noise and depth to float64.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def build(
         texture=Texture(shortest, seed),
         rig=StereoRig(camera=PinholeCamera.centred(width, height, focal), baseline=baseline),
         shutter=RollingShutter(height=height, readout_ratio=readout_ratio),
-        motion=LinearMotion(np.deg2rad(w_deg), d),
+        motion=LinearMotion(np.deg2rad(w_deg), np.array(d)),
         sky=sky,
     )
 

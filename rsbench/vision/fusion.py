@@ -1,0 +1,144 @@
+"""Filling what a corrected frame did not see: from the other camera, from the other frame, at last by a guess.
+
+A pixel of the target is a hole of the corrected frame for one of three reasons: something hid the place, it lies
+outside the frame, or its depth is unknown. Another image of the same scene may have seen it. Each is warped to the
+target like the frame itself; where several see the place, the nearest surface is what the target camera sees, and
+among those that agree in depth the earlier in the list wins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.se3 import Pose
+from rsbench.vision import forward_warp
+from rsbench.vision.correction import Corrected, WarpOptions, inverse_depth, relative_row_maps, warp
+
+Mask = NDArray[np.bool_]
+
+
+class Origin(IntEnum):
+    """Where a pixel of a corrected frame comes from."""
+
+    NOBODY = 0
+    """No frame saw the place, as far as depth is known."""
+    HERE = 1
+    """The frame itself, at a measured depth or at infinity."""
+    GUESSED = 2
+    """The frame itself, at a depth guessed from its neighbours."""
+    OTHER_CAMERA = 3
+    """The other camera's frame of the same time."""
+    OTHER_FRAME = 4
+    """A frame of the other time, of either camera."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SourceView:
+    """One image that may know something about the target."""
+
+    image: NDArray[Any]
+    """(H, W) or (H, W, C)."""
+    depth: NDArray[np.float32]
+    """(H, W) metres; inf is infinitely far, 0 or NaN unknown."""
+    poses: Pose
+    """``cam_from_world`` of every row."""
+    origin: Origin
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fused:
+    """A corrected frame with its holes filled as far as anything is known."""
+
+    image: NDArray[Any]
+    """(H, W) or (H, W, C), type of the sources; 0 where the origin is NOBODY."""
+    origin: NDArray[np.uint8]
+    """(H, W) of ``Origin``."""
+    depth: NDArray[np.float32]
+    """(H, W) z in the target camera, metres; inf at infinity, NaN where the origin is NOBODY."""
+    corrected: Corrected
+    """The frame itself, before filling."""
+
+    def shares(self) -> dict[str, float]:
+        """Share of the pixels of each origin, by its name in lower case."""
+        counts = np.bincount(self.origin.ravel(), minlength=len(Origin))
+        return {origin.name.lower(): float(counts[origin]) / self.origin.size for origin in Origin}
+
+
+_AGREE = 0.03
+"""Relative difference of depth below which two views show the same surface."""
+_MARGIN = 3
+"""Pixels around a hole whose sources are drawn too, so that the mesh reaches its rim."""
+
+
+def fuse(
+    views: Sequence[SourceView], camera: PinholeCamera, target_pose: Pose, options: WarpOptions | None = None
+) -> Fused:
+    """Warp the first view to ``target_pose`` and fill its holes from the others; views of origin GUESSED come last.
+
+    Raises ValueError as ``rsbench.vision.correction.warp``.
+    """
+    first, others = views[0], views[1:]
+    corrected = warp(first.image, first.depth, camera, first.poses, target_pose, options=options)
+    image, depth = corrected.image.copy(), corrected.depth.copy()
+    origin = np.where(corrected.mask, np.uint8(first.origin), np.uint8(Origin.NOBODY))
+    measured = [view for view in others if view.origin is not Origin.GUESSED]
+    guessed = [view for view in others if view.origin is Origin.GUESSED]
+    for group in (measured, guessed):
+        holes = origin == Origin.NOBODY
+        for view in group:
+            if not np.any(holes):
+                break
+            candidate = _warp_into(view, holes, camera, target_pose, options)
+            if candidate is None:
+                continue
+            # Where two know a pixel of a hole, the nearer surface hides the other.
+            known = np.where(np.isnan(depth), np.float32(np.inf), depth)
+            with np.errstate(invalid="ignore"):  # inf * 0.97 against inf
+                nearer = candidate.depth < known * (1.0 - _AGREE)
+            take = candidate.mask & holes & ((origin == Origin.NOBODY) | nearer)
+            image[take], depth[take] = candidate.image[take], candidate.depth[take]
+            origin[take] = view.origin
+    return Fused(image=image, origin=origin, depth=depth, corrected=corrected)
+
+
+def _warp_into(
+    view: SourceView, holes: Mask, camera: PinholeCamera, target_pose: Pose, options: WarpOptions | None
+) -> Corrected | None:
+    """The part of a view that falls into the holes; None when nothing does."""
+    M, b = relative_row_maps(camera, view.poses, target_pose)
+    moved = np.zeros((3, *view.depth.shape))
+    forward_warp.move_rows(inverse_depth(view.depth), M, b, moved)
+    wanted = cv2.dilate(holes.astype(np.uint8), np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)) > 0
+    with np.errstate(invalid="ignore"):  # NaN behind the camera and where the depth is unknown
+        inside = camera.contains(np.moveaxis(moved[:2], 0, -1))
+    x, y = (np.where(inside, np.rint(coordinate), 0.0).astype(np.intp) for coordinate in moved[:2])
+    np.clip(x, 0, camera.width - 1, out=x)
+    np.clip(y, 0, camera.height - 1, out=y)
+    useful = inside & wanted[y, x]
+    if not np.any(useful):
+        return None
+    depth = np.where(useful, view.depth, np.float32(0.0))
+    return warp(view.image, depth, camera, view.poses, target_pose, options=options)
+
+
+def inpaint(image: NDArray[Any], missing: Mask, radius: float = 3.0) -> NDArray[Any]:
+    """``image`` (H, W[, C]), uint8 or uint16, with its ``missing`` (H, W) pixels invented from those around them.
+
+    Telea, "An image inpainting technique based on the fast marching method", 2004 (OpenCV).
+    """
+    if not np.any(missing) or np.all(missing):
+        return image.copy()
+    marked = missing.astype(np.uint8)
+    if image.dtype == np.uint8 and (image.ndim == 2 or image.shape[2] == 3):
+        return np.asarray(cv2.inpaint(np.ascontiguousarray(image), marked, radius, cv2.INPAINT_TELEA))
+    planes = np.moveaxis(np.atleast_3d(image), -1, 0)
+    filled = [cv2.inpaint(np.ascontiguousarray(plane), marked, radius, cv2.INPAINT_TELEA) for plane in planes]
+    return np.stack(filled, axis=-1).reshape(image.shape)
