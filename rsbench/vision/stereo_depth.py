@@ -126,15 +126,15 @@ def _match_both(left: U8, right: U8, count: int, options: SgmOptions) -> tuple[F
 
 
 def _finish(reference: U8, other: U8, raw: F32, raw_other: F32, options: SgmOptions) -> F32:
-    """Checked against the other image's disparities, speckles dropped, refined; ``reference`` is the left image."""
+    """Checked against the other image's disparities, speckles dropped, refined; ``reference`` is the left."""
     kept = _without_speckles(_consistent(raw, raw_other, options.consistency_px), options)
     return refine_disparity(reference, other, kept, iterations=options.refine_iterations)
 
 
 def _finish_mirrored(left: U8, right: U8, raw_left: F32, raw_right: F32, options: SgmOptions) -> F32:
     """``_finish`` for the right image as the reference."""
-    mirrors = (_mirrored(image) for image in (right, left, raw_right, raw_left))
-    return _mirrored(_finish(*mirrors, options))
+    raws = _mirrored(raw_right), _mirrored(raw_left)
+    return _mirrored(_finish(_mirrored(right), _mirrored(left), *raws, options))
 
 
 def disparity_range(left: U8, right: U8, rig: StereoRig, options: SgmOptions) -> int:
