@@ -192,7 +192,8 @@ def pair_terms(
     w = (theta[0], theta[1], theta[2])
     for m in range(len(pairs)):
         x, y, offset = (pairs[m, 0], pairs[m, 1], 1.0), (pairs[m, 2], pairs[m, 3], 1.0), pairs[m, 6]
-        T, rate0, rate1 = move(theta, twist, pairs[m, 4], pairs[m, 5], R, A)
+        tau0, tau1 = pairs[m, 4], pairs[m, 5]
+        T, rate0, rate1 = move(theta, twist, tau0, tau1, R, A)
         Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
         T, turn = plus((T[0] + offset, T[1], T[2]), -1.0, Ro), cross(w, Ro)
         value, q = _pair_gradient(w, x, y, R, T, plus(rate0, 1.0, turn), plus(rate1, -1.0, turn), focal, h)
@@ -200,10 +201,12 @@ def pair_terms(
         residuals[m] = value / math.sqrt(qq) if qq > 0.0 else 0.0
         if not want or qq <= 0.0:
             continue
-        step0, step1 = value / qq / focal[0], value / qq / focal[1]
-        x, y = (x[0] - step0 * q[0], x[1] - step1 * q[1], 1.0), (y[0] - step0 * q[2], y[1] - step1 * q[3], 1.0)
-        translation_jacobian(theta, twist, pairs[m, 4], pairs[m, 5], R, A, T_w, T_v)
-        _pair_jacobian(x, y, R, A, T, T_w, T_v, Ro, J)
+        step = value / qq
+        x = (x[0] - step * q[0] / focal[0], x[1] - step * q[1] / focal[1], 1.0)
+        y = (y[0] - step * q[2] / focal[0], y[1] - step * q[3] / focal[1], 1.0)
+        _pair_jacobian(
+            theta, twist, x, y, tau0 - h * step * q[1], tau1 - h * step * q[3], offset, R, A, T_w, T_v, J
+        )
         for i in range(6):
             gradient[i] += J[i] / math.sqrt(qq) * residuals[m]
             for j in range(6):
@@ -234,22 +237,28 @@ def _pair_gradient(
 
 @compiled
 def _pair_jacobian(
+    theta: FloatArray,
+    twist: bool,
     x: Vector,
     y: Vector,
+    tau0: float,
+    tau1: float,
+    offset: float,
     R: FloatArray,
     A: FloatArray,
-    T: Vector,
     T_w: FloatArray,
     T_v: FloatArray,
-    Ro: Vector,
     J: FloatArray,
 ) -> None:
-    """Derivative (6,) of y^T [T]x R x by theta; T includes the camera's offset, T_w only the body's motion."""
+    """Derivative (6,) of y^T [T]x R x by theta; R, A, T_w, T_v are work space."""
+    T, _, _ = move(theta, twist, tau0, tau1, R, A)
+    translation_jacobian(theta, twist, tau0, tau1, R, A, T_w, T_v)
+    Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
+    T = plus((T[0] + offset, T[1], T[2]), -1.0, Ro)
     p = apply(R, x)
     n = cross(p, y)
     turned = plus(plus(times(dot(T, p), y), -dot(y, p), T), -1.0, cross(Ro, n))
-    by_w = apply_transposed(A, turned)
-    by_w = plus(by_w, 1.0, apply_transposed(T_w, n))
+    by_w = plus(apply_transposed(A, turned), 1.0, apply_transposed(T_w, n))
     by_v = apply_transposed(T_v, n)
     for j in range(3):
         J[j], J[3 + j] = by_w[j], by_v[j]

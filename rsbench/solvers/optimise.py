@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt on six parameters."""
+"""Levenberg-Marquardt on six parameters (w, v)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from rsbench.core.so3 import FloatArray
 
 Evaluate = Callable[[FloatArray], tuple[float, FloatArray, FloatArray]]
+_LARGEST_DAMPING = 1e10
 
 
 class Minimum(NamedTuple):
@@ -18,7 +19,7 @@ class Minimum(NamedTuple):
     theta: FloatArray
     cost: float
     H: FloatArray
-    """Gauss-Newton Hessian at the end."""
+    """Gauss-Newton Hessian at the end, by theta."""
 
 
 def levenberg_marquardt(
@@ -26,6 +27,7 @@ def levenberg_marquardt(
     theta: FloatArray,
     iterations: int,
     limit: float,
+    inverse_length: bool = False,
     tolerance: float = 1e-12,
 ) -> Minimum:
     """Minimise ``evaluate(theta) -> (cost, gradient, Hessian)``.
@@ -33,26 +35,23 @@ def levenberg_marquardt(
     Args:
         theta: (6,) start.
         iterations: most evaluations.
-        limit: largest length of theta[3:]: without it, an unobservable scale runs to infinity.
-        tolerance: relative change at which to stop.
+        limit: largest length of v: without it, an unobservable scale runs to infinity.
+        inverse_length: take the steps in the direction of v and in 1 / |v|, which cannot pass zero. Pairs feel
+            the length of v as baseline / |v| only, and the cost is nearly quadratic in that, while in v it is a
+            valley that flattens out.
+        tolerance: relative change of the parameters or the cost at which to stop.
     """
     theta = _clamped(theta, limit)
     cost, gradient, H = evaluate(theta)
     damping = 1e-4
     for _ in range(iterations):
-        diagonal = np.diagonal(H)
-        scale = np.sqrt(np.maximum(diagonal, 1e-12 * np.max(diagonal)) + 1e-300)
-        A = H / np.outer(scale, scale)
-        A[np.diag_indices(6)] += damping
-        step = -np.linalg.solve(A, gradient / scale) / scale
-        trial = _clamped(theta + step, limit)
+        trial = _trial(theta, gradient, H, damping, limit, inverse_length)
         if not np.all(np.isfinite(trial)):
             break
         trial_cost, trial_gradient, trial_H = evaluate(trial)
         moved = np.abs(trial - theta)
-        small = np.all(moved[:3] <= tolerance) and np.all(
-            moved[3:] <= tolerance * (1e-3 + np.linalg.norm(theta[3:]))
-        )
+        length = 1e-3 + float(np.linalg.norm(theta[3:]))
+        small = bool(np.all(moved[:3] <= tolerance) and np.all(moved[3:] <= tolerance * length))
         if trial_cost <= cost:
             flat = cost - trial_cost <= tolerance * cost
             theta, cost, gradient, H = trial, trial_cost, trial_gradient, trial_H
@@ -61,9 +60,46 @@ def levenberg_marquardt(
                 break
         else:
             damping *= 10.0
-            if small or damping > 1e10:
+            if small or damping > _LARGEST_DAMPING:
                 break
     return Minimum(theta, cost, H)
+
+
+def _trial(
+    theta: FloatArray, gradient: FloatArray, H: FloatArray, damping: float, limit: float, inverse_length: bool
+) -> FloatArray:
+    """Where a damped step leads."""
+    length = float(np.linalg.norm(theta[3:]))
+    if not inverse_length or length == 0.0:
+        return _clamped(theta + _damped_step(H, gradient, damping), limit)
+    Q, M = _chart(theta[3:], length)
+    gradient, H = M.T @ gradient, M.T @ H @ M
+    free = np.ones(6, dtype=np.bool_)
+    free[3] = length < 0.999 * limit or gradient[3] < 0.0
+    step = np.zeros(6)
+    step[free] = _damped_step(H[np.ix_(free, free)], gradient[free], damping)
+    direction = Q @ np.array([1.0, step[4], step[5]])
+    inverse = max(1.0 / length + step[3], 1.0 / limit)
+    return np.concatenate([theta[:3] + step[:3], direction / (np.linalg.norm(direction) * inverse)])
+
+
+def _damped_step(H: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
+    diagonal = np.diagonal(H)
+    scale = np.sqrt(np.maximum(diagonal, 1e-12 * np.max(diagonal)) + 1e-300)
+    A = H / np.outer(scale, scale)
+    A[np.diag_indices(len(A))] += damping
+    return -np.linalg.solve(A, gradient / scale) / scale
+
+
+def _chart(v: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
+    """Axes (3, 3) along and across v; derivative (6, 6) of (w, v) by w, 1 / |v| and the direction's two angles."""
+    u = v / length
+    first = np.cross(u, np.eye(3)[np.argmin(np.abs(u))])
+    first /= np.linalg.norm(first)
+    Q = np.column_stack([u, first, np.cross(u, first)])
+    M = np.eye(6)
+    M[3:, 3:] = Q * np.array([-(length**2), length, length])
+    return Q, M
 
 
 def _clamped(theta: FloatArray, limit: float) -> FloatArray:

@@ -22,6 +22,8 @@ from rsbench.solvers.optimise import Minimum, levenberg_marquardt
 from rsbench.solvers.packed import Packed, pack
 
 _SCREEN_ITERATIONS, _SCREEN_MATCHES, _SAMPLE_ITERATIONS = 6, 150, 4
+_LONGEST_START = 2.0
+"""Length of d in baselines that a descent on pairs starts with at most."""
 _LEAST_IN_FRONT = 0.75
 _LEAST_NOISE_PX = 0.01
 """Noise assumed at least when judging whether data determine a rotation: exact data fit anything exactly."""
@@ -102,7 +104,13 @@ class RefinedSolver(Solver):
         return self.report(packed, self._checked(packed, packed.theta(motion.w, motion.d)))
 
     def _minimise(self, packed: Packed, theta: FloatArray, iterations: int) -> Minimum:
-        return levenberg_marquardt(packed.normal_equations, theta, iterations, self.max_translation_m)
+        return levenberg_marquardt(
+            packed.normal_equations,
+            theta,
+            iterations,
+            self.max_translation_m,
+            inverse_length=len(packed.tracks) == 0,
+        )
 
     def _descend(self, packed: Packed, rig: StereoRig) -> Minimum | None:
         if len(packed.tracks) >= 3:
@@ -117,9 +125,12 @@ class RefinedSolver(Solver):
 
     def _checked(self, packed: Packed, theta: FloatArray) -> Minimum:
         """Descent; when the points then lie behind the cameras, another from the opposite translation."""
-        best = self._minimise(packed, theta, self.iterations)
         if len(packed.tracks) >= 3:
-            return best
+            return self._minimise(packed, theta, self.iterations)
+        # A start on fewer matches may have left the length of d at its limit, where the cost is flat.
+        length, most = float(np.linalg.norm(theta[3:])), _LONGEST_START * packed.baseline
+        start = np.concatenate([theta[:3], theta[3:] * (most / max(length, most))])
+        best = self._minimise(packed, start, self.iterations)
         flipped = np.concatenate([best.theta[:3], -best.theta[3:]])
         if packed.in_front(flipped) > packed.in_front(best.theta):
             return self._minimise(packed, flipped, self.iterations)
@@ -211,7 +222,7 @@ def _signed_start(packed: Packed, pairs: FloatArray, w: FloatArray, d: FloatArra
     scaled = scaled_translation(pairs, w, 10.0 * rig.baseline)
     length = 0.5 * rig.baseline
     if scaled is not None:
-        length = float(np.clip(np.linalg.norm(scaled), 0.1 * rig.baseline, 2.0 * rig.baseline))
+        length = float(np.clip(np.linalg.norm(scaled), 0.1 * rig.baseline, _LONGEST_START * rig.baseline))
     return _signed(packed, w, d / np.linalg.norm(d) * length)
 
 

@@ -199,7 +199,7 @@ def test_options_refuse_nonsense(bad: dict[str, float]) -> None:
 
 
 def test_false_alarms_by_hand() -> None:
-    # C(10, 4) = 210 choices, two inliers beyond a sample of 2 at one in a hundred each, 50 samples: 210 * 50 * 1e-4.
+    # C(10, 4) = 210 choices, two inliers beyond a sample of 2 at 1 in 100 each, 50 samples: 210 * 50 * 1e-4.
     assert log10_false_alarms(4, 10, 2, 50, 0.01) == pytest.approx(math.log10(210 * 50 * 1e-4), abs=1e-12)
 
 

@@ -68,7 +68,8 @@ def test_built_in_solvers_are_listed() -> None:
 def test_parameters_come_from_the_card(tmp_path: Path) -> None:
     path = card(
         tmp_path,
-        'class = "rsbench.solvers.linear:LinearSolver"\ndescription = "mine"\n[parameters]\nextraction = "symmetric"\n'
+        'class = "rsbench.solvers.linear:LinearSolver"\ndescription = "mine"\n'
+        '[parameters]\nextraction = "symmetric"\n',
     )
     loaded = load_solver_card(path)
     assert isinstance(loaded.solver, LinearSolver) and loaded.solver.extraction == "symmetric"
