@@ -26,6 +26,7 @@ RIGHT, BELOW = 1, 2
 """Bits of ``connect``: joined to the neighbour on the right, below."""
 _SLACK = 1e-7  # px and barycentric; a centre on a shared edge must fall into one triangle at least
 _DEGENERATE = 1e9  # inverse area, px^-2, of a triangle seen edge-on
+_MAX_STRETCH = 16.0  # px that one source pixel may span at the target: wider ones show nothing and cost their area
 _SAME_SURFACE = 1.001  # a cell yields to the mesh unless it is nearer by this factor of inverse depth
 
 
@@ -135,10 +136,12 @@ def _quad(
     cx, cy, cz = lower[near, 0], lower[near, 1], lower[near, 2]
     dx, dy, dz = lower[far, 0], lower[far, 1], lower[far, 2]
     height, width = buffer.shape
-    start = max(0.0, np.ceil(min(min(ax, bx), min(cx, dx)) - _SLACK))
-    stop = min(width - 1.0, np.floor(max(max(ax, bx), max(cx, dx)) + _SLACK))
-    top = max(0.0, np.ceil(min(min(ay, by), min(cy, dy)) - _SLACK))
-    bottom = min(height - 1.0, np.floor(max(max(ay, by), max(cy, dy)) + _SLACK))
+    low_x, high_x = min(min(ax, bx), min(cx, dx)), max(max(ax, bx), max(cx, dx))
+    low_y, high_y = min(min(ay, by), min(cy, dy)), max(max(ay, by), max(cy, dy))
+    if not (high_x - low_x <= _MAX_STRETCH and high_y - low_y <= _MAX_STRETCH):
+        return
+    start, stop = max(0.0, np.ceil(low_x - _SLACK)), min(width - 1.0, np.floor(high_x + _SLACK))
+    top, bottom = max(0.0, np.ceil(low_y - _SLACK)), min(height - 1.0, np.floor(high_y + _SLACK))
     if not (start <= stop and top <= bottom):
         return
     ux, uy, vx, vy = bx - ax, by - ay, cx - ax, cy - ay
@@ -211,6 +214,8 @@ def _cell(
     if not abs(scale) < _DEGENERATE:
         return
     reach_x, reach_y = 0.5 * (abs(ux) + abs(vx)) + _SLACK, 0.5 * (abs(uy) + abs(vy)) + _SLACK
+    if not (2.0 * reach_x <= _MAX_STRETCH and 2.0 * reach_y <= _MAX_STRETCH):
+        return
     top, bottom = max(0.0, np.ceil(ay - reach_y)), min(height - 1.0, np.floor(ay + reach_y))
     left, right = max(0.0, np.ceil(ax - reach_x)), min(width - 1.0, np.floor(ax + reach_x))
     if not (top <= bottom and left <= right):
