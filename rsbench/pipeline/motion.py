@@ -95,9 +95,7 @@ def _conclude(
     """The solver on all inliers, and the matches that this final motion explains."""
     if not report.success or report.model is None:
         return MotionEstimate.failed(report.reason), problem.masks(report.inliers)
-    final = problem.refine(report.model, report.inliers)
-    if final is None:
-        return report.model, problem.masks(report.inliers)
+    final = problem.conclude(report.model, report.inliers)
     return final, problem.masks(np.abs(problem.residuals(final)) <= threshold)
 
 
@@ -165,8 +163,14 @@ class _RobustProblem:
 
     def refine(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate | None:
         subset = self._subset(np.flatnonzero(inliers))
-        estimate = self.solver.improve(model, subset, self.rig, self.shutter)
+        estimate = self.solver.improve(model, subset, self.rig, self.shutter, quick=True)
         return estimate if estimate.success else None
+
+    def conclude(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate:
+        """The solver on all inliers; the model itself when the solver fails there."""
+        subset = self._subset(np.flatnonzero(inliers))
+        estimate = self.solver.improve(model, subset, self.rig, self.shutter)
+        return estimate if estimate.success else model
 
     def _subset(self, indices: IntArray) -> Correspondences:
         left, right, _ = self.num_data

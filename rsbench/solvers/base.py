@@ -95,7 +95,17 @@ class Solver(ABC):
         return [estimate] if estimate.success else []
 
     def improve(
-        self, motion: MotionEstimate, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        quick: bool = False,
     ) -> MotionEstimate:
-        """Like ``estimate``, for a solver that gains from starting at a nearby motion."""
+        """Like ``estimate``, for a solver that gains from starting at a nearby motion.
+
+        Args:
+            motion: where to start.
+            quick: a step of a search, whose result is improved again: need not be the last digit.
+        """
         return self.estimate(correspondences, rig, shutter)

@@ -11,6 +11,8 @@ from rsbench.core.so3 import FloatArray
 
 Evaluate = Callable[[FloatArray], tuple[float, FloatArray, FloatArray]]
 _LARGEST_DAMPING = 1e10
+_FLAT = 1e-10
+"""Relative decrease of the cost at which to stop: with n matches sqrt(n 1e-10) standard deviations from the end."""
 
 
 class Minimum(NamedTuple):
@@ -39,7 +41,7 @@ def levenberg_marquardt(
         inverse_length: take the steps in the direction of v and in 1 / |v|, which cannot pass zero. Pairs feel
             the length of v as baseline / |v| only, and the cost is nearly quadratic in that, while in v it is a
             valley that flattens out.
-        tolerance: relative change of the parameters or the cost at which to stop.
+        tolerance: relative change of the parameters at which to stop.
     """
     theta = _clamped(theta, limit)
     cost, gradient, H = evaluate(theta)
@@ -53,7 +55,7 @@ def levenberg_marquardt(
         length = 1e-3 + float(np.linalg.norm(theta[3:]))
         small = bool(np.all(moved[:3] <= tolerance) and np.all(moved[3:] <= tolerance * length))
         if trial_cost <= cost:
-            flat = cost - trial_cost <= tolerance * cost
+            flat = cost - trial_cost <= _FLAT * cost
             theta, cost, gradient, H = trial, trial_cost, trial_gradient, trial_H
             damping = max(damping * 0.1, 1e-12)
             if small or flat:
@@ -93,10 +95,11 @@ def _damped_step(H: FloatArray, gradient: FloatArray, damping: float) -> FloatAr
 
 def _chart(v: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
     """Axes (3, 3) along and across v; derivative (6, 6) of (w, v) by w, 1 / |v| and the direction's two angles."""
-    u = v / length
-    first = np.cross(u, np.eye(3)[np.argmin(np.abs(u))])
-    first /= np.linalg.norm(first)
-    Q = np.column_stack([u, first, np.cross(u, first)])
+    # The Householder reflection that takes the first axis to v / |v|, up to sign.
+    sign = 1.0 if v[0] >= 0.0 else -1.0
+    h = v / length
+    h[0] += sign
+    Q = -sign * (np.eye(3) - (2.0 / (h @ h)) * np.outer(h, h))
     M = np.eye(6)
     M[3:, 3:] = Q * np.array([-(length**2), length, length])
     return Q, M

@@ -26,6 +26,8 @@ def track_pairs(tracks: FloatArray, side: Side) -> FloatArray:
 def unlinked_pairs(correspondences: Correspondences, side: Side) -> np.ndarray:
     """Mask of the left or right matches that no track repeats: the tracks know more about those that it does."""
     pairs: FloatArray = getattr(correspondences, side)
+    if len(pairs) == 0 or len(correspondences.tracks) == 0:
+        return np.ones(len(pairs), dtype=np.bool_)
     known = {row.tobytes() for row in np.ascontiguousarray(track_pairs(correspondences.tracks, side))}
     return np.array([row.tobytes() not in known for row in pairs], dtype=np.bool_)
 
@@ -153,14 +155,14 @@ def pack(
     if motion_model not in MOTION_MODELS:
         raise ValueError(f"motion_model must be one of {', '.join(MOTION_MODELS)}, got {motion_model!r}")
     tracks = correspondences.tracks if use_tracks else correspondences.tracks[:0]
-    pairs = []
+    pairs = [np.zeros((0, 7))]
     for side in SIDES:
         if use_tracks:
-            matches = getattr(correspondences, side)
-            matches = matches[unlinked_pairs(correspondences, side)] if len(tracks) else matches
+            matches = getattr(correspondences, side)[unlinked_pairs(correspondences, side)]
         else:
             matches = temporal_pairs(correspondences, side)
-        pairs.append(pack_pairs(matches, side, rig, shutter))
+        if len(matches):
+            pairs.append(pack_pairs(matches, side, rig, shutter))
     camera = rig.camera
     return Packed(
         pairs=np.concatenate(pairs),
@@ -175,23 +177,21 @@ def pack(
 
 def pack_pairs(matches: FloatArray, side: Side, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
     """(n, 7) for ``kernels.pair_terms`` from matches (n, 4) of one camera."""
-    ray0, ray1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
-    tau0, tau1 = shutter.row_time(matches[:, 1], 0), shutter.row_time(matches[:, 3], 1)
-    offset = np.full(len(matches), rig.offset(side)[0])
-    return np.column_stack([ray0[:, :2], ray1[:, :2], tau0, tau1, offset])
+    out = np.zeros((len(matches), 7))
+    out[:, :2] = rig.camera.unproject(matches[:, :2])[:, :2]
+    out[:, 2:4] = rig.camera.unproject(matches[:, 2:])[:, :2]
+    out[:, 4], out[:, 5] = shutter.row_time(matches[:, 1], 0), shutter.row_time(matches[:, 3], 1)
+    out[:, 6] = rig.offset(side)[0]
+    return out
 
 
 def pack_tracks(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
     """(n, 8) for ``track_kernels.track_terms`` from tracks (n, 8)."""
     camera = rig.camera
-    m0, m1 = 0.5 * (tracks[:, :2] + tracks[:, 2:4]), 0.5 * (tracks[:, 4:6] + tracks[:, 6:8])
-    return np.column_stack(
-        [
-            camera.unproject(m0)[:, :2],
-            tracks[:, 0] - tracks[:, 2],
-            m1 - np.array([camera.cx, camera.cy]),
-            tracks[:, 4] - tracks[:, 6],
-            shutter.row_time(m0[:, 1], 0),
-            shutter.row_time(m1[:, 1], 1),
-        ]
-    )
+    middle = 0.5 * (tracks[:, [0, 1, 4, 5]] + tracks[:, [2, 3, 6, 7]])
+    out = np.zeros((len(tracks), 8))
+    out[:, :2] = camera.unproject(middle[:, :2])[:, :2]
+    out[:, 2], out[:, 5] = tracks[:, 0] - tracks[:, 2], tracks[:, 4] - tracks[:, 6]
+    out[:, 3], out[:, 4] = middle[:, 2] - camera.cx, middle[:, 3] - camera.cy
+    out[:, 6], out[:, 7] = shutter.row_time(middle[:, 1], 0), shutter.row_time(middle[:, 3], 1)
+    return out

@@ -98,10 +98,19 @@ class RefinedSolver(Solver):
         return [MotionEstimate(w=w, d=d, success=True) for w, d in motions if np.all(np.isfinite(np.append(w, d)))]
 
     def improve(
-        self, motion: MotionEstimate, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        quick: bool = False,
     ) -> MotionEstimate:
         packed = pack(correspondences, rig, shutter, self.motion_model, self.use_tracks)
-        return self.report(packed, self._checked(packed, packed.theta(motion.w, motion.d)))
+        start = packed.theta(motion.w, motion.d)
+        if not quick:
+            return self.report(packed, self._checked(packed, start))
+        w, d = packed.motion(self._minimise(packed, start, _SCREEN_ITERATIONS).theta)
+        return MotionEstimate(w=w, d=d, success=True)
 
     def _minimise(self, packed: Packed, theta: FloatArray, iterations: int) -> Minimum:
         return levenberg_marquardt(
