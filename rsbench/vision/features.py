@@ -9,6 +9,7 @@ Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +29,7 @@ Indices = NDArray[np.int64]
 class MatchOptions:
     """What counts as a feature and what as a match; distances between descriptors are SIFT's, 0 to about 720."""
 
-    max_features: int = 8000
+    max_features: int = 6000
     """Strongest features kept per image; 0 keeps all."""
     contrast_threshold: float = 0.04
     edge_threshold: float = 10.0
@@ -86,7 +87,7 @@ def detect(image: NDArray[Any], options: MatchOptions | None = None) -> Features
     keypoints, descriptors = sift.detectAndCompute(grey_u8(image), None)
     if not keypoints:
         return Features(points=np.zeros((0, 2)), descriptors=np.zeros((0, 128), dtype=np.float32))
-    points = np.array([k.pt for k in keypoints], dtype=np.float64)
+    points = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
     order = np.lexsort((points[:, 0], points[:, 1]))
     return Features(points=points[order], descriptors=descriptors[order])
 
@@ -126,20 +127,19 @@ def match_stereo_frames(
     for name, image in images.items():
         if image.shape[:2] != left_0.shape[:2]:
             raise ValueError(f"{name} must have the size of left_0, {left_0.shape[:2]}, got {image.shape[:2]}")
-    features = {name: detect(image, options) for name, image in images.items()}
     reach = float(max(left_0.shape)) if options.search_radius is None else options.search_radius
     anywhere = Gate(dx=(-reach, reach), dy=(-reach, reach))
     disparity = float(left_0.shape[1]) if options.max_disparity is None else options.max_disparity
     tolerance = options.row_tolerance
     beside = Gate(dx=(-disparity, -np.finfo(np.float64).tiny), dy=(-tolerance, tolerance))
-    left = match(features["left_0"], features["left_1"], anywhere, options)
-    right = match(features["right_0"], features["right_1"], anywhere, options)
-    stereo_0 = match(features["left_0"], features["right_0"], beside, options)
-    stereo_1 = match(features["left_1"], features["right_1"], beside, options)
+    # OpenCV, the BLAS and the compiled loop let go of the GIL.
+    with ThreadPoolExecutor() as pool:
+        l0, r0, l1, r1 = pool.map(lambda image: detect(image, options), images.values())
+        tasks = ((l0, l1, anywhere), (r0, r1, anywhere), (l0, r0, beside), (l1, r1, beside))
+        left, right, stereo_0, stereo_1 = pool.map(lambda t: match(t[0], t[1], t[2], options), tasks)
     tracks = close_loops(left, right, stereo_0, stereo_1)
     if options.drop_contradicted:
         left, right = _agreeing(left, right, stereo_0, stereo_1)
-    l0, r0, l1, r1 = (features[name].points for name in images)
     return Correspondences(
         left=_positions((l0, l1), left),
         right=_positions((r0, r1), right),
@@ -177,5 +177,5 @@ def _lookup(pairs: Indices, keys: Indices) -> Indices:
     return table[np.where(keys >= 0, keys, size)]
 
 
-def _positions(points: tuple[FloatArray, ...], indices: Indices) -> FloatArray:
-    return np.concatenate([p[i] for p, i in zip(points, indices.T, strict=True)], axis=1)
+def _positions(features: tuple[Features, ...], indices: Indices) -> FloatArray:
+    return np.concatenate([f.points[i] for f, i in zip(features, indices.T, strict=True)], axis=1)

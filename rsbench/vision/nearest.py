@@ -63,7 +63,7 @@ def best_two(
     return best, nearest, second, back
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _scan(
     products: F32,
     norms_a: F32,
@@ -86,10 +86,13 @@ def _scan(
         x, y = points_a[i, 0], points_a[i, 1]
         for c in range(columns):
             j = low + c
+            distance = norms_a[i] + norms_b[j] - np.float32(2.0) * products[r, c]
+            # Most candidates improve on nothing; where they lie matters for the others only.
+            if distance >= second[i] and distance >= back_nearest[j]:
+                continue
             dx, dy = points_b[j, 0] - x, points_b[j, 1] - y
             if dx < window[0] or dx > window[1] or dy < window[2] or dy > window[3]:
                 continue
-            distance = norms_a[i] + norms_b[j] - np.float32(2.0) * products[r, c]
             if distance < nearest[i]:
                 second[i] = nearest[i]
                 nearest[i], best[i] = distance, j
