@@ -54,7 +54,7 @@ class Bound:
     @property
     def covariance(self) -> FloatArray | None:
         """(6, 6) of (w, d); None where the data leave something open."""
-        scale = np.sqrt(np.maximum(np.diagonal(self.information), 1e-300))
+        scale = _scale(self.information)
         values, vectors = np.linalg.eigh(self.information / np.outer(scale, scale))
         if not values[0] > _SINGULAR * values[-1]:
             return None
@@ -108,13 +108,20 @@ def bound_from_information(F: FloatArray, w: FloatArray, d: FloatArray) -> Bound
     )
 
 
+def _scale(F: FloatArray) -> FloatArray:
+    """Factors (6,) that give F a unit diagonal, but for entries that are zero up to rounding."""
+    diagonal = np.diagonal(F)
+    return np.sqrt(np.maximum(diagonal, max(_SINGULAR * float(np.max(diagonal)), 1e-300)))
+
+
 def _marginal_rms(F: FloatArray, target: FloatArray) -> float:
     """Root of the trace of the covariance of ``target @ (w, d)``, infinite when it touches the null space."""
-    scale = np.sqrt(np.maximum(np.diagonal(F), 1e-300))
+    scale = _scale(F)
     values, vectors = np.linalg.eigh(F / np.outer(scale, scale))
     weights = (target / scale) @ vectors
     unknown = values <= _SINGULAR * max(values[-1], 1e-300)
-    if np.any(np.abs(weights[:, unknown]) > 1e-6 * np.linalg.norm(weights)):
+    # Rounding mixes up to 1e-5 of the weakest known directions into the null space of a pure translation.
+    if np.any(np.abs(weights[:, unknown]) > 1e-3 * np.linalg.norm(weights)):
         return float(np.inf)
     known = ~unknown
     return float(np.sqrt(np.sum(weights[:, known] ** 2 / values[known])))

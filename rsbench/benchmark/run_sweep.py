@@ -2,9 +2,10 @@
 
 A folder holds
 
-    sweep.json         the card, the solvers, the cells
-    trials/NNN.npz     truth and predictions of a cell (arrays of ``trials.Trials``, reasons as codes)
-    seconds.csv        median time of a solver per cell; the only file that differs between runs
+    sweep.json           the card, the solvers, the cells
+    trials/NNN.npz       truth and predictions of a cell (see ``trials.run_trials``; reasons as codes)
+    bounds/NNN.npz       Cramer-Rao bounds of all cells with the exact matches of NNN (see ``trials.run_bounds``)
+    seconds/NNN.npz      how long the solvers took: no two runs agree on that
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -26,7 +27,7 @@ import pandas as pd
 from rsbench import __version__
 from rsbench.benchmark.predict import load_arrays, save_arrays
 from rsbench.benchmark.sweeps import Cell, SweepCard
-from rsbench.benchmark.trials import Arrays, Entrant, entrant, run_trials
+from rsbench.benchmark.trials import Arrays, Entrant, entrant, run_bounds, run_trials
 from rsbench.dataset.files import read_json, write_bytes, write_json
 from rsbench.errors import RsbenchError
 
@@ -38,16 +39,45 @@ Progress = Callable[[str], None]
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 
-class _Job(NamedTuple):
-    card: SweepCard
+class _Part(NamedTuple):
+    """A file of the results: arrays over the trials of a cell."""
+
+    kind: Literal["trials", "bounds"]
     cell: Cell
+
+    def path(self, out: Path) -> Path:
+        return out / self.kind / f"{self.cell.index:03d}.npz"
+
+
+class _Job(NamedTuple):
+    """A chunk of a part."""
+
+    card: SweepCard
+    part: _Part
     first: int
+    trials: int
     path: Path
 
 
 def sweep_steps(card: SweepCard) -> int:
     """Number of chunks, for a progress bar."""
-    return len(card.cells()) * -(-card.trials // CHUNK)
+    return len(_parts(card)) * len(_firsts(card))
+
+
+def _firsts(card: SweepCard) -> range:
+    return range(0, card.trials, CHUNK)
+
+
+def _parts(card: SweepCard) -> list[_Part]:
+    cells = card.cells()
+    own_bounds = [cell for cell in cells if geometry_of(card, cell).index == cell.index]
+    return [_Part("trials", cell) for cell in cells] + [_Part("bounds", cell) for cell in own_bounds]
+
+
+def geometry_of(card: SweepCard, cell: Cell) -> Cell:
+    """The first cell with the same exact matches: noise and what solvers are told may differ."""
+    exact = cell.setting.exact()
+    return next(other for other in card.cells() if other.setting.exact() == exact)
 
 
 def run_sweep(card: SweepCard, out: Path, *, workers: int = 1, progress: Progress | None = None) -> None:
@@ -62,29 +92,33 @@ def run_sweep(card: SweepCard, out: Path, *, workers: int = 1, progress: Progres
     Raises:
         RsbenchError: no such solver; ``out`` holds another sweep; a motion leaves too few points in view.
     """
-    entrants = {name: entrant(name) for name in card.solvers}
-    _open_folder(card, entrants, out)
+    _open_folder(card, {name: entrant(name) for name in card.solvers}, out)
     step = progress or (lambda word: None)
     chunks = out / ".chunks"
     chunks.mkdir(exist_ok=True)
     todo = []
-    for cell in card.cells():
-        for first in range(0, card.trials, CHUNK):
-            job = _Job(card, cell, first, chunks / f"{cell.index:03d}-{first:06d}.npz")
-            if trials_path(out, cell).is_file() or job.path.is_file():
-                step(cell.variant)
+    for part in _parts(card):
+        for first in _firsts(card):
+            path = chunks / f"{part.kind}-{part.cell.index:03d}-{first:06d}.npz"
+            if part.path(out).is_file() or path.is_file():
+                step(part.cell.variant)
             else:
-                todo.append(job)
-    for cell in _run_all(todo, workers):
-        step(cell.variant)
-    rows = [row for cell in card.cells() for row in _collect(card, cell, out)]
-    write_table(out / "seconds.csv", pd.DataFrame(rows))
+                todo.append(_Job(card, part, first, min(CHUNK, card.trials - first), path))
+    for part in _run_all(todo, workers):
+        step(part.cell.variant)
+    for part in _parts(card):
+        _collect(card, part, out)
     shutil.rmtree(chunks)
 
 
-def trials_path(out: Path, cell: Cell) -> Path:
-    """File of a cell."""
-    return out / "trials" / f"{cell.index:03d}.npz"
+def read_trials(out: Path, cell: Cell) -> Arrays:
+    """Stored truth and predictions of a cell."""
+    return load_arrays(_Part("trials", cell).path(out))
+
+
+def read_bounds(out: Path, card: SweepCard, cell: Cell) -> Arrays:
+    """Stored bounds of a cell, for a noise of 1 px."""
+    return load_arrays(_Part("bounds", geometry_of(card, cell)).path(out))
 
 
 def read_sweep(folder: Path) -> dict[str, Any]:
@@ -137,11 +171,12 @@ def _open_folder(card: SweepCard, entrants: dict[str, Entrant], out: Path) -> No
             raise RsbenchError(
                 f"{out}: holds another sweep (differs in {', '.join(other)}); choose another --out or delete it"
             )
-    (out / "trials").mkdir(parents=True, exist_ok=True)
+    for kind in ("trials", "bounds", "seconds"):
+        (out / kind).mkdir(parents=True, exist_ok=True)
     write_json(out / "sweep.json", plan)
 
 
-def _run_all(todo: list[_Job], workers: int) -> Iterator[Cell]:
+def _run_all(todo: list[_Job], workers: int) -> Iterator[_Part]:
     """Always in children, so that BLAS has one thread and one summation order whatever the parent has loaded."""
     if not todo:
         return
@@ -152,7 +187,7 @@ def _run_all(todo: list[_Job], workers: int) -> Iterator[Cell]:
             try:
                 for done in as_completed(jobs):
                     done.result()
-                    yield jobs[done].cell
+                    yield jobs[done].part
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
@@ -175,14 +210,16 @@ def _environment(changes: dict[str, str]) -> Iterator[None]:
 def _run_job(job: _Job) -> None:
     """One chunk, in a child."""
     _single_thread()
-    card, cell = job.card, job.cell
-    count = min(CHUNK, card.trials - job.first)
+    card, cell = job.card, job.part.cell
     try:
-        trials = run_trials(cell.setting, card.solvers, card.seed, job.first, count, card.robust)
+        if job.part.kind == "bounds":
+            arrays = run_bounds(cell.setting, card.solvers, card.seed, job.first, job.trials)
+        else:
+            arrays = run_trials(cell.setting, card.solvers, card.seed, job.first, job.trials, card.robust)
     except RsbenchError as error:
         where = f"sweep {card.name}, {cell.variant}, {card.axis} = {cell.value:g}"
         raise RsbenchError(f"{where}: {error}") from error
-    save_arrays(job.path, {**trials.predictions, "seconds": trials.seconds})
+    save_arrays(job.path, arrays)
 
 
 @lru_cache(maxsize=1)
@@ -192,22 +229,17 @@ def _single_thread() -> None:
     cv2.setNumThreads(1)
 
 
-def _collect(card: SweepCard, cell: Cell, out: Path) -> list[dict[str, Any]]:
-    """Join the chunks of a cell into its file; returns its rows of seconds.csv."""
-    path, folder = trials_path(out, cell), out / ".chunks"
-    if not path.is_file():
-        parts = [
-            load_arrays(folder / f"{cell.index:03d}-{first:06d}.npz") for first in range(0, card.trials, CHUNK)
-        ]
-        joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        seconds = joined.pop("seconds")
-        save_arrays(path.with_suffix(".seconds.npz"), {"seconds": seconds})
-        save_arrays(path, _coded(joined))
-    seconds = load_arrays(path.with_suffix(".seconds.npz"))["seconds"]
-    return [
-        {"variant": cell.variant, "value": cell.value, "solver": solver, "median_ms": 1e3 * np.median(column)}
-        for solver, column in zip(card.solvers, seconds.T, strict=True)
-    ]
+def _collect(card: SweepCard, part: _Part, out: Path) -> None:
+    """Join the chunks of a part into its file."""
+    path, prefix = part.path(out), f"{part.kind}-{part.cell.index:03d}"
+    if path.is_file():
+        return
+    chunks = [load_arrays(out / ".chunks" / f"{prefix}-{first:06d}.npz") for first in _firsts(card)]
+    joined = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
+    if part.kind == "trials":
+        save_arrays(out / "seconds" / path.name, {"seconds": joined.pop("seconds")})
+        joined = _coded(joined)
+    save_arrays(path, joined)
 
 
 def _coded(arrays: Arrays) -> Arrays:

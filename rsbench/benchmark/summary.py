@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from rsbench.benchmark.predict import load_arrays
-from rsbench.benchmark.run_sweep import read_sweep, trials_path, write_table
+from rsbench.benchmark.run_sweep import read_bounds, read_sweep, read_trials, write_table
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.sweeps import Cell, SweepCard
 from rsbench.benchmark.trials import Arrays
@@ -28,6 +27,8 @@ from rsbench.core.so3 import FloatArray
 
 SUCCESS_DEG = (1.0, 5.0)
 """A trial counts as solved when e_R and e_T are below these."""
+OBSERVABLE = 0.5
+"""Standard deviation of the direction of d (radians), or of its relative length, above which it is not known."""
 RESAMPLES = 1000
 COVERAGE = 0.95
 Statistic = Callable[[FloatArray], FloatArray]
@@ -52,9 +53,10 @@ def summarise_sweep(folder: Path) -> pd.DataFrame:
     card, solvers = read_card(folder), read_sweep(folder)["solvers"]
     rows = []
     for cell in card.cells():
-        arrays = load_arrays(trials_path(folder, cell))
+        trials, bounds = read_trials(folder, cell), read_bounds(folder, card, cell)
         for number, solver in enumerate(solvers):
-            scores = score_trials(arrays, number, solver["reference_point"], cell)
+            scores = score_trials(trials, number, solver["reference_point"], cell)
+            limit = {name: _scaled(values[:, number], cell.setting.noise_px) for name, values in bounds.items()}
             identity = {
                 "sweep": card.name,
                 "variant": cell.variant,
@@ -65,10 +67,16 @@ def summarise_sweep(folder: Path) -> pd.DataFrame:
                 "information": solver["information"],
                 "ransac": card.robust,
             }
-            rows.append(identity | summary_row(scores, arrays["success"][:, number], card.seed))
+            rows.append(identity | summary_row(scores, trials["success"][:, number], limit, card.seed))
     table = pd.DataFrame(rows)
     write_table(folder / "summary.csv", table)
     return table
+
+
+def _scaled(bounds: FloatArray, noise_px: float) -> FloatArray:
+    """Bounds at a noise; what the matches do not tell stays unknown without noise too."""
+    known = np.isfinite(bounds)
+    return np.where(known, noise_px * np.where(known, bounds, 0.0), np.inf)
 
 
 def score_trials(arrays: Arrays, solver: int, reference_point: str, cell: Cell) -> dict[str, FloatArray]:
@@ -90,8 +98,20 @@ def score_trials(arrays: Arrays, solver: int, reference_point: str, cell: Cell) 
     return {"e_R_deg": np.rad2deg(e_R), "e_T_deg": np.rad2deg(e_T), "e_s": e_s}
 
 
-def summary_row(scores: dict[str, FloatArray], success: NDArray[np.bool_], seed: int) -> dict[str, Any]:
-    """Statistics of one solver in one cell; None where a score does not exist in it."""
+def summary_row(
+    scores: dict[str, FloatArray], success: NDArray[np.bool_], limit: Arrays, seed: int
+) -> dict[str, Any]:
+    """Statistics of one solver in one cell.
+
+    Args:
+        scores: see ``score_trials``.
+        success: (trials,).
+        limit: bounds ``rotation`` and ``direction`` (radians) and ``scale`` (trials,) at the noise of the cell.
+        seed: of the bootstrap.
+
+    Returns:
+        Columns of summary.csv; errors that the data cannot determine are None, and ``unobservable`` names them.
+    """
     e_R, e_T = scores["e_R_deg"], scores["e_T_deg"]
     solved = success & (e_R < SUCCESS_DEG[0]) & ~(e_T >= SUCCESS_DEG[1])
     low, high = bootstrap_interval(solved.astype(np.float64), _mean, seed)
@@ -102,12 +122,32 @@ def summary_row(scores: dict[str, FloatArray], success: NDArray[np.bool_], seed:
         "success_low": low,
         "success_high": high,
     }
-    for name, values in (("e_R", e_R), ("e_T", e_T)):
-        row |= {f"{name}_{key}": value for key, value in statistics(values, seed).items()}
+    known = {name: limit[name] <= OBSERVABLE for name in ("direction", "scale")}
+    hidden = {name: np.mean(known[name]) < 0.5 for name in known}
+    row["unobservable"] = " and ".join(name for name in known if hidden[name])
+    sigmas = {"e_R": np.rad2deg(limit["rotation"]), "e_T": np.rad2deg(limit["direction"])}
+    for name, values, usable in (("e_R", e_R, np.isfinite(limit["rotation"])), ("e_T", e_T, known["direction"])):
+        hide = name == "e_T" and hidden["direction"]
+        shown = np.full(len(values), np.nan) if hide else values
+        found = statistics(shown, seed) | over_bound(shown[usable], sigmas[name][usable])
+        row |= {f"{name}_{key}": value for key, value in found.items()}
     metric = scores["e_s"][~np.isnan(scores["e_s"])]
     row["metric_share"] = len(metric) / len(success)
-    row["e_s_median"] = float(np.median(metric)) if len(metric) else None
+    row["e_s_median"] = float(np.median(metric)) if len(metric) and not hidden["scale"] else None
+    row["e_s_bound"] = float(_rms(limit["scale"][known["scale"]])) if not hidden["scale"] else None
     return row
+
+
+def over_bound(values: FloatArray, sigmas: FloatArray) -> dict[str, float | None]:
+    """Root mean square of errors (n,), of their bounds (n,), and the quotient; None where they do not exist."""
+    if len(values) == 0 or np.any(np.isnan(values)):
+        return {"rms": None, "bound": None, "over_bound": None}
+    rms, bound = float(_rms(values)), float(_rms(sigmas))
+    return {"rms": rms, "bound": bound, "over_bound": rms / bound if bound > 0.0 else None}
+
+
+def _rms(values: FloatArray) -> FloatArray:
+    return np.sqrt(np.mean(values**2))
 
 
 def statistics(values: FloatArray, seed: int) -> dict[str, float | None]:

@@ -114,6 +114,10 @@ class Setting:
             shape=self.shape,
         )
 
+    def exact(self) -> Setting:
+        """The setting of the same matches without noise and with the truth for the solver."""
+        return replace(self, noise_px=0.0, readout_ratio_error=0.0)
+
     def changed(self, changes: Mapping[str, Any], where: str) -> Setting:
         """The setting with some fields replaced.
 

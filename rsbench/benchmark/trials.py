@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.benchmark.bound import Bound, bound_from_information, motion_bound
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulation import Simulation, simulate
 from rsbench.benchmark.sweeps import Setting
+from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.metrics import translation_of_offset
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.motion import RobustOptions, estimate_motion
 from rsbench.solvers.base import MotionEstimate, Solver
@@ -63,42 +66,30 @@ def given_matches(simulation: Simulation, information: Information) -> Correspon
     return Correspondences(left=c.left, right=c.right if information == "left and right pairs" else c.right[:0])
 
 
-class Trials(NamedTuple):
-    """Answers of all solvers to some trials of a cell."""
-
-    predictions: Arrays
-    """``w``, ``d`` (trials, 3): the truth; ``w_est``, ``d_est`` (trials, solvers, 3), ``success``, ``metric``,
-    ``direction_known`` and ``reason`` (trials, solvers)."""
-    seconds: NDArray[np.float64]
-    """(trials, solvers); apart, because no two runs agree on them."""
-
-
 def run_trials(
     setting: Setting, solvers: tuple[str, ...], seed: int, first: int, count: int, robust: bool
-) -> Trials:
+) -> Arrays:
     """Trials ``first`` to ``first + count - 1`` of a setting.
 
     A trial's scene, motion and noise depend on its number and the seed alone, so that all solvers, values and
     sweeps share them as far as their settings allow.
 
+    Returns:
+        ``w``, ``d`` (trials, 3), the truth; ``w_est``, ``d_est`` (trials, solvers, 3), ``success``, ``metric``,
+        ``direction_known``, ``reason`` and ``seconds`` (trials, solvers).
+
     Raises:
         RsbenchError: no such solver; the motion of the setting leaves too few points in view.
     """
     entrants = [entrant(name) for name in solvers]
-    tracks = any(e.information in ("linked pairs", "tracks") for e in entrants)
     truth, answers, seconds = [], [], []
     for trial in range(first, first + count):
-        motion = setting.motion(generator(seed, "simulate", "motion", trial))
-        rng = generator(seed, "simulate", "scene", trial)
-        try:
-            simulation = simulate(setting.rig(), setting.shutter(), motion, setting.options(tracks), rng)
-        except ValueError as error:
-            raise RsbenchError(f"trial {trial}: {error}") from error
-        truth.append((motion.w, motion.d))
+        simulation = _simulation(setting, entrants, seed, trial)
+        truth.append((simulation.motion.w, simulation.motion.d))
         timed = [_timed(e, simulation, setting, seed, trial, robust) for e in entrants]
         answers.append([estimate for estimate, _ in timed])
         seconds.append([duration for _, duration in timed])
-    predictions: Arrays = {
+    return {
         "w": np.array([w for w, _ in truth]),
         "d": np.array([d for _, d in truth]),
         "w_est": np.array([[a.w for a in row] for row in answers]),
@@ -107,8 +98,63 @@ def run_trials(
         "metric": np.array([[a.metric for a in row] for row in answers], dtype=np.bool_),
         "direction_known": np.array([[a.direction_known for a in row] for row in answers], dtype=np.bool_),
         "reason": np.array([[a.reason for a in row] for row in answers], dtype=np.str_),
+        "seconds": np.array(seconds),
     }
-    return Trials(predictions, np.array(seconds))
+
+
+def run_bounds(setting: Setting, solvers: tuple[str, ...], seed: int, first: int, count: int) -> Arrays:
+    """Cramer-Rao bounds of trials for a noise of 1 px; outliers are left out.
+
+    Returns:
+        ``rotation``, ``direction`` (radians) and ``scale`` (trials, solvers): root mean square errors of e_R, e_T
+        and the length of d that no unbiased solver undercuts, given what each solver is given; infinite where the
+        matches do not tell.
+    """
+    entrants = [entrant(name) for name in solvers]
+    kinds = list(dict.fromkeys(e.information for e in entrants))
+    rows = []
+    for trial in range(first, first + count):
+        simulation = _simulation(setting.exact(), entrants, seed, trial)
+        found = {kind: _bound(simulation, kind) for kind in kinds}
+        rows.append([found[e.information] for e in entrants])
+    return {
+        "rotation": np.array([[bound.rotation for bound in row] for row in rows]),
+        "direction": np.array([[bound.direction for bound in row] for row in rows]),
+        "scale": np.array([[bound.scale for bound in row] for row in rows]),
+    }
+
+
+def _simulation(setting: Setting, entrants: list[Entrant], seed: int, trial: int) -> Simulation:
+    tracks = any(e.information in ("linked pairs", "tracks") for e in entrants)
+    motion = setting.motion(generator(seed, "simulate", "motion", trial))
+    rng = generator(seed, "simulate", "scene", trial)
+    try:
+        return simulate(setting.rig(), setting.shutter(), motion, setting.options(tracks), rng)
+    except ValueError as error:
+        raise RsbenchError(f"trial {trial}: {error}") from error
+
+
+def _bound(simulation: Simulation, information: Information) -> Bound:
+    """Bound at 1 px of what a solver is given."""
+    c = simulation.correspondences
+    good = {name: getattr(c, name)[~simulation.outliers[name]] for name in ("left", "right", "tracks")}
+    rig, motion = simulation.rig, simulation.motion
+    if information in ("linked pairs", "tracks"):
+        return motion_bound(Correspondences(tracks=good["tracks"]), rig, simulation.shutter, motion, 1.0)
+    if information == "left and right pairs":
+        pairs = Correspondences(left=good["left"], right=good["right"])
+        return motion_bound(pairs, rig, simulation.shutter, motion, 1.0)
+    bound = motion_bound(Correspondences(left=good["left"]), rig, simulation.shutter, motion, 1.0)
+    return _of_left_camera(bound, simulation)
+
+
+def _of_left_camera(bound: Bound, simulation: Simulation) -> Bound:
+    """The same information, about the left camera's translation d + b - R b instead of the body's."""
+    motion, offset = simulation.motion, simulation.rig.offset("left")
+    d = translation_of_offset(motion.w, motion.d, offset)
+    T = np.eye(6)
+    T[3:, :3] = -so3.hat(so3.exp(motion.w) @ offset) @ so3.left_jacobian(motion.w)
+    return bound_from_information(T.T @ bound.information @ T, motion.w, d)
 
 
 def _timed(

@@ -66,21 +66,24 @@ def show(card: SweepCard, table: pd.DataFrame) -> None:
     """The medians of each variant as a terminal table."""
     from rsbench.cli.console import print_table
 
-    shown = {
+    given = {"left pairs": "L", "left and right pairs": "L+R", "linked pairs": "L+R linked", "tracks": "tracks"}
+    columns = {
         "value": card.axis,
         "solver": "solver",
-        "information": "given",
-        "e_R_median": "e_R median",
-        "e_R_mean": "mean",
-        "e_T_median": "e_T median",
-        "e_T_mean": "mean ",
+        "given": "given",
+        "e_R_median": "e_R",
+        "e_T_median": "e_T",
         "success_share": "solved",
-        "failures": "failed",
+        "failures": "fail",
     }
-    digits = {card.axis: 4, "e_R median": 4, "mean": 4, "e_T median": 4, "mean ": 4, "solved": 2}
+    digits = {card.axis: 4, "e_R": 4, "e_T": 4, "solved": 2}
+    table = table.assign(given=table.information.map(given))
     for variant, rows in table.groupby("variant", sort=False):
-        title = f"{card.name}, {variant}: errors in degrees over {card.axis}, {card.trials} trials"
-        print_table(title, rows[list(shown)].rename(columns=shown), digits)
+        title = f"{card.name}, {variant}: median errors in degrees, {card.trials} trials"
+        print_table(title, rows[list(columns)].rename(columns=columns), digits)
+    typer.echo(
+        "given: matches over time of the left camera (L) or of both (L+R), or tracks through all four images"
+    )
 
 
 def _changes(assignments: list[str]) -> dict[str, object]:

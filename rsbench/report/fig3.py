@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from rsbench.benchmark.claims import READINGS, Centre
+from rsbench.benchmark.claims import OURS, READINGS, Centre
 from rsbench.benchmark.sweeps import Setting, SweepCard
 from rsbench.errors import RsbenchError
 
@@ -35,6 +35,7 @@ _STYLES: dict[str, dict[str, Any]] = {
     "rs-stereo-refined": {"color": "#009E73", "linestyle": (0, (3, 1, 1, 1, 1, 1)), "marker": "v"},
     "gs-8pt": {"color": "#000000", "linestyle": "--", "marker": "^"},
 }
+_BOUND: dict[str, Any] = {"color": "0.45", "linestyle": ":", "linewidth": 2.0, "zorder": 1}
 _OTHER = {"color": "#CC79A7", "linestyle": ":", "marker": "x"}
 _LABELS = {
     "rs-stereo-linear": "published linear",
@@ -118,6 +119,8 @@ def _panel(axes: Axes, table: pd.DataFrame, name: str, measure: str, centre: Cen
         axes.fill_between(
             rows.value, rows[f"{key}_low"], rows[f"{key}_high"], color=style["color"], alpha=0.2, linewidth=0
         )
+    limit = table[table.solver == OURS]
+    axes.plot(limit.value, limit[f"{measure}_bound"], label="Cramér-Rao bound (rms)", **_BOUND)
     axes.set_yscale("log")
     if name in _LOG_X:
         axes.set_xscale("log")

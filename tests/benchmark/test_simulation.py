@@ -35,7 +35,7 @@ def test_without_noise_all_matches_satisfy_the_exact_constraint(model: str) -> N
     # Both cameras read a row at the same time, so a point keeps its row and has its true depth.
     np.testing.assert_allclose(c.tracks[:, 1], c.tracks[:, 3], atol=1e-7)
     np.testing.assert_allclose(c.tracks[:, 5], c.tracks[:, 7], atol=1e-7)
-    assert np.all((RIG.depth(c.tracks[:, 0] - c.tracks[:, 2]) > 2.0 - 1e-9))
+    assert np.all(RIG.depth(c.tracks[:, 0] - c.tracks[:, 2]) > 2.0 - 1e-9)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_points_of_a_plane_lie_on_one() -> None:
     still = LinearMotion(np.zeros(3), np.array([0.0, 0.0, 1e-9]))
     tracks = simulate(RIG, SHUTTER, still, options, np.random.default_rng(8)).correspondences.tracks
     X = RIG.depth(tracks[:, 0] - tracks[:, 2])[:, None] * RIG.camera.unproject(tracks[:, :2])
-    normal, residual, *_ = np.linalg.lstsq(X, np.ones(len(X)), rcond=None)
+    normal, *_ = np.linalg.lstsq(X, np.ones(len(X)), rcond=None)
     np.testing.assert_allclose(X @ normal, 1.0, atol=1e-6)
 
 

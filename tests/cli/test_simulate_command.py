@@ -1,0 +1,76 @@
+"""``rsbench simulate`` as users meet it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+CARD = """
+name = "mine"
+axis = "noise_px"
+values = [0.0, 0.5]
+solvers = ["gs-8pt"]
+trials = 3
+[setting]
+width = 640
+height = 480
+focal = 500.0
+baseline = 0.2
+readout_ratio = 0.5
+points = 30
+depth = [2.0, 5.0]
+rotation_deg = 1.0
+translation = 0.1
+noise_px = 0.0
+"""
+
+
+def rsbench(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "rsbench", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_a_users_own_sweep(tmp_path: Path) -> None:
+    card = tmp_path / "mine.toml"
+    card.write_text(CARD)
+    out = tmp_path / "results"
+    result = rsbench(
+        "simulate", card, "--out", out, "--solver", "rs-stereo-linear", "--set", "points=40", "--workers", 1
+    )
+    assert result.returncode == 0, result.stderr
+    assert "rs-stereo-linear" in result.stdout
+    assert f"table: {out / 'summary.csv'}" in result.stdout
+    table = pd.read_csv(out / "summary.csv")
+    assert list(table.solver) == ["rs-stereo-linear"] * 2 and list(table.value) == [0.0, 0.5]
+    assert table.e_R_median[0] < table.e_R_median[1]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "bounds",
+        "provenance.json",
+        "seconds",
+        "summary.csv",
+        "sweep.json",
+        "trials",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nois"], ["did you mean 'noise'?"]),
+        (["noise", "--set", "pints=9"], ["unknown key 'pints'", "did you mean 'points'?"]),
+        (["noise", "--set", "points"], ["--set points", "FIELD=VALUE"]),
+        (["noise", "--set", "shape=ball"], ["shape = 'ball'"]),
+        (["noise", "--solver", "nobody"], ["solver 'nobody' does not exist"]),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+    result = rsbench("simulate", *arguments, "--out", tmp_path / "results")
+    assert result.returncode == 2, result.stderr
+    lines = [line for line in result.stderr.splitlines() if "rsbench: error:" in line]
+    assert len(lines) == 1 and "Traceback" not in result.stderr
+    assert all(word in lines[0] for word in words), lines[0]
+    assert not (tmp_path / "results").exists()

@@ -1,0 +1,76 @@
+"""Figure 3: drawn from stored summaries alone, and equal bytes from equal summaries."""
+
+from __future__ import annotations
+
+import re
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from rsbench.benchmark.claims import READINGS
+from rsbench.benchmark.sweeps import load_sweep
+from rsbench.errors import RsbenchError
+from rsbench.report.fig3 import SWEEPS, draw_fig3, setting_table
+
+SOLVERS = {"rs-stereo-linear": 0.5, "rs-stereo-refined-pairs": 0.01, "gs-8pt": 1.0, "somebody-elses": 0.3}
+
+
+def write_summaries(folder: Path) -> None:
+    for name in SWEEPS:
+        card = load_sweep(name)
+        rows = []
+        for cell in card.cells():
+            for k, (solver, error) in enumerate(SOLVERS.items()):
+                row = {"variant": cell.variant, "value": cell.value, "solver": solver, "trials": 300}
+                row |= {"information": "left pairs" if solver == "gs-8pt" else "left and right pairs"}
+                for measure in ("e_R", "e_T"):
+                    value = error * (1 + 0.1 * np.sin(k + cell.index))
+                    for centre in ("mean", "median"):
+                        ends = {"": value, "_low": 0.9 * value, "_high": 1.1 * value}
+                        row |= {f"{measure}_{centre}{end}": number for end, number in ends.items()}
+                    row[f"{measure}_bound"] = 0.009
+                rows.append(row)
+        pd.DataFrame(rows).to_csv(folder / f"{name}.csv", index=False)
+
+
+def test_equal_summaries_give_equal_bytes_without_dates(tmp_path: Path) -> None:
+    drawn = []
+    for name in ("a", "b"):
+        folder = tmp_path / name
+        folder.mkdir()
+        write_summaries(folder)
+        paths = draw_fig3(folder)
+        assert [path.suffix for path in paths] == [".pdf", ".png"] * 4
+        drawn.append({path.name: path.read_bytes() for path in paths})
+    assert drawn[0] == drawn[1]
+    assert len(set(drawn[0].values())) == 8
+    for name, content in drawn[0].items():
+        assert b"CreationDate" not in content and b"Matplotlib" not in content
+        if name.endswith(".pdf"):
+            # Vector: no image objects, and text that can be searched.
+            assert b"/Subtype /Image" not in content and b"/FontFile2" in content
+            streams = [_inflated(s) for s in re.findall(rb"stream\r?\n(.*?)endstream", content, re.DOTALL)]
+            assert any(b" l\n" in stream for stream in streams)
+
+
+def _inflated(stream: bytes) -> bytes:
+    try:
+        return zlib.decompress(stream)
+    except zlib.error:
+        return b""
+
+
+def test_a_missing_summary_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RsbenchError, match=r"noise\.csv: no such summary"):
+        draw_fig3(tmp_path)
+
+
+def test_the_table_of_settings_says_what_the_paper_leaves_open() -> None:
+    table = setting_table([load_sweep(name) for name in SWEEPS]).set_index("sweep")
+    assert table.loc["rotation", "rotation (deg)"] == "varies"
+    assert table.loc["noise", "depth (m)"] == "2 to 10, uniform"
+    assert set(table["points per camera"]) == {"100"} and set(table.trials) == {"300"}
+    assert set(READINGS) == {cell.variant for cell in load_sweep("rotation").cells()}
