@@ -54,7 +54,7 @@ def flat(surface: str, triangles: ArrayLike, *, turned: bool = False) -> Piece:
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     side = np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)
     level = np.linalg.norm(side, axis=1) < 1e-3
-    side[level] = (1.0, 0.0, 0.0)
+    side[level] = np.array([1.0, 0.0, 0.0]) - normal[level] * normal[level, :1]
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     up = _cross(normal, side)
     uv = np.stack([np.einsum("nkc,nc->nk", points, axis) for axis in (side, up)], axis=2)

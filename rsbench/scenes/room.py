@@ -135,7 +135,7 @@ def _sides(rng: np.random.Generator) -> list[Piece]:
         pieces.append(beam("brass", *rod, 0.03))
         pieces += placed(fit.pot_plant(rng, 0.8), (-x + 0.22, middle + 0.1, 0.0)) if middle > 0 else []
     pieces += placed(fit.pot_plant(rng), (-2.3, 2.15, 0)) + placed(fit.pot_plant(rng, 1.1), (2.35, 0.35, 0))
-    pieces += placed(fit.bookcase(rng, 1.3), (-0.6, -y + 0.34, 0), 180)
+    pieces += placed(fit.bookcase(rng, 1.3), (0.4, -y + 0.34, 0), 180)
     pieces += placed(door(0.95, 2.1, "oak", "walnut")[:4], (-1.2, -y, 0), 180)
     pieces += placed(fit.table((1.1, 0.45, 0.82)), (1.7, -y + 0.35, 0), 180)
     pieces += placed(fit.vase(rng, 0.34, 8), (1.9, -y + 0.33, 0.82)) + placed(

@@ -1,0 +1,217 @@
+"""The built-in scenes: sound geometry, determinism, and what their default viewpoints see."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rsbench.cards import card_path, list_cards
+from rsbench.errors import RsbenchError
+from rsbench.scenes import castle, old_town, room
+from rsbench.scenes.load import CARDS, load_scene, read_scene_card
+from rsbench.scenes.model import Material, Scene, SceneMesh
+from rsbench.scenes.palette import RECIPES
+from rsbench.scenes.surfaces import Surface
+
+BUILT_IN = ("castle", "old-town", "room")
+FOCAL, SIZE = 1384.6, 900  # the paper's camera, 36 degrees
+
+scene_named = cache(load_scene)
+
+
+@pytest.fixture(params=BUILT_IN)
+def scene(request: pytest.FixtureRequest) -> Scene:
+    return scene_named(str(request.param))
+
+
+def test_every_card_parses_and_every_builder_has_one() -> None:
+    cards = {name: read_scene_card(path) for name, path in list_cards("scenes").items()}
+    assert {card.builder for card in cards.values()} == set(CARDS)
+    for name, card in cards.items():
+        assert card.name == name
+
+
+def test_the_example_of_a_mesh_card_asks_for_its_file() -> None:
+    with pytest.raises(RsbenchError, match=r"model\.glb: no such file"):
+        load_scene("mesh")
+
+
+def test_meshes_are_sound(scene: Scene) -> None:
+    assert len({mesh.name for mesh in scene.meshes}) == len(scene.meshes)
+    for mesh in scene.meshes:
+        count = len(mesh.vertices)
+        assert mesh.vertices.shape == (count, 3) and np.isfinite(mesh.vertices).all()
+        assert mesh.faces.dtype == np.int32 and mesh.faces.min() >= 0 and mesh.faces.max() < count
+        corners = mesh.vertices[mesh.faces]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        assert np.mean(area < 1e-9) < 0.01
+        assert mesh.material.texture is not None and mesh.material.texture.dtype == np.uint8
+        assert mesh.uv is not None and mesh.uv.shape == (count, 2) and np.isfinite(mesh.uv).all()
+        assert mesh.normals is not None and mesh.normals.shape == (count, 3)
+        assert np.linalg.norm(mesh.normals, axis=1) == pytest.approx(1, abs=1e-6)
+
+
+def test_scenes_stay_within_their_budget(scene: Scene) -> None:
+    assert sum(len(mesh.faces) for mesh in scene.meshes) < 400_000
+    textures = {id(mesh.material.texture): mesh.material.texture for mesh in scene.meshes}
+    assert sum(texture.nbytes for texture in textures.values() if texture is not None) < 200e6
+
+
+def test_texels_are_as_fine_as_pixels_need(scene: Scene) -> None:
+    """Texels of the median triangle: about a pixel at one to twenty metres, 0.7 to 14 mm."""
+    for mesh in scene.meshes:
+        assert mesh.material.texture is not None and mesh.uv is not None
+        a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+        p, q, r = (mesh.uv[mesh.faces[:, k]] * mesh.material.texture.shape[1::-1] for k in range(3))
+        metres2 = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        texels2 = np.abs((q - p)[:, 0] * (r - p)[:, 1] - (q - p)[:, 1] * (r - p)[:, 0])
+        size = np.median(np.sqrt(metres2 / np.maximum(texels2, 1e-9)))
+        assert 0.0004 < size < 0.012, mesh.name
+
+
+def test_viewpoints_are_several_and_free(scene: Scene) -> None:
+    assert "default" in scene.viewpoints and len(scene.viewpoints) >= 3
+    for viewpoint in scene.viewpoints.values():
+        viewpoint.world_from_scene()
+        nearest = min(float(np.linalg.norm(mesh.vertices - viewpoint.eye, axis=1).min()) for mesh in scene.meshes)
+        assert nearest > 0.4
+
+
+def depths_seen(scene: Scene, view: str, across: int) -> NDArray[np.float64]:
+    """z of the nearest surface on a grid of pixels, infinite where there is none (Moeller and Trumbore 1997)."""
+    seen = scene.seen_from(scene.viewpoints[view])
+    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in seen.meshes])
+    corners = corners[corners[..., 2].max(axis=1) > 0]
+    a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    out = np.cross(a, ab)
+    pixels = (np.arange(across) + 0.5) * SIZE / across - (SIZE - 1) / 2
+    depths = np.full((across, across), np.inf)
+    for i, y in enumerate(pixels):
+        for j, x in enumerate(pixels):
+            ray = np.array([x / FOCAL, y / FOCAL, 1.0])
+            normal = np.stack(
+                [
+                    ray[1] * ac[:, 2] - ac[:, 1],
+                    ac[:, 0] - ray[0] * ac[:, 2],
+                    ray[0] * ac[:, 1] - ray[1] * ac[:, 0],
+                ],
+                1,
+            )
+            with np.errstate(divide="ignore", invalid="ignore"):
+                inverse = 1 / np.einsum("nc,nc->n", ab, normal)
+                u = -np.einsum("nc,nc->n", a, normal) * inverse
+                v = -(out @ ray) * inverse
+                z = -np.einsum("nc,nc->n", ac, out) * inverse
+            hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (z > 1e-6)
+            depths[i, j] = z[hit].min(initial=np.inf)
+    return depths
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest", "middle", "farthest"),
+    [("castle", 4.0, (8, 27), 70.0), ("old-town", 4.0, (8, 25), 70.0), ("room", 1.2, (2.5, 5.5), 6.5)],
+)
+def test_default_views_have_depths_a_stereo_rig_can_use(
+    name: str, nearest: float, middle: tuple[float, float], farthest: float
+) -> None:
+    depths = depths_seen(scene_named(name), "default", 9)
+    seen = depths[np.isfinite(depths)]
+    assert len(seen) / depths.size > 0.85  # little sky
+    assert seen.min() > nearest and seen.max() < farthest
+    assert middle[0] < np.median(seen) < middle[1]
+    low, high = np.quantile(seen, [0.1, 0.9])
+    assert high / low > 1.5  # a flat scene would hide the translation
+
+
+BUILDERS: dict[str, tuple[ModuleType, Callable[[int], tuple[SceneMesh, ...]]]] = {
+    "castle": (castle, lambda seed: castle.build_castle(castle.CastleParameters(), seed)),
+    "old-town": (old_town, lambda seed: old_town.build_old_town(old_town.OldTownParameters(), seed)),
+    "room": (room, lambda seed: room.build_room(room.RoomParameters(), seed)),
+}
+
+
+def unpainted(names: Iterable[str], seed: int) -> dict[str, Surface]:
+    """Surfaces of the right size without pictures, which follow from the seed (test_scene_textures)."""
+    sizes = {name: RECIPES[name].metres for name in names}
+    return {n: Surface(Material(name=n), None if size is None else (size, size)) for n, size in sizes.items()}
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_the_seed_decides_the_arrays(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    module, build = BUILDERS[name]
+    monkeypatch.setattr(module, "paint_palette", unpainted)
+    card = read_scene_card(card_path("scenes", name))
+    for mesh, again in zip(scene_named(name).meshes, build(card.seed), strict=True):
+        assert mesh.uv is not None and again.uv is not None
+        assert np.array_equal(mesh.vertices, again.vertices)
+        assert np.array_equal(mesh.uv, again.uv)
+    before = {mesh.name: mesh.vertices for mesh in scene_named(name).meshes}
+    after = {mesh.name: mesh.vertices for mesh in build(card.seed + 1)}
+    assert any(not np.array_equal(before[key], after[key]) for key in before.keys() & after.keys())
+
+
+def write(folder: Path, name: str, old: str, new: str) -> Path:
+    text = card_path("scenes", name).read_text()
+    assert old in text
+    path = folder / f"{name}.toml"
+    path.write_text(text.replace(old, new))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        (
+            "castle",
+            'builder = "castle"',
+            'builder = "castel"',
+            "'castel' does not exist (did you mean 'castle'?)",
+        ),
+        ("castle", 'builder = "castle"', "", "'builder' is required"),
+        ("castle", 'builder = "castle"', "builder = 3", "builder = 3 does not exist"),
+        ("castle", "trees = 26", "treees = 26", "unknown key 'parameters.treees' (did you mean 'trees'?)"),
+        ("castle", "trees = 26", "trees = 2.5", "parameters.trees = 2.5"),
+        ("castle", "trees = 26", "trees = 1000", "trees = 1000: allowed are 0 to 60"),
+        ("castle", "wall_height = 6.5", "wall_height = nan", "parameters.wall_height"),
+        ("castle", "seed = 1", "seed = -1", "seed = -1: allowed are 0 and above"),
+        ("castle", "sun_elevation_deg = 48.0", "sun_elevation_deg = -3.0", "sun_elevation_deg = -3.0: allowed"),
+        ("castle", "[viewpoints.default]", "[viewpoints.first]", "[viewpoints.default] is required"),
+        ("castle", "[viewpoints.default]", "[viewpoints.default]\nup = 1", "unknown key 'viewpoints.default.up'"),
+        (
+            "old-town",
+            "storeys = [2, 3]",
+            "storeys = [3, 2]",
+            "storeys = (3, 2): allowed are 1 to 5",
+        ),
+        ("old-town", "eye = [0.6, -8.0, 3.6]", "eye = [0.6, inf, 3.6]", "viewpoints.default.eye.1"),
+        (
+            "old-town",
+            "eye = [0.6, -8.0, 3.6]",
+            "eye = [0.0, 14.0, 3.6]",
+            "viewpoints.default: viewpoint looks",
+        ),
+        ("room", "chairs = 3 ", "chairs = 9 ", "chairs = 9: allowed are 0 to 4"),
+        (
+            "room",
+            "ceiling_height = 2.7",
+            "ceiling_height = 1",
+            "ceiling_height = 1.0: allowed are 2.5 to 4",
+        ),
+    ],
+)
+def test_bad_cards_are_refused_in_one_line(tmp_path: Path, name: str, old: str, new: str, message: str) -> None:
+    path = write(tmp_path, name, old, new)
+    with pytest.raises(RsbenchError) as caught:
+        load_scene(path)
+    assert message in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_unknown_scenes_are_refused_with_the_known_ones() -> None:
+    with pytest.raises(RsbenchError, match="'atlantis' does not exist; there are: castle, mesh, old-town, room"):
+        load_scene("atlantis")

@@ -1,0 +1,189 @@
+"""The mesh builder against models that the test makes itself: colours, units, axes, scene graph, broken files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+
+from rsbench.errors import RsbenchError
+from rsbench.scenes.load import load_scene
+from rsbench.scenes.model import Scene, SceneMesh
+
+RED, GREEN, BLUE, WHITE = (200, 20, 20), (20, 180, 30), (20, 40, 190), (240, 240, 240)
+
+CARD = """
+name = "mine"
+builder = "mesh"
+[parameters]
+{parameters}
+[viewpoints.default]
+eye = [0.0, -5.0, 1.0]
+target = [0.0, 0.0, 1.0]
+"""
+
+
+def load(folder: Path, parameters: str) -> Scene:
+    card = folder / "mine.toml"
+    card.write_text(CARD.format(parameters=parameters))
+    return load_scene(card)
+
+
+def textured_quad(material: trimesh.visual.material.Material | None = None) -> trimesh.Trimesh:
+    """A 2 x 1 rectangle in the file's x, y; the image has red at its top left, blue at its bottom right."""
+    image = Image.fromarray(np.array([[RED, GREEN], [WHITE, BLUE]], dtype=np.uint8))
+    if material is None:
+        material = trimesh.visual.material.PBRMaterial(baseColorTexture=image, name="four")
+    uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=float)
+    vertices = np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]], dtype=float)
+    faces = [[0, 1, 2], [0, 2, 3]]
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    return trimesh.Trimesh(vertices=vertices, faces=faces, visual=visual, process=False)
+
+
+def colour_at(mesh: SceneMesh, uv: NDArray[np.float64]) -> tuple[int, ...]:
+    """Nearest texel by the rule of the contract: v up, row 0 at the top."""
+    texture = mesh.material.texture
+    assert texture is not None
+    height, width = texture.shape[:2]
+    column, row = int(uv[0] % 1 * width), int((1 - uv[1] % 1) * height)
+    return tuple(int(value) for value in texture[row, column])
+
+
+def uv_of(mesh: SceneMesh, point: tuple[float, float, float]) -> NDArray[np.float64]:
+    assert mesh.uv is not None
+    distance = np.linalg.norm(mesh.vertices - point, axis=1)
+    assert distance.min() < 1e-6
+    uv: NDArray[np.float64] = mesh.uv[int(np.argmin(distance))]
+    return uv
+
+
+@pytest.mark.parametrize("suffix", ["glb", "obj"])
+def test_colours_sit_at_their_corners(tmp_path: Path, suffix: str) -> None:
+    textured_quad().export(tmp_path / f"quad.{suffix}")
+    (mesh,) = load(tmp_path, f'file = "quad.{suffix}"').meshes
+    middle = np.array([0.5, 0.5])
+    # y up in the file is z up in the scene; a step of a quarter towards the middle stays in the corner's texel.
+    corners = {(0, 0, 1): RED, (2, 0, 1): GREEN, (0, 0, 0): WHITE, (2, 0, 0): BLUE}
+    for (x, y, z), colour in corners.items():
+        uv = uv_of(mesh, (x, y, z))
+        assert colour_at(mesh, uv + 0.5 * (middle - uv)) == colour
+
+
+@pytest.mark.parametrize(
+    ("axis", "where"),
+    [("z", (2, 1, 0)), ("y", (2, 0, 1)), ("x", (1, 0, 2))],
+)
+def test_up_axis_and_units(tmp_path: Path, axis: str, where: tuple[float, float, float]) -> None:
+    textured_quad().export(tmp_path / "quad.glb")
+    parameters = f'file = "quad.glb"\nup_axis = "{axis}"\nmetres_per_unit = 0.25'
+    (mesh,) = load(tmp_path, parameters).meshes
+    uv_of(mesh, tuple(0.25 * value for value in where))  # type: ignore[arg-type]
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    assert sorted(high - low) == pytest.approx([0.0, 0.25, 0.5])
+
+
+def test_heading_turns_about_the_vertical(tmp_path: Path) -> None:
+    textured_quad().export(tmp_path / "quad.glb")
+    (mesh,) = load(tmp_path, 'file = "quad.glb"\nheading_deg = 90.0').meshes
+    uv_of(mesh, (0.0, 2.0, 1.0))
+
+
+def test_scene_graph_transforms_are_applied(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    transform = np.eye(4)
+    transform[:3, 3] = (10.0, 0.0, 0.0)
+    mirrored = np.diag([-3.0, 3.0, 3.0, 1.0])
+    scene.add_geometry(textured_quad(), node_name="a", geom_name="quad", transform=transform)
+    scene.add_geometry(textured_quad(), node_name="b", geom_name="other", transform=mirrored)
+    scene.export(tmp_path / "two.glb")
+    meshes = load(tmp_path, 'file = "two.glb"\nup_axis = "z"').meshes
+    spans = sorted((float(m.vertices[:, 0].min()), float(m.vertices[:, 0].max())) for m in meshes)
+    assert np.ravel(spans) == pytest.approx([-6.0, 0.0, 10.0, 12.0])
+
+
+def test_smooth_normals_of_a_sphere_point_outward(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    ball.apply_transform(np.diag([1.0, 2.0, 0.5, 1.0]))
+    ball.export(tmp_path / "ball.ply")
+    (mesh,) = load(tmp_path, 'file = "ball.ply"\nshading = "smooth"').meshes
+    assert mesh.normals is not None
+    # Normal of x^2 + (y/2)^2 + (z/0.5)^2 = 1 in the file's axes, with y up: scene z is the file's y.
+    x, y, z = mesh.vertices.T
+    truth = np.stack([x, y / 0.25, z / 4], axis=1)
+    truth /= np.linalg.norm(truth, axis=1, keepdims=True)
+    # A 320-triangle ellipsoid's vertex normals are a few degrees off where it bends most.
+    assert np.min(np.sum(truth * mesh.normals, axis=1)) > np.cos(np.deg2rad(12))
+
+
+def test_a_factor_multiplies_the_texture_in_linear_light(tmp_path: Path) -> None:
+    image = Image.fromarray(np.full((2, 2, 3), 255, dtype=np.uint8))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image, baseColorFactor=[128, 255, 0, 255])
+    textured_quad(material).export(tmp_path / "quad.glb")
+    (mesh,) = load(tmp_path, 'file = "quad.glb"').meshes
+    assert mesh.material.texture is not None
+    # 128/255 linear is 188 in sRGB (IEC 61966-2-1).
+    assert np.abs(mesh.material.texture[0, 0].astype(int) - (188, 255, 0)).max() <= 1
+
+
+def test_a_plain_factor_becomes_an_srgb_colour(tmp_path: Path) -> None:
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[55, 128, 255, 255])
+    textured_quad(material).export(tmp_path / "quad.glb")
+    (mesh,) = load(tmp_path, 'file = "quad.glb"').meshes
+    assert mesh.material.texture is None
+    assert np.asarray(mesh.material.colour) * 255 == pytest.approx([128, 188, 255], abs=1)
+
+
+def test_face_colours_survive(tmp_path: Path) -> None:
+    box = trimesh.creation.box()
+    box.visual.face_colors = [[10 * k, 255 - 10 * k, 7, 255] for k in range(12)]
+    box.export(tmp_path / "box.ply")
+    (mesh,) = load(tmp_path, 'file = "box.ply"\nup_axis = "z"').meshes
+    assert mesh.uv is not None
+    corners = mesh.vertices[mesh.faces]
+    for triangle, colour in zip(box.triangles, box.visual.face_colors, strict=True):
+        k = int(np.argmin(np.abs(corners - triangle).max(axis=(1, 2))))
+        assert np.abs(corners[k] - triangle).max() < 1e-6
+        assert {colour_at(mesh, uv) for uv in mesh.uv[mesh.faces[k]]} == {tuple(int(c) for c in colour[:3])}
+
+
+def test_missing_and_broken_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(RsbenchError, match=r"absent\.glb: no such file"):
+        load(tmp_path, 'file = "absent.glb"')
+    (tmp_path / "broken.glb").write_bytes(b"glTF but not really")
+    with pytest.raises(RsbenchError, match=r"broken\.glb: cannot be read"):
+        load(tmp_path, 'file = "broken.glb"')
+    (tmp_path / "odd.xyzabc").write_bytes(b"?")
+    with pytest.raises(RsbenchError, match=r"odd\.xyzabc: cannot be read"):
+        load(tmp_path, 'file = "odd.xyzabc"')
+    trimesh.PointCloud(np.eye(3)).export(tmp_path / "points.ply")
+    with pytest.raises(RsbenchError, match=r"points\.ply: holds no triangles"):
+        load(tmp_path, 'file = "points.ply"')
+
+
+def test_a_missing_texture_file_is_named(tmp_path: Path) -> None:
+    textured_quad().export(tmp_path / "quad.obj")
+    (image,) = [path for path in tmp_path.iterdir() if path.suffix in (".png", ".jpg", ".jpeg")]
+    image.unlink()
+    with pytest.raises(RsbenchError, match=f"refers to .*{image.name}.*missing"):
+        load(tmp_path, 'file = "quad.obj"')
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ("", "'parameters.file' is required"),
+        ('file = "a.glb"\nup_axis = "w"', "parameters.up_axis = 'w'"),
+        ('file = "a.glb"\nmetres_per_unit = 0.0', "metres_per_unit = 0.0: must be positive"),
+        ('file = "a.glb"\nmetres_per_unit = nan', "parameters.metres_per_unit"),
+        ('file = "a.glb"\nunits = "m"', "unknown key 'parameters.units'"),
+    ],
+)
+def test_bad_parameters_are_refused(tmp_path: Path, parameters: str, message: str) -> None:
+    with pytest.raises(RsbenchError) as caught:
+        load(tmp_path, parameters)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
