@@ -32,7 +32,7 @@ OBSERVABLE = 0.5
 RESAMPLES = 1000
 COVERAGE = 0.95
 Statistic = Callable[[FloatArray], FloatArray]
-"""Reduces the last axis."""
+"""Reduces the axis of trials of resampled values (resamples, trials, ...)."""
 
 
 def read_card(folder: Path) -> SweepCard:
@@ -129,7 +129,7 @@ def summary_row(
     for name, values, usable in (("e_R", e_R, np.isfinite(limit["rotation"])), ("e_T", e_T, known["direction"])):
         hide = name == "e_T" and hidden["direction"]
         shown = np.full(len(values), np.nan) if hide else values
-        found = statistics(shown, seed) | over_bound(shown[usable], sigmas[name][usable])
+        found = statistics(shown, seed) | over_bound(shown[usable], sigmas[name][usable], seed)
         row |= {f"{name}_{key}": value for key, value in found.items()}
     metric = scores["e_s"][~np.isnan(scores["e_s"])]
     row["metric_share"] = len(metric) / len(success)
@@ -138,12 +138,24 @@ def summary_row(
     return row
 
 
-def over_bound(values: FloatArray, sigmas: FloatArray) -> dict[str, float | None]:
-    """Root mean square of errors (n,), of their bounds (n,), and the quotient; None where they do not exist."""
+def over_bound(values: FloatArray, sigmas: FloatArray, seed: int) -> dict[str, float | None]:
+    """Root mean square of errors (n,), of their bounds (n,), and the quotient with its interval.
+
+    None where they do not exist.
+    """
     if len(values) == 0 or np.any(np.isnan(values)):
-        return {"rms": None, "bound": None, "over_bound": None}
+        return dict.fromkeys(("rms", "bound", "over_bound", "over_bound_low", "over_bound_high"))
     rms, bound = float(_rms(values)), float(_rms(sigmas))
-    return {"rms": rms, "bound": bound, "over_bound": rms / bound if bound > 0.0 else None}
+    if bound == 0.0:
+        return {"rms": rms, "bound": bound, "over_bound": None, "over_bound_low": None, "over_bound_high": None}
+    squares = np.stack([values**2, sigmas**2], axis=-1)
+    low, high = bootstrap_interval(squares, _rms_quotient, seed)
+    return {"rms": rms, "bound": bound, "over_bound": rms / bound, "over_bound_low": low, "over_bound_high": high}
+
+
+def _rms_quotient(squares: FloatArray) -> FloatArray:
+    means = np.mean(squares, axis=-2)
+    return np.sqrt(means[..., 0] / means[..., 1])
 
 
 def _rms(values: FloatArray) -> FloatArray:
@@ -171,7 +183,7 @@ def _mean(values: FloatArray) -> FloatArray:
 def bootstrap_interval(
     values: FloatArray, statistic: Statistic, seed: int, resamples: int = RESAMPLES
 ) -> tuple[float, float]:
-    """Percentile interval of a statistic of values (n,) that holds with probability ``COVERAGE``.
+    """Percentile interval of a statistic of values (n, ...) that holds with probability ``COVERAGE``.
 
     All calls with the same n and seed draw the same trials, so that solvers are compared on common draws.
     """

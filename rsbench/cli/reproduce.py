@@ -17,7 +17,10 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench reproduce fig3 --out results                     [dim](simulated points: results/fig3)[/dim]
 
-  rsbench reproduce claims --out results                   [dim](results/claims; runs fig3 first)[/dim]"""
+  rsbench reproduce claims --out results                   [dim](results/claims; runs fig3 first)[/dim]
+
+  rsbench reproduce sweeps --out results                   [dim](results/sweeps: limits, degeneracies)[/dim]"""
+_OTHER_SWEEPS = ("solvers", "limit", "degenerate", "planar", "outliers", "wrong-readout", "wrong-motion")
 
 
 class Target(StrEnum):
@@ -26,6 +29,7 @@ class Target(StrEnum):
     images = "images"
     fig3 = "fig3"
     claims = "claims"
+    sweeps = "sweeps"
 
 
 def reproduce(
@@ -33,7 +37,7 @@ def reproduce(
         Target,
         typer.Argument(
             help="images: the paper's image experiment in the three built-in scenes. fig3: its Figure 3 on "
-            "simulated points. claims: what became of each claim of its text."
+            "simulated points. claims: what became of each claim of its text. sweeps: the other simulations."
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("results"),
@@ -45,6 +49,8 @@ def reproduce(
     """Make the committed results again: render or simulate what is missing, run, score, draw."""
     if target is Target.images:
         _images(out, data)
+    elif target is Target.sweeps:
+        _sweeps(out, data, workers)
     else:
         _fig3(out, data, workers)
         if target is Target.claims:
@@ -92,6 +98,20 @@ def _fig3(out: Path, data: Path, workers: int | None) -> None:
     write_json(folder / "provenance.json", provenance(command, sweeps=list(SWEEPS), seeds=seeds))
     for path in draw_fig3(folder):
         typer.echo(f"figure: {path}")
+
+
+def _sweeps(out: Path, data: Path, workers: int | None) -> None:
+    from rsbench.benchmark.provenance import provenance
+    from rsbench.benchmark.run_sweep import write_table
+    from rsbench.dataset.files import write_json
+
+    folder = out / "sweeps"
+    folder.mkdir(parents=True, exist_ok=True)
+    command = "rsbench reproduce sweeps"
+    for name in _OTHER_SWEEPS:
+        write_table(folder / f"{name}.csv", _simulate(name, None, data, workers, command))
+    write_json(folder / "provenance.json", provenance(command, sweeps=list(_OTHER_SWEEPS)))
+    typer.echo(f"tables: {folder}")
 
 
 def _claims(out: Path, data: Path, workers: int | None) -> None:

@@ -99,10 +99,12 @@ def test_quotient_of_errors_at_the_bound_is_one() -> None:
     sigmas = rng.uniform(0.5, 2.0, 4000)
     # The norm of three normal errors whose squares add up to sigma^2 in the mean.
     errors = np.linalg.norm(rng.standard_normal((4000, 3)), axis=1) * sigmas / np.sqrt(3)
-    found = over_bound(errors, sigmas)
+    found = over_bound(errors, sigmas, 0)
     assert found["over_bound"] == pytest.approx(1.0, abs=0.03)  # three standard deviations of such a mean
-    assert over_bound(errors, np.zeros(4000))["over_bound"] is None
-    assert over_bound(errors[:0], sigmas[:0])["over_bound"] is None
+    low, high = found["over_bound_low"], found["over_bound_high"]
+    assert low is not None and high is not None and 0.95 < low < 1.0 < high < 1.05
+    assert over_bound(errors, np.zeros(4000), 0)["over_bound"] is None
+    assert over_bound(errors[:0], sigmas[:0], 0)["over_bound"] is None
 
 
 def test_bootstrap_intervals_cover_the_truth() -> None:
