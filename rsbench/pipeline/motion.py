@@ -9,19 +9,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.stats import chi2
 
-from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.epipolar import essential_matrix, sampson_error
 from rsbench.core.rig import SIDES, StereoRig
-from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.robust.ransac import BoolArray, IntArray, RansacOptions, RansacReport, ransac
 from rsbench.solvers.base import MatchSet, MotionEstimate, Solver
-from rsbench.solvers.packed import pack, track_pairs, unlinked_pairs
+from rsbench.solvers.packed import Packed, pack, track_pairs, unlinked_pairs
 
 _TRACK_FREEDOM = 5
-_GROUPS: tuple[MatchSet, ...] = ("left", "right", "tracks")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +98,7 @@ def _conclude(
 class _RobustProblem:
     """Correspondences and a solver as the estimator of the robust loop.
 
-    The data are the tracks that the solver uses as such, then the left, then the right pairs.
+    The data are the left pairs, the right pairs, and the tracks that the solver uses as such.
     """
 
     def __init__(
@@ -112,22 +108,31 @@ class _RobustProblem:
         sizes = solver.sample_sizes(correspondences)
         self.linked = sizes.get("tracks", 0) > 0
         self.data = self._data()
-        self.packed = pack(self.data, rig, shutter, solver.motion_model)
+        self.packed = self._packed()
         self._sizes = (sizes.get("left", 0), sizes.get("right", 0), sizes.get("tracks", 0))
 
     def _data(self) -> Correspondences:
         """Each measurement once: tracks as tracks or as pairs, and the pairs that no track repeats."""
-        given = self.given
+        given, needs = self.given, self.solver.needs
         pairs = {}
         for side in SIDES:
             own = getattr(given, side)[unlinked_pairs(given, side)]
             halves = track_pairs(given.tracks, side)
             pairs[side] = own if self.linked else np.concatenate([own, halves])
-        if self.solver.needs == {"left"}:
-            pairs["right"] = pairs["right"][:0]
-        return Correspondences(
-            left=pairs["left"], right=pairs["right"], tracks=given.tracks if self.linked else given.tracks[:0]
-        )
+            if side not in needs:
+                pairs[side] = pairs[side][:0]
+        tracks = given.tracks if self.linked else given.tracks[:0]
+        return Correspondences(left=pairs["left"], right=pairs["right"], tracks=tracks)
+
+    def _packed(self) -> Packed:
+        """The data under the shutter that the solver believes in, about the point whose motion it gives."""
+        shutter = self.shutter
+        if self.solver.shutter == "global":
+            shutter = RollingShutter(height=shutter.height, readout_ratio=0.0)
+        packed = pack(self.data, self.rig, shutter, self.solver.motion_model)
+        if self.solver.reference_point == "left":
+            packed.pairs[:, 6] = 0.0
+        return packed
 
     @property
     def num_data(self) -> tuple[int, ...]:
@@ -141,25 +146,9 @@ class _RobustProblem:
         return self.solver.propose(self._subset(sample), self.rig, self.shutter)
 
     def residuals(self, model: MotionEstimate) -> FloatArray:
-        if self.solver.shutter == "global":
-            return self._global_residuals(model)
         theta = self.packed.theta(model.w, model.d)
         tracks = np.sqrt(self.packed.track_squares(theta)) * _track_scale()
         return np.concatenate([self.packed.pair_residuals(theta), tracks])
-
-    def _global_residuals(self, model: MotionEstimate) -> FloatArray:
-        errors = []
-        R = so3.exp(model.w)
-        for side in SIDES:
-            matches = getattr(self.data, side)
-            t = model.d
-            if self.solver.reference_point == "body":
-                offset = self.rig.offset(side)
-                t = model.d + offset - R @ offset
-            x0 = self.rig.camera.unproject(matches[:, :2])
-            x1 = self.rig.camera.unproject(matches[:, 2:])
-            errors.append(sampson_error(essential_matrix(Pose(R, t)), x0, x1, self.rig.camera))
-        return np.concatenate(errors)
 
     def refine(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate | None:
         subset = self._subset(np.flatnonzero(inliers))

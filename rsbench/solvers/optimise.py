@@ -12,7 +12,7 @@ from rsbench.core.so3 import FloatArray
 Evaluate = Callable[[FloatArray], tuple[float, FloatArray, FloatArray]]
 _LARGEST_DAMPING = 1e10
 _FLAT = 1e-10
-"""Relative decrease of the cost at which to stop: with n matches sqrt(n 1e-10) standard deviations from the end."""
+"""Relative decrease of the cost at which to stop: sqrt(n 1e-10) standard deviations from the end."""
 
 
 class Minimum(NamedTuple):

@@ -69,6 +69,10 @@ class Packed:
         step_p, step_t = max(1, len(self.pairs) // most), max(1, len(self.tracks) // most)
         return self._of(self.pairs[::step_p], self.tracks[::step_t], self.row_checks[::step_t])
 
+    def tracks_only(self) -> Packed:
+        """Without the pairs."""
+        return self._of(self.pairs[:0], self.tracks, self.row_checks)
+
     def _of(self, pairs: FloatArray, tracks: FloatArray, row_checks: FloatArray) -> Packed:
         return Packed(
             pairs=pairs,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, final
+from typing import ClassVar, Literal, final
 
 import numpy as np
 
@@ -44,6 +44,10 @@ class RefinedSolver(Solver):
     """Interpolation between the rows: the paper's, or a constant twist."""
     use_tracks: bool = True
     """Off: tracks count as unlinked left and right matches, for a fair comparison with solvers of pairs."""
+    use_pairs: bool = True
+    """Off: only tracks, of which there must be three."""
+    shutter: Literal["rolling", "global"] = "rolling"
+    """Global: the same solver without readout, to see what the rolling shutter costs."""
     iterations: int = 60
     max_translation_m: float = 50.0
     """Longest translation per frame period; pairs alone may not bound it."""
@@ -58,7 +62,6 @@ class RefinedSolver(Solver):
     needs = frozenset[MatchSet]({"left", "right"})
     minimum: ClassVar[Mapping[MatchSet, int]] = MappingProxyType({"left": 7, "right": 7})
     metric = True
-    shutter = "rolling"
     reference_point = "body"
     reference = "rsbench; maximum likelihood of the motion model of Wang, Fan, Dai, eq. 1-6 without linearisation"
     assumes = "constant velocity of the chosen motion model, Gaussian noise, no outliers"
@@ -66,16 +69,32 @@ class RefinedSolver(Solver):
     def __post_init__(self) -> None:
         if self.motion_model not in ("linear", "twist"):
             raise ValueError(f"motion_model must be 'linear' or 'twist', got {self.motion_model!r}")
+        if not (self.use_tracks or self.use_pairs):
+            raise ValueError("use_tracks and use_pairs cannot both be off")
+        if not self.use_pairs:
+            # The class is frozen; what it needs follows from its parameters.
+            object.__setattr__(self, "needs", frozenset[MatchSet]({"tracks"}))
+            object.__setattr__(self, "minimum", MappingProxyType({"tracks": 3}))
+
+    def packed(self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter) -> Packed:
+        """The measurements that this solver uses, with the shutter that it believes in."""
+        if self.shutter == "global":
+            shutter = RollingShutter(height=shutter.height, readout_ratio=0.0)
+        if not self.use_pairs:
+            correspondences = Correspondences(tracks=correspondences.tracks)
+        linked = self.use_tracks and len(correspondences.tracks) >= 3
+        return pack(correspondences, rig, shutter, self.motion_model, use_tracks=linked)
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        packed = pack(correspondences, rig, shutter, self.motion_model, self.use_tracks)
-        if len(packed.tracks) < 3:
-            packed = pack(correspondences, rig, shutter, self.motion_model, use_tracks=False)
-            for side, count in packed.pair_counts().items():
-                if count < self.minimum[side]:
-                    return MotionEstimate.failed(f"{count} {side} matches, need {self.minimum[side]}")
+        packed = self.packed(correspondences, rig, shutter)
+        if len(packed.tracks) == 0:
+            pairs = packed.pair_counts()
+            counts = {"tracks": len(correspondences.tracks), "left": pairs["left"], "right": pairs["right"]}
+            for name, least in self.minimum.items():
+                if counts[name] < least:
+                    return MotionEstimate.failed(f"{counts[name]} {name} matches, need {least}")
         best = self._descend(packed, rig)
         if best is None:
             return MotionEstimate.failed("no start found: degenerate motion or scene")
@@ -83,13 +102,13 @@ class RefinedSolver(Solver):
 
     def sample_sizes(self, correspondences: Correspondences) -> dict[MatchSet, int]:
         """Three tracks, else five matches of the camera that has more of them."""
-        if self.use_tracks and len(correspondences.tracks) >= 3:
+        if not self.use_pairs or (self.use_tracks and len(correspondences.tracks) >= 3):
             return {"tracks": 3}
         return {"left": 5} if len(correspondences.left) >= len(correspondences.right) else {"right": 5}
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
-        packed = pack(sample, rig, shutter, self.motion_model, self.use_tracks)
-        if len(packed.tracks) >= 3:
+        packed = self.packed(sample, rig, shutter)
+        if len(packed.tracks) > 0:
             found = [self._minimise(packed, np.zeros(6), _SAMPLE_ITERATIONS).theta]
         else:
             length = 0.5 * rig.baseline
@@ -105,7 +124,7 @@ class RefinedSolver(Solver):
         shutter: RollingShutter,
         quick: bool = False,
     ) -> MotionEstimate:
-        packed = pack(correspondences, rig, shutter, self.motion_model, self.use_tracks)
+        packed = self.packed(correspondences, rig, shutter)
         start = packed.theta(motion.w, motion.d)
         if not quick:
             return self.report(packed, self._checked(packed, start))
@@ -122,8 +141,8 @@ class RefinedSolver(Solver):
         )
 
     def _descend(self, packed: Packed, rig: StereoRig) -> Minimum | None:
-        if len(packed.tracks) >= 3:
-            return self._minimise(packed, np.zeros(6), self.iterations)
+        if len(packed.tracks) > 0:
+            return self._checked(packed, self._minimise(packed.tracks_only(), np.zeros(6), self.iterations).theta)
         starts = linear_starts(packed, (15, 11, 9), rig)
         if not starts:
             return None
@@ -134,7 +153,7 @@ class RefinedSolver(Solver):
 
     def _checked(self, packed: Packed, theta: FloatArray) -> Minimum:
         """Descent; when the points then lie behind the cameras, another from the opposite translation."""
-        if len(packed.tracks) >= 3:
+        if len(packed.tracks) > 0:
             return self._minimise(packed, theta, self.iterations)
         # A start on fewer matches may have left the length of d at its limit, where the cost is flat.
         length, most = float(np.linalg.norm(theta[3:])), _LONGEST_START * packed.baseline
@@ -156,7 +175,7 @@ class RefinedSolver(Solver):
         scale_sigma, direction_sigma = _translation_sigmas(d, covariance)
         at_limit = float(np.linalg.norm(best.theta[3:])) >= 0.999 * self.max_translation_m
         # Tracks measure d in metres, however short it is; pairs only the direction of d well.
-        linked = len(packed.tracks) >= 3
+        linked = len(packed.tracks) > 0
         metric = linked or (scale_sigma <= self.max_scale_sigma and not at_limit)
         # Without parallax, noise looks like translation, but half of the points come out behind the cameras.
         in_front = linked or packed.in_front(best.theta) >= _LEAST_IN_FRONT * len(packed.pairs)

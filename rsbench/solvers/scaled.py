@@ -1,0 +1,91 @@
+"""One line that turns any global-shutter solver into one for a rolling shutter and a constant twist.
+
+B. Zhuang, L.-F. Cheong, G. Lee, Rolling-Shutter-Aware Differential SfM and Image Rectification, ICCV 2017: at
+constant velocity, a match that took ``a = 1 + h (y1 - y0)`` frame periods has moved a times as far as in one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import final
+
+import numpy as np
+
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.errors import RsbenchError
+from rsbench.solvers.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.registry import load_solver
+
+_LEAST_DURATION = 0.05
+"""Frame periods; a shorter one means a jump of nearly the whole image upwards, which no flow survives."""
+
+
+def scale_flow(correspondences: Correspondences, shutter: RollingShutter) -> Correspondences:
+    """Matches whose frame-1 ends are moved to where they would be after exactly one frame period."""
+    tracks = correspondences.tracks
+    left = _scaled(tracks[:, [0, 1, 4, 5]], shutter)
+    right = _scaled(tracks[:, [2, 3, 6, 7]], shutter)
+    return Correspondences(
+        left=_scaled(correspondences.left, shutter),
+        right=_scaled(correspondences.right, shutter),
+        tracks=np.concatenate([tracks[:, :4], left[:, 2:], right[:, 2:]], axis=1),
+    )
+
+
+def _scaled(matches: FloatArray, shutter: RollingShutter) -> FloatArray:
+    duration = shutter.row_time(matches[:, 3], 1) - shutter.row_time(matches[:, 1], 0)
+    duration = np.maximum(duration, _LEAST_DURATION)[:, None]
+    return np.concatenate([matches[:, :2], matches[:, :2] + (matches[:, 2:] - matches[:, :2]) / duration], axis=1)
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class FlowScaledSolver(Solver):
+    """A global-shutter solver on scaled matches; its motion is that of a constant twist to first order."""
+
+    solver: str
+    """Name or card of the global-shutter solver."""
+    inner: Solver = field(init=False, repr=False)
+
+    name = "flow-scaled"
+    motion_model = "twist"
+    shutter = "rolling"
+
+    def __post_init__(self) -> None:
+        try:
+            inner = load_solver(self.solver)
+        except RecursionError:
+            raise RsbenchError(f"solver = {self.solver!r}: refers to this card itself") from None
+        if inner.shutter != "global":
+            raise RsbenchError(f"solver = {self.solver!r}: must be a global-shutter solver")
+        # The class is frozen; what it declares is what the solver inside declares.
+        object.__setattr__(self, "inner", inner)
+        for name in ("needs", "minimum", "metric", "reference_point"):
+            object.__setattr__(self, name, getattr(inner, name))
+        object.__setattr__(self, "reference", f"Zhuang, Cheong, Lee, ICCV 2017, eq. 8-9; {inner.reference}")
+        object.__setattr__(self, "assumes", f"constant twist, small motion; {inner.assumes}")
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        return self.inner.estimate(scale_flow(correspondences, shutter), rig, shutter)
+
+    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
+        return self.inner.sample_sizes(correspondences)
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        return self.inner.propose(scale_flow(sample, shutter), rig, shutter)
+
+    def improve(
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        quick: bool = False,
+    ) -> MotionEstimate:
+        return self.inner.improve(motion, scale_flow(correspondences, shutter), rig, shutter, quick)
