@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from rsbench import __version__
-from rsbench.cli import cards, demo, doctor, evaluate, generate, reproduce, simulate, solve, verify
+from rsbench.cli import cards, correct, demo, doctor, evaluate, generate, reproduce, simulate, solve, verify
 from rsbench.errors import RsbenchError
 
 app = typer.Typer(
@@ -38,7 +38,7 @@ def _root(
     pass
 
 
-for module in (demo, cards, doctor, generate, verify, solve, evaluate, simulate, reproduce):
+for module in (demo, cards, doctor, generate, verify, solve, evaluate, correct, simulate, reproduce):
     module.register(app)
 
 

@@ -81,7 +81,7 @@ _MARGIN = 3
 def fuse(
     views: Sequence[SourceView], camera: PinholeCamera, target_pose: Pose, options: WarpOptions | None = None
 ) -> Fused:
-    """Warp the first view to ``target_pose`` and fill its holes from the others; views of origin GUESSED come last.
+    """Warp the first view to ``target_pose`` and fill its holes from the others, GUESSED ones last.
 
     Raises ValueError as ``rsbench.vision.correction.warp``.
     """

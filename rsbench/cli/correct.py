@@ -1,0 +1,235 @@
+"""``rsbench correct``: rolling-shutter correction of a user's own stereo frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rsbench.core.shutter import RollingShutter
+    from rsbench.pipeline.correct import CorrectionOptions
+    from rsbench.pipeline.footage import FrameSource, RigCard
+    from rsbench.pipeline.readout import ReadoutEstimate
+    from rsbench.pipeline.sliding import CorrectedMoment
+
+EPILOG = """[bold]Examples[/bold]
+
+  rsbench correct l0.png r0.png l1.png r1.png --rig rig.toml --out corrected
+
+  rsbench correct --left left.mp4 --right right.mp4 --rig rig.toml --out corrected --target middle
+
+RIG.toml, for rectified images (pixels, metres; without readout_ratio it is estimated):
+
+  baseline = 0.12
+  readout_ratio = 0.8        [dim]# readout time / frame period[/dim]
+  \\[camera]
+  fx = 812.3
+  fy = 812.3
+  cx = 479.5
+  cy = 269.5
+
+DIR gets [bold]report.html[/bold] (before and after), [bold]corrected/*.png[/bold], [bold]depth/*.exr[/bold]
+(of the corrected frames, metres), [bold]mask/*.png[/bold] (255 seen in the frame, 192 at a guessed depth, 128 from
+the other camera, 64 from the other frame, 0 seen by nobody) and [bold]motion.json[/bold]."""
+
+_PAGE_FRAMES = 6
+
+
+def correct(
+    frames: Annotated[
+        list[Path] | None, typer.Argument(metavar="LEFT_0 RIGHT_0 LEFT_1 RIGHT_1", help="Four images.")
+    ] = None,
+    rig: Annotated[Path | None, typer.Option(metavar="RIG.toml", help="Camera, baseline, readout ratio.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the results.")] = None,
+    left: Annotated[Path | None, typer.Option(help="Folder of images or video of the left camera.")] = None,
+    right: Annotated[Path | None, typer.Option(help="The same of the right camera.")] = None,
+    target: Annotated[
+        str, typer.Option(help="Time of the corrected frame: first, middle or last row, or a row's number.")
+    ] = "first",
+    inpaint: Annotated[bool, typer.Option("--inpaint", help="Invent what nobody saw; it stays marked.")] = False,
+    sky: Annotated[bool, typer.Option(help="Look for sky, which moves by rotation alone.")] = True,
+    fill: Annotated[bool, typer.Option(help="Fill what a frame did not see from the other frames.")] = True,
+    solver: Annotated[
+        str, typer.Option(help="Card of a refined solver: rs-stereo-refined or rs-stereo-refined-twist.")
+    ] = "rs-stereo-refined",
+    seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
+) -> None:
+    """Correct your own rolling-shutter stereo frames: two times of a rig, or a whole sequence."""
+    from rsbench.errors import RsbenchError
+    from rsbench.pipeline.correct import CorrectionOptions, NoMotionError
+    from rsbench.pipeline.footage import read_rig_card
+
+    if rig is None or out is None:
+        raise RsbenchError(f"--{'rig' if rig is None else 'out'}: is required")
+    card = read_rig_card(rig)
+    options = CorrectionOptions(
+        use_other_views=fill, find_sky=sky, inpaint=inpaint, seed=seed, solver=_solver(solver)
+    )
+    try:
+        if frames:
+            if left or right or len(frames) != 4:
+                raise RsbenchError(
+                    f"frames: {len(frames)} images; give LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right"
+                )
+            _correct_four(frames, card, out, target, options)
+        elif left and right:
+            _correct_sequence(left, right, card, out, target, options)
+        else:
+            raise RsbenchError("frames: give four images LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right")
+    except NoMotionError as error:
+        typer.echo(f"rsbench: not corrected: {error}", err=True)
+        raise typer.Exit(1) from None
+
+
+def _solver(name: str) -> Any:
+    from rsbench.errors import RsbenchError
+    from rsbench.solvers.refined import RefinedSolver
+    from rsbench.solvers.registry import load_solver
+
+    solver = load_solver(name)
+    if not isinstance(solver, RefinedSolver):
+        raise RsbenchError(f"--solver {name}: a card of rsbench.solvers.refined:RefinedSolver is needed")
+    return solver
+
+
+def _target_row(target: str, height: int) -> float:
+    from rsbench.errors import RsbenchError
+
+    named = {"first": 0.0, "middle": (height - 1) / 2, "last": height - 1.0}
+    if target in named:
+        return named[target]
+    try:
+        row = float(target)
+    except ValueError:
+        row = -1.0
+    if not 0.0 <= row <= height - 1:
+        raise RsbenchError(f"--target {target}: must be first, middle, last or a row from 0 to {height - 1}")
+    return row
+
+
+def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, options: CorrectionOptions) -> None:
+    from dataclasses import replace
+
+    from rsbench.cli.console import progress_bar
+    from rsbench.pipeline.correct import correct_four
+    from rsbench.pipeline.footage import read_four
+    from rsbench.report.correct import card_of, fresh_folder, motion_record, rig_record, write_frame, write_record
+
+    order = (("left", 0), ("right", 0), ("left", 1), ("right", 1))
+    images = read_four(dict(zip(order, paths, strict=True)))  # type: ignore[arg-type]
+    height, width = images["left", 0].shape[:2]
+    rig = card.rig(width, height)
+    options = replace(options, target_row=_target_row(target, height))
+    with fresh_folder(out) as folder:
+        with progress_bar("correcting", 4) as advance:
+            result = correct_four(images, rig, card.readout_ratio, options, advance)
+        for (side, frame), fused in result.frames.items():
+            write_frame(folder, f"{side}_{frame}", fused)
+        record = rig_record(rig, result.shutter, result.readout, options.target_row)
+        record["motion"] = motion_record(result.robust, options.solver.motion_model)
+        record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in result.frames.items()}
+        record["seconds"] = result.seconds
+        write_record(folder, record)
+        cards = [card_of(f"{s} {f}", images[s, f], fused) for (s, f), fused in result.frames.items()]
+        _page(folder, out, result.shutter, result.readout, record["motion"], cards)
+    _say(out, result.shutter, result.readout, record["motion"])
+
+
+def _page(
+    folder: Path,
+    out: Path,
+    shutter: RollingShutter,
+    readout: ReadoutEstimate | None,
+    motion: dict[str, Any] | None,
+    cards: list[Any],
+) -> None:
+    from rsbench.report.correct import write_page
+
+    facts = [("readout ratio", _readout(shutter, readout))]
+    if motion is not None:
+        facts += [("rotation", f"{motion['rotation_deg']:.4f} deg per frame period")]
+        facts += [("translation", f"{motion['translation']:.4f} m per frame period")]
+        facts += [("matches that agree", ", ".join(f"{n} {name}" for name, n in motion["inliers"].items()))]
+        facts += [("noise of a match", f"{motion['noise_px'] or float('nan'):.2f} px")]
+    write_page(folder, f"rsbench correct: {out.name}", "Rolling shutter to global shutter", facts, cards)
+
+
+def _readout(shutter: RollingShutter, readout: ReadoutEstimate | None) -> str:
+    return f"{shutter.readout_ratio:.3f} (given)" if readout is None else f"{readout} (estimated)"
+
+
+def _say(out: Path, shutter: RollingShutter, readout: ReadoutEstimate | None, motion: dict[str, Any]) -> None:
+    typer.echo(f"readout ratio {_readout(shutter, readout)}")
+    typer.echo(f"motion {motion['rotation_deg']:.4f} deg, {motion['translation']:.4f} m per frame period")
+    if motion["note"]:
+        typer.echo(f"note: {motion['note']}")
+    typer.echo(f"report: {(out / 'report.html').resolve()}")
+
+
+def _correct_sequence(
+    left_path: Path, right_path: Path, card: RigCard, out: Path, target: str, options: CorrectionOptions
+) -> None:
+    from dataclasses import replace
+
+    from rsbench.cli.console import progress_bar
+    from rsbench.core.shutter import RollingShutter
+    from rsbench.pipeline.footage import FrameSource
+    from rsbench.pipeline.sliding import correct_sequence, estimate_sequence_readout
+    from rsbench.report.correct import fresh_folder, rig_record, write_record
+
+    left, right = FrameSource(left_path), FrameSource(right_path)
+    height, width = next(iter(left)).shape[:2]
+    rig = card.rig(width, height)
+    options = replace(options, target_row=_target_row(target, height))
+    ratio, readout = card.readout_ratio, None
+    with fresh_folder(out) as folder:
+        if ratio is None:
+            readout = estimate_sequence_readout(left, right, rig, options)
+            ratio = readout.readout_ratio
+        shutter = RollingShutter(height=height, readout_ratio=ratio)
+        record = rig_record(rig, shutter, readout, options.target_row)
+        with progress_bar("correcting", max(left.count, 1)) as advance:
+            moments = correct_sequence(left, right, rig, ratio, options)
+            record["frames"], cards = _write_moments(folder, moments, left, options, advance)
+        write_record(folder, record)
+        _page(folder, out, shutter, readout, None, cards)
+    failed = [f"{frame['number']} ({frame['reason']})" for frame in record["frames"] if "motion" not in frame]
+    typer.echo(f"readout ratio {_readout(shutter, readout)}")
+    typer.echo(f"{len(record['frames']) - len(failed)} of {len(record['frames'])} times corrected")
+    typer.echo(f"report: {(out / 'report.html').resolve()}")
+    if failed:
+        typer.echo(f"rsbench: not corrected: frame {'; frame '.join(failed)}", err=True)
+        raise typer.Exit(1)
+
+
+def _write_moments(
+    folder: Path, moments: Any, left: FrameSource, options: CorrectionOptions, advance: Any
+) -> tuple[list[dict[str, Any]], list[Any]]:
+    """Write every corrected time; returns what motion.json says of each, and some for the page."""
+    from rsbench.report.correct import card_of, motion_record, write_frame
+
+    every = max(left.count // _PAGE_FRAMES, 1)
+    records: list[dict[str, Any]] = []
+    cards: list[Any] = []
+    moment: CorrectedMoment
+    for moment in moments:
+        entry: dict[str, Any] = {"number": moment.number}
+        for side, fused in moment.frames.items():
+            write_frame(folder, f"{side}_{moment.number:06d}", fused)
+            entry[side] = fused.shares()
+        if moment.robust is None:
+            entry["reason"] = moment.reason
+        else:
+            entry["motion"] = motion_record(moment.robust, options.solver.motion_model)
+            if moment.number % every == 0 and len(cards) < _PAGE_FRAMES:
+                title = f"left, frame {moment.number}"
+                cards.append(card_of(title, moment.images["left"], moment.frames["left"]))
+        records.append(entry)
+        advance(f"frame {moment.number}")
+    return records, cards
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog=EPILOG)(correct)

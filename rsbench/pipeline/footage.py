@@ -1,0 +1,177 @@
+"""A user's own footage: the card of the rig, and frames from files, folders and videos.
+
+Frames are read as the sensor delivered them: an orientation tag is ignored, for turning an image turns its rows
+into columns, and rows are what a rolling shutter reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.cards import parse_card, read_toml
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.errors import RsbenchError
+
+View = tuple[Side, int]
+"""Side and frame, 0 or 1."""
+VIEWS: tuple[View, ...] = tuple(product(SIDES, (0, 1)))
+_SMALLEST = 32
+"""Pixels of the shorter side; below that there is nothing to match."""
+_IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm"}
+_READ = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraCard:
+    """Intrinsics of both cameras after rectification, pixels; the centre of the top-left pixel is (0, 0)."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigCard:
+    """What must be known of a rig to correct its frames; the size comes from the images."""
+
+    camera: CameraCard
+    baseline: float
+    """Full distance between the cameras, metres."""
+    readout_ratio: float | None = None
+    """Readout time over frame period, 0 to 1; estimated from the frames when absent."""
+
+    def __post_init__(self) -> None:
+        self.rig(1, 1)
+        if self.readout_ratio is not None and not 0.0 <= self.readout_ratio <= 1.0:
+            raise ValueError(f"readout_ratio = {self.readout_ratio}: must lie in [0, 1], or be absent if unknown")
+
+    def rig(self, width: int, height: int) -> StereoRig:
+        """The rig with images of this size."""
+        c = self.camera
+        camera = PinholeCamera(width=width, height=height, fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy)
+        return StereoRig(camera=camera, baseline=self.baseline)
+
+
+def read_rig_card(path: Path) -> RigCard:
+    """Rig card: ``baseline``, ``readout_ratio`` and a table ``[camera]`` with fx, fy, cx, cy.
+
+    Raises:
+        RsbenchError: one line with the file, the field, the value and what is allowed.
+    """
+    return parse_card(RigCard, read_toml(path), str(path))
+
+
+def read_frame(path: Path) -> NDArray[Any]:
+    """Image (H, W) grey or (H, W, 3) RGB, uint8 or uint16; transparency and orientation tags are ignored.
+
+    Raises:
+        RsbenchError: missing, not an image, too small, or of another type.
+    """
+    if not path.is_file():
+        raise RsbenchError(f"{path}: no such image file")
+    pixels = cv2.imread(str(path), _READ)
+    if pixels is None:
+        raise RsbenchError(f"{path}: cannot be decoded as an image")
+    return _checked(pixels, str(path))
+
+
+def _checked(pixels: NDArray[Any], where: str) -> NDArray[Any]:
+    """RGB or grey image from OpenCV's BGR or grey."""
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise RsbenchError(f"{where}: has {pixels.dtype} pixels; 8 and 16 bit are allowed")
+    if min(pixels.shape[:2]) < _SMALLEST:
+        raise RsbenchError(
+            f"{where}: is {pixels.shape[1]} x {pixels.shape[0]} pixels; at least {_SMALLEST} x {_SMALLEST} needed"
+        )
+    if pixels.ndim == 3 and pixels.shape[2] == 3:
+        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
+    return np.ascontiguousarray(pixels if pixels.ndim == 2 else pixels[..., 0])
+
+
+def read_four(paths: dict[View, Path]) -> dict[View, NDArray[Any]]:
+    """The four frames of one motion; all of one size and kind.
+
+    Raises:
+        RsbenchError: see ``read_frame`` and ``check_alike``.
+    """
+    frames = {view: read_frame(path) for view, path in paths.items()}
+    check_alike({str(paths[view]): frame for view, frame in frames.items()})
+    return frames
+
+
+def check_alike(frames: dict[str, NDArray[Any]]) -> None:
+    """All frames must have the size, channels and depth of the first.
+
+    Raises:
+        RsbenchError: names the frame that differs.
+    """
+    first_name, first = next(iter(frames.items()))
+    for name, frame in frames.items():
+        if frame.shape != first.shape or frame.dtype != first.dtype:
+            raise RsbenchError(
+                f"{name}: is {_kind(frame)}, but {first_name} is {_kind(first)}; all frames must be alike"
+            )
+
+
+def _kind(frame: NDArray[Any]) -> str:
+    height, width = frame.shape[:2]
+    colour = "grey" if frame.ndim == 2 else "colour"
+    return f"{width} x {height} {8 * frame.dtype.itemsize}-bit {colour}"
+
+
+class FrameSource:
+    """Frames of one camera, in order, from a folder of images (by name) or a video; can be read repeatedly."""
+
+    def __init__(self, path: Path) -> None:
+        """Open a folder or video.
+
+        Raises:
+            RsbenchError: missing, no frames, or not a video that OpenCV can read.
+        """
+        self.path = path
+        self._files: list[Path] = []
+        if path.is_dir():
+            self._files = sorted(file for file in path.iterdir() if file.suffix.lower() in _IMAGE_SUFFIXES)
+            if not self._files:
+                raise RsbenchError(f"{path}: no images; files may end in {', '.join(sorted(_IMAGE_SUFFIXES))}")
+            self.count = len(self._files)
+        elif path.is_file():
+            video = self._open()
+            self.count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+            video.release()
+        else:
+            raise RsbenchError(f"{path}: no such folder or video")
+
+    def _open(self) -> Any:
+        video = cv2.VideoCapture(str(self.path))
+        if not video.isOpened():
+            raise RsbenchError(f"{self.path}: cannot be read as a video")
+        # Turning frames would turn rows into columns.
+        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        return video
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        if self._files:
+            yield from map(read_frame, self._files)
+            return
+        video = self._open()
+        try:
+            number = 0
+            while True:
+                ok, pixels = video.read()
+                if not ok:
+                    return
+                yield _checked(pixels, f"{self.path}, frame {number}")
+                number += 1
+        finally:
+            video.release()
