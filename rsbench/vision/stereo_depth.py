@@ -40,6 +40,8 @@ class SgmOptions:
 
     num_disparities: int | None = None
     """Disparities searched, from 0; None derives them from ``nearest_depth``."""
+    least_disparity: float = 0.5
+    """Smaller disparities are unknown: hardly told from infinity, and what the matcher says without any texture."""
     nearest_depth: float | None = None
     """Metres; None finds the range in the images, by matching them at a quarter of the size."""
     block_size: int = 5
@@ -67,6 +69,8 @@ class SgmOptions:
             raise ValueError(f"num_disparities must be at least 1, got {self.num_disparities}")
         if self.nearest_depth is not None and not self.nearest_depth > 0.0:
             raise ValueError(f"nearest_depth must be positive metres, got {self.nearest_depth}")
+        if not self.least_disparity > 0.0:
+            raise ValueError(f"least_disparity must be positive, got {self.least_disparity}")
         if not 0 < self.p1 <= self.p2:
             raise ValueError(f"p1 and p2 must satisfy 0 < p1 <= p2, got {self.p1} and {self.p2}")
         if self.refine_iterations < 0:
@@ -181,7 +185,7 @@ def _sgm(reference: U8, other: U8, count: int, options: SgmOptions) -> F32:
     disparity = np.asarray(matcher.compute(a, b)[:, count:], dtype=np.float32) / np.float32(_FRACTION)
     # Beyond the other image's border there is only padding to match.
     columns = np.arange(disparity.shape[1], dtype=np.float32)
-    return np.where((disparity >= 0.0) & (columns - disparity >= 0.0), disparity, np.float32(np.nan))
+    return np.where((disparity >= options.least_disparity) & (columns - disparity >= 0.0), disparity, np.float32(np.nan))
 
 
 def _consistent(reference: F32, other: F32, tolerance: float) -> F32:

@@ -15,7 +15,7 @@ import pytest
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion, Motion
-from rsbench.core.projection import row_poses
+from rsbench.core.projection import row_poses, rs_project
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
@@ -92,13 +92,20 @@ class World:
     sky: bool = False
     """Rays that meet nothing see a texture at infinity; otherwise black."""
 
+    def depth_along(self, poses: Pose, pixels: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Depth of pixels (..., 2), inf where nothing is met, with the camera centres and rays in the world."""
+        R, t = poses
+        rays = (np.swapaxes(R, -1, -2) @ self.rig.camera.unproject(pixels)[..., None])[..., 0]
+        centre = -(np.swapaxes(R, -1, -2) @ t[..., None])[..., 0]
+        centre = np.broadcast_to(centre, rays.shape)
+        nothing = np.full(rays.shape[:-1], np.inf)
+        depth = np.min([nothing, *(s.distance(centre, rays) for s in self.surfaces)], axis=0)
+        return depth, centre, rays
+
     def see(self, poses: Pose) -> tuple[FloatArray, FloatArray]:
         """Image (H, W, 3) in [0, 1] and depth (H, W), inf where nothing is met, through one pose per row."""
-        rays_in_cam = self.rig.camera.unproject(self.rig.camera.pixel_grid())
-        R, t = poses
-        rays = rays_in_cam @ R
-        centre = -(np.swapaxes(R, -1, -2) @ t[..., None])[..., 0][:, None, :]
-        depth = np.min([s.distance(centre, rays) for s in self.surfaces], axis=0)
+        by_row = Pose(poses.R[:, None], poses.t[:, None])
+        depth, centre, rays = self.depth_along(by_row, self.rig.camera.pixel_grid())
         hit = np.isfinite(depth)
         image = self.texture(centre + np.where(hit, depth, 0.0)[..., None] * rays)
         far = self.texture(40.0 * self.texture.shortest * rays / np.linalg.norm(rays, axis=-1, keepdims=True))
@@ -154,3 +161,36 @@ def shapes() -> tuple[type[Plane], type[Sphere]]:
 @pytest.fixture(scope="session")
 def u8() -> Callable[[FloatArray], np.ndarray]:
     return to_u8
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the global-shutter camera at one time sees, and where the rolling-shutter frame saw it."""
+
+    image: FloatArray
+    depth: FloatArray
+    source: FloatArray
+    """(H, W, 2) pixel of the rolling-shutter frame that shows the same point; NaN when none does."""
+    visible: FloatArray
+    """(H, W) the frame saw the point: inside its outermost pixel centres and not hidden."""
+
+
+def truth_at(world: World, side: Side, frame: int, tau: float) -> Truth:
+    """Closed-form truth of a correction: rays of the target, their points, and ``rs_project`` of these."""
+    rig, camera = world.rig, world.rig.camera
+    image, _ = world.still(side, tau)
+    depth, centre, rays = world.depth_along(rig.cam_from_world(world.motion, tau, side), camera.pixel_grid())
+    points = centre + np.where(np.isfinite(depth), depth, 1e9)[..., None] * rays
+    seen = rs_project(rig, world.shutter, world.motion, side, frame, points)
+    known = np.isfinite(seen.depth)
+    pixels, times = np.where(known[..., None], seen.pixels, 0.0), np.where(known, seen.tau, 0.0)
+    nearest, _, _ = world.depth_along(rig.cam_from_world(world.motion, times, side), pixels)
+    hidden = np.minimum(nearest, 1e9) < seen.depth * (1 - 1e-6)
+    limit = np.array([camera.width - 1, camera.height - 1])
+    inside = np.all((pixels >= 0) & (pixels <= limit), axis=-1)
+    return Truth(image=image, depth=depth, source=seen.pixels, visible=known & ~hidden & inside)
+
+
+@pytest.fixture(scope="session")
+def truth() -> Callable[..., Truth]:
+    return truth_at

@@ -1,0 +1,188 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rsbench.core.projection import back_project, rs_project
+from rsbench.vision.features import Gate, MatchOptions, close_loops, detect, match_stereo_frames
+from rsbench.vision.nearest import best_two
+
+Build = Callable[..., Any]
+Four = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def scene(world: Build, shapes: Any) -> Any:
+    Plane, Sphere = shapes
+    return world((Plane((0.2, 0.3, 1), 8), Sphere((0.2, 0.1, 4), 0.6)), size=(240, 320), focal=400, shortest=0.12)
+
+
+@pytest.fixture(scope="module")
+def images(scene: Any, u8: Build) -> Four:
+    left_0, right_0, left_1, right_1 = (scene.rolling(side, k)[0] for k in (0, 1) for side in ("left", "right"))
+    return u8(left_0), u8(right_0), u8(left_1), u8(right_1)
+
+
+def test_blob_centres_have_no_offset() -> None:
+    """Gaussian blobs at known sub-pixel places: OpenCV's default would be 0.25 px off in x and in y."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:300, :300]
+    centres = np.stack(np.meshgrid(np.arange(6), np.arange(6)), -1).reshape(-1, 2) * 44.0 + 40
+    centres += rng.uniform(-0.5, 0.5, centres.shape)
+    image = np.full((300, 300), 60.0)
+    for (cx, cy), sigma in zip(centres, rng.uniform(2, 5, len(centres)), strict=True):
+        image += 120 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * sigma**2))
+    points = detect(np.clip(np.rint(image), 0, 255).astype(np.uint8)).points
+    distance = np.linalg.norm(points[:, None] - centres, axis=-1)
+    found = distance.min(axis=1) < 1
+    assert np.unique(distance[found].argmin(axis=1)).size > 30
+    offset = points[found] - centres[distance[found].argmin(axis=1)]
+    assert np.all(np.abs(offset.mean(axis=0)) < 0.01)
+    assert np.all(np.abs(offset) < 0.1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_best_two_is_exhaustive_search(seed: int) -> None:
+    """Against all distances in float64, masked by the window."""
+    rng = np.random.default_rng(seed)
+    sets = []
+    for n in (300, 700):  # more than one chunk
+        points = rng.uniform(0, 50, (n, 2))
+        sets.append((points[np.argsort(points[:, 1])], rng.integers(0, 256, (n, 128)).astype(np.float32)))
+    (pa, da), (pb, db) = sets
+    best, nearest, second, back = best_two(pa, da, pb, db, (-20.0, 5.0), (-8.0, 9.0))
+    gap = pb - pa[:, None]
+    allowed = (gap[..., 0] >= -20) & (gap[..., 0] <= 5) & (gap[..., 1] >= -8) & (gap[..., 1] <= 9)
+    distance = ((da[:, None].astype(float) - db) ** 2).sum(-1)
+    distance[~allowed] = np.inf
+    ordered = np.sort(distance, axis=1)
+    np.testing.assert_array_equal(nearest, ordered[:, 0])
+    np.testing.assert_array_equal(second, ordered[:, 1])
+    some = np.isfinite(ordered[:, 0])
+    np.testing.assert_array_equal(best[some], distance[some].argmin(axis=1))
+    assert np.all(best[~some] == -1)
+    np.testing.assert_array_equal(back, np.where(allowed.any(axis=0), distance.argmin(axis=0), -1))
+
+
+def _flow_error(scene: Any, matches: np.ndarray, source: tuple[Any, int], target: tuple[Any, int]) -> np.ndarray:
+    """Distance, px, from the matched point to where ``rs_project`` puts the exact point of the surface."""
+    rig, shutter, motion = scene.rig, scene.shutter, scene.motion
+    pose = rig.cam_from_world(motion, shutter.row_time(matches[:, 1], source[1]), source[0])
+    depth, _, _ = scene.depth_along(pose, matches[:, :2])
+    points = back_project(rig, shutter, motion, *source, matches[:, :2], depth)
+    return np.linalg.norm(rs_project(rig, shutter, motion, *target, points).pixels - matches[:, 2:], axis=1)
+
+
+def test_matches_follow_the_true_flow(scene: Any, images: Four) -> None:
+    found = match_stereo_frames(*images)
+    pairs = {
+        "left": (("left", 0), ("left", 1)),
+        "right": (("right", 0), ("right", 1)),
+        "stereo_0": (("left", 0), ("right", 0)),
+        "stereo_1": (("left", 1), ("right", 1)),
+    }
+    for name, (source, target) in pairs.items():
+        matches = getattr(found, name)
+        assert len(matches) > 100
+        error = _flow_error(scene, matches, source, target)
+        assert np.nanmedian(error) < 0.15
+        assert np.mean(~(error < 2.0)) < 0.05
+    for name in ("stereo_0", "stereo_1"):
+        matches = getattr(found, name)
+        assert np.all(matches[:, 0] > matches[:, 2])
+        assert np.all(np.abs(matches[:, 1] - matches[:, 3]) <= 1.5)
+
+
+def test_tracks_are_made_of_the_pairwise_matches(images: Four) -> None:
+    found = match_stereo_frames(*images)
+    tracks = found.tracks
+    assert len(tracks) > 50
+
+    def rows(matches: np.ndarray) -> set[tuple[float, ...]]:
+        return {tuple(row) for row in matches.tolist()}
+
+    assert rows(tracks[:, [0, 1, 4, 5]]) <= rows(found.left)
+    assert rows(tracks[:, [2, 3, 6, 7]]) <= rows(found.right)
+    assert rows(tracks[:, :4]) <= rows(found.stereo_0)
+    assert rows(tracks[:, 4:]) <= rows(found.stereo_1)
+    assert len(rows(tracks)) == len(tracks)
+
+
+def test_loops_close_or_open_or_contradict() -> None:
+    left = np.array([[0, 10], [1, 11], [2, 12], [3, 13]])
+    right = np.array([[20, 30], [21, 31], [22, 32]])
+    stereo_0 = np.array([[0, 20], [1, 21], [2, 22]])
+    stereo_1 = np.array([[10, 30], [11, 32], [13, 31]])
+    np.testing.assert_array_equal(close_loops(left, right, stereo_0, stereo_1), [[0, 20, 10, 30]])
+    none = np.zeros((0, 2), dtype=np.int64)
+    for sets in ((none, right, stereo_0, stereo_1), (left, none, stereo_0, stereo_1), (left, right, none, none)):
+        assert close_loops(*sets).shape == (0, 4)
+
+
+def test_search_radius_bounds_temporal_matches(images: Four) -> None:
+    found = match_stereo_frames(*images, MatchOptions(search_radius=6.0, max_disparity=30.0))
+    for matches in (found.left, found.right):
+        assert np.abs(matches[:, 2:] - matches[:, :2]).max(initial=0.0) <= 6.0
+    assert np.max(found.stereo_0[:, 0] - found.stereo_0[:, 2], initial=0.0) <= 30.0
+
+
+def test_the_same_images_give_the_same_matches(images: Four) -> None:
+    a, b = match_stereo_frames(*images), match_stereo_frames(*images)
+    deep = [image.astype(np.uint16) * 257 for image in images]
+    wide = match_stereo_frames(deep[0], deep[1], deep[2], deep[3])
+    for name in ("left", "right", "stereo_0", "stereo_1", "tracks"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        # 16-bit colour is made grey before it is rounded: a few keypoints differ.
+        assert abs(len(getattr(wide, name)) - len(getattr(a, name))) < 0.2 * len(getattr(a, name)) + 5
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_no_texture_is_no_match(value: int) -> None:
+    flat = np.full((60, 80, 3), value, dtype=np.uint8)
+    found = match_stereo_frames(flat, flat, flat, flat)
+    for name in ("left", "right", "stereo_0", "stereo_1", "tracks"):
+        assert len(getattr(found, name)) == 0
+
+
+def test_one_blank_image_leaves_the_other_sets(images: Four) -> None:
+    found = match_stereo_frames(images[0], images[1], images[2], np.zeros_like(images[3]))
+    assert len(found.left) > 100 and len(found.stereo_0) > 100
+    assert len(found.right) == len(found.stereo_1) == len(found.tracks) == 0
+
+
+@pytest.mark.parametrize("shape", [(60, 80, 2), (60,), (0, 80), (60, 80, 3, 1)])
+def test_bad_shapes(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="image must have shape"):
+        detect(np.zeros(shape, dtype=np.uint8))
+
+
+def test_bad_types_sizes_and_options(images: Four) -> None:
+    with pytest.raises(ValueError, match="uint8 or uint16"):
+        detect(images[0].astype(np.float32))
+    with pytest.raises(ValueError, match="right_1 must have the size"):
+        match_stereo_frames(images[0], images[1], images[2], images[3][:-1])
+    wrong: list[dict[str, Any]] = [
+        {"ratio": 0.0},
+        {"max_features": -1},
+        {"search_radius": 0.0},
+        {"row_tolerance": -1.0},
+    ]
+    for options in wrong:
+        with pytest.raises(ValueError, match="must"):
+            MatchOptions(**options)
+
+
+def test_gate_of_one_candidate_needs_a_small_distance() -> None:
+    """With a single candidate the ratio test passes anything; the distance does not."""
+    from rsbench.vision.features import Features, match
+
+    far = np.zeros((1, 128), dtype=np.float32)
+    far[0, 0] = 255
+    a = Features(points=np.zeros((1, 2)), descriptors=np.zeros((1, 128), dtype=np.float32))
+    b = Features(points=np.zeros((1, 2)), descriptors=far)
+    gate = Gate(dx=(-1.0, 1.0), dy=(-1.0, 1.0))
+    assert len(match(a, b, gate, MatchOptions(max_distance=254.0))) == 0
+    assert len(match(a, b, gate, MatchOptions(max_distance=256.0))) == 1

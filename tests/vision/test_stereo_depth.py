@@ -1,0 +1,194 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.rig import StereoRig
+from rsbench.vision.disparity_refinement import refine_disparity
+from rsbench.vision.stereo_depth import (
+    SgmOptions,
+    depth_metrics,
+    disparity_range,
+    fill_holes,
+    stereo_disparities,
+    stereo_disparity,
+)
+
+Build = Callable[..., Any]
+Pair = tuple[np.ndarray, np.ndarray]
+RIG = StereoRig(camera=PinholeCamera.centred(200, 160, 260.0), baseline=0.4)
+
+
+@pytest.fixture(scope="module")
+def scene(world: Build, shapes: Any) -> Any:
+    """A slanted wall and a ball, rolling shutter, strong motion: the rows still match."""
+    Plane, Sphere = shapes
+    return world((Plane((0.3, 0.3, 1), 7), Sphere((0.1, 0.1, 4), 0.6)), size=(240, 320), focal=400, shortest=0.12)
+
+
+@pytest.fixture(scope="module")
+def pair(scene: Any, u8: Build) -> Pair:
+    return u8(scene.rolling("left", 1)[0]), u8(scene.rolling("right", 1)[0])
+
+
+def _flat(disparity: np.ndarray) -> np.ndarray:
+    d = disparity.astype(np.float32)
+    kernel = np.ones((11, 11), dtype=np.uint8)
+    return cv2.dilate(d, kernel) - cv2.erode(d, kernel) < 3.0
+
+
+def _bias(error: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Median error by eighths of the fraction of the true disparity: pixel locking shows as a wave."""
+    fraction = truth - np.floor(truth)
+    return np.array([np.median(error[(fraction >= a) & (fraction < a + 0.125)]) for a in np.arange(0, 1, 0.125)])
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_disparity_is_true_to_hundredths_of_a_pixel(scene: Any, pair: Pair, side: Any) -> None:
+    truth = scene.rig.disparity(scene.rolling(side, 1)[1])
+    raw = stereo_disparity(*pair, scene.rig, side, SgmOptions(refine_iterations=0))
+    fine = stereo_disparity(*pair, scene.rig, side)
+    assert fine.dtype == np.float32 and fine.shape == truth.shape
+    np.testing.assert_array_equal(np.isfinite(raw), np.isfinite(fine))
+    good = np.isfinite(fine) & _flat(truth)
+    # Seen by both cameras: the rest of the image must be matched.
+    columns = np.arange(320) - truth if side == "left" else np.arange(320) + truth
+    both = (columns >= 0) & (columns <= 319) & _flat(truth)
+    assert np.mean(np.isfinite(fine)[both]) > 0.97
+    error = (fine - truth)[good]
+    assert np.median(np.abs(error)) < 0.03
+    assert np.mean(np.abs(error) > 0.5) < 0.01
+    # The matcher's own interpolation is off by more than 0.1 px at some fractions, the refined one nowhere.
+    assert np.abs(_bias((raw - truth)[good], truth[good])).max() > 0.1
+    assert np.abs(_bias(error, truth[good])).max() < 0.015
+
+
+def test_both_sides_are_the_two_single_sides(scene: Any, pair: Pair) -> None:
+    left, right = stereo_disparities(*pair, scene.rig)
+    np.testing.assert_array_equal(left, stereo_disparity(*pair, scene.rig, "left"))
+    np.testing.assert_array_equal(right, stereo_disparity(*pair, scene.rig, "right"))
+
+
+def test_a_band_that_the_other_camera_misses_is_unknown(scene: Any, pair: Pair) -> None:
+    """The left band of the left image and the right band of the right one stay unknown, and nothing else."""
+    left, right = stereo_disparities(*pair, scene.rig)
+    true_left = scene.rig.disparity(scene.rolling("left", 1)[1])
+    true_right = scene.rig.disparity(scene.rolling("right", 1)[1])
+    columns = np.arange(320)
+    assert np.mean(np.isfinite(left)[columns - true_left < -2]) < 0.02
+    assert np.mean(np.isfinite(right)[columns + true_right > 321]) < 0.02
+    # OpenCV alone would leave out as many columns as there are disparities.
+    assert np.mean(np.isfinite(left)[(columns - true_left > 2) & (columns < 60)]) > 0.9
+
+
+@pytest.mark.parametrize("mode", ["sgbm", "hh", "3way", "hh4"])
+def test_every_mode_matches(scene: Any, pair: Pair, mode: Any) -> None:
+    truth = scene.rolling("left", 1)[1]
+    found = stereo_disparity(*pair, scene.rig, options=SgmOptions(mode=mode, num_disparities=64))
+    scores = depth_metrics(scene.rig.depth(found), truth, scene.rig)
+    assert scores["coverage"] > 0.75 and scores["bad_1px"] < 0.03 and scores["median_m"] < 0.02
+
+
+def test_range_from_depth_number_and_images(scene: Any, pair: Pair) -> None:
+    left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in pair)
+
+    def count(**options: Any) -> int:
+        return disparity_range(left, right, scene.rig, SgmOptions(**options))
+
+    assert count(nearest_depth=3.0) == 64  # 400 px * 0.4 m / 3 m = 53.3 px
+    assert count(num_disparities=70) == 80
+    assert count(nearest_depth=0.01) == 320  # never more than the image is wide
+    largest = float(np.max(scene.rig.disparity(scene.rolling("left", 1)[1])))
+    assert largest <= count() <= 2 * largest + 32
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_no_texture_is_no_depth(value: int) -> None:
+    flat = np.full((160, 200, 3), value, dtype=np.uint8)
+    for disparity in stereo_disparities(flat, flat, RIG):
+        assert np.all(np.isnan(disparity))
+    assert depth_metrics(RIG.depth(disparity), np.ones((160, 200)), RIG)["coverage"] == 0.0
+
+
+def test_refinement_finds_a_constant_shift() -> None:
+    """A pattern moved by a known fraction, started 0.4 px away on either side; NaN stays."""
+    y, x = np.mgrid[:60, :90].astype(np.float64)
+
+    def pattern(at: np.ndarray) -> np.ndarray:
+        wave = 40 * np.sin(at / 2.1 + y / 5) + 30 * np.sin(at / 3.7 - y / 3) + 20 * np.sin(at / 6.1 + 1)
+        return np.rint(128 + wave).astype(np.uint8)
+
+    shift = 7.37
+    left, right = pattern(x), pattern(x + shift)
+    for start in (shift - 0.4, shift + 0.4):
+        initial = np.full((60, 90), start, dtype=np.float32)
+        initial[20:22, 30:40] = np.nan
+        refined = refine_disparity(left, right, initial, iterations=3)
+        np.testing.assert_array_equal(np.isnan(refined), np.isnan(initial))
+        inner = refined[:, 16:-6]
+        # Rounding to 8 bits and the cubic's own error; worst where the phases leave a window little slope.
+        assert np.nanmedian(np.abs(inner - shift)) < 0.015
+        assert np.nanmax(np.abs(inner - shift)) < 0.06
+    np.testing.assert_array_equal(refine_disparity(left, right, initial, iterations=0), initial)
+
+
+def test_holes_are_filled_from_behind() -> None:
+    nan = np.nan
+    rows = np.array(
+        [[nan, 4, nan, nan, 2, nan], [nan] * 6, [1, 2, 3, 4, 5, 6], [nan, nan, nan, 7, nan, 9]], dtype=np.float32
+    )
+    expected = [[4, 4, 2, 2, 2, 2], [nan] * 6, [1, 2, 3, 4, 5, 6], [7, 7, 7, 7, 7, 9]]
+    np.testing.assert_array_equal(fill_holes(rows), expected)
+    narrow = [[4, 4, nan, nan, 2, 2], [nan] * 6, [1, 2, 3, 4, 5, 6], [nan, nan, nan, 7, 7, 9]]
+    np.testing.assert_array_equal(fill_holes(rows, max_width=1), narrow)
+
+
+def test_metrics_of_known_errors() -> None:
+    """Ten surface pixels at 10 m (10.4 px), one of each fault; depth by hand."""
+    truth = np.full((1, 12), 10.0)
+    truth[0, 10:] = 0.0, np.inf  # sky either way
+    estimate = truth.copy()
+    estimate[0, :6] = np.nan, 0.0, 13.0, 10.5, 7.0, np.inf
+    scores = depth_metrics(estimate, truth, RIG)
+    assert scores["coverage"] == pytest.approx(0.7)
+    assert scores["median_m"] == 0.0
+    assert scores["rmse_m"] == pytest.approx(math.sqrt((9 + 0.25 + 9) / 7))
+    assert scores["over_2m"] == pytest.approx(2 / 7)
+    # 104 / 13 = 8 px is 2.4 px off, 104 / 10.5 0.5 px, 104 / 7 4.5 px.
+    assert scores["bad_1px"] == pytest.approx(2 / 7)
+    assert scores["bad_2px"] == pytest.approx(2 / 7)
+    assert scores["bad_3px"] == pytest.approx(1 / 7)
+
+
+def test_metrics_without_pixels() -> None:
+    for truth in (np.zeros((2, 2)), np.ones((2, 2))):
+        scores = depth_metrics(np.full((2, 2), np.nan), truth, RIG)
+        assert scores["coverage"] == 0.0
+        assert all(math.isnan(value) for name, value in scores.items() if name != "coverage")
+    with pytest.raises(ValueError, match="shape of truth"):
+        depth_metrics(np.ones((2, 2)), np.ones((2, 3)), RIG)
+
+
+def test_bad_input() -> None:
+    good = np.zeros((160, 200), dtype=np.uint8)
+    for left, right in ((good[:-1], good), (good, good[:, :-1]), (good.astype(np.float32), good)):
+        with pytest.raises(ValueError, match="must"):
+            stereo_disparity(left, right, RIG)
+    wrong: list[dict[str, Any]] = [
+        {"mode": "fast"},
+        {"block_size": 4},
+        {"num_disparities": 0},
+        {"nearest_depth": -1.0},
+        {"p1": 40},
+        {"refine_iterations": -1},
+        {"least_disparity": 0.0},
+    ]
+    for options in wrong:
+        with pytest.raises(ValueError, match="must"):
+            SgmOptions(**options)
