@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
 
 Vector = tuple[float, float, float]
+Axis = Vector | Literal["random"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,10 +36,11 @@ class MotionCard:
 
     model: str = "linear"
     rotation_deg: float
-    rotation_axis: Vector
+    rotation_axis: Axis
+    """``"random"`` in the file of a card: drawn for each sequence from its seed and name when the card is loaded."""
     translation: float
     """Metres."""
-    translation_axis: Vector
+    translation_axis: Axis
 
     def __post_init__(self) -> None:
         if self.model not in MOTION_MODELS:
@@ -48,12 +52,33 @@ class MotionCard:
                 raise ValueError(f"{name}_axis must not be zero when there is {name}")
 
     def motion(self) -> Motion:
-        """The motion of the rig's body, radians and metres per frame period."""
+        """The motion of the rig's body, radians and metres per frame period.
+
+        Raises ValueError when an axis was not drawn yet.
+        """
         w = _scaled(self.rotation_axis, np.deg2rad(self.rotation_deg))
         return MOTION_MODELS[self.model](w, _scaled(self.translation_axis, self.translation))
 
+    def drawn(self, seed: int, name: str) -> MotionCard:
+        """With random axes drawn, each uniform on the sphere; the same whatever the lengths are."""
+        axes = {
+            field: _random_axis(f"{seed}/{name}/{field}")
+            for field in ("rotation_axis", "translation_axis")
+            if getattr(self, field) == "random"
+        }
+        return replace(self, **axes)  # type: ignore[arg-type]
 
-def _scaled(axis: Vector, length: float) -> np.ndarray:
+
+def _random_axis(text: str) -> Vector:
+    seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little")
+    v = np.random.default_rng(seed).standard_normal(3)
+    x, y, z = (v / np.linalg.norm(v)).tolist()
+    return x, y, z
+
+
+def _scaled(axis: Axis, length: float) -> np.ndarray:
+    if axis == "random":
+        raise ValueError('an axis is still "random"; load_dataset_card draws it')
     v = np.asarray(axis, dtype=np.float64)
     return v * (length / np.linalg.norm(v)) if length > 0 else np.zeros(3)
 
@@ -93,6 +118,8 @@ class DatasetCard:
     renderer: str = "default"
     """Name of a renderer card, or a path to one."""
     seed: int = 0
+    seeds: tuple[int, ...] = ()
+    """When given, every sequence is made once per seed under the name NAME-SEED; random axes change with it."""
     sequence: tuple[SequenceCard, ...] = field(default=())
 
     def __post_init__(self) -> None:
@@ -101,6 +128,10 @@ class DatasetCard:
             self.rig_of(sequence)
         if not self.frame_period_s > 0:
             raise ValueError(f"frame_period_s must be positive, got {self.frame_period_s}")
+        if any(sequence.seed is not None for sequence in self.sequence) and self.seeds:
+            raise ValueError("seeds and the seed of a sequence exclude each other")
+        if len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"seeds = {list(self.seeds)}: must differ from each other")
         names = [sequence.name for sequence in self.sequence]
         if not names:
             raise ValueError("a dataset needs at least one [[sequence]]")
@@ -134,7 +165,24 @@ class DatasetCard:
                 raise RsbenchError(f"dataset {self.name}: no sequence {name!r}; there are: {', '.join(known)}")
         return replace(self, sequence=tuple(known[name] for name in names))
 
+    def expanded(self) -> DatasetCard:
+        """One sequence per seed, and every random axis drawn: a card that says all that it will make."""
+        if not self.seeds:
+            return replace(self, sequence=tuple(self._drawn(sequence) for sequence in self.sequence))
+        repeated = tuple(
+            self._drawn(replace(sequence, name=f"{sequence.name}-{seed}", seed=seed))
+            for sequence in self.sequence
+            for seed in self.seeds
+        )
+        return replace(self, sequence=repeated, seeds=())
+
+    def _drawn(self, sequence: SequenceCard) -> SequenceCard:
+        motion = sequence.motion or self.motion
+        if "random" not in (motion.rotation_axis, motion.translation_axis):
+            return sequence
+        return replace(sequence, motion=motion.drawn(self.seed_of(sequence), sequence.name))
+
 
 def load_dataset_card(name_or_path: str) -> DatasetCard:
-    """Dataset card by name or path; errors as ``rsbench.cards.load_card``."""
-    return load_card(DatasetCard, "datasets", name_or_path)
+    """Dataset card by name or path, expanded; errors as ``rsbench.cards.load_card``."""
+    return load_card(DatasetCard, "datasets", name_or_path).expanded()
