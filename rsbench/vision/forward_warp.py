@@ -114,6 +114,15 @@ def draw_mesh(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F32
 
 
 @njit(cache=True, error_model="numpy", inline="always")
+def _covered(a: float, b: float, c: float, d: float, size: int) -> tuple[int, int]:
+    """First and last pixel between the corners' coordinates; none when one is NaN or they are too far apart."""
+    low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+    if not high - low <= _MAX_STRETCH:
+        return 1, 0
+    return int(max(0.0, np.ceil(low - _SLACK))), int(min(size - 1.0, np.floor(high + _SLACK)))
+
+
+@njit(cache=True, error_model="numpy", inline="always")
 def _quad(
     upper: F64,
     lower: F64,
@@ -136,12 +145,8 @@ def _quad(
     cx, cy, cz = lower[near, 0], lower[near, 1], lower[near, 2]
     dx, dy, dz = lower[far, 0], lower[far, 1], lower[far, 2]
     height, width = buffer.shape
-    low_x, high_x = min(min(ax, bx), min(cx, dx)), max(max(ax, bx), max(cx, dx))
-    low_y, high_y = min(min(ay, by), min(cy, dy)), max(max(ay, by), max(cy, dy))
-    if not (high_x - low_x <= _MAX_STRETCH and high_y - low_y <= _MAX_STRETCH):
-        return
-    start, stop = max(0.0, np.ceil(low_x - _SLACK)), min(width - 1.0, np.floor(high_x + _SLACK))
-    top, bottom = max(0.0, np.ceil(low_y - _SLACK)), min(height - 1.0, np.floor(high_y + _SLACK))
+    start, stop = _covered(ax, bx, cx, dx, width)
+    top, bottom = _covered(ay, by, cy, dy, height)
     if not (start <= stop and top <= bottom):
         return
     ux, uy, vx, vy = bx - ax, by - ay, cx - ax, cy - ay
@@ -150,8 +155,8 @@ def _quad(
     # Also false for NaN, a corner behind the target camera.
     first = first and abs(scale) < _DEGENERATE
     second = second and abs(scale_2) < _DEGENERATE
-    for row in range(int(top), int(bottom) + 1):
-        for column in range(int(start), int(stop) + 1):
+    for row in range(top, bottom + 1):
+        for column in range(start, stop + 1):
             px, py = column - ax, row - ay
             s, t = (px * vy - py * vx) * scale, (ux * py - uy * px) * scale
             z = az + s * (bz - az) + t * (cz - az)
