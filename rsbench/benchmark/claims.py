@@ -7,6 +7,7 @@ global-shutter eight-point algorithm it is compared with, into "holds", "fails" 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -25,13 +26,15 @@ SUFFICIENT_SHARE = 0.9
 
 
 class Figure(NamedTuple):
-    """A statistic with its 95 % interval."""
+    """A statistic with its 95 % interval; NaN where the matches do not determine it."""
 
     value: float
     low: float
     high: float
 
     def __str__(self) -> str:
+        if math.isnan(self.value):
+            return "not observable"
         return f"{self.value:.3g} [{self.low:.3g}, {self.high:.3g}]"
 
 
@@ -116,8 +119,8 @@ def verdict(checks: Sequence[Check], axis: str) -> str:
 
 
 def better(a: Figure, b: Figure) -> bool:
-    """Smaller, and the intervals do not overlap."""
-    return a.high < b.low
+    """Smaller, and the intervals do not overlap; what can be observed is better than what cannot."""
+    return a.high < b.low or (math.isnan(b.value) and not math.isnan(a.value))
 
 
 def small_increase(ours: Series, other: Series) -> list[Check]:
@@ -169,7 +172,7 @@ def enough_solved(ours: Series, other: Series) -> list[Check]:
 
 def _range(figures: Sequence[Figure]) -> float:
     values = [figure.value for figure in figures]
-    return max(values) - min(values)
+    return math.inf if any(map(math.isnan, values)) else max(values) - min(values)
 
 
 _VELOCITY = (

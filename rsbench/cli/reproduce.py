@@ -84,8 +84,8 @@ def _fig3(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.benchmark.provenance import provenance
     from rsbench.benchmark.run_sweep import write_table
     from rsbench.benchmark.sweeps import load_sweep
-    from rsbench.dataset.files import write_json
-    from rsbench.report.fig3 import SWEEPS, draw_fig3, setting_table
+    from rsbench.dataset.files import write_bytes, write_json
+    from rsbench.report.fig3 import SWEEPS, draw_fig3, fig3_page, setting_table
 
     folder = out / "fig3"
     folder.mkdir(parents=True, exist_ok=True)
@@ -93,7 +93,9 @@ def _fig3(out: Path, data: Path, workers: int | None) -> None:
     for name in SWEEPS:
         write_table(folder / f"{name}.csv", _simulate(name, None, data, workers, command))
     cards = [load_sweep(name) for name in SWEEPS]
-    write_table(folder / "settings.csv", setting_table(cards))
+    settings = setting_table(cards)
+    write_table(folder / "settings.csv", settings)
+    write_bytes(folder / "README.md", fig3_page(settings).encode())
     seeds = {card.name: card.seed for card in cards}
     write_json(folder / "provenance.json", provenance(command, sweeps=list(SWEEPS), seeds=seeds))
     for path in draw_fig3(folder):
@@ -136,7 +138,7 @@ def _claims(out: Path, data: Path, workers: int | None) -> None:
         }
     )
     write_table(folder / "claims.csv", verdicts)
-    page = folder / "claims.md"
+    page = folder / "README.md"
     write_bytes(page, claims_page(verdicts).encode())
     write_json(folder / "provenance.json", provenance(command, sweeps=[*SWEEPS, "points"]))
     typer.echo(f"claims: {page}")

@@ -71,6 +71,15 @@ def test_better_needs_intervals_apart() -> None:
     assert not better(Figure(1.3, 1.2, 1.4), Figure(1.0, 0.9, 1.1))
 
 
+def test_what_cannot_be_observed_is_worse_than_what_can() -> None:
+    known, unknown = Figure(1.0, 0.9, 1.1), Figure(np.nan, np.nan, np.nan)
+    assert better(known, unknown) and not better(unknown, known) and not better(unknown, unknown)
+    assert str(unknown) == "not observable" and str(known) == "1 [0.9, 1.1]"
+    blind = Series(VALUES, {"e_R": figures([1, 1, 1]), "e_T": (known, known, unknown)})
+    assert verdict(more_stable(of([1, 2, 3]), blind), "x") == "holds only for e_T"
+    assert verdict(more_stable(blind, of([1, 2, 3])), "x") == "holds only for e_R"
+
+
 @pytest.mark.parametrize(
     ("rule", "ours", "other", "expected"),
     [

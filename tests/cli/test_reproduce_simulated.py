@@ -1,0 +1,50 @@
+"""``rsbench reproduce claims`` from simulation to page, with few trials."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from rsbench.benchmark import run_sweep, sweeps
+from rsbench.cli.reproduce import Target, reproduce
+from rsbench.report.fig3 import SWEEPS
+
+
+def test_claims_and_figure_come_from_the_stored_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    complete = sweeps.load_sweep
+
+    def short(name: str) -> sweeps.SweepCard:
+        card = complete(name)
+        return replace(card, trials=3, values=(card.values[0], card.values[-1]))
+
+    def run_here(todo: list[run_sweep._Job], workers: int) -> Iterator[run_sweep._Part]:
+        for job in todo:
+            run_sweep._run_job(job)
+            yield job.part
+
+    monkeypatch.setattr(sweeps, "load_sweep", short)
+    monkeypatch.setattr(run_sweep, "_run_all", run_here)  # starting processes would take most of the time
+    out, data = tmp_path / "results", tmp_path / "data"
+    reproduce(Target.claims, out, data, workers=2)
+    names = {path.name for path in (out / "fig3").iterdir()}
+    assert names >= {f"{name}.csv" for name in SWEEPS} | {"settings.csv", "provenance.json", "README.md"}
+    assert names >= {
+        f"fig3-{end}-{c}.{kind}"
+        for end in ("px", "normalised")
+        for c in ("mean", "median")
+        for kind in ("pdf", "png")
+    }
+    verdicts = pd.read_csv(out / "claims" / "claims.csv")
+    assert set(verdicts.matches) == {"100 + 100", "9 + 9", "9 + 9 and more"}
+    assert verdicts.verdict.str.match("holds|fails").all()
+    page = (out / "claims" / "README.md").read_text()
+    assert "Rule: " in page and "nan" not in page
+    stored = pd.read_csv(out / "claims" / "rotation-9.csv")
+    assert set(stored.trials) == {3} and set(stored.value) == {0.25, 8.0}
+    record = json.loads((out / "claims" / "provenance.json").read_text())
+    assert record["command"] == "rsbench reproduce claims"
