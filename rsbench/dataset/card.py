@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import re
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
 
 Vector = tuple[float, float, float]
-Axis = Vector | Literal["random"]
+Axis = Vector | str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +36,7 @@ class MotionCard:
     model: str = "linear"
     rotation_deg: float
     rotation_axis: Axis
-    """``"random"`` in the file of a card: drawn for each sequence from its seed and name when the card is loaded."""
+    """Or ``"random"``: drawn for each sequence from its seed and name when the card is loaded."""
     translation: float
     """Metres."""
     translation_axis: Axis
@@ -48,7 +47,10 @@ class MotionCard:
         for name, length in (("rotation", self.rotation_deg), ("translation", self.translation)):
             if length < 0:
                 raise ValueError(f"{name} must not be negative, got {length}")
-            if length > 0 and not np.any(getattr(self, f"{name}_axis")):
+            axis = getattr(self, f"{name}_axis")
+            if isinstance(axis, str) and axis != "random":
+                raise ValueError(f'{name}_axis = {axis!r}: must be three numbers or "random"')
+            if length > 0 and not isinstance(axis, str) and not np.any(axis):
                 raise ValueError(f"{name}_axis must not be zero when there is {name}")
 
     def motion(self) -> Motion:
@@ -77,7 +79,7 @@ def _random_axis(text: str) -> Vector:
 
 
 def _scaled(axis: Axis, length: float) -> np.ndarray:
-    if axis == "random":
+    if isinstance(axis, str):
         raise ValueError('an axis is still "random"; load_dataset_card draws it')
     v = np.asarray(axis, dtype=np.float64)
     return v * (length / np.linalg.norm(v)) if length > 0 else np.zeros(3)

@@ -1,0 +1,93 @@
+"""Cards that repeat their sequences over seeds and draw axes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard, load_dataset_card
+
+STRATA = ("mild", "moderate", "aggressive")
+
+
+def _card(**changes: object) -> DatasetCard:
+    motion = MotionCard(rotation_deg=2.0, rotation_axis="random", translation=0.3, translation_axis="random")
+    card = DatasetCard(
+        name="x",
+        camera=CameraCard(width=8, height=8, focal=8.0),
+        baseline=0.1,
+        readout_ratio=0.8,
+        motion=motion,
+        seeds=(1, 2),
+        sequence=(SequenceCard(name="a", scene="castle"), SequenceCard(name="b", scene="room")),
+    )
+    return replace(card, **changes)  # type: ignore[arg-type]
+
+
+def test_every_sequence_is_made_once_per_seed() -> None:
+    card = _card().expanded()
+    assert [(s.name, s.scene, s.seed) for s in card.sequence] == [
+        ("a-1", "castle", 1),
+        ("a-2", "castle", 2),
+        ("b-1", "room", 1),
+        ("b-2", "room", 2),
+    ]
+    # What is written down says all: expanding it again changes nothing.
+    assert card.expanded() == card
+
+
+def test_axes_change_with_seed_and_sequence_and_keep_their_lengths() -> None:
+    card = _card().expanded()
+    motions = [card.motion_of(sequence) for sequence in card.sequence]
+    assert len({tuple(motion.w) for motion in motions}) == 4
+    for motion in motions:
+        np.testing.assert_allclose(np.linalg.norm(motion.w), np.deg2rad(2.0), rtol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(motion.d), 0.3, rtol=1e-12)
+
+
+def test_given_axes_stay() -> None:
+    motion = MotionCard(rotation_deg=2.0, rotation_axis=(0, 0, 2), translation=1.0, translation_axis="random")
+    card = _card(motion=motion).expanded()
+    for sequence in card.sequence:
+        np.testing.assert_allclose(card.motion_of(sequence).w, [0, 0, np.deg2rad(2.0)], rtol=1e-12)
+
+
+def test_an_axis_is_not_used_before_it_is_drawn() -> None:
+    with pytest.raises(ValueError, match="random"):
+        _card().motion.motion()
+
+
+def test_axes_are_uniform_on_the_sphere() -> None:
+    card = _card(seeds=tuple(range(2000)), sequence=(SequenceCard(name="a", scene="castle"),)).expanded()
+    axes = np.array([sequence.motion.rotation_axis for sequence in card.sequence if sequence.motion])
+    # Each component of a uniform direction has mean 0 and variance 1/3; 5 standard errors of 2000 draws.
+    assert np.all(np.abs(axes.mean(axis=0)) < 5 * np.sqrt(1 / 3 / 2000))
+    assert np.all(np.abs((axes**2).mean(axis=0) - 1 / 3) < 5 * np.sqrt(4 / 45 / 2000))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seeds": (1, 1)}, "must differ"),
+        ({"sequence": (SequenceCard(name="a", scene="castle", seed=3),)}, "exclude each other"),
+    ],
+)
+def test_contradictions_are_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        _card(**changes)
+
+
+def test_an_axis_is_numbers_or_random() -> None:
+    with pytest.raises(ValueError, match='three numbers or "random"'):
+        MotionCard(rotation_deg=2.0, rotation_axis="up", translation=0.3, translation_axis="random")
+
+
+def test_the_strata_share_scenes_and_axes() -> None:
+    cards = [load_dataset_card(name) for name in STRATA]
+    assert all(len(card.sequence) == 9 for card in cards)
+    for sequences in zip(*(card.sequence for card in cards), strict=True):
+        assert len({sequence.name for sequence in sequences}) == 1
+        axes = {sequence.motion.rotation_axis for sequence in sequences if sequence.motion}
+        assert len(axes) == 1
