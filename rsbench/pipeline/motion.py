@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -13,11 +13,15 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.robust.ransac import BoolArray, IntArray, RansacOptions, RansacReport, ransac
+from rsbench.robust.ransac import BoolArray, IntArray, RansacOptions, ransac
 from rsbench.solvers.base import MatchSet, MotionEstimate, Solver
 from rsbench.solvers.packed import Packed, pack, track_pairs, unlinked_pairs
 
 _TRACK_FREEDOM = 5
+_SIGMAS = 2.5
+_SECOND_TRY = 3.0
+"""Factor on the threshold when nothing was found."""
+_ADAPTATIONS, _FIXED_POINT_STEPS = 2, 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +30,8 @@ class RobustOptions:
 
     threshold_px: float = 1.25
     """Largest Sampson error of an inlier: 2.5 standard deviations of a match's noise of 0.5 px."""
+    adapt_threshold: bool = True
+    """Whether the threshold then follows the noise that the inliers show, between a fifth and four times it."""
     confidence: float = 0.999
     min_iterations: int = 10
     max_iterations: int = 1000
@@ -56,6 +62,8 @@ class RobustEstimate:
     """Masks over ``left``, ``right`` and ``tracks``; all False after a failure."""
     iterations: int
     seconds: float
+    threshold_px: float
+    """The threshold that the inliers have passed."""
 
 
 def estimate_motion(
@@ -75,24 +83,47 @@ def estimate_motion(
     """
     start = time.perf_counter()
     problem = _RobustProblem(correspondences, rig, shutter, solver)
+    threshold = options.threshold_px
     report = ransac(problem, options.ransac(), rng)
-    estimate, inliers = _conclude(problem, report, options.threshold_px)
+    iterations = report.iterations
+    if options.adapt_threshold and report.model is None and problem.enough:
+        # Noise far above the threshold scatters the inliers of any model.
+        threshold *= _SECOND_TRY
+        report = ransac(problem, replace(options, threshold_px=threshold).ransac(), rng)
+        iterations += report.iterations
+    if report.model is None:
+        estimate, inliers = MotionEstimate.failed(report.reason), report.inliers
+    else:
+        estimate, inliers, threshold = _conclude(problem, report.model, report.inliers, threshold, options)
     return RobustEstimate(
         estimate=estimate,
-        inliers=inliers,
-        iterations=report.iterations,
+        inliers=problem.masks(inliers),
+        iterations=iterations,
         seconds=time.perf_counter() - start,
+        threshold_px=threshold,
     )
 
 
 def _conclude(
-    problem: _RobustProblem, report: RansacReport[MotionEstimate], threshold: float
-) -> tuple[MotionEstimate, dict[MatchSet, BoolArray]]:
-    """The solver on all inliers, and the matches that this final motion explains."""
-    if not report.success or report.model is None:
-        return MotionEstimate.failed(report.reason), problem.masks(report.inliers)
-    final = problem.conclude(report.model, report.inliers)
-    return final, problem.masks(np.abs(problem.residuals(final)) <= threshold)
+    problem: _RobustProblem,
+    model: MotionEstimate,
+    inliers: BoolArray,
+    threshold: float,
+    options: RobustOptions,
+) -> tuple[MotionEstimate, BoolArray, float]:
+    """The solver on all inliers, the matches that this motion explains, and the threshold for them."""
+    if options.adapt_threshold:
+        least, most = 0.2 * options.threshold_px, 4.0 * options.threshold_px
+        for _ in range(_ADAPTATIONS):
+            model = problem.refine(model, inliers) or model
+            threshold = float(np.clip(problem.noise_threshold(model, threshold), least, most))
+            inliers = np.abs(problem.residuals(model)) <= threshold
+    final = problem.conclude(model, inliers)
+    explained = np.abs(problem.residuals(final)) <= threshold
+    if np.count_nonzero(explained) < 0.5 * np.count_nonzero(inliers):
+        # A solver that more matches make worse: what the search found stands.
+        return model, inliers, threshold
+    return final, explained, threshold
 
 
 class _RobustProblem:
@@ -150,6 +181,26 @@ class _RobustProblem:
         tracks = np.sqrt(self.packed.track_squares(theta)) * _track_scale()
         return np.concatenate([self.packed.pair_residuals(theta), tracks])
 
+    @property
+    def enough(self) -> bool:
+        """Whether there is more than a minimal sample."""
+        return all(count >= size for count, size in zip(self.num_data, self.sample_size, strict=True))
+
+    def noise_threshold(self, model: MotionEstimate, threshold: float) -> float:
+        """Threshold at 2.5 standard deviations of the noise that the residuals below it show.
+
+        A fixed point of: noise from the residuals below the threshold (a truncated distribution), threshold from
+        the noise. Outliers are spread too thinly to disturb it.
+        """
+        squares = self.residuals(model) ** 2
+        moments = np.repeat([_moment(1), _moment(1), _moment(_TRACK_FREEDOM)], self.num_data)
+        for _ in range(_FIXED_POINT_STEPS):
+            below = squares <= threshold**2
+            if not np.any(below):
+                break
+            threshold = _SIGMAS * float(np.sqrt(np.sum(squares[below]) / np.sum(moments[below])))
+        return threshold
+
     def refine(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate | None:
         subset = self._subset(np.flatnonzero(inliers))
         estimate = self.solver.improve(model, subset, self.rig, self.shutter, quick=True)
@@ -197,6 +248,20 @@ def _found(rows: FloatArray, keys: set[bytes]) -> BoolArray:
 
 
 @functools.cache
+def _quantile(freedom: int) -> float:
+    """Of chi-squared, with the probability that a normal variable lies within 2.5 standard deviations."""
+    return float(chi2.ppf(chi2.cdf(_SIGMAS**2, 1), freedom))
+
+
+@functools.cache
 def _track_scale() -> float:
     """Factor that gives the root of a track's squared error the quantile of a pair's error at 2.5 sigma."""
-    return 2.5 / float(np.sqrt(chi2.ppf(chi2.cdf(2.5**2, 1), _TRACK_FREEDOM)))
+    return _SIGMAS / float(np.sqrt(_quantile(_TRACK_FREEDOM)))
+
+
+@functools.cache
+def _moment(freedom: int) -> float:
+    """Mean square of a scaled residual below its threshold, at a noise of 1 px."""
+    quantile = _quantile(freedom)
+    truncated = freedom * chi2.cdf(quantile, freedom + 2) / chi2.cdf(quantile, freedom)
+    return float(truncated) * _SIGMAS**2 / quantile

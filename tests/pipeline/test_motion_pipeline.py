@@ -62,7 +62,7 @@ def test_refined_withstands_outliers(sets: str, outliers: float, e_R: float, e_T
 
 def test_the_threshold_rejects_as_many_tracks_as_pairs() -> None:
     s = simulation(pairs=800, tracks=800, outliers=0.0)
-    inliers = run(s).inliers
+    inliers = run(s, adapt_threshold=False).inliers
     for name in ("left", "right", "tracks"):
         # 1.24 % beyond 2.5 sigma; the binomial spread of 800 is 0.4 %.
         assert 1 - np.mean(inliers[name]) == pytest.approx(0.0124, abs=0.012)
@@ -99,6 +99,25 @@ def test_every_solver_runs_in_the_loop(name: str) -> None:
     assert result.iterations >= 1 and result.seconds > 0.0
 
 
+@pytest.mark.parametrize("sets", ["pairs", "tracks"])
+@pytest.mark.parametrize("noise", [0.15, 0.5, 1.2])
+def test_threshold_follows_the_noise(sets: str, noise: float) -> None:
+    s = simulation(300 if sets == "pairs" else 0, 0 if sets == "pairs" else 300, noise=noise)
+    result = run(s)
+    assert result.threshold_px == pytest.approx(2.5 * noise, rel=0.15)
+    fixed = run(s, adapt_threshold=False)
+    assert fixed.threshold_px == 1.25
+
+
+def test_noise_far_above_the_threshold_gets_a_second_try() -> None:
+    s = simulation(tracks=300, noise=2.0)
+    assert not run(s, adapt_threshold=False).estimate.success
+    result = run(s)
+    assert result.estimate.success
+    # Eight times the bound for 210 tracks: 0.018 degrees per pixel.
+    assert np.degrees(rotation_error(result.estimate.w, s.motion.w)) < 0.3
+
+
 def test_same_generator_same_bytes() -> None:
     s = simulation(pairs=100, tracks=100)
     first, second = run(s), run(s)
@@ -132,7 +151,7 @@ def test_reported_inliers_are_those_of_the_reported_motion() -> None:
     result = run(s)
     motion = LinearMotion(result.estimate.w, result.estimate.d)
     errors = rs_sampson_error(RIG, SHUTTER, motion, "left", s.correspondences.left)
-    np.testing.assert_array_equal(result.inliers["left"], np.abs(errors) <= RobustOptions().threshold_px)
+    np.testing.assert_array_equal(result.inliers["left"], np.abs(errors) <= result.threshold_px)
 
 
 @pytest.mark.parametrize("bad", [{"threshold_px": 0.0}, {"confidence": 2.0}, {"max_iterations": 0}])
