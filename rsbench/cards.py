@@ -10,9 +10,10 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
+import math
 import os
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from types import UnionType
@@ -48,9 +49,7 @@ def card_path(kind: CardKind, name_or_path: str | Path) -> Path:
         return path
     cards = list_cards(kind)
     if value not in cards:
-        raise RsbenchError(
-            f"{kind} card {value!r} does not exist{choices(value, cards)}; a path ends in .toml"
-        )
+        raise RsbenchError(f"{kind} card {value!r} does not exist{choices(value, cards)}; a path ends in .toml")
     return cards[value]
 
 
@@ -97,6 +96,9 @@ def parse_card(cls: type[T], data: Mapping[str, Any], where: str) -> T:
     # pydantic takes no settings for a standard dataclass itself, but hands those of a container down to it.
     adapter: TypeAdapter[Any] = TypeAdapter(tuple[cls], config=_CONFIG)  # type: ignore[valid-type]
     card: tuple[T]
+    stray = next(_not_finite(data), None)
+    if stray is not None:
+        raise RsbenchError(f"{where}: {stray}: numbers must be finite")
     try:
         card = adapter.validate_json(json.dumps([data], default=str))
     except ValidationError as error:
@@ -119,6 +121,18 @@ def _card_folder(kind: CardKind) -> Path:
     package = Path(str(resources.files("rsbench")))
     checkout = package.parent
     return checkout / kind if (checkout / "pyproject.toml").is_file() else package / "_cards" / kind
+
+
+def _not_finite(value: Any, field: str = "") -> Iterator[str]:
+    """Fields that are not finite; fields typed ``Any`` would let them pass."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _not_finite(item, f"{field}.{key}" if field else str(key))
+    elif isinstance(value, list | tuple):
+        for number, item in enumerate(value):
+            yield from _not_finite(item, f"{field}.{number}")
+    elif isinstance(value, float) and not math.isfinite(value):
+        yield f"{field} = {value}"
 
 
 def _first_problem(cls: type, error: ValidationError) -> str:

@@ -25,6 +25,7 @@ class Card:
     lens: Lens | None = None
     views: dict[str, Lens] = field(default_factory=dict)
     steps: tuple[Lens, ...] = ()
+    extra: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.name == "forbidden":
@@ -55,7 +56,7 @@ def test_tables_become_nested_dataclasses() -> None:
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
-        ({"nme": "b"}, ["unknown key 'nme'", "did you mean 'name'?", "lens, name, size, steps, views"]),
+        ({"nme": "b"}, ["unknown key 'nme'", "did you mean 'name'?", "extra, lens, name, size, steps, views"]),
         ({"lens": {"focal": 1.0}}, ["unknown key 'lens.focal'", "focal_px, shape"]),
         ({"views": {"x": {"focal_px": 1.0, "shap": 1}}}, ["unknown key 'views.x.shap'", "focal_px, shape"]),
         ({"steps": [{"focal_px": 1.0, "z": 1}]}, ["unknown key 'steps.0.z'", "focal_px, shape"]),
@@ -64,6 +65,7 @@ def test_tables_become_nested_dataclasses() -> None:
         ({"lens": {"focal_px": True}}, ["lens.focal_px = True", "valid number"]),
         ({"lens": {"focal_px": float("nan")}}, ["lens.focal_px", "finite"]),
         ({"lens": {"focal_px": float("-inf")}}, ["lens.focal_px", "finite"]),
+        ({"extra": {"a": [1.0, float("nan")]}}, ["extra.a.1 = nan: numbers must be finite"]),
         ({"lens": {"focal_px": 1.0, "shape": "cube"}}, ["lens.shape = 'cube'", "'flat' or 'round'"]),
         ({"size": [900]}, ["size.1"]),
         ({"size": [900.5, 900]}, ["size.0 = 900.5", "valid integer"]),
@@ -109,3 +111,14 @@ def test_shipped_names_resolve_and_unknown_ones_list_them() -> None:
     assert card_path("scenes", "castle") == cards["castle"]
     with pytest.raises(RsbenchError, match=r"'castel'.*did you mean 'castle'.*old-town"):
         card_path("scenes", "castel")
+
+
+def test_an_installed_package_finds_its_own_cards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "rsbench" / "_cards" / "scenes"
+    folder.mkdir(parents=True)
+    (folder / "only.toml").write_text('name = "only"\n')
+    monkeypatch.setattr("rsbench.cards.resources.files", lambda package: tmp_path / package)
+    assert list_cards("scenes") == {"only": folder / "only.toml"}
+    assert list_cards("solvers") == {}
+    with pytest.raises(RsbenchError, match="there are: only"):
+        card_path("scenes", "castle")

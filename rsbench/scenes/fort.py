@@ -105,7 +105,7 @@ def round_tower(
         pieces += placed(placed(bracket, (0, -radius, 0)), (0, 0, 0), 360 * k / count)
     for k in range(10):
         heading = 36.0 * k + 6
-        level = height * (0.2 + 0.28 * (k % 3)) if k % 3 < 3 else 0.0
+        level = height * (0.2 + 0.28 * (k % 3))
         if level < height * 0.72:
             pieces += placed(placed(loop_window(0.5, 1.2), (0, -radius, level)), (0, 0, 0), heading)
     merlons = int(2 * np.pi * (radius + 0.3) / 1.5)
@@ -116,21 +116,17 @@ def round_tower(
         ]
         pieces += placed(placed(merlon, (0, -radius - 0.32, top + 0.9)), (0, 0, 0), 360 * k / merlons)
     if roof is not None:
-        apex = top + 0.8 + radius * rise
-        eave = radius + 0.75
-        cone = [(0, top + 0.7), (eave, top + 0.7), (eave * 0.62, top + 0.95 + radius * rise * 0.36), (0.0, apex)]
-        pieces.append(revolve(roof, cone, 40))
-        finial = [
-            (0.14, apex - 0.35),
-            (0.1, apex + 0.1),
-            (0.2, apex + 0.3),
-            (0.04, apex + 0.5),
-            (0.03, apex + 1.4),
-            (0, apex + 1.4),
-        ]
-        pieces.append(revolve("iron", finial, 8))
-        pieces += placed(banner(1.3, 0.6), (0.03, 0, apex + 0.75), float(rng.uniform(-40, 40)))
+        pieces += placed(_cone_roof(roof, radius, rise), (0, 0, top))
+        pieces += placed(banner(1.3, 0.6), (0.03, 0, top + 1.55 + radius * rise), float(rng.uniform(-40, 40)))
     return pieces
+
+
+def _cone_roof(tiles: str, radius: float, rise: float) -> list[Piece]:
+    """A bell-cast cone over a tower that ends at z = 0, with an iron finial."""
+    apex, eave = 0.8 + radius * rise, radius + 0.75
+    cone = [(0, 0.7), (eave, 0.7), (eave * 0.62, 0.95 + radius * rise * 0.36), (0.0, apex)]
+    knob = [(0.14, -0.35), (0.1, 0.1), (0.2, 0.3), (0.04, 0.5), (0.03, 1.4), (0.0, 1.4)]
+    return [revolve(tiles, cone, 40), revolve("iron", [(r, apex + z) for r, z in knob], 8)]
 
 
 def banner(length: float, height: float, surface: str = "cloth_0") -> list[Piece]:
@@ -167,24 +163,21 @@ def square_tower(
         face += placed(corbels(width + 0.7, wall), (0, 0, height))
         face += placed(battlement(rng, width + 0.66, wall), (0, -0.33, height))
         pieces += placed(placed(face, (0, -half, 0)), (0, 0, 0), heading)
-    if roof is not None:
-        pieces += placed(gable_roof(roof, width - 1.6, width - 1.4, height + 1.3, width * 0.42), (0, 0, 0), 90)
-        gable = [
-            (-half + 0.8, 0.0),
-            (half - 0.8, 0.0),
-            (half - 0.8, 1.4),
-            (0.0, 1.2 + width * 0.4),
-            (-half + 0.8, 1.4),
-        ]
-        for heading in (0, 180):
-            attic = [
-                panel(wall, gable, 0.3, [arch(0.9, 1.6, base=1.0)]),
-                *placed(loop_window(0.9, 1.6), (0, 0, 1.0)),
-            ]
-            pieces += placed(placed(attic, (0, -half + 0.8, height)), (0, 0, 0), heading)
-        stack = [block("stone", (0.9, 0.7, 4.2)), block("stone", (1.1, 0.9, 0.2), (0, 0, 4.0))]
-        pieces += placed(stack, (half * 0.35, 0.8, height + 1.2))
-    return pieces
+    return pieces if roof is None else pieces + placed(_saddle_roof(wall, roof, width), (0, 0, height))
+
+
+def _saddle_roof(wall: str, tiles: str, width: float) -> list[Piece]:
+    """A gabled roof with a chimney inside the battlements of a tower that ends at z = 0."""
+    half = width / 2
+    pieces = placed(gable_roof(tiles, width - 1.6, width - 1.4, 1.3, width * 0.42), (0, 0, 0), 90)
+    inner = half - 0.8
+    gable = [(-inner, 0.0), (inner, 0.0), (inner, 1.4), (0.0, 1.2 + width * 0.4), (-inner, 1.4)]
+    for heading in (0, 180):
+        attic = placed(loop_window(0.9, 1.6), (0, 0, 1.0))
+        attic.append(panel(wall, gable, 0.3, [arch(0.9, 1.6, base=1.0)]))
+        pieces += placed(placed(attic, (0, -inner, 0)), (0, 0, 0), heading)
+    stack = [block("stone", (0.9, 0.7, 4.2)), block("stone", (1.1, 0.9, 0.2), (0, 0, 4.0))]
+    return pieces + placed(stack, (half * 0.35, 0.8, 1.2))
 
 
 def gatehouse(rng: np.random.Generator, wall: str, roof: str, height: float = 8.5) -> list[Piece]:

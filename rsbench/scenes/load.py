@@ -56,6 +56,7 @@ class SceneCard:
     name: str
     builder: str
     viewpoints: dict[str, Viewpoint]
+    description: str = ""
     seed: int = 0
     light: LightCard = field(default_factory=LightCard)
 

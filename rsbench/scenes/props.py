@@ -193,8 +193,8 @@ def stall(rng: np.random.Generator, awning: str = "cloth_0") -> list[Piece]:
     pieces += [box("planks", (-1.28, -0.47, 0.1), (1.28, -0.43, 0.85))]
     for x in (-1.25, 1.25):
         pieces += [
-            beam("timber", (x, -0.75, 0), (x, -0.75, 2.15), 0.09),
-            beam("timber", (x, 0.75, 0), (x, 0.75, 2.75), 0.09),
+            beam("timber", (x, -0.75, 0), (x, -0.75, 2.03), 0.09),
+            beam("timber", (x, 0.75, 0), (x, 0.75, 2.62), 0.09),
         ]
     rows, columns = np.meshgrid(np.linspace(0, 1, 7), np.linspace(-1.5, 1.5, 13), indexing="ij")
     sag = 0.09 * np.sin(np.pi * rows) * (1 + np.cos(columns * 2.4))

@@ -91,8 +91,6 @@ class Cells:
     """Which course, from the top."""
     edge: Field
     """Distance to the block's border, metres."""
-    along: Field
-    """Position in the block from left to right, 0 to 1."""
     across: Field
     """Position in the course from its top to its bottom, 0 to 1."""
     count: int
@@ -135,12 +133,10 @@ def cut_courses(
     from_left, to_right = x - left[index], right[index] - x
     from_top, to_bottom = y - tops[row], tops[row + 1] - y
     edge = _rounded(np.minimum(from_left, to_right), np.minimum(from_top, to_bottom), corner * scale)
-    edge = np.maximum(edge, 0)  # a look-up table puts borders up to a quarter of a pixel off
     return Cells(
         index=index,
         course=row,
-        edge=edge * np.float32(1 / scale),
-        along=from_left / (from_left + to_right),
+        edge=np.maximum(edge, 0) * np.float32(1 / scale),  # the look-up puts borders up to a quarter pixel off
         across=from_top / (from_top + to_bottom),
         count=len(left),
     )
@@ -155,13 +151,21 @@ def blend(image: Field, over: Colour | Field, weight: Field) -> Field:
     """Image (3, h, w) with a colour or image laid on it at ``weight`` (h, w) in [0, 1]."""
     top = np.asarray(over, dtype=np.float32)
     top = top[:, None, None] if top.ndim == 1 else top
-    return image + (top - image) * weight
+    change: Field = top - image
+    change *= weight  # in place: fresh memory costs more than arithmetic
+    change += image
+    return change
 
 
 def ramp(value: Field, start: float, end: float) -> Field:
     """0 below ``start``, 1 above ``end``, smooth between (a falling ramp when ``end < start``)."""
-    t = np.clip((value - np.float32(start)) * np.float32(1 / (end - start)), 0, 1)
-    return t * t * (np.float32(3) - np.float32(2) * t)
+    t: Field = value - np.float32(start)
+    t *= np.float32(1 / (end - start))
+    np.clip(t, 0, 1, out=t)
+    slope = np.float32(3) - np.float32(2) * t
+    t *= t
+    t *= slope
+    return t
 
 
 def pick(colours: Sequence[Colour], tone: Field) -> Field:
@@ -175,8 +179,10 @@ def pick(colours: Sequence[Colour], tone: Field) -> Field:
 
 def to_bytes(image: Field) -> NDArray[np.uint8]:
     """sRGB image (3, h, w) in [0, 1] as bytes (h, w, 3), kept off black and white, which nothing outdoors is."""
-    levels = (np.clip(image, 0.03, 0.95) * np.float32(255) + np.float32(0.5)).astype(np.uint8)
-    return np.ascontiguousarray(levels.transpose(1, 2, 0))
+    levels = np.clip(image, 0.03, 0.95)
+    levels *= np.float32(255)
+    levels += np.float32(0.5)
+    return np.ascontiguousarray(levels.astype(np.uint8).transpose(1, 2, 0))
 
 
 def _lattice_positions(size: int, cells: int) -> tuple[NDArray[np.intp], Field]:

@@ -75,42 +75,41 @@ def test_texels_are_as_fine_as_pixels_need(scene: Scene) -> None:
         assert 0.0004 < size < 0.012, mesh.name
 
 
-def test_viewpoints_are_several_and_free(scene: Scene) -> None:
-    assert "default" in scene.viewpoints and len(scene.viewpoints) >= 3
-    for viewpoint in scene.viewpoints.values():
-        viewpoint.world_from_scene()
-        nearest = min(float(np.linalg.norm(mesh.vertices - viewpoint.eye, axis=1).min()) for mesh in scene.meshes)
-        assert nearest > 0.4
+def first_hits(scene: Scene, view: str, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance along each ray (n, 3) from a viewpoint, in lengths of the ray; infinite where nothing is hit.
 
-
-def depths_seen(scene: Scene, view: str, across: int) -> NDArray[np.float64]:
-    """z of the nearest surface on a grid of pixels, infinite where there is none (Moeller and Trumbore 1997)."""
+    Moeller and Trumbore, "Fast, minimum storage ray-triangle intersection", 1997.
+    """
     seen = scene.seen_from(scene.viewpoints[view])
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in seen.meshes])
-    corners = corners[corners[..., 2].max(axis=1) > 0]
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     out = np.cross(a, ab)
-    pixels = (np.arange(across) + 0.5) * SIZE / across - (SIZE - 1) / 2
-    depths = np.full((across, across), np.inf)
-    for i, y in enumerate(pixels):
-        for j, x in enumerate(pixels):
-            ray = np.array([x / FOCAL, y / FOCAL, 1.0])
-            normal = np.stack(
-                [
-                    ray[1] * ac[:, 2] - ac[:, 1],
-                    ac[:, 0] - ray[0] * ac[:, 2],
-                    ray[0] * ac[:, 1] - ray[1] * ac[:, 0],
-                ],
-                1,
-            )
-            with np.errstate(divide="ignore", invalid="ignore"):
-                inverse = 1 / np.einsum("nc,nc->n", ab, normal)
-                u = -np.einsum("nc,nc->n", a, normal) * inverse
-                v = -(out @ ray) * inverse
-                z = -np.einsum("nc,nc->n", ac, out) * inverse
-            hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (z > 1e-6)
-            depths[i, j] = z[hit].min(initial=np.inf)
-    return depths
+    distances = np.full(len(rays), np.inf)
+    for k, ray in enumerate(rays):
+        normal = np.cross(ray, ac)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = 1 / np.einsum("nc,nc->n", ab, normal)
+            u = -np.einsum("nc,nc->n", a, normal) * inverse
+            v = -(out @ ray) * inverse
+            t = -np.einsum("nc,nc->n", ac, out) * inverse
+            hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-6)
+        distances[k] = t[hit].min(initial=np.inf)
+    return distances
+
+
+def pixel_rays(across: int) -> NDArray[np.float64]:
+    """Rays (across^2, 3) with z = 1 through a grid of pixels, so that distances along them are depths."""
+    steps = ((np.arange(across) + 0.5) * SIZE / across - SIZE / 2) / FOCAL
+    return np.stack([*(axis.ravel() for axis in np.meshgrid(steps, steps)), np.ones(across * across)], axis=1)
+
+
+def test_viewpoints_are_several_and_leave_room_for_the_rig(scene: Scene) -> None:
+    assert "default" in scene.viewpoints and len(scene.viewpoints) >= 3
+    # Cameras stand 0.25 m left and right and move 0.3 m.
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    for view in scene.viewpoints:
+        assert first_hits(scene, view, axes).min() > 0.35, view
+        assert first_hits(scene, view, pixel_rays(3)).min() > 1.0, view
 
 
 @pytest.mark.parametrize(
@@ -120,7 +119,7 @@ def depths_seen(scene: Scene, view: str, across: int) -> NDArray[np.float64]:
 def test_default_views_have_depths_a_stereo_rig_can_use(
     name: str, nearest: float, middle: tuple[float, float], farthest: float
 ) -> None:
-    depths = depths_seen(scene_named(name), "default", 9)
+    depths = first_hits(scene_named(name), "default", pixel_rays(9))
     seen = depths[np.isfinite(depths)]
     assert len(seen) / depths.size > 0.85  # little sky
     assert seen.min() > nearest and seen.max() < farthest
