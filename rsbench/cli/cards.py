@@ -27,18 +27,13 @@ def list_(kind: Annotated[Kind, typer.Argument(help="What to list.")]) -> None:
     from rsbench.solvers.registry import list_solvers
 
     cards = list_cards(kind.value)
-    rows = [
-        {"name": name, "description": read_toml(path).get("description", ""), "card": str(path)}
-        for name, path in cards.items()
-    ]
+    rows = [{"name": name, "description": read_toml(path).get("description", "")} for name, path in cards.items()]
     if kind is Kind.solvers:
         plugins = [name for name in list_solvers() if name not in cards]
-        rows += [
-            {"name": name, "description": "", "card": "entry point of an installed package"} for name in plugins
-        ]
-    print_table(
-        f"{kind.value} (a name, or a path ending in .toml, is accepted wherever a card is)", pd.DataFrame(rows)
-    )
+        rows += [{"name": name, "description": "from an installed package"} for name in plugins]
+    print_table(kind.value, pd.DataFrame(rows))
+    folder = next(iter(cards.values())).parent
+    typer.echo(f"cards: {folder}; copy one, edit it, and pass its path (ending in .toml) instead of a name")
 
 
 def register(app: typer.Typer) -> None:

@@ -21,9 +21,9 @@ xl1, yl1, xr1, yr1); absent sets are empty. The centre of the top-left pixel is 
 
 def solve(
     problem: Annotated[Path, typer.Argument(metavar="PROBLEM.json", help="Camera, rig, shutter and matches.")],
-    solver: Annotated[str, typer.Option(help="Name of a solver card (rsbench list solvers) or path.")] = (
-        "rs-stereo-refined"
-    ),
+    solver: Annotated[
+        str, typer.Option(help="Name of a solver card (rsbench list solvers) or path.")
+    ] = "rs-stereo",
     threshold_px: Annotated[float, typer.Option(help="Largest Sampson error of an inlier, px.")] = 1.25,
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
     json: Annotated[bool, typer.Option("--json", help="Answer as one JSON object.")] = False,
