@@ -40,7 +40,9 @@ def evaluate_dataset(
     from rsbench.report.evaluation import summary_tables, write_report
     from rsbench.solvers.registry import list_solvers
 
-    chosen = tuple(dict.fromkeys([*(solvers or list_solvers()), correct_with]))
+    # rs-stereo is another name of rs-stereo-refined: one row of it is enough.
+    everything = [name for name in list_solvers() if name != "rs-stereo"]
+    chosen = tuple(dict.fromkeys([*(solvers or everything), correct_with]))
     options = EvaluationOptions(solvers=chosen, correction_solver=correct_with, seed=seed)
     command = command or f"rsbench evaluate {folder} --out {out}"
     with progress_bar(f"evaluating {folder.name}", evaluation_steps(folder, options)) as advance:
