@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -82,19 +83,14 @@ def estimate_motion(
     failed estimate with the reason.
     """
     start = time.perf_counter()
-    problem = _RobustProblem(correspondences, rig, shutter, solver)
-    threshold = options.threshold_px
-    report = ransac(problem, options.ransac(), rng)
-    iterations = report.iterations
-    if options.adapt_threshold and report.model is None and problem.enough:
-        # Noise far above the threshold scatters the inliers of any model.
-        threshold *= _SECOND_TRY
+    iterations = 0
+    for problem, threshold in _attempts(correspondences, rig, shutter, solver, options):
         report = ransac(problem, replace(options, threshold_px=threshold).ransac(), rng)
         iterations += report.iterations
-    if report.model is None:
+        if report.model is not None:
+            estimate, inliers, threshold = _conclude(problem, report.model, report.inliers, threshold, options)
+            break
         estimate, inliers = MotionEstimate.failed(report.reason), report.inliers
-    else:
-        estimate, inliers, threshold = _conclude(problem, report.model, report.inliers, threshold, options)
     return RobustEstimate(
         estimate=estimate,
         inliers=problem.masks(inliers),
@@ -102,6 +98,24 @@ def estimate_motion(
         seconds=time.perf_counter() - start,
         threshold_px=threshold,
     )
+
+
+def _attempts(
+    correspondences: Correspondences,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    solver: Solver,
+    options: RobustOptions,
+) -> Iterator[tuple[_RobustProblem, float]]:
+    """Problems and thresholds to try until one gives a motion."""
+    problem = _RobustProblem(correspondences, rig, shutter, solver)
+    yield problem, options.threshold_px
+    if problem.linked and len(problem.packed.pairs) > len(problem.packed.tracks):
+        # Left-right matches that are mostly wrong: those over time may still be right.
+        yield _RobustProblem(correspondences, rig, shutter, solver, linked=False), options.threshold_px
+    if options.adapt_threshold and problem.enough:
+        # Noise far above the threshold scatters the inliers of any model.
+        yield problem, _SECOND_TRY * options.threshold_px
 
 
 def _conclude(
@@ -133,10 +147,16 @@ class _RobustProblem:
     """
 
     def __init__(
-        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter, solver: Solver
+        self,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        solver: Solver,
+        linked: bool = True,
     ) -> None:
         self.given, self.rig, self.shutter, self.solver = correspondences, rig, shutter, solver
-        sizes = solver.sample_sizes(correspondences)
+        pairs = Correspondences(left=correspondences.left, right=correspondences.right)
+        sizes = solver.sample_sizes(correspondences if linked else pairs)
         self.linked = sizes.get("tracks", 0) > 0
         self.data = self._data()
         self.packed = self._packed()

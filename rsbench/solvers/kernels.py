@@ -198,7 +198,7 @@ def pair_terms(
         T, turn = plus((T[0] + offset, T[1], T[2]), -1.0, Ro), cross(w, Ro)
         value, q = _pair_gradient(w, x, y, R, T, plus(rate0, 1.0, turn), plus(rate1, -1.0, turn), focal, h)
         qq = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
-        residuals[m] = value / math.sqrt(qq) if qq > 0.0 else 0.0
+        residuals[m] = value / math.sqrt(qq) if qq > 0.0 else _displacement(apply(R, x), y, focal)
         if not want or qq <= 0.0:
             continue
         step = value / qq
@@ -211,6 +211,14 @@ def pair_terms(
             gradient[i] += J[i] / math.sqrt(qq) * residuals[m]
             for j in range(6):
                 H[i, j] += J[i] * J[j] / qq
+
+
+@compiled
+def _displacement(p: Vector, y: Vector, focal: FloatArray) -> float:
+    """Error (px) of a pair where the camera only turns: its constraint vanishes, and would let anything pass."""
+    if p[2] <= 0.0:
+        return math.sqrt(BEHIND)
+    return math.hypot(focal[0] * (y[0] - p[0] / p[2]), focal[1] * (y[1] - p[1] / p[2])) / math.sqrt(2.0)
 
 
 @compiled

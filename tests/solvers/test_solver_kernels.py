@@ -138,3 +138,13 @@ def test_cheirality_equals_the_numpy_one(model: str) -> None:
             x0, x1 = RIG.camera.unproject(matches[:, :2]), RIG.camera.unproject(matches[:, 2:])
             expected += int(np.count_nonzero(in_front(pose, x0, x1)))
         assert packed.in_front(theta_of(candidate)) == expected
+
+
+def test_no_motion_explains_only_matches_that_stay(model: str) -> None:
+    """Without translation the constraint vanishes; the residual must not."""
+    c, _, _ = problem(model, noise_px=0.0)
+    moved = pack(Correspondences(left=c.left), RIG, SHUTTER, model).pair_residuals(np.zeros(6))
+    distance = np.linalg.norm(c.left[:, 2:] - c.left[:, :2], axis=1)
+    np.testing.assert_allclose(moved, distance / np.sqrt(2.0), rtol=1e-12)
+    still = np.hstack([c.left[:, :2], c.left[:, :2]])
+    assert np.max(pack(Correspondences(left=still), RIG, SHUTTER, model).pair_residuals(np.zeros(6))) < 1e-9
