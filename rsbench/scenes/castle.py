@@ -110,16 +110,16 @@ def _yard(rng: np.random.Generator) -> list[Piece]:
     pieces = placed(props.well(rng), (-0.2, 1.6, 0), 25)
     pieces += placed(props.cart(rng), (3.5, 6.0, 0), 200)
     pieces += placed(props.cart(rng, "sack"), (-3.0, 11.0, 0), -35)
-    pieces += placed(props.hay_bales(rng), (5.2, 1.2, 0), 70)
-    pieces += placed(props.sacks(rng, 6), (-3.4, 0.2, 0), 20)
+    pieces += placed(props.hay_bales(rng), (4.9, 3.2, 0), 70)
+    pieces += placed(props.sacks(rng, 6), (-3.5, 1.6, 0), 20)
     pieces += placed(props.log_pile(rng), (-4.4, 8.9, 0), 75)
     pieces += placed(props.stall(rng, "cloth_1"), (4.9, 10.2, 0), -40)
     pieces += placed(props.bench(), (-4.9, 4.4, 0), 90)
-    for x, y in ((-3.2, -2.6), (-2.6, -3.1), (3.7, -1.9), (-4.7, 1.2), (6.6, 8.6), (7.0, 9.3), (2.6, 16.5)):
+    for x, y in ((-2.9, 0.0), (-2.3, -0.5), (3.5, -0.4), (-4.7, 1.2), (6.6, 8.6), (7.0, 9.3), (2.6, 16.5)):
         pieces += placed(props.barrel(0.85 + 0.2 * rng.random()), (x, y, 0), float(rng.uniform(0, 90)))
-    for x, y, size in ((-2.2, -2.2, 0.7), (3.1, -2.9, 0.8), (3.9, -2.7, 0.6), (6.4, 7.6, 0.9), (-3.5, 14.0, 0.9)):
+    for x, y, size in ((-1.9, 0.4, 0.7), (2.8, -0.3, 0.8), (3.6, 0.5, 0.6), (6.4, 7.6, 0.9), (-3.5, 14.0, 0.9)):
         pieces += placed(props.crate(size), (x, y, 0), float(rng.uniform(0, 90)))
-    pieces += placed(props.crate(0.5), (3.15, -2.85, 0.8), 30)
+    pieces += placed(props.crate(0.5), (2.85, -0.25, 0.8), 30)
     for x, y, height, crown in (
         (2.0, 13.0, 6.5, 2.0),
         (10.5, 19.5, 7.0, 2.4),
