@@ -258,3 +258,12 @@ def test_the_wheel_carries_cards_and_type_marker(tmp_path: Path) -> None:
 
 def test_the_changelog_knows_this_version() -> None:
     assert f"## [{rsbench.__version__}]" in (ROOT / "CHANGELOG.md").read_text("utf-8")
+
+
+def test_readme_figures_are_those_of_the_committed_results() -> None:
+    published = {
+        line for path in (ROOT / "results").rglob("*.md") for line in path.read_text("utf-8").splitlines()
+    }
+    rows = re.findall(r"^\| (?:castle|old-town|room) \|.*$", (ROOT / "README.md").read_text("utf-8"), re.MULTILINE)
+    assert rows, "the README shows results"
+    assert [row for row in rows if row not in published] == []
