@@ -41,7 +41,7 @@ class SgmOptions:
     num_disparities: int | None = None
     """Disparities searched, from 0; None derives them from ``nearest_depth``."""
     least_disparity: float = 0.5
-    """Smaller disparities are unknown: hardly told from infinity, and what the matcher says without any texture."""
+    """Smaller disparities are unknown: hardly told from infinity, and what the matcher says without texture."""
     nearest_depth: float | None = None
     """Metres; None finds the range in the images, by matching them at a quarter of the size."""
     block_size: int = 5
@@ -185,7 +185,9 @@ def _sgm(reference: U8, other: U8, count: int, options: SgmOptions) -> F32:
     disparity = np.asarray(matcher.compute(a, b)[:, count:], dtype=np.float32) / np.float32(_FRACTION)
     # Beyond the other image's border there is only padding to match.
     columns = np.arange(disparity.shape[1], dtype=np.float32)
-    return np.where((disparity >= options.least_disparity) & (columns - disparity >= 0.0), disparity, np.float32(np.nan))
+    return np.where(
+        (disparity >= options.least_disparity) & (columns - disparity >= 0.0), disparity, np.float32(np.nan)
+    )
 
 
 def _consistent(reference: F32, other: F32, tolerance: float) -> F32:
