@@ -22,6 +22,11 @@ def _median(values: FloatArray) -> FloatArray:
     return np.asarray(np.median(values, axis=-1))
 
 
+def numbers_table(numbers: dict[tuple[str, str], dict[str, Any]]) -> pd.DataFrame:
+    """One row per card and sequence, of numbers by their name."""
+    return pd.DataFrame([{"card": card, "sequence": name, **row} for (card, name), row in numbers.items()])
+
+
 def by_sequence(images: pd.DataFrame) -> pd.DataFrame:
     """Mean of the views: one row per stratum, sequence and method."""
     keys = ["stratum", "sequence", "method"]

@@ -1,0 +1,130 @@
+"""What semi-global matching loses when the two cameras do not read the same row at the same time.
+
+Both cameras of the rig share their rotation and differ by the baseline along the rows. A point that the left one
+sees at (x, y) at the time of row y is at that time at (x - f b / z, y) in the right one: on the same row. When the
+right camera reads that row at the same time, it sees the point there, whatever the motion is, so the pair is
+rectified and ``disparity = f b / z`` exactly.
+
+When the right camera reads row y' at another time, the point has moved by the image velocity u (px per frame
+period) times the difference D: ``x' = x - f b / z + u_x D`` and ``y' = y + u_y D``, to first order. With a delay
+of delta frame periods ``D = delta + h (y' - y)``, hence ``D = delta / (1 - h u_y)``; read from the bottom up,
+``D = h (H - 1 - y' - y)``, hence ``D = h (H - 1 - 2 y) / (1 + h u_y)``: zero on the middle row, almost a whole
+readout at the upper and lower border. The disparity is wrong by ``-u_x D`` and the partner ``u_y D`` rows away,
+where the matcher does not look.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.motion import Motion
+from rsbench.core.rig import StereoRig
+from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.vision.stereo_depth import SgmOptions, stereo_disparity
+
+DELAYS = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1)
+"""Of the right camera, frame periods."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing:
+    """When the right camera reads its rows."""
+
+    delay: float = 0.0
+    """Frame periods after the left camera."""
+    opposite: bool = False
+    """From the bottom row to the top row."""
+
+    @property
+    def name(self) -> str:
+        return "opposite" if self.opposite else f"delay-{self.delay:g}"
+
+    def row_time(self, shutter: RollingShutter, y: FloatArray, frame: int) -> FloatArray:
+        """Time (...) at which the right camera reads rows (...)."""
+        rows = shutter.height - 1 - y if self.opposite else y
+        return shutter.row_time(rows, frame) + self.delay
+
+    def lag(self, shutter: RollingShutter, y: FloatArray, velocity_y: FloatArray) -> FloatArray:
+        """D (...): how much later than the left camera the right one sees a point of the left row y."""
+        if self.opposite:
+            return (self.delay + shutter.h * (shutter.height - 1 - 2 * y)) / (1.0 + shutter.h * velocity_y)
+        return self.delay / (1.0 - shutter.h * velocity_y)
+
+
+TIMINGS = (*(Timing(delay=delay) for delay in DELAYS), Timing(opposite=True))
+
+
+def right_row_poses(
+    rig: StereoRig, shutter: RollingShutter, motion: Motion, timing: Timing, frame: int = 0
+) -> Pose:
+    """``cam_from_world`` of every row of the right camera, (height, 3, 3) and (height, 3)."""
+    rows = np.arange(shutter.height, dtype=np.float64)
+    return rig.cam_from_world(motion, timing.row_time(shutter, rows, frame), "right")
+
+
+def predicted_shift(
+    depth: NDArray[Any],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    timing: Timing,
+    frame: int = 0,
+) -> FloatArray:
+    """Error of the disparity and rows by which the partner is off (H, W, 2), px, on the left frame's pixels.
+
+    ``depth`` (H, W) is the true one of the left frame, metres; NaN where it is 0.
+    """
+    camera = rig.camera
+    grid = camera.pixel_grid()
+    z = np.where(depth > 0, depth, np.nan).astype(np.float64)[..., None]
+    tau = shutter.row_time(grid[:, :1, 1], frame)
+    in_left = z * camera.unproject(grid)
+    _, t = rig.cam_from_world(motion, tau, "left")
+    w_rate, t_rate = motion.velocity(tau)
+    rate = np.cross(np.broadcast_to(w_rate, in_left.shape), in_left - t) + t_rate
+    in_right = in_left + (rig.offset("right") - rig.offset("left"))
+    velocity = (rate[..., :2] - in_right[..., :2] / z * rate[..., 2:]) / z * (camera.fx, camera.fy)
+    lag = timing.lag(shutter, grid[..., 1], velocity[..., 1])
+    return np.stack([-velocity[..., 0] * lag, velocity[..., 1] * lag], axis=-1)
+
+
+def compare(
+    left: NDArray[Any],
+    right: NDArray[Any],
+    depth: NDArray[np.float32],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    timing: Timing,
+    options: SgmOptions | None = None,
+) -> dict[str, Any]:
+    """Measured and predicted errors of SGM on a left frame and a right frame of this timing.
+
+    Both over the pixels with a disparity; ``unexplained_px`` is what the prediction leaves.
+    """
+    disparity = stereo_disparity(left, right, rig, "left", options)
+    error = disparity - rig.disparity(depth)
+    shift = predicted_shift(depth, rig, shutter, motion, timing)
+    known = np.isfinite(error)
+    surface = depth > 0
+    measured, predicted = error[known], shift[known, 0]
+    depth_error = np.abs(rig.depth(disparity[known]) - depth[known])
+    return {
+        "timing": timing.name,
+        "delay": timing.delay,
+        "opposite": timing.opposite,
+        "coverage": float(np.mean(known[surface])),
+        "error_px": float(np.median(np.abs(measured))),
+        "predicted_px": float(np.median(np.abs(predicted))),
+        "unexplained_px": float(np.median(np.abs(measured - predicted))),
+        "vertical_px": float(np.nanmedian(np.abs(shift[surface, 1]))),
+        "bad_1px": float(np.mean(np.abs(measured) > 1.0)),
+        "depth_error_m": float(np.nanmedian(depth_error)),
+        "over_2m": float(np.mean(depth_error > 2.0)),
+    }

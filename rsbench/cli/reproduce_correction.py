@@ -1,0 +1,147 @@
+"""Targets of ``rsbench reproduce`` about depth and correction: fig4, correction, sgm."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rsbench.benchmark.sgm_study import Timing
+
+STRATA = ("mild", "moderate", "aggressive")
+SCENES = ("castle", "old-town", "room")
+_FIG4 = (("paper", ""), ("moderate", "-2"), ("aggressive", "-2"))
+"""Cards of the figure, and what their sequences' names add to the scene's."""
+_SGM = (("mild", "castle-2"), ("moderate", "castle-2"), ("mild", "room-3"), ("moderate", "room-3"))
+
+
+def fig4(out: Path, data: Path) -> None:
+    """The six panels of the paper's Figure 4 in every scene, for its motion and two larger ones."""
+    from rsbench.benchmark.correction_summary import numbers_table
+    from rsbench.benchmark.fig4_panels import load_panels, make_panels, save_panels
+    from rsbench.benchmark.provenance import dataset_record, provenance
+    from rsbench.benchmark.run_sweep import write_table
+    from rsbench.cli.console import progress_bar
+    from rsbench.dataset.files import write_json
+    from rsbench.dataset.sequence import read_sequence
+    from rsbench.report.fig4 import draw_fig4
+
+    folder = out / "fig4"
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers: dict[tuple[str, str], dict[str, Any]] = {}
+    for card, ending in _FIG4:
+        names = [f"{scene}{ending}" for scene in SCENES]
+        _generate(card, data)
+        with progress_bar(f"correcting {card}", len(names)) as advance:
+            for name in names:
+                save_panels(data / "fig4" / card / name, make_panels(read_sequence(data / card / name)))
+                advance(name)
+        rows = [(name, load_panels(data / "fig4" / card / name)) for name in names]
+        numbers |= {(card, name): panels.numbers for name, panels in rows}
+        for path in draw_fig4(rows, folder / f"fig4-{card}"):
+            typer.echo(f"figure: {path}")
+    write_table(folder / "numbers.csv", numbers_table(numbers))
+    records = [dataset_record(data / card) for card, _ in _FIG4]
+    write_json(folder / "provenance.json", provenance("rsbench reproduce fig4", datasets=records))
+
+
+def correction(out: Path, data: Path) -> None:
+    """Baselines, ours and oracles on the three strata."""
+    import pandas as pd
+
+    from rsbench.benchmark.correction_study import study_dataset, study_steps
+    from rsbench.benchmark.correction_summary import summarise, summarise_bands
+    from rsbench.benchmark.provenance import dataset_record, provenance
+    from rsbench.benchmark.run_sweep import write_table
+    from rsbench.cli.console import progress_bar
+    from rsbench.dataset.files import write_json
+    from rsbench.report.correction_study import write_study
+
+    folder = out / "correction"
+    folder.mkdir(parents=True, exist_ok=True)
+    tables: list[list[pd.DataFrame]] = [[], [], []]
+    for card in STRATA:
+        _generate(card, data)
+        with progress_bar(f"correcting {card}", study_steps(data / card)) as advance:
+            for table, rows in zip(tables, study_dataset(data / card, advance), strict=True):
+                frame = pd.DataFrame(rows)
+                frame.insert(0, "stratum", card)
+                table.append(frame)
+    images, bands, motions = (pd.concat(table, ignore_index=True) for table in tables)
+    write_table(folder / "views.csv", images)
+    write_table(folder / "motions.csv", motions)
+    write_table(folder / "summary.csv", summarise(images))
+    write_table(folder / "rows.csv", summarise_bands(bands))
+    records = [dataset_record(data / card) for card in STRATA]
+    write_json(folder / "provenance.json", provenance("rsbench reproduce correction", datasets=records))
+    for path in write_study(folder):
+        typer.echo(f"written: {path}")
+
+
+def sgm(out: Path, data: Path) -> None:
+    """Semi-global matching when the right camera reads its rows at other times."""
+    import pandas as pd
+
+    from rsbench.benchmark.provenance import dataset_record, provenance
+    from rsbench.benchmark.run_sweep import write_table
+    from rsbench.benchmark.sgm_study import TIMINGS, compare
+    from rsbench.cli.console import progress_bar
+    from rsbench.dataset.files import read_png, write_json
+    from rsbench.dataset.sequence import read_sequence
+    from rsbench.report.sgm_study import write_sgm_page
+
+    folder = out / "sgm"
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = []
+    with progress_bar("matching", len(_SGM) * len(TIMINGS)) as advance:
+        for card, name in _SGM:
+            _generate(card, data)
+            sequence = read_sequence(data / card / name)
+            left, depth = sequence.image("rs", "left", 0), sequence.depth("rs", "left", 0)
+            for timing in TIMINGS:
+                path = data / "sgm" / card / name / f"{timing.name}.png"
+                if not path.is_file():
+                    _render_right(card, name, timing, path)
+                geometry = sequence.rig, sequence.shutter, sequence.motion
+                scores = compare(left, read_png(path), depth, *geometry, timing)
+                rows.append({"stratum": card, "sequence": name, **scores})
+                advance(f"{name}, {timing.name}")
+    write_table(folder / "sgm.csv", pd.DataFrame(rows))
+    records = [dataset_record(data / card) for card in dict.fromkeys(card for card, _ in _SGM)]
+    write_json(folder / "provenance.json", provenance("rsbench reproduce sgm", datasets=records))
+    for path in write_sgm_page(folder):
+        typer.echo(f"written: {path}")
+
+
+def _generate(card: str, data: Path) -> None:
+    """Render what is missing of a card: all its sequences, so that every target finds the same dataset."""
+    from rsbench.cli.generate import generate
+
+    generate(card, data / card, None, workers=1)
+
+
+def _render_right(card: str, name: str, timing: Timing, path: Path) -> None:
+    from rsbench.benchmark.sgm_study import right_row_poses
+    from rsbench.cards import load_card
+    from rsbench.dataset.card import load_dataset_card
+    from rsbench.dataset.files import write_png
+    from rsbench.renderers.backend import start_backend
+    from rsbench.renderers.image import to_srgb8
+    from rsbench.renderers.options import RendererOptions
+    from rsbench.renderers.render import render
+    from rsbench.renderers.scene import MitsubaScene
+    from rsbench.scenes.load import load_scene
+
+    dataset = load_dataset_card(card)
+    sequence = next(one for one in dataset.sequence if one.name == name)
+    options = load_card(RendererOptions, "renderers", dataset.renderer)
+    start_backend()
+    scene = load_scene(sequence.scene)
+    rig, shutter, motion = dataset.rig_of(sequence), dataset.shutter(), dataset.motion_of(sequence)
+    poses = right_row_poses(rig, shutter, motion, timing)
+    seen = MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint]))
+    frame = render(seen, rig.camera, poses.R, poses.t, options)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_png(path, to_srgb8(frame.image, options.exposure))
