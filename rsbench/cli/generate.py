@@ -11,7 +11,9 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench generate paper --out data/paper
 
-  rsbench generate datasets/smoke.toml --out data/smoke --sequence castle"""
+  rsbench generate datasets/smoke.toml --out data/smoke --sequence castle
+
+  rsbench generate smoke --out data/stack --full-frames    [dim](keeps every row's whole image)[/dim]"""
 
 
 def generate(
@@ -21,6 +23,10 @@ def generate(
     out: Annotated[Path, typer.Option(help="Folder of the dataset; an interrupted run resumes there.")],
     sequence: Annotated[list[str] | None, typer.Option(help="Only this sequence of the card; repeatable.")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes; each renders whole sequences.")] = 1,
+    full_frames: Annotated[
+        bool,
+        typer.Option("--full-frames", help="The paper's recipe: render and keep a whole image per row (slow)."),
+    ] = False,
 ) -> None:
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
     from rsbench.cli.console import progress_bar
@@ -35,7 +41,7 @@ def generate(
     if backend.message:
         typer.echo(backend.message, err=True)
     with progress_bar(f"rendering {dataset.name}", STEPS * len(dataset.sequence)) as advance:
-        rendered = generate_dataset(dataset, out, workers=workers, progress=advance)
+        rendered = generate_dataset(dataset, out, workers=workers, full_frames=full_frames, progress=advance)
     typer.echo(f"{out}: {len(dataset.sequence)} sequences, {len(rendered)} rendered now")
 
 

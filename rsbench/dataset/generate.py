@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rsbench import __version__
 from rsbench.cards import load_card
@@ -40,7 +41,12 @@ STEPS = 1 + 2 * len(SIDES) * len(FRAMES)
 
 
 def generate_dataset(
-    card: DatasetCard, out: Path, *, workers: int = 1, progress: Progress | None = None
+    card: DatasetCard,
+    out: Path,
+    *,
+    workers: int = 1,
+    full_frames: bool = False,
+    progress: Progress | None = None,
 ) -> list[str]:
     """Render every sequence that ``out`` does not hold yet and write dataset.json; returns what was rendered.
 
@@ -51,13 +57,18 @@ def generate_dataset(
         card: what to make.
         out: folder of the dataset, made if missing.
         workers: processes; each renders whole sequences.
+        full_frames: make every rolling-shutter frame as the paper did, from one whole global-shutter image per
+            row, and keep these images as gs_stack/<side>_<frame>/<row>.png.
         progress: see ``Progress``.
 
     Raises:
         RsbenchError: ``out`` cannot be written or holds a dataset of another card; a scene, viewpoint or
             renderer of the card does not exist.
     """
-    plans = {sequence.name: _plan(card, sequence) for sequence in card.sequence}
+    options = load_card(RendererOptions, "renderers", card.renderer)
+    if full_frames:
+        options = replace(options, method="stitched", full_frames=True)
+    plans = {sequence.name: _plan(card, sequence, options) for sequence in card.sequence}
     _open_folder(out)
     todo = []
     for sequence in card.sequence:
@@ -66,14 +77,14 @@ def generate_dataset(
                 progress(sequence.name)  # type: ignore[misc]
         else:
             todo.append(sequence)
-    for name in _render_all(card, todo, out, workers):
+    for name in _render_all(card, todo, options, out, workers):
         if progress:
             progress(name)
     _write_manifest(card, out)
     return [sequence.name for sequence in todo]
 
 
-def _plan(card: DatasetCard, sequence: SequenceCard) -> dict[str, Any]:
+def _plan(card: DatasetCard, sequence: SequenceCard, options: RendererOptions) -> dict[str, Any]:
     """All that decides the bytes of a sequence, as it stands in its sequence.json."""
     scene = _scene(sequence.scene)
     if sequence.viewpoint not in scene.viewpoints:
@@ -88,8 +99,13 @@ def _plan(card: DatasetCard, sequence: SequenceCard) -> dict[str, Any]:
         frame_period_s=card.frame_period_s,
     )
     return manifest | {
-        "scene": {"name": scene.name, "viewpoint": sequence.viewpoint, **_listed(asdict(viewpoint))},
-        "renderer": _listed(asdict(_options(card))),
+        "scene": {
+            "name": scene.name,
+            "sha256": _scene_digest(sequence.scene),
+            "viewpoint": sequence.viewpoint,
+            **_listed(asdict(viewpoint)),
+        },
+        "renderer": _listed(asdict(options)),
         "seed": card.seed_of(sequence),
     }
 
@@ -98,13 +114,22 @@ def _listed(values: dict[str, Any]) -> dict[str, Any]:
     return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
 
-def _options(card: DatasetCard) -> RendererOptions:
-    return load_card(RendererOptions, "renderers", card.renderer)
-
-
 @lru_cache(maxsize=2)
 def _scene(name: str) -> Scene:
     return load_scene(name)
+
+
+@lru_cache(maxsize=64)
+def _scene_digest(name: str) -> str:
+    """Hash of all that is rendered of a scene: geometry, materials and light."""
+    digest = hashlib.sha256()
+    scene = _scene(name)
+    digest.update(repr(scene.light).encode())
+    for mesh in scene.meshes:
+        digest.update(f"{mesh.name}/{mesh.material.name}/{mesh.material.colour}".encode())
+        for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.normals, mesh.material.texture):
+            digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 def _open_folder(out: Path) -> None:
@@ -130,45 +155,54 @@ def _is_complete(folder: Path, plan: dict[str, Any]) -> bool:
             f"{folder}: holds a sequence of another card (differs in {', '.join(other)}); choose another --out"
         )
     files = manifest.get("files", {})
-    intact = all((folder / name).is_file() and sha256(folder / name) == files.get(name) for name in RELATIVE_FILES)
+    names = {*RELATIVE_FILES, *files}
+    intact = all((folder / name).is_file() and sha256(folder / name) == files.get(name) for name in names)
     if not intact:
         shutil.rmtree(folder)
     return intact
 
 
-def _render_all(card: DatasetCard, todo: list[SequenceCard], out: Path, workers: int) -> Iterator[str]:
+def _render_all(
+    card: DatasetCard, todo: list[SequenceCard], options: RendererOptions, out: Path, workers: int
+) -> Iterator[str]:
     if workers <= 1 or len(todo) <= 1:
         for sequence in todo:
-            for _ in _render_sequence(card, sequence, out):
+            for _ in _render_sequence(card, sequence, options, out):
                 yield sequence.name
         return
     # Spawned, because Dr.Jit's threads do not survive a fork; one task each, so memory goes back to the system.
     context = multiprocessing.get_context("spawn")
     threads = max(1, (os.cpu_count() or 1) // workers)
     with ProcessPoolExecutor(workers, mp_context=context, max_tasks_per_child=1) as pool:
-        jobs = {pool.submit(_render_in_child, card, sequence, out, threads): sequence for sequence in todo}
+        jobs = {
+            pool.submit(_render_in_child, card, sequence, options, out, threads): sequence for sequence in todo
+        }
         for job in as_completed(jobs):
             job.result()
             for _ in range(STEPS):
                 yield jobs[job].name
 
 
-def _render_in_child(card: DatasetCard, sequence: SequenceCard, out: Path, threads: int) -> None:
+def _render_in_child(
+    card: DatasetCard, sequence: SequenceCard, options: RendererOptions, out: Path, threads: int
+) -> None:
     from rsbench.renderers.backend import set_threads, start_backend
 
     start_backend()
     set_threads(threads)
-    for _ in _render_sequence(card, sequence, out):
+    for _ in _render_sequence(card, sequence, options, out):
         pass
 
 
-def _render_sequence(card: DatasetCard, sequence: SequenceCard, out: Path) -> Iterator[None]:
+def _render_sequence(
+    card: DatasetCard, sequence: SequenceCard, options: RendererOptions, out: Path
+) -> Iterator[None]:
     """Render into a temporary folder and rename it when complete; yields after each step."""
     from rsbench.renderers.backend import start_backend
     from rsbench.renderers.scene import MitsubaScene
 
     backend = start_backend()
-    plan = _plan(card, sequence)
+    plan = _plan(card, sequence, options)
     scene = _scene(sequence.scene)
     mitsuba_scene = MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint]))
     partial = out / f".{sequence.name}.partial"
@@ -176,8 +210,9 @@ def _render_sequence(card: DatasetCard, sequence: SequenceCard, out: Path) -> It
         (partial / folder).mkdir(parents=True, exist_ok=True)
     yield
     for side, frame in product(SIDES, FRAMES):
-        yield from _render_camera(card, sequence, mitsuba_scene, side, frame, partial)
-    files = {name: sha256(partial / name) for name in RELATIVE_FILES}
+        yield from _render_camera(card, sequence, options, mitsuba_scene, side, frame, partial)
+    paths = sorted(path for path in partial.rglob("*") if path.is_file())
+    files = {path.relative_to(partial).as_posix(): sha256(path) for path in paths}
     made_by = {
         "rsbench": __version__,
         "mitsuba": version("mitsuba"),
@@ -189,25 +224,39 @@ def _render_sequence(card: DatasetCard, sequence: SequenceCard, out: Path) -> It
 
 
 def _render_camera(
-    card: DatasetCard, sequence: SequenceCard, scene: MitsubaScene, side: Side, frame: int, folder: Path
+    card: DatasetCard,
+    sequence: SequenceCard,
+    options: RendererOptions,
+    scene: MitsubaScene,
+    side: Side,
+    frame: int,
+    folder: Path,
 ) -> Iterator[None]:
     """One camera at one time: the rolling-shutter frame, then the global-shutter frame at its row 0's pose."""
     from rsbench.renderers.image import to_srgb8
     from rsbench.renderers.render import render
 
     rig, shutter = card.rig_of(sequence), card.shutter()
-    options = replace(_options(card), seed=_image_seed(card.seed_of(sequence), sequence.name, side, frame))
+    options = replace(options, seed=_image_seed(card.seed_of(sequence), sequence.name, side, frame))
     poses = row_poses(rig, shutter, card.motion_of(sequence), side, frame)
     tau = shutter.row_time(np.arange(shutter.height), frame)
     write_poses(folder / "poses" / f"{side}_{frame}.csv", tau, poses)
     first = Pose(np.broadcast_to(poses.R[0], poses.R.shape), np.broadcast_to(poses.t[0], poses.t.shape))
+    keep = _stack_writer(folder / "gs_stack" / f"{side}_{frame}", options) if options.full_frames else None
     for kind, pose in (("rs", poses), ("gs", first)):
         # A global-shutter frame needs no stitching: all its rows have one pose.
         chosen = options if kind == "rs" else replace(options, method="single-pass")
-        rendered = render(scene, rig.camera, pose.R, pose.t, chosen)
+        rendered = render(scene, rig.camera, pose.R, pose.t, chosen, on_gs_frame=keep if kind == "rs" else None)
         write_png(folder / kind / f"{side}_{frame}.png", to_srgb8(rendered.image, options.exposure))
         write_depth(folder / f"{kind}_depth" / f"{side}_{frame}.exr", rendered.depth)
         yield
+
+
+def _stack_writer(folder: Path, options: RendererOptions) -> Callable[[int, NDArray[np.float32]], None]:
+    from rsbench.renderers.image import to_srgb8
+
+    folder.mkdir(parents=True)
+    return lambda row, image: write_png(folder / f"{row:04d}.png", to_srgb8(image, options.exposure))
 
 
 def _image_seed(seed: int, sequence: str, side: Side, frame: int) -> int:
@@ -218,7 +267,9 @@ def _image_seed(seed: int, sequence: str, side: Side, frame: int) -> int:
 
 def _write_manifest(card: DatasetCard, out: Path) -> None:
     paths = [
-        f"{sequence.name}/{name}" for sequence in card.sequence for name in ("sequence.json", *RELATIVE_FILES)
+        f"{sequence.name}/{name}"
+        for sequence in card.sequence
+        for name in ("sequence.json", *read_json(out / sequence.name / "sequence.json")["files"])
     ]
     files = {path: {"sha256": sha256(out / path), "size": (out / path).stat().st_size} for path in paths}
     write_json(

@@ -108,6 +108,7 @@ def _verify_sequence(
 
 def _file_faults(folder: Path, name: str, files: dict[str, dict[str, object]]) -> Iterator[str]:
     expected = {f"{name}/{relative}" for relative in ("sequence.json", *RELATIVE_FILES)}
+    expected |= {path for path in files if path.startswith(f"{name}/")}
     for relative in sorted(expected):
         path = folder / relative
         if relative not in files:

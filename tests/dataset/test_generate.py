@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -13,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rsbench.dataset.card import DatasetCard, MotionCard, load_dataset_card
-from rsbench.dataset.files import sha256
+from rsbench.dataset import generate as generation
+from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, load_dataset_card
+from rsbench.dataset.files import read_png, sha256
 from rsbench.dataset.generate import STEPS, generate_dataset
 from rsbench.dataset.sequence import read_dataset
 from rsbench.dataset.verify import verify_dataset
@@ -145,3 +147,37 @@ def test_only_names_the_sequences_that_exist() -> None:
 def test_dataset_manifest_lists_every_file(smoke_dataset: Path) -> None:
     manifest = json.loads((smoke_dataset / "dataset.json").read_text())
     assert set(manifest["files"]) == set(bytes_of(smoke_dataset)) - {"dataset.json"}
+
+
+def test_full_frames_keep_the_stack_that_the_frame_is_stitched_from(tmp_path: Path) -> None:
+    small = replace(
+        load_dataset_card("smoke").only(["room-twist"]), camera=CameraCard(width=20, height=12, focal=22.0)
+    )
+    generate_dataset(small, tmp_path / "stack", full_frames=True)
+    generate_dataset(small, tmp_path / "single")
+    (stacked,), (single,) = read_dataset(tmp_path / "stack"), read_dataset(tmp_path / "single")
+    frame = stacked.image("rs", "right", 1)
+    np.testing.assert_array_equal(frame, single.image("rs", "right", 1))
+    for row in range(12):
+        whole = read_png(stacked.folder / f"gs_stack/right_1/{row:04d}.png")
+        np.testing.assert_array_equal(whole[row], frame[row])
+    lost = stacked.folder / "gs_stack/left_0/0003.png"
+    lost.unlink()
+    (report,) = verify_dataset(tmp_path / "stack")
+    assert any("0003.png: missing" in fault for fault in report.faults)
+
+
+def test_changed_scene_is_not_taken_for_the_old_one(tmp_path: Path) -> None:
+    source = Path(__file__).parents[2] / "scenes/room.toml"
+    scene, dataset = tmp_path / "room.toml", tmp_path / "card.toml"
+    scene.write_text(source.read_text())
+    text = (Path(__file__).parents[2] / "datasets/smoke.toml").read_text()
+    dataset.write_text(text.replace('scene = "room"', f'scene = "{scene}"'))
+    card = load_dataset_card(str(dataset)).only(["room-twist"])
+    generate_dataset(card, tmp_path / "out")
+    scene.write_text(re.sub(r"^seed = \d+", "seed = 987", source.read_text(), flags=re.MULTILINE))
+    # A new process would read the card anew; here the cache stands for the old one.
+    generation._scene.cache_clear()
+    generation._scene_digest.cache_clear()
+    with pytest.raises(RsbenchError, match=r"another card \(differs in scene"):
+        generate_dataset(card, tmp_path / "out")
