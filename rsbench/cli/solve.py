@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from rsbench.errors import RsbenchError
+
 EPILOG = """[bold]Examples[/bold]
 
   rsbench solve problem.json
@@ -24,7 +26,9 @@ def solve(
     solver: Annotated[
         str, typer.Option(help="Name of a solver card (rsbench list solvers) or path.")
     ] = "rs-stereo",
-    threshold_px: Annotated[float, typer.Option(help="Largest Sampson error of an inlier, px.")] = 1.25,
+    threshold_px: Annotated[
+        float | None, typer.Option(help="Largest Sampson error of an inlier, px. Default: follows the noise.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
     json: Annotated[bool, typer.Option("--json", help="Answer as one JSON object.")] = False,
 ) -> None:
@@ -38,7 +42,12 @@ def solve(
     from rsbench.solvers.registry import load_solver
 
     chosen = load_solver(solver)
-    answer = solve_problem(read_problem(problem), chosen, RobustOptions(threshold_px=threshold_px), seed)
+    options = RobustOptions()
+    if threshold_px is not None:
+        if not threshold_px > 0.0:
+            raise RsbenchError(f"--threshold-px = {threshold_px}: must be a positive number of pixels")
+        options = RobustOptions(threshold_px=threshold_px, adapt_threshold=False)
+    answer = solve_problem(read_problem(problem), chosen, options, seed)
     if json:
         typer.echo(json_module.dumps(answer, allow_nan=False))
     elif answer["success"]:
