@@ -37,7 +37,7 @@ def _overview(table: pd.DataFrame) -> list[str]:
 
 
 def _claim(claim: Claim, table: pd.DataFrame) -> list[str]:
-    lines = [f"## {claim.key[0].upper()}{claim.key[1:]}", "", f"> {claim.text}", "", f"Rule: {claim.rule}.", ""]
+    lines = [f"## {claim.key[0].upper()}{claim.key[1:]}", "", f"{claim.text}.", "", f"Rule: {claim.rule}.", ""]
     lines += [
         f"| matches | noise | statistic | solver | verdict | at the first and last {claim.axis} | GS there |",
         "|---|---|---|---|---|---|---|",

@@ -198,7 +198,8 @@ _PAGE = """# The paper's Figure 3, made again
 Made by `rsbench reproduce fig3`: simulated points, bare solvers without RANSAC, the same scenes and the same noise
 for all of them. The paper's noise of "10^-3" has no unit, so each figure exists for both readings; the paper plots
 means, which a few flipped translations can dominate, so medians stand beside them. Bands are 95 % bootstrap
-intervals, the dotted line is the Cramer-Rao bound for left and right pairs, the vertical line marks the reading.
+intervals, the dotted line is the Cramer-Rao bound of the rms error from left and right pairs (the median of a
+solver at the bound lies below it), the vertical line marks the reading.
 
 | | 10^-3 px | 10^-3 of the normalised image plane, 0.81 px |
 |---|---|---|
