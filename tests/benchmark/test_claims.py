@@ -138,7 +138,7 @@ def test_every_claim_is_judged_for_both_solvers_readings_and_statistics() -> Non
     page = claims_page(table)
     assert "| rotation velocity: better than GS | 100 + 100 | 1e-3 px | fails | holds |" in page
     for claim in CLAIMS:
-        assert f"> {claim.text}" in page and claim.rule in page
+        assert f"{claim.text}." in page and claim.rule in page
     # Every table of the page has as many cells in each row as in its head.
     tables = [block.splitlines() for block in page.split("\n\n") if block.startswith("|")]
     assert len(tables) == 1 + len(CLAIMS)
