@@ -36,6 +36,8 @@ _FEW_STEREO = 0.1
 """Left-right matches per temporal match below which the images may be swapped or not rectified."""
 _FEWEST_MATCHES = 12
 _MAX_READOUT_SIGMA = 0.25
+_BRIGHT = 99.9
+"""Percentile of a 16-bit image that becomes white for matching."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,10 +93,12 @@ class NoMotionError(Exception):
 def frame_pair(left: NDArray[Any], right: NDArray[Any], rig: StereoRig, options: CorrectionOptions) -> FramePair:
     """Depth of both images (H, W[, 3]), uint8 or uint16, of one time."""
     images = dict(zip(SIDES, (left, right), strict=True))
-    disparities = dict(zip(SIDES, stereo_disparities(left, right, rig, options.sgm), strict=True))
+    levels = dict(zip(SIDES, eight_bit([left, right]), strict=True))
+    both = stereo_disparities(levels["left"], levels["right"], rig, options.sgm)
+    disparities = dict(zip(SIDES, both, strict=True))
     depth, guess = {}, {}
     for side in SIDES:
-        sky = sky_mask(images[side], disparities[side]) if options.find_sky else np.zeros(left.shape[:2], np.bool_)
+        sky = sky_mask(levels[side], disparities[side]) if options.find_sky else np.zeros(left.shape[:2], np.bool_)
         disparity = np.where(sky, np.float32(0.0), disparities[side])
         depth[side] = _depth(disparity, rig)
         filled = fill_holes(disparity)
@@ -134,10 +138,17 @@ def match_frames(images: Images, options: CorrectionOptions) -> Correspondences:
 
 
 def _matches(images: Images, sides: tuple[Side, Side], options: CorrectionOptions) -> Correspondences:
-    first, second = sides
-    return match_stereo_frames(
-        images[first, 0], images[second, 0], images[first, 1], images[second, 1], options.matching
-    )
+    left_0, right_0, left_1, right_1 = eight_bit([images[side, frame] for frame in (0, 1) for side in sides])
+    return match_stereo_frames(left_0, right_0, left_1, right_1, options.matching)
+
+
+def eight_bit(images: list[NDArray[Any]]) -> list[NDArray[np.uint8]]:
+    """Images for matching; 16-bit ones are brought to 8 bits by one factor, for they may use few of their bits."""
+    if images[0].dtype == np.uint8:
+        return images
+    top = max(float(np.percentile(image, _BRIGHT)) for image in images)
+    scale = np.float32(255.0 / max(top, 1.0))
+    return [np.clip(image * scale + np.float32(0.5), 0.0, 255.0).astype(np.uint8) for image in images]
 
 
 def solve_frames(

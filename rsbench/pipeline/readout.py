@@ -63,7 +63,9 @@ def estimate_readout_ratio(
 
     def robust(ratio: float) -> RobustEstimate:
         shutter = RollingShutter(height=height, readout_ratio=ratio)
-        return estimate_motion(correspondences, rig, shutter, solver, options, np.random.default_rng(seed))
+        # A proposal far off may put a point next to a camera's plane, where its error overflows: an outlier.
+        with np.errstate(invalid="ignore", over="ignore"):
+            return estimate_motion(correspondences, rig, shutter, solver, options, np.random.default_rng(seed))
 
     tried = {ratio: robust(ratio) for ratio in COARSE}
     found = {ratio: result for ratio, result in tried.items() if result.estimate.success}

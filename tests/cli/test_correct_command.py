@@ -1,0 +1,159 @@
+"""``rsbench correct`` as users meet it."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from rsbench.dataset.files import read_depth, read_png
+from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.report.correct import MASK_VALUES, fresh_folder
+
+ORDER = ("left_0", "right_0", "left_1", "right_1")
+
+
+def rsbench(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "rsbench", "correct", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+def assert_refused(result: subprocess.CompletedProcess[str], *words: str) -> None:
+    assert result.returncode == 2, result.stderr
+    (line,) = [line for line in result.stderr.splitlines() if "rsbench: error:" in line]
+    assert "Traceback" not in result.stderr
+    for word in words:
+        assert word in line
+
+
+@pytest.fixture(scope="module")
+def castle(smoke_dataset: Path) -> Sequence:
+    return read_dataset(smoke_dataset)[0]
+
+
+@pytest.fixture
+def frames(castle: Sequence) -> list[Path]:
+    return [castle.folder / "rs" / f"{name}.png" for name in ORDER]
+
+
+@pytest.fixture
+def rig(tmp_path: Path, castle: Sequence) -> Path:
+    c = castle.rig.camera
+    path = tmp_path / "rig.toml"
+    path.write_text(
+        f"baseline = {castle.rig.baseline}\nreadout_ratio = {castle.shutter.readout_ratio}\n"
+        f"[camera]\nfx = {c.fx}\nfy = {c.fy}\ncx = {c.cx}\ncy = {c.cy}\n"
+    )
+    return path
+
+
+def _check_outputs(out: Path, names: tuple[str, ...]) -> dict[str, Any]:
+    for name in names:
+        image = cv2.imread(str(out / "corrected" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+        mask = cv2.imread(str(out / "mask" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+        depth = read_depth(out / "depth" / f"{name}.exr")
+        assert image is not None and mask is not None
+        assert image.shape[:2] == mask.shape == depth.shape
+        assert set(np.unique(mask)) <= set(MASK_VALUES.values())
+        assert np.all(image[mask == 0] == 0) and np.all(depth[mask == 0] == 0)
+        assert np.mean(mask == 255) > 0.8
+    page = (out / "report.html").read_text("utf-8")
+    # Opens from disk with no network: whatever it shows is in it.
+    assert not re.search(r'(src|href)="(?!data:)', page)
+    record: dict[str, Any] = json.loads((out / "motion.json").read_text("utf-8"))
+    return record
+
+
+def test_four_frames(tmp_path: Path, castle: Sequence, frames: list[Path], rig: Path) -> None:
+    out = tmp_path / "out"
+    result = rsbench(*frames, "--rig", rig, "--out", out, "--target", "middle")
+    assert result.returncode == 0, result.stderr
+    assert str(out / "report.html") in result.stdout
+    record = _check_outputs(out, ORDER)
+    assert record["target_row"] == (castle.rig.camera.height - 1) / 2
+    assert not record["readout_ratio_estimated"]
+    # 128 x 96 px: a quarter of a degree is half a pixel.
+    np.testing.assert_allclose(record["motion"]["w"], castle.motion.w, atol=np.deg2rad(0.25))
+    assert {path.name for path in tmp_path.iterdir()} == {"out", "rig.toml"}
+    # The same command again replaces its own results, and gives the same.
+    before = (out / "corrected" / "left_0.png").read_bytes()
+    assert rsbench(*frames, "--rig", rig, "--out", out, "--target", "middle").returncode == 0
+    assert (out / "corrected" / "left_0.png").read_bytes() == before
+
+
+def test_a_sequence_of_folders(tmp_path: Path, frames: list[Path], rig: Path) -> None:
+    for number, path in enumerate(frames):
+        side = tmp_path / ("left", "right")[number % 2]
+        side.mkdir(exist_ok=True)
+        (side / f"{number // 2}.png").write_bytes(path.read_bytes())
+    out = tmp_path / "out"
+    arguments = (
+        "--left",
+        tmp_path / "left",
+        "--right",
+        tmp_path / "right",
+        "--rig",
+        rig,
+        "--out",
+        out,
+        "--inpaint",
+    )
+    result = rsbench(*arguments)
+    assert result.returncode == 0, result.stderr
+    assert "2 of 2 times corrected" in result.stdout
+    names = ("left_000000", "right_000000", "left_000001", "right_000001")
+    for name in names:
+        assert (out / "corrected" / f"{name}.png").is_file()
+    record = json.loads((out / "motion.json").read_text("utf-8"))
+    assert [frame["number"] for frame in record["frames"]] == [0, 1]
+
+
+def test_bad_calls_are_refused_and_leave_nothing(tmp_path: Path, frames: list[Path], rig: Path) -> None:
+    out = tmp_path / "out"
+    common = ("--rig", rig, "--out", out)
+    small = tmp_path / "small.png"
+    cv2.imwrite(str(small), read_png(frames[0])[:60])
+    flat = tmp_path / "flat.png"
+    cv2.imwrite(str(flat), np.full((96, 128), 128, np.uint8))
+    assert_refused(rsbench(*frames[:3], *common), "3 images")
+    assert_refused(rsbench(*frames[:3], small, *common), "small.png", "128 x 60", "128 x 96")
+    assert_refused(rsbench(*frames[:3], tmp_path / "none.png", *common), "none.png", "no such")
+    assert_refused(rsbench(*[flat] * 4, *common), "no texture")
+    assert_refused(rsbench(*frames, *common, "--target", "500"), "--target 500", "95")
+    assert_refused(rsbench(*frames, "--out", out), "--rig")
+    assert_refused(rsbench(*frames, *common, "--solver", "gs-8pt"), "gs-8pt", "RefinedSolver")
+    assert_refused(rsbench(*frames, "--rig", tmp_path / "no.toml", "--out", out), "no.toml")
+    assert {path.name for path in tmp_path.iterdir()} == {"rig.toml", "small.png", "flat.png"}
+
+
+def test_a_folder_of_others_is_not_touched(tmp_path: Path, frames: list[Path], rig: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "precious.txt").write_text("mine")
+    assert_refused(rsbench(*frames, "--rig", rig, "--out", out), "choose another --out")
+    assert (out / "precious.txt").read_text() == "mine"
+
+
+def test_matches_that_leave_the_readout_open_exit_with_1(tmp_path: Path, castle: Sequence, rig: Path) -> None:
+    """The same pair twice: no motion, so nothing tells how the rows were read."""
+    left, right = (castle.folder / "gs" / f"{side}_0.png" for side in ("left", "right"))
+    rig.write_text("\n".join(line for line in rig.read_text().splitlines() if "readout" not in line))
+    result = rsbench(left, right, left, right, "--rig", rig, "--out", tmp_path / "out")
+    assert result.returncode == 1, result.stderr
+    assert "not corrected" in result.stderr and "readout_ratio" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(RuntimeError), fresh_folder(out) as folder:
+        (folder / "half").write_text("x")
+        raise RuntimeError
+    assert not any(tmp_path.iterdir())

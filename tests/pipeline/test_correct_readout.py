@@ -1,0 +1,111 @@
+"""The readout ratio from matches: recovered, with an honest uncertainty, and told from its reverse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rsbench.benchmark.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.pipeline.motion import RobustOptions, estimate_motion
+from rsbench.pipeline.readout import (
+    estimate_readout_ratio,
+    reversed_in_time,
+    runs_backwards,
+    select,
+    truncated_cost,
+)
+from rsbench.solvers.refined import RefinedSolver
+
+RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.5)
+SOLVER, ROBUST = RefinedSolver(), RobustOptions()
+
+
+def _simulated(seed: int, ratio: float, degrees: float, tracks: int, noise: float = 0.3) -> Simulation:
+    rng = np.random.default_rng(seed)
+    shutter = RollingShutter(height=900, readout_ratio=ratio)
+    motion = random_motion(rng, np.deg2rad(degrees), 0.3)
+    options = SimulationOptions(pairs=tracks // 4, tracks=tracks, noise_px=noise, outlier_ratio=0.2)
+    return simulate(RIG, shutter, motion, options, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize(
+    ("seed", "ratio", "degrees"), [(0, 0.35, 1.0), (1, 0.8, 1.0), (2, 0.6, 2.0), (3, 0.97, 6.0)]
+)
+def test_the_ratio_is_recovered_within_a_fiftieth(seed: int, ratio: float, degrees: float) -> None:
+    """|w| >= 1 deg, noise 0.3 px, a fifth outliers; 6000 tracks make 0.02 two standard deviations or more."""
+    data = _simulated(seed, ratio, degrees, 6000)
+    found = estimate_readout_ratio(data.correspondences, RIG, SOLVER, ROBUST)
+    assert found is not None
+    assert found.sigma < 0.011
+    assert abs(found.readout_ratio - ratio) < 0.02
+
+
+def test_the_uncertainty_is_honest() -> None:
+    """Errors over their standard deviations have a root mean square of 1: here of 12 draws, 1 +- 3 / sqrt(24)."""
+    scores = []
+    for seed in range(12):
+        ratio = float(np.random.default_rng(seed).uniform(0.2, 0.8))
+        found = estimate_readout_ratio(_simulated(seed, ratio, 2.0, 600).correspondences, RIG, SOLVER, ROBUST)
+        assert found is not None
+        scores.append((found.readout_ratio - ratio) / found.sigma)
+    assert 0.38 < np.sqrt(np.mean(np.square(scores))) < 1.62
+
+
+def test_exact_matches_give_the_exact_ratio() -> None:
+    data = _simulated(5, 0.47, 2.0, 200, noise=0.0)
+    found = estimate_readout_ratio(data.correspondences, RIG, SOLVER, ROBUST)
+    assert found is not None
+    # The search stops at 1e-5.
+    assert abs(found.readout_ratio - 0.47) < 1e-4
+
+
+def test_a_global_shutter_is_recognised() -> None:
+    found = estimate_readout_ratio(_simulated(4, 0.0, 3.0, 1500).correspondences, RIG, SOLVER, ROBUST)
+    assert found is not None
+    assert found.readout_ratio < 0.02
+
+
+def test_no_motion_leaves_the_ratio_open() -> None:
+    shutter = RollingShutter(height=900, readout_ratio=0.8)
+    still = random_motion(np.random.default_rng(0), 0.0, 0.0)
+    options = SimulationOptions(tracks=300, noise_px=0.3)
+    data = simulate(RIG, shutter, still, options, np.random.default_rng(0))
+    found = estimate_readout_ratio(data.correspondences, RIG, SOLVER, ROBUST)
+    assert found is None or not found.sigma < 0.25
+
+
+def test_nothing_is_estimated_from_nothing() -> None:
+    assert estimate_readout_ratio(Correspondences(), RIG, SOLVER, ROBUST) is None
+
+
+def test_frames_in_the_wrong_order_are_noticed() -> None:
+    data = _simulated(6, 0.8, 2.0, 800)
+    matches = data.correspondences
+    for given, backwards in ((matches, False), (reversed_in_time(matches), True)):
+        forward = estimate_motion(given, RIG, data.shutter, SOLVER, ROBUST, np.random.default_rng(0))
+        assert runs_backwards(given, RIG, 0.8, 0.8, SOLVER, ROBUST, forward) == backwards
+
+
+def test_reversing_twice_changes_nothing() -> None:
+    matches = _simulated(7, 0.8, 2.0, 20).correspondences
+    again = reversed_in_time(reversed_in_time(matches))
+    for name in ("left", "right", "stereo_0", "stereo_1", "tracks"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(matches, name))
+
+
+def test_the_truncated_cost_counts_an_outlier_once() -> None:
+    """Exact matches cost nothing; an outlier costs the threshold, squared, however far it is off."""
+    data = _simulated(8, 0.8, 2.0, 100, noise=0.0)
+    motion = estimate_motion(data.correspondences, RIG, data.shutter, SOLVER, ROBUST, np.random.default_rng(0))
+    inliers = select(data.correspondences, motion)
+    assert truncated_cost(inliers, RIG, 0.8, SOLVER, ROBUST, motion) < 1e-9
+    for shift in (30.0, 300.0):
+        left = inliers.left.copy()
+        left[0, 2:] += shift
+        hurt = Correspondences(left=left, right=inliers.right, tracks=inliers.tracks)
+        cost = truncated_cost(hurt, RIG, 0.8, SOLVER, ROBUST, motion)
+        np.testing.assert_allclose(cost, ROBUST.threshold_px**2, rtol=1e-6)
