@@ -1,0 +1,101 @@
+"""Time of the whole chain on one pair of stereo frames, step by step: match, solve, depth, correct.
+
+The sequence is rendered once (card ``paper``, scene castle) into --data; any dataset folder can be given instead.
+Wall-clock seconds are those of the best run, for another program on the machine only adds to them; the processor
+seconds beside them, summed over threads, tell how much of it was work. With --profile the functions that take
+longest are listed.
+
+    python benchmarks/correct_chain.py --data data/paper --runs 7
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import os
+import pstats
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.pipeline.correct import (
+    CorrectionOptions,
+    correct_frames,
+    frame_pair,
+    match_frames,
+    motion_of,
+    solve_frames,
+)
+from rsbench.pipeline.footage import VIEWS
+
+BOUND_S = 3.0
+STEPS = ("match", "solve", "depth", "correct")
+
+
+def run(sequence: Sequence, options: CorrectionOptions) -> dict[str, tuple[float, float]]:
+    """Wall and processor seconds of each step, on images that are in memory."""
+    images = {view: sequence.image("rs", *view) for view in VIEWS}
+    rig, times = sequence.rig, {}
+
+    def timed(name: str, work: Callable[[], Any]) -> Any:
+        wall, cpu = time.perf_counter(), time.process_time()
+        result = work()
+        times[name] = (time.perf_counter() - wall, time.process_time() - cpu)
+        return result
+
+    matches = timed("match", lambda: match_frames(images, options))
+    robust, shutter, _ = timed(
+        "solve", lambda: solve_frames(matches, rig, sequence.shutter.readout_ratio, options)
+    )
+    pairs = timed(
+        "depth", lambda: [frame_pair(images["left", k], images["right", k], rig, options) for k in (0, 1)]
+    )
+    motion = motion_of(robust, options)
+    timed("correct", lambda: correct_frames((pairs[0], pairs[1]), rig, shutter, motion, options))
+    return times
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path("data/paper"), help="dataset; rendered when missing")
+    parser.add_argument("--sequence", default="castle", help="which of its sequences (default castle)")
+    parser.add_argument("--runs", type=int, default=7, help="runs of which the best counts (default 7)")
+    parser.add_argument("--profile", action="store_true", help="list the functions that take longest")
+    arguments = parser.parse_args()
+    if not (arguments.data / "dataset.json").is_file():
+        from rsbench.cli.generate import generate
+
+        generate("paper", arguments.data, None, workers=1)
+    sequence = next(one for one in read_dataset(arguments.data) if one.name == arguments.sequence)
+    options = CorrectionOptions()
+    run(sequence, options)  # compiles and warms up
+    runs = [run(sequence, options) for _ in range(arguments.runs)]
+    report(sequence, runs)
+    if arguments.profile:
+        profile = cProfile.Profile()
+        profile.runcall(run, sequence, options)
+        pstats.Stats(profile, stream=sys.stdout).sort_stats("tottime").print_stats(15)
+
+
+def report(sequence: Sequence, runs: list[dict[str, tuple[float, float]]]) -> None:
+    """One line per step and the sum, and whether that is below the bound."""
+    camera = sequence.rig.camera
+    write = sys.stdout.write
+    write(f"{camera.width} x {camera.height} px, 4 frames, {os.cpu_count()} cores, {len(runs)} runs\n")
+    write(f"{'step':10}{'best wall (s)':>15}{'median wall (s)':>17}{'processor (s)':>15}\n")
+    for step in STEPS:
+        wall, cpu = np.array([times[step] for times in runs]).T
+        write(f"{step:10}{wall.min():15.2f}{np.median(wall):17.2f}{np.median(cpu):15.2f}\n")
+    totals = np.array([np.sum([times[step] for step in STEPS], axis=0) for times in runs])
+    wall, cpu = totals.T
+    write(f"{'all':10}{wall.min():15.2f}{np.median(wall):17.2f}{np.median(cpu):15.2f}\n")
+    write(f"bound: {BOUND_S:g} s: {'holds' if wall.min() < BOUND_S else 'FAILS'}\n")
+
+
+if __name__ == "__main__":
+    main()
