@@ -15,6 +15,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import lru_cache
@@ -90,7 +91,8 @@ def run_sweep(card: SweepCard, out: Path, *, workers: int = 1, progress: Progres
         progress: see ``Progress``.
 
     Raises:
-        RsbenchError: no such solver; ``out`` holds another sweep; a motion leaves too few points in view.
+        RsbenchError: no such solver; ``out`` holds another sweep; a motion leaves too few points in view; a
+            worker was killed.
     """
     _open_folder(card, {name: entrant(name) for name in card.solvers}, out)
     step = progress or (lambda word: None)
@@ -188,6 +190,10 @@ def _run_all(todo: list[_Job], workers: int) -> Iterator[_Part]:
                 for done in as_completed(jobs):
                     done.result()
                     yield jobs[done].part
+            except BrokenProcessPool as error:
+                raise RsbenchError(
+                    "a worker process was killed, perhaps for want of memory; the same command resumes"
+                ) from error
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise

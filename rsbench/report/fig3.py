@@ -122,6 +122,7 @@ def _panel(axes: Axes, table: pd.DataFrame, name: str, measure: str, centre: Cen
     limit = table[table.solver == OURS]
     axes.plot(limit.value, limit[f"{measure}_bound"], label="Cramér-Rao bound (rms)", **_BOUND)
     axes.set_yscale("log")
+    _label_decades(axes)
     if name in _LOG_X:
         axes.set_xscale("log")
     if name in ("rotation", "translation", "readout"):
@@ -131,6 +132,17 @@ def _panel(axes: Axes, table: pd.DataFrame, name: str, measure: str, centre: Cen
     axes.set_xlabel(_X_LABELS[name])
     axes.set_ylabel(_Y_LABELS[measure], labelpad=1)
     axes.grid(True, which="major", color="0.88", linewidth=0.6)
+
+
+def _label_decades(axes: Axes) -> None:
+    """Ticks that fit: decades where there are some, else 1, 2 and 5 of each."""
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
+    low, high = axes.get_ylim()
+    if high < 50 * low:
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _title(figure: Any, tables: dict[str, pd.DataFrame], variant: str, centre: Centre) -> None:
@@ -198,8 +210,8 @@ _PAGE = """# The paper's Figure 3, made again
 Made by `rsbench reproduce fig3`: simulated points, bare solvers without RANSAC, the same scenes and the same noise
 for all of them. The paper's noise of "10^-3" has no unit, so each figure exists for both readings; the paper plots
 means, which a few flipped translations can dominate, so medians stand beside them. Bands are 95 % bootstrap
-intervals, the dotted line is the Cramer-Rao bound of the rms error from left and right pairs (the median of a
-solver at the bound lies below it), the vertical line marks the reading.
+intervals. The dotted line is the Cramer-Rao bound of the root mean square error from left and right pairs: the
+median and the mean of a solver at the bound lie below it. The vertical line marks the reading.
 
 | | 10^-3 px | 10^-3 of the normalised image plane, 0.81 px |
 |---|---|---|

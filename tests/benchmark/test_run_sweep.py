@@ -94,6 +94,29 @@ def test_a_motion_that_loses_the_scene_names_its_cell(tmp_path: Path) -> None:
         run_sweep(card, tmp_path / "lost")
 
 
+FATAL = """
+import os
+from rsbench.solvers.base import Solver
+
+class Fatal(Solver):
+    needs, minimum, metric, motion_model = frozenset({"left"}), {"left": 8}, False, "linear"
+    shutter, reference_point, reference, assumes = "global", "left", "", ""
+
+    def estimate(self, correspondences, rig, shutter):
+        os._exit(1)
+"""
+
+
+def test_a_killed_worker_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A solver that ends its process, as a want of memory would."""
+    (tmp_path / "fatal_plugin.py").write_text(FATAL)
+    (tmp_path / "fatal.toml").write_text('class = "fatal_plugin:Fatal"\n')
+    monkeypatch.syspath_prepend(tmp_path)
+    card = replace(CARD, solvers=(str(tmp_path / "fatal.toml"),))
+    with pytest.raises(RsbenchError, match=r"worker process was killed.*resumes"):
+        run_sweep(card, tmp_path / "killed")
+
+
 def test_trials_depend_on_their_number_alone() -> None:
     whole = run_trials(SETTING, CARD.solvers, 0, 0, 4, robust=False)
     part = run_trials(SETTING, CARD.solvers, 0, 2, 2, robust=False)
