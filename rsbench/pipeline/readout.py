@@ -24,7 +24,6 @@ from rsbench.solvers.refined import RefinedSolver
 
 COARSE = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Ratios at which outliers are sorted out; between two of them the error of a match stays within its noise."""
-_PASSES = 2
 _REACH = 0.3
 _STEP = 0.02
 _ITERATIONS = 30
@@ -72,14 +71,12 @@ def estimate_readout_ratio(
     if not found:
         return None
     ratio = min(found, key=lambda r: truncated_cost(correspondences, rig, r, solver, options, found[r]))
-    result = found[ratio]
-    profile = _Profile(correspondences, rig, solver, result)
-    for _ in range(_PASSES):
-        profile = _Profile(correspondences, rig, solver, result)
-        low, high = max(ratio - _REACH, 0.0), min(ratio + _REACH, 1.0)
-        ratio = float(minimize_scalar(profile, bounds=(low, high), method="bounded", options={"xatol": 1e-5}).x)
-        again = robust(ratio)
-        result = again if again.estimate.success else result
+    profile = _Profile(correspondences, rig, solver, found[ratio])
+    ratio = profile.minimum(ratio)
+    again = robust(ratio)
+    if again.estimate.success:  # outliers sorted out at nearly the right ratio
+        profile = _Profile(correspondences, rig, solver, again)
+        ratio = profile.minimum(ratio)
     return ReadoutEstimate(readout_ratio=ratio, sigma=profile.sigma(ratio), matches=profile.matches)
 
 
@@ -103,6 +100,11 @@ class _Profile:
         theta = packed.theta(self.start[:3], self.start[3:])
         fitted = levenberg_marquardt(packed.normal_equations, theta, _ITERATIONS, self.solver.max_translation_m)
         return fitted.cost
+
+    def minimum(self, ratio: float) -> float:
+        """The ratio of the smallest cost near ``ratio``."""
+        bounds = (max(ratio - _REACH, 0.0), min(ratio + _REACH, 1.0))
+        return float(minimize_scalar(self, bounds=bounds, method="bounded", options={"xatol": 1e-5}).x)
 
     def sigma(self, ratio: float) -> float:
         """Standard deviation by the curvature of the profile, with the noise that the residuals show."""

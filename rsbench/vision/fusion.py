@@ -101,8 +101,7 @@ def fuse(
                 continue
             # Where two know a pixel of a hole, the nearer surface hides the other.
             known = np.where(np.isnan(depth), np.float32(np.inf), depth)
-            with np.errstate(invalid="ignore"):  # inf * 0.97 against inf
-                nearer = candidate.depth < known * (1.0 - _AGREE)
+            nearer = candidate.depth < known * (1.0 - _AGREE)
             take = candidate.mask & holes & ((origin == Origin.NOBODY) | nearer)
             image[take], depth[take] = candidate.image[take], candidate.depth[take]
             origin[take] = view.origin
@@ -117,8 +116,7 @@ def _warp_into(
     moved = np.zeros((3, *view.depth.shape))
     forward_warp.move_rows(inverse_depth(view.depth), M, b, moved)
     wanted = cv2.dilate(holes.astype(np.uint8), np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)) > 0
-    with np.errstate(invalid="ignore"):  # NaN behind the camera and where the depth is unknown
-        inside = camera.contains(np.moveaxis(moved[:2], 0, -1))
+    inside = camera.contains(np.moveaxis(moved[:2], 0, -1))  # not NaN: behind the camera, or of unknown depth
     x, y = (np.where(inside, np.rint(coordinate), 0.0).astype(np.intp) for coordinate in moved[:2])
     np.clip(x, 0, camera.width - 1, out=x)
     np.clip(y, 0, camera.height - 1, out=y)
