@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,7 +21,7 @@ from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
-from rsbench.pipeline.footage import VIEWS, View
+from rsbench.pipeline.footage import FRAMES, VIEWS, View
 from rsbench.pipeline.motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.pipeline.readout import ReadoutEstimate, estimate_readout_ratio, reversed_in_time, runs_backwards
 from rsbench.solvers.refined import RefinedSolver
@@ -269,12 +270,21 @@ def correct_four(
         NoMotionError: the matches determine no motion or readout ratio.
     """
     clock = _Clock(step)
-    matches = match_frames(images, options)
-    clock("matching")
-    robust, shutter, readout = solve_frames(matches, rig, readout_ratio, options)
-    clock("motion")
-    first = frame_pair(images["left", 0], images["right", 0], rig, options)
-    second = frame_pair(images["left", 1], images["right", 1], rig, options)
+    with ThreadPoolExecutor(len(FRAMES)) as pool:
+        # Depth needs no motion: its threads fill the gaps that matching and solving leave.
+        pairs = [
+            pool.submit(frame_pair, images["left", frame], images["right", frame], rig, options)
+            for frame in FRAMES
+        ]
+        try:
+            matches = match_frames(images, options)
+            clock("matching")
+            robust, shutter, readout = solve_frames(matches, rig, readout_ratio, options)
+            clock("motion")
+        except (RsbenchError, NoMotionError):
+            pool.shutdown(cancel_futures=True)
+            raise
+        first, second = (pair.result() for pair in pairs)
     clock("depth")
     motion = motion_of(robust, options)
     frames = correct_frames((first, second), rig, shutter, motion, options)
@@ -291,7 +301,7 @@ def correct_four(
 
 
 class _Clock:
-    """Seconds of each step."""
+    """Wall-clock seconds of each step; depth runs beside the first two, so its time is what is left of it."""
 
     def __init__(self, step: Step) -> None:
         self.seconds: dict[str, float] = {}

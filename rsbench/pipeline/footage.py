@@ -23,7 +23,8 @@ from rsbench.errors import RsbenchError
 
 View = tuple[Side, int]
 """Side and frame, 0 or 1."""
-VIEWS: tuple[View, ...] = tuple(product(SIDES, (0, 1)))
+FRAMES = (0, 1)
+VIEWS: tuple[View, ...] = tuple(product(SIDES, FRAMES))
 _SMALLEST = 32
 """Pixels of the shorter side; below that there is nothing to match."""
 _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm"}

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="untyped-decorator"
 """Filling what a corrected frame did not see: from the other camera, from the other frame, at last by a guess.
 
 A pixel of the target is a hole of the corrected frame for one of three reasons: something hid the place, it lies
@@ -15,11 +16,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
-from rsbench.vision import forward_warp
+from rsbench.core.so3 import FloatArray
 from rsbench.vision.correction import Corrected, WarpOptions, inverse_depth, relative_row_maps, warp
 
 Mask = NDArray[np.bool_]
@@ -113,18 +115,40 @@ def _warp_into(
 ) -> Corrected | None:
     """The part of a view that falls into the holes; None when nothing does."""
     M, b = relative_row_maps(camera, view.poses, target_pose)
-    moved = np.zeros((3, *view.depth.shape))
-    forward_warp.move_rows(inverse_depth(view.depth), M, b, moved)
-    wanted = cv2.dilate(holes.astype(np.uint8), np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)) > 0
-    inside = camera.contains(np.moveaxis(moved[:2], 0, -1))  # not NaN: behind the camera, or of unknown depth
-    x, y = (np.where(inside, np.rint(coordinate), 0.0).astype(np.intp) for coordinate in moved[:2])
-    np.clip(x, 0, camera.width - 1, out=x)
-    np.clip(y, 0, camera.height - 1, out=y)
-    useful = inside & wanted[y, x]
-    if not np.any(useful):
+    wanted = cv2.dilate(holes.astype(np.uint8), np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8))
+    depth = np.zeros_like(view.depth)
+    if _keep_landing(view.depth, inverse_depth(view.depth), M, b, wanted, depth) == 0:
         return None
-    depth = np.where(useful, view.depth, np.float32(0.0))
     return warp(view.image, depth, camera, view.poses, target_pose, options=options)
+
+
+@njit(cache=True, error_model="numpy")
+def _keep_landing(
+    depth: NDArray[np.float32],
+    rho: NDArray[np.float32],
+    M: FloatArray,
+    b: FloatArray,
+    wanted: NDArray[np.uint8],
+    kept: NDArray[np.float32],
+) -> int:
+    """Copy to ``kept`` the depth (H, W) of pixels that land on wanted target pixels (H, W); how many these are.
+
+    ``rho`` is inverse depth, NaN where unknown; ``M`` (H, 3, 3) and ``b`` (H, 3) as of ``relative_row_maps``.
+    """
+    height, width = depth.shape
+    count = 0
+    for y in range(height):
+        for x in range(width):
+            near = rho[y, x]
+            z = M[y, 2, 0] * x + M[y, 2, 1] * y + M[y, 2, 2] + near * b[y, 2]
+            if not z > 0.0:  # NaN included
+                continue
+            u = (M[y, 0, 0] * x + M[y, 0, 1] * y + M[y, 0, 2] + near * b[y, 0]) / z + 0.5
+            v = (M[y, 1, 0] * x + M[y, 1, 1] * y + M[y, 1, 2] + near * b[y, 1]) / z + 0.5
+            if 0.0 <= u < width and 0.0 <= v < height and wanted[int(v), int(u)] != 0:
+                kept[y, x] = depth[y, x]
+                count += 1
+    return count
 
 
 def inpaint(image: NDArray[Any], missing: Mask, radius: float = 3.0) -> NDArray[Any]:
