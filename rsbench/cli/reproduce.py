@@ -120,13 +120,17 @@ def _fig3(out: Path, data: Path, workers: int | None) -> None:
 def _sweeps(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.benchmark.provenance import provenance
     from rsbench.benchmark.run_sweep import write_table
-    from rsbench.dataset.files import write_json
+    from rsbench.benchmark.sweeps import load_sweep
+    from rsbench.dataset.files import write_bytes, write_json
+    from rsbench.report.sweeps import sweeps_page
 
     folder = out / "sweeps"
     folder.mkdir(parents=True, exist_ok=True)
     command = "rsbench reproduce sweeps"
     for name in _OTHER_SWEEPS:
         write_table(folder / f"{name}.csv", _simulate(name, None, data, workers, command))
+    page = sweeps_page([load_sweep(name) for name in _OTHER_SWEEPS])
+    write_bytes(folder / "README.md", page.encode())
     write_json(folder / "provenance.json", provenance(command, sweeps=list(_OTHER_SWEEPS)))
     typer.echo(f"tables: {folder}")
 
