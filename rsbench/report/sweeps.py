@@ -6,11 +6,11 @@ from rsbench.benchmark.sweeps import SweepCard
 
 _INTRODUCTION = """# Simulations beyond the paper
 
-Made by `rsbench reproduce sweeps`. One row per solver and value; `information` says which matches a solver was given
-(methods that see pairs and methods that see tracks through all four images are not on a par), `_low` and `_high`
-are 95 % bootstrap intervals, failures score 180 degrees, `over_bound` is the root mean square error over its
-Cramer-Rao bound for that information, and `unobservable` names what the matches do not determine.
-Translations of solvers of the left camera are scored against that camera's own.
+Made by `rsbench reproduce sweeps`. One row per solver and value; `information` says which matches a solver was
+given (methods that see pairs and methods that see tracks through all four images are not on a par), `_low` and
+`_high` are 95 % bootstrap intervals, failures score 180 degrees, `over_bound` is the root mean square error over
+its Cramer-Rao bound for that information, and `unobservable` names what the matches do not determine. Translations
+of solvers of the left camera are scored against that camera's own.
 
 | table | what | varies | noise (px) | trials | RANSAC |
 |---|---|---|---|---|---|
