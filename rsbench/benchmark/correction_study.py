@@ -131,10 +131,7 @@ class Bench:
         self.motion = LinearMotion(self.robust.estimate.w, self.robust.estimate.d)
         rng = generator(seed, "study", sequence.name, "gs")
         self.gs_motion = global_shutter_motion(self.matches, self.rig, self.options.robust, rng)
-        pairs = [
-            frame_pair(self.images["left", k], self.images["right", k], self.rig, self.options) for k in (0, 1)
-        ]
-        self.sgm = (pairs[0], pairs[1])
+        self.sgm = frame_pairs(self.images, self.rig, self.options)
         self.true = (self._true_pair(0), self._true_pair(1))
 
     def _robust(self, rng: np.random.Generator) -> RobustEstimate:

@@ -5,6 +5,7 @@ Images in, arrays out; files are the business of others.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -105,6 +106,15 @@ def frame_pair(left: NDArray[Any], right: NDArray[Any], rig: StereoRig, options:
         filled = fill_holes(disparity)
         guess[side] = np.where(np.isnan(disparity), _depth(filled, rig), np.float32(0.0))
     return FramePair(images=images, depth=depth, guess=guess)
+
+
+def frame_pairs(images: Images, rig: StereoRig, options: CorrectionOptions) -> tuple[FramePair, FramePair]:
+    """``frame_pair`` of frame 0 and of frame 1, side by side: the matcher itself keeps one core busy."""
+    with ThreadPoolExecutor(len(FRAMES)) as pool:
+        first, second = pool.map(
+            lambda frame: frame_pair(images["left", frame], images["right", frame], rig, options), FRAMES
+        )
+    return first, second
 
 
 def _depth(disparity: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:
@@ -219,22 +229,34 @@ def correct_frames(
 ) -> dict[View, Fused]:
     """Corrected frames of the views asked for, at the time of ``options.target_row`` of each."""
     poses = {view: row_poses(rig, shutter, motion, *view) for view in VIEWS}
-    out = {}
-    for side, frame in views:
-        other: Side = "right" if side == "left" else "left"
-        here, then = pairs[frame], pairs[1 - frame]
-        sources = [_view(here, side, poses[side, frame], Origin.HERE)]
-        if options.use_other_views:
-            sources += [
-                _view(here, other, poses[other, frame], Origin.OTHER_CAMERA),
-                _view(then, side, poses[side, 1 - frame], Origin.OTHER_FRAME),
-                _view(then, other, poses[other, 1 - frame], Origin.OTHER_FRAME),
-            ]
-        if options.guess_depth:
-            sources.append(_view(here, side, poses[side, frame], Origin.GUESSED))
+
+    def corrected(view: View) -> Fused:
+        side, frame = view
         target = rig.cam_from_world(motion, shutter.row_time(options.target_row, frame), side)
-        out[side, frame] = _finish(fuse(sources, rig.camera, target, options.warp), options)
-    return out
+        fused = fuse(_sources(pairs, view, poses, options), rig.camera, target, options.warp)
+        return _finish(fused, options)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return dict(zip(views, pool.map(corrected, views), strict=True))
+
+
+def _sources(
+    pairs: tuple[FramePair, FramePair], view: View, poses: Mapping[View, Pose], options: CorrectionOptions
+) -> list[SourceView]:
+    """The images that a corrected view is made of, in the order in which they are trusted."""
+    side, frame = view
+    other: Side = "right" if side == "left" else "left"
+    here, then = pairs[frame], pairs[1 - frame]
+    sources = [_view(here, side, poses[side, frame], Origin.HERE)]
+    if options.use_other_views:
+        sources += [
+            _view(here, other, poses[other, frame], Origin.OTHER_CAMERA),
+            _view(then, side, poses[side, 1 - frame], Origin.OTHER_FRAME),
+            _view(then, other, poses[other, 1 - frame], Origin.OTHER_FRAME),
+        ]
+    if options.guess_depth:
+        sources.append(_view(here, side, poses[side, frame], Origin.GUESSED))
+    return sources
 
 
 def _view(pair: FramePair, side: Side, poses: Pose, origin: Origin) -> SourceView:
@@ -270,21 +292,11 @@ def correct_four(
         NoMotionError: the matches determine no motion or readout ratio.
     """
     clock = _Clock(step)
-    with ThreadPoolExecutor(len(FRAMES)) as pool:
-        # Depth needs no motion: its threads fill the gaps that matching and solving leave.
-        pairs = [
-            pool.submit(frame_pair, images["left", frame], images["right", frame], rig, options)
-            for frame in FRAMES
-        ]
-        try:
-            matches = match_frames(images, options)
-            clock("matching")
-            robust, shutter, readout = solve_frames(matches, rig, readout_ratio, options)
-            clock("motion")
-        except (RsbenchError, NoMotionError):
-            pool.shutdown(cancel_futures=True)
-            raise
-        first, second = (pair.result() for pair in pairs)
+    matches = match_frames(images, options)
+    clock("matching")
+    robust, shutter, readout = solve_frames(matches, rig, readout_ratio, options)
+    clock("motion")
+    first, second = frame_pairs(images, rig, options)
     clock("depth")
     motion = motion_of(robust, options)
     frames = correct_frames((first, second), rig, shutter, motion, options)
@@ -301,7 +313,7 @@ def correct_four(
 
 
 class _Clock:
-    """Wall-clock seconds of each step; depth runs beside the first two, so its time is what is left of it."""
+    """Seconds of each step."""
 
     def __init__(self, step: Step) -> None:
         self.seconds: dict[str, float] = {}

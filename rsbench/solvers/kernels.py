@@ -32,7 +32,7 @@ BEHIND = 1e12
 
 def compiled(function: F) -> F:
     """Compile once per machine."""
-    out: F = njit(cache=True)(function)
+    out: F = njit(cache=True, nogil=True)(function)
     return out
 
 

@@ -122,7 +122,7 @@ def _warp_into(
     return warp(view.image, depth, camera, view.poses, target_pose, options=options)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _keep_landing(
     depth: NDArray[np.float32],
     rho: NDArray[np.float32],
