@@ -22,7 +22,7 @@ from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.baselines import global_shutter_motion, monocular_motion, single_camera
-from rsbench.pipeline.correct import CorrectionOptions, FramePair, correct_frames, frame_pair, match_frames
+from rsbench.pipeline.correct import CorrectionOptions, FramePair, correct_frames, frame_pairs, match_frames
 from rsbench.pipeline.footage import VIEWS, View
 from rsbench.pipeline.motion import RobustEstimate, estimate_motion
 from rsbench.pipeline.readout import select

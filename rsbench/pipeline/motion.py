@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -193,8 +193,8 @@ class _RobustProblem:
     def sample_size(self) -> tuple[int, ...]:
         return self._sizes
 
-    def generate(self, sample: IntArray, rng: np.random.Generator) -> list[MotionEstimate]:
-        return self.solver.propose(self._subset(sample), self.rig, self.shutter)
+    def generate(self, samples: IntArray) -> Iterable[list[MotionEstimate]]:
+        return self.solver.propose_all([self._subset(sample) for sample in samples], self.rig, self.shutter)
 
     def residuals(self, model: MotionEstimate) -> FloatArray:
         theta = self.packed.theta(model.w, model.d)

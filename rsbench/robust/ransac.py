@@ -7,6 +7,7 @@ Locally Optimized RANSAC, DAGM 2003.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
@@ -18,6 +19,8 @@ from rsbench.core.so3 import FloatArray
 Model = TypeVar("Model")
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
+_BATCH = 10
+"""Samples drawn at a time: a compiled solver does a batch for little more than one."""
 
 
 class Estimator(Protocol[Model]):
@@ -31,8 +34,8 @@ class Estimator(Protocol[Model]):
     def sample_size(self) -> tuple[int, ...]:
         """Data that a minimal sample takes from each group; 0 where a group is only scored."""
 
-    def generate(self, sample: IntArray, rng: np.random.Generator) -> list[Model]:
-        """Models of a minimal sample (indices); may be empty."""
+    def generate(self, samples: IntArray) -> Iterable[list[Model]]:
+        """Models of each minimal sample (b, sum(sample_size)) of indices; none where a sample gives none."""
 
     def residuals(self, model: Model) -> FloatArray:
         """Errors of all data, (sum(num_data),), in the unit of the threshold; infinite where there is none."""
@@ -157,33 +160,42 @@ def ransac(estimator: Estimator[Model], options: RansacOptions, rng: np.random.G
     best = _Best(estimator, options)
     if any(count < size for count, size in zip(counts, sizes, strict=True)):
         return _report(best, 0, f"{counts} data, a minimal sample needs {sizes}")
-    starts = np.cumsum([0, *counts[:-1]])
     needed: float = options.max_iterations
     iterations = 0
-    while iterations < max(min(needed, options.max_iterations), options.min_iterations):
+    for models in _proposals(estimator, rng):
         iterations += 1
-        sample = np.concatenate(
-            [
-                start + rng.choice(count, size, replace=False)
-                for start, count, size in zip(starts, counts, sizes, strict=True)
-            ]
-        ).astype(np.int64)
-        improved = False
-        for model in estimator.generate(sample, rng):
-            improved |= best.offer(model)
-        if improved:
+        if any([best.offer(model) for model in models]):
             _optimise(best, options.lo_steps)
-            needed = required_iterations(_sample_probability(best, starts), options.confidence)
+            needed = required_iterations(_sample_probability(best), options.confidence)
+        if iterations >= max(min(needed, options.max_iterations), options.min_iterations):
+            break
     for _ in range(options.final_steps):
         if not _step(best, 1.0):
             break
     return _report(best, iterations, "")
 
 
-def _sample_probability(best: _Best[Model], starts: NDArray[np.int64]) -> float:
+def _proposals(estimator: Estimator[Model], rng: np.random.Generator) -> Iterator[list[Model]]:
+    """Models of one random minimal sample after the other, without end."""
+    counts, sizes = estimator.num_data, estimator.sample_size
+    groups = list(zip(_starts(counts), counts, sizes, strict=True))
+    while True:
+        samples = [
+            np.concatenate([start + rng.choice(count, size, replace=False) for start, count, size in groups])
+            for _ in range(_BATCH)
+        ]
+        yield from estimator.generate(np.array(samples, dtype=np.int64))
+
+
+def _starts(counts: tuple[int, ...]) -> IntArray:
+    """Index of the first datum of each group."""
+    return np.cumsum([0, *counts[:-1]], dtype=np.int64)
+
+
+def _sample_probability(best: _Best[Model]) -> float:
     inliers = best.inliers()
     counts, sizes = best.estimator.num_data, best.estimator.sample_size
-    good = tuple(int(np.count_nonzero(inliers[s : s + n])) for s, n in zip(starts, counts, strict=True))
+    good = tuple(int(np.count_nonzero(inliers[s : s + n])) for s, n in zip(_starts(counts), counts, strict=True))
     return all_inlier_probability(good, counts, sizes)
 
 

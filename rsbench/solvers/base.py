@@ -8,7 +8,7 @@ identity motion.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -93,6 +93,12 @@ class Solver(ABC):
         """Motions that may explain a minimal sample; failures are left out."""
         estimate = self.estimate(sample, rig, shutter)
         return [estimate] if estimate.success else []
+
+    def propose_all(
+        self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
+    ) -> Iterable[list[MotionEstimate]]:
+        """``propose`` for each of several samples of equal sizes, for a solver that does many at once."""
+        return (self.propose(sample, rig, shutter) for sample in samples)
 
     def improve(
         self,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar, Literal, final
@@ -18,10 +18,11 @@ from rsbench.solvers.base import MatchSet, MotionEstimate, MotionModel, Solver
 from rsbench.solvers.eight_point import decompose_essential, eight_point
 from rsbench.solvers.five_point import five_point
 from rsbench.solvers.iterated import scaled_translation, solve_reduced
+from rsbench.solvers.minimal import solve_triples
 from rsbench.solvers.optimise import Minimum, levenberg_marquardt
 from rsbench.solvers.packed import Packed, pack
 
-_SCREEN_ITERATIONS, _SCREEN_MATCHES, _SAMPLE_ITERATIONS = 6, 150, 4
+_SCREEN_ITERATIONS, _SCREEN_MATCHES = 6, 150
 _LONGEST_START = 2.0
 """Length of d in baselines that a descent on pairs starts with at most."""
 _LEAST_IN_FRONT = 0.75
@@ -107,14 +108,23 @@ class RefinedSolver(Solver):
         return {"left": 5} if len(correspondences.left) >= len(correspondences.right) else {"right": 5}
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
-        packed = self.packed(sample, rig, shutter)
-        if len(packed.tracks) > 0:
-            found = [self._minimise(packed, np.zeros(6), _SAMPLE_ITERATIONS).theta]
-        else:
-            length = 0.5 * rig.baseline
-            found = [_signed(packed, w, length * d) for w, d in five_point(packed.pairs)]
-        motions = [packed.motion(theta) for theta in found]
-        return [MotionEstimate(w=w, d=d, success=True) for w, d in motions if np.all(np.isfinite(np.append(w, d)))]
+        (found,) = self.propose_all([sample], rig, shutter)
+        return found
+
+    def propose_all(
+        self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
+    ) -> Iterable[list[MotionEstimate]]:
+        size = len(samples[0].tracks)
+        if not self.use_pairs or (self.use_tracks and size >= 3):
+            together = Correspondences(tracks=np.concatenate([sample.tracks for sample in samples]))
+            packed = self.packed(together, rig, shutter)
+            thetas = solve_triples(packed, np.arange(len(together.tracks)).reshape(-1, size))
+            return (_finite(packed, [theta]) for theta in thetas)
+        return (self._propose_pairs(self.packed(sample, rig, shutter), rig) for sample in samples)
+
+    def _propose_pairs(self, packed: Packed, rig: StereoRig) -> list[MotionEstimate]:
+        length = 0.5 * rig.baseline
+        return _finite(packed, [_signed(packed, w, length * d) for w, d in five_point(packed.pairs)])
 
     def improve(
         self,
@@ -192,6 +202,11 @@ class RefinedSolver(Solver):
             covariance=covariance,
             noise_px=float(np.sqrt(variance)) if freedom > 0 else None,
         )
+
+
+def _finite(packed: Packed, thetas: Iterable[FloatArray]) -> list[MotionEstimate]:
+    motions = [packed.motion(theta) for theta in thetas if np.all(np.isfinite(theta))]
+    return [MotionEstimate(w=w, d=d, success=True) for w, d in motions]
 
 
 def rotation_sigma(H: FloatArray, variance: float) -> float:

@@ -6,7 +6,7 @@ constant velocity, a match that took ``a = 1 + h (y1 - y0)`` frame periods has m
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import final
 
@@ -79,6 +79,11 @@ class FlowScaledSolver(Solver):
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
         return self.inner.propose(scale_flow(sample, shutter), rig, shutter)
+
+    def propose_all(
+        self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
+    ) -> Iterable[list[MotionEstimate]]:
+        return self.inner.propose_all([scale_flow(sample, shutter) for sample in samples], rig, shutter)
 
     def improve(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,13 +36,12 @@ class LineEstimator:
     refines: int = 0
     generates: int = 0
 
-    def generate(self, sample: IntArray, rng: np.random.Generator) -> list[Line]:
-        self.generates += 1
-        (x0, y0), (x1, y1) = self.points[sample]
-        if x0 == x1:
-            return []
-        a = (y1 - y0) / (x1 - x0)
-        return [(a, y0 - a * x0)]
+    def generate(self, samples: IntArray) -> Iterator[list[Line]]:
+        for sample in samples:
+            self.generates += 1
+            (x0, y0), (x1, y1) = self.points[sample]
+            a = (y1 - y0) / (x1 - x0) if x0 != x1 else 0.0
+            yield [(a, y0 - a * x0)] if x0 != x1 else []
 
     def residuals(self, model: Line) -> FloatArray:
         return self.points[:, 1] - model[0] * self.points[:, 0] - model[1]
@@ -105,9 +105,9 @@ def test_groups_are_sampled_separately() -> None:
     seen: list[IntArray] = []
     original = estimator.generate
 
-    def generate(sample: IntArray, rng: np.random.Generator) -> list[Line]:
-        seen.append(sample)
-        return original(sample, rng)
+    def generate(samples: IntArray) -> Iterator[list[Line]]:
+        seen.extend(samples)
+        return original(samples)
 
     estimator.generate = generate  # type: ignore[method-assign]
     estimator.num_data, estimator.sample_size = (20, 20, 10), (1, 1, 0)
