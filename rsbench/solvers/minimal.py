@@ -16,7 +16,7 @@ _DAMPING = 1e-4
 
 
 def solve_triples(packed: Packed, samples: NDArray[np.int64], iterations: int = 4) -> FloatArray:
-    """Parameters (b, 6) of samples (b, k) of k >= 3 tracks; NaN where they determine no motion.
+    """Parameters (b, 6) of samples (b, k) of k >= 3 tracks; NaN where the step is not determined.
 
     Damped Gauss-Newton from no motion at all, whose first step is the linear stereo pose-from-points solution.
     A step that does not lower the cost is not taken and the damping grows.
