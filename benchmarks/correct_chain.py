@@ -25,6 +25,7 @@ import numpy as np
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.correct import (
     CorrectionOptions,
+    complete_depth,
     correct_frames,
     frame_pairs,
     match_frames,
@@ -52,8 +53,8 @@ def run(sequence: Sequence, options: CorrectionOptions) -> dict[str, tuple[float
     robust, shutter, _ = timed(
         "solve", lambda: solve_frames(matches, rig, sequence.shutter.readout_ratio, options)
     )
-    pairs = timed("depth", lambda: frame_pairs(images, rig, options))
     motion = motion_of(robust, options)
+    pairs = timed("depth", lambda: complete_depth(frame_pairs(images, rig, options), rig, shutter, motion))
     timed("correct", lambda: correct_frames(pairs, rig, shutter, motion, options))
     return times
 

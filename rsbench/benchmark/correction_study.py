@@ -18,16 +18,23 @@ from numpy.typing import NDArray
 from rsbench.benchmark.seeds import generator
 from rsbench.core.metrics import rotation_error, translation_error
 from rsbench.core.motion import LinearMotion, Motion
-from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.baselines import global_shutter_motion, monocular_motion, single_camera
-from rsbench.pipeline.correct import CorrectionOptions, FramePair, correct_frames, frame_pairs, match_frames
+from rsbench.pipeline.correct import (
+    CorrectionOptions,
+    FramePair,
+    complete_depth,
+    correct_frames,
+    frame_pairs,
+    match_frames,
+)
 from rsbench.pipeline.footage import VIEWS, View
 from rsbench.pipeline.motion import RobustEstimate, estimate_motion
 from rsbench.pipeline.readout import select
-from rsbench.vision.baselines import dense_flow, flow_depth, plane_depth
+from rsbench.vision.baselines import monocular_depth, plane_depth
 from rsbench.vision.correction import correct_frame, correction_flow
+from rsbench.vision.flow import dense_flow
 from rsbench.vision.fusion import Origin, inpaint
 from rsbench.vision.quality import psnr, ssim
 
@@ -67,7 +74,12 @@ METHODS = (
     Method(
         key="plane", title="one plane", kind="baseline", knows="our motion; the plane that fits SGM depth best"
     ),
-    Method(key="ours", title="ours", kind="ours", knows="motion and SGM depth, both estimated"),
+    Method(
+        key="ours",
+        title="ours",
+        kind="ours",
+        knows="estimated motion; SGM depth, and depth from the motion where SGM finds none",
+    ),
     Method(key="true-motion", title="true motion, SGM depth", kind="oracle", knows="true motion"),
     Method(key="true-depth", title="our motion, true depth", kind="oracle", knows="true depth"),
     Method(key="truth", title="true motion, true depth", kind="oracle", knows="true motion and depth"),
@@ -202,13 +214,13 @@ class Bench:
             if motion is None:
                 return None
             flow = dense_flow(self.images[side, frame], self.images[side, 1 - frame])
-            here, there = (row_poses(rig, self.shutter, motion, side, k) for k in (frame, 1 - frame))
-            depth = flow_depth(flow, rig.camera, here, there)
+            depth = monocular_depth(flow, rig, self.shutter, motion, side, frame)
             out[side, frame] = self._alone((side, frame), depth, rig, motion)
         return out
 
     def _whole(self, pairs: tuple[FramePair, FramePair], motion: Motion) -> dict[View, Attempt]:
         """Depth and motion of the whole rig: holes are filled from the other frames."""
+        pairs = complete_depth(pairs, self.rig, self.shutter, motion)
         fused = correct_frames(pairs, self.rig, self.shutter, motion, self.options)
         out = {}
         for (side, frame), result in fused.items():

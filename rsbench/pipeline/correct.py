@@ -28,6 +28,7 @@ from rsbench.pipeline.readout import ReadoutEstimate, estimate_readout_ratio, re
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.vision.correction import WarpOptions
 from rsbench.vision.features import MatchOptions, match_stereo_frames
+from rsbench.vision.flow import depth_from_motion
 from rsbench.vision.fusion import Fused, Origin, SourceView, fuse, inpaint
 from rsbench.vision.sky import sky_mask
 from rsbench.vision.stereo_depth import SgmOptions, fill_holes, stereo_disparities
@@ -50,6 +51,8 @@ class CorrectionOptions:
     """The time of this row of the frame is the time of its corrected image."""
     use_other_views: bool = True
     """Fill what the frame did not see from the other three."""
+    depth_from_motion: bool = True
+    """Where the other camera gives no depth, take it from the flow to the other frame and the motion."""
     guess_depth: bool = True
     """Where no depth was found, take that of the farther neighbour in the row."""
     find_sky: bool = True
@@ -115,6 +118,28 @@ def frame_pairs(images: Images, rig: StereoRig, options: CorrectionOptions) -> t
             lambda frame: frame_pair(images["left", frame], images["right", frame], rig, options), FRAMES
         )
     return first, second
+
+
+def complete_depth(
+    pairs: tuple[FramePair, FramePair], rig: StereoRig, shutter: RollingShutter, motion: Motion
+) -> tuple[FramePair, FramePair]:
+    """The same frames with depth from the motion where the other camera gave none."""
+
+    def side_depths(side: Side) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        first, second = eight_bit([pair.images[side] for pair in pairs])
+        unknown = pairs[0].depth[side] == 0.0, pairs[1].depth[side] == 0.0
+        return depth_from_motion((first, second), unknown, rig, shutter, motion, side)
+
+    with ThreadPoolExecutor(len(SIDES)) as pool:
+        found = dict(zip(SIDES, pool.map(side_depths, SIDES), strict=True))
+    first, second = (_completed(pair, {side: found[side][k] for side in SIDES}) for k, pair in enumerate(pairs))
+    return first, second
+
+
+def _completed(pair: FramePair, found: dict[Side, NDArray[np.float32]]) -> FramePair:
+    depth = {side: np.where(found[side] > 0.0, found[side], pair.depth[side]) for side in SIDES}
+    guess = {side: np.where(found[side] > 0.0, np.float32(0.0), pair.guess[side]) for side in SIDES}
+    return FramePair(images=pair.images, depth=depth, guess=guess)
 
 
 def _depth(disparity: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:
@@ -296,10 +321,12 @@ def correct_four(
     clock("matching")
     robust, shutter, readout = solve_frames(matches, rig, readout_ratio, options)
     clock("motion")
-    first, second = frame_pairs(images, rig, options)
-    clock("depth")
     motion = motion_of(robust, options)
-    frames = correct_frames((first, second), rig, shutter, motion, options)
+    pairs = frame_pairs(images, rig, options)
+    if options.depth_from_motion:
+        pairs = complete_depth(pairs, rig, shutter, motion)
+    clock("depth")
+    frames = correct_frames(pairs, rig, shutter, motion, options)
     clock("correction")
     return CorrectedFrames(
         motion=motion,

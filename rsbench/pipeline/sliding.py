@@ -18,6 +18,7 @@ from rsbench.pipeline.correct import (
     CorrectionOptions,
     FramePair,
     NoMotionError,
+    complete_depth,
     correct_frames,
     frame_pair,
     match_frames,
@@ -133,7 +134,8 @@ def _moment(
         return CorrectedMoment(number=number, images=pair.images, frames={}, robust=None, reason=reason)
     motion: Motion = motion_of(use.robust, options)
     views = tuple((side, frame) for side in SIDES)
-    fused = correct_frames(use.pairs, rig, shutter, motion, options, views)
+    pairs = complete_depth(use.pairs, rig, shutter, motion) if options.depth_from_motion else use.pairs
+    fused = correct_frames(pairs, rig, shutter, motion, options, views)
     frames = {side: fused[side, frame] for side in SIDES}
     return CorrectedMoment(number=number, images=pair.images, frames=frames, robust=use.robust, reason="")
 

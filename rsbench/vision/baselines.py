@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.epipolar import ray_depths
-from rsbench.core.se3 import Pose, compose, inverse
-from rsbench.vision.images import grey_u8
+from rsbench.core.motion import Motion
+from rsbench.core.rig import Side, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.vision.flow import flow_depth
 
 F32 = NDArray[np.float32]
 _ROUNDS = 8
@@ -43,34 +43,18 @@ def plane_depth(depth: NDArray[Any]) -> F32:
         return np.where(fitted > 0.0, 1.0 / np.maximum(fitted, 0.0), np.inf).astype(np.float32)
 
 
-def dense_flow(first: NDArray[Any], second: NDArray[Any]) -> F32:
-    """Displacement (H, W, 2), px, from ``first`` to ``second`` (H, W[, 3]), uint8 or uint16.
+def monocular_depth(
+    flow: F32, rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int
+) -> F32:
+    """Depth (H, W) of every pixel of a frame from the flow (H, W, 2) to the other one, in the motion's unit.
 
-    Kroeger et al., "Fast optical flow using dense inverse search", ECCV 2016 (OpenCV).
+    inf where the rays do not meet in front of the camera. Median-filtered in inverse depth.
     """
-    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    return np.asarray(dis.calc(grey_u8(first), grey_u8(second), None), dtype=np.float32)
-
-
-def flow_depth(flow: F32, camera: PinholeCamera, poses: Pose, other_poses: Pose) -> F32:
-    """Depth (H, W) of one moving camera's frame from the flow (H, W, 2) to its other frame.
-
-    ``poses`` and ``other_poses`` are ``cam_from_world`` of the rows of both frames; the depth is in the unit of
-    their translation. Every pixel's two rays are brought closest (the row that sees the target decides its pose);
-    a point behind either camera or with parallel rays is put at infinity. Median-filtered in inverse depth.
-    """
-    grid = camera.pixel_grid()
-    height = camera.height
-    rho = np.zeros((height, camera.width), dtype=np.float32)
-    for start in range(0, height, _CHUNK_ROWS):
-        rows = slice(start, min(start + _CHUNK_ROWS, height))
-        target = grid[rows] + flow[rows]
-        other = np.clip(np.rint(target[..., 1]), 0, height - 1).astype(np.intp)
-        from_world = inverse(Pose(poses.R[rows, None], poses.t[rows, None]))
-        relative = compose(Pose(other_poses.R[other], other_poses.t[other]), from_world)
-        z = ray_depths(relative, camera.unproject(grid[rows]), camera.unproject(target))
-        front = np.all(np.where(np.isfinite(z), z, -1.0) > 0.0, axis=-1)
-        rho[rows] = np.where(front, 1.0 / np.where(front, z[..., 0], 1.0), 0.0)
+    grid = rig.camera.pixel_grid()
+    rho = np.zeros(flow.shape[:2], dtype=np.float32)
+    for start in range(0, len(rho), _CHUNK_ROWS):
+        rows = slice(start, start + _CHUNK_ROWS)
+        rho[rows] = 1.0 / flow_depth(grid[rows], flow[rows], rig, shutter, motion, side, frame)[0]
     # One pixel near the focus of expansion must not swallow the picture.
     rho = cv2.medianBlur(np.minimum(rho, np.float32(np.quantile(rho, _NEAREST_SHARE))), 5)
     with np.errstate(divide="ignore"):
