@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar, Literal, final
 
+import cv2
 import numpy as np
 
 from rsbench.core import so3
@@ -26,6 +27,8 @@ _SCREEN_ITERATIONS, _SCREEN_MATCHES = 6, 150
 _LONGEST_START = 2.0
 """Length of d in baselines that a descent on pairs starts with at most."""
 _LEAST_IN_FRONT = 0.75
+_NEARLY_PLANAR = 0.15
+"""Share of the flow that a homography leaves, at most, for its motions to be tried; 0.2 and more off a plane."""
 _LEAST_NOISE_PX = 0.01
 """Noise assumed at least when judging whether data determine a rotation: exact data fit anything exactly."""
 
@@ -257,7 +260,30 @@ def linear_starts(packed: Packed, families: tuple[int, ...], rig: StereoRig) -> 
         if E is not None:
             pose, _ = decompose_essential(E, x0, x1)
             motions.append((so3.log(pose.R), pose.t))
+        motions += planar_motions(left)
     return [_signed_start(packed, pairs, w, d, rig) for w, d in motions]
+
+
+def planar_motions(pairs: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """``(w, d)``, d of arbitrary length and sign, that the homography of pairs (n, 7) of one camera allows.
+
+    None when the pairs are far from being on a plane. On a plane every system of linear equations above loses
+    rank. O. Faugeras, F. Lustman, Motion and structure from motion in a piecewise planar environment, 1988.
+    """
+    x, y = np.ascontiguousarray(pairs[:, :2]), np.ascontiguousarray(pairs[:, 2:4])
+    H, _ = cv2.findHomography(x, y, 0)
+    if H is None or not np.all(np.isfinite(H)):
+        return []
+    missed = np.linalg.norm(cv2.perspectiveTransform(x[:, None], H)[:, 0] - y)
+    if not missed <= _NEARLY_PLANAR * np.linalg.norm(y - x):
+        return []
+    _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.eye(3))
+    lengths = [float(np.linalg.norm(t)) for t in translations]
+    return [
+        (so3.log(R), t[:, 0])
+        for R, t, length in zip(rotations, translations, lengths, strict=True)
+        if length > 0.0
+    ]
 
 
 def _signed_start(packed: Packed, pairs: FloatArray, w: FloatArray, d: FloatArray, rig: StereoRig) -> FloatArray:

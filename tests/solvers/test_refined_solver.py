@@ -114,6 +114,19 @@ def test_yaw_and_forward_of_pairs_has_no_length() -> None:
     assert np.linalg.norm(estimate.d) <= RefinedSolver().max_translation_m * 1.001
 
 
+def test_pairs_on_a_plane_are_solved_from_the_motions_of_their_homography() -> None:
+    """Exact pairs always; with noise a plane that turns seldom leaves another motion of lower cost."""
+    lost = 0
+    for seed in range(30):
+        motion = random_motion(np.random.default_rng([5, seed]), np.radians(2.0), 0.3)
+        exact = RefinedSolver().estimate(data(motion, pairs=100, plane=True, seed=seed), RIG, SHUTTER)
+        assert_motion(exact, motion, 1e-6)
+        c = data(motion, pairs=100, plane=True, seed=seed, noise_px=0.3)
+        estimate = RefinedSolver().estimate(c, RIG, SHUTTER)
+        lost += int(np.degrees(rotation_error(estimate.w, motion.w)) > 0.3)
+    assert lost <= 3
+
+
 def test_pure_rotation_has_no_direction() -> None:
     motion = LinearMotion(np.array([0.01, -0.03, 0.02]), np.zeros(3))
     for use_tracks in (True, False):
