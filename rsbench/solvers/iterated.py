@@ -25,7 +25,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.base import MatchSet, MotionEstimate, Solver
 from rsbench.solvers.linear import null_vector, rotation_from_essential
-from rsbench.solvers.packed import Packed, pack
+from rsbench.solvers.packed import Packed, pack, pack_tracks
 
 _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -96,12 +96,32 @@ def scaled_translation(pairs: FloatArray, w: FloatArray, limit: float) -> FloatA
     return d / factor
 
 
+def length_from_tracks(tracks: FloatArray, packed: Packed, w: FloatArray, u: FloatArray) -> float | None:
+    """Signed length, metres, of a translation along u (3,) for a known rotation, from tracks (n, 8); or None.
+
+    A left-right match holds its point's inverse depth rho, so that ``y x (R x + rho s T(u)) = 0`` is linear in the
+    length s; one least-squares quotient over all tracks.
+    """
+    ones = np.ones(len(tracks))
+    x = np.column_stack([tracks[:, :2], ones])
+    y = np.column_stack([tracks[:, 3:5] / packed.focal, ones])
+    rho = tracks[:, 2] / (packed.focal[0] * packed.baseline)
+    tau0, tau1 = tracks[:, 6], tracks[:, 7]
+    R = so3.exp((tau1 - tau0)[:, None] * w)
+    turned = np.cross(y, (R @ x[:, :, None])[:, :, 0])
+    moved = rho[:, None] * np.cross(y, tau1[:, None] * u - tau0[:, None] * (R @ u))
+    squares = float(np.sum(moved * moved))
+    return -float(np.sum(moved * turned)) / squares if squares > 0.0 else None
+
+
 @final
 @dataclass(frozen=True, kw_only=True)
 class IteratedSolver(Solver):
     """Singular value decompositions with the rotation of the last pass folded in; no descent, no starts."""
 
     unknowns: Literal[9, 11, 15] = 15
+    scale: Literal["pairs", "tracks"] = "pairs"
+    """Where the length of d comes from: the pairs, by the columns of the baseline, or left-right matches."""
     passes: int = 5
     max_translation_m: float = 50.0
     """Longest translation per frame period that counts as known length."""
@@ -119,18 +139,29 @@ class IteratedSolver(Solver):
     def __post_init__(self) -> None:
         if self.passes < 1:
             raise ValueError(f"passes must be at least 1, got {self.passes}")
+        if self.scale == "tracks":
+            # The class is frozen; what it needs follows from its parameters.
+            object.__setattr__(self, "needs", frozenset[MatchSet]({"tracks"}))
+            object.__setattr__(self, "minimum", MappingProxyType({"tracks": 7}))
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         packed = pack(correspondences, rig, shutter, use_tracks=False)
-        for side, count in packed.pair_counts().items():
-            if count < self.minimum[side]:
-                return MotionEstimate.failed(f"{count} {side} matches, need {self.minimum[side]}")
+        pairs = packed.pair_counts()
+        counts = {"left": pairs["left"], "right": pairs["right"], "tracks": len(correspondences.tracks)}
+        for name, least in self.minimum.items():
+            if counts[name] < least:
+                return MotionEstimate.failed(f"{counts[name]} {name} matches, need {least}")
         solution = solve_reduced(packed.pairs, self.unknowns, self.passes)
         if isinstance(solution, str):
             return MotionEstimate.failed(solution)
         w, d = solution
+        if self.scale == "tracks":
+            length = length_from_tracks(pack_tracks(correspondences.tracks, rig, shutter), packed, w, d)
+            if length is None or not 0.0 < abs(length) <= self.max_translation_m:
+                return MotionEstimate.failed("the left-right matches do not determine the length of d")
+            return MotionEstimate(w=w, d=length * d, success=True, metric=True)
         return with_scale_and_sign(packed, w, d, self.max_translation_m)
 
 

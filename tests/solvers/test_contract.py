@@ -27,6 +27,7 @@ MODEL_ERROR = {
     "rs-stereo-linear": (2e-3, 3e-3),
     "rs-stereo-linear-symmetric": (2e-3, 3e-3),
     "rs-stereo-iterated": (1e-3, 1e-3),
+    "rs-stereo-iterated-metric": (1e-3, 1e-3),
     "gs-8pt-scaled": (5e-4, 3e-3),
     "gs-poselib-scaled": (5e-4, 3e-3),
     "gs-poselib-stereo-scaled": (5e-4, 3e-3),
