@@ -88,5 +88,6 @@ def verdict(summary: pd.DataFrame) -> pd.DataFrame:
             for name, score, gain in (("covered", "psnr_covered", "gain"), ("all", "psnr_all", "gain_all")):
                 row[f"{name}_apart"] = bool(ours[f"{score}_low"] > other[f"{score}_high"])
                 row[f"{name}_paired"] = bool(other[f"{gain}_low"] > 0.0)
+            row["flow_apart"] = bool(ours["flow_median_px_high"] < other["flow_median_px_low"])
             rows.append(row)
     return pd.DataFrame(rows)

@@ -52,7 +52,8 @@ def _table(summary: pd.DataFrame) -> str:
         "SSIM covered",
         "PSNR all (dB)",
         "SSIM all",
-        "flow (px)",
+        "flow, median (px)",
+        "flow, mean (px)",
         "own pixels",
     )
     lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
@@ -64,6 +65,7 @@ def _table(summary: pd.DataFrame) -> str:
             _with_interval(row, "ssim_covered", 3),
             _with_interval(row, "psnr_all", 2),
             f"{row['ssim_all']:.3f}",
+            _with_interval(row, "flow_median_px", 3),
             f"{row['flow_mean_px']:.3f}",
             f"{100 * row['coverage']:.1f} %",
         ]
@@ -76,7 +78,8 @@ def _table(summary: pd.DataFrame) -> str:
 
 
 def _with_interval(row: pd.Series, name: str, digits: int) -> str:
-    return f"{row[name]:.{digits}f} [{row[f'{name}_low']:.{digits}f}, {row[f'{name}_high']:.{digits}f}]"
+    value, low, high = (round(float(row[key]), digits) + 0.0 for key in (name, f"{name}_low", f"{name}_high"))
+    return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"  # + 0.0: no minus sign before zero
 
 
 def _findings(images: pd.DataFrame, summary: pd.DataFrame) -> str:
@@ -84,10 +87,11 @@ def _findings(images: pd.DataFrame, summary: pd.DataFrame) -> str:
     for _, row in loss_to_true_motion(images).iterrows():
         lines.append(
             f"- {row['stratum']}: replacing our motion by the true one on the same SGM depth gains "
-            f"{row['median_loss_db']:.3f} dB at the median view, {row['largest_loss_db']:.3f} dB at most."
+            f"{round(row['median_loss_db'], 3) + 0.0:.3f} dB at the median view, {row['largest_loss_db']:.3f} dB at most."
         )
     checked = verdict(summary)
     for column, text in (
+        ("flow_apart", "median flow error, separate intervals do not overlap"),
         ("covered_apart", "covered PSNR, separate intervals do not overlap"),
         ("covered_paired", "covered PSNR, paired difference above 0"),
         ("all_apart", "PSNR of all pixels, separate intervals do not overlap"),

@@ -103,6 +103,7 @@ def test_paired_differences_see_what_separate_intervals_do_not() -> None:
     assert not checked["covered_apart"].any() and checked["covered_paired"].all()
     far = verdict(summarise(_synthetic([value + 30.0 for value in base], base)))
     assert far["covered_apart"].all()
+    assert not far["flow_apart"].any()  # equal in the synthetic table
     equal = verdict(summarise(_synthetic(base, base)))
     assert not equal["covered_paired"].any()
 
