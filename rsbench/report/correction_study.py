@@ -87,8 +87,8 @@ def _findings(images: pd.DataFrame, summary: pd.DataFrame) -> str:
     for _, row in loss_to_true_motion(images).iterrows():
         median = round(float(row["median_loss_db"]), 3) + 0.0
         lines.append(
-            f"- {row['stratum']}: replacing our motion by the true one on the same SGM depth gains {median:.3f} dB at "
-            f"the median view, {row['largest_loss_db']:.3f} dB at most."
+            f"- {row['stratum']}: replacing our motion by the true one on the same SGM depth gains "
+            f"{median:.3f} dB at the median view, {row['largest_loss_db']:.3f} dB at most."
         )
     checked = verdict(summary)
     for column, text in (
