@@ -15,7 +15,7 @@ from rsbench.core.metrics import rotation_error, translation_error
 from rsbench.core.rig import Side
 from rsbench.dataset.files import read_json, write_json
 from rsbench.dataset.sequence import Sequence
-from rsbench.pipeline.correct import correct_frames
+from rsbench.pipeline.correct import complete_depth, correct_frames
 from rsbench.vision.correction import correct_frame
 from rsbench.vision.fusion import Origin
 from rsbench.vision.quality import psnr
@@ -49,7 +49,8 @@ def make_panels(sequence: Sequence, seed: int = 0) -> Panels:
     """
     bench = Bench(sequence, seed)
     view = SIDE, FRAME
-    fused = correct_frames(bench.sgm, bench.rig, bench.shutter, bench.motion, bench.options, (view,))[view]
+    pairs = complete_depth(bench.sgm, bench.rig, bench.shutter, bench.motion)
+    fused = correct_frames(pairs, bench.rig, bench.shutter, bench.motion, bench.options, (view,))[view]
     rolling, truth = bench.images[view], sequence.image("gs", *view)
     true_depth = sequence.depth("rs", *view)
     depth = np.where(np.isfinite(bench.sgm[FRAME].depth[SIDE]), bench.sgm[FRAME].depth[SIDE], np.float32(0.0))
