@@ -16,10 +16,11 @@ class Kind(StrEnum):
     solvers = "solvers"
     datasets = "datasets"
     sweeps = "sweeps"
+    matchers = "matchers"
 
 
 def list_(kind: Annotated[Kind, typer.Argument(help="What to list.")]) -> None:
-    """List scenes, renderers, solvers, datasets or sweeps, with the files to copy and edit."""
+    """List scenes, renderers, solvers, datasets, sweeps or matchers, with the files to copy and edit."""
     import pandas as pd
 
     from rsbench.cards import list_cards, read_toml

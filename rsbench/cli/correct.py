@@ -54,30 +54,35 @@ def correct(
     solver: Annotated[
         str, typer.Option(help="Card of a refined solver: rs-stereo-refined or rs-stereo-refined-twist.")
     ] = "rs-stereo-refined",
+    matcher: Annotated[str, typer.Option(help="Card of the stereo matcher that finds depth.")] = "sgm",
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
 ) -> None:
     """Correct your own rolling-shutter stereo frames: two times of a rig, or a whole sequence."""
     from rsbench.errors import RsbenchError
     from rsbench.pipeline.correct import CorrectionOptions, NoMotionError
     from rsbench.pipeline.footage import read_rig_card
+    from rsbench.vision.matcher_card import load_matcher
 
     if rig is None or out is None:
         raise RsbenchError(f"--{'rig' if rig is None else 'out'}: is required")
     card = read_rig_card(rig)
     options = CorrectionOptions(
-        use_other_views=fill, find_sky=sky, inpaint=inpaint, seed=seed, solver=_solver(solver)
+        use_other_views=fill,
+        find_sky=sky,
+        inpaint=inpaint,
+        seed=seed,
+        solver=_solver(solver),
+        sgm=load_matcher(matcher),
     )
+    four = frames is not None and len(frames) == 4 and not (left or right)
+    if not four and (frames or not (left and right)):
+        count = f"{len(frames)} images; " if frames else ""
+        raise RsbenchError(f"frames: {count}give LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right")
     try:
         if frames:
-            if left or right or len(frames) != 4:
-                raise RsbenchError(
-                    f"frames: {len(frames)} images; give LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right"
-                )
             _correct_four(frames, card, out, target, options)
         elif left and right:
             _correct_sequence(left, right, card, out, target, options)
-        else:
-            raise RsbenchError("frames: give four images LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right")
     except NoMotionError as error:
         typer.echo(f"rsbench: not corrected: {error}", err=True)
         raise typer.Exit(1) from None

@@ -24,14 +24,21 @@ def evaluate(
     correct_with: Annotated[
         str, typer.Option(help="Solver whose motion the correction uses.")
     ] = "rs-stereo-refined",
+    matcher: Annotated[str, typer.Option(help="Card of the stereo matcher.")] = "sgm",
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
 ) -> None:
     """Pose, depth and correction against the truth of a dataset, with a report."""
-    evaluate_dataset(folder, out, solver, correct_with, seed)
+    evaluate_dataset(folder, out, solver, correct_with, seed, matcher=matcher)
 
 
 def evaluate_dataset(
-    folder: Path, out: Path, solvers: list[str] | None, correct_with: str, seed: int, command: str | None = None
+    folder: Path,
+    out: Path,
+    solvers: list[str] | None,
+    correct_with: str,
+    seed: int,
+    command: str | None = None,
+    matcher: str = "sgm",
 ) -> Path:
     """Evaluate with a progress bar, print the tables, and return the path of the report."""
     from rsbench.benchmark.evaluate import evaluation_steps, run_evaluation
@@ -39,11 +46,14 @@ def evaluate_dataset(
     from rsbench.cli.console import print_table, progress_bar
     from rsbench.report.evaluation import summary_tables, write_report
     from rsbench.solvers.registry import list_solvers
+    from rsbench.vision.matcher_card import load_matcher
 
     # rs-stereo is another name of rs-stereo-refined: one row of it is enough.
     everything = [name for name in list_solvers() if name != "rs-stereo"]
     chosen = tuple(dict.fromkeys([*(solvers or everything), correct_with]))
-    options = EvaluationOptions(solvers=chosen, correction_solver=correct_with, seed=seed)
+    options = EvaluationOptions(
+        solvers=chosen, correction_solver=correct_with, seed=seed, sgm=load_matcher(matcher)
+    )
     command = command or f"rsbench evaluate {folder} --out {out}"
     with progress_bar(f"evaluating {folder.name}", evaluation_steps(folder, options)) as advance:
         run_evaluation(folder, out, options, command, advance)
