@@ -36,6 +36,7 @@ from rsbench.vision.baselines import monocular_depth, plane_depth
 from rsbench.vision.correction import correct_frame, correction_flow
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.fusion import Origin, inpaint
+from rsbench.vision.legacy_quality import flip, ssim_deepunroll, ssim_uniform
 from rsbench.vision.quality import psnr, ssim
 
 Mask = NDArray[np.bool_]
@@ -250,9 +251,23 @@ def _image_rows(sequence: Sequence, view: View, attempts: dict[str, Attempt]) ->
                 "flow_known": float(np.mean(known)),
                 "coverage": float(np.mean(attempt.covered)),
                 "common": float(np.mean(common)),
+                **_extra_scores(attempt.image, truth, common, view == VIEWS[0]),
             }
         )
     return rows
+
+
+def _extra_scores(image: NDArray[Any], truth: NDArray[Any], common: Mask, wanted: bool) -> dict[str, float]:
+    """Slow scores, of one view per sequence: FLIP on covered pixels and all, SSIM by the protocols of others."""
+    names = ("flip_covered", "flip_all", "ssim_deepunroll", "ssim_uniform")
+    if not wanted:
+        return dict.fromkeys(names, float("nan"))
+    errors = flip(image, truth)
+    if errors is None:
+        errors = np.full(common.shape, np.nan)
+    covered = float(np.mean(errors[common])) if np.any(common) else float("nan")
+    scores = covered, float(np.mean(errors)), ssim_deepunroll(image, truth), ssim_uniform(image, truth)
+    return dict(zip(names, scores, strict=True))
 
 
 def _band_rows(attempts: dict[str, Attempt]) -> list[Row]:

@@ -15,7 +15,18 @@ from rsbench.benchmark.correction_study import METHODS
 from rsbench.benchmark.summary import bootstrap_interval
 from rsbench.core.so3 import FloatArray
 
-SCORES = ("psnr_covered", "ssim_covered", "psnr_all", "ssim_all", "flow_mean_px", "flow_median_px", "coverage")
+EXTRA = ("flip_covered", "flip_all", "ssim_deepunroll", "ssim_uniform")
+"""Scores of the first view of a sequence only."""
+SCORES = (
+    "psnr_covered",
+    "ssim_covered",
+    "psnr_all",
+    "ssim_all",
+    "flow_mean_px",
+    "flow_median_px",
+    "coverage",
+    *EXTRA,
+)
 
 
 def _median(values: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ from rsbench.dataset.files import read_json
 from rsbench.dataset.sequence import Sequence
 from rsbench.vision.correction import Corrected, correct_frame
 from rsbench.vision.quality import psnr, ssim
-from rsbench.vision.stereo_depth import depth_metrics
+from rsbench.vision.stereo_depth import depth_metrics, seen_by_other
 
 Row = dict[str, Any]
 
@@ -67,14 +67,20 @@ def pose_errors(sequence: Sequence, answer: Row) -> dict[str, float]:
 
 
 def score_depth(sequence: Sequence, folder: Path) -> list[Row]:
-    """One row per view: SGM depth against the truth, in the row's own camera."""
+    """Rows per view: SGM depth against the truth, in the row's own camera.
+
+    Over all surface pixels, those that the other camera sees, and those that it does not.
+    """
     disparities = load_arrays(folder / "disparity.npz")
     rows = []
     for side, frame in VIEWS:
         truth = sequence.depth("rs", side, frame)
         estimate = depth_of(disparities[f"{side}_{frame}"], sequence.rig)
-        scores = depth_metrics(estimate, truth, sequence.rig)
-        rows.append({"sequence": sequence.name, "side": side, "frame": frame, **scores})
+        other: Side = "right" if side == "left" else "left"
+        seen = seen_by_other(truth, sequence.depth("rs", other, frame), sequence.rig, side)
+        for name, part in (("all", None), ("visible", seen), ("occluded", ~seen)):
+            scores = depth_metrics(estimate, truth, sequence.rig, part)
+            rows.append({"sequence": sequence.name, "side": side, "frame": frame, "pixels": name, **scores})
     return rows
 
 

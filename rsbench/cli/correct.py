@@ -66,14 +66,8 @@ def correct(
     if rig is None or out is None:
         raise RsbenchError(f"--{'rig' if rig is None else 'out'}: is required")
     card = read_rig_card(rig)
-    options = CorrectionOptions(
-        use_other_views=fill,
-        find_sky=sky,
-        inpaint=inpaint,
-        seed=seed,
-        solver=_solver(solver),
-        sgm=load_matcher(matcher),
-    )
+    cards = {"solver": _solver(solver), "sgm": load_matcher(matcher)}
+    options = CorrectionOptions(use_other_views=fill, find_sky=sky, inpaint=inpaint, seed=seed, **cards)
     four = frames is not None and len(frames) == 4 and not (left or right)
     if not four and (frames or not (left and right)):
         count = f"{len(frames)} images; " if frames else ""

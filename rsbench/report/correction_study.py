@@ -54,6 +54,7 @@ def _table(summary: pd.DataFrame) -> str:
         "SSIM all",
         "flow, median (px)",
         "flow, mean (px)",
+        "FLIP covered",
         "own pixels",
     )
     lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
@@ -67,6 +68,7 @@ def _table(summary: pd.DataFrame) -> str:
             f"{row['ssim_all']:.3f}",
             _with_interval(row, "flow_median_px", 3),
             f"{row['flow_mean_px']:.3f}",
+            _with_interval(row, "flip_covered", 4),
             f"{100 * row['coverage']:.1f} %",
         ]
         if row["failures"]:

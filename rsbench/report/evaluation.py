@@ -68,10 +68,15 @@ def _pose_table(out: Path) -> SummaryTable:
 
 def _depth_table(out: Path) -> SummaryTable:
     scores = read_scores(out, "depth")
-    mean = scores.drop(columns=["side", "frame"]).groupby("sequence", as_index=False).mean()
-    note = "SGM depth of the rolling-shutter pairs against the truth on surface pixels, mean of the four frames."
+    mean = (
+        scores.drop(columns=["side", "frame"]).groupby(["sequence", "pixels"], as_index=False, sort=False).mean()
+    )
+    note = (
+        "SGM depth of the rolling-shutter pairs against the truth on surface pixels, mean of the four frames: "
+        "all of them, those that the other camera sees (visible), and those that it does not."
+    )
     names = {"median_m": "median (m)", "over_2m": "> 2 m", "bad_1px": "> 1 px", "coverage": "coverage"}
-    brief = mean[["sequence", *names]].rename(columns=names)
+    brief = mean[["sequence", "pixels", *names]].rename(columns=names)
     return SummaryTable(title="Depth (SGM)", note=note, frame=mean, brief=brief)
 
 

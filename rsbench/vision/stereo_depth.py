@@ -228,9 +228,26 @@ def fill_holes(disparity: F32, max_width: int | None = None) -> F32:
     return np.where(known, disparity, np.where(fits, guess, np.nan)).astype(np.float32)
 
 
-def depth_metrics(estimate: NDArray[Any], truth: NDArray[Any], rig: StereoRig) -> dict[str, float]:
+def seen_by_other(depth: NDArray[Any], other_depth: NDArray[Any], rig: StereoRig, side: Side) -> NDArray[np.bool_]:
+    """Pixels (H, W) whose point the other camera sees too, from the true depth of both, metres.
+
+    It does when its own disparity at that place is the same to a pixel: nothing nearer hides the point, which lies
+    inside the picture. A rolling shutter changes nothing: both cameras read a row at the same time.
+    """
+    sign = 1.0 if side == "left" else -1.0
+    disparity, other = (np.nan_to_num(rig.disparity(z)) for z in (depth, other_depth))
+    partner = np.rint(np.arange(depth.shape[1]) - sign * disparity).astype(np.int64)
+    inside = (disparity > 0.0) & (partner >= 0) & (partner < depth.shape[1])
+    there = np.take_along_axis(other, np.clip(partner, 0, depth.shape[1] - 1), axis=1)
+    return inside & (np.abs(there - disparity) <= 1.0)
+
+
+def depth_metrics(
+    estimate: NDArray[Any], truth: NDArray[Any], rig: StereoRig, part: NDArray[np.bool_] | None = None
+) -> dict[str, float]:
     """Errors of a depth map (H, W), metres, over the surface pixels of ``truth`` (finite and positive).
 
+    ``part`` (H, W) restricts it to some of them.
     ``coverage`` is the share of surface pixels with an estimate (finite and positive); the errors are over these:
     ``median_m`` and ``rmse_m`` of the absolute depth error, ``over_2m`` the share beyond 2 m (the paper's figure),
     ``bad_1px`` .. ``bad_3px`` the share beyond that disparity error. NaN where no pixel counts. Raises ValueError
@@ -239,6 +256,8 @@ def depth_metrics(estimate: NDArray[Any], truth: NDArray[Any], rig: StereoRig) -
     if estimate.shape != truth.shape:
         raise ValueError(f"estimate must have the shape of truth, {truth.shape}, got {estimate.shape}")
     surface = np.isfinite(truth) & (truth > 0.0)
+    if part is not None:
+        surface &= part
     known = surface & np.isfinite(estimate) & (estimate > 0.0)
     depth, true_depth = estimate[known].astype(np.float64), truth[known].astype(np.float64)
     error = np.abs(depth - true_depth)

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.rig import StereoRig
+from rsbench.core.rig import Side, StereoRig
 from rsbench.vision.disparity_refinement import refine_disparity
 from rsbench.vision.stereo_depth import (
     SgmOptions,
     depth_metrics,
     disparity_range,
     fill_holes,
+    seen_by_other,
     stereo_disparities,
     stereo_disparity,
 )
@@ -85,6 +86,24 @@ def test_a_band_that_the_other_camera_misses_is_unknown(scene: Any, pair: Pair) 
     assert np.mean(np.isfinite(right)[columns + true_right > 321]) < 0.02
     # OpenCV alone would leave out as many columns as there are disparities.
     assert np.mean(np.isfinite(left)[(columns - true_left > 2) & (columns < 60)]) > 0.9
+
+
+def test_a_square_before_a_wall_hides_the_band_that_geometry_says() -> None:
+    """Disparity 30 before 10: the left camera sees 20 columns left of the square that the right one does not."""
+    square = {"left": slice(100, 150), "right": slice(70, 120)}
+    depth = {}
+    for side, columns in square.items():
+        disparity = np.full((40, 200), 10.0)
+        disparity[10:30, columns] = 30.0
+        depth[side] = RIG.depth(disparity)
+    depth["left"][0], depth["right"][0] = np.nan, np.nan  # sky
+    hidden = {"left": (slice(80, 100), slice(0, 10)), "right": (slice(120, 140), slice(190, 200))}
+    sides: tuple[Side, Side] = ("left", "right")
+    for side, other in (sides, sides[::-1]):
+        expected = np.ones((40, 200), dtype=np.bool_)
+        band, outside = hidden[side]
+        expected[10:30, band], expected[:, outside], expected[0] = False, False, False
+        np.testing.assert_array_equal(seen_by_other(depth[side], depth[other], RIG, side), expected)
 
 
 @pytest.mark.parametrize("mode", ["sgbm", "hh", "3way", "hh4"])
