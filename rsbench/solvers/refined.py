@@ -27,6 +27,8 @@ _SCREEN_ITERATIONS, _SCREEN_MATCHES = 6, 150
 _LONGEST_START = 2.0
 """Length of d in baselines that a descent on pairs starts with at most."""
 _LEAST_IN_FRONT = 0.75
+_AS_GOOD, _APART = 3.0, 25.0
+"""Two motions fit alike within so many standard deviations, and are two beyond so many squared ones."""
 _NEARLY_PLANAR = 0.15
 """Share of the flow that a homography leaves, at most, for its motions to be tried; 0.2 and more off a plane."""
 _LEAST_NOISE_PX = 0.01
@@ -102,7 +104,7 @@ class RefinedSolver(Solver):
         best = self._descend(packed, rig)
         if best is None:
             return MotionEstimate.failed("no start found: degenerate motion or scene")
-        return self.report(packed, best)
+        return self.report(packed, *self._settle(packed, best, rig))
 
     def sample_sizes(self, correspondences: Correspondences) -> dict[MatchSet, int]:
         """Three tracks, else five matches of the camera that has more of them."""
@@ -140,7 +142,7 @@ class RefinedSolver(Solver):
         packed = self.packed(correspondences, rig, shutter)
         start = packed.theta(motion.w, motion.d)
         if not quick:
-            return self.report(packed, self._checked(packed, start))
+            return self.report(packed, *self._settle(packed, self._checked(packed, start), rig))
         w, d = packed.motion(self._minimise(packed, start, _SCREEN_ITERATIONS).theta)
         return MotionEstimate(w=w, d=d, success=True)
 
@@ -177,10 +179,24 @@ class RefinedSolver(Solver):
             return self._minimise(packed, flipped, self.iterations)
         return best
 
-    def report(self, packed: Packed, best: Minimum) -> MotionEstimate:
-        """Estimate with covariance and what the data leave open."""
+    def _settle(self, packed: Packed, best: Minimum, rig: StereoRig) -> tuple[Minimum, bool]:
+        """The lowest of the minima that pairs of a plane allow, and whether another one fits as well."""
+        if len(packed.tracks) > 0:
+            return best, False
+        left = packed.pairs[packed.pairs[:, 6] > 0.0]
+        starts = [_signed_start(packed, packed.pairs, w, d, rig) for w, d in planar_motions(left)]
+        found = sorted([best, *(self._checked(packed, start) for start in starts)], key=lambda each: each.cost)
+        lowest, variance = found[0], max(noise_variance(packed, found[0]), _LEAST_NOISE_PX**2)
+        for other in found[1:]:
+            step = other.theta - lowest.theta
+            if step @ lowest.H @ step > _APART * variance and _as_good(packed, lowest, other):
+                return lowest, True
+        return lowest, False
+
+    def report(self, packed: Packed, best: Minimum, rival: bool = False) -> MotionEstimate:
+        """Estimate with covariance and what the data leave open; ``rival``: another motion fits as well."""
         freedom = packed.constraints - 6
-        variance = 2.0 * best.cost / freedom if freedom > 0 else 0.0
+        variance = noise_variance(packed, best)
         if rotation_sigma(best.H, max(variance, _LEAST_NOISE_PX**2)) > self.max_rotation_sigma:
             return MotionEstimate.failed("the rotation is not determined: degenerate matches")
         w, d = packed.motion(best.theta)
@@ -192,9 +208,11 @@ class RefinedSolver(Solver):
         metric = linked or (scale_sigma <= self.max_scale_sigma and not at_limit)
         # Without parallax, noise looks like translation, but half of the points come out behind the cameras.
         in_front = linked or packed.in_front(best.theta) >= _LEAST_IN_FRONT * len(packed.pairs)
-        direction_known = in_front and direction_sigma <= self.max_direction_sigma
+        direction_known = in_front and direction_sigma <= self.max_direction_sigma and not rival
         reasons = [] if metric else ["the length of d is not determined by these matches"]
-        reasons += [] if direction_known else ["the direction of d is not determined: too little translation"]
+        if not direction_known:
+            why = "another motion explains these matches as well (a plane)" if rival else "too little translation"
+            reasons.append(f"the direction of d is not determined: {why}")
         return MotionEstimate(
             w=w,
             d=d,
@@ -210,6 +228,21 @@ class RefinedSolver(Solver):
 def _finite(packed: Packed, thetas: Iterable[FloatArray]) -> list[MotionEstimate]:
     motions = [packed.motion(theta) for theta in thetas if np.all(np.isfinite(theta))]
     return [MotionEstimate(w=w, d=d, success=True) for w, d in motions]
+
+
+def _as_good(packed: Packed, best: Minimum, other: Minimum) -> bool:
+    """Whether the pairs do not prefer one of two motions: each sees another component of the noise of a pair.
+
+    Q. Vuong, Likelihood ratio tests for model selection and non-nested hypotheses, Econometrica 1989.
+    """
+    squares = packed.pair_residuals(other.theta) ** 2 - packed.pair_residuals(best.theta) ** 2
+    return float(np.sum(squares)) <= _AS_GOOD * float(np.std(squares)) * np.sqrt(len(squares))
+
+
+def noise_variance(packed: Packed, best: Minimum) -> float:
+    """Variance (px^2) of a coordinate that the residuals show; 0 without more equations than unknowns."""
+    freedom = packed.constraints - 6
+    return 2.0 * best.cost / freedom if freedom > 0 else 0.0
 
 
 def rotation_sigma(H: FloatArray, variance: float) -> float:

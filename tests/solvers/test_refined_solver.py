@@ -127,6 +127,21 @@ def test_pairs_on_a_plane_are_solved_from_the_motions_of_their_homography() -> N
     assert lost <= 3
 
 
+def test_a_second_motion_that_a_plane_allows_is_told() -> None:
+    """Pure translation before a plane: two motions fit as well, and half of the time the other one fits better."""
+    wrong = 0
+    for seed in range(20):
+        motion = random_motion(np.random.default_rng([5, seed]), 0.0, 0.3)
+        c = data(motion, pairs=100, plane=True, seed=seed, noise_px=0.3)
+        estimate = RefinedSolver().estimate(c, RIG, SHUTTER)
+        if np.degrees(rotation_error(estimate.w, motion.w)) > 0.5:
+            wrong += 1
+            assert not estimate.direction_known and "another motion" in estimate.reason
+        scattered = RefinedSolver().estimate(data(motion, pairs=100, seed=seed, noise_px=0.3), RIG, SHUTTER)
+        assert scattered.direction_known and "another motion" not in scattered.reason
+    assert wrong > 0
+
+
 def test_pure_rotation_has_no_direction() -> None:
     motion = LinearMotion(np.array([0.01, -0.03, 0.02]), np.zeros(3))
     for use_tracks in (True, False):
