@@ -64,6 +64,11 @@ class Packed:
         left = int(np.count_nonzero(self.pairs[:, 6] > 0.0))
         return {"left": left, "right": len(self.pairs) - left}
 
+    def larger_side(self) -> FloatArray:
+        """The pairs (n, 7) of the camera that has more of them."""
+        left = self.pairs[:, 6] > 0.0
+        return self.pairs[left if 2 * np.count_nonzero(left) >= len(left) else ~left]
+
     def subset(self, most: int) -> Packed:
         """At most about ``most`` evenly chosen pairs and tracks, for choosing among starts."""
         step_p, step_t = max(1, len(self.pairs) // most), max(1, len(self.tracks) // most)

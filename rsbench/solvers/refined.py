@@ -183,8 +183,7 @@ class RefinedSolver(Solver):
         """The lowest of the minima that pairs of a plane allow, and whether another one fits as well."""
         if len(packed.tracks) > 0:
             return best, False
-        left = packed.pairs[packed.pairs[:, 6] > 0.0]
-        starts = [_signed_start(packed, packed.pairs, w, d, rig) for w, d in planar_motions(left)]
+        starts = [_signed_start(packed, packed.pairs, w, d, rig) for w, d in planar_motions(packed.larger_side())]
         found = sorted([best, *(self._checked(packed, start) for start in starts)], key=lambda each: each.cost)
         lowest, variance = found[0], max(noise_variance(packed, found[0]), _LEAST_NOISE_PX**2)
         for other in found[1:]:
@@ -293,7 +292,7 @@ def linear_starts(packed: Packed, families: tuple[int, ...], rig: StereoRig) -> 
         if E is not None:
             pose, _ = decompose_essential(E, x0, x1)
             motions.append((so3.log(pose.R), pose.t))
-        motions += planar_motions(left)
+    motions += planar_motions(packed.larger_side())
     return [_signed_start(packed, pairs, w, d, rig) for w, d in motions]
 
 
@@ -303,6 +302,8 @@ def planar_motions(pairs: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
     None when the pairs are far from being on a plane. On a plane every system of linear equations above loses
     rank. O. Faugeras, F. Lustman, Motion and structure from motion in a piecewise planar environment, 1988.
     """
+    if len(pairs) < 4:
+        return []
     x, y = np.ascontiguousarray(pairs[:, :2]), np.ascontiguousarray(pairs[:, 2:4])
     H, _ = cv2.findHomography(x, y, 0)
     if H is None or not np.all(np.isfinite(H)):
