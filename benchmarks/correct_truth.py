@@ -1,10 +1,13 @@
 """What correction costs when depth and motion are true: geometry, and resampling.
 
-Geometry: every pixel of the corrected frame says which pixel of the rolling-shutter frame it shows; the exact
-answer is the row equation of the true point. Image: what is left against the rendered truth, beside what
-resampling a global-shutter image by the same sub-pixel shifts leaves. For that, images are rendered with the
-principal point shifted by quarters of a pixel in x and y and resampled back; each pixel takes the one whose shift
-is nearest to its own in the corrected frame.
+Geometry: the flow takes every pixel of the rolling-shutter frame to its place in the corrected one; the exact
+place is the projection of its true point. Backwards, every pixel of the corrected frame says which pixel of the
+rolling-shutter frame it shows; the exact answer is the row equation of the point that a global-shutter depth map
+sees there, which the correction has to guess from the depth of the neighbouring pixels.
+
+Image: what is left against the rendered truth, beside what resampling a global-shutter image by the same sub-pixel
+shifts leaves. For that, images are rendered with the principal point shifted by quarters of a pixel in x and y and
+resampled back; each pixel takes the one whose shift is nearest to its own in the corrected frame.
 
     python benchmarks/correct_truth.py --data data/paper --sequence castle
 """
@@ -23,7 +26,7 @@ from numpy.typing import NDArray
 
 from rsbench.cards import load_card
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.projection import rs_project_near
+from rsbench.core.projection import back_project, project_at, rs_project_near
 from rsbench.core.rig import Side
 from rsbench.core.se3 import Pose
 from rsbench.dataset.card import load_dataset_card
@@ -34,7 +37,7 @@ from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import render_global
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.load import load_scene
-from rsbench.vision.correction import Corrected, correct_frame
+from rsbench.vision.correction import Corrected, correct_frame, correction_flow
 from rsbench.vision.quality import psnr
 from rsbench.vision.resample import resample
 
@@ -62,6 +65,16 @@ def visible(sequence: Sequence, corrected: Corrected) -> tuple[NDArray[np.float6
     inside = np.all((near >= 1) & (near <= limit - 1), axis=-1)
     mask = (depth > 0) & np.isfinite(seen.depth) & same & clear & inside
     return np.linalg.norm(corrected.source_map - seen.pixels, axis=-1), mask
+
+
+def flow_errors(sequence: Sequence) -> NDArray[np.float64]:
+    """Errors (n,), px, of the flow of all surface pixels of the rolling-shutter frame."""
+    depth, grid = sequence.depth("rs", SIDE, FRAME), sequence.rig.camera.pixel_grid()
+    geometry = sequence.rig, sequence.shutter, sequence.motion
+    flow = correction_flow(depth, *geometry, SIDE, FRAME)
+    points = back_project(*geometry, SIDE, FRAME, grid, depth)
+    exact = project_at(sequence.rig, sequence.motion, SIDE, float(FRAME), points)[..., :2] - grid
+    return np.asarray(np.linalg.norm(flow - exact, axis=-1)[depth > 0])
 
 
 def flat(depth: NDArray[np.float32], reach: int = 3) -> Mask:
@@ -112,6 +125,8 @@ def main() -> None:
     corrected = correct_frame(rolling, depth, *geometry, SIDE, FRAME, sky_mask=depth == 0)
     error, mask = visible(sequence, corrected)
     write = sys.stdout.write
+    flow = flow_errors(sequence)
+    write(f"flow of {len(flow)} surface pixels: at most {np.max(flow):.1e} px\n")
     write(f"{sequence.name}: {np.count_nonzero(mask)} visible pixels clear of depth edges, ")
     write(f"{100 * np.mean(corrected.mask[mask]):.3f} % of them covered\n")
     known = error[mask & corrected.mask]
