@@ -30,14 +30,15 @@ def simulate(
         list[str] | None, typer.Option(help="Solver card instead of the sweep's; repeatable.")
     ] = None,
     change: Annotated[
-        list[str] | None, typer.Option("--set", help="FIELD=VALUE of the card's [setting] to replace; repeatable.")
+        list[str] | None, typer.Option("--set", help="FIELD=VALUE to replace in the card's setting; repeatable.")
     ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of every trial instead of the card's.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
 ) -> None:
     """Simulate points seen by a moving rolling-shutter rig, solve for its motion, and tabulate the errors."""
     from rsbench.benchmark.sweeps import load_sweep, with_options
 
-    card = with_options(load_sweep(sweep), solver, trials)
+    card = with_options(load_sweep(sweep), solver, trials, seed)
     if change:
         card = card.with_setting(**_changes(change))
     table = run_and_summarise(card, out, workers, f"rsbench simulate {sweep} --out {out}")

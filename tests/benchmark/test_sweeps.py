@@ -111,6 +111,7 @@ def test_bad_cards_are_refused_in_one_line(changes: dict[str, Any], parts: list[
 def test_command_line_options_are_checked_like_cards() -> None:
     assert with_options(parse(), ["rs-stereo-linear"], 7).trials == 7
     assert with_options(parse(), None, None) == parse()
+    assert with_options(parse(), None, None, 5).seed == 5
     with pytest.raises(RsbenchError, match="solvers must be different names"):
         with_options(parse(), ["gs-8pt", "gs-8pt"], None)
     with pytest.raises(RsbenchError, match="unknown key 'pints'"):
