@@ -63,7 +63,10 @@ METHODS = (
     Method(key="gyro", title="rotation only, true", kind="baseline", knows="true rotation, as of a perfect gyro"),
     Method(key="rotation", title="rotation only, estimated", kind="baseline", knows="our rotation; no depth"),
     Method(
-        key="gs", title="GS motion, SGM depth", kind="baseline", knows="motion solved as if the shutter was global"
+        key="gs",
+        title="GS motion, SGM depth",
+        kind="baseline",
+        knows="motion solved as if the shutter was global; depth as ours, with that motion",
     ),
     Method(
         key="mono",
@@ -81,7 +84,7 @@ METHODS = (
         kind="ours",
         knows="estimated motion; SGM depth, and depth from the motion where SGM finds none",
     ),
-    Method(key="true-motion", title="true motion, SGM depth", kind="oracle", knows="true motion"),
+    Method(key="true-motion", title="true motion, SGM depth", kind="oracle", knows="true motion; depth as ours"),
     Method(key="true-depth", title="our motion, true depth", kind="oracle", knows="true depth"),
     Method(key="truth", title="true motion, true depth", kind="oracle", knows="true motion and depth"),
 )

@@ -21,7 +21,7 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench reproduce sweeps --out results                   [dim](results/sweeps: limits, degeneracies)[/dim]
 
-  rsbench reproduce fig4 --out results --data data         [dim](renders 21 sequences first: half an hour)[/dim]"""
+  rsbench reproduce fig4 --out results --data data         [dim](renders 21 sequences first: minutes)[/dim]"""
 _OTHER_SWEEPS = ("solvers", "limit", "degenerate", "planar", "outliers", "wrong-readout", "wrong-motion")
 
 

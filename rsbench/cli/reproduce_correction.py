@@ -94,10 +94,11 @@ def sgm(out: Path, data: Path) -> None:
 
     folder = out / "sgm"
     folder.mkdir(parents=True, exist_ok=True)
+    for card in dict.fromkeys(card for card, _ in _SGM):
+        _generate(card, data)
     rows = []
     with progress_bar("matching", len(_SGM) * len(TIMINGS)) as advance:
         for card, name in _SGM:
-            _generate(card, data)
             sequence = read_sequence(data / card / name)
             left, depth = sequence.image("rs", "left", 0), sequence.depth("rs", "left", 0)
             for timing in TIMINGS:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.sgm_study import DELAYS
@@ -37,7 +38,18 @@ def sgm_page(table: pd.DataFrame) -> str:
         opposite_low=100 * opposite["coverage"].min(),
         opposite_high=100 * opposite["coverage"].max(),
         tolerable=_tolerable(delayed),
+        **_underestimate(delayed),
     )
+
+
+def _underestimate(delayed: pd.DataFrame) -> dict[str, Any]:
+    """Where the first-order formula, with the matcher's own error, falls short most."""
+    floors = delayed[delayed["delay"] == 0.0].set_index(["stratum", "sequence"])["error_px"]
+    later = delayed[delayed["delay"] > 0.0]
+    floor = floors.loc[list(zip(later["stratum"], later["sequence"], strict=True))].to_numpy()
+    ratio = later["error_px"] / np.hypot(later["predicted_px"], floor)
+    worst = later.loc[ratio.idxmax()]
+    return {"short_factor": ratio.max(), "short_where": f"{worst['stratum']}, {worst['sequence']}"}
 
 
 def _tolerable(delayed: pd.DataFrame) -> str:

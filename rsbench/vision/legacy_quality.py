@@ -8,40 +8,38 @@ on 8-bit images without a mask, whether the estimate is rounded or not, for ours
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.so3 import FloatArray
+from rsbench.vision.quality import ssim_map, to_unit
 
 _SIZE, _SIGMA = 11, 1.5
 _UNIFORM = 7
-_C1, _C2 = 0.01**2, 0.03**2
 
 
 def ssim_deepunroll(estimate: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
     """SSIM of images (H, W[, C]) with DeepUnrollNet's window, centred at 5.5 of 0 ... 10; all windows count."""
     window = np.exp(-((np.arange(_SIZE) - _SIZE / 2) ** 2) / (2 * _SIGMA**2))
     window /= window.sum()
-    # It is applied without mirroring, as a network's convolution; so does sepFilter2D.
-    return float(
-        np.mean(
-            _ssim(
-                estimate,
-                truth,
-                lambda image: cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_CONSTANT),
-            )
-        )
-    )
+
+    def mean(image: FloatArray) -> FloatArray:
+        # Not mirrored, as a network's convolution.
+        filtered = cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(filtered).reshape(image.shape)
+
+    return float(np.mean(ssim_map(to_unit(estimate), to_unit(truth), mean)))
 
 
 def ssim_uniform(estimate: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
     """SSIM of images (H, W[, C]) over the 7 x 7 uniform windows inside the image, with the sample covariance."""
     rim, count = _UNIFORM // 2, _UNIFORM**2
-    scores = _ssim(estimate, truth, lambda image: cv2.blur(image, (_UNIFORM, _UNIFORM)), count / (count - 1))
+
+    def mean(image: FloatArray) -> FloatArray:
+        return np.asarray(cv2.blur(image, (_UNIFORM, _UNIFORM))).reshape(image.shape)
+
+    scores = ssim_map(to_unit(estimate), to_unit(truth), mean, count / (count - 1))
     return float(np.mean(scores[rim:-rim, rim:-rim]))
 
 
@@ -58,15 +56,3 @@ def flip(estimate: NDArray[np.uint8], truth: NDArray[np.uint8]) -> FloatArray | 
     images = [np.ascontiguousarray(image, dtype=np.float32) / np.float32(255.0) for image in (truth, estimate)]
     errors, _, _ = evaluate(*images, "LDR", applyMagma=False)
     return np.asarray(errors, dtype=np.float64).reshape(truth.shape[:2])
-
-
-def _ssim(
-    estimate: NDArray[np.uint8], truth: NDArray[np.uint8], mean: Callable[[Any], Any], factor: float = 1.0
-) -> FloatArray:
-    """Local SSIM, with ``factor`` on variances and covariance."""
-    a, b = (image.astype(np.float64) / 255.0 for image in (estimate, truth))
-    mean_a, mean_b = mean(a), mean(b)
-    var_a, var_b = factor * (mean(a * a) - mean_a * mean_a), factor * (mean(b * b) - mean_b * mean_b)
-    covariance = factor * (mean(a * b) - mean_a * mean_b)
-    luminance = (2.0 * mean_a * mean_b + _C1) / (mean_a * mean_a + mean_b * mean_b + _C1)
-    return np.asarray(luminance * (2.0 * covariance + _C2) / (var_a + var_b + _C2))

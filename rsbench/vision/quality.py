@@ -11,6 +11,7 @@ scored under the same mask.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -46,7 +47,7 @@ def ssim(estimate: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.bool_] | 
     a, b = _pair(estimate, truth, mask)
     if not np.any(windows):
         return math.nan
-    return float(np.mean(_ssim_map(a, b)[windows]))
+    return float(np.mean(ssim_map(a, b, _blur)[windows]))
 
 
 def window_mask(size: tuple[int, ...], mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
@@ -56,12 +57,17 @@ def window_mask(size: tuple[int, ...], mask: NDArray[np.bool_] | None) -> NDArra
     return cv2.erode(covered, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0).astype(np.bool_)
 
 
-def _ssim_map(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Local SSIM (H, W[, C]); meaningful where the window lies inside the image."""
-    mean_a, mean_b = _blur(a), _blur(b)
-    var_a = _blur(a * a) - mean_a * mean_a
-    var_b = _blur(b * b) - mean_b * mean_b
-    covariance = _blur(a * b) - mean_a * mean_b
+def ssim_map(
+    a: FloatArray, b: FloatArray, mean: Callable[[FloatArray], FloatArray], factor: float = 1.0
+) -> FloatArray:
+    """Local SSIM (H, W[, C]) of images in [0, 1].
+
+    ``mean`` averages an image over the window of every pixel; ``factor`` multiplies variances and covariance.
+    """
+    mean_a, mean_b = mean(a), mean(b)
+    var_a = factor * (mean(a * a) - mean_a * mean_a)
+    var_b = factor * (mean(b * b) - mean_b * mean_b)
+    covariance = factor * (mean(a * b) - mean_a * mean_b)
     luminance = (2.0 * mean_a * mean_b + _C1) / (mean_a * mean_a + mean_b * mean_b + _C1)
     return luminance * (2.0 * covariance + _C2) / (var_a + var_b + _C2)
 
@@ -78,10 +84,11 @@ def _pair(
         raise ValueError(f"images must have one shape (H, W) or (H, W, C), got {estimate.shape} and {truth.shape}")
     if mask is not None and (mask.shape != truth.shape[:2] or mask.dtype != np.bool_):
         raise ValueError(f"mask must be bool of shape {truth.shape[:2]}, got {mask.dtype} {mask.shape}")
-    return _unit(estimate), _unit(truth)
+    return to_unit(estimate), to_unit(truth)
 
 
-def _unit(image: NDArray[Any]) -> FloatArray:
+def to_unit(image: NDArray[Any]) -> FloatArray:
+    """Image as float64; integers are divided by the largest of their type."""
     if image.dtype in (np.uint8, np.uint16):
         return image.astype(np.float64) / np.iinfo(image.dtype).max
     if np.issubdtype(image.dtype, np.floating):

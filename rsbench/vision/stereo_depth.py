@@ -71,6 +71,13 @@ class SgmOptions:
             raise ValueError(f"nearest_depth must be positive metres, got {self.nearest_depth}")
         if not self.least_disparity > 0.0:
             raise ValueError(f"least_disparity must be positive, got {self.least_disparity}")
+        if not self.consistency_px > 0.0:
+            raise ValueError(f"consistency_px must be positive, got {self.consistency_px}")
+        if not 0 <= self.uniqueness_percent <= 100:
+            raise ValueError(f"uniqueness_percent must lie in [0, 100], got {self.uniqueness_percent}")
+        for name in ("prefilter_cap", "speckle_window", "speckle_range"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
         if not 0 < self.p1 <= self.p2:
             raise ValueError(f"p1 and p2 must satisfy 0 < p1 <= p2, got {self.p1} and {self.p2}")
         if self.refine_iterations < 0:

@@ -21,9 +21,22 @@ def test_the_default_card_states_the_defaults() -> None:
     assert load_matcher("sgm") == SgmOptions()
 
 
-def test_a_wrong_value_is_named(tmp_path: Path) -> None:
-    card = tmp_path / "even.toml"
-    card.write_text('description = "x"\n[sgm]\nblock_size = 4\n', "utf-8")
-    with pytest.raises(RsbenchError, match="block_size must be odd") as caught:
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("block_size = 4", "block_size must be odd"),
+        ("consistency_px = -1.0", "consistency_px must be positive"),
+        ("uniqueness_percent = 500", "uniqueness_percent must lie in"),
+        ("prefilter_cap = -3", "prefilter_cap must be at least 0"),
+        ("speckle_window = -5", "speckle_window must be at least 0"),
+        ("speckle_range = -5", "speckle_range must be at least 0"),
+        ("consistency_px = nan", "must be finite"),
+        ("blok_size = 3", "unknown key"),
+    ],
+)
+def test_a_wrong_value_is_named(tmp_path: Path, line: str, message: str) -> None:
+    card = tmp_path / "wrong.toml"
+    card.write_text(f'description = "x"\n[sgm]\n{line}\n', "utf-8")
+    with pytest.raises(RsbenchError, match=message) as caught:
         load_matcher(card)
     assert "\n" not in str(caught.value)
