@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.pipeline.correct import (
+from rsbench.pipeline.chain import (
     CorrectionOptions,
     complete_depth,
     correct_frames,

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rsbench.benchmark.simulation import SimulationOptions, random_motion, simulate
+from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.sequence import read_dataset
-from rsbench.pipeline.correct import CorrectionOptions, match_frames
+from rsbench.pipeline.chain import CorrectionOptions, match_frames
 from rsbench.pipeline.footage import VIEWS
 from rsbench.pipeline.readout import estimate_readout_ratio
 

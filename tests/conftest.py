@@ -12,7 +12,7 @@ def smoke_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset of datasets/smoke.toml, rendered once per test run."""
     # Imported here, so that a broken part does not stop the tests of the others.
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.generate import generate_dataset
+    from rsbench.dataset.generation import generate_dataset
 
     folder = tmp_path_factory.mktemp("smoke") / "smoke"
     generate_dataset(load_dataset_card("smoke"), folder)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import rsbench
-from rsbench.benchmark.simulation import SimulationOptions, simulate
+from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.cards import CardKind, list_cards, load_card, read_toml
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.metrics import rotation_error, translation_error
@@ -25,7 +25,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import load_dataset_card
 from rsbench.renderers.options import RendererOptions
-from rsbench.solvers.registry import list_solvers, load_solver, load_solver_card
+from rsbench.solvers.engine.registry import list_solvers, load_solver, load_solver_card
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "rsbench").rglob("*.py"))

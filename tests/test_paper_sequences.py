@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rsbench.benchmark.evaluate import read_scores, run_evaluation
-from rsbench.benchmark.predict import EvaluationOptions
+from rsbench.benchmark.images.evaluation import read_scores, run_evaluation
+from rsbench.benchmark.images.predict import EvaluationOptions
 from rsbench.cards import load_card
 from rsbench.core.projection import row_poses
 from rsbench.dataset.card import load_dataset_card
-from rsbench.dataset.generate import generate_dataset
-from rsbench.dataset.verify import verify_dataset
+from rsbench.dataset.generation import generate_dataset
+from rsbench.dataset.verification import verify_dataset
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import render
 from rsbench.renderers.scene import MitsubaScene

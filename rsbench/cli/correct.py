@@ -9,7 +9,7 @@ import typer
 
 if TYPE_CHECKING:
     from rsbench.core.shutter import RollingShutter
-    from rsbench.pipeline.correct import CorrectionOptions
+    from rsbench.pipeline.chain import CorrectionOptions
     from rsbench.pipeline.footage import FrameSource, RigCard
     from rsbench.pipeline.readout import ReadoutEstimate
     from rsbench.pipeline.sliding import CorrectedMoment
@@ -59,7 +59,7 @@ def correct(
 ) -> None:
     """Correct your own rolling-shutter stereo frames: two times of a rig, or a whole sequence."""
     from rsbench.errors import RsbenchError
-    from rsbench.pipeline.correct import CorrectionOptions, NoMotionError
+    from rsbench.pipeline.chain import CorrectionOptions, NoMotionError
     from rsbench.pipeline.footage import read_rig_card
     from rsbench.vision.matcher_card import load_matcher
 
@@ -84,8 +84,8 @@ def correct(
 
 def _solver(name: str) -> Any:
     from rsbench.errors import RsbenchError
+    from rsbench.solvers.engine.registry import load_solver
     from rsbench.solvers.refined import RefinedSolver
-    from rsbench.solvers.registry import load_solver
 
     solver = load_solver(name)
     if not isinstance(solver, RefinedSolver):
@@ -112,9 +112,10 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
     from dataclasses import replace
 
     from rsbench.cli.console import progress_bar
-    from rsbench.pipeline.correct import correct_four
+    from rsbench.dataset.corrected_frames import fresh_folder, motion_record, rig_record, write_frame, write_record
+    from rsbench.pipeline.chain import correct_four
     from rsbench.pipeline.footage import read_four
-    from rsbench.report.correct import card_of, fresh_folder, motion_record, rig_record, write_frame, write_record
+    from rsbench.report.corrected_page import card_of
 
     order = (("left", 0), ("right", 0), ("left", 1), ("right", 1))
     images = read_four(dict(zip(order, paths, strict=True)))  # type: ignore[arg-type]
@@ -144,7 +145,7 @@ def _page(
     motion: dict[str, Any] | None,
     cards: list[Any],
 ) -> None:
-    from rsbench.report.correct import write_page
+    from rsbench.report.corrected_page import write_page
 
     facts = [("readout ratio", _readout(shutter, readout))]
     if motion is not None:
@@ -174,9 +175,9 @@ def _correct_sequence(
 
     from rsbench.cli.console import progress_bar
     from rsbench.core.shutter import RollingShutter
+    from rsbench.dataset.corrected_frames import fresh_folder, rig_record, write_record
     from rsbench.pipeline.footage import FrameSource
     from rsbench.pipeline.sliding import correct_sequence, estimate_sequence_readout
-    from rsbench.report.correct import fresh_folder, rig_record, write_record
 
     left, right = FrameSource(left_path), FrameSource(right_path)
     height, width = next(iter(left)).shape[:2]
@@ -207,7 +208,8 @@ def _write_moments(
     folder: Path, moments: Any, left: FrameSource, options: CorrectionOptions, advance: Any
 ) -> tuple[list[dict[str, Any]], list[Any]]:
     """Write every corrected time; returns what motion.json says of each, and some for the page."""
-    from rsbench.report.correct import card_of, motion_record, write_frame
+    from rsbench.dataset.corrected_frames import motion_record, write_frame
+    from rsbench.report.corrected_page import card_of
 
     every = max(left.count // _PAGE_FRAMES, 1)
     records: list[dict[str, Any]] = []

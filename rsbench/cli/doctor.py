@@ -10,7 +10,7 @@ def doctor() -> None:
     import pandas as pd
 
     from rsbench.cli.console import print_table
-    from rsbench.renderers.doctor import doctor_report
+    from rsbench.renderers.diagnosis import doctor_report
 
     rows = [{"component": row.component, "status": row.status, "detail": row.detail} for row in doctor_report()]
     print_table("rsbench doctor", pd.DataFrame(rows))

@@ -41,11 +41,11 @@ def evaluate_dataset(
     matcher: str = "sgm",
 ) -> Path:
     """Evaluate with a progress bar, print the tables, and return the path of the report."""
-    from rsbench.benchmark.evaluate import evaluation_steps, run_evaluation
-    from rsbench.benchmark.predict import EvaluationOptions
+    from rsbench.benchmark.images.evaluation import evaluation_steps, run_evaluation
+    from rsbench.benchmark.images.predict import EvaluationOptions
     from rsbench.cli.console import print_table, progress_bar
-    from rsbench.report.evaluation import summary_tables, write_report
-    from rsbench.solvers.registry import list_solvers
+    from rsbench.report.evaluation_page import summary_tables, write_report
+    from rsbench.solvers.engine.registry import list_solvers
     from rsbench.vision.matcher_card import load_matcher
 
     # rs-stereo is another name of rs-stereo-refined: one row of it is enough.

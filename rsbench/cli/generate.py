@@ -31,7 +31,7 @@ def generate(
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.generate import STEPS, generate_dataset
+    from rsbench.dataset.generation import STEPS, generate_dataset
     from rsbench.renderers.backend import start_backend
 
     dataset = load_dataset_card(card)

@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from rsbench import __version__
-from rsbench.cli import cards, correct, demo, doctor, evaluate, generate, reproduce, simulate, solve, verify
+from rsbench.cli import correct, demo, doctor, evaluate, generate, reproduce, simulate, solve, verify
+from rsbench.cli import list_cards as cards
 from rsbench.errors import RsbenchError
 
 app = typer.Typer(

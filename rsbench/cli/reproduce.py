@@ -75,7 +75,7 @@ def _correction(target: Target, out: Path, data: Path) -> None:
 def _images(out: Path, data: Path) -> None:
     from rsbench.cli.evaluate import evaluate_dataset
     from rsbench.cli.generate import generate
-    from rsbench.report.evaluation import publish
+    from rsbench.report.evaluation_page import publish
 
     generate("paper", data / "paper", None, workers=1)
     evaluation = data / "paper-evaluation"
@@ -85,7 +85,7 @@ def _images(out: Path, data: Path) -> None:
 
 def _simulate(name: str, points: int | None, data: Path, workers: int | None, command: str) -> pd.DataFrame:
     """Summary of a sweep, with another number of matches per camera if given; its trials stay in ``data``."""
-    from rsbench.benchmark.sweeps import load_sweep
+    from rsbench.benchmark.simulated.sweep_card import load_sweep
     from rsbench.cli.simulate import run_and_summarise
 
     card = load_sweep(name)
@@ -97,9 +97,8 @@ def _simulate(name: str, points: int | None, data: Path, workers: int | None, co
 
 def _fig3(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.benchmark.provenance import provenance
-    from rsbench.benchmark.run_sweep import write_table
-    from rsbench.benchmark.sweeps import load_sweep
-    from rsbench.dataset.files import write_bytes, write_json
+    from rsbench.benchmark.simulated.sweep_card import load_sweep
+    from rsbench.dataset.files import write_bytes, write_json, write_table
     from rsbench.report.fig3 import SWEEPS, draw_fig3, fig3_page, setting_table
 
     folder = out / "fig3"
@@ -119,10 +118,9 @@ def _fig3(out: Path, data: Path, workers: int | None) -> None:
 
 def _sweeps(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.benchmark.provenance import provenance
-    from rsbench.benchmark.run_sweep import write_table
-    from rsbench.benchmark.sweeps import load_sweep
-    from rsbench.dataset.files import write_bytes, write_json
-    from rsbench.report.sweeps import sweeps_page
+    from rsbench.benchmark.simulated.sweep_card import load_sweep
+    from rsbench.dataset.files import write_bytes, write_json, write_table
+    from rsbench.report.sweep_pages import sweeps_page
 
     folder = out / "sweeps"
     folder.mkdir(parents=True, exist_ok=True)
@@ -136,11 +134,10 @@ def _sweeps(out: Path, data: Path, workers: int | None) -> None:
 
 
 def _claims(out: Path, data: Path, workers: int | None) -> None:
-    from rsbench.benchmark.claims import judge_claims
     from rsbench.benchmark.provenance import provenance
-    from rsbench.benchmark.run_sweep import write_table
-    from rsbench.dataset.files import write_bytes, write_json
-    from rsbench.report.claims import claims_page
+    from rsbench.benchmark.studies.claims import judge_claims
+    from rsbench.dataset.files import write_bytes, write_json, write_table
+    from rsbench.report.claims_page import claims_page
     from rsbench.report.fig3 import SWEEPS, read_summaries
 
     folder = out / "claims"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 if TYPE_CHECKING:
-    from rsbench.benchmark.sgm_study import Timing
+    from rsbench.benchmark.studies.sgm_timing import Timing
 
 STRATA = ("mild", "moderate", "aggressive")
 SCENES = ("castle", "old-town", "room")
@@ -19,12 +19,11 @@ _SGM = (("mild", "castle-2"), ("moderate", "castle-2"), ("mild", "room-3"), ("mo
 
 def fig4(out: Path, data: Path) -> None:
     """The six panels of the paper's Figure 4 in every scene, for its motion and two larger ones."""
-    from rsbench.benchmark.correction_summary import numbers_table
-    from rsbench.benchmark.fig4_panels import load_panels, make_panels, save_panels
     from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.run_sweep import write_table
+    from rsbench.benchmark.studies.correction_summary import numbers_table
+    from rsbench.benchmark.studies.fig4_panels import load_panels, make_panels, save_panels
     from rsbench.cli.console import progress_bar
-    from rsbench.dataset.files import write_json
+    from rsbench.dataset.files import write_json, write_table
     from rsbench.dataset.sequence import read_sequence
     from rsbench.report.fig4 import draw_fig4
 
@@ -51,13 +50,12 @@ def correction(out: Path, data: Path) -> None:
     """Baselines, ours and oracles on the three strata."""
     import pandas as pd
 
-    from rsbench.benchmark.correction_study import study_dataset, study_steps
-    from rsbench.benchmark.correction_summary import summarise, summarise_bands
     from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.run_sweep import write_table
+    from rsbench.benchmark.studies.correction_study import study_dataset, study_steps
+    from rsbench.benchmark.studies.correction_summary import summarise, summarise_bands
     from rsbench.cli.console import progress_bar
-    from rsbench.dataset.files import write_json
-    from rsbench.report.correction_study import write_study
+    from rsbench.dataset.files import write_json, write_table
+    from rsbench.report.correction_page import write_study
 
     folder = out / "correction"
     folder.mkdir(parents=True, exist_ok=True)
@@ -85,12 +83,11 @@ def sgm(out: Path, data: Path) -> None:
     import pandas as pd
 
     from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.run_sweep import write_table
-    from rsbench.benchmark.sgm_study import TIMINGS, compare
+    from rsbench.benchmark.studies.sgm_timing import TIMINGS, compare
     from rsbench.cli.console import progress_bar
-    from rsbench.dataset.files import read_png, write_json
+    from rsbench.dataset.files import read_png, write_json, write_table
     from rsbench.dataset.sequence import read_sequence
-    from rsbench.report.sgm_study import write_sgm_page
+    from rsbench.report.sgm_page import write_sgm_page
 
     folder = out / "sgm"
     folder.mkdir(parents=True, exist_ok=True)
@@ -124,7 +121,7 @@ def _generate(card: str, data: Path) -> None:
 
 
 def _render_right(card: str, name: str, timing: Timing, path: Path) -> None:
-    from rsbench.benchmark.sgm_study import right_row_poses
+    from rsbench.benchmark.studies.sgm_timing import right_row_poses
     from rsbench.cards import load_card
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.files import write_png

@@ -10,7 +10,7 @@ import typer
 if TYPE_CHECKING:
     import pandas as pd
 
-    from rsbench.benchmark.sweeps import SweepCard
+    from rsbench.benchmark.simulated.sweep_card import SweepCard
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -36,7 +36,7 @@ def simulate(
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
 ) -> None:
     """Simulate points seen by a moving rolling-shutter rig, solve for its motion, and tabulate the errors."""
-    from rsbench.benchmark.sweeps import load_sweep, with_options
+    from rsbench.benchmark.simulated.sweep_card import load_sweep, with_options
 
     card = with_options(load_sweep(sweep), solver, trials, seed)
     if change:
@@ -51,8 +51,8 @@ def run_and_summarise(card: SweepCard, out: Path, workers: int | None, command: 
     import os
 
     from rsbench.benchmark.provenance import provenance
-    from rsbench.benchmark.run_sweep import run_sweep, sweep_steps
-    from rsbench.benchmark.summary import summarise_sweep
+    from rsbench.benchmark.simulated.run_sweep import run_sweep, sweep_steps
+    from rsbench.benchmark.simulated.sweep_summary import summarise_sweep
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.files import write_json
 

@@ -37,9 +37,9 @@ def solve(
 
     import numpy as np
 
-    from rsbench.pipeline.motion import RobustOptions
     from rsbench.pipeline.problem import read_problem, solve_problem
-    from rsbench.solvers.registry import load_solver
+    from rsbench.pipeline.robust_motion import RobustOptions
+    from rsbench.solvers.engine.registry import load_solver
 
     chosen = load_solver(solver)
     options = RobustOptions()

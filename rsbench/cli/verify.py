@@ -23,7 +23,7 @@ def verify(
 
     from rsbench.cli.console import print_table, progress_bar
     from rsbench.dataset.files import read_json
-    from rsbench.dataset.verify import verification_steps, verify_dataset
+    from rsbench.dataset.verification import verification_steps, verify_dataset
 
     with progress_bar("verifying", verification_steps(read_json(folder / "dataset.json"))) as advance:
         reports = verify_dataset(folder, stride, advance)

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+MATCH_SETS = ("left", "right", "stereo_0", "stereo_1", "tracks")
 POSE_COLUMNS = "row,tau,qw,qx,qy,qz,tx,ty,tz"
 
 
@@ -138,3 +144,28 @@ def read_poses(path: Path) -> tuple[FloatArray, Pose]:
     if not np.all(np.isfinite(table)) or not np.array_equal(table[:, 0], np.arange(len(table))):
         raise RsbenchError(f"{path}: rows must be numbered 0, 1, ... with finite numbers")
     return table[:, 1], Pose(so3.from_quaternion(table[:, 2:6]), table[:, 6:9])
+
+
+def save_matches(path: Path, matches: Correspondences) -> None:
+    save_arrays(path, {name: getattr(matches, name) for name in MATCH_SETS})
+
+
+def load_matches(path: Path) -> Correspondences:
+    return Correspondences(**load_arrays(path))
+
+
+def save_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    """Compressed npz, written atomically."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    with np.load(path, allow_pickle=False) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+def write_table(path: Path, frame: pd.DataFrame) -> None:
+    """CSV with enough digits to compare runs and few enough to read."""
+    write_bytes(path, frame.to_csv(index=False, float_format="%.6g", lineterminator="\n").encode())

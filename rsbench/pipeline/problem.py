@@ -16,9 +16,9 @@ from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
-from rsbench.pipeline.motion import RobustOptions, estimate_motion
-from rsbench.solvers.base import Solver
-from rsbench.solvers.packed import track_pairs
+from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.engine.base import Solver
+from rsbench.solvers.engine.packed import track_pairs
 
 _COLUMNS = {
     "left": "x0, y0, x1, y1",

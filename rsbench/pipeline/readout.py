@@ -17,9 +17,9 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.motion import RobustEstimate, RobustOptions, estimate_motion
-from rsbench.solvers.optimise import levenberg_marquardt
-from rsbench.solvers.packed import Packed, pack
+from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions, estimate_motion
+from rsbench.solvers.engine.optimise import levenberg_marquardt
+from rsbench.solvers.engine.packed import Packed, pack
 from rsbench.solvers.refined import RefinedSolver
 
 COARSE = (0.0, 0.25, 0.5, 0.75, 1.0)

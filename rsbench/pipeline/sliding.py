@@ -14,7 +14,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
-from rsbench.pipeline.correct import (
+from rsbench.pipeline.chain import (
     CorrectionOptions,
     FramePair,
     NoMotionError,
@@ -26,8 +26,8 @@ from rsbench.pipeline.correct import (
     solve_frames,
 )
 from rsbench.pipeline.footage import FrameSource, check_alike
-from rsbench.pipeline.motion import RobustEstimate
 from rsbench.pipeline.readout import ReadoutEstimate, estimate_readout_ratio
+from rsbench.pipeline.robust_motion import RobustEstimate
 from rsbench.vision.fusion import Fused
 
 _READOUT_WINDOWS = 5
@@ -62,7 +62,7 @@ def estimate_sequence_readout(
     """Readout ratio of a sequence: the weighted mean of its first windows.
 
     Raises:
-        RsbenchError: as ``rsbench.pipeline.correct.match_frames``.
+        RsbenchError: as ``rsbench.pipeline.chain.match_frames``.
         NoMotionError: no window determines it.
     """
     estimates = []

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from rsbench.benchmark.claims import OURS, READINGS, Centre
-from rsbench.benchmark.sweeps import Setting, SweepCard
+from rsbench.benchmark.simulated.sweep_card import Setting, SweepCard
+from rsbench.benchmark.studies.claims import OURS, READINGS, Centre
 from rsbench.errors import RsbenchError
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.benchmark.fig4_panels import Panels
+from rsbench.benchmark.studies.fig4_panels import Panels
 from rsbench.report import pictures
 from rsbench.report.pictures import Image
 

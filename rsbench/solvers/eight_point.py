@@ -16,8 +16,8 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.base import MatchSet, MotionEstimate, Solver
-from rsbench.solvers.packed import temporal_pairs
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.packed import temporal_pairs
 
 _ROUNDING = 1e-10
 

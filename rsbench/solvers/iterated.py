@@ -23,9 +23,9 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.packed import Packed, pack, pack_tracks
 from rsbench.solvers.linear import null_vector, rotation_from_essential
-from rsbench.solvers.packed import Packed, pack, pack_tracks
 
 _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 

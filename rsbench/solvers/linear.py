@@ -16,8 +16,8 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.base import MatchSet, MotionEstimate, Solver
-from rsbench.solvers.packed import pack, temporal_pairs
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.packed import pack, temporal_pairs
 
 _ROUNDING = 1e-10
 """Below this, relative to the largest, a column norm or singular value of A is rounding. Exact data of the

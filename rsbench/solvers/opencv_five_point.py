@@ -15,9 +15,9 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.base import MatchSet, MotionEstimate, Solver
 from rsbench.solvers.eight_point import decompose_essential
-from rsbench.solvers.packed import temporal_pairs
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.packed import temporal_pairs
 
 
 @final

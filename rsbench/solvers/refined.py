@@ -15,13 +15,13 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.base import MatchSet, MotionEstimate, MotionModel, Solver
 from rsbench.solvers.eight_point import decompose_essential, eight_point
-from rsbench.solvers.five_point import five_point
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, MotionModel, Solver
+from rsbench.solvers.engine.five_point import five_point
+from rsbench.solvers.engine.minimal import solve_triples
+from rsbench.solvers.engine.optimise import Minimum, levenberg_marquardt
+from rsbench.solvers.engine.packed import Packed, pack
 from rsbench.solvers.iterated import scaled_translation, solve_reduced
-from rsbench.solvers.minimal import solve_triples
-from rsbench.solvers.optimise import Minimum, levenberg_marquardt
-from rsbench.solvers.packed import Packed, pack
 
 _SCREEN_ITERATIONS, _SCREEN_MATCHES = 6, 150
 _LONGEST_START = 2.0

@@ -17,8 +17,8 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
-from rsbench.solvers.base import MatchSet, MotionEstimate, Solver
-from rsbench.solvers.registry import load_solver
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.registry import load_solver
 
 _LEAST_DURATION = 0.05
 """Frame periods; a shorter one means a jump of nearly the whole image upwards, which no flow survives."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsbench.benchmark.simulation import SimulationOptions, random_motion, simulate
+from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter

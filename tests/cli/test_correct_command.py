@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
+from rsbench.dataset.corrected_frames import MASK_VALUES, fresh_folder
 from rsbench.dataset.files import read_depth, read_png
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.report.correct import MASK_VALUES, fresh_folder
 
 ORDER = ("left_0", "right_0", "left_1", "right_1")
 

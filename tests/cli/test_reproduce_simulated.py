@@ -10,15 +10,15 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from rsbench.benchmark import run_sweep, sweeps
+from rsbench.benchmark.simulated import run_sweep, sweep_card
 from rsbench.cli.reproduce import Target, reproduce
 from rsbench.report.fig3 import SWEEPS
 
 
 def test_claims_and_figure_come_from_the_stored_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    complete = sweeps.load_sweep
+    complete = sweep_card.load_sweep
 
-    def short(name: str) -> sweeps.SweepCard:
+    def short(name: str) -> sweep_card.SweepCard:
         card = complete(name)
         return replace(card, trials=3, values=(card.values[0], card.values[-1]))
 
@@ -27,7 +27,7 @@ def test_claims_and_figure_come_from_the_stored_tables(tmp_path: Path, monkeypat
             run_sweep._run_job(job)
             yield job.part
 
-    monkeypatch.setattr(sweeps, "load_sweep", short)
+    monkeypatch.setattr(sweep_card, "load_sweep", short)
     monkeypatch.setattr(run_sweep, "_run_all", run_here)  # starting processes would take most of the time
     out, data = tmp_path / "results", tmp_path / "data"
     reproduce(Target.claims, out, data, workers=2)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rsbench.benchmark.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.pipeline.motion import RobustOptions, estimate_motion
 from rsbench.pipeline.readout import (
     estimate_readout_ratio,
     reversed_in_time,
@@ -18,6 +17,7 @@ from rsbench.pipeline.readout import (
     select,
     truncated_cost,
 )
+from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.5)

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsbench.benchmark.simulation import SimulationOptions, simulate
+from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
-from rsbench.pipeline.motion import RobustOptions
 from rsbench.pipeline.problem import link_tracks, parse_problem, read_problem, solve_problem
-from rsbench.solvers.registry import load_solver
+from rsbench.pipeline.robust_motion import RobustOptions
+from rsbench.solvers.engine.registry import load_solver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from rsbench.errors import RsbenchError
-from rsbench.renderers import backend, doctor, llvm, verdicts
+from rsbench.renderers import backend, diagnosis, llvm, verdicts
 from rsbench.renderers.backend import Backend, start_backend
 from rsbench.renderers.llvm import Candidate, Verdict
 
@@ -270,7 +270,7 @@ def test_without_a_driver_cuda_costs_no_process(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_doctor_reports_and_outlives_everything_broken(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = {row.component: row for row in doctor.doctor_report()}
+    rows = {row.component: row for row in diagnosis.doctor_report()}
     assert rows["scalar_rgb"].status == "ok" and rows["OpenEXR works"].status == "ok"
     assert {"python", "mitsuba", "processor", "threads", "llvm_ad_rgb", "cuda_ad_rgb"} <= set(rows)
 
@@ -279,9 +279,9 @@ def test_doctor_reports_and_outlives_everything_broken(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(llvm, "run_child", broken)
     monkeypatch.setattr(llvm, "candidates", broken)
-    monkeypatch.setattr(doctor, "probe_cuda", broken)
+    monkeypatch.setattr(diagnosis, "probe_cuda", broken)
     monkeypatch.setattr(importlib.metadata, "version", broken)
-    broken_rows = doctor.doctor_report()
+    broken_rows = diagnosis.doctor_report()
     assert sum(row.status == "fail" for row in broken_rows) >= 4
     assert any("everything is broken" in row.detail for row in broken_rows)
 

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rsbench.benchmark.claims import READINGS
-from rsbench.benchmark.sweeps import load_sweep
+from rsbench.benchmark.simulated.sweep_card import load_sweep
+from rsbench.benchmark.studies.claims import READINGS
 from rsbench.errors import RsbenchError
 from rsbench.report.fig3 import SWEEPS, draw_fig3, setting_table
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rsbench.benchmark.fig4_panels import Panels, load_panels, make_panels, save_panels
+from rsbench.benchmark.studies.fig4_panels import Panels, load_panels, make_panels, save_panels
 from rsbench.dataset.sequence import read_dataset
 from rsbench.report.fig4 import caption, draw_fig4, few_colours, panel_images
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rsbench.benchmark.simulation import Simulation, SimulationOptions, simulate
+from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, simulate
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.metrics import rotation_error, translation_error, translation_of_offset
@@ -13,8 +13,8 @@ from rsbench.core.motion import MOTION_MODELS
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.base import MotionEstimate, Solver
-from rsbench.solvers.registry import list_solvers, load_solver
+from rsbench.solvers.engine.base import MotionEstimate, Solver
+from rsbench.solvers.engine.registry import list_solvers, load_solver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 ROLLING = RollingShutter(height=900, readout_ratio=0.8)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rsbench.benchmark.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.metrics import rotation_error, scale_error, translation_error, translation_of_offset
@@ -15,7 +15,7 @@ from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
-from rsbench.solvers.registry import load_solver
+from rsbench.solvers.engine.registry import load_solver
 from rsbench.solvers.scaled import FlowScaledSolver, scale_flow
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rsbench.benchmark.simulation import SimulationOptions, random_motion, simulate
+from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
@@ -19,11 +19,11 @@ from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat
-from rsbench.solvers.base import Solver
 from rsbench.solvers.eight_point import EightPointSolver, decompose_essential, eight_point
+from rsbench.solvers.engine.base import Solver
+from rsbench.solvers.engine.packed import pack
 from rsbench.solvers.iterated import IteratedSolver, length_from_tracks, reduced_blocks, scaled_translation
 from rsbench.solvers.linear import LinearSolver, null_vector, rotation_from_essential, system_rows
-from rsbench.solvers.packed import pack
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)

@@ -7,15 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsbench.benchmark.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.base import MotionModel
-from rsbench.solvers.minimal import damped_step, solve_triples
-from rsbench.solvers.optimise import levenberg_marquardt
-from rsbench.solvers.packed import pack, theta_of
+from rsbench.solvers.engine.base import MotionModel
+from rsbench.solvers.engine.minimal import damped_step, solve_triples
+from rsbench.solvers.engine.optimise import levenberg_marquardt
+from rsbench.solvers.engine.packed import pack, theta_of
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)

@@ -15,10 +15,10 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
-from rsbench.solvers import registry
-from rsbench.solvers.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine import registry
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.registry import list_solvers, load_solver, load_solver_card
 from rsbench.solvers.linear import LinearSolver
-from rsbench.solvers.registry import list_solvers, load_solver, load_solver_card
 
 
 class _Nothing(Solver):
@@ -85,7 +85,7 @@ def test_parameters_come_from_the_card(tmp_path: Path) -> None:
         ('class = "rsbench.solvers.nowhere:X"', ["cannot be imported", "nowhere"]),
         ('class = "rsbench.solvers.linear:Nope"', ["cannot be imported", "Nope"]),
         ('class = "rsbench.solvers.linear:null_vector"', ["not a solver"]),
-        ('class = "rsbench.solvers.base:Solver"', ["not a solver"]),
+        ('class = "rsbench.solvers.engine.base:Solver"', ["not a solver"]),
         (
             'class = "rsbench.solvers.linear:LinearSolver"\n[parameters]\nextracton = "full"',
             ["unknown key 'extracton'", "did you mean 'extraction'", "there are: extraction"],

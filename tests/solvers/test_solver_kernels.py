@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from rsbench.benchmark.simulation import SimulationOptions, random_motion, simulate
+from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import in_front, row_pair_pose, rs_sampson_error, rs_stereo_transfer
@@ -15,7 +15,7 @@ from rsbench.core.projection import back_project, project_at
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.packed import Packed, pack, theta_of
+from rsbench.solvers.engine.packed import Packed, pack, theta_of
 
 # Unequal focal lengths, so that no two of them can be mistaken for one another.
 RIG = StereoRig(camera=PinholeCamera(width=900, height=700, fx=810.0, fy=760.0, cx=440.0, cy=355.0), baseline=0.5)

@@ -1,0 +1,218 @@
+"""Sweep cards: one parameter of a simulated experiment varies, all others stay as the card states them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from rsbench.benchmark.simulated.simulation import SceneShape, SimulationOptions, random_direction
+from rsbench.cards import load_card, parse_card
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.motion import MOTION_MODELS, Motion
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.errors import RsbenchError
+
+Axis = Literal[
+    "noise_px",
+    "rotation_deg",
+    "translation",
+    "readout_ratio",
+    "readout_ratio_error",
+    "baseline",
+    "points",
+    "outlier_ratio",
+]
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """One simulated experiment; the paper leaves depth, points, rotation, translation and baseline open."""
+
+    width: int
+    height: int
+    focal: float
+    """Pixels; the principal point is centred."""
+    baseline: float
+    """Full distance between the cameras, metres."""
+    readout_ratio: float
+    points: int
+    """Matches over time per camera, of points of its own; and tracks, for solvers that need all four images."""
+    depth: tuple[float, float]
+    """Range of depths in frame 0, metres, uniform."""
+    rotation_deg: float
+    """Angle per frame period."""
+    translation: float
+    """Metres per frame period."""
+    noise_px: float
+    """Standard deviation of the noise on every pixel coordinate."""
+    rotation_axis: Vector | None = None
+    """Need not be a unit vector; absent: drawn uniformly for every trial."""
+    translation_axis: Vector | None = None
+    """Likewise."""
+    motion_model: str = "linear"
+    shape: SceneShape = "box"
+    outlier_ratio: float = 0.0
+    outlier_px: float = 80.0
+    readout_ratio_error: float = 0.0
+    """What the solver is told minus what is true."""
+
+    def __post_init__(self) -> None:
+        if self.motion_model not in MOTION_MODELS:
+            raise ValueError(f"motion_model = {self.motion_model!r}: must be one of {', '.join(MOTION_MODELS)}")
+        for name in ("rotation_deg", "translation", "noise_px", "outlier_px"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+        for name in ("rotation_axis", "translation_axis"):
+            if getattr(self, name) is not None and not any(getattr(self, name)):
+                raise ValueError(f"{name} must not be zero")
+        if self.points < 1:
+            raise ValueError(f"points must be at least 1, got {self.points}")
+        if not 0 <= self.outlier_ratio < 1:
+            raise ValueError(f"outlier_ratio must lie in [0, 1), got {self.outlier_ratio}")
+        if not 0 < self.depth[0] <= self.depth[1]:
+            raise ValueError(f"depth must be two positive numbers in order, got {list(self.depth)}")
+        self.rig()
+        self.shutter()
+        self.told_shutter()
+
+    def rig(self) -> StereoRig:
+        return StereoRig(camera=PinholeCamera.centred(self.width, self.height, self.focal), baseline=self.baseline)
+
+    def shutter(self) -> RollingShutter:
+        """The shutter that made the images."""
+        return RollingShutter(height=self.height, readout_ratio=self.readout_ratio)
+
+    def told_shutter(self) -> RollingShutter:
+        """The shutter that the solver believes in."""
+        return RollingShutter(height=self.height, readout_ratio=self.readout_ratio + self.readout_ratio_error)
+
+    def motion(self, rng: np.random.Generator) -> Motion:
+        """Motion of one trial; equal generators give equal random directions, whatever the magnitudes."""
+        random = (random_direction(rng), random_direction(rng))
+        axes = []
+        for given, drawn in zip((self.rotation_axis, self.translation_axis), random, strict=True):
+            axis = drawn if given is None else np.asarray(given, dtype=np.float64)
+            axes.append(axis / np.linalg.norm(axis))
+        w, d = np.deg2rad(self.rotation_deg) * axes[0], self.translation * axes[1]
+        return MOTION_MODELS[self.motion_model](w, d)
+
+    def options(self, tracks: bool) -> SimulationOptions:
+        """What ``simulate`` needs; ``tracks`` asks for points in all four images besides the pairs."""
+        return SimulationOptions(
+            pairs=self.points,
+            tracks=self.points if tracks else 0,
+            noise_px=self.noise_px,
+            outlier_ratio=self.outlier_ratio,
+            outlier_px=self.outlier_px,
+            depth=self.depth,
+            shape=self.shape,
+        )
+
+    def exact(self) -> Setting:
+        """The setting of the same matches without noise and with the truth for the solver."""
+        return replace(self, noise_px=0.0, readout_ratio_error=0.0)
+
+    def changed(self, changes: Mapping[str, Any], where: str) -> Setting:
+        """The setting with some fields replaced.
+
+        Raises:
+            RsbenchError: one line beginning with ``where`` if a field does not exist or cannot have its value.
+        """
+        return parse_card(Setting, {**asdict(self), **changes}, where)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """The whole sweep once more, with some fields of the setting replaced."""
+
+    name: str
+    setting: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One value of the axis in one variant: the unit of which statistics are taken."""
+
+    index: int
+    variant: str
+    value: float
+    setting: Setting
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepCard:
+    """An experiment on simulated points."""
+
+    name: str
+    description: str = ""
+    axis: Axis
+    """The field of the setting that varies."""
+    values: tuple[float, ...]
+    solvers: tuple[str, ...]
+    """Solver cards, by name or path."""
+    trials: int = 300
+    """Repetitions per value, each with a scene, a motion and noise of its own."""
+    seed: int = 0
+    robust: bool = False
+    """Whether RANSAC goes round the solvers; without, they see all matches, as in the paper."""
+    setting: Setting
+    variant: tuple[Variant, ...] = (Variant(name="all"),)
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", self.name):
+            raise ValueError(f"name = {self.name!r}: a folder name of letters, digits, '.', '_' and '-'")
+        if not self.values or len(set(self.values)) < len(self.values):
+            raise ValueError("values must be different numbers, at least one")
+        if not self.solvers or len(set(self.solvers)) < len(self.solvers):
+            raise ValueError("solvers must be different names, at least one")
+        names = [variant.name for variant in self.variant]
+        if not names or len(set(names)) < len(names):
+            raise ValueError("each [[variant]] needs a name of its own")
+        if self.trials < 1:
+            raise ValueError(f"trials must be at least 1, got {self.trials}")
+        self.cells()
+
+    def cells(self) -> list[Cell]:
+        """All cells, variant by variant."""
+        cells: list[Cell] = []
+        for variant in self.variant:
+            base = self.setting.changed(variant.setting, f"variant {variant.name!r}")
+            for value in self.values:
+                number = int(value) if self.axis == "points" and value == int(value) else value
+                setting = base.changed({self.axis: number}, f"variant {variant.name!r}, {self.axis} = {value:g}")
+                cells.append(Cell(index=len(cells), variant=variant.name, value=value, setting=setting))
+        return cells
+
+    def with_setting(self, **changes: Any) -> SweepCard:
+        """The same sweep with fields of its base setting replaced."""
+        return replace(self, setting=self.setting.changed(changes, f"sweep {self.name}"))
+
+
+def load_sweep(name_or_path: str) -> SweepCard:
+    """Sweep card by name or path; errors as ``rsbench.cards.load_card``."""
+    return load_card(SweepCard, "sweeps", name_or_path)
+
+
+def with_options(
+    card: SweepCard, solvers: list[str] | None, trials: int | None, seed: int | None = None
+) -> SweepCard:
+    """The card with what the command line replaces.
+
+    Raises:
+        RsbenchError: a value that a card could not have either.
+    """
+    try:
+        return replace(
+            card,
+            solvers=tuple(solvers) if solvers else card.solvers,
+            trials=card.trials if trials is None else trials,
+            seed=card.seed if seed is None else seed,
+        )
+    except ValueError as error:
+        raise RsbenchError(f"sweep {card.name}: {error}") from error

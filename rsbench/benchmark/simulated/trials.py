@@ -1,0 +1,181 @@
+"""Trials of one cell of a sweep: simulate, let every solver see what it needs, keep its answer and the truth."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.benchmark.seeds import generator
+from rsbench.benchmark.simulated.bound import Bound, bound_from_information, motion_bound
+from rsbench.benchmark.simulated.simulation import Simulation, simulate
+from rsbench.benchmark.simulated.sweep_card import Setting
+from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.metrics import translation_of_offset
+from rsbench.core.so3 import FloatArray
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.engine.base import MotionEstimate, Solver
+from rsbench.solvers.engine.packed import track_pairs
+from rsbench.solvers.engine.registry import load_solver
+
+Arrays = dict[str, NDArray[Any]]
+Information = Literal["left pairs", "left and right pairs", "linked pairs", "tracks"]
+"""What a solver is given: matches over time of one or both cameras, of points of their own; the same points in
+both cameras with their left-right matches; or tracks through all four images. The last two hold metric depth."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Entrant:
+    """A solver and the matches that it is given."""
+
+    solver: Solver
+    information: Information
+
+
+def entrant(name_or_path: str) -> Entrant:
+    """The solver of a card with the least information that it can use fully.
+
+    Raises:
+        RsbenchError: no such solver.
+    """
+    solver = load_solver(name_or_path)
+    probe = Correspondences(left=np.ones((50, 4)), right=np.ones((50, 4)), tracks=np.ones((50, 8)))
+    if "tracks" in solver.needs or solver.sample_sizes(probe).get("tracks", 0) > 0:
+        return Entrant(solver=solver, information="tracks")
+    if "stereo" in solver.needs:
+        return Entrant(solver=solver, information="linked pairs")
+    return Entrant(solver=solver, information="left pairs" if solver.needs == {"left"} else "left and right pairs")
+
+
+def given_matches(simulation: Simulation, information: Information) -> Correspondences:
+    """The part of the simulated matches that ``information`` names."""
+    c = simulation.correspondences
+    if information == "tracks":
+        return Correspondences(tracks=c.tracks)
+    if information == "linked pairs":
+        return Correspondences(
+            left=track_pairs(c.tracks, "left"),
+            right=track_pairs(c.tracks, "right"),
+            stereo_0=c.tracks[:, :4],
+            stereo_1=c.tracks[:, 4:],
+        )
+    return Correspondences(left=c.left, right=c.right if information == "left and right pairs" else c.right[:0])
+
+
+def run_trials(
+    setting: Setting, solvers: tuple[str, ...], seed: int, first: int, count: int, robust: bool
+) -> Arrays:
+    """Trials ``first`` to ``first + count - 1`` of a setting.
+
+    A trial's scene, motion and noise depend on its number and the seed alone, so that all solvers, values and
+    sweeps share them as far as their settings allow.
+
+    Returns:
+        ``w``, ``d`` (trials, 3), the truth; ``w_est``, ``d_est`` (trials, solvers, 3), ``success``, ``metric``,
+        ``direction_known``, ``reason`` and ``seconds`` (trials, solvers).
+
+    Raises:
+        RsbenchError: no such solver; the motion of the setting leaves too few points in view.
+    """
+    entrants = [entrant(name) for name in solvers]
+    truth, answers, seconds = [], [], []
+    for trial in range(first, first + count):
+        simulation = _simulation(setting, entrants, seed, trial)
+        truth.append((simulation.motion.w, simulation.motion.d))
+        timed = [_timed(e, simulation, setting, seed, trial, robust) for e in entrants]
+        answers.append([estimate for estimate, _ in timed])
+        seconds.append([duration for _, duration in timed])
+    return {
+        "w": np.array([w for w, _ in truth]),
+        "d": np.array([d for _, d in truth]),
+        "w_est": np.array([[a.w for a in row] for row in answers]),
+        "d_est": np.array([[a.d for a in row] for row in answers]),
+        "success": np.array([[a.success for a in row] for row in answers], dtype=np.bool_),
+        "metric": np.array([[a.metric for a in row] for row in answers], dtype=np.bool_),
+        "direction_known": np.array([[a.direction_known for a in row] for row in answers], dtype=np.bool_),
+        "reason": np.array([[a.reason for a in row] for row in answers], dtype=np.str_),
+        "seconds": np.array(seconds),
+    }
+
+
+def run_bounds(setting: Setting, solvers: tuple[str, ...], seed: int, first: int, count: int) -> Arrays:
+    """Cramer-Rao bounds of trials for a noise of 1 px; outliers are left out.
+
+    Returns:
+        ``rotation``, ``direction`` (radians) and ``scale`` (trials, solvers): root mean square errors of e_R, e_T
+        and the length of d that no unbiased solver undercuts, given what each solver is given; infinite where the
+        matches do not tell.
+    """
+    entrants = [entrant(name) for name in solvers]
+    rows = []
+    for trial in range(first, first + count):
+        simulation = _simulation(setting.exact(), entrants, seed, trial)
+        found = _bounds(simulation, {e.information for e in entrants})
+        rows.append([found[e.information] for e in entrants])
+    return {
+        "rotation": np.array([[bound.rotation for bound in row] for row in rows]),
+        "direction": np.array([[bound.direction for bound in row] for row in rows]),
+        "scale": np.array([[bound.scale for bound in row] for row in rows]),
+    }
+
+
+def _simulation(setting: Setting, entrants: list[Entrant], seed: int, trial: int) -> Simulation:
+    tracks = any(e.information in ("linked pairs", "tracks") for e in entrants)
+    motion = setting.motion(generator(seed, "simulate", "motion", trial))
+    rng = generator(seed, "simulate", "scene", trial)
+    try:
+        return simulate(setting.rig(), setting.shutter(), motion, setting.options(tracks), rng)
+    except ValueError as error:
+        raise RsbenchError(f"trial {trial}: {error}") from error
+
+
+def _bounds(simulation: Simulation, kinds: set[Information]) -> dict[Information, Bound]:
+    """Bounds at 1 px of what solvers are given."""
+    c, rig, motion = simulation.correspondences, simulation.rig, simulation.motion
+    good = {name: getattr(c, name)[~simulation.outliers[name]] for name in ("left", "right", "tracks")}
+
+    def of(name: str) -> Bound:
+        return motion_bound(Correspondences(**{name: good[name]}), rig, simulation.shutter, motion, 1.0)
+
+    found: dict[Information, Bound] = {}
+    if "tracks" in kinds or "linked pairs" in kinds:
+        found["tracks"] = found["linked pairs"] = of("tracks")
+    if "left pairs" in kinds or "left and right pairs" in kinds:
+        left = of("left").information
+        found["left pairs"] = _of_left_camera(left, simulation)
+        if "left and right pairs" in kinds:
+            # Independent matches add their information.
+            both = left + of("right").information
+            found["left and right pairs"] = bound_from_information(both, motion.w, motion.d)
+    return found
+
+
+def _of_left_camera(information: FloatArray, simulation: Simulation) -> Bound:
+    """What information (6, 6) about the body's motion says of the left camera's translation d + b - R b."""
+    motion, offset = simulation.motion, simulation.rig.offset("left")
+    d = translation_of_offset(motion.w, motion.d, offset)
+    T = np.eye(6)
+    T[3:, :3] = -so3.hat(so3.exp(motion.w) @ offset) @ so3.left_jacobian(motion.w)
+    return bound_from_information(T.T @ information @ T, motion.w, d)
+
+
+def _timed(
+    e: Entrant, simulation: Simulation, setting: Setting, seed: int, trial: int, robust: bool
+) -> tuple[MotionEstimate, float]:
+    matches, rig, shutter = given_matches(simulation, e.information), setting.rig(), setting.told_shutter()
+    # Processor time: solvers have one thread here, and other processes shall not count.
+    start = time.process_time()
+    try:
+        if robust:
+            rng = generator(seed, "simulate", "robust", e.solver.name, trial)
+            estimate = estimate_motion(matches, rig, shutter, e.solver, RobustOptions(), rng).estimate
+        else:
+            estimate = e.solver.estimate(matches, rig, shutter)
+    except Exception as error:  # a plug-in that breaks the contract must not end a run of hours
+        estimate = MotionEstimate.failed(f"raised {type(error).__name__}: {error}")
+    return estimate, time.process_time() - start

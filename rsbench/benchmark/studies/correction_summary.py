@@ -1,0 +1,104 @@
+"""Statistics of the correction study: medians over sequences with clustered intervals, and paired differences.
+
+The four views of a sequence share scene, motion and matches, so they count as one: every number is first averaged
+over them, and the bootstrap draws whole sequences.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rsbench.benchmark.simulated.sweep_summary import bootstrap_interval
+from rsbench.benchmark.studies.correction_study import METHODS
+from rsbench.core.so3 import FloatArray
+
+EXTRA = ("flip_covered", "flip_all", "ssim_deepunroll", "ssim_uniform")
+"""Scores of the first view of a sequence only."""
+SCORES = (
+    "psnr_covered",
+    "ssim_covered",
+    "psnr_all",
+    "ssim_all",
+    "flow_mean_px",
+    "flow_median_px",
+    "coverage",
+    *EXTRA,
+)
+
+
+def _median(values: FloatArray) -> FloatArray:
+    return np.asarray(np.median(values, axis=-1))
+
+
+def numbers_table(numbers: dict[tuple[str, str], dict[str, Any]]) -> pd.DataFrame:
+    """One row per card and sequence, of numbers by their name."""
+    return pd.DataFrame([{"card": card, "sequence": name, **row} for (card, name), row in numbers.items()])
+
+
+def by_sequence(images: pd.DataFrame) -> pd.DataFrame:
+    """Mean of the views: one row per stratum, sequence and method."""
+    keys = ["stratum", "sequence", "method"]
+    return images[[*keys, *SCORES, "common"]].groupby(keys, as_index=False, sort=False).mean()
+
+
+def summarise(images: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
+    """One row per stratum and method: median over sequences of each score with its 95 % interval.
+
+    ``gain`` is the paired difference of the covered PSNR, ours minus the method, and ``gain_all`` that of all
+    pixels. ``images`` has the rows of ``study_dataset`` and a column ``stratum``.
+    """
+    table = by_sequence(images)
+    rows = []
+    for stratum, group in table.groupby("stratum", sort=False):
+        ours = group[group["method"] == "ours"].set_index("sequence")
+        for method in METHODS:
+            own = group[group["method"] == method.key].set_index("sequence")
+            row: dict[str, Any] = {"stratum": stratum, "method": method.key, "kind": method.kind}
+            row |= {"sequences": len(own), "failures": len(ours) - len(own)}
+            for score in SCORES:
+                row |= _interval(score, own[score].to_numpy(), seed)
+            for name, score in (("gain", "psnr_covered"), ("gain_all", "psnr_all")):
+                row |= _interval(name, (ours[score] - own[score]).dropna().to_numpy(), seed)
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _interval(name: str, values: FloatArray, seed: int) -> dict[str, float]:
+    """Median and its interval; NaN where nothing is known."""
+    known = values[np.isfinite(values)]
+    if len(known) == 0:
+        return {name: np.nan, f"{name}_low": np.nan, f"{name}_high": np.nan}
+    low, high = bootstrap_interval(known, _median, seed)
+    return {name: float(np.median(known)), f"{name}_low": low, f"{name}_high": high}
+
+
+def summarise_bands(bands: pd.DataFrame) -> pd.DataFrame:
+    """Mean flow error, px, over the views of each stratum, method and band of rows."""
+    keys = ["stratum", "method", "band"]
+    return bands[[*keys, "flow_mean_px"]].groupby(keys, as_index=False, sort=False).mean()
+
+
+def loss_to_true_motion(images: pd.DataFrame) -> pd.DataFrame:
+    """Per stratum, the median and the largest loss in dB of single views to the true motion on the same depth."""
+    keys = ["stratum", "sequence", "side", "frame"]
+    wide = images.pivot_table(index=keys, columns="method", values="psnr_covered", sort=False)
+    loss = (wide["true-motion"] - wide["ours"]).groupby("stratum", sort=False)
+    return pd.DataFrame({"median_loss_db": loss.median(), "largest_loss_db": loss.max()}).reset_index()
+
+
+def verdict(summary: pd.DataFrame) -> pd.DataFrame:
+    """Per stratum and baseline: whether ours is better, by separate intervals and by the paired difference."""
+    rows = []
+    for stratum, group in summary.groupby("stratum", sort=False):
+        ours = group[group["method"] == "ours"].iloc[0]
+        for _, other in group[group["kind"].isin(["none", "baseline"])].iterrows():
+            row: dict[str, Any] = {"stratum": stratum, "method": other["method"]}
+            for name, score, gain in (("covered", "psnr_covered", "gain"), ("all", "psnr_all", "gain_all")):
+                row[f"{name}_apart"] = bool(ours[f"{score}_low"] > other[f"{score}_high"])
+                row[f"{name}_paired"] = bool(other[f"{gain}_low"] > 0.0)
+            row["flow_apart"] = bool(ours["flow_median_px_high"] < other["flow_median_px_low"])
+            rows.append(row)
+    return pd.DataFrame(rows)

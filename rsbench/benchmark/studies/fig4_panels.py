@@ -1,0 +1,105 @@
+"""What the paper's Figure 4 shows of one sequence: six pictures of the left camera's frame 0, and numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.benchmark.studies.correction_study import Bench
+from rsbench.core.metrics import rotation_error, translation_error
+from rsbench.core.rig import Side
+from rsbench.dataset.files import load_arrays, read_json, save_arrays, write_json
+from rsbench.dataset.sequence import Sequence
+from rsbench.pipeline.chain import complete_depth, correct_frames
+from rsbench.vision.correction import correct_frame
+from rsbench.vision.fusion import Origin
+from rsbench.vision.quality import psnr
+from rsbench.vision.stereo_depth import depth_metrics
+
+SIDE: Side = "left"
+FRAME = 0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Panels:
+    """Arrays of the six panels; depth in metres, NaN where there is none."""
+
+    rolling: NDArray[np.uint8]
+    corrected: NDArray[np.uint8]
+    known: NDArray[np.bool_]
+    """(H, W) pixels of ``corrected`` that some frame saw."""
+    truth: NDArray[np.uint8]
+    """The global-shutter image at row 0's pose."""
+    true_depth: NDArray[np.float32]
+    depth_error: NDArray[np.float32]
+    """Absolute, of SGM against ``true_depth``."""
+    numbers: dict[str, Any]
+
+
+def make_panels(sequence: Sequence, seed: int = 0) -> Panels:
+    """Match, solve, find depth and correct with the estimates; compare with the truth.
+
+    Raises:
+        RuntimeError: no motion was found.
+    """
+    bench = Bench(sequence, seed)
+    view = SIDE, FRAME
+    pairs = complete_depth(bench.sgm, bench.rig, bench.shutter, bench.motion)
+    fused = correct_frames(pairs, bench.rig, bench.shutter, bench.motion, bench.options, (view,))[view]
+    rolling, truth = bench.images[view], sequence.image("gs", *view)
+    true_depth = sequence.depth("rs", *view)
+    depth = np.where(np.isfinite(bench.sgm[FRAME].depth[SIDE]), bench.sgm[FRAME].depth[SIDE], np.float32(0.0))
+    surface = true_depth > 0
+    error = np.where(surface & (depth > 0), np.abs(depth - true_depth), np.float32(np.nan))
+    here = fused.origin == Origin.HERE
+    oracle = correct_frame(
+        rolling, bench.true[FRAME].depth[SIDE], bench.rig, bench.shutter, sequence.motion, *view
+    )
+    true = sequence.motion
+    numbers = {
+        "rotation_deg": float(np.rad2deg(np.linalg.norm(true.w))),
+        "translation": float(np.linalg.norm(true.d)),
+        "readout_ratio": sequence.shutter.readout_ratio,
+        "e_R_deg": float(np.rad2deg(rotation_error(bench.motion.w, true.w))),
+        "e_T_deg": float(np.rad2deg(translation_error(bench.motion.d, true.d))),
+        "psnr_rolling": psnr(rolling, truth, here),
+        "psnr_corrected": psnr(fused.image, truth, here),
+        "psnr_oracle": psnr(oracle.image, truth, here & oracle.mask),
+        "psnr_corrected_all": psnr(fused.image, truth),
+        "psnr_rolling_all": psnr(rolling, truth),
+        **{f"share_{name}": share for name, share in fused.shares().items()},
+        **{f"depth_{name}": value for name, value in depth_metrics(depth, true_depth, bench.rig).items()},
+    }
+    return Panels(
+        rolling=rolling,
+        corrected=fused.image,
+        known=fused.origin != Origin.NOBODY,
+        truth=truth,
+        true_depth=np.where(surface, true_depth, np.float32(np.nan)),
+        depth_error=error.astype(np.float32),
+        numbers=numbers,
+    )
+
+
+_ARRAYS = ("rolling", "corrected", "known", "truth", "true_depth", "depth_error")
+
+
+def save_panels(folder: Path, panels: Panels) -> None:
+    """panels.npz and numbers.json in ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    save_arrays(folder / "panels.npz", {name: getattr(panels, name) for name in _ARRAYS})
+    write_json(folder / "numbers.json", panels.numbers)
+
+
+def load_panels(folder: Path) -> Panels:
+    """What ``save_panels`` wrote.
+
+    Raises:
+        RsbenchError: numbers.json is missing or damaged.
+    """
+    numbers = read_json(folder / "numbers.json")
+    return Panels(**load_arrays(folder / "panels.npz"), numbers=numbers)

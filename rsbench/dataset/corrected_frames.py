@@ -1,0 +1,107 @@
+"""What ``rsbench correct`` stores: corrected frames, masks, depth and the motion."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.files import write_depth, write_json, write_png
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.readout import ReadoutEstimate
+from rsbench.pipeline.robust_motion import RobustEstimate
+from rsbench.vision.fusion import Fused, Origin
+
+MASK_VALUES = {
+    Origin.NOBODY: 0,
+    Origin.OTHER_FRAME: 64,
+    Origin.OTHER_CAMERA: 128,
+    Origin.GUESSED: 192,
+    Origin.HERE: 255,
+}
+"""Grey value of each origin in the mask files: the larger, the better founded."""
+MARKER = "motion.json"
+
+
+@contextmanager
+def fresh_folder(out: Path) -> Iterator[Path]:
+    """A temporary folder beside ``out`` that takes its name when all is written; nothing is left after an error.
+
+    Raises:
+        RsbenchError: ``out`` cannot be written, or holds something that ``rsbench correct`` did not write.
+    """
+    if out.exists() and not (out.is_dir() and (not any(out.iterdir()) or (out / MARKER).is_file())):
+        raise RsbenchError(f"{out}: exists and was not written by 'rsbench correct'; choose another --out")
+    partial = out.with_name(f".{out.name}.partial")
+    try:
+        if partial.exists():
+            shutil.rmtree(partial)
+        partial.mkdir(parents=True)
+    except OSError as error:
+        raise RsbenchError(f"{out}: cannot be written: {error.strerror}; choose another --out") from error
+    try:
+        yield partial
+        if out.exists():
+            shutil.rmtree(out)
+        os.replace(partial, out)
+    finally:
+        if partial.exists():
+            shutil.rmtree(partial)
+
+
+def write_frame(folder: Path, name: str, fused: Fused) -> None:
+    """corrected/NAME.png, mask/NAME.png and depth/NAME.exr below ``folder``."""
+    for part in ("corrected", "mask", "depth"):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    write_png(folder / "corrected" / f"{name}.png", fused.image)
+    values = np.zeros(len(Origin), dtype=np.uint8)
+    values[list(MASK_VALUES)] = list(MASK_VALUES.values())
+    write_png(folder / "mask" / f"{name}.png", values[fused.origin])
+    depth = np.where(np.isfinite(fused.depth), fused.depth, np.float32(0.0))
+    write_depth(folder / "depth" / f"{name}.exr", depth)
+
+
+def motion_record(robust: RobustEstimate, model: str) -> dict[str, Any]:
+    """The motion of one window, ready for JSON."""
+    estimate = robust.estimate
+    covariance = None if estimate.covariance is None else estimate.covariance.tolist()
+    return {
+        "model": model,
+        "w": estimate.w.tolist(),
+        "d": estimate.d.tolist(),
+        "rotation_deg": float(np.rad2deg(np.linalg.norm(estimate.w))),
+        "translation": float(np.linalg.norm(estimate.d)),
+        "metric": estimate.metric,
+        "note": estimate.reason,
+        "noise_px": estimate.noise_px,
+        "covariance_w_d": covariance,
+        "inliers": {str(name): int(np.count_nonzero(mask)) for name, mask in robust.inliers.items()},
+    }
+
+
+def rig_record(
+    rig: StereoRig, shutter_: RollingShutter, readout: ReadoutEstimate | None, target_row: float
+) -> dict[str, Any]:
+    """What the correction assumed, ready for JSON."""
+    camera = rig.camera
+    return {
+        "units": {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = infinite or unknown"},
+        "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
+        "baseline": rig.baseline,
+        "readout_ratio": shutter_.readout_ratio,
+        "readout_ratio_sigma": readout.sigma if readout is not None and np.isfinite(readout.sigma) else None,
+        "readout_ratio_estimated": readout is not None,
+        "target_row": target_row,
+        "mask_values": {origin.name.lower(): value for origin, value in MASK_VALUES.items()},
+    }
+
+
+def write_record(folder: Path, record: dict[str, Any]) -> None:
+    write_json(folder / MARKER, record)

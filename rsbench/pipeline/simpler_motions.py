@@ -1,0 +1,62 @@
+"""Motions as simpler assumptions find them, on the same matches and in the same robust loop."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.metrics import translation_of_offset
+from rsbench.core.motion import LinearMotion, Motion
+from rsbench.core.rig import Side, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.engine.packed import temporal_pairs
+from rsbench.solvers.refined import RefinedSolver
+
+_NO_BASELINE = 1e-9
+"""Metres: the rig of one camera, which turns about itself."""
+
+
+def global_shutter_motion(
+    matches: Correspondences, rig: StereoRig, options: RobustOptions, rng: np.random.Generator
+) -> Motion | None:
+    """Metric motion of the rig from all matches as if the shutter were global; None when there is none.
+
+    The same maximum-likelihood solver as for the rolling shutter, with a readout ratio of 0.
+    """
+    shutter = RollingShutter(height=rig.camera.height, readout_ratio=0.0)
+    # Rolling-shutter matches miss a global-shutter motion by pixels: the threshold must let them in.
+    loose = RobustOptions(threshold_px=4.0 * options.threshold_px, max_iterations=options.max_iterations)
+    estimate = estimate_motion(matches, rig, shutter, RefinedSolver(), loose, rng).estimate
+    return LinearMotion(estimate.w, estimate.d) if estimate.success else None
+
+
+def single_camera(rig: StereoRig) -> StereoRig:
+    """The rig that one camera alone is: its body is its own centre."""
+    return StereoRig(camera=rig.camera, baseline=_NO_BASELINE)
+
+
+def monocular_motion(
+    inliers: Correspondences, rig: StereoRig, shutter: RollingShutter, side: Side, start: Motion
+) -> Motion | None:
+    """Constant-velocity motion of one camera alone, in the frame of ``single_camera``; None when there is none.
+
+    Maximum likelihood on the matches over time of one side, which must be free of outliers, descending from the
+    rig's motion ``start``: the most that one camera can know, spared the false minima that its own search may end
+    in. The translation has length 1: one camera does not know it. A depth map made with it has the same unit, so
+    the correction does not need to.
+    """
+    d = translation_of_offset(start.w, start.d, rig.offset(side))
+    pairs = Correspondences(**{side: temporal_pairs(inliers, side)})
+    first = MotionEstimate(w=start.w, d=_unit(d), success=True)
+    estimate = RefinedSolver(use_tracks=False).improve(first, pairs, single_camera(rig), shutter)
+    if not estimate.success or not np.any(estimate.d):
+        return None
+    return LinearMotion(estimate.w, _unit(estimate.d))
+
+
+def _unit(d: FloatArray) -> FloatArray:
+    length = float(np.linalg.norm(d))
+    return d / length if length > 0.0 else np.array([0.0, 0.0, 1.0])

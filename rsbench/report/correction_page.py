@@ -1,0 +1,135 @@
+"""The page and the figure of the correction study, from its stored tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from rsbench.benchmark.studies.correction_study import METHODS, ROW_BANDS
+from rsbench.benchmark.studies.correction_summary import loss_to_true_motion, verdict
+from rsbench.report import pages
+
+_TITLES = {method.key: method.title for method in METHODS}
+_LINES = {
+    "none": ("#000000", "--", "x"),
+    "gyro": ("#CC79A7", "-.", "+"),
+    "gs": ("#E69F00", "-", "s"),
+    "mono": ("#56B4E9", "-", "^"),
+    "plane": ("#D55E00", "-", "v"),
+    "ours": ("#0072B2", "-", "o"),
+    "true-depth": ("#009E73", ":", "D"),
+}
+
+
+def write_study(folder: Path) -> list[Path]:
+    """README.md and rows.svg from the tables in ``folder``; returns the files."""
+    images, summary = pd.read_csv(folder / "views.csv"), pd.read_csv(folder / "summary.csv")
+    page = folder / "README.md"
+    page.write_text(study_page(images, summary), "utf-8")
+    return [page, _draw_rows(pd.read_csv(folder / "rows.csv"), folder / "rows.svg")]
+
+
+def study_page(images: pd.DataFrame, summary: pd.DataFrame) -> str:
+    """The page as Markdown."""
+    strata = list(dict.fromkeys(summary["stratum"]))
+    return pages.markdown(
+        "correction.md.j2",
+        strata=", ".join(strata),
+        methods=METHODS,
+        tables=[(stratum, _table(summary[summary["stratum"] == stratum])) for stratum in strata],
+        findings=_findings(images, summary),
+        bands=ROW_BANDS,
+    )
+
+
+def _table(summary: pd.DataFrame) -> str:
+    names = (
+        "method",
+        "PSNR covered (dB)",
+        "ours + (dB)",
+        "SSIM covered",
+        "PSNR all (dB)",
+        "SSIM all",
+        "flow, median (px)",
+        "flow, mean (px)",
+        "FLIP covered",
+        "own pixels",
+    )
+    lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
+    for _, row in summary.iterrows():
+        cells = [
+            _TITLES[str(row["method"])],
+            _with_interval(row, "psnr_covered", 2),
+            "" if row["method"] == "ours" else _with_interval(row, "gain", 2),
+            _with_interval(row, "ssim_covered", 3),
+            _with_interval(row, "psnr_all", 2),
+            f"{row['ssim_all']:.3f}",
+            _with_interval(row, "flow_median_px", 3),
+            f"{row['flow_mean_px']:.3f}",
+            _with_interval(row, "flip_covered", 4),
+            f"{100 * row['coverage']:.1f} %",
+        ]
+        if row["failures"]:
+            cells[0] += f" ({row['failures']:.0f} failed)"
+        if row["method"] == "ours":
+            cells = [f"**{cell}**" if cell else "" for cell in cells]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _with_interval(row: pd.Series, name: str, digits: int) -> str:
+    value, low, high = (round(float(row[key]), digits) + 0.0 for key in (name, f"{name}_low", f"{name}_high"))
+    return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"  # + 0.0: no minus sign before zero
+
+
+def _findings(images: pd.DataFrame, summary: pd.DataFrame) -> str:
+    lines = []
+    for _, row in loss_to_true_motion(images).iterrows():
+        median = round(float(row["median_loss_db"]), 3) + 0.0
+        lines.append(
+            f"- {row['stratum']}: replacing our motion by the true one on the same SGM depth gains "
+            f"{median:.3f} dB at the median view, {row['largest_loss_db']:.3f} dB at most."
+        )
+    checked = verdict(summary)
+    for column, text in (
+        ("flow_apart", "median flow error, separate intervals do not overlap"),
+        ("covered_apart", "covered PSNR, separate intervals do not overlap"),
+        ("covered_paired", "covered PSNR, paired difference above 0"),
+        ("all_apart", "PSNR of all pixels, separate intervals do not overlap"),
+        ("all_paired", "PSNR of all pixels, paired difference above 0"),
+    ):
+        wrong = checked[~checked[column]]
+        names = ", ".join(
+            f"{_TITLES[str(m)]} ({s})" for s, m in zip(wrong["stratum"], wrong["method"], strict=True)
+        )
+        lines.append(
+            f"- Ours against every baseline in every stratum, {text}: "
+            f"{len(checked) - len(wrong)} of {len(checked)}" + (f"; not: {names}." if names else ".")
+        )
+    return "\n".join(lines)
+
+
+def _draw_rows(rows: pd.DataFrame, path: Path) -> Path:
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    strata = list(dict.fromkeys(rows["stratum"]))
+    middle = (np.arange(ROW_BANDS) + 0.5) / ROW_BANDS
+    with rc_context({"font.size": 8, "svg.hashsalt": "rsbench", "svg.fonttype": "none"}):
+        figure = Figure(figsize=(2.6 * len(strata), 3.0), layout="constrained")
+        panels = figure.subplots(1, len(strata), sharey=True, squeeze=False)[0]
+        for axes, stratum in zip(panels, strata, strict=True):
+            own = rows[rows["stratum"] == stratum]
+            for key, (colour, line, marker) in _LINES.items():
+                values = own[own["method"] == key].sort_values("band")["flow_mean_px"].to_numpy()
+                if len(values) == ROW_BANDS:
+                    style = {"color": colour, "linestyle": line, "marker": marker, "markersize": 3, "linewidth": 1}
+                    axes.plot(middle, values, label=_TITLES[key], **style)
+            axes.set(yscale="log", title=stratum, xlabel="row / height")
+            axes.grid(True, which="major", linewidth=0.3)
+        panels[0].set_ylabel("flow error (px)")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+        figure.savefig(path, metadata={"Date": None})
+    return path

@@ -1,0 +1,206 @@
+"""Correspondences as the compiled residuals want them: normalised rays, times, cameras, each measured once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.motion import MOTION_MODELS, Motion, TwistMotion
+from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.kernels import BEHIND, count_in_front, pair_terms
+from rsbench.solvers.engine.track_kernels import track_terms
+
+_TRACK_HALF: dict[Side, list[int]] = {"left": [0, 1, 4, 5], "right": [2, 3, 6, 7]}
+
+
+def track_pairs(tracks: FloatArray, side: Side) -> FloatArray:
+    """The matches over time (n, 4) of one camera in tracks (n, 8)."""
+    return tracks[:, _TRACK_HALF[side]]
+
+
+def unlinked_pairs(correspondences: Correspondences, side: Side) -> np.ndarray:
+    """Mask of the left or right matches that no track repeats: the tracks know more about those that it does."""
+    pairs: FloatArray = getattr(correspondences, side)
+    if len(pairs) == 0 or len(correspondences.tracks) == 0:
+        return np.ones(len(pairs), dtype=np.bool_)
+    known = {row.tobytes() for row in np.ascontiguousarray(track_pairs(correspondences.tracks, side))}
+    return np.array([row.tobytes() not in known for row in pairs], dtype=np.bool_)
+
+
+def temporal_pairs(correspondences: Correspondences, side: Side) -> FloatArray:
+    """All matches over time (n, 4) of one camera: its own, and the halves of tracks that they do not repeat."""
+    own: FloatArray = getattr(correspondences, side)
+    rest = own[unlinked_pairs(correspondences, side)]
+    return np.concatenate([track_pairs(correspondences.tracks, side), rest])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Packed:
+    """Measurements of one problem."""
+
+    pairs: FloatArray
+    """(n, 7), see ``kernels.pair_terms``."""
+    tracks: FloatArray
+    """(m, 8), see ``track_kernels.track_terms``."""
+    row_checks: FloatArray
+    """(m,) squared row differences within the stereo pairs of the tracks: px^2, chi-squared with 2 degrees."""
+    focal: FloatArray
+    h: float
+    baseline: float
+    twist: bool
+
+    @property
+    def constraints(self) -> int:
+        """Number of scalar equations that depend on the motion."""
+        return len(self.pairs) + 3 * len(self.tracks)
+
+    def pair_counts(self) -> dict[Side, int]:
+        """Pairs of either camera."""
+        left = int(np.count_nonzero(self.pairs[:, 6] > 0.0))
+        return {"left": left, "right": len(self.pairs) - left}
+
+    def larger_side(self) -> FloatArray:
+        """The pairs (n, 7) of the camera that has more of them."""
+        left = self.pairs[:, 6] > 0.0
+        return self.pairs[left if 2 * np.count_nonzero(left) >= len(left) else ~left]
+
+    def subset(self, most: int) -> Packed:
+        """At most about ``most`` evenly chosen pairs and tracks, for choosing among starts."""
+        step_p, step_t = max(1, len(self.pairs) // most), max(1, len(self.tracks) // most)
+        return self._of(self.pairs[::step_p], self.tracks[::step_t], self.row_checks[::step_t])
+
+    def tracks_only(self) -> Packed:
+        """Without the pairs."""
+        return self._of(self.pairs[:0], self.tracks, self.row_checks)
+
+    def _of(self, pairs: FloatArray, tracks: FloatArray, row_checks: FloatArray) -> Packed:
+        return Packed(
+            pairs=pairs,
+            tracks=tracks,
+            row_checks=row_checks,
+            focal=self.focal,
+            h=self.h,
+            baseline=self.baseline,
+            twist=self.twist,
+        )
+
+    def normal_equations(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Half the sum of squares in px^2, its gradient (6,) and Gauss-Newton Hessian (6, 6)."""
+        residuals, squares = np.zeros(len(self.pairs)), np.zeros(len(self.tracks))
+        H, gradient = np.zeros((6, 6)), np.zeros(6)
+        pair_terms(theta, self.twist, self.pairs, self.focal, self.h, residuals, H, gradient, True)
+        track_terms(theta, self.twist, self.tracks, self.focal, self.h, self.baseline, squares, H, gradient, True)
+        return 0.5 * float(residuals @ residuals + np.sum(squares)), gradient, H
+
+    def pair_residuals(self, theta: FloatArray) -> FloatArray:
+        """Sampson errors (n,) of the pairs, px."""
+        residuals = np.zeros(len(self.pairs))
+        pair_terms(
+            theta, self.twist, self.pairs, self.focal, self.h, residuals, np.zeros((6, 6)), np.zeros(6), False
+        )
+        return residuals
+
+    def track_squares(self, theta: FloatArray) -> FloatArray:
+        """Squared whitened errors (m,) of the tracks with their row checks, px^2, 5 degrees of freedom."""
+        squares = np.zeros(len(self.tracks))
+        track_terms(
+            theta,
+            self.twist,
+            self.tracks,
+            self.focal,
+            self.h,
+            self.baseline,
+            squares,
+            np.zeros((6, 6)),
+            np.zeros(6),
+            False,
+        )
+        return np.where(squares >= BEHIND, BEHIND, squares + self.row_checks)
+
+    def in_front(self, theta: FloatArray) -> int:
+        """Number of pairs whose point lies in front of both cameras."""
+        return count_in_front(theta, self.twist, self.pairs)
+
+    def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
+        """Parameters (6,) of the motion (w, d)."""
+        v = np.linalg.solve(so3.left_jacobian(w), d) if self.twist else d
+        return np.concatenate([w, v])
+
+    def motion(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """``(w, d)`` of the parameters."""
+        w, v = theta[:3], theta[3:]
+        return w, so3.left_jacobian(w) @ v if self.twist else v
+
+    def motion_jacobian(self, theta: FloatArray) -> FloatArray:
+        """Derivative (6, 6) of (w, d) by the parameters."""
+        out = np.eye(6)
+        if self.twist:
+            step = 1e-6
+            for j in range(3):
+                shift = step * np.eye(6)[j]
+                out[3:, j] = (self.motion(theta + shift)[1] - self.motion(theta - shift)[1]) / (2 * step)
+            out[3:, 3:] = so3.left_jacobian(theta[:3])
+        return out
+
+
+def theta_of(motion: Motion) -> FloatArray:
+    """Parameters (6,) of a motion of either model."""
+    return np.concatenate([motion.w, motion.v if isinstance(motion, TwistMotion) else motion.d])
+
+
+def pack(
+    correspondences: Correspondences,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion_model: str = "linear",
+    use_tracks: bool = True,
+) -> Packed:
+    """Measurements of a problem; without ``use_tracks`` the tracks count as independent left and right pairs."""
+    if motion_model not in MOTION_MODELS:
+        raise ValueError(f"motion_model must be one of {', '.join(MOTION_MODELS)}, got {motion_model!r}")
+    tracks = correspondences.tracks if use_tracks else correspondences.tracks[:0]
+    pairs = [np.zeros((0, 7))]
+    for side in SIDES:
+        if use_tracks:
+            matches = getattr(correspondences, side)[unlinked_pairs(correspondences, side)]
+        else:
+            matches = temporal_pairs(correspondences, side)
+        if len(matches):
+            pairs.append(pack_pairs(matches, side, rig, shutter))
+    camera = rig.camera
+    return Packed(
+        pairs=np.concatenate(pairs),
+        tracks=pack_tracks(tracks, rig, shutter),
+        row_checks=0.5 * ((tracks[:, 1] - tracks[:, 3]) ** 2 + (tracks[:, 5] - tracks[:, 7]) ** 2),
+        focal=np.array([camera.fx, camera.fy]),
+        h=shutter.h,
+        baseline=rig.baseline,
+        twist=motion_model == TwistMotion.name,
+    )
+
+
+def pack_pairs(matches: FloatArray, side: Side, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
+    """(n, 7) for ``kernels.pair_terms`` from matches (n, 4) of one camera."""
+    out = np.zeros((len(matches), 7))
+    out[:, :2] = rig.camera.unproject(matches[:, :2])[:, :2]
+    out[:, 2:4] = rig.camera.unproject(matches[:, 2:])[:, :2]
+    out[:, 4], out[:, 5] = shutter.row_time(matches[:, 1], 0), shutter.row_time(matches[:, 3], 1)
+    out[:, 6] = rig.offset(side)[0]
+    return out
+
+
+def pack_tracks(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
+    """(n, 8) for ``track_kernels.track_terms`` from tracks (n, 8)."""
+    camera = rig.camera
+    middle = 0.5 * (tracks[:, [0, 1, 4, 5]] + tracks[:, [2, 3, 6, 7]])
+    out = np.zeros((len(tracks), 8))
+    out[:, :2] = camera.unproject(middle[:, :2])[:, :2]
+    out[:, 2], out[:, 5] = tracks[:, 0] - tracks[:, 2], tracks[:, 4] - tracks[:, 6]
+    out[:, 3], out[:, 4] = middle[:, 2] - camera.cx, middle[:, 3] - camera.cy
+    out[:, 6], out[:, 7] = shutter.row_time(middle[:, 1], 0), shutter.row_time(middle[:, 3], 1)
+    return out

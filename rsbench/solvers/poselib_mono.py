@@ -1,0 +1,77 @@
+"""PoseLib on the left camera: five points, then the Sampson error of all its matches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar, final
+
+from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.packed import temporal_pairs
+from rsbench.solvers.engine.poselib_adapter import (
+    BUNDLE,
+    MISSING,
+    estimate_of,
+    five_point_motions,
+    left_start,
+    poselib_camera,
+    poselib_module,
+    poselib_pose,
+)
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class PoselibMonoSolver(Solver):
+    """Left camera only: five-point proposals, then the Sampson error of all matches."""
+
+    name = "gs-poselib"
+    needs = frozenset[MatchSet]({"left"})
+    minimum: ClassVar[Mapping[MatchSet, int]] = MappingProxyType({"left": 8})
+    metric = False
+    motion_model = "linear"
+    shutter = "global"
+    reference_point = "left"
+    reference = "PoseLib; Nister: An efficient solution to the five-point relative pose problem, PAMI 2004"
+    assumes = "global shutter; translation"
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        matches = temporal_pairs(correspondences, "left")
+        if len(matches) < self.minimum["left"]:
+            return MotionEstimate.failed(f"{len(matches)} left matches, need {self.minimum['left']}")
+        start = left_start(matches, rig)
+        if start is None:
+            return MotionEstimate.failed(
+                "the matches fit more than one essential matrix: degenerate scene or motion"
+            )
+        return self.improve(MotionEstimate(w=start[0], d=start[1], success=True), correspondences, rig, shutter)
+
+    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
+        return {"left": 5}
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        return five_point_motions(temporal_pairs(sample, "left"), rig)
+
+    def improve(
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        quick: bool = False,
+    ) -> MotionEstimate:
+        poselib = poselib_module()
+        if poselib is None:
+            return MotionEstimate.failed(MISSING)
+        matches, camera = temporal_pairs(correspondences, "left"), poselib_camera(rig.camera)
+        start = poselib_pose(poselib, so3.exp(motion.w), motion.d)
+        options = {**BUNDLE, "max_iterations": 10} if quick else BUNDLE
+        pose, _ = poselib.refine_relative_pose(matches[:, :2], matches[:, 2:], start, camera, camera, options)
+        return estimate_of(pose, metric=False)

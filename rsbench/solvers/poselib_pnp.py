@@ -1,0 +1,106 @@
+"""PoseLib: points from the disparities of frame 0, pose of frame 1 from points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, ClassVar, final
+
+import numpy as np
+
+from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.poselib_adapter import (
+    BUNDLE,
+    MISSING,
+    estimate_of,
+    poselib_camera,
+    poselib_module,
+    poselib_pose,
+    rig_extrinsics,
+)
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class PoselibPnpSolver(Solver):
+    """Points from the disparities of frame 0, then the pose of frame 1's stereo pair from them."""
+
+    name = "gs-stereo-pnp"
+    needs = frozenset[MatchSet]({"tracks"})
+    minimum: ClassVar[Mapping[MatchSet, int]] = MappingProxyType({"tracks": 4})
+    metric = True
+    motion_model = "linear"
+    shutter = "global"
+    reference_point = "body"
+    reference = "PoseLib, generalised absolute pose; Persson, Nordberg: Lambda Twist, ECCV 2018"
+    assumes = "global shutter; depth of frame 0 without noise"
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        usable = _with_depth(correspondences.tracks)
+        if len(usable) < self.minimum["tracks"]:
+            return MotionEstimate.failed(
+                f"{len(usable)} tracks with positive disparity, need {self.minimum['tracks']}"
+            )
+        # A frame's motion is small: no motion at all is as good a start as a minimal solver's.
+        still = MotionEstimate(w=np.zeros(3), d=np.zeros(3), success=True)
+        return self.improve(still, correspondences, rig, shutter)
+
+    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
+        return {"tracks": 3}
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        poselib, tracks = poselib_module(), _with_depth(sample.tracks)
+        if poselib is None or len(tracks) < 3:
+            return []
+        rays = rig.camera.unproject(tracks[:3, 4:6])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        # Points in the body; the left camera of frame 1 sees them at R x + d + offset.
+        poses = poselib.p3p(rays, _points(tracks[:3], rig))
+        return [_shifted(pose, rig.offset("left")) for pose in poses if np.all(np.isfinite(pose.t))]
+
+    def improve(
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        quick: bool = False,
+    ) -> MotionEstimate:
+        poselib, tracks = poselib_module(), _with_depth(correspondences.tracks)
+        if poselib is None:
+            return MotionEstimate.failed(MISSING)
+        points = _points(tracks, rig)
+        start = poselib_pose(poselib, so3.exp(motion.w), motion.d)
+        options = {**BUNDLE, "max_iterations": 10} if quick else BUNDLE
+        pose, _ = poselib.refine_generalized_absolute_pose(
+            [tracks[:, 4:6], tracks[:, 6:8]],
+            [points, points],
+            start,
+            rig_extrinsics(poselib, rig),
+            [poselib_camera(rig.camera)] * 2,
+            options,
+        )
+        return estimate_of(pose, metric=True)
+
+
+def _with_depth(tracks: FloatArray) -> FloatArray:
+    """Tracks with a positive disparity in frame 0."""
+    return tracks[tracks[:, 0] - tracks[:, 2] > 0.0]
+
+
+def _points(tracks: FloatArray, rig: StereoRig) -> FloatArray:
+    """Points (n, 3) in the body of frame 0."""
+    depth = rig.depth(tracks[:, 0] - tracks[:, 2])
+    return depth[:, None] * rig.camera.unproject(tracks[:, :2]) - rig.offset("left")
+
+
+def _shifted(pose: Any, offset: FloatArray) -> MotionEstimate:
+    return MotionEstimate(w=so3.log(np.array(pose.R)), d=np.array(pose.t) - offset, success=True, metric=True)

@@ -1,0 +1,93 @@
+"""PoseLib on the rig: generalised relative pose of left and right pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar, final
+
+from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.packed import temporal_pairs
+from rsbench.solvers.engine.poselib_adapter import (
+    BUNDLE,
+    MISSING,
+    estimate_of,
+    five_point_motions,
+    left_start,
+    poselib_camera,
+    poselib_module,
+    poselib_pose,
+    rig_extrinsics,
+)
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class PoselibStereoSolver(Solver):
+    """Left and right pairs of the rig as one generalised camera."""
+
+    name = "gs-poselib-stereo"
+    needs = frozenset[MatchSet]({"left", "right"})
+    minimum: ClassVar[Mapping[MatchSet, int]] = MappingProxyType({"left": 8, "right": 8})
+    metric = True
+    motion_model = "linear"
+    shutter = "global"
+    reference_point = "body"
+    reference = "PoseLib, generalised relative pose of left-left and right-right matches"
+    assumes = "global shutter; translation; rotation that moves the baseline, for the scale"
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        for side in SIDES:
+            count = len(temporal_pairs(correspondences, side))
+            if count < self.minimum[side]:
+                return MotionEstimate.failed(f"{count} {side} matches, need {self.minimum[side]}")
+        start = left_start(temporal_pairs(correspondences, "left"), rig)
+        if start is None:
+            return MotionEstimate.failed(
+                "the matches fit more than one essential matrix: degenerate scene or motion"
+            )
+        motion = MotionEstimate(w=start[0], d=0.5 * rig.baseline * start[1], success=True)
+        return self.improve(motion, correspondences, rig, shutter)
+
+    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
+        return {"left": 5}
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        length = 0.5 * rig.baseline
+        return [
+            MotionEstimate(w=motion.w, d=length * motion.d, success=True)
+            for motion in five_point_motions(temporal_pairs(sample, "left"), rig)
+        ]
+
+    def improve(
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        quick: bool = False,
+    ) -> MotionEstimate:
+        poselib = poselib_module()
+        if poselib is None:
+            return MotionEstimate.failed(MISSING)
+        pairs = []
+        for k, side in enumerate(SIDES):
+            matches = temporal_pairs(correspondences, side)
+            pair = poselib.PairwiseMatches()
+            pair.cam_id1, pair.cam_id2 = k, k
+            pair.x1, pair.x2 = matches[:, :2], matches[:, 2:]
+            pairs.append(pair)
+        extrinsics, cameras = rig_extrinsics(poselib, rig), [poselib_camera(rig.camera)] * 2
+        start = poselib_pose(poselib, so3.exp(motion.w), motion.d)
+        options = {**BUNDLE, "max_iterations": 10} if quick else BUNDLE
+        pose, _ = poselib.refine_generalized_relative_pose(
+            pairs, start, extrinsics, cameras, extrinsics, cameras, options
+        )
+        return estimate_of(pose, metric=True)

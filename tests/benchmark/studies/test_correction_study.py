@@ -1,0 +1,147 @@
+"""The correction study: methods against the truth on a small dataset, statistics against direct computation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from rsbench.benchmark.studies.correction_study import METHODS, ROW_BANDS, flow_error, study_dataset, study_steps
+from rsbench.benchmark.studies.correction_summary import (
+    EXTRA,
+    SCORES,
+    loss_to_true_motion,
+    summarise,
+    summarise_bands,
+    verdict,
+)
+from rsbench.report.correction_page import study_page, write_study
+
+Tables = tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]
+
+
+@pytest.fixture(scope="module")
+def tables(smoke_dataset: Path) -> Tables:
+    """Of the two sequences of 128 x 96 px."""
+    words: list[str] = []
+    images, bands, motions = study_dataset(smoke_dataset, words.append)
+    assert len(words) == study_steps(smoke_dataset)
+    frames = [pd.DataFrame(rows) for rows in (images, bands, motions)]
+    for frame in frames:
+        frame.insert(0, "stratum", "small")
+    return frames[0], frames[1], frames[2]
+
+
+def test_every_method_scores_every_view(tables: Tables) -> None:
+    images, bands, motions = tables
+    assert len(images) == 2 * 4 * len(METHODS)
+    assert len(bands) == len(images) * ROW_BANDS
+    assert len(motions) == 2
+    first = (images["side"] == "left") & (images["frame"] == 0)
+    assert not images[first].isna().any().any()
+    assert not images.drop(columns=list(EXTRA)).isna().any().any()
+    assert images[~first][list(EXTRA)].isna().all().all()
+
+
+def test_the_truth_makes_no_flow_error_and_knowing_more_never_makes_it_worse(tables: Tables) -> None:
+    castle = tables[0][tables[0]["sequence"] == "castle"]
+    flow = castle.groupby("method")["flow_mean_px"].mean()
+    assert flow["truth"] == 0.0
+    assert flow["ours"] < 0.5 * flow["none"]
+    # The motion's own error, without that of the depth.
+    assert flow["true-depth"] < 0.2
+    assert flow["true-motion"] < flow["ours"] + 0.05
+
+
+def test_nothing_beats_ours_but_the_oracles(tables: Tables) -> None:
+    """On 128 x 96 px, resampling costs more than the motion, so ties within 0.3 dB are allowed."""
+    psnr = tables[0].groupby("method")["psnr_covered"].mean()
+    for method in METHODS:
+        if method.kind in ("none", "baseline"):
+            assert psnr["ours"] > psnr[method.key] - 0.3, method.key
+    assert psnr["ours"] > psnr["none"] + 4.0
+
+
+def test_uncorrected_frames_cover_everything(tables: Tables) -> None:
+    images = tables[0]
+    assert np.all(images[images["method"] == "none"]["coverage"] == 1.0)
+    assert np.all(images["common"] <= images["coverage"] + 1e-12)
+
+
+def test_the_summary_is_the_median_over_sequences_of_the_mean_of_views(tables: Tables) -> None:
+    summary = summarise(tables[0]).set_index("method")
+    images = tables[0]
+    for score in SCORES:
+        by_hand = [
+            images[(images["method"] == "ours") & (images["sequence"] == name)][score].mean()
+            for name in images["sequence"].unique()
+        ]
+        np.testing.assert_allclose(summary[score]["ours"], np.median(by_hand))
+    # The interval of two sequences spans both.
+    ours = summary.loc["ours"]
+    assert ours["psnr_covered_low"] <= ours["psnr_covered"] <= ours["psnr_covered_high"]
+    assert np.all(summary["sequences"] == 2) and np.all(summary["failures"] == 0)
+    np.testing.assert_allclose(summary["gain"]["ours"], 0.0)
+
+
+def _synthetic(ours: list[float], other: list[float]) -> pd.DataFrame:
+    """Scores of two methods on sequences of one view each; all other scores are 1."""
+    rows = []
+    for k, values in enumerate(zip(ours, other, strict=True)):
+        for method in METHODS:
+            row = {"stratum": "s", "sequence": f"q{k}", "side": "left", "frame": 0, "method": method.key}
+            row |= dict.fromkeys(SCORES, 1.0) | {"common": 1.0}
+            row["psnr_covered"] = row["psnr_all"] = values[0] if method.kind in ("ours", "oracle") else values[1]
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def test_paired_differences_see_what_separate_intervals_do_not() -> None:
+    """Sequences differ by 10 dB, methods by 1 dB on each."""
+    base = [20.0, 25.0, 30.0, 22.0, 28.0]
+    summary = summarise(_synthetic([value + 1.0 for value in base], base))
+    checked = verdict(summary)
+    assert len(checked) == sum(method.kind in ("none", "baseline") for method in METHODS)
+    assert not checked["covered_apart"].any() and checked["covered_paired"].all()
+    far = verdict(summarise(_synthetic([value + 30.0 for value in base], base)))
+    assert far["covered_apart"].all()
+    assert not far["flow_apart"].any()  # equal in the synthetic table
+    equal = verdict(summarise(_synthetic(base, base)))
+    assert not equal["covered_paired"].any()
+
+
+def test_the_loss_to_the_true_motion_is_paired_by_view() -> None:
+    images = _synthetic([30.0, 40.0, 50.0], [20.0, 20.0, 20.0])
+    mask = images["method"] == "true-motion"
+    images.loc[mask, "psnr_covered"] += [0.1, 0.3, 0.2]
+    loss = loss_to_true_motion(images).iloc[0]
+    np.testing.assert_allclose([loss["median_loss_db"], loss["largest_loss_db"]], [0.2, 0.3])
+
+
+def test_a_failed_method_is_counted(tables: Tables) -> None:
+    images = tables[0]
+    kept = images[~((images["method"] == "mono") & (images["sequence"] == "castle"))]
+    summary = summarise(kept).set_index("method")
+    assert summary.loc["mono", "failures"] == 1 and summary.loc["ours", "failures"] == 0
+
+
+def test_the_page_and_the_figure_come_from_the_stored_tables(tables: Tables, tmp_path: Path) -> None:
+    images, bands, _ = tables
+    images.to_csv(tmp_path / "views.csv", index=False)
+    summarise(images).to_csv(tmp_path / "summary.csv", index=False)
+    summarise_bands(bands).to_csv(tmp_path / "rows.csv", index=False)
+    first = [path.read_bytes() for path in write_study(tmp_path)]
+    assert [path.read_bytes() for path in write_study(tmp_path)] == first
+    text = study_page(images, summarise(images))
+    for method in METHODS:
+        assert method.title in text
+
+
+def test_flow_errors_are_lengths() -> None:
+    flow, truth = np.zeros((2, 3, 2), np.float32), np.zeros((2, 3, 2), np.float32)
+    flow[0, 0] = (3.0, 4.0)
+    flow[1, 2] = np.nan
+    error = flow_error(flow, truth)
+    assert error[0, 0] == 5.0 and np.isnan(error[1, 2]) and error[0, 1] == 0.0
