@@ -25,7 +25,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import load_dataset_card
 from rsbench.renderers.options import RendererOptions
-from rsbench.solvers.engine.registry import list_solvers, load_solver, load_solver_card
+from rsbench.solvers.engine.registry import list_solvers, load_solver_entry
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "rsbench").rglob("*.py"))
@@ -149,7 +149,7 @@ def test_renderer_cards_load(name: str) -> None:
 
 @pytest.mark.parametrize("name", list_cards("solvers"))
 def test_solver_cards_load(name: str) -> None:
-    assert load_solver_card(name).description
+    assert load_solver_entry(name).description
 
 
 @pytest.mark.parametrize("name", list_cards("datasets"))
@@ -212,8 +212,9 @@ def documented_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
 
 
 def test_the_documented_solver_works(documented_solver: Path) -> None:
-    solver = load_solver(documented_solver / "scipy-huber.toml")
-    assert solver.name == "scipy-huber"
+    entry = load_solver_entry(documented_solver / "scipy-huber.toml")
+    solver = entry.solver
+    assert entry.name == "scipy-huber"
     rig = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
     shutter = RollingShutter(height=900, readout_ratio=0.8)
     motion = LinearMotion(np.array([0.012, -0.02, 0.016]), np.array([0.2, -0.12, 0.18]))
@@ -234,7 +235,7 @@ def test_the_documented_entry_point_is_found(documented_solver: Path) -> None:
     (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
     assert "scipy" in {entry.name for entry in metadata.entry_points(group="rsbench.solvers")}
     assert "scipy" in list_solvers()
-    assert load_solver("scipy").name == "scipy"
+    assert load_solver_entry("scipy").name == "scipy"
 
 
 # Packaging

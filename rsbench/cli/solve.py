@@ -39,9 +39,9 @@ def solve(
 
     from rsbench.pipeline.problem import read_problem, solve_problem
     from rsbench.pipeline.robust_motion import RobustOptions
-    from rsbench.solvers.engine.registry import load_solver
+    from rsbench.solvers.engine.registry import load_solver_entry
 
-    chosen = load_solver(solver)
+    chosen = load_solver_entry(solver)
     options = RobustOptions()
     if threshold_px is not None:
         if not threshold_px > 0.0:

@@ -17,8 +17,8 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
-from rsbench.solvers.engine.base import Solver
 from rsbench.solvers.engine.packed import track_pairs
+from rsbench.solvers.engine.registry import SolverEntry
 
 _COLUMNS = {
     "left": "x0, y0, x1, y1",
@@ -133,22 +133,23 @@ def link_tracks(correspondences: Correspondences) -> Correspondences:
     )
 
 
-def solve_problem(problem: Problem, solver: Solver, options: RobustOptions, seed: int = 0) -> dict[str, Any]:
+def solve_problem(problem: Problem, entry: SolverEntry, options: RobustOptions, seed: int = 0) -> dict[str, Any]:
     """Answer to a problem, ready for JSON; a failure has ``w`` and ``d`` null and the reason."""
+    solver = entry.solver
     result = estimate_motion(
         problem.correspondences, problem.rig, problem.shutter, solver, options, np.random.default_rng(seed)
     )
     estimate = result.estimate
     counts: dict[str, int] = {}
     for side in SIDES:
-        if not solver.needs & {side, "tracks"}:
+        if not solver.spec.needs & {side, "tracks"}:
             counts[side] = 0
             continue
         own = getattr(problem.correspondences, side)[result.inliers[side]]
         halves = track_pairs(problem.correspondences.tracks, side)[result.inliers["tracks"]]
         counts[side] = len({row.tobytes() for row in np.concatenate([own, halves])})
     return {
-        "solver": solver.name,
+        "solver": entry.name,
         "success": estimate.success,
         "reason": estimate.reason,
         "w": estimate.w.tolist() if estimate.success else None,

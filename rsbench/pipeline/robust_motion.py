@@ -27,7 +27,7 @@ _ADAPTATIONS, _FIXED_POINT_STEPS = 2, 8
 
 @dataclass(frozen=True, kw_only=True)
 class RobustOptions:
-    """The robust loop, equal for every solver unless its card says otherwise."""
+    """The robust loop, equal for every solver."""
 
     threshold_px: float = 1.25
     """Largest Sampson error of an inlier: 2.5 standard deviations of a match's noise of 0.5 px."""
@@ -164,7 +164,7 @@ class _RobustProblem:
 
     def _data(self) -> Correspondences:
         """Each measurement once: tracks as tracks or as pairs, and the pairs that no track repeats."""
-        given, needs = self.given, self.solver.needs
+        given, needs = self.given, self.solver.spec.needs
         pairs = {}
         for side in SIDES:
             own = getattr(given, side)[unlinked_pairs(given, side)]
@@ -178,10 +178,10 @@ class _RobustProblem:
     def _packed(self) -> Packed:
         """The data under the shutter that the solver believes in, about the point whose motion it gives."""
         shutter = self.shutter
-        if self.solver.shutter == "global":
+        if self.solver.spec.shutter == "global":
             shutter = RollingShutter(height=shutter.height, readout_ratio=0.0)
-        packed = pack(self.data, self.rig, shutter, self.solver.motion_model)
-        if self.solver.reference_point == "left":
+        packed = pack(self.data, self.rig, shutter, self.solver.spec.motion_model)
+        if self.solver.spec.reference_point == "left":
             packed.pairs[:, 6] = 0.0
         return packed
 
@@ -251,7 +251,7 @@ class _RobustProblem:
         out: dict[MatchSet, BoolArray] = {side: _found(getattr(self.given, side), good[side]) for side in SIDES}
         out["tracks"] = split[2]
         if not self.linked:
-            sides = [side for side in SIDES if side in self.solver.needs]
+            sides = [side for side in SIDES if side in self.solver.spec.needs]
             halves_good = [_found(track_pairs(self.given.tracks, side), good[side]) for side in sides]
             out["tracks"] = (
                 np.all(halves_good, axis=0) if sides else np.zeros(len(self.given.tracks), dtype=np.bool_)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import ClassVar, final
+from typing import final
 
 import numpy as np
 
@@ -16,7 +14,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.packed import temporal_pairs
 
 _ROUNDING = 1e-10
@@ -62,22 +60,24 @@ def decompose_essential(E: FloatArray, x0: FloatArray, x1: FloatArray) -> tuple[
 class EightPointSolver(Solver):
     """Ignores the rolling shutter; gives the left camera's motion, its translation without length."""
 
-    name = "gs-8pt"
-    needs = frozenset[MatchSet]({"left"})
-    minimum: ClassVar[Mapping[MatchSet, int]] = MappingProxyType({"left": 8})
-    metric = False
-    motion_model = "linear"
-    shutter = "global"
-    reference_point = "left"
-    reference = "Hartley: In Defense of the Eight-Point Algorithm, PAMI 1997"
-    assumes = "global shutter; a scene that is not planar; translation"
+    spec = SolverSpec(
+        needs=frozenset({"left"}),
+        minimum={"left": 8},
+        metric=False,
+        motion_model="linear",
+        shutter="global",
+        reference_point="left",
+        reference="Hartley: In Defense of the Eight-Point Algorithm, PAMI 1997",
+        assumes="global shutter; a scene that is not planar; translation",
+    )
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         matches = temporal_pairs(correspondences, "left")
-        if len(matches) < self.minimum["left"]:
-            return MotionEstimate.failed(f"{len(matches)} left matches, need {self.minimum['left']}")
+        short = self.spec.shortage({"left": len(matches)})
+        if short is not None:
+            return short
         x0, x1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
         E = eight_point(x0, x1)
         if E is None:

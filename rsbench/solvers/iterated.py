@@ -11,10 +11,8 @@ antisymmetric terms in w w cancel against the second-order rotation that it drop
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import ClassVar, Literal, final
+from typing import Literal, final
 
 import numpy as np
 
@@ -23,7 +21,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.packed import Packed, pack, pack_tracks
 from rsbench.solvers.linear import null_vector, rotation_from_essential
 
@@ -126,33 +124,37 @@ class IteratedSolver(Solver):
     max_translation_m: float = 50.0
     """Longest translation per frame period that counts as known length."""
 
-    name = "rs-stereo-iterated"
-    needs = frozenset[MatchSet]({"left", "right"})
-    minimum: ClassVar[Mapping[MatchSet, int]] = MappingProxyType({"left": 7, "right": 7})
-    metric = True
-    motion_model = "linear"
-    shutter = "rolling"
-    reference_point = "body"
-    reference = "rsbench; after Wang, Fan, Dai, eq. 7-10, with the antisymmetric part of E folded into d"
-    assumes = "small rotation, constant velocity, a scene that is not planar, translation"
-
     def __post_init__(self) -> None:
         if self.passes < 1:
             raise ValueError(f"passes must be at least 1, got {self.passes}")
-        if self.scale == "tracks":
-            # The class is frozen; what it needs follows from its parameters.
-            object.__setattr__(self, "needs", frozenset[MatchSet]({"tracks"}))
-            object.__setattr__(self, "minimum", MappingProxyType({"tracks": 7}))
+
+    @property
+    def spec(self) -> SolverSpec:
+        minimum: dict[MatchSet, int] = {"left": 7, "right": 7} if self.scale == "pairs" else {"tracks": 7}
+        return SolverSpec(
+            needs=frozenset(minimum),
+            minimum=minimum,
+            metric=True,
+            motion_model="linear",
+            shutter="rolling",
+            reference_point="body",
+            reference="rsbench; after Wang, Fan, Dai, eq. 7-10, with the antisymmetric part of E folded into d",
+            assumes="small rotation, constant velocity, a scene that is not planar, translation",
+        )
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         packed = pack(correspondences, rig, shutter, use_tracks=False)
         pairs = packed.pair_counts()
-        counts = {"left": pairs["left"], "right": pairs["right"], "tracks": len(correspondences.tracks)}
-        for name, least in self.minimum.items():
-            if counts[name] < least:
-                return MotionEstimate.failed(f"{counts[name]} {name} matches, need {least}")
+        counts: dict[MatchSet, int] = {
+            "left": pairs["left"],
+            "right": pairs["right"],
+            "tracks": len(correspondences.tracks),
+        }
+        short = self.spec.shortage(counts)
+        if short is not None:
+            return short
         solution = solve_reduced(packed.pairs, self.unknowns, self.passes)
         if isinstance(solution, str):
             return MotionEstimate.failed(solution)

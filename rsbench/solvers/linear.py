@@ -5,10 +5,8 @@ Nine left and nine right matches over time (or more) give a linear system A X = 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import ClassVar, Literal, final
+from typing import Literal, final
 
 import numpy as np
 
@@ -16,7 +14,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.packed import pack, temporal_pairs
 
 _ROUNDING = 1e-10
@@ -92,23 +90,24 @@ class LinearSolver(Solver):
     extraction: Literal["full", "symmetric"] = "full"
     """Entries of E that give w: all nine, or the symmetric part, which noise reaches less."""
 
-    name = "rs-stereo-linear"
-    needs = frozenset[MatchSet]({"left", "right"})
-    minimum: ClassVar[Mapping[MatchSet, int]] = MappingProxyType({"left": 9, "right": 9})
-    metric = True
-    motion_model = "linear"
-    shutter = "rolling"
-    reference_point = "body"
-    reference = "Wang, Fan, Dai: Relative Pose Estimation for Stereo Rolling Shutter Cameras, eq. 7-10"
-    assumes = "small rotation, constant velocity, readout ratio above 0, generic motion, very low noise"
+    spec = SolverSpec(
+        needs=frozenset({"left", "right"}),
+        minimum={"left": 9, "right": 9},
+        metric=True,
+        motion_model="linear",
+        shutter="rolling",
+        reference_point="body",
+        reference="Wang, Fan, Dai: Relative Pose Estimation for Stereo Rolling Shutter Cameras, eq. 7-10",
+        assumes="small rotation, constant velocity, readout ratio above 0, generic motion, very low noise",
+    )
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         matches = {side: temporal_pairs(correspondences, side) for side in SIDES}
-        for side in SIDES:
-            if len(matches[side]) < self.minimum[side]:
-                return MotionEstimate.failed(f"{len(matches[side])} {side} matches, need {self.minimum[side]}")
+        short = self.spec.shortage({side: len(matches[side]) for side in SIDES})
+        if short is not None:
+            return short
         A = np.concatenate([system_rows(matches[side], side, rig, shutter) for side in SIDES])
         X, reason = null_vector(A)
         if X is None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import ClassVar, final
+from typing import final
 
 import cv2
 import numpy as np
@@ -16,7 +15,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.eight_point import decompose_essential
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.packed import temporal_pairs
 
 
@@ -32,22 +31,24 @@ class OpenCvFivePointSolver(Solver):
     """Inlier threshold of OpenCV's own RANSAC, which it always runs."""
     confidence: float = 0.999
 
-    name = "gs-5pt-opencv"
-    needs = frozenset[MatchSet]({"left"})
-    minimum: ClassVar[Mapping[MatchSet, int]] = MappingProxyType({"left": 6})
-    metric = False
-    motion_model = "linear"
-    shutter = "global"
-    reference_point = "left"
-    reference = "OpenCV findEssentialMat; Nister: An efficient solution to the five-point problem, PAMI 2004"
-    assumes = "global shutter; translation"
+    spec = SolverSpec(
+        needs=frozenset({"left"}),
+        minimum={"left": 6},
+        metric=False,
+        motion_model="linear",
+        shutter="global",
+        reference_point="left",
+        reference="OpenCV findEssentialMat; Nister: An efficient solution to the five-point problem, PAMI 2004",
+        assumes="global shutter; translation",
+    )
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         matches = temporal_pairs(correspondences, "left")
-        if len(matches) < self.minimum["left"]:
-            return MotionEstimate.failed(f"{len(matches)} left matches, need {self.minimum['left']}")
+        short = self.spec.shortage({"left": len(matches)})
+        if short is not None:
+            return short
         motions = self._motions(matches, rig)
         return motions[0] if motions else MotionEstimate.failed("OpenCV found no essential matrix")
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import ClassVar, final
+from typing import final
 
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.packed import temporal_pairs
 from rsbench.solvers.engine.poselib_adapter import (
     BUNDLE,
@@ -30,22 +29,24 @@ from rsbench.solvers.engine.poselib_adapter import (
 class PoselibMonoSolver(Solver):
     """Left camera only: five-point proposals, then the Sampson error of all matches."""
 
-    name = "gs-poselib"
-    needs = frozenset[MatchSet]({"left"})
-    minimum: ClassVar[Mapping[MatchSet, int]] = MappingProxyType({"left": 8})
-    metric = False
-    motion_model = "linear"
-    shutter = "global"
-    reference_point = "left"
-    reference = "PoseLib; Nister: An efficient solution to the five-point relative pose problem, PAMI 2004"
-    assumes = "global shutter; translation"
+    spec = SolverSpec(
+        needs=frozenset({"left"}),
+        minimum={"left": 8},
+        metric=False,
+        motion_model="linear",
+        shutter="global",
+        reference_point="left",
+        reference="PoseLib; Nister: An efficient solution to the five-point relative pose problem, PAMI 2004",
+        assumes="global shutter; translation",
+    )
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         matches = temporal_pairs(correspondences, "left")
-        if len(matches) < self.minimum["left"]:
-            return MotionEstimate.failed(f"{len(matches)} left matches, need {self.minimum['left']}")
+        short = self.spec.shortage({"left": len(matches)})
+        if short is not None:
+            return short
         start = left_start(matches, rig)
         if start is None:
             return MotionEstimate.failed(

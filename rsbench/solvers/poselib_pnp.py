@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.poselib_adapter import (
     BUNDLE,
     MISSING,
@@ -31,23 +30,24 @@ from rsbench.solvers.engine.poselib_adapter import (
 class PoselibPnpSolver(Solver):
     """Points from the disparities of frame 0, then the pose of frame 1's stereo pair from them."""
 
-    name = "gs-stereo-pnp"
-    needs = frozenset[MatchSet]({"tracks"})
-    minimum: ClassVar[Mapping[MatchSet, int]] = MappingProxyType({"tracks": 4})
-    metric = True
-    motion_model = "linear"
-    shutter = "global"
-    reference_point = "body"
-    reference = "PoseLib, generalised absolute pose; Persson, Nordberg: Lambda Twist, ECCV 2018"
-    assumes = "global shutter; depth of frame 0 without noise"
+    spec = SolverSpec(
+        needs=frozenset({"tracks"}),
+        minimum={"tracks": 4},
+        metric=True,
+        motion_model="linear",
+        shutter="global",
+        reference_point="body",
+        reference="PoseLib, generalised absolute pose; Persson, Nordberg: Lambda Twist, ECCV 2018",
+        assumes="global shutter; depth of frame 0 without noise",
+    )
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         usable = _with_depth(correspondences.tracks)
-        if len(usable) < self.minimum["tracks"]:
+        if len(usable) < self.spec.minimum["tracks"]:
             return MotionEstimate.failed(
-                f"{len(usable)} tracks with positive disparity, need {self.minimum['tracks']}"
+                f"{len(usable)} tracks with positive disparity, need {self.spec.minimum['tracks']}"
             )
         # A frame's motion is small: no motion at all is as good a start as a minimal solver's.
         still = MotionEstimate(w=np.zeros(3), d=np.zeros(3), success=True)

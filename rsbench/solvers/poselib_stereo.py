@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import ClassVar, final
+from typing import final
 
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.packed import temporal_pairs
 from rsbench.solvers.engine.poselib_adapter import (
     BUNDLE,
@@ -31,23 +30,23 @@ from rsbench.solvers.engine.poselib_adapter import (
 class PoselibStereoSolver(Solver):
     """Left and right pairs of the rig as one generalised camera."""
 
-    name = "gs-poselib-stereo"
-    needs = frozenset[MatchSet]({"left", "right"})
-    minimum: ClassVar[Mapping[MatchSet, int]] = MappingProxyType({"left": 8, "right": 8})
-    metric = True
-    motion_model = "linear"
-    shutter = "global"
-    reference_point = "body"
-    reference = "PoseLib, generalised relative pose of left-left and right-right matches"
-    assumes = "global shutter; translation; rotation that moves the baseline, for the scale"
+    spec = SolverSpec(
+        needs=frozenset({"left", "right"}),
+        minimum={"left": 8, "right": 8},
+        metric=True,
+        motion_model="linear",
+        shutter="global",
+        reference_point="body",
+        reference="PoseLib, generalised relative pose of left-left and right-right matches",
+        assumes="global shutter; translation; rotation that moves the baseline, for the scale",
+    )
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        for side in SIDES:
-            count = len(temporal_pairs(correspondences, side))
-            if count < self.minimum[side]:
-                return MotionEstimate.failed(f"{count} {side} matches, need {self.minimum[side]}")
+        short = self.spec.shortage({side: len(temporal_pairs(correspondences, side)) for side in SIDES})
+        if short is not None:
+            return short
         start = left_start(temporal_pairs(correspondences, "left"), rig)
         if start is None:
             return MotionEstimate.failed(

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import ClassVar, Literal, final
+from typing import Literal, final
 
 import cv2
 import numpy as np
@@ -16,7 +15,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.eight_point import decompose_essential, eight_point
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, MotionModel, Solver
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.five_point import five_point
 from rsbench.solvers.engine.minimal import solve_triples
 from rsbench.solvers.engine.optimise import Minimum, levenberg_marquardt
@@ -46,7 +45,7 @@ class RefinedSolver(Solver):
     linear solvers with 15, 11 and 9 unknowns and the eight-point algorithm. The sign of d comes from cheirality.
     """
 
-    motion_model: MotionModel = "linear"
+    motion_model: str = "linear"
     """Interpolation between the rows: the paper's, or a constant twist."""
     use_tracks: bool = True
     """Off: tracks count as unlinked left and right matches, for a fair comparison with solvers of pairs."""
@@ -64,23 +63,25 @@ class RefinedSolver(Solver):
     max_rotation_sigma: float = 0.2
     """Standard deviation of the rotation (radians) above which there is no estimate."""
 
-    name = "rs-stereo-refined"
-    needs = frozenset[MatchSet]({"left", "right"})
-    minimum: ClassVar[Mapping[MatchSet, int]] = MappingProxyType({"left": 7, "right": 7})
-    metric = True
-    reference_point = "body"
-    reference = "rsbench; maximum likelihood of the motion model of Wang, Fan, Dai, eq. 1-6 without linearisation"
-    assumes = "constant velocity of the chosen motion model, Gaussian noise, no outliers"
-
     def __post_init__(self) -> None:
         if self.motion_model not in ("linear", "twist"):
             raise ValueError(f"motion_model must be 'linear' or 'twist', got {self.motion_model!r}")
         if not (self.use_tracks or self.use_pairs):
             raise ValueError("use_tracks and use_pairs cannot both be off")
-        if not self.use_pairs:
-            # The class is frozen; what it needs follows from its parameters.
-            object.__setattr__(self, "needs", frozenset[MatchSet]({"tracks"}))
-            object.__setattr__(self, "minimum", MappingProxyType({"tracks": 3}))
+
+    @property
+    def spec(self) -> SolverSpec:
+        minimum: dict[MatchSet, int] = {"left": 7, "right": 7} if self.use_pairs else {"tracks": 3}
+        return SolverSpec(
+            needs=frozenset(minimum),
+            minimum=minimum,
+            metric=True,
+            motion_model=self.motion_model,
+            shutter=self.shutter,
+            reference_point="body",
+            reference="rsbench; maximum likelihood of Wang, Fan, Dai, eq. 1-6 without linearisation",
+            assumes="constant velocity of the chosen motion model, Gaussian noise, no outliers",
+        )
 
     def packed(self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter) -> Packed:
         """The measurements that this solver uses, with the shutter that it believes in."""
@@ -97,10 +98,14 @@ class RefinedSolver(Solver):
         packed = self.packed(correspondences, rig, shutter)
         if len(packed.tracks) == 0:
             pairs = packed.pair_counts()
-            counts = {"tracks": len(correspondences.tracks), "left": pairs["left"], "right": pairs["right"]}
-            for name, least in self.minimum.items():
-                if counts[name] < least:
-                    return MotionEstimate.failed(f"{counts[name]} {name} matches, need {least}")
+            counts: dict[MatchSet, int] = {
+                "tracks": len(correspondences.tracks),
+                "left": pairs["left"],
+                "right": pairs["right"],
+            }
+            short = self.spec.shortage(counts)
+            if short is not None:
+                return short
         best = self._descend(packed, rig)
         if best is None:
             return MotionEstimate.failed("no start found: degenerate motion or scene")

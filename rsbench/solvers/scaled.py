@@ -7,7 +7,8 @@ constant velocity, a match that took ``a = 1 + h (y1 - y0)`` frame periods has m
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -17,8 +18,8 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 
 _LEAST_DURATION = 0.05
 """Frame periods; a shorter one means a jump of nearly the whole image upwards, which no flow survives."""
@@ -49,25 +50,38 @@ class FlowScaledSolver(Solver):
 
     solver: str
     """Name or card of the global-shutter solver."""
-    inner: Solver = field(init=False, repr=False)
-
-    name = "flow-scaled"
-    motion_model = "twist"
-    shutter = "rolling"
 
     def __post_init__(self) -> None:
+        if self._entry.solver.spec.shutter != "global":
+            raise RsbenchError(f"solver = {self.solver!r}: must be a global-shutter solver")
+
+    @cached_property
+    def _entry(self) -> SolverEntry:
         try:
-            inner = load_solver(self.solver)
+            return load_solver_entry(self.solver)
         except RecursionError:
             raise RsbenchError(f"solver = {self.solver!r}: refers to this card itself") from None
-        if inner.shutter != "global":
-            raise RsbenchError(f"solver = {self.solver!r}: must be a global-shutter solver")
-        # The class is frozen; what it declares is what the solver inside declares.
-        object.__setattr__(self, "inner", inner)
-        for name in ("needs", "minimum", "metric", "reference_point"):
-            object.__setattr__(self, name, getattr(inner, name))
-        object.__setattr__(self, "reference", f"Zhuang, Cheong, Lee, ICCV 2017, eq. 8-9; {inner.reference}")
-        object.__setattr__(self, "assumes", f"constant twist, small motion; {inner.assumes}")
+
+    @property
+    def inner(self) -> Solver:
+        """The global-shutter solver."""
+        return self._entry.solver
+
+    @property
+    def inner_keys(self) -> tuple[str, ...]:
+        return (self._entry.key,)
+
+    @property
+    def spec(self) -> SolverSpec:
+        """What the solver inside declares, on a rolling shutter."""
+        inner = self.inner.spec
+        return replace(
+            inner,
+            motion_model="twist",
+            shutter="rolling",
+            reference=f"Zhuang, Cheong, Lee, ICCV 2017, eq. 8-9; {inner.reference}",
+            assumes=f"constant twist, small motion; {inner.assumes}",
+        )
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter

@@ -18,7 +18,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.problem import link_tracks, parse_problem, read_problem, solve_problem
 from rsbench.pipeline.robust_motion import RobustOptions
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.registry import load_solver_entry
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
@@ -120,7 +120,7 @@ def test_left_right_matches_at_the_same_pixels_become_tracks() -> None:
 def test_answer_has_the_documented_fields(name: str) -> None:
     problem = parse_problem(json.dumps(content()), "p.json")
     options = RobustOptions(threshold_px=5.0)
-    answer = solve_problem(problem, load_solver(name), options)
+    answer = solve_problem(problem, load_solver_entry(name), options)
     keys = ["solver", "success", "reason", "w", "d", "metric", "inliers_left", "inliers_right", "seconds"]
     assert list(answer) == keys
     assert json.loads(json.dumps(answer, allow_nan=False)) == answer
@@ -133,6 +133,6 @@ def test_answer_has_the_documented_fields(name: str) -> None:
 
 def test_a_failure_has_no_motion() -> None:
     problem = parse_problem(json.dumps(content(left=[], right=[], tracks=None)), "p.json")
-    answer = solve_problem(problem, load_solver("rs-stereo-refined"), RobustOptions())
+    answer = solve_problem(problem, load_solver_entry("rs-stereo-refined"), RobustOptions())
     assert answer["success"] is False and answer["w"] is None and answer["d"] is None and answer["reason"]
     json.dumps(answer, allow_nan=False)

@@ -86,12 +86,12 @@ def test_every_solver_runs_in_the_loop(name: str) -> None:
     """Low noise and few outliers: what even the most sensitive solver stands."""
     s = simulation(pairs=60, tracks=60, outliers=0.05, noise=1e-3)
     solver = load_solver(name)
-    threshold = 0.3 if solver.shutter == "rolling" else 3.0
+    threshold = 0.3 if solver.spec.shutter == "rolling" else 3.0
     result = run(s, name, threshold_px=threshold, max_iterations=300)
     estimate = result.estimate
     assert estimate.success, estimate.reason
     d = s.motion.d
-    if solver.reference_point == "left":
+    if solver.spec.reference_point == "left":
         d = translation_of_offset(s.motion.w, d, RIG.offset("left"))
     assert np.degrees(rotation_error(estimate.w, s.motion.w)) < 0.5
     assert np.degrees(translation_error(estimate.d, d)) < 4.0

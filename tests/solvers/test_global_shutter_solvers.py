@@ -37,11 +37,11 @@ def medians(name: str, model: str, noise_px: float, trials: int = 30) -> tuple[f
     solver = load_solver(name)
     errors = []
     for seed in range(trials):
-        s = trial(seed, model, noise_px, tracks="tracks" in solver.needs)
+        s = trial(seed, model, noise_px, tracks="tracks" in solver.spec.needs)
         estimate = solver.estimate(s.correspondences, RIG, SHUTTER)
         assert estimate.success, estimate.reason
         d = s.motion.d
-        if solver.reference_point == "left":
+        if solver.spec.reference_point == "left":
             d = translation_of_offset(s.motion.w, d, RIG.offset("left"))
         errors.append([float(rotation_error(estimate.w, s.motion.w)), float(translation_error(estimate.d, d))])
     e_R, e_T = np.degrees(np.median(errors, axis=0))
@@ -85,7 +85,7 @@ def test_flow_scaling_removes_most_of_the_error_on_twist_data(name: str) -> None
 @pytest.mark.parametrize("name", ["gs-poselib-stereo", "gs-stereo-tracks", "gs-stereo-pnp"])
 def test_stereo_baselines_are_metric(name: str) -> None:
     solver = load_solver(name)
-    s = trial(0, "linear", 0.0, GLOBAL, tracks="tracks" in solver.needs)
+    s = trial(0, "linear", 0.0, GLOBAL, tracks="tracks" in solver.spec.needs)
     estimate = solver.estimate(s.correspondences, RIG, GLOBAL)
     assert estimate.metric and scale_error(estimate.d, s.motion.d) < 1e-6
 
@@ -97,7 +97,7 @@ def test_both_global_shutter_optima_agree(tmp_path: Path) -> None:
         'class = "rsbench.solvers.refined:RefinedSolver"\n[parameters]\nshutter = "global"\nuse_tracks = false\n'
     )
     ours, theirs = load_solver(card), load_solver("gs-poselib-stereo")
-    assert ours.shutter == "global"
+    assert ours.spec.shutter == "global"
     for seed in range(5):
         s = trial(seed, "linear", 0.5)
         first, second = (solver.estimate(s.correspondences, RIG, SHUTTER) for solver in (ours, theirs))
@@ -131,8 +131,16 @@ def test_scaled_solver_declares_what_its_inner_one_does(tmp_path: Path) -> None:
     solver = load_solver("gs-poselib-scaled")
     assert isinstance(solver, FlowScaledSolver)
     inner = load_solver("gs-poselib")
-    assert (solver.needs, solver.minimum, solver.reference_point) == (inner.needs, inner.minimum, "left")
-    assert solver.shutter == "rolling" and solver.motion_model == "twist" and "Zhuang" in solver.reference
+    assert (solver.spec.needs, solver.spec.minimum, solver.spec.reference_point) == (
+        inner.spec.needs,
+        inner.spec.minimum,
+        "left",
+    )
+    assert (
+        solver.spec.shutter == "rolling"
+        and solver.spec.motion_model == "twist"
+        and "Zhuang" in solver.spec.reference
+    )
     for text, message in (("rs-stereo-linear", "must be a global-shutter solver"), ("gs-9pt", "gs-9pt")):
         card = tmp_path / "bad.toml"
         card.write_text(f'class = "rsbench.solvers.scaled:FlowScaledSolver"\n[parameters]\nsolver = "{text}"\n')
@@ -148,4 +156,4 @@ def test_tracks_only_solver_wants_tracks() -> None:
     c = simulate(RIG, SHUTTER, motion, SimulationOptions(pairs=30), np.random.default_rng(0)).correspondences
     estimate = load_solver("rs-stereo-tracks").estimate(c, RIG, SHUTTER)
     assert not estimate.success and "tracks" in estimate.reason
-    assert load_solver("rs-stereo-tracks").needs == {"tracks"}
+    assert load_solver("rs-stereo-tracks").spec.needs == {"tracks"}

@@ -92,7 +92,7 @@ def median_errors(solver: Solver, pairs: int, noise_px: float, trials: int = 40)
         options = SimulationOptions(pairs=pairs, noise_px=noise_px)
         estimate = solver.estimate(simulate(RIG, SHUTTER, motion, options, rng).correspondences, RIG, SHUTTER)
         d = motion.d
-        if solver.reference_point == "left":
+        if solver.spec.reference_point == "left":
             d = translation_of_offset(motion.w, d, RIG.offset("left"))
         if estimate.success:
             errors.append([float(rotation_error(estimate.w, motion.w)), float(translation_error(estimate.d, d))])

@@ -12,7 +12,6 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.engine.base import MotionModel
 from rsbench.solvers.engine.minimal import damped_step, solve_triples
 from rsbench.solvers.engine.optimise import levenberg_marquardt
 from rsbench.solvers.engine.packed import pack, theta_of
@@ -21,7 +20,7 @@ RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
 
 
-def trial(model: MotionModel, noise_px: float) -> Simulation:
+def trial(model: str, noise_px: float) -> Simulation:
     rng = np.random.default_rng(3)
     motion = random_motion(rng, np.radians(2.0), 0.3, model)
     return simulate(RIG, SHUTTER, motion, SimulationOptions(tracks=60, noise_px=noise_px), rng)
@@ -46,7 +45,7 @@ def test_no_step_from_a_singular_matrix() -> None:
 
 
 @pytest.mark.parametrize("model", ["linear", "twist"])
-def test_exact_samples_give_the_motion(model: MotionModel) -> None:
+def test_exact_samples_give_the_motion(model: str) -> None:
     s = trial(model, 0.0)
     packed = pack(s.correspondences, RIG, SHUTTER, model)
     samples = np.arange(60).reshape(20, 3)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import sys
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
-from typing import ClassVar, final
+from typing import final
 
 import numpy as np
 import pytest
@@ -15,21 +15,24 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
-from rsbench.solvers.engine import registry
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
-from rsbench.solvers.engine.registry import list_solvers, load_solver, load_solver_card
+from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.engine.registry import SOLVERS, list_solvers, load_solver, load_solver_entry
 from rsbench.solvers.linear import LinearSolver
+
+SPEC = SolverSpec(
+    needs=frozenset({"left"}),
+    minimum={"left": 1},
+    metric=False,
+    motion_model="linear",
+    shutter="global",
+    reference_point="body",
+    reference="a test",
+    assumes="nothing",
+)
 
 
 class _Nothing(Solver):
-    needs = frozenset()
-    minimum: ClassVar[Mapping[MatchSet, int]] = {}
-    metric = False
-    motion_model = "linear"
-    shutter = "global"
-    reference_point = "body"
-    reference = "a test"
-    assumes = "nothing"
+    spec = SPEC
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
@@ -71,9 +74,9 @@ def test_parameters_come_from_the_card(tmp_path: Path) -> None:
         'class = "rsbench.solvers.linear:LinearSolver"\ndescription = "mine"\n'
         '[parameters]\nextraction = "symmetric"\n',
     )
-    loaded = load_solver_card(path)
+    loaded = load_solver_entry(path)
     assert isinstance(loaded.solver, LinearSolver) and loaded.solver.extraction == "symmetric"
-    assert loaded.solver.name == loaded.name == "mine" and loaded.description == "mine"
+    assert loaded.name == "mine" and loaded.description == "mine"
 
 
 @pytest.mark.parametrize(
@@ -113,7 +116,7 @@ def test_an_unknown_name_lists_what_exists() -> None:
 
 
 def entry(name: str, target: str) -> metadata.EntryPoint:
-    return metadata.EntryPoint(name=name, value=target, group=registry.ENTRY_POINT_GROUP)
+    return metadata.EntryPoint(name=name, value=target, group=SOLVERS.group)
 
 
 def install(monkeypatch: pytest.MonkeyPatch, solver: object, *names: str) -> None:
@@ -126,16 +129,17 @@ def install(monkeypatch: pytest.MonkeyPatch, solver: object, *names: str) -> Non
 def test_an_installed_package_adds_a_solver(monkeypatch: pytest.MonkeyPatch, cls: type[Solver]) -> None:
     install(monkeypatch, cls, "patient")
     assert "patient" in list_solvers()
-    solver = load_solver("patient")
-    assert type(solver) is cls and solver.name == "patient"
+    loaded = load_solver_entry("patient")
+    assert type(loaded.solver) is cls and loaded.name == "patient" and not loaded.built_in
 
 
-def test_a_name_clash_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    install(monkeypatch, Patient, "gs-8pt")
-    with pytest.raises(RsbenchError, match=r"gs-8pt.*taken by a built-in"):
-        list_solvers()
-    install(monkeypatch, Patient, "twice", "twice")
-    with pytest.raises(RsbenchError, match=r"twice.*taken by package0"):
+def test_a_name_clash_is_an_error_of_that_name_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch, Patient, "gs-8pt", "twice", "twice")
+    assert list_solvers().count("twice") == 1
+    assert load_solver_entry("rs-stereo-linear").built_in
+    with pytest.raises(RsbenchError, match=r"gs-8pt.*card gs-8pt.toml of rsbench and of package0:Solver"):
+        load_solver("gs-8pt")
+    with pytest.raises(RsbenchError, match=r"twice.*package1:Solver.* and of package2:Solver"):
         load_solver("twice")
 
 
@@ -152,11 +156,75 @@ def test_a_broken_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
         load_solver("odd")
 
 
-def test_parameters_of_a_plain_class() -> None:
-    solver = registry._instance(Plain, {"mood": "wild"}, "plain", "card.toml")
-    assert isinstance(solver, Plain) and solver.mood == "wild"
+def test_a_card_finds_the_module_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "moody_solver.py").write_text(PLAIN, "utf-8")
+    text = 'class = "moody_solver:Plain"\ntime_limit_s = 5\nrobust = "own"\n[parameters]\nmood = "wild"'
+    loaded = load_solver_entry(card(tmp_path, text))
+    assert vars(loaded.solver)["mood"] == "wild"
+    assert loaded.options.time_limit_s == 5.0 and loaded.options.robust == "own"
     with pytest.raises(RsbenchError, match=r"unknown key 'moood'.*mood"):
-        registry._instance(Plain, {"moood": "wild"}, "plain", "card.toml")
+        load_solver(card(tmp_path, 'class = "moody_solver:Plain"\n[parameters]\nmoood = "wild"'))
+    with pytest.raises(RsbenchError, match=r"unknown key 'time_limit'.*did you mean 'time_limit_s'"):
+        load_solver(card(tmp_path, 'class = "moody_solver:Plain"\ntime_limit = 5'))
+    sys.modules.pop("moody_solver")
+
+
+PLAIN = """
+from rsbench.solvers.engine.base import MotionEstimate, Solver
+from rsbench.solvers.engine.registry import load_solver
+
+
+class Plain(Solver):
+    spec = load_solver("gs-8pt").spec
+
+    def __init__(self, mood="calm"):
+        self.mood = mood
+
+    def estimate(self, correspondences, rig, shutter):
+        return MotionEstimate.failed(self.mood)
+"""
+
+
+def test_the_key_follows_class_parameters_source_and_what_is_inside(tmp_path: Path) -> None:
+    scaled = 'class = "rsbench.solvers.scaled:FlowScaledSolver"\n[parameters]\nsolver = "{}"'
+    inner = tmp_path / "inner.toml"
+    keys = set()
+    for iterations in (20, 30):
+        inner.write_text(
+            'class = "rsbench.solvers.refined:RefinedSolver"\n'
+            f'[parameters]\nshutter = "global"\niterations = {iterations}'
+        )
+        keys.add(load_solver_entry(card(tmp_path, scaled.format(inner))).key)
+    module = tmp_path / "moody_solver.py"
+    for text in (PLAIN, PLAIN + "# changed\n"):
+        module.write_text(text, "utf-8")
+        for mood in ("calm", "wild"):
+            path = card(tmp_path, f'class = "moody_solver:Plain"\n[parameters]\nmood = "{mood}"')
+            keys.add(load_solver_entry(path).key)
+            assert load_solver_entry(path).key in keys  # an object that is no dataclass keeps its key
+        sys.modules.pop("moody_solver")
+    assert len(keys) == 2 + 4
+    assert (
+        load_solver_entry("gs-8pt").key == load_solver_entry("gs-8pt").key != load_solver_entry("gs-poselib").key
+    )
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "part"),
+    [
+        ("shutter", "GS", "rolling, global"),
+        ("reference_point", "Left", "body, left"),
+        ("needs", {"Left"}, "left, right, stereo, tracks"),
+        ("needs", set(), "at least one"),
+        ("minimum", {"right": 8}, "says nothing about left"),
+        ("minimum", {"left": 0}, "above 0"),
+        ("metric", "yes", "True or False"),
+        ("motion_model", "", "must be a text"),
+    ],
+)
+def test_a_wrong_declaration_is_refused(field: str, value: object, part: str) -> None:
+    with pytest.raises(ValueError, match=part):
+        replace(SPEC, **{field: value})  # type: ignore[arg-type]
 
 
 def test_a_failure_holds_no_motion() -> None:

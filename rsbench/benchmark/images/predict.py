@@ -25,7 +25,7 @@ from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.dataset.files import MATCH_SETS, read_json, save_arrays, save_matches, sha256, write_json, write_png
 from rsbench.dataset.sequence import FRAMES, Sequence
 from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.registry import load_solver_entry
 from rsbench.vision.correction import correct_frame
 from rsbench.vision.features import MatchOptions, match_stereo_frames
 from rsbench.vision.stereo_depth import SgmOptions, stereo_disparities
@@ -94,29 +94,30 @@ def predict_sequence(sequence: Sequence, options: EvaluationOptions, folder: Pat
 def _predict_motion(
     sequence: Sequence, matches: Correspondences, name: str, options: EvaluationOptions, folder: Path
 ) -> None:
-    solver = load_solver(name)
-    rng = generator(options.seed, "images", sequence.name, solver.name, 0)
+    entry = load_solver_entry(name)
+    solver, spec = entry.solver, entry.solver.spec
+    rng = generator(options.seed, "images", sequence.name, entry.name, 0)
     robust = estimate_motion(matches, sequence.rig, sequence.shutter, solver, options.robust, rng)
     estimate = robust.estimate
     answer = {
-        "solver": solver.name,
+        "solver": entry.name,
         "success": estimate.success,
         "reason": estimate.reason,
         "w": estimate.w.tolist() if estimate.success else None,
         "d": estimate.d.tolist() if estimate.success else None,
         "metric": estimate.metric,
-        "motion_model": solver.motion_model,
-        "reference_point": solver.reference_point,
-        "shutter": solver.shutter,
-        "uses": sorted(solver.needs | {name for name, size in solver.sample_sizes(matches).items() if size}),
+        "motion_model": spec.motion_model,
+        "reference_point": spec.reference_point,
+        "shutter": spec.shutter,
+        "uses": sorted(spec.needs | {name for name, size in solver.sample_sizes(matches).items() if size}),
         "inliers": {key: int(np.count_nonzero(mask)) for key, mask in robust.inliers.items()},
         "matches": {key: len(getattr(matches, key)) for key in MATCH_SETS},
         "iterations": robust.iterations,
         "seconds": robust.seconds,
     }
-    write_json(folder / "motion" / f"{solver.name}.json", answer)
+    write_json(folder / "motion" / f"{entry.name}.json", answer)
     save_arrays(
-        folder / "motion" / f"{solver.name}-inliers.npz", {str(key): mask for key, mask in robust.inliers.items()}
+        folder / "motion" / f"{entry.name}-inliers.npz", {str(key): mask for key, mask in robust.inliers.items()}
     )
 
 
@@ -142,13 +143,13 @@ def depth_of(disparity: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float
 
 def read_motion(folder: Path, solver: str) -> Motion | None:
     """Motion that a solver predicted, or None when it found none."""
-    answer = read_json(folder / "motion" / f"{load_solver(solver).name}.json")
+    answer = read_json(folder / "motion" / f"{load_solver_entry(solver).name}.json")
     return MOTION_MODELS[answer["motion_model"]](answer["w"], answer["d"]) if answer["success"] else None
 
 
 def _identity(sequence: Sequence, options: EvaluationOptions) -> str:
     """Hash of what decides the predictions: the sequence's bytes, the options, the cards and the version."""
-    solvers = [repr(load_solver(name)) for name in options.solvers]
+    solvers = [load_solver_entry(name).key for name in options.solvers]
     parts = [
         sha256(sequence.folder / "sequence.json"),
         json.dumps(asdict(options), default=str),

@@ -137,13 +137,13 @@ def _plan(card: SweepCard, entrants: dict[str, Entrant]) -> dict[str, Any]:
     """All that decides the bytes of a run."""
     solvers = [
         {
-            "name": e.solver.name,
-            "parameters": repr(e.solver),
+            "name": e.name,
+            "key": e.entry.key,
             "information": e.information,
-            "shutter": e.solver.shutter,
-            "motion_model": e.solver.motion_model,
-            "reference_point": e.solver.reference_point,
-            "reference": e.solver.reference,
+            "shutter": e.solver.spec.shutter,
+            "motion_model": e.solver.spec.motion_model,
+            "reference_point": e.solver.spec.reference_point,
+            "reference": e.solver.spec.reference,
         }
         for e in entrants.values()
     ]

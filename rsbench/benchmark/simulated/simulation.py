@@ -58,9 +58,7 @@ def random_direction(rng: np.random.Generator) -> FloatArray:
     return v / np.linalg.norm(v)
 
 
-def random_motion(
-    rng: np.random.Generator, angle: float, distance: float, model: Literal["linear", "twist"] = "linear"
-) -> Motion:
+def random_motion(rng: np.random.Generator, angle: float, distance: float, model: str = "linear") -> Motion:
     """Motion that turns by ``angle`` (radians) and shifts by ``distance`` (metres) per frame period."""
     return MOTION_MODELS[model](angle * random_direction(rng), distance * random_direction(rng))
 

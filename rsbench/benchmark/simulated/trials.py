@@ -21,7 +21,7 @@ from rsbench.errors import RsbenchError
 from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.base import MotionEstimate, Solver
 from rsbench.solvers.engine.packed import track_pairs
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 
 Arrays = dict[str, NDArray[Any]]
 Information = Literal["left pairs", "left and right pairs", "linked pairs", "tracks"]
@@ -33,8 +33,16 @@ both cameras with their left-right matches; or tracks through all four images. T
 class Entrant:
     """A solver and the matches that it is given."""
 
-    solver: Solver
+    entry: SolverEntry
     information: Information
+
+    @property
+    def name(self) -> str:
+        return self.entry.name
+
+    @property
+    def solver(self) -> Solver:
+        return self.entry.solver
 
 
 def entrant(name_or_path: str) -> Entrant:
@@ -43,13 +51,14 @@ def entrant(name_or_path: str) -> Entrant:
     Raises:
         RsbenchError: no such solver.
     """
-    solver = load_solver(name_or_path)
+    entry = load_solver_entry(name_or_path)
+    solver, needs = entry.solver, entry.solver.spec.needs
     probe = Correspondences(left=np.ones((50, 4)), right=np.ones((50, 4)), tracks=np.ones((50, 8)))
-    if "tracks" in solver.needs or solver.sample_sizes(probe).get("tracks", 0) > 0:
-        return Entrant(solver=solver, information="tracks")
-    if "stereo" in solver.needs:
-        return Entrant(solver=solver, information="linked pairs")
-    return Entrant(solver=solver, information="left pairs" if solver.needs == {"left"} else "left and right pairs")
+    if "tracks" in needs or solver.sample_sizes(probe).get("tracks", 0) > 0:
+        return Entrant(entry=entry, information="tracks")
+    if "stereo" in needs:
+        return Entrant(entry=entry, information="linked pairs")
+    return Entrant(entry=entry, information="left pairs" if needs == {"left"} else "left and right pairs")
 
 
 def given_matches(simulation: Simulation, information: Information) -> Correspondences:
@@ -172,7 +181,7 @@ def _timed(
     start = time.process_time()
     try:
         if robust:
-            rng = generator(seed, "simulate", "robust", e.solver.name, trial)
+            rng = generator(seed, "simulate", "robust", e.name, trial)
             estimate = estimate_motion(matches, rig, shutter, e.solver, RobustOptions(), rng).estimate
         else:
             estimate = e.solver.estimate(matches, rig, shutter)

@@ -1,6 +1,8 @@
 """The solver contract: correspondences in, one motion estimate out; no sampling, no files.
 
-A solver is a final, frozen dataclass below ``Solver``; its fields are the parameters that its card may set.
+A solver is a final, frozen dataclass below ``Solver``; its fields are the parameters that its card may set, and
+its ``spec`` says what it needs and what it gives. A solver has no name: its card or entry point has
+(``SolverEntry``).
 A solver that finds nothing says so in the value it returns: failure is never an exception and never an
 identity motion.
 """
@@ -10,7 +12,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from types import MappingProxyType
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -20,7 +23,6 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
 MatchSet = Literal["left", "right", "stereo", "tracks"]
-MotionModel = Literal["linear", "twist"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,19 +63,22 @@ class MotionEstimate:
         return cls(w=nowhere, d=nowhere, success=False, reason=reason, direction_known=False)
 
 
-class Solver(ABC):
-    """Relative pose of a stereo rig over one frame period."""
+@dataclass(frozen=True, kw_only=True)
+class SolverSpec:
+    """What a solver declares, checked when it is made: data, which tables, cards and RANSAC read.
 
-    name: str
-    """Name of the card it was loaded from, or the class's own."""
-    needs: ClassVar[frozenset[MatchSet]]
+    Raises ValueError on a set, model, shutter or point that does not exist, so that a slip of the pen cannot
+    change scores in silence.
+    """
+
+    needs: frozenset[MatchSet]
     """Sets without which it cannot work; it may use others when they are there."""
-    minimum: ClassVar[Mapping[MatchSet, int]]
+    minimum: Mapping[MatchSet, int]
     """Fewest matches in each set that it needs."""
     metric: bool
     """Whether it can give the length of d in metres."""
     motion_model: str
-    """Interpolation it assumes between the rows: a key of ``rsbench.core.motion.MOTION_MODELS``."""
+    """Interpolation it assumes between the rows: the name of a motion model."""
     shutter: Literal["rolling", "global"]
     reference_point: Literal["body", "left"]
     """The point of the rig whose translation ``d`` is."""
@@ -81,6 +86,55 @@ class Solver(ABC):
     """Where it was published: paper and equation."""
     assumes: str
     """What must hold for it to work, in words."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "needs", frozenset(self.needs))
+        object.__setattr__(self, "minimum", MappingProxyType(dict(self.minimum)))
+        sets = get_args(MatchSet)
+        for name, given in (("needs", self.needs), ("minimum", self.minimum)):
+            for value in given:
+                if value not in sets:
+                    raise ValueError(f"{name}: {value!r} is no set of matches; there are: {', '.join(sets)}")
+        if not self.needs:
+            raise ValueError(f"needs: must name at least one of {', '.join(sets)}")
+        missing = self.needs - set(self.minimum)
+        if missing:
+            raise ValueError(f"minimum: says nothing about {', '.join(sorted(missing))}, which needs names")
+        self._check_values()
+
+    def _check_values(self) -> None:
+        for name, count in self.minimum.items():
+            if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+                raise ValueError(f"minimum[{name!r}] = {count!r}: must be a whole number above 0")
+        for field, allowed in (("shutter", ("rolling", "global")), ("reference_point", ("body", "left"))):
+            if getattr(self, field) not in allowed:
+                raise ValueError(f"{field} = {getattr(self, field)!r}: must be one of {', '.join(allowed)}")
+        if not isinstance(self.metric, bool):
+            raise ValueError(f"metric = {self.metric!r}: must be True or False")
+        for field in ("motion_model", "reference", "assumes"):
+            if not isinstance(getattr(self, field), str) or not getattr(self, field):
+                raise ValueError(f"{field} = {getattr(self, field)!r}: must be a text")
+
+    def shortage(self, counts: Mapping[MatchSet, int]) -> MotionEstimate | None:
+        """The failure that too few matches are; None when there are enough."""
+        for name, least in self.minimum.items():
+            if counts.get(name, 0) < least:
+                return MotionEstimate.failed(f"{counts.get(name, 0)} {name} matches, need {least}")
+        return None
+
+
+class Solver(ABC):
+    """Relative pose of a stereo rig over one frame period."""
+
+    @property
+    @abstractmethod
+    def spec(self) -> SolverSpec:
+        """What it declares; a class attribute where the parameters do not change it."""
+
+    @property
+    def inner_keys(self) -> tuple[str, ...]:
+        """Keys (``SolverEntry.key``) of the solvers inside this one: they are part of its identity."""
+        return ()
 
     @abstractmethod
     def estimate(
@@ -90,7 +144,7 @@ class Solver(ABC):
 
     def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
         """Matches per set that ``propose`` wants in a minimal sample of these correspondences."""
-        return self.minimum
+        return self.spec.minimum
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
         """Motions that may explain a minimal sample; failures are left out."""
