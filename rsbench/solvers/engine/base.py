@@ -10,7 +10,7 @@ identity motion.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal, get_args
@@ -71,7 +71,7 @@ class SolverSpec:
     change scores in silence.
     """
 
-    needs: frozenset[MatchSet]
+    needs: Set[MatchSet]
     """Sets without which it cannot work; it may use others when they are there."""
     minimum: Mapping[MatchSet, int]
     """Fewest matches in each set that it needs."""

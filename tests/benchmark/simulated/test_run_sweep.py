@@ -97,10 +97,10 @@ def test_a_motion_that_loses_the_scene_names_its_cell(tmp_path: Path) -> None:
 FATAL = """
 import os
 from rsbench.solvers.engine.base import Solver
+from rsbench.solvers.engine.registry import load_solver
 
 class Fatal(Solver):
-    needs, minimum, metric, motion_model = frozenset({"left"}), {"left": 8}, False, "linear"
-    shutter, reference_point, reference, assumes = "global", "left", "", ""
+    spec = load_solver("gs-8pt").spec
 
     def estimate(self, correspondences, rig, shutter):
         os._exit(1)
