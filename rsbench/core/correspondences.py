@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rsbench.core.rig import Side
 from rsbench.core.so3 import FloatArray
 
+_TRACK_HALF: dict[Side, list[int]] = {"left": [0, 1, 4, 5], "right": [2, 3, 6, 7]}
 _COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8}
 
 
@@ -51,3 +53,24 @@ def _matches(value: ArrayLike, name: str, columns: int) -> FloatArray:
         raise ValueError(f"{name}[{bad[0]}] must be finite pixels, got {rows[bad[0]].tolist()}")
     rows.setflags(write=False)
     return rows
+
+
+def track_pairs(tracks: FloatArray, side: Side) -> FloatArray:
+    """The matches over time (n, 4) of one camera in tracks (n, 8)."""
+    return tracks[:, _TRACK_HALF[side]]
+
+
+def unlinked_pairs(correspondences: Correspondences, side: Side) -> np.ndarray:
+    """Mask of the left or right matches that no track repeats: the tracks know more about those that it does."""
+    pairs: FloatArray = getattr(correspondences, side)
+    if len(pairs) == 0 or len(correspondences.tracks) == 0:
+        return np.ones(len(pairs), dtype=np.bool_)
+    known = {row.tobytes() for row in np.ascontiguousarray(track_pairs(correspondences.tracks, side))}
+    return np.array([row.tobytes() not in known for row in pairs], dtype=np.bool_)
+
+
+def temporal_pairs(correspondences: Correspondences, side: Side) -> FloatArray:
+    """All matches over time (n, 4) of one camera: its own, and the halves of tracks that they do not repeat."""
+    own: FloatArray = getattr(correspondences, side)
+    rest = own[unlinked_pairs(correspondences, side)]
+    return np.concatenate([track_pairs(correspondences.tracks, side), rest])

@@ -11,13 +11,12 @@ import numpy as np
 
 from rsbench.cards import parse_card
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, track_pairs
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
-from rsbench.solvers.engine.packed import track_pairs
 from rsbench.solvers.engine.registry import SolverEntry
 
 _COLUMNS = {

@@ -10,13 +10,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.stats import chi2
 
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, track_pairs, unlinked_pairs
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.robust.ransac import BoolArray, IntArray, RansacOptions, ransac
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
-from rsbench.solvers.engine.packed import Packed, pack, track_pairs, unlinked_pairs
+from rsbench.solvers.engine.packed import Packed, pack
 
 _TRACK_FREEDOM = 5
 _SIGMAS = 2.5

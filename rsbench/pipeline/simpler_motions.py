@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.metrics import translation_of_offset
 from rsbench.core.motion import LinearMotion, Motion
 from rsbench.core.rig import Side, StereoRig
@@ -12,7 +12,6 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.base import MotionEstimate
-from rsbench.solvers.engine.packed import temporal_pairs
 from rsbench.solvers.refined import RefinedSolver
 
 _NO_BASELINE = 1e-9

@@ -8,14 +8,13 @@ from typing import final
 import numpy as np
 
 from rsbench.core import so3
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.epipolar import in_front
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.packed import temporal_pairs
 
 _ROUNDING = 1e-10
 

@@ -10,12 +10,12 @@ from typing import Literal, final
 
 import numpy as np
 
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.packed import pack, temporal_pairs
+from rsbench.solvers.engine.packed import pack
 
 _ROUNDING = 1e-10
 """Below this, relative to the largest, a column norm or singular value of A is rounding. Exact data of the

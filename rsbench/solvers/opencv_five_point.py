@@ -10,13 +10,12 @@ import cv2
 import numpy as np
 
 from rsbench.core import so3
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.eight_point import decompose_essential
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.packed import temporal_pairs
 
 
 @final

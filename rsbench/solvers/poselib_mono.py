@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import final
 
 from rsbench.core import so3
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.packed import temporal_pairs
 from rsbench.solvers.engine.poselib_adapter import (
     BUNDLE,
     MISSING,

@@ -14,13 +14,12 @@ from rsbench.benchmark.simulated.bound import Bound, bound_from_information, mot
 from rsbench.benchmark.simulated.simulation import Simulation, simulate
 from rsbench.benchmark.simulated.sweep_card import Setting
 from rsbench.core import so3
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, track_pairs
 from rsbench.core.metrics import translation_of_offset
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.base import MotionEstimate, Solver
-from rsbench.solvers.engine.packed import track_pairs
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 
 Arrays = dict[str, NDArray[Any]]

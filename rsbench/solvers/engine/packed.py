@@ -7,36 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsbench.core import so3
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, temporal_pairs, unlinked_pairs
 from rsbench.core.motion import MOTION_MODELS, Motion, TwistMotion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.kernels import BEHIND, count_in_front, pair_terms
 from rsbench.solvers.engine.track_kernels import track_terms
-
-_TRACK_HALF: dict[Side, list[int]] = {"left": [0, 1, 4, 5], "right": [2, 3, 6, 7]}
-
-
-def track_pairs(tracks: FloatArray, side: Side) -> FloatArray:
-    """The matches over time (n, 4) of one camera in tracks (n, 8)."""
-    return tracks[:, _TRACK_HALF[side]]
-
-
-def unlinked_pairs(correspondences: Correspondences, side: Side) -> np.ndarray:
-    """Mask of the left or right matches that no track repeats: the tracks know more about those that it does."""
-    pairs: FloatArray = getattr(correspondences, side)
-    if len(pairs) == 0 or len(correspondences.tracks) == 0:
-        return np.ones(len(pairs), dtype=np.bool_)
-    known = {row.tobytes() for row in np.ascontiguousarray(track_pairs(correspondences.tracks, side))}
-    return np.array([row.tobytes() not in known for row in pairs], dtype=np.bool_)
-
-
-def temporal_pairs(correspondences: Correspondences, side: Side) -> FloatArray:
-    """All matches over time (n, 4) of one camera: its own, and the halves of tracks that they do not repeat."""
-    own: FloatArray = getattr(correspondences, side)
-    rest = own[unlinked_pairs(correspondences, side)]
-    return np.concatenate([track_pairs(correspondences.tracks, side), rest])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
