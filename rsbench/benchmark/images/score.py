@@ -10,14 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.benchmark.images.predict import VIEWS, depth_of, read_motion
-from rsbench.core.metrics import (
-    WORST_ANGLE,
-    WORST_SCALE,
-    rotation_error,
-    scale_error,
-    translation_error,
-    translation_of_offset,
-)
+from rsbench.benchmark.scoring import pose_errors
 from rsbench.core.motion import Motion
 from rsbench.core.rig import Side
 from rsbench.dataset.files import load_arrays, read_json
@@ -41,7 +34,7 @@ def score_poses(sequence: Sequence, folder: Path) -> list[Row]:
                 "shutter": answer["shutter"],
                 "uses": "+".join(answer["uses"]),
                 "success": answer["success"],
-                **pose_errors(sequence, answer),
+                **_pose_errors(sequence, answer),
                 "inliers": sum(answer["inliers"].values()),
                 "iterations": answer["iterations"],
                 "seconds": answer["seconds"],
@@ -51,19 +44,14 @@ def score_poses(sequence: Sequence, folder: Path) -> list[Row]:
     return rows
 
 
-def pose_errors(sequence: Sequence, answer: Row) -> dict[str, float]:
-    """e_R_deg, e_T_deg and e_s of one prediction; e_s is NaN for a solver that does not claim metres."""
-    if not answer["success"]:
-        worst = float(np.rad2deg(WORST_ANGLE))
-        return {"e_R_deg": worst, "e_T_deg": worst, "e_s": WORST_SCALE}
-    w, d = sequence.motion.w, sequence.motion.d
-    if answer["reference_point"] == "left":
-        d = translation_of_offset(w, d, sequence.rig.offset("left"))
-    return {
-        "e_R_deg": float(np.rad2deg(rotation_error(answer["w"], w))),
-        "e_T_deg": float(np.rad2deg(translation_error(answer["d"], d))),
-        "e_s": float(scale_error(answer["d"], d)) if answer["metric"] else float("nan"),
-    }
+def _pose_errors(sequence: Sequence, answer: Row) -> dict[str, float]:
+    nothing = [np.nan] * 3
+    errors = pose_errors(
+        answer["w"] or nothing, answer["d"] or nothing, true_w=sequence.motion.w, true_d=sequence.motion.d,
+        rig=sequence.rig, success=answer["success"], metric=answer["metric"],
+        reference_point=answer["reference_point"],
+    )  # fmt: skip
+    return {name: float(value) for name, value in errors.items()}
 
 
 def score_depth(sequence: Sequence, folder: Path) -> list[Row]:

@@ -10,19 +10,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.run_sweep import read_bounds, read_sweep, read_trials
 from rsbench.benchmark.simulated.sweep_card import Cell, SweepCard
 from rsbench.benchmark.simulated.trials import Arrays
 from rsbench.cards import parse_card
-from rsbench.core.metrics import (
-    WORST_ANGLE,
-    WORST_SCALE,
-    rotation_error,
-    scale_error,
-    translation_error,
-    translation_of_offset,
-)
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.files import write_table
 
@@ -81,22 +74,17 @@ def _scaled(bounds: FloatArray, noise_px: float) -> FloatArray:
 
 
 def score_trials(arrays: Arrays, solver: int, reference_point: str, cell: Cell) -> dict[str, FloatArray]:
-    """e_R_deg, e_T_deg and e_s (trials,) of one solver.
-
-    A failure scores the worst value. A solver that estimates the left camera's translation is scored against
-    that. NaN: e_T and e_s where the true translation is zero, e_s where the solver does not claim metres.
-    """
-    w, d, success = arrays["w"], arrays["d"], arrays["success"][:, solver]
-    if reference_point == "left":
-        d = translation_of_offset(w, d, cell.setting.rig().offset("left"))
-    # Failures are stored as NaN, which no score may meet: no warning, no NaN that would vanish from a median.
-    w_est = np.where(success[:, None], arrays["w_est"][:, solver], 0.0)
-    d_est = np.where(success[:, None], arrays["d_est"][:, solver], 0.0)
-    e_R = np.where(success, rotation_error(w_est, w), WORST_ANGLE)
-    e_T = np.where(success | ~np.any(d != 0.0, axis=-1), translation_error(d_est, d), WORST_ANGLE)
-    e_s = np.where(success, scale_error(d_est, d), WORST_SCALE)
-    e_s = np.where(success & ~arrays["metric"][:, solver], np.nan, e_s)
-    return {"e_R_deg": np.rad2deg(e_R), "e_T_deg": np.rad2deg(e_T), "e_s": e_s}
+    """e_R_deg, e_T_deg and e_s (trials,) of one solver: see ``scoring.pose_errors``."""
+    return pose_errors(
+        arrays["w_est"][:, solver],
+        arrays["d_est"][:, solver],
+        true_w=arrays["w"],
+        true_d=arrays["d"],
+        rig=cell.setting.rig(),
+        success=arrays["success"][:, solver],
+        metric=arrays["metric"][:, solver],
+        reference_point=reference_point,
+    )
 
 
 def summary_row(

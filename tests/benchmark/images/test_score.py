@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.images.predict import VIEWS
-from rsbench.benchmark.images.score import pose_errors, score_correction, score_depth, score_poses
-from rsbench.core.metrics import translation_of_offset
+from rsbench.benchmark.images.score import score_correction, score_depth, score_poses
 from rsbench.dataset.files import MATCH_SETS, save_arrays
 from rsbench.dataset.sequence import Sequence, read_dataset
 
@@ -81,21 +80,3 @@ def test_failure_scores_the_worst_and_is_told_apart(sequence: Sequence, tmp_path
     assert len(estimated) == 8
     assert all(not row["success"] and np.isnan(row["psnr"]) and row["coverage"] == 0.0 for row in estimated)
     assert all(row["success"] for row in rows if row["motion"] == "true")
-
-
-def test_monocular_solver_is_scored_against_its_own_camera(sequence: Sequence) -> None:
-    w, d = sequence.motion.w, sequence.motion.d
-    own = translation_of_offset(w, d, sequence.rig.offset("left"))
-    errors = pose_errors(
-        sequence, answer_of(sequence, d=(0.01 * own).tolist(), metric=False, reference_point="left")
-    )
-    assert errors["e_T_deg"] < 1e-9
-    assert np.isnan(errors["e_s"])
-    wrong = pose_errors(sequence, answer_of(sequence, d=d.tolist(), metric=False, reference_point="left"))
-    assert wrong["e_T_deg"] > 0.1
-
-
-def test_opposite_translation_is_half_a_turn_away(sequence: Sequence) -> None:
-    errors = pose_errors(sequence, answer_of(sequence, d=(-2 * sequence.motion.d).tolist()))
-    assert errors["e_T_deg"] == pytest.approx(180.0, abs=1e-9)
-    assert errors["e_s"] == pytest.approx(np.log(2.0), rel=1e-12)

@@ -1,0 +1,73 @@
+"""The one scorer of motions: an estimate and the truth into errors, and the only rule of what a failure scores.
+
+Simulated trials, image sequences and the studies all score here. A failure is an estimate that says so, or that
+is not finite: it scores the worst value of every error, is counted, and is never replaced by "no motion".
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rsbench.core.metrics import (
+    WORST_ANGLE,
+    WORST_SCALE,
+    rotation_error,
+    scale_error,
+    translation_error,
+    translation_of_offset,
+)
+from rsbench.core.rig import StereoRig
+from rsbench.core.so3 import FloatArray
+
+POSE_ERRORS = ("e_R_deg", "e_T_deg", "e_s")
+
+
+def answered(w: ArrayLike, d: ArrayLike, success: ArrayLike = True) -> NDArray[np.bool_]:
+    """Whether estimates (..., 3), (..., 3) are answers: successful (...) by their own word, and finite."""
+    finite = np.all(np.isfinite(w), axis=-1) & np.all(np.isfinite(d), axis=-1)
+    return np.asarray(success, dtype=np.bool_) & finite
+
+
+def pose_errors(
+    w: ArrayLike,
+    d: ArrayLike,
+    *,
+    true_w: ArrayLike,
+    true_d: ArrayLike,
+    rig: StereoRig,
+    success: ArrayLike = True,
+    metric: ArrayLike = True,
+    reference_point: str = "body",
+) -> dict[str, FloatArray]:
+    """Errors (...) of estimated motions, as docs/conventions.md defines them; all arguments broadcast.
+
+    Args:
+        w, d: (..., 3) estimated motion over one frame period, rad and m (or any length where not ``metric``).
+        true_w, true_d: (..., 3) true motion of the body, rad and m.
+        rig: whose left camera ``reference_point`` may mean.
+        success: (...) what the estimates say of themselves; see ``answered``.
+        metric: (...) whether the length of ``d`` claims metres.
+        reference_point: ``body`` or ``left``, the point whose translation ``d`` is; the truth is moved there.
+
+    Returns:
+        ``e_R_deg`` and ``e_T_deg`` (degrees) and ``e_s``. A failure scores 180, 180 and infinity. NaN where an
+        error does not exist, for nobody then: e_T where the true translation is zero; and for an estimate that
+        did not fail, e_s where that is so or no metres are claimed.
+
+    Raises:
+        ValueError: no such reference point.
+    """
+    if reference_point not in ("body", "left"):
+        raise ValueError(f"reference_point = {reference_point!r}: must be 'body' or 'left'")
+    if reference_point == "left":
+        true_d = translation_of_offset(true_w, true_d, rig.offset("left"))
+    good = answered(w, d, success)
+    # Failures hold NaN, which no formula may meet: no warning, no NaN that would vanish from a median.
+    w, d = (np.where(good[..., None], value, 0.0) for value in (w, d))
+    exists = np.any(np.asarray(true_d) != 0.0, axis=-1)
+    e_R = np.where(good, rotation_error(w, true_w), WORST_ANGLE)
+    e_T = np.where(good | ~exists, translation_error(d, true_d), WORST_ANGLE)
+    claimed = np.where(np.asarray(metric, dtype=np.bool_), scale_error(d, true_d), np.nan)
+    e_s = np.where(good, claimed, WORST_SCALE)
+    return dict(zip(POSE_ERRORS, (np.rad2deg(e_R), np.rad2deg(e_T), e_s), strict=True))
