@@ -54,17 +54,39 @@ class RobustOptions:
         self.ransac()
 
 
+@dataclass(frozen=True, kw_only=True)
+class MatchCount:
+    """How many matches there were for the solver, and how many of them its motion explains."""
+
+    inliers: int
+    matches: int
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RobustEstimate:
     """A motion, and the matches that it explains."""
 
     estimate: MotionEstimate
     inliers: dict[MatchSet, BoolArray] = field(default_factory=dict)
-    """Masks over ``left``, ``right`` and ``tracks``; all False after a failure."""
+    """Masks over ``left``, ``right`` and ``tracks``; all False after a failure. Sets may repeat the same points:
+    their sum counts those twice, ``counts`` does not."""
+    counts: dict[MatchSet, MatchCount] = field(default_factory=dict)
+    """Of the matches that the solver works on, each once: ``tracks``, and under ``left`` and ``right`` the pairs
+    that no track repeats. For a solver of pairs a track is a left and a right pair, which count there."""
     iterations: int
     seconds: float
     threshold_px: float
     """The threshold that the inliers have passed."""
+
+    @property
+    def inlier_count(self) -> int:
+        """Matches that the motion explains, each counted once; at most ``match_count``."""
+        return sum(count.inliers for count in self.counts.values())
+
+    @property
+    def match_count(self) -> int:
+        """Matches that the solver had to work on, each counted once."""
+        return sum(count.matches for count in self.counts.values())
 
 
 def estimate_motion(
@@ -94,6 +116,7 @@ def estimate_motion(
     return RobustEstimate(
         estimate=estimate,
         inliers=problem.masks(inliers),
+        counts=problem.counts(inliers),
         iterations=iterations,
         seconds=time.perf_counter() - start,
         threshold_px=threshold,
@@ -239,6 +262,15 @@ class _RobustProblem:
             right=self.data.right[indices[(indices >= left) & (indices < left + right)] - left],
             tracks=self.data.tracks[indices[indices >= left + right] - left - right],
         )
+
+    def counts(self, inliers: BoolArray) -> dict[MatchSet, MatchCount]:
+        """Inliers and matches of each group of data."""
+        names: tuple[MatchSet, ...] = ("left", "right", "tracks")
+        parts = np.split(inliers, np.cumsum(self.num_data)[:-1])
+        return {
+            name: MatchCount(inliers=int(np.count_nonzero(part)), matches=len(part))
+            for name, part in zip(names, parts, strict=True)
+        }
 
     def masks(self, inliers: BoolArray) -> dict[MatchSet, BoolArray]:
         """Inliers over the sets as they were given."""

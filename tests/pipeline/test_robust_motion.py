@@ -14,6 +14,7 @@ from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions, estimate_motion
+from rsbench.solvers.engine.base import MatchSet
 from rsbench.solvers.engine.registry import list_solvers, load_solver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
@@ -79,6 +80,28 @@ def test_tracks_whose_halves_are_repeated_change_nothing() -> None:
     np.testing.assert_allclose(both.estimate.w, alone.estimate.w, atol=1e-12)
     np.testing.assert_array_equal(both.inliers["left"], both.inliers["tracks"])
     np.testing.assert_array_equal(both.inliers["tracks"], alone.inliers["tracks"])
+
+
+@pytest.mark.parametrize(
+    ("name", "matches"),
+    [  # 40 pairs per camera, and 70 points in all four images of which 50 are repeated as left pairs
+        ("gs-8pt", {"left": 110, "right": 0, "tracks": 0}),
+        ("rs-stereo-refined-pairs", {"left": 110, "right": 110, "tracks": 0}),
+        ("rs-stereo-refined", {"left": 40, "right": 40, "tracks": 70}),
+        ("rs-stereo-tracks", {"left": 0, "right": 0, "tracks": 70}),
+    ],
+)
+def test_each_match_counts_once(name: str, matches: dict[MatchSet, int]) -> None:
+    s = simulation(pairs=40, tracks=70, outliers=0.0, noise=0.0)
+    c = s.correspondences
+    left = np.concatenate([c.left, c.tracks[:50, [0, 1, 4, 5]]])
+    given = Correspondences(left=left, right=c.right, tracks=c.tracks)
+    # A rolling shutter's matches miss a global motion by pixels: 100 px let all of these in.
+    options = RobustOptions(threshold_px=100.0 if name.startswith("gs") else 1.0, adapt_threshold=False)
+    result = estimate_motion(given, RIG, SHUTTER, load_solver(name), options, np.random.default_rng(0))
+    assert {key: count.matches for key, count in result.counts.items()} == matches
+    assert {key: count.inliers for key, count in result.counts.items()} == matches
+    assert result.inlier_count == result.match_count == sum(matches.values())
 
 
 @pytest.mark.parametrize("name", list_solvers())
