@@ -1,3 +1,92 @@
-"""Rolling-shutter stereo: rendered ground truth, solvers, correction and scores."""
+"""Rolling-shutter stereo: rendered ground truth, solvers, correction and scores.
+
+The names below are the public interface; everything else may change between versions. Each is imported when it
+is first used, so that ``import rsbench`` costs nothing. docs/api.md tells what they do.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rsbench.api import (
+        correct,
+        estimate_motion,
+        evaluate,
+        generate,
+        match,
+        pose_errors,
+        project,
+        read_dataset,
+        simulate,
+        stereo_depth,
+        verify,
+    )
+    from rsbench.core.camera import PinholeCamera
+    from rsbench.core.correspondences import Correspondences
+    from rsbench.core.motion import LinearMotion, TwistMotion
+    from rsbench.core.rig import StereoRig
+    from rsbench.core.shutter import RollingShutter
+    from rsbench.errors import RsbenchError
+    from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
+    from rsbench.solvers.engine.registry import list_solvers, load_solver
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "Correspondences",
+    "LinearMotion",
+    "MotionEstimate",
+    "PinholeCamera",
+    "RollingShutter",
+    "RsbenchError",
+    "Solver",
+    "SolverSpec",
+    "StereoRig",
+    "TwistMotion",
+    "correct",
+    "estimate_motion",
+    "evaluate",
+    "generate",
+    "list_solvers",
+    "load_solver",
+    "match",
+    "pose_errors",
+    "project",
+    "read_dataset",
+    "simulate",
+    "stereo_depth",
+    "verify",
+]
+
+_HOMES = {
+    "Correspondences": "rsbench.core.correspondences",
+    "LinearMotion": "rsbench.core.motion",
+    "MotionEstimate": "rsbench.solvers.engine.base",
+    "PinholeCamera": "rsbench.core.camera",
+    "RollingShutter": "rsbench.core.shutter",
+    "RsbenchError": "rsbench.errors",
+    "Solver": "rsbench.solvers.engine.base",
+    "SolverSpec": "rsbench.solvers.engine.base",
+    "StereoRig": "rsbench.core.rig",
+    "TwistMotion": "rsbench.core.motion",
+    "list_solvers": "rsbench.solvers.engine.registry",
+    "load_solver": "rsbench.solvers.engine.registry",
+}
+"""Modules of the names that ``rsbench.api`` does not define itself."""
+
+
+if not TYPE_CHECKING:  # a type checker then knows every name, and a misspelt one
+
+    def __getattr__(name: str) -> object:
+        if name not in __all__:
+            raise AttributeError(f"module 'rsbench' has no attribute {name!r}")
+        from importlib import import_module
+
+        value = getattr(import_module(_HOMES.get(name, "rsbench.api")), name)
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -57,6 +57,10 @@ class Sequence:
         self._check_size(path, pixels.shape[:2])
         return pixels
 
+    def images(self, shutter: Shutter = "rs") -> list[NDArray[np.uint8]]:
+        """Left 0, right 0, left 1, right 1: the order of ``rsbench.match`` and ``rsbench.correct``."""
+        return [self.image(shutter, side, frame) for frame in FRAMES for side in SIDES]
+
     def depth(self, shutter: Shutter, side: Side, frame: int) -> NDArray[np.float32]:
         """(H, W) z in the camera of the row that saw the pixel, metres, 0 = no surface."""
         path = self.folder / f"{shutter}_depth" / f"{side}_{frame}.exr"

@@ -1,0 +1,337 @@
+"""The functions of ``import rsbench``: arrays in, arrays out, every option with a default.
+
+Thin: each finds the cards that it is given by name and calls the module that does the work. Images are (H, W) or
+(H, W, 3), uint8 or uint16; four images are in the order left 0, right 0, left 1, right 1. Angles are radians and
+lengths metres unless a name says otherwise; frames and times are those of docs/conventions.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Series
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.motion import Motion
+from rsbench.core.projection import RSProjection, rs_project
+from rsbench.core.rig import Side, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.errors import RsbenchError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from rsbench.benchmark.simulated.simulation import Simulation
+    from rsbench.dataset.sequence import Sequence
+    from rsbench.dataset.verification import SequenceReport
+    from rsbench.pipeline.chain import CorrectedFrames
+    from rsbench.pipeline.robust_motion import RobustEstimate
+    from rsbench.solvers.engine.base import MotionEstimate, Solver
+
+AnyPath: TypeAlias = str | PathLike[str]
+Image: TypeAlias = NDArray[Any]
+
+
+def project(
+    points: ArrayLike,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    side: Side = "left",
+    frame: int = 0,
+) -> RSProjection:
+    """Pixels at which a moving rolling-shutter camera sees world points (..., 3), metres.
+
+    Exact: the row that sees a point is solved for, to 1e-9 px. ``frame`` is 0 or 1.
+
+    Returns:
+        ``pixels`` (..., 2), ``depth`` (...) z in the camera of that row, ``tau`` (...) its time, ``status`` (...):
+        0 seen, 1 never seen, 2 seen twice (the first is given), 3 not converged. NaN where nothing was seen.
+    """
+    return rs_project(rig, shutter, motion, side, frame, points)
+
+
+def simulate(
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    *,
+    pairs: int = 100,
+    tracks: int = 100,
+    noise_px: float = 0.3,
+    outlier_ratio: float = 0.0,
+    depth: tuple[float, float] = (2.0, 10.0),
+    shape: Literal["box", "plane"] = "box",
+    seed: int = 0,
+) -> Simulation:
+    """Matches of random points that the moving rig sees, with noise and outliers.
+
+    Args:
+        rig, shutter, motion: what sees, how it reads, how it moves.
+        pairs: matches over time of each camera, with points of their own.
+        tracks: points seen in all four images.
+        noise_px: standard deviation of every pixel coordinate.
+        outlier_ratio: share of matches whose pixels in frame 1 are wrong, by up to 80 px.
+        depth: range of the points' depths in frame 0, metres.
+        shape: points at random depths, or on one slanted plane.
+        seed: the same seed gives the same points and noise whatever the other arguments are.
+
+    Returns:
+        ``correspondences``, and ``outliers`` with a mask for each of ``left``, ``right`` and ``tracks``.
+
+    Raises:
+        ValueError: the motion leaves too few points in view.
+    """
+    from rsbench.benchmark.simulated.simulation import SimulationOptions
+    from rsbench.benchmark.simulated.simulation import simulate as simulate_points
+
+    options = SimulationOptions(
+        pairs=pairs, tracks=tracks, noise_px=noise_px, outlier_ratio=outlier_ratio, depth=depth, shape=shape
+    )
+    return simulate_points(rig, shutter, motion, options, np.random.default_rng(seed))
+
+
+def estimate_motion(
+    correspondences: Correspondences,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    solver: str | Path | Solver = "rs-stereo",
+    *,
+    threshold_px: float | None = None,
+    seed: int = 0,
+) -> RobustEstimate:
+    """Motion of the rig over one frame period from matches that may hold outliers.
+
+    Args:
+        correspondences: matches, px.
+        rig, shutter: the cameras and how they read their rows.
+        solver: a name of ``list_solvers``, the path of a card, or a solver.
+        threshold_px: largest error of an inlier; None follows the noise that the inliers show.
+        seed: of the samples that the robust loop draws.
+
+    Returns:
+        ``estimate``, a ``MotionEstimate`` whose ``success`` is False, with a ``reason``, when there is none; and
+        ``inliers``, a mask for each of ``left``, ``right`` and ``tracks``.
+
+    Raises:
+        RsbenchError: no such solver.
+    """
+    from rsbench.pipeline.robust_motion import RobustOptions
+    from rsbench.pipeline.robust_motion import estimate_motion as estimate_robustly
+
+    options = RobustOptions()
+    if threshold_px is not None:
+        options = RobustOptions(threshold_px=threshold_px, adapt_threshold=False)
+    rng = np.random.default_rng(seed)
+    return estimate_robustly(correspondences, rig, shutter, _solver(solver), options, rng)
+
+
+def pose_errors(
+    estimate: MotionEstimate, motion: Motion, rig: StereoRig, *, reference_point: Literal["body", "left"] = "body"
+) -> dict[str, float]:
+    """Errors of an estimate against the true motion, as docs/conventions.md defines them.
+
+    Args:
+        estimate: the answer of a solver.
+        motion: the truth.
+        rig: whose left camera ``reference_point`` may mean.
+        reference_point: the point whose translation the estimate gives, as its solver's ``spec`` says.
+
+    Returns:
+        ``e_R_deg``, ``e_T_deg`` (degrees) and ``e_s``. A failure scores 180, 180 and infinity; e_s is NaN for an
+        estimate without metres.
+    """
+    from rsbench.core import metrics
+
+    if not estimate.success:
+        worst = float(np.rad2deg(metrics.WORST_ANGLE))
+        return {"e_R_deg": worst, "e_T_deg": worst, "e_s": metrics.WORST_SCALE}
+    d = motion.d
+    if reference_point == "left":
+        d = metrics.translation_of_offset(motion.w, motion.d, rig.offset("left"))
+    return {
+        "e_R_deg": float(np.rad2deg(metrics.rotation_error(estimate.w, motion.w))),
+        "e_T_deg": float(np.rad2deg(metrics.translation_error(estimate.d, d))),
+        "e_s": float(metrics.scale_error(estimate.d, d)) if estimate.metric else float("nan"),
+    }
+
+
+def match(images: Series[Image]) -> Correspondences:
+    """Matches of the four images of a rig over two frames: over time, left to right, and through all four.
+
+    Raises:
+        ValueError: not four images of one size and of a type that can be matched.
+    """
+    from rsbench.vision.features import match_stereo_frames
+
+    left_0, right_0, left_1, right_1 = _four(images)
+    return match_stereo_frames(left_0, right_0, left_1, right_1)
+
+
+def stereo_depth(
+    left: Image, right: Image, rig: StereoRig, *, side: Side = "left", matcher: str | Path = "sgm"
+) -> NDArray[np.float32]:
+    """Depth (H, W), metres, on the pixels of one image of a rectified pair; 0 where it is unknown.
+
+    Holds for rolling-shutter pairs too: both cameras read the same row at the same time.
+
+    Raises:
+        ValueError: the images do not fit each other or the rig.
+        RsbenchError: no such matcher.
+    """
+    from rsbench.vision.matcher_card import load_matcher
+    from rsbench.vision.stereo_depth import stereo_disparity
+
+    disparity = stereo_disparity(left, right, rig, side, load_matcher(str(matcher)))
+    return np.nan_to_num(rig.depth(disparity), nan=0.0).astype(np.float32)
+
+
+def correct(
+    images: Series[Image],
+    rig: StereoRig,
+    readout_ratio: float | None = None,
+    *,
+    solver: str | Path | Solver = "rs-stereo",
+    matcher: str | Path = "sgm",
+    target_row: float = 0.0,
+    inpaint: bool = False,
+    seed: int = 0,
+) -> CorrectedFrames:
+    """The global-shutter frames that the cameras would have taken, from their four rolling-shutter frames.
+
+    Args:
+        images: four images, rectified and as the sensor read them.
+        rig: the cameras.
+        readout_ratio: readout time over frame period; None has it estimated.
+        solver: finds the motion; as in ``estimate_motion``.
+        matcher: card of the stereo matcher that finds depth.
+        target_row: the time of this row of a frame is the time of its corrected image.
+        inpaint: invent what nobody saw.
+        seed: of the samples that the robust loop draws.
+
+    Returns:
+        ``frames["left", 0]`` and so on, each with ``image``, ``depth`` and ``origin``; ``motion``, ``shutter``.
+
+    Raises:
+        RsbenchError: frames that cannot be what they are said to be, or no such solver or matcher.
+        NoMotionError: the matches determine no motion or readout ratio.
+    """
+    from rsbench.pipeline.chain import CorrectionOptions, correct_four
+    from rsbench.pipeline.footage import check_alike
+    from rsbench.solvers.refined import RefinedSolver
+    from rsbench.vision.matcher_card import load_matcher
+
+    left_0, right_0, left_1, right_1 = _four(images)
+    views = {("left", 0): left_0, ("right", 0): right_0, ("left", 1): left_1, ("right", 1): right_1}
+    check_alike({f"{side} {frame}": image for (side, frame), image in views.items()})
+    found = _solver(solver)
+    if not isinstance(found, RefinedSolver):
+        raise RsbenchError(f"solver {solver}: a card of rsbench.solvers.refined:RefinedSolver is needed")
+    options = CorrectionOptions(
+        solver=found, sgm=load_matcher(str(matcher)), target_row=target_row, inpaint=inpaint, seed=seed
+    )
+    return correct_four(views, rig, readout_ratio, options)  # type: ignore[arg-type]
+
+
+def read_dataset(folder: AnyPath) -> list[Sequence]:
+    """Sequences of a dataset on disk; their images, depth and row poses are read when asked for.
+
+    Raises:
+        RsbenchError: not a finished dataset, or a sequence that cannot be read.
+    """
+    from rsbench.dataset import sequence
+
+    return sequence.read_dataset(Path(folder))
+
+
+def generate(card: str, out: AnyPath, *, sequences: Series[str] | None = None, workers: int = 1) -> list[Sequence]:
+    """Render a dataset into a folder and open it; what was rendered before from the same card is kept.
+
+    Args:
+        card: name of a dataset card (``rsbench list datasets``) or path to one.
+        out: folder.
+        sequences: names of those to render; None renders all.
+        workers: processes; each renders whole sequences.
+
+    Raises:
+        RsbenchError: no such card or sequence, or a folder with another dataset.
+    """
+    from rsbench.dataset.card import load_dataset_card
+    from rsbench.dataset.generation import generate_dataset
+
+    dataset = load_dataset_card(card)
+    if sequences is not None:
+        dataset = dataset.only(list(sequences))
+    generate_dataset(dataset, Path(out), workers=workers)
+    return read_dataset(out)
+
+
+def verify(folder: AnyPath, *, stride: int = 1) -> list[SequenceReport]:
+    """Check a dataset: files against checksums, poses against the motion, all depth maps against each other.
+
+    Args:
+        folder: of the dataset.
+        stride: compare every n-th pixel in both directions.
+
+    Returns:
+        One report per sequence; a sequence is in order when its ``faults`` are empty.
+
+    Raises:
+        RsbenchError: not a dataset.
+    """
+    from rsbench.dataset.verification import verify_dataset
+
+    return verify_dataset(Path(folder), stride)
+
+
+def evaluate(
+    folder: AnyPath,
+    out: AnyPath,
+    *,
+    solvers: Series[str] = ("rs-stereo-refined", "gs-8pt"),
+    correct_with: str = "rs-stereo-refined",
+    matcher: str = "sgm",
+    seed: int = 0,
+) -> dict[str, pd.DataFrame]:
+    """Run solvers, depth and correction on a dataset and score them against its truth.
+
+    Args:
+        folder: of the dataset.
+        out: folder of predictions and scores; what was predicted before from the same input is kept.
+        solvers: names of ``list_solvers`` or paths of cards.
+        correct_with: solver whose motion the correction uses.
+        matcher: card of the stereo matcher.
+        seed: of every random choice.
+
+    Returns:
+        The tables ``pose``, ``depth`` and ``correction``.
+
+    Raises:
+        RsbenchError: not a dataset, or no such solver or matcher.
+    """
+    from rsbench.benchmark.images.evaluation import TABLES, read_scores, run_evaluation
+    from rsbench.benchmark.images.predict import EvaluationOptions
+    from rsbench.vision.matcher_card import load_matcher
+
+    chosen = tuple(dict.fromkeys([*solvers, correct_with]))
+    options = EvaluationOptions(
+        solvers=chosen, correction_solver=correct_with, seed=seed, sgm=load_matcher(matcher)
+    )
+    run_evaluation(Path(folder), Path(out), options, "rsbench.evaluate", lambda word: None)
+    return {table: read_scores(Path(out), table) for table in TABLES}
+
+
+def _solver(solver: str | Path | Solver) -> Solver:
+    from rsbench.solvers.engine.registry import load_solver
+
+    return load_solver(solver) if isinstance(solver, str | Path) else solver
+
+
+def _four(images: Series[Image]) -> Series[Image]:
+    if len(images) != 4:
+        raise ValueError(f"images: got {len(images)}; four are needed: left 0, right 0, left 1, right 1")
+    return images

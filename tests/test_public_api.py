@@ -1,0 +1,180 @@
+"""The public names: which, what they cost, their types, and a whole experiment that uses nothing else."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+from typing import assert_type
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import rsbench
+from rsbench.benchmark.simulated.simulation import Simulation
+from rsbench.core.projection import RSProjection
+from rsbench.dataset.sequence import Sequence
+from rsbench.pipeline.robust_motion import RobustEstimate
+
+NAMES = [
+    "Correspondences",
+    "LinearMotion",
+    "MotionEstimate",
+    "PinholeCamera",
+    "RollingShutter",
+    "RsbenchError",
+    "Solver",
+    "SolverSpec",
+    "StereoRig",
+    "TwistMotion",
+    "correct",
+    "estimate_motion",
+    "evaluate",
+    "generate",
+    "list_solvers",
+    "load_solver",
+    "match",
+    "pose_errors",
+    "project",
+    "read_dataset",
+    "simulate",
+    "stereo_depth",
+    "verify",
+]
+RIG = rsbench.StereoRig(camera=rsbench.PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
+SHUTTER = rsbench.RollingShutter(height=900, readout_ratio=0.8)
+MOTION = rsbench.LinearMotion([0.012, -0.02, 0.016], [0.2, -0.12, 0.18])
+
+
+def test_the_public_names_are_these() -> None:
+    assert rsbench.__all__ == NAMES
+    assert len(NAMES) <= 25
+    assert dir(rsbench) == sorted([*NAMES, "__version__"])
+
+
+def test_the_names_that_editors_see_are_those_that_exist() -> None:
+    tree = ast.parse(Path(str(rsbench.__file__)).read_text("utf-8"))
+    (block,) = [n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"]
+    typed = {
+        alias.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
+    assert sorted(typed) == NAMES
+    for name, module in typed.items():
+        assert getattr(rsbench, name) is getattr(sys.modules[str(module)], name)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_public_names_are_documented(name: str) -> None:
+    assert inspect.getdoc(getattr(rsbench, name))
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="'rsbench' has no attribute 'solve_everything'"):
+        rsbench.solve_everything  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_the_import_brings_nothing_along() -> None:
+    """A time would depend on the machine; what is imported does not."""
+    code = "import sys; before = set(sys.modules); import rsbench; print(*sorted(set(sys.modules) - before))"
+    run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=60)
+    brought = run.stdout.split()
+    assert "rsbench" in brought
+    # Modules of the standard library may be there; numpy and our own parts wait for their first use.
+    assert [name for name in brought if name.partition(".")[0] not in sys.stdlib_module_names] == ["rsbench"]
+
+
+# One experiment. mypy checks the assert_type lines: the types reach those who import rsbench alone.
+
+
+def test_points_are_projected() -> None:
+    points = np.random.default_rng(0).uniform([-2, -2, 4], [2, 2, 9], (5, 3))
+    seen = rsbench.project(points, RIG, SHUTTER, MOTION, "right", 1)
+    assert_type(seen, RSProjection)
+    for X, pixel, tau in zip(points, seen.pixels, seen.tau, strict=True):
+        # The pinhole equation at the row's own time, written out with Rodrigues' formula in full.
+        assert tau == pytest.approx(1 + 0.8 * pixel[1] / 900, abs=1e-12)
+        angle = tau * np.linalg.norm(MOTION.w)
+        k = MOTION.w / np.linalg.norm(MOTION.w)
+        turned = X * np.cos(angle) + np.cross(k, X) * np.sin(angle) + k * (k @ X) * (1 - np.cos(angle))
+        x = turned + tau * MOTION.d - [0.3, 0.0, 0.0]
+        # The row equation is solved to 1e-9 px.
+        np.testing.assert_allclose(pixel, 810.0 * x[:2] / x[2] + 449.5, atol=2e-9)
+
+
+def test_a_simulated_motion_is_found_and_scored() -> None:
+    data = rsbench.simulate(RIG, SHUTTER, MOTION, pairs=60, tracks=60, outlier_ratio=0.2, seed=3)
+    assert_type(data, Simulation)
+    assert {name: int(mask.sum()) for name, mask in data.outliers.items()} == dict(left=12, right=12, tracks=12)
+    found = rsbench.estimate_motion(data.correspondences, RIG, SHUTTER)
+    assert_type(found, RobustEstimate)
+    assert_type(found.estimate, rsbench.MotionEstimate)
+    assert found.estimate.success, found.estimate.reason
+    # Few outliers are kept, fewer than one in ten good matches lost.
+    assert not np.any(found.inliers["tracks"] & data.outliers["tracks"])
+    assert np.mean(found.inliers["tracks"][~data.outliers["tracks"]]) > 0.9
+    errors = rsbench.pose_errors(found.estimate, MOTION, RIG)
+    assert_type(errors, dict[str, float])
+    # Three standard deviations of this noise at this size, rounded up.
+    assert errors["e_R_deg"] < 0.05 and errors["e_T_deg"] < 1.0 and errors["e_s"] < 0.02
+
+
+def test_a_solver_is_taken_by_name_by_card_and_as_it_is(tmp_path: Path) -> None:
+    data = rsbench.simulate(RIG, SHUTTER, MOTION, pairs=40, tracks=0, noise_px=0.1)
+    assert "gs-8pt" in rsbench.list_solvers()
+    card = tmp_path / "mine.toml"
+    card.write_text('class = "rsbench.solvers.eight_point:EightPointSolver"\n')
+    solver = rsbench.load_solver("gs-8pt")
+    assert_type(solver, rsbench.Solver)
+    answers = [
+        rsbench.estimate_motion(data.correspondences, RIG, SHUTTER, chosen).estimate.w
+        for chosen in ("gs-8pt", card, solver)
+    ]
+    np.testing.assert_array_equal(answers[0], answers[1])
+    np.testing.assert_array_equal(answers[0], answers[2])
+    with pytest.raises(rsbench.RsbenchError, match="did you mean 'gs-8pt'"):
+        rsbench.estimate_motion(data.correspondences, RIG, SHUTTER, "gs-8pts")
+
+
+def test_the_left_cameras_translation_is_scored_as_such() -> None:
+    """The camera's own motion, from its two poses: what a single camera can know."""
+    (R0, t0), (R1, t1) = (RIG.cam_from_world(MOTION, tau, "left") for tau in (0.0, 1.0))
+    of_left = t1 - R1 @ R0.T @ t0
+    answer = rsbench.MotionEstimate(w=MOTION.w, d=2.0 * of_left, success=True, metric=False)
+    errors = rsbench.pose_errors(answer, MOTION, RIG, reference_point="left")
+    assert errors["e_R_deg"] < 1e-9 and errors["e_T_deg"] < 1e-9  # rounding
+    assert np.isnan(errors["e_s"])
+
+
+def test_a_failure_scores_the_worst() -> None:
+    errors = rsbench.pose_errors(rsbench.MotionEstimate.failed("nothing to see"), MOTION, RIG)
+    assert errors == {"e_R_deg": 180.0, "e_T_deg": 180.0, "e_s": np.inf}
+
+
+def test_a_dataset_is_read_matched_and_measured(smoke_dataset: Path) -> None:
+    sequences = rsbench.read_dataset(str(smoke_dataset))
+    assert_type(sequences, list[Sequence])
+    images = sequences[0].images()
+    assert all(image.shape == (96, 128, 3) for image in images)
+    np.testing.assert_array_equal(images[1], sequences[0].image("rs", "right", 0))
+    np.testing.assert_array_equal(images[2], sequences[0].image("rs", "left", 1))
+    matches = rsbench.match(images)
+    assert_type(matches, rsbench.Correspondences)
+    assert len(matches.left) > 20
+    depth = rsbench.stereo_depth(images[0], images[1], sequences[0].rig)
+    assert_type(depth, NDArray[np.float32])
+    truth = sequences[0].depth("rs", "left", 0)
+    both = (depth > 0) & (truth > 0)
+    # At 128 x 96 a tenth of a pixel of disparity is some percent of depth.
+    assert both.mean() > 0.3 and np.median(np.abs(depth[both] / truth[both] - 1)) < 0.05
+    assert not any(report.faults for report in rsbench.verify(smoke_dataset, stride=4))
+
+
+@pytest.mark.parametrize("count", [3, 5])
+def test_other_than_four_images_are_refused(count: int) -> None:
+    images = [np.zeros((64, 64), np.uint8)] * count
+    for call in (rsbench.match, lambda four: rsbench.correct(four, RIG)):
+        with pytest.raises(ValueError, match=f"got {count}; four are needed"):
+            call(images)
