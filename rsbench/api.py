@@ -142,22 +142,22 @@ def pose_errors(
         reference_point: the point whose translation the estimate gives, as its solver's ``spec`` says.
 
     Returns:
-        ``e_R_deg``, ``e_T_deg`` (degrees) and ``e_s``. A failure scores 180, 180 and infinity; e_s is NaN for an
-        estimate without metres.
+        ``e_R_deg``, ``e_T_deg`` (degrees) and ``e_s``. A failure scores 180, 180 and infinity. NaN where there is
+        nothing to compare: e_s of an estimate without metres, e_T and e_s where the true translation is zero.
     """
-    from rsbench.core import metrics
+    from rsbench.benchmark import scoring
 
-    if not estimate.success:
-        worst = float(np.rad2deg(metrics.WORST_ANGLE))
-        return {"e_R_deg": worst, "e_T_deg": worst, "e_s": metrics.WORST_SCALE}
-    d = motion.d
-    if reference_point == "left":
-        d = metrics.translation_of_offset(motion.w, motion.d, rig.offset("left"))
-    return {
-        "e_R_deg": float(np.rad2deg(metrics.rotation_error(estimate.w, motion.w))),
-        "e_T_deg": float(np.rad2deg(metrics.translation_error(estimate.d, d))),
-        "e_s": float(metrics.scale_error(estimate.d, d)) if estimate.metric else float("nan"),
-    }
+    errors = scoring.pose_errors(
+        estimate.w,
+        estimate.d,
+        true_w=motion.w,
+        true_d=motion.d,
+        rig=rig,
+        success=estimate.success,
+        metric=estimate.metric,
+        reference_point=reference_point,
+    )
+    return {name: float(value) for name, value in errors.items()}
 
 
 def match(images: Series[Image]) -> Correspondences:
