@@ -1,0 +1,227 @@
+"""Solvers run for scores: rsbench's own here, other packages' each in a child process of its own.
+
+Whatever another package's solver does is a failed estimate with the reason. What goes wrong in rsbench's own code
+raises, wherever it runs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import cached_property
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.isolation import EntryFailure, IsolatedWorker, Outcome, one_line
+from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions, estimate_motion
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+T = TypeVar("T")
+
+
+class SolverRunner:
+    """Runs solvers with a limit of time for those of other packages; use as a context manager."""
+
+    def __init__(self, *, time_limit_s: float | None = None) -> None:
+        """
+        Args:
+            time_limit_s: for one problem, instead of what each solver's card says.
+        """
+        self._time_limit_s = time_limit_s
+        self._workers: dict[str, IsolatedWorker] = {}
+        self._stack = ExitStack()
+
+    def robust(
+        self,
+        entry: SolverEntry,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        options: RobustOptions,
+        rng: np.random.Generator,
+    ) -> RobustEstimate:
+        """``estimate_motion``, all of it in the child; ``rng`` then stays as it is here."""
+        if entry.built_in:
+            return estimate_motion(correspondences, rig, shutter, entry.solver, options, rng)
+        start = time.perf_counter()
+        outcome = self._call(entry, "robust", correspondences, rig, shutter, options, rng)
+        if outcome.success and isinstance(outcome.value, RobustEstimate):
+            return outcome.value
+        names: tuple[MatchSet, ...] = ("left", "right", "tracks")
+        return RobustEstimate(
+            estimate=MotionEstimate.failed(outcome.reason),
+            inliers={name: np.zeros(len(getattr(correspondences, name)), dtype=np.bool_) for name in names},
+            iterations=0,
+            seconds=time.perf_counter() - start,
+            threshold_px=options.threshold_px,
+        )
+
+    def bare(
+        self, entry: SolverEntry, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> tuple[MotionEstimate, float]:
+        """``Solver.estimate`` on all matches, and its seconds of processor time; NaN when its process ended."""
+        if entry.built_in:
+            return _timed(entry.solver, correspondences, rig, shutter)
+        outcome = self._call(entry, "bare", correspondences, rig, shutter)
+        return outcome.value if outcome.success else (MotionEstimate.failed(outcome.reason), float("nan"))
+
+    def _call(self, entry: SolverEntry, *arguments: object) -> Outcome:
+        place = os.fspath(entry.path.resolve()) if entry.path is not None else entry.name
+        if place not in self._workers:
+            worker = IsolatedWorker(_serve_solver, place, classes=(MotionEstimate, RobustEstimate))
+            self._workers[place] = self._stack.enter_context(worker)
+        limit_s = entry.options.time_limit_s if self._time_limit_s is None else self._time_limit_s
+        return self._workers[place].call(*arguments, limit_s=limit_s)
+
+    def close(self) -> None:
+        """End all children."""
+        self._workers.clear()
+        self._stack.close()
+
+    def __enter__(self) -> SolverRunner:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: object, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def _timed(
+    solver: Solver, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+) -> tuple[MotionEstimate, float]:
+    start = time.process_time()
+    estimate = solver.estimate(correspondences, rig, shutter)
+    return estimate, time.process_time() - start
+
+
+# In the child
+
+
+def _serve_solver(place: str) -> Callable[..., object]:
+    """What answers calls to a solver."""
+    with _entrys_own():
+        solver = GuardedSolver(load_solver_entry(place).solver)
+    if not isinstance(solver.spec, SolverSpec):
+        raise EntryFailure(f"declares a {type(solver.spec).__name__}, not a SolverSpec")
+
+    def answer(what: str, *arguments: Any) -> object:
+        if what == "bare":
+            return _timed(solver, *arguments)
+        correspondences, rig, shutter, options, rng = arguments
+        return estimate_motion(correspondences, rig, shutter, solver, options, rng)
+
+    return answer
+
+
+class GuardedSolver(Solver):
+    """Another package's solver, held to the contract: what it does wrong is an ``EntryFailure``."""
+
+    def __init__(self, solver: Solver) -> None:
+        self._solver = solver
+
+    @cached_property
+    def spec(self) -> SolverSpec:  # type: ignore[override]
+        with _entrys_own():
+            return self._solver.spec
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        with _entrys_own():
+            estimate = self._solver.estimate(correspondences, rig, shutter)
+        return checked_estimate(estimate)
+
+    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
+        with _entrys_own():
+            sizes = dict(self._solver.sample_sizes(correspondences))
+        if any(isinstance(n, bool) or not isinstance(n, int) or n < 0 for n in sizes.values()):
+            raise EntryFailure(f"returned sample sizes {sizes}")
+        return sizes
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        with _entrys_own():
+            models = list(self._solver.propose(sample, rig, shutter))
+        return [checked_estimate(model) for model in models]
+
+    def propose_all(
+        self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
+    ) -> Iterable[list[MotionEstimate]]:
+        with _entrys_own():
+            proposals = iter(self._solver.propose_all(samples, rig, shutter))
+        for _ in samples:
+            with _entrys_own():
+                models = list(next(proposals, ()))
+            yield [checked_estimate(model) for model in models]
+
+    def improve(
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        quick: bool = False,
+    ) -> MotionEstimate:
+        with _entrys_own():
+            estimate = self._solver.improve(motion, correspondences, rig, shutter, quick=quick)
+        return checked_estimate(estimate)
+
+
+@contextmanager
+def _entrys_own() -> Iterator[None]:
+    """Whatever is raised inside is the entry's fault, also an exit or an interrupt."""
+    try:
+        yield
+    except EntryFailure:
+        raise
+    except RsbenchError as error:
+        raise EntryFailure(str(error)) from error
+    except BaseException as error:
+        raise EntryFailure(f"raised {one_line(error)}") from error
+
+
+_FIELD_TYPES: dict[str, tuple[type, ...]] = {
+    "success": (bool, np.bool_),
+    "reason": (str,),
+    "metric": (bool, np.bool_),
+    "direction_known": (bool, np.bool_),
+    "noise_px": (float, int, np.floating, type(None)),
+}
+
+
+def checked_estimate(estimate: object) -> MotionEstimate:
+    """An estimate made anew from fields of the right types and shapes, with finite numbers.
+
+    Raises:
+        EntryFailure: it is something else.
+    """
+    if not isinstance(estimate, MotionEstimate):
+        raise EntryFailure(f"returned a {type(estimate).__name__}, not a MotionEstimate")
+    given: dict[str, Any] = {}
+    for field in dataclasses.fields(MotionEstimate):
+        value = getattr(estimate, field.name, None)
+        if field.name in _FIELD_TYPES and not isinstance(value, _FIELD_TYPES[field.name]):
+            raise EntryFailure(f"returned {field.name} = {value!r}")
+        given[field.name] = value.item() if isinstance(value, np.generic) else value
+    if given["covariance"] is not None:
+        covariance = np.asarray(given["covariance"])
+        if covariance.dtype.kind not in "fiu" or covariance.shape != (6, 6) or not np.all(np.isfinite(covariance)):
+            raise EntryFailure("returned a covariance that is not 6 x 6 finite numbers")
+        given["covariance"] = covariance.astype(np.float64)
+    if given["noise_px"] is not None and not np.isfinite(given["noise_px"]):
+        raise EntryFailure(f"returned noise_px = {given['noise_px']}")
+    try:
+        return MotionEstimate(**given)
+    except (TypeError, ValueError) as error:
+        raise EntryFailure(f"returned {error}") from error
