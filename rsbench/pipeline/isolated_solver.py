@@ -126,10 +126,16 @@ def _serve_solver(place: str) -> Callable[..., object]:
 
 
 class GuardedSolver(Solver):
-    """Another package's solver, held to the contract: what it does wrong is an ``EntryFailure``."""
+    """Another package's solver, held to the contract: what it does wrong is an ``EntryFailure``.
+
+    Methods that it leaves as ``Solver`` has them run here, on the guarded ``estimate``.
+    """
 
     def __init__(self, solver: Solver) -> None:
         self._solver = solver
+
+    def _leaves(self, method: str) -> bool:
+        return getattr(type(self._solver), method) is getattr(Solver, method)
 
     @cached_property
     def spec(self) -> SolverSpec:  # type: ignore[override]
@@ -151,6 +157,8 @@ class GuardedSolver(Solver):
         return sizes
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        if self._leaves("propose"):
+            return super().propose(sample, rig, shutter)
         with _entrys_own():
             models = list(self._solver.propose(sample, rig, shutter))
         return [checked_estimate(model) for model in models]
@@ -158,6 +166,9 @@ class GuardedSolver(Solver):
     def propose_all(
         self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
     ) -> Iterable[list[MotionEstimate]]:
+        if self._leaves("propose_all"):
+            yield from super().propose_all(samples, rig, shutter)
+            return
         with _entrys_own():
             proposals = iter(self._solver.propose_all(samples, rig, shutter))
         for _ in samples:
@@ -173,6 +184,8 @@ class GuardedSolver(Solver):
         shutter: RollingShutter,
         quick: bool = False,
     ) -> MotionEstimate:
+        if self._leaves("improve"):
+            return super().improve(motion, correspondences, rig, shutter, quick)
         with _entrys_own():
             estimate = self._solver.improve(motion, correspondences, rig, shutter, quick=quick)
         return checked_estimate(estimate)

@@ -1,4 +1,4 @@
-"""Other people's code in a child process: every way to go wrong is a failure with its reason, and of nobody else."""
+"""Other people's code in a child process: each way to go wrong is a failure with its reason, of nobody else."""
 
 from __future__ import annotations
 
