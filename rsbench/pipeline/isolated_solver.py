@@ -17,14 +17,16 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolation import EntryFailure, IsolatedWorker, Outcome, one_line
-from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions, estimate_motion
+from rsbench.pipeline.robust_motion import MatchCount, RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.solvers.refined import RefinedSolver
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -81,7 +83,7 @@ class SolverRunner:
     def _call(self, entry: SolverEntry, *arguments: object) -> Outcome:
         place = os.fspath(entry.path.resolve()) if entry.path is not None else entry.name
         if place not in self._workers:
-            worker = IsolatedWorker(_serve_solver, place, classes=(MotionEstimate, RobustEstimate))
+            worker = IsolatedWorker(_serve_solver, place, classes=(MotionEstimate, RobustEstimate, MatchCount))
             self._workers[place] = self._stack.enter_context(worker)
         limit_s = entry.options.time_limit_s if self._time_limit_s is None else self._time_limit_s
         return self._workers[place].call(*arguments, limit_s=limit_s)
@@ -113,6 +115,7 @@ def _serve_solver(place: str) -> Callable[..., object]:
     """What answers calls to a solver."""
     with _entrys_own():
         solver = GuardedSolver(load_solver_entry(place).solver)
+    _compile()  # not in the entry's time
     if not isinstance(solver.spec, SolverSpec):
         raise EntryFailure(f"declares a {type(solver.spec).__name__}, not a SolverSpec")
 
@@ -123,6 +126,15 @@ def _serve_solver(place: str) -> Callable[..., object]:
         return estimate_motion(correspondences, rig, shutter, solver, options, rng)
 
     return answer
+
+
+def _compile() -> None:
+    """Run a small problem, so that the robust loop's kernels are there."""
+    rig = StereoRig(camera=PinholeCamera.centred(640, 480, 500.0), baseline=0.2)
+    points = np.random.default_rng(0).uniform(0.0, 480.0, (20, 8))
+    given = Correspondences(left=points[:, :4], right=points[:, 4:], tracks=points)
+    shutter, options = RollingShutter(height=480, readout_ratio=0.5), RobustOptions(max_iterations=10)
+    estimate_motion(given, rig, shutter, RefinedSolver(iterations=1), options, np.random.default_rng(0))
 
 
 class GuardedSolver(Solver):
@@ -138,7 +150,7 @@ class GuardedSolver(Solver):
         return getattr(type(self._solver), method) is getattr(Solver, method)
 
     @cached_property
-    def spec(self) -> SolverSpec:  # type: ignore[override]
+    def spec(self) -> SolverSpec:
         with _entrys_own():
             return self._solver.spec
 

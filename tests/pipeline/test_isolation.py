@@ -36,14 +36,17 @@ from rsbench.solvers.engine.base import MotionEstimate, Solver
 from rsbench.solvers.engine.registry import load_solver
 
 
+EIGHT_POINT = load_solver("gs-8pt")
+
+
 class Mischief(Solver):
-    spec = load_solver("gs-8pt").spec
+    spec = EIGHT_POINT.spec
 
     def __init__(self, what, note=""):
         self.what, self.note = what, note
 
     def estimate(self, correspondences, rig, shutter):
-        good = load_solver("gs-8pt").estimate(correspondences, rig, shutter)
+        good = EIGHT_POINT.estimate(correspondences, rig, shutter)
         if os.environ.get("MISCHIEF_SPARES_FEW") and len(correspondences.left) < 20:
             return good
         return getattr(self, "_" + self.what)(good)
