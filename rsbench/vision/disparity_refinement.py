@@ -20,9 +20,9 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from rsbench.compiled import compiled
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.resample import keys_weights
 
@@ -59,7 +59,7 @@ def _in_bands(height: int, work: Callable[[int, int], None]) -> None:
             piece.result()
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _measure(a: F32, b: F32, disparity: F32, first_row: int, end_row: int, weight: F32, pull: F32) -> None:
     """Fill each pixel's weight ``g^2`` plus the prior's, and ``g e``: what the images say of its disparity.
 
@@ -89,7 +89,7 @@ def _measure(a: F32, b: F32, disparity: F32, first_row: int, end_row: int, weigh
             pull[y, x] = slope * (partner - a[y, x])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _fit_planes(disparity: F32, weight: F32, pull: F32, first_row: int, end_row: int, fitted: F32) -> None:
     """Centre value of the plane fitted to each pixel's window; NaN where the disparity is NaN."""
     height, width = disparity.shape
@@ -117,7 +117,7 @@ def _fit_planes(disparity: F32, weight: F32, pull: F32, first_row: int, end_row:
             fitted[y, x] = disparity[y, x] + _plane_at_centre(window[:, x])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _add_column(
     u: np.float32,
     centre: F32,
@@ -146,7 +146,7 @@ def _add_column(
         ru[x] += r * u
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _add_line(v: float, line: F32, window: FloatArray) -> None:
     """Add the sums of a window row, v rows below the centre, to (9, n): these 5, w v, w u v, w v^2, r v."""
     for x in range(line.shape[1]):
@@ -159,7 +159,7 @@ def _add_line(v: float, line: F32, window: FloatArray) -> None:
         window[8, x] += r0 * v
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _plane_at_centre(sums: FloatArray) -> float:
     """The plane's value at the window's centre, relative to the disparity there."""
     w0, wu, wuu, r0, ru, wv, wuv, wvv, rv = (

@@ -15,8 +15,9 @@ every side along the surface it belongs to, so that a tear leaves no gap where t
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from rsbench.compiled import compiled
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -30,7 +31,7 @@ _MAX_STRETCH = 16.0  # px that one source pixel may span at the target: wider on
 _SAME_SURFACE = 1.001  # a cell yields to the mesh unless it is nearer by this factor of inverse depth
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _continues(step: float, before: float, after: float, limit: float) -> bool:
     """Whether a step between neighbours is small or continues the surface on one side of it.
 
@@ -40,7 +41,7 @@ def _continues(step: float, before: float, after: float, limit: float) -> bool:
     return abs(step) <= limit or abs(step - before) <= limit or abs(step - after) <= limit
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def connect(rho: F32, limit: F64) -> U8:
     """(H, W) bits RIGHT and BELOW: the neighbours that lie on the same surface.
 
@@ -67,7 +68,7 @@ def connect(rho: F32, limit: F64) -> U8:
     return joined
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _move(M: F64, b: F64, x: int, y: int, rho: float) -> tuple[float, float, float]:
     """Target pixel and inverse depth; NaN behind the target camera or where rho is NaN."""
     z = M[y, 2, 0] * x + M[y, 2, 1] * y + M[y, 2, 2] + rho * b[y, 2]
@@ -77,7 +78,7 @@ def _move(M: F64, b: F64, x: int, y: int, rho: float) -> tuple[float, float, flo
     return u * s, v * s, rho * s
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def move_rows(rho: F32, M: F64, b: F64, moved: F64) -> None:
     """Fill ``moved`` (3, H, W) with target x, y and inverse depth of every source pixel centre."""
     height, width = rho.shape
@@ -86,7 +87,7 @@ def move_rows(rho: F32, M: F64, b: F64, moved: F64) -> None:
             moved[0, y, x], moved[1, y, x], moved[2, y, x] = _move(M, b, x, y, rho[y, x])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def draw_mesh(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F32) -> None:
     """Draw the triangles of all joined neighbours into ``source_map`` (H, W, 2) and ``buffer`` (H, W).
 
@@ -113,7 +114,7 @@ def draw_mesh(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F32
                 _quad(upper, lower, x + 1, x, y - 1, top and right, bottom and left, source_map, buffer)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _covered(a: float, b: float, c: float, d: float, size: int) -> tuple[int, int]:
     """First and last pixel between the corners' coordinates; none when one is NaN or they are too far apart."""
     low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
@@ -122,7 +123,7 @@ def _covered(a: float, b: float, c: float, d: float, size: int) -> tuple[int, in
     return int(max(0.0, np.ceil(low - _SLACK))), int(min(size - 1.0, np.floor(high + _SLACK)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _quad(
     upper: F64,
     lower: F64,
@@ -174,7 +175,7 @@ def _quad(
                 source_map[row, column, 1] = y + t
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def draw_cells(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F32) -> None:
     """Draw the cells of pixels that are not joined to all their neighbours, behind ``draw_mesh``'s result.
 
@@ -202,7 +203,7 @@ def draw_cells(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F3
             _cell(rho, x, y, along_x, along_y, M, b, source_map, buffer)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _cell(
     rho: F32, x: int, y: int, along_x: float, along_y: float, M: F64, b: F64, source_map: F32, buffer: F32
 ) -> None:

@@ -16,9 +16,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from rsbench.compiled import compiled
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
@@ -122,7 +122,7 @@ def _warp_into(
     return warp(view.image, depth, camera, view.poses, target_pose, options=options)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _keep_landing(
     depth: NDArray[np.float32],
     rho: NDArray[np.float32],

@@ -8,9 +8,9 @@ float32 whatever the order of the sums: the result depends neither on the BLAS n
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from rsbench.compiled import compiled
 from rsbench.core.so3 import FloatArray
 
 _CHUNK = 256
@@ -35,8 +35,8 @@ def best_two(
     best, nearest = np.full(n, -1, dtype=np.int64), np.full(n, np.inf, dtype=np.float32)
     second, back = np.full(n, np.inf, dtype=np.float32), np.full(m, -1, dtype=np.int64)
     back_nearest = np.full(m, np.inf, dtype=np.float32)
-    norms_a = np.sum(descriptors_a * descriptors_a, axis=1, dtype=np.float32)
-    norms_b = np.sum(descriptors_b * descriptors_b, axis=1, dtype=np.float32)
+    norms_a: F32 = np.asarray(np.sum(descriptors_a * descriptors_a, axis=1, dtype=np.float32))
+    norms_b: F32 = np.asarray(np.sum(descriptors_b * descriptors_b, axis=1, dtype=np.float32))
     window = np.array([*dx, *dy], dtype=np.float64)
     for start in range(0, n, _CHUNK):
         stop = min(start + _CHUNK, n)
@@ -63,7 +63,7 @@ def best_two(
     return best, nearest, second, back
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _scan(
     products: F32,
     norms_a: F32,

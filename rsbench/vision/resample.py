@@ -13,8 +13,9 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from rsbench.compiled import compiled
 
 F32 = NDArray[np.float32]
 Interpolation = Literal["cubic", "linear"]
@@ -44,7 +45,7 @@ def resample(image: NDArray[Any], positions: F32, interpolation: Interpolation =
     return (np.clip(values, 0.0, largest) + np.float32(0.5)).astype(image.dtype)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def keys_weights(t: np.float32) -> Weights:
     """Weights of the samples at -1, 0, 1, 2 for position t in [0, 1]."""
     half, t2 = np.float32(0.5), t * t
@@ -57,7 +58,7 @@ def keys_weights(t: np.float32) -> Weights:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def _cubic(image: F32, positions: F32, values: F32) -> None:
     height, width, channels = image.shape
     flat = image.ravel()
@@ -76,7 +77,7 @@ def _cubic(image: F32, positions: F32, values: F32) -> None:
                 _border_pixel(image, px, py, values, y, x)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, inline="always")
+@compiled(error_model="numpy", fastmath={"contract"}, inline="always")
 def _pixel(
     flat: F32, width: int, channels: int, px: np.float32, py: np.float32, values: F32, y: int, x: int
 ) -> None:
@@ -93,13 +94,13 @@ def _pixel(
         values[y, x, c] = total
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, inline="always")
+@compiled(error_model="numpy", fastmath={"contract"}, inline="always")
 def _taps(flat: F32, at: np.uint64, step: np.uint64, w: Weights) -> np.float32:
     two = np.uint64(2) * step
     return w[0] * flat[at] + w[1] * flat[at + step] + w[2] * flat[at + two] + w[3] * flat[at + two + step]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _border_pixel(image: F32, px: np.float32, py: np.float32, values: F32, y: int, x: int) -> None:
     """One position whose window leaves the image: the border pixels are repeated outward."""
     height, width, channels = image.shape

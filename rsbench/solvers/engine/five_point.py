@@ -16,8 +16,9 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.compiled import compiled
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.kernels import compiled, cross, dot
+from rsbench.solvers.engine.kernels import cross, dot
 
 IntArray = NDArray[np.int64]
 

@@ -15,25 +15,16 @@ vanishes. Taking the constraint's derivative at the corrected measurement gives 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import TypeVar
 
 import numpy as np
-from numba import njit
 
+from rsbench.compiled import compiled
 from rsbench.core.so3 import FloatArray
 
 Vector = tuple[float, float, float]
-F = TypeVar("F", bound=Callable[..., object])
 
 BEHIND = 1e12
 """Squared error, px^2, of a track that the motion puts behind the camera; no descent step ever accepts it."""
-
-
-def compiled(function: F) -> F:
-    """Compile once per machine."""
-    out: F = njit(cache=True, nogil=True)(function)
-    return out
 
 
 @compiled

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.compiled import compiled
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.kernels import compiled
 from rsbench.solvers.engine.packed import Packed
 from rsbench.solvers.engine.track_kernels import track_terms
 

@@ -56,9 +56,10 @@ class Packed:
         return self._of(self.pairs[:0], self.tracks, self.row_checks)
 
     def _of(self, pairs: FloatArray, tracks: FloatArray, row_checks: FloatArray) -> Packed:
+        # In one piece, as they came: of other arrays the kernels would need another compilation.
         return Packed(
-            pairs=pairs,
-            tracks=tracks,
+            pairs=np.ascontiguousarray(pairs),
+            tracks=np.ascontiguousarray(tracks),
             row_checks=row_checks,
             focal=self.focal,
             h=self.h,

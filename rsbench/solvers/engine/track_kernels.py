@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from rsbench.compiled import compiled
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.kernels import (
     BEHIND,
     Vector,
     apply,
     apply_transposed,
-    compiled,
     cross,
     dot,
     move,
