@@ -1,5 +1,6 @@
 # make demo    render, solve, correct and score one sequence; ends with the path of its report
 # make test    format, lint, types, layers and every test
+# make docs    the documentation site, in build/docs; warnings are errors
 # make lock    renew constraints.txt from pyproject.toml (needs uv)
 # make clean   remove .venv and caches
 # Needs Python >= 3.11 with pip and venv. `make demo PYTHON=/path/to/python` chooses one.
@@ -11,7 +12,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 CANDIDATES = $(or $(PYTHON),python3 python3.14 python3.13 python3.12 python3.11)
 SUITABLE := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: demo test lock clean
+.PHONY: demo test docs lock clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -23,6 +24,10 @@ test: $(STAMP)
 	@echo "== types";  $(BIN)/mypy
 	@echo "== layers"; $(BIN)/lint-imports
 	@echo "== tests";  $(BIN)/python -m pytest
+
+docs: $(STAMP)
+	@$(BIN)/sphinx-build -W --keep-going -q -b html docs build/docs
+	@echo "site: $(CURDIR)/build/docs/index.html"
 
 # A venv without a working pip is what a killed `python -m venv` leaves: it is made anew.
 $(STAMP): constraints.txt pyproject.toml
@@ -43,7 +48,7 @@ $(STAMP): constraints.txt pyproject.toml
 
 lock:
 	@command -v uv >/dev/null || { echo "make: 'make lock' needs uv, which is not installed" >&2; exit 1; }
-	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 \
+	uv pip compile pyproject.toml --extra dev --extra docs --universal --python-version 3.11 \
 	  --generate-hashes --no-annotate --no-header --quiet --output-file constraints.txt
 
 clean:

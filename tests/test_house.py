@@ -123,7 +123,10 @@ def test_constraints_are_exact_and_hashed() -> None:
 
 def test_every_dependency_is_locked() -> None:
     project = read_toml(ROOT / "pyproject.toml")["project"]
-    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    wanted = [
+        *project["dependencies"],
+        *(line for extra in project["optional-dependencies"].values() for line in extra),
+    ]
     text = (ROOT / "constraints.txt").read_text("utf-8")
     locked = {_normal(name) for name in re.findall(r"^([A-Za-z0-9._-]+)==", text, flags=re.MULTILINE)}
     missing = {name for line in wanted if (name := _normal(re.split(r"[ \[<>=!~;]", line)[0])) not in locked}

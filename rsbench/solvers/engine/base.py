@@ -43,7 +43,7 @@ class MotionEstimate:
     covariance: FloatArray | None = None
     """(6, 6) of (w, d), rad and metres, from the residuals; None when the solver does not estimate it.
 
-    The length of d from pairs alone is nearly Gaussian in 1 / |d| rather than in |d|.
+    The length of d from pairs alone is nearly Gaussian in ``1 / |d|`` rather than in ``|d|``.
     """
     noise_px: float | None = None
     """Standard deviation of one pixel coordinate that the residuals show."""
