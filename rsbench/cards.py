@@ -32,7 +32,7 @@ _UNKNOWN_KEY = ("unexpected_keyword_argument", "extra_forbidden")
 
 def list_cards(kind: CardKind) -> dict[str, Path]:
     """Names of the cards of one kind that come with rsbench, sorted, with their files."""
-    return {path.stem: path for path in sorted(_card_folder(kind).glob("*.toml"))}
+    return {path.stem: path for path in sorted(_card_folder(kind).glob("*.toml"), key=lambda path: path.stem)}
 
 
 def card_path(kind: CardKind, name_or_path: str | Path) -> Path:
@@ -96,9 +96,7 @@ def parse_card(cls: type[T], data: Mapping[str, Any], where: str) -> T:
     # pydantic takes no settings for a standard dataclass itself, but hands those of a container down to it.
     adapter: TypeAdapter[Any] = TypeAdapter(tuple[cls], config=_CONFIG)  # type: ignore[valid-type]
     card: tuple[T]
-    stray = next(_not_finite(data), None)
-    if stray is not None:
-        raise RsbenchError(f"{where}: {stray}: numbers must be finite")
+    check_finite(data, where)
     try:
         card = adapter.validate_json(json.dumps([data], default=str))
     except ValidationError as error:
@@ -106,6 +104,17 @@ def parse_card(cls: type[T], data: Mapping[str, Any], where: str) -> T:
     except RsbenchError as error:
         raise RsbenchError(f"{where}: {error}") from error
     return card[0]
+
+
+def check_finite(data: Mapping[str, Any], where: str) -> None:
+    """Refuse numbers that are not finite, however deep they lie.
+
+    Raises:
+        RsbenchError: one line with ``where`` and the dotted field.
+    """
+    stray = next(_not_finite(data), None)
+    if stray is not None:
+        raise RsbenchError(f"{where}: {stray}: numbers must be finite")
 
 
 def choices(value: str, names: Iterable[str]) -> str:

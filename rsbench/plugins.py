@@ -1,37 +1,58 @@
 """Components by name: cards that come with rsbench, a user's card, or an installed package's entry point.
 
-Every kind of component is found in the same way. A name is that of a card or of an entry point; a value that
-ends in ``.toml`` is the path of a card. A card says ``class = "package.module:Class"``, may say ``description``,
-sets ``parameters``, and may set the options of its kind. A name that two packages claim is an error of whoever
-uses that name, and of nobody else.
+Every kind of component is found in the same way. A name is that of a card, of an entry point, or of a class of
+rsbench's own that needs no card; a value that ends in ``.toml`` is the path of a card. A card says
+``class = "package.module:Class"``, may say ``description``, sets ``parameters``, and may set the options of its
+kind. A name that two packages claim is an error of whoever uses that name, and of nobody else; what a package
+raises is told in one line, with its name.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import functools
-import hashlib
-import importlib
 import inspect
-import json
 import os
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib import metadata, resources
+from importlib import metadata
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from rsbench.cards import CardKind, card_path, choices, list_cards, parse_card, read_toml
-from rsbench.errors import RsbenchError
+from pydantic.errors import PydanticUserError
 
-T = TypeVar("T")
+from rsbench.cards import CardKind, card_path, check_finite, choices, list_cards, parse_card, read_toml
+from rsbench.errors import RsbenchError
+from rsbench.identity import component_key, own_source_version, source_version
+from rsbench.imports import blaming, import_target, in_words
+
+__all__ = [
+    "Entry",
+    "Kind",
+    "Offer",
+    "component_key",
+    "list_names",
+    "load_class",
+    "load_entry",
+    "make_component",
+    "offers",
+    "own_source_version",
+    "source_version",
+]
+
 Component = TypeVar("Component")
 Options = TypeVar("Options")
 _OWN = ("class", "description", "parameters")
-_NUMERIC_ROOMS = ("core", "solvers", "robust", "vision", "pipeline")
-"""Packages whose source decides what a component of ours answers."""
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """Of a kind whose cards set nothing beside the parameters."""
+
+
+def _anything_goes(component: Any) -> None:
+    pass
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,17 +61,21 @@ class Kind(Generic[Component, Options]):
 
     singular: str
     """Its name in messages, such as ``solver``."""
-    cards: CardKind
-    """Folder of its cards; its entry points are of the group ``rsbench.<folder>``."""
+    cards: CardKind | None = None
+    """Folder of its cards; None when the classes are named in cards of something else."""
+    group: str = ""
+    """Group of its entry points; by default ``rsbench.<folder of its cards>``."""
     base: type[Component]
     """Contract: what classes must be below of."""
     options: type[Options]
     """Dataclass of what a card may set beside the parameters; without values it must be valid."""
+    built_in: Mapping[str, str] = field(default_factory=dict)
+    """Names of rsbench's own classes that need no card, as ``package.module:Class``."""
+    check: Callable[[Component], None] = _anything_goes
+    """Raises ValueError when what a component declares cannot be right."""
 
-    @property
-    def group(self) -> str:
-        """Entry point group."""
-        return f"rsbench.{self.cards}"
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "group", self.group or f"rsbench.{self.cards}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,8 +95,25 @@ class Entry(Generic[Component, Options]):
 
     @property
     def built_in(self) -> bool:
-        """Whether the class is rsbench's own, so that it may run in this process."""
-        return type(self.component).__module__.partition(".")[0] == "rsbench"
+        """Whether the class, and that of the component inside it, is rsbench's own: it may run in this process."""
+        part: object = self.component
+        while part is not None:
+            if type(part).__module__.partition(".")[0] != "rsbench":
+                return False
+            part = getattr(part, "inner", None)
+        return True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Offer:
+    """A name, before anything is loaded."""
+
+    name: str
+    origin: str
+    """``rsbench``, or the package that claims the name."""
+    path: Path | None = None
+    """Its card."""
+    point: metadata.EntryPoint | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +125,20 @@ class _Content:
 
 def list_names(kind: Kind[Any, Any]) -> list[str]:
     """Names of all components of a kind, sorted; a clash of names is not an error here."""
-    return sorted({*list_cards(kind.cards), *_entry_points(kind)})
+    return sorted({offer.name for offer in offers(kind)})
+
+
+def offers(kind: Kind[Any, Any]) -> list[Offer]:
+    """Every claim to a name of a kind, sorted by name: two of one name are a clash. Loads nothing."""
+    cards = list_cards(kind.cards) if kind.cards is not None else {}
+    own = [Offer(name=name, origin="rsbench", path=path) for name, path in cards.items()]
+    own += [Offer(name=name, origin="rsbench") for name in kind.built_in if name not in cards]
+    installed = [
+        Offer(name=name, origin=_package(point), point=point)
+        for name, points in _entry_points(kind).items()
+        for point in points
+    ]
+    return sorted([*own, *installed], key=lambda offer: offer.name)
 
 
 def load_entry(kind: Kind[Component, Options], name_or_path: str | Path) -> Entry[Component, Options]:
@@ -94,38 +149,55 @@ def load_entry(kind: Kind[Component, Options], name_or_path: str | Path) -> Entr
             the card or the entry point.
     """
     text = os.fspath(name_or_path)
-    cards, points = list_cards(kind.cards), _entry_points(kind).get(text, [])
-    owners = ([f"the card {text}.toml of rsbench"] if text in cards else []) + [_owner(point) for point in points]
-    if len(owners) > 1:
-        raise RsbenchError(
-            f"{kind.singular} {text!r}: is the name of {' and of '.join(owners)}; rename one of them"
-        )
-    if points:
-        return _from_entry_point(kind, text, points[0])
-    if not text.endswith(".toml") and "/" not in text and os.sep not in text and text not in cards:
-        known = list_names(kind)
-        raise RsbenchError(f"{kind.singular} {text!r} does not exist{choices(text, known)}; a path ends in .toml")
-    return _from_card(kind, card_path(kind.cards, name_or_path))
-
-
-def _from_entry_point(
-    kind: Kind[Component, Options], name: str, point: metadata.EntryPoint
-) -> Entry[Component, Options]:
-    where = f"entry point {kind.group}:{name} ({_owner(point)})"
-    try:
-        cls = point.load()
-    except Exception as error:  # whatever a package's import raises, it is that package's fault
-        raise RsbenchError(f"{where}: cannot be loaded: {_in_words(error)}") from error
-    component = _instance(kind, cls, {}, where)
-    description = (inspect.getdoc(cls) or "").partition("\n")[0]
+    if kind.cards is not None and (text.endswith(".toml") or "/" in text or os.sep in text):
+        return _from_card(kind, card_path(kind.cards, name_or_path))
+    offer = _only_offer(kind, text, "; a path ends in .toml" if kind.cards is not None else "")
+    if offer.path is not None:
+        return _from_card(kind, offer.path)
+    cls, where = _offered_class(kind, offer)
+    component = make_component(kind, cls, {}, where)
     return Entry(
-        name=name,
+        name=text,
         path=None,
-        description=description,
+        description=(inspect.getdoc(cls) or "").partition("\n")[0],
         component=component,
         options=kind.options(),
         key=component_key(component, {}),
     )
+
+
+def load_class(kind: Kind[Component, Any], name: str, card: Path) -> type[Component]:
+    """The class that a card names: by the name of a class of rsbench's own or of an entry point, or as
+    ``package.module:Class``, where the module may lie beside the card.
+
+    Raises:
+        RsbenchError: no such class, two of that name, or it cannot be loaded or is not of this kind.
+    """
+    if ":" in name:
+        return _checked(kind, import_target(name, card.parent, f"{card}: {kind.singular} = {name!r}"), str(card))
+    return _offered_class(kind, _only_offer(kind, name, "", f"{card}: "))[0]
+
+
+def _only_offer(kind: Kind[Any, Any], name: str, advice: str, where: str = "") -> Offer:
+    everything = offers(kind)
+    found = [offer for offer in everything if offer.name == name]
+    if len(found) > 1:
+        owners = " and of ".join(_owner(offer) for offer in found)
+        raise RsbenchError(f"{where}{kind.singular} {name!r}: is the name of {owners}; rename one of them")
+    if not found:
+        known = choices(name, {offer.name for offer in everything})
+        raise RsbenchError(f"{where}{kind.singular} {name!r} does not exist{known}{advice}")
+    return found[0]
+
+
+def _offered_class(kind: Kind[Component, Any], offer: Offer) -> tuple[type[Component], str]:
+    """The class of an offer without a card, and how messages call it."""
+    if offer.point is None:
+        return _checked(kind, import_target(kind.built_in[offer.name], None, offer.name), offer.name), offer.name
+    where = f"entry point {kind.group}:{offer.name} ({_owner(offer)})"
+    with blaming(where, "cannot be loaded"):
+        cls = offer.point.load()
+    return _checked(kind, cls, where), where
 
 
 def _from_card(kind: Kind[Component, Options], path: Path) -> Entry[Component, Options]:
@@ -140,8 +212,10 @@ def _from_card(kind: Kind[Component, Options], path: Path) -> Entry[Component, O
         _Content, {("class_" if key == "class" else key): data[key] for key in _OWN if key in data}, str(path)
     )
     options = parse_card(kind.options, {key: data[key] for key in data if key not in _OWN}, str(path))
-    cls = _import(content.class_, path)
-    component = _instance(kind, cls, content.parameters, str(path))
+    cls = _checked(
+        kind, import_target(content.class_, path.parent, f"{path}: class = {content.class_!r}"), str(path)
+    )
+    component = make_component(kind, cls, content.parameters, str(path))
     return Entry(
         name=path.stem,
         path=path,
@@ -153,102 +227,109 @@ def _from_card(kind: Kind[Component, Options], path: Path) -> Entry[Component, O
     )
 
 
+# What others' packages say
+
+
 def _entry_points(kind: Kind[Any, Any]) -> dict[str, list[metadata.EntryPoint]]:
     found: dict[str, list[metadata.EntryPoint]] = {}
-    for point in metadata.entry_points(group=kind.group):
+    for point in _all_points(kind.group):
         same = found.setdefault(point.name, [])
         if all(other.value != point.value for other in same):
             same.append(point)
     return found
 
 
-def _owner(point: metadata.EntryPoint) -> str:
-    package = point.dist.name if point.dist is not None else "a package"
-    return f"{point.value} of {package}"
-
-
-def _import(target: str, card: Path) -> object:
-    """The class of ``package.module:Class``; modules beside the card are found too."""
-    where = f"{card}: class = {target!r}"
-    module, _, name = target.partition(":")
-    if not all(part.isidentifier() for part in [*module.split("."), name]):
-        raise RsbenchError(f"{where}: must be 'package.module:Class'")
+def _all_points(group: str) -> list[metadata.EntryPoint]:
+    """Entry points of a group. A package whose files about itself cannot be read has none, and stops no other."""
     try:
-        with _importable(card.parent.resolve()):
-            return getattr(importlib.import_module(module), name)
-    except Exception as error:
-        raise RsbenchError(f"{where}: cannot be imported: {_in_words(error)}") from error
+        return list(metadata.entry_points(group=group))
+    except Exception:
+        points, seen = [], set()
+        for package in metadata.distributions():
+            with contextlib.suppress(Exception):
+                if (name := str(package.metadata["Name"]).lower()) not in seen:
+                    points += [point for point in package.entry_points if point.group == group]
+                    seen.add(name)
+        return points
 
 
-@contextmanager
-def _importable(folder: Path) -> Iterator[None]:
-    """Lets modules in a folder be imported, after those that are installed."""
-    sys.path.append(str(folder))
+def _package(point: metadata.EntryPoint) -> str:
     try:
-        yield
-    finally:
-        sys.path.remove(str(folder))
+        name = point.dist.name if point.dist is not None else None
+    except Exception:  # files about the package are missing or cannot be read
+        name = None
+    return name or "a package"
 
 
-def _instance(kind: Kind[Component, Options], cls: object, parameters: dict[str, Any], where: str) -> Component:
-    """The component with its parameters."""
+def _owner(offer: Offer) -> str:
+    if offer.point is not None:
+        return f"{offer.point.value} of {offer.origin}"
+    return f"the card {offer.name}.toml of rsbench" if offer.path is not None else "rsbench's own"
+
+
+# Classes
+
+
+def _checked(kind: Kind[Component, Any], cls: object, where: str) -> type[Component]:
     if not (isinstance(cls, type) and issubclass(cls, kind.base)) or inspect.isabstract(cls):
         base = f"{kind.base.__module__}.{kind.base.__qualname__}"
-        raise RsbenchError(f"{where}: {cls!r} is not a {kind.singular}: it must be a concrete subclass of {base}")
-    if hasattr(cls, "__dataclass_fields__"):
-        return parse_card(cls, parameters, f"{where}: parameters")
-    known = list(inspect.signature(cls).parameters)
-    for key in parameters:
-        if key not in known:
-            raise RsbenchError(f"{where}: parameters: unknown key {key!r}{choices(key, known)}")
-    try:
-        return cls(**parameters)
-    except (TypeError, ValueError) as error:
-        raise RsbenchError(f"{where}: parameters: {error}") from error
+        missing = ", ".join(sorted(getattr(cls, "__abstractmethods__", ()))) if isinstance(cls, type) else ""
+        lacks = f"; it lacks {missing}" if missing and issubclass(cls, kind.base) else ""  # type: ignore[arg-type]
+        raise RsbenchError(
+            f"{where}: {cls!r} is not a {kind.singular}: it must be a concrete subclass of {base}{lacks}"
+        )
+    return cls
 
 
-def component_key(component: object, parameters: Mapping[str, Any]) -> str:
-    """Identity of a component: class, source, parameters, and the keys of the components inside it.
+def make_component(
+    kind: Kind[Component, Any], cls: type[Component], parameters: Mapping[str, Any], where: str
+) -> Component:
+    """An object of the class with the parameters of a card.
 
-    A dataclass's parameters are all its fields, so that a changed default is a change; another object's are what
-    its card gave.
+    Args:
+        kind: whose ``check`` it must pass.
+        cls: a dataclass, whose fields are checked strictly, or any class.
+        parameters: by name.
+        where: card or entry point, for messages.
+
+    Raises:
+        RsbenchError: an unknown or wrong parameter, or whatever the class raises: one line.
     """
-    cls = type(component)
-    if dataclasses.is_dataclass(component) and not isinstance(component, type):
-        parameters = {f.name: getattr(component, f.name) for f in dataclasses.fields(component) if f.init}
-    identity = {
-        "class": f"{cls.__module__}:{cls.__qualname__}",
-        "source": source_version(cls),
-        "parameters": dict(parameters),
-        "inner": list(getattr(component, "inner_keys", ())),
-    }
-    return hashlib.sha256(json.dumps(identity, sort_keys=True, default=repr).encode()).hexdigest()
+    check_finite(parameters, f"{where}: parameters")
+    if _has_dataclass_init(cls):
+        component = _blamed_parse(cls, parameters, where)
+    else:
+        known = inspect.signature(cls).parameters
+        for key in parameters:
+            if key not in known and all(p.kind is not p.VAR_KEYWORD for p in known.values()):
+                raise RsbenchError(f"{where}: parameters: unknown key {key!r}{choices(key, known)}")
+        with blaming(where, "parameters"):
+            component = cls(**parameters)
+    with blaming(where, "declares what cannot be"):
+        kind.check(component)
+    return component
 
 
-def source_version(cls: type) -> str:
-    """Hash of the source that a class's answers come from: all of rsbench's numerics, or the class's own file."""
-    module = cls.__module__
-    if module.partition(".")[0] == "rsbench":
-        return own_source_version()
+def _has_dataclass_init(cls: type) -> bool:
+    """Whether the constructor is that which ``@dataclass`` writes, on this class or one above it."""
+    owner = next(parent for parent in cls.__mro__ if "__init__" in vars(parent))
+    params = vars(owner).get("__dataclass_params__")
+    return params is not None and bool(params.init)
+
+
+def _blamed_parse(cls: type[Component], parameters: Mapping[str, Any], where: str) -> Component:
     try:
-        file = inspect.getsourcefile(cls)
-    except TypeError:  # built in, or made in a shell
-        file = None
-    return _file_hash(Path(file)) if file is not None and Path(file).is_file() else f"{module}: no source"
-
-
-@functools.cache
-def own_source_version() -> str:
-    """Hash of rsbench's own sources that decide what solvers, matchers and correctors answer."""
-    package = Path(str(resources.files("rsbench")))
-    files = sorted(path for room in _NUMERIC_ROOMS for path in (package / room).rglob("*.py"))
-    text = "\n".join(f"{path.relative_to(package).as_posix()} {_file_hash(path)}" for path in files)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _file_hash(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _in_words(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        with contextlib.redirect_stdout(sys.stderr):
+            return parse_card(cls, parameters, f"{where}: parameters")
+    except (RsbenchError, RecursionError):
+        raise
+    except PydanticUserError as error:
+        if not parameters:
+            with blaming(where, "parameters"):
+                return cls()
+        raise RsbenchError(
+            f"{where}: parameters: the fields of {cls.__name__} must have types that a card can hold "
+            f"(numbers, texts, tuples, dataclasses): {str(error).partition(chr(10))[0]}"
+        ) from error
+    except (Exception, SystemExit) as error:  # the constructor's own
+        raise RsbenchError(f"{where}: parameters: {in_words(error)}") from error

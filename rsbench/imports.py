@@ -1,0 +1,108 @@
+"""Classes by ``package.module:Class``, installed or beside a card; what others' code raises becomes one line."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from rsbench.errors import RsbenchError
+from rsbench.identity import file_hash, with_neighbours
+
+_beside_cards: dict[str, tuple[Path, str]] = {}
+"""Modules that were imported from beside a card: file, and its hash when it was imported."""
+_folders: list[str] = []
+"""Folders of cards on ``sys.path``, the last used first."""
+
+
+@contextlib.contextmanager
+def blaming(where: str, what: str) -> Iterator[None]:
+    """What others' code raises becomes one line with its name; what it prints stays out of answers on stdout."""
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    except RecursionError:  # whoever closed the circle says so
+        raise
+    except (Exception, SystemExit) as error:
+        text = str(error).partition("\n")[0] if isinstance(error, RsbenchError) else in_words(error)
+        raise RsbenchError(f"{where}: {what}: {text}") from error
+
+
+def in_words(error: BaseException) -> str:
+    """Type and text of an error, in one line."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def import_target(target: str, folder: Path | None, where: str) -> object:
+    """What ``package.module:Class`` names; modules in a folder are found too."""
+    module, _, name = target.partition(":")
+    if not all(part.isidentifier() for part in [*module.split("."), name]):
+        raise RsbenchError(f"{where}: must be 'package.module:Class'")
+    with blaming(where, "cannot be imported"):
+        if folder is None or module.partition(".")[0] == "rsbench":
+            return getattr(importlib.import_module(module), name)
+        return getattr(_import_beside(module, folder.resolve()), name)
+
+
+def _import_beside(module: str, folder: Path) -> object:
+    """Import a module that is installed or lies in a folder.
+
+    The folder stays on the path, after everything that is installed, for what is imported later, in child
+    processes too. A module that changed since it was imported is imported anew.
+    """
+    _put_on_path(str(folder))
+    _forget_changed(folder)
+    importlib.invalidate_caches()
+    first = folder / module.partition(".")[0]
+    beside = next((path for path in (first.with_suffix(".py"), first / "__init__.py") if path.is_file()), None)
+    if beside is not None:
+        _refuse_other(first.name, beside)
+    before = set(sys.modules)
+    found = importlib.import_module(module)
+    for name in set(sys.modules) - before:
+        file = _file_of(name)
+        if file is not None and file.is_relative_to(folder):
+            _beside_cards[name] = file, file_hash(file)
+    for file in with_neighbours(beside) if beside is not None else ():
+        if file.parent == folder and file.stem in sys.modules:
+            _refuse_other(file.stem, file)
+    return found
+
+
+def _put_on_path(folder: str) -> None:
+    """At the end of the path, before the folders of other cards."""
+    if folder in sys.path and folder not in _folders:
+        return
+    if folder in _folders:
+        _folders.remove(folder)
+    sys.path[:] = [entry for entry in sys.path if entry not in (folder, *_folders)] + [folder, *_folders]
+    _folders.insert(0, folder)
+
+
+def _forget_changed(folder: Path) -> None:
+    """Drop the modules of a folder when the file of one of them changed."""
+    mine = {name: file for name, (file, _) in _beside_cards.items() if file.is_relative_to(folder)}
+    if any(not file.is_file() or file_hash(file) != _beside_cards[name][1] for name, file in mine.items()):
+        for name in mine:
+            del _beside_cards[name]
+            sys.modules.pop(name, None)
+
+
+def _refuse_other(name: str, beside: Path) -> None:
+    """A module beside a card must not be taken for one of the same name from elsewhere."""
+    if name in sys.modules:
+        other = _file_of(name)
+    else:
+        spec = importlib.util.find_spec(name)
+        other = Path(spec.origin).resolve() if spec is not None and spec.has_location and spec.origin else None
+    if other is not None and other != beside.resolve():
+        raise ImportError(f"module {name!r} is taken by {other}: rename the one beside the card")
+
+
+def _file_of(module: str) -> Path | None:
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return Path(file).resolve() if file else None
