@@ -6,20 +6,21 @@ The yard spans x from -17 to 17 and y from -18 to 25; the gate looks north (+y),
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from rsbench.scenes import props
 from rsbench.scenes.buildings import HouseStyle, house
 from rsbench.scenes.fort import curtain_wall, gatehouse, round_tower, square_tower, wall_stairs
-from rsbench.scenes.model import FloatArray, SceneMesh
+from rsbench.scenes.model import FloatArray, SceneBuilder, SceneMesh
 from rsbench.scenes.palette import paint_palette
 from rsbench.scenes.parts import Piece, assemble, grid, lump, placed
 
 
 @dataclass(frozen=True, kw_only=True)
-class CastleParameters:
-    """What a card may change about the castle; lengths in metres."""
+class CastleBuilder(SceneBuilder):
+    """The courtyard of a castle; lengths in metres."""
 
     wall_height: float = 6.5
     keep_height: float = 15.0
@@ -34,13 +35,12 @@ class CastleParameters:
         if not 0 <= self.trees <= 60:
             raise ValueError(f"trees = {self.trees}: allowed are 0 to 60")
 
-
-def build_castle(parameters: CastleParameters, seed: int) -> tuple[SceneMesh, ...]:
-    """Meshes of the castle in the scene frame."""
-    rng = np.random.default_rng((seed, 1))
-    pieces = [*_ground(), *_walls(rng, parameters), *_buildings(rng, parameters), *_yard(rng)]
-    pieces += _surroundings(rng, parameters)
-    return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
+    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
+        """Meshes of the castle in the scene frame."""
+        rng = np.random.default_rng((seed, 1))
+        pieces = [*_ground(), *_walls(rng, self), *_buildings(rng, self), *_yard(rng)]
+        pieces += _surroundings(rng, self)
+        return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
 
 
 def terrain_height(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -69,7 +69,7 @@ def _ground() -> list[Piece]:
     return [hills, yard, way]
 
 
-def _walls(rng: np.random.Generator, parameters: CastleParameters) -> list[Piece]:
+def _walls(rng: np.random.Generator, parameters: CastleBuilder) -> list[Piece]:
     h = parameters.wall_height
     pieces: list[Piece] = []
     # Outer faces: north in two parts beside the gate, then west, south, east.
@@ -87,7 +87,7 @@ def _walls(rng: np.random.Generator, parameters: CastleParameters) -> list[Piece
     return pieces
 
 
-def _buildings(rng: np.random.Generator, parameters: CastleParameters) -> list[Piece]:
+def _buildings(rng: np.random.Generator, parameters: CastleBuilder) -> list[Piece]:
     pieces = placed(gatehouse(rng, "ashlar_1", "tiles_1", parameters.wall_height + 2.2), (7.0, 29.0, 0), 180)
     pieces += placed(square_tower(rng, 9.0, parameters.keep_height, "ashlar_2", 4, "tiles_0"), (-5.2, 18.5, 0))
     pieces += placed(
@@ -135,7 +135,7 @@ def _yard(rng: np.random.Generator) -> list[Piece]:
     return pieces
 
 
-def _surroundings(rng: np.random.Generator, parameters: CastleParameters) -> list[Piece]:
+def _surroundings(rng: np.random.Generator, parameters: CastleBuilder) -> list[Piece]:
     pieces: list[Piece] = []
     for k in range(parameters.trees):
         angle = 2 * np.pi * (k + rng.uniform(-0.3, 0.3)) / parameters.trees

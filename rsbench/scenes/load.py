@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from rsbench.cards import card_path, choices, parse_card, read_toml
+from rsbench.cards import card_path, parse_card, read_toml
 from rsbench.errors import RsbenchError
-from rsbench.scenes.castle import CastleParameters, build_castle
-from rsbench.scenes.mesh import MeshParameters, build_from_file
-from rsbench.scenes.model import Light, Scene, SceneMesh, Viewpoint
-from rsbench.scenes.old_town import OldTownParameters, build_old_town
-from rsbench.scenes.room import RoomParameters, build_room
+from rsbench.imports import blaming
+from rsbench.plugins import Kind, NoOptions, load_class, make_component
+from rsbench.scenes.model import Light, Scene, SceneBuilder, SceneMesh, Viewpoint
 
 Rgb: TypeAlias = tuple[float, float, float]
 
@@ -51,10 +49,13 @@ class LightCard:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneCard:
-    """What every scene card holds; builders add their ``parameters``."""
+    """What a scene card holds."""
 
     name: str
     builder: str
+    """Name of a scene builder, or ``package.module:Class``; the module may lie beside the card."""
+    parameters: dict[str, Any] = field(default_factory=dict)
+    """Of the builder."""
     viewpoints: dict[str, Viewpoint]
     description: str = ""
     seed: int = 0
@@ -74,37 +75,19 @@ class SceneCard:
                 raise ValueError(f"viewpoints.{name}: {error}") from error
 
 
-@dataclass(frozen=True, kw_only=True)
-class CastleCard(SceneCard):
-    builder: Literal["castle"]
-    parameters: CastleParameters = field(default_factory=CastleParameters)
-
-
-@dataclass(frozen=True, kw_only=True)
-class OldTownCard(SceneCard):
-    builder: Literal["old-town"]
-    parameters: OldTownParameters = field(default_factory=OldTownParameters)
-
-
-@dataclass(frozen=True, kw_only=True)
-class RoomCard(SceneCard):
-    builder: Literal["room"]
-    parameters: RoomParameters = field(default_factory=RoomParameters)
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeshCard(SceneCard):
-    builder: Literal["mesh"]
-    parameters: MeshParameters
-
-
-CARDS: dict[str, type[SceneCard]] = {
-    "castle": CastleCard,
-    "old-town": OldTownCard,
-    "room": RoomCard,
-    "mesh": MeshCard,
-}
-"""Builder name to the dataclass of its cards."""
+BUILDERS: Kind[SceneBuilder, NoOptions] = Kind(
+    singular="scene builder",
+    group="rsbench.scenes",
+    base=SceneBuilder,  # type: ignore[type-abstract]
+    options=NoOptions,
+    built_in={
+        "castle": "rsbench.scenes.castle:CastleBuilder",
+        "mesh": "rsbench.scenes.mesh:MeshBuilder",
+        "old-town": "rsbench.scenes.old_town:OldTownBuilder",
+        "room": "rsbench.scenes.room:RoomBuilder",
+    },
+)
+"""What ``builder`` in a scene card may name; others' are of the entry points ``rsbench.scenes``."""
 
 
 def load_scene(name_or_path: str | Path) -> Scene:
@@ -114,36 +97,61 @@ def load_scene(name_or_path: str | Path) -> Scene:
         name_or_path: a card that comes with rsbench, or a path that ends in ``.toml``.
 
     Raises:
-        RsbenchError: the card or a file that it names is missing or wrong, in one line.
+        RsbenchError: the card, its builder or a file that it names is missing or wrong, in one line.
     """
     path = card_path("scenes", name_or_path)
-    card = read_scene_card(path)
-    meshes = _build(card, path.parent)
+    card, builder = read_scene_card(path)
+    if type(builder).__module__.partition(".")[0] == "rsbench":
+        meshes = tuple(builder.build(card.seed, path.parent))
+    else:
+        with blaming(f"{path}: builder = {card.builder!r}", "failed"):
+            meshes = tuple(builder.build(card.seed, path.parent))
+    _check_meshes(meshes, f"{path}: builder = {card.builder!r}")
     return Scene(name=card.name, meshes=meshes, light=card.light.light(), viewpoints=card.viewpoints)
 
 
-def read_scene_card(path: Path) -> SceneCard:
-    """Parse a scene card without building the scene.
+def read_scene_card(path: Path) -> tuple[SceneCard, SceneBuilder]:
+    """Parse a scene card without building the scene: the card, and its builder with the card's parameters.
 
     Raises:
         RsbenchError: the card is wrong, in one line.
     """
-    data = read_toml(path)
-    builder = data.get("builder")
-    if not isinstance(builder, str) or builder not in CARDS:
-        problem = "'builder' is required" if builder is None else f"builder = {builder!r} does not exist"
-        raise RsbenchError(f"{path}: {problem}{choices(str(builder), CARDS)}")
-    return parse_card(CARDS[builder], data, str(path))
+    card = parse_card(SceneCard, read_toml(path), str(path))
+    cls = load_class(BUILDERS, card.builder, path)
+    return card, make_component(BUILDERS, cls, card.parameters, str(path))
 
 
-def _build(card: SceneCard, folder: Path) -> tuple[SceneMesh, ...]:
-    match card:
-        case CastleCard():
-            return build_castle(card.parameters, card.seed)
-        case OldTownCard():
-            return build_old_town(card.parameters, card.seed)
-        case RoomCard():
-            return build_room(card.parameters, card.seed)
-        case MeshCard():
-            return build_from_file(card.parameters, folder)
-    raise TypeError(f"no builder for {type(card).__name__}")
+def _check_meshes(meshes: tuple[SceneMesh, ...], where: str) -> None:
+    """Refuse what a renderer would stumble over, or read beyond its end."""
+    if not meshes:
+        raise RsbenchError(f"{where}: made no meshes")
+    names: set[str] = set()
+    for number, mesh in enumerate(meshes):
+        if not isinstance(mesh, SceneMesh):
+            raise RsbenchError(f"{where}: item {number} is a {type(mesh).__name__}, not a SceneMesh")
+        problem = _problem_of(mesh) or ("has the name of another" if mesh.name in names else None)
+        if problem is not None:
+            raise RsbenchError(f"{where}: mesh {mesh.name!r} {problem}")
+        names.add(mesh.name)
+
+
+def _problem_of(mesh: SceneMesh) -> str | None:
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    count = len(vertices) if vertices.ndim else 0
+    for name, columns in (("vertices", 3), ("uv", 2), ("normals", 3)):
+        values = getattr(mesh, name)
+        if values is None:
+            continue
+        if np.shape(values) != (count, columns) or np.asarray(values).dtype.kind != "f":
+            return f"has {name} of shape {np.shape(values)}: must be ({count}, {columns}) real numbers"
+        used = name != "uv" or mesh.material.texture is not None
+        if used and not np.all(np.isfinite(values)):
+            return f"has {name} that are not finite"
+    if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces) or faces.dtype.kind not in "iu":
+        return f"has faces of shape {faces.shape}: must be (m, 3) whole numbers, m > 0"
+    if faces.min() < 0 or faces.max() >= count:
+        return f"has faces that name vertices beyond its {count}"
+    texture = mesh.material.texture
+    if texture is not None and (texture.ndim != 3 or texture.shape[2] != 3 or texture.dtype != np.uint8):
+        return f"has a texture of shape {texture.shape}, {texture.dtype}: must be (h, w, 3) of uint8"
+    return "has a texture but no uv" if texture is not None and mesh.uv is None else None

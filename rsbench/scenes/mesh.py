@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from rsbench.errors import RsbenchError
-from rsbench.scenes.model import FloatArray, Material, SceneMesh
+from rsbench.scenes.model import FloatArray, Material, SceneBuilder, SceneMesh
 
 # Rows turn file axes into a right-handed frame with z up.
 _Z_UP = {
@@ -23,8 +23,8 @@ _SHEET = 1024  # columns of the sheet that holds colours of faces
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeshParameters:
-    """Which file, and how its axes and units become the scene frame's."""
+class MeshBuilder(SceneBuilder):
+    """A mesh file: which, and how its axes and units become the scene frame's."""
 
     file: str
     """Relative to the card, or absolute."""
@@ -39,32 +39,31 @@ class MeshParameters:
         if not self.metres_per_unit > 0:
             raise ValueError(f"metres_per_unit = {self.metres_per_unit}: must be positive")
 
+    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
+        """Meshes of a file in the scene frame, one for each part of its scene graph, textures and uv kept.
 
-def build_from_file(parameters: MeshParameters, folder: Path) -> tuple[SceneMesh, ...]:
-    """Meshes of a file in the scene frame, one for each part of its scene graph, textures and uv kept.
+        Args:
+            seed: decides nothing here.
+            folder: where a relative path starts.
 
-    Args:
-        parameters: of the card.
-        folder: where a relative path starts.
-
-    Raises:
-        RsbenchError: the file or one that it refers to is missing or broken, or holds no triangles.
-    """
-    path = folder / Path(parameters.file).expanduser()
-    model = _read(path)
-    angle = np.deg2rad(parameters.heading_deg)
-    heading = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    axes = parameters.metres_per_unit * heading @ _Z_UP[parameters.up_axis]
-    materials: dict[int, Material] = {}
-    meshes = []
-    for node in sorted(model.graph.nodes_geometry):
-        transform, name = model.graph[node]
-        part = model.geometry[name]
-        if isinstance(part, trimesh.Trimesh) and len(part.faces):
-            meshes.append(_scene_mesh(str(node), part, axes, transform, parameters.shading, materials, path))
-    if not meshes:
-        raise RsbenchError(f"{path}: holds no triangles")
-    return tuple(meshes)
+        Raises:
+            RsbenchError: the file or one that it refers to is missing or broken, or holds no triangles.
+        """
+        path = folder / Path(self.file).expanduser()
+        model = _read(path)
+        angle = np.deg2rad(self.heading_deg)
+        heading = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        axes = self.metres_per_unit * heading @ _Z_UP[self.up_axis]
+        materials: dict[int, Material] = {}
+        meshes = []
+        for node in sorted(model.graph.nodes_geometry):
+            transform, name = model.graph[node]
+            part = model.geometry[name]
+            if isinstance(part, trimesh.Trimesh) and len(part.faces):
+                meshes.append(_scene_mesh(str(node), part, axes, transform, self.shading, materials, path))
+        if not meshes:
+            raise RsbenchError(f"{path}: holds no triangles")
+        return tuple(meshes)
 
 
 class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc,unused-ignore]

@@ -1,13 +1,16 @@
 """What a scene is: textured meshes, a sun, a sky and the places to look from.
 
-A scene builder returns a ``Scene`` in the *scene frame*: right-handed, z up, metres, ground near z = 0.
+A scene builder returns meshes in the *scene frame*: right-handed, z up, metres, ground near z = 0.
 ``Scene.seen_from`` moves it into the *world frame* of the conventions (x right, y down, z forward, the rig's
 body at time 0), which is the only frame that renderers see.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +82,19 @@ class Viewpoint:
         x = right / np.linalg.norm(right)
         rotation = np.stack([x, np.cross(z, x), z])
         return rotation, -rotation @ eye
+
+
+class SceneBuilder(ABC):
+    """Makes the meshes of a scene. A frozen dataclass: its fields are the parameters that a scene card may set."""
+
+    @abstractmethod
+    def build(self, seed: int, folder: Path) -> Sequence[SceneMesh]:
+        """Meshes in the scene frame: right-handed, z up, metres, ground near z = 0.
+
+        Args:
+            seed: of the card; the same seed gives the same arrays.
+            folder: of the card, where relative paths in parameters start.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)

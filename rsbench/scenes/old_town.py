@@ -6,13 +6,14 @@ The street runs along y from -26 (a town gate) to 14, the square spans x from -1
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from rsbench.scenes import props
 from rsbench.scenes.buildings import HouseStyle, arch, house, rectangle
 from rsbench.scenes.fort import gatehouse, loop_window, square_tower
-from rsbench.scenes.model import SceneMesh
+from rsbench.scenes.model import SceneBuilder, SceneMesh
 from rsbench.scenes.palette import paint_palette
 from rsbench.scenes.parts import Piece, assemble, beam, box, grid, leaned, lump, panel, placed, profile, revolve
 
@@ -21,8 +22,8 @@ _GROUNDS = ("stone", "ashlar_1", "ashlar_3", "brick")
 
 
 @dataclass(frozen=True, kw_only=True)
-class OldTownParameters:
-    """What a card may change about the town; lengths in metres."""
+class OldTownBuilder(SceneBuilder):
+    """A street and a market square; lengths in metres."""
 
     street_width: float = 9.0
     storeys: tuple[int, int] = (2, 3)
@@ -38,16 +39,15 @@ class OldTownParameters:
         if not 0 <= self.stalls <= 7:
             raise ValueError(f"stalls = {self.stalls}: allowed are 0 to 7")
 
+    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
+        """Meshes of the town in the scene frame."""
+        rng = np.random.default_rng((seed, 1))
+        pieces = [*_ground(self), *_street(rng, self), *_square(rng, self)]
+        pieces += [*_street_life(rng, self), *_market(rng, self), *_surroundings(rng)]
+        return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
 
-def build_old_town(parameters: OldTownParameters, seed: int) -> tuple[SceneMesh, ...]:
-    """Meshes of the town in the scene frame."""
-    rng = np.random.default_rng((seed, 1))
-    pieces = [*_ground(parameters), *_street(rng, parameters), *_square(rng, parameters)]
-    pieces += [*_street_life(rng, parameters), *_market(rng, parameters), *_surroundings(rng)]
-    return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
 
-
-def _ground(parameters: OldTownParameters) -> list[Piece]:
+def _ground(parameters: OldTownBuilder) -> list[Piece]:
     half = parameters.street_width / 2
     x, y = np.meshgrid(np.linspace(-80, 80, 81), np.linspace(-80, 100, 91))
     rise = np.clip((np.hypot(x, y - 5) - 46) / 30, 0, 1)
@@ -63,7 +63,7 @@ def _ground(parameters: OldTownParameters) -> list[Piece]:
     return pieces
 
 
-def _style(rng: np.random.Generator, parameters: OldTownParameters, width: float, number: int) -> HouseStyle:
+def _style(rng: np.random.Generator, parameters: OldTownBuilder, width: float, number: int) -> HouseStyle:
     """Neighbours differ in colour, roof and height; three houses of four are timber-framed."""
     framed = bool(rng.random() < 0.7)
     low, high = parameters.storeys
@@ -85,7 +85,7 @@ def _style(rng: np.random.Generator, parameters: OldTownParameters, width: float
 
 def _row(
     rng: np.random.Generator,
-    parameters: OldTownParameters,
+    parameters: OldTownBuilder,
     start: tuple[float, float],
     heading: float,
     widths: list[float],
@@ -107,7 +107,7 @@ def _row(
     return pieces
 
 
-def _street(rng: np.random.Generator, parameters: OldTownParameters) -> list[Piece]:
+def _street(rng: np.random.Generator, parameters: OldTownBuilder) -> list[Piece]:
     half = parameters.street_width / 2
     pieces = _row(rng, parameters, (-half, -26.0), 90, [6.2, 5.4, 6.8, 5.6, 6.0, 5.2, 6.4], 0)
     pieces += _row(rng, parameters, (half, 13.0), -90, [5.6, 6.4, 5.8, 6.6, 5.2, 6.2, 4.6], 3)
@@ -115,7 +115,7 @@ def _street(rng: np.random.Generator, parameters: OldTownParameters) -> list[Pie
     return pieces
 
 
-def _square(rng: np.random.Generator, parameters: OldTownParameters) -> list[Piece]:
+def _square(rng: np.random.Generator, parameters: OldTownBuilder) -> list[Piece]:
     pieces = _row(rng, parameters, (-13.0, 16.0), 90, [5.8, 6.0], 2)
     pieces += _row(rng, parameters, (13.0, 27.0), -90, [6.0, 5.6], 4)
     pieces += _row(rng, parameters, (-13.0, 28.0), 0, [6.0, 5.4], 6)
@@ -182,7 +182,7 @@ def church(rng: np.random.Generator) -> list[Piece]:
     return pieces
 
 
-def _street_life(rng: np.random.Generator, parameters: OldTownParameters) -> list[Piece]:
+def _street_life(rng: np.random.Generator, parameters: OldTownBuilder) -> list[Piece]:
     half = parameters.street_width / 2
     pieces: list[Piece] = []
     for side, y in ((-1, 3.4), (1, 9.5), (-1, -9.0), (1, -15.0), (-1, 13.6), (1, 16.5)):
@@ -213,7 +213,7 @@ def _street_life(rng: np.random.Generator, parameters: OldTownParameters) -> lis
     return pieces
 
 
-def _market(rng: np.random.Generator, parameters: OldTownParameters) -> list[Piece]:
+def _market(rng: np.random.Generator, parameters: OldTownBuilder) -> list[Piece]:
     pieces = placed(props.fountain(rng), (-0.9, 13.2, 0), 10)
     places = (
         (3.6, 17.6, -25),

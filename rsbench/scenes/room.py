@@ -6,13 +6,14 @@ The room spans x from -2.7 to 2.7 and y from -2.9 to 2.9; the floor is z = 0.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from rsbench.scenes import furniture as fit
 from rsbench.scenes import props
 from rsbench.scenes.buildings import door, rectangle, window
-from rsbench.scenes.model import SceneMesh
+from rsbench.scenes.model import SceneBuilder, SceneMesh
 from rsbench.scenes.palette import paint_palette
 from rsbench.scenes.parts import Piece, Point, assemble, beam, box, grid, leaned, panel, picture, placed
 
@@ -20,8 +21,8 @@ _HALF_X, _HALF_Y = 2.7, 2.9
 
 
 @dataclass(frozen=True, kw_only=True)
-class RoomParameters:
-    """What a card may change about the room."""
+class RoomBuilder(SceneBuilder):
+    """A living room, furnished."""
 
     ceiling_height: float = 2.7
     """Metres."""
@@ -34,13 +35,12 @@ class RoomParameters:
         if not 0 <= self.chairs <= 4:
             raise ValueError(f"chairs = {self.chairs}: allowed are 0 to 4")
 
-
-def build_room(parameters: RoomParameters, seed: int) -> tuple[SceneMesh, ...]:
-    """Meshes of the room in the scene frame."""
-    rng = np.random.default_rng((seed, 1))
-    pieces = [*_shell(parameters.ceiling_height), *_back_wall(rng, parameters.ceiling_height)]
-    pieces += [*_seats(), *_table(rng, parameters.chairs), *_sides(rng), *_garden(rng)]
-    return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
+    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
+        """Meshes of the room in the scene frame."""
+        rng = np.random.default_rng((seed, 1))
+        pieces = [*_shell(self.ceiling_height), *_back_wall(rng, self.ceiling_height)]
+        pieces += [*_seats(), *_table(rng, self.chairs), *_sides(rng), *_garden(rng)]
+        return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
 
 
 def _shell(height: float) -> list[Piece]:

@@ -176,11 +176,11 @@ def test_a_missing_texture_file_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ("", "'parameters.file' is required"),
-        ('file = "a.glb"\nup_axis = "w"', "parameters.up_axis = 'w'"),
+        ("", "parameters: 'file' is required"),
+        ('file = "a.glb"\nup_axis = "w"', "parameters: up_axis = 'w'"),
         ('file = "a.glb"\nmetres_per_unit = 0.0', "metres_per_unit = 0.0: must be positive"),
         ('file = "a.glb"\nmetres_per_unit = nan', "parameters.metres_per_unit"),
-        ('file = "a.glb"\nunits = "m"', "unknown key 'parameters.units'"),
+        ('file = "a.glb"\nunits = "m"', "parameters: unknown key 'units'"),
     ],
 )
 def test_bad_parameters_are_refused(tmp_path: Path, parameters: str, message: str) -> None:

@@ -169,6 +169,12 @@ def test_a_card_finds_the_module_beside_it(tmp_path: Path) -> None:
     sys.modules.pop("moody_solver")
 
 
+def test_a_solver_must_say_what_it_is(tmp_path: Path) -> None:
+    (tmp_path / "specless_solver.py").write_text(PLAIN.replace('load_solver("gs-8pt").spec', '"a text"'), "utf-8")
+    with pytest.raises(RsbenchError, match=r"mine.toml: declares what cannot be: .*must be a SolverSpec"):
+        load_solver(card(tmp_path, 'class = "specless_solver:Plain"'))
+
+
 PLAIN = """
 from rsbench.solvers.engine.base import MotionEstimate, Solver
 from rsbench.solvers.engine.registry import load_solver

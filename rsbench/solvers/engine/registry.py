@@ -8,7 +8,7 @@ from typing import Literal
 
 from rsbench import plugins
 from rsbench.plugins import Entry, Kind
-from rsbench.solvers.engine.base import Solver
+from rsbench.solvers.engine.base import Solver, SolverSpec
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,11 +25,17 @@ class SolverOptions:
             raise ValueError(f"time_limit_s = {self.time_limit_s}: must be a positive number of seconds")
 
 
+def _check_spec(solver: Solver) -> None:
+    if not isinstance(solver.spec, SolverSpec):
+        raise ValueError(f"spec = {solver.spec!r}: must be a SolverSpec")
+
+
 SOLVERS: Kind[Solver, SolverOptions] = Kind(
     singular="solver",
     cards="solvers",
     base=Solver,  # type: ignore[type-abstract]
     options=SolverOptions,
+    check=_check_spec,
 )
 
 
