@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from rsbench import __version__
-from rsbench.cli import correct, demo, doctor, evaluate, generate, reproduce, simulate, solve, verify
+from rsbench.cli import check_solver, correct, demo, doctor, evaluate, generate, reproduce, simulate, solve, verify
 from rsbench.cli import list_cards as cards
 from rsbench.errors import RsbenchError
 
@@ -39,7 +39,7 @@ def _root(
     pass
 
 
-for module in (demo, cards, doctor, generate, verify, solve, evaluate, correct, simulate, reproduce):
+for module in (demo, cards, doctor, generate, verify, solve, check_solver, evaluate, correct, simulate, reproduce):
     module.register(app)
 
 

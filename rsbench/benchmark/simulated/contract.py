@@ -1,0 +1,347 @@
+"""What every solver promises, as named checks: for authors (``rsbench check-solver``) and for our own tests.
+
+Each check looks at exact, simulated data of a solver's own motion model and shutter. A solver need not be exact: a
+linearised one must come nearer to the truth as the motion becomes smaller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from rsbench.benchmark.simulated.contract_subject import BrokenContractError, Subject
+from rsbench.benchmark.simulated.misreadings import misreading
+from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, simulate
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.metrics import rotation_error, scale_error, translation_error, translation_of_offset
+from rsbench.core.motion import MOTION_MODELS
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.engine.registry import SolverEntry
+
+RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
+ROLLING = RollingShutter(height=900, readout_ratio=0.8)
+GLOBAL = RollingShutter(height=900, readout_ratio=0.0)
+W, D = np.array([0.012, -0.02, 0.016]), np.array([0.2, -0.12, 0.18])
+"""1.6 degrees and 0.3 m per frame: the paper's size of motion, along no axis."""
+
+Verdict = Literal["passed", "warning", "failed", "skipped"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """What one check found."""
+
+    check: str
+    verdict: Verdict
+    why: str = ""
+    """What was measured, or what is wrong."""
+
+
+def check_solver(
+    entry: SolverEntry, *, isolated: bool | None = None, time_limit_s: float | None = None
+) -> list[Finding]:
+    """Hold a solver to the contract.
+
+    Args:
+        entry: the solver.
+        isolated: whether it runs in a child process; by default when it is not rsbench's own.
+        time_limit_s: for one problem; by default what its card says.
+    """
+    limit = entry.options.time_limit_s if time_limit_s is None else time_limit_s
+    findings: list[Finding] = []
+    with Subject(
+        entry, isolated=not entry.built_in if isolated is None else isolated, time_limit_s=limit
+    ) as subject:
+        for name, check in CHECKS.items():
+            if subject.hung or (findings and findings[0].verdict == "failed"):
+                finding = Finding(check=name, verdict="skipped", why="it does not answer")
+            else:
+                finding = _found(name, check, subject)
+            findings.append(finding)
+    return findings
+
+
+def _found(name: str, check: Callable[[Subject], tuple[Verdict, str]], subject: Subject) -> Finding:
+    try:
+        verdict, why = check(subject)
+    except BrokenContractError as error:
+        verdict, why = "failed", str(error)
+    return Finding(check=name, verdict=verdict, why=why)
+
+
+# Data
+
+
+def own_problem(subject: Subject, size: float = 1.0, seed: int = 5, noise_px: float = 0.0) -> Simulation:
+    """60 + 60 matches and 60 tracks that satisfy what the solver assumes, under ``size`` times the motion."""
+    shutter = ROLLING if subject.spec.shutter == "rolling" else GLOBAL
+    if subject.spec.motion_model not in MOTION_MODELS:
+        known = ", ".join(MOTION_MODELS)
+        raise BrokenContractError(
+            f"motion_model = {subject.spec.motion_model!r} does not exist; there are: {known}"
+        )
+    motion = MOTION_MODELS[subject.spec.motion_model](size * W, size * D)
+    options = SimulationOptions(pairs=60, tracks=60, noise_px=noise_px)
+    return simulate(RIG, shutter, motion, options, np.random.default_rng(seed))
+
+
+def given(subject: Subject, simulation: Simulation) -> Correspondences:
+    """The matches of a simulation, with those between the cameras where the solver speaks of them."""
+    c = simulation.correspondences
+    if "stereo" not in {*subject.spec.needs, *subject.spec.minimum}:
+        return c
+    return Correspondences(
+        left=c.left, right=c.right, tracks=c.tracks, stereo_0=c.tracks[:, :4], stereo_1=c.tracks[:, 4:]
+    )
+
+
+def true_translation(subject: Subject, simulation: Simulation) -> FloatArray:
+    """Of the point whose translation the solver gives."""
+    motion = simulation.motion
+    if subject.spec.reference_point == "body":
+        return motion.d
+    return translation_of_offset(motion.w, motion.d, RIG.offset("left"))
+
+
+def _solved(
+    subject: Subject, simulation: Simulation, correspondences: Correspondences | None = None
+) -> MotionEstimate:
+    """A success, on data that the solver must be able to solve."""
+    estimate = subject.estimate(
+        given(subject, simulation) if correspondences is None else correspondences, RIG, simulation.shutter
+    )
+    if not estimate.success:
+        raise BrokenContractError(f"failed on 60 + 60 matches and 60 tracks: {estimate.reason}")
+    return estimate
+
+
+# Checks
+
+
+def answers(subject: Subject) -> tuple[Verdict, str]:
+    """A ``MotionEstimate`` of finite numbers, on data that are easy."""
+    _solved(subject, own_problem(subject))
+    return "passed", ""
+
+
+_SIZES, _SEEDS = (1.0, 0.5, 0.25), (5, 6, 7)
+_EXACT = 1e-6
+"""Of the motion's angle, in radians of direction, in log of length: rounding, and the last step of a descent."""
+_LARGEST, _BIAS = 0.1, (0.02, 0.005, 0.02)
+"""What a linearised solver may be off at the paper's motion, and what remains however small the motion is. The
+latter tells a bias of the method from a wrong point of the rig, whose direction is 0.03 rad off."""
+
+
+def finds_the_truth(subject: Subject) -> tuple[Verdict, str]:
+    """The motion of exact data: exactly, or the better the smaller the motion is."""
+    errors = np.array([[_errors(subject, size, seed) for seed in _SEEDS] for size in _SIZES]).max(axis=1)
+    names = ("rotation", "direction", "length")
+    told = [f"{name} {full:.0e}" for name, full in zip(names, errors[0], strict=True) if np.isfinite(full)]
+    biased = []
+    for name, (full, _, quarter), bias in zip(names, errors.T, _BIAS, strict=True):
+        if not np.isfinite(full) or max(full, quarter) < _EXACT:
+            continue
+        if full > _LARGEST or (quarter > 0.5 * full and quarter > bias):
+            raise BrokenContractError(_what_is_wrong(subject, name, full, quarter))
+        if quarter > 0.5 * full:
+            biased.append(f"{name} {quarter:.1e} off however small the motion is")
+    if biased:
+        return "warning", "; ".join(biased)
+    return "passed", f"relative errors on exact data: {', '.join(told)}"
+
+
+def _errors(subject: Subject, size: float, seed: int) -> tuple[float, float, float]:
+    """Of rotation (share of its angle), direction (rad) and length (log; NaN when it is not metric)."""
+    simulation = own_problem(subject, size, seed)
+    estimate, d = _solved(subject, simulation), true_translation(subject, simulation)
+    rotation = rotation_error(estimate.w, simulation.motion.w) / np.linalg.norm(simulation.motion.w)
+    length = float(scale_error(estimate.d, d)) if estimate.metric else np.nan
+    return float(rotation), float(translation_error(estimate.d, d)), length
+
+
+def _what_is_wrong(subject: Subject, name: str, full: float, quarter: float) -> str:
+    simulation = own_problem(subject)
+    estimate, truth = _solved(subject, simulation), simulation.motion
+    words = misreading(estimate.w, estimate.d, truth.w, truth.d, RIG, subject.spec.reference_point)
+    if words is not None:
+        return words
+    d = true_translation(subject, simulation)
+    if name == "length":
+        factor = np.linalg.norm(estimate.d) / np.linalg.norm(d)
+        return f"d is {factor:.3g} times as long as it is in metres (its spec says metric = True)"
+    return (
+        f"{name} is {full:.1e} off on exact data, and {quarter:.1e} at a quarter of the motion: "
+        f"w = {_vector(estimate.w)}, d = {_vector(estimate.d)}; the truth is {_vector(truth.w)}, {_vector(d)}"
+    )
+
+
+def _vector(values: FloatArray) -> str:
+    return "[" + ", ".join(f"{value:.4f}" for value in values) + "]"
+
+
+def ignores_the_order(subject: Subject) -> tuple[Verdict, str]:
+    """The same matches in another order have the same motion."""
+
+    def shuffled(c: Correspondences) -> Correspondences:
+        rng = np.random.default_rng(1)
+        return Correspondences(**{name: rng.permutation(matches) for name, matches in vars(c).items()})
+
+    return _agree(subject, shuffled, np.ones(3), np.ones(3), "in another order")
+
+
+def mirrors(subject: Subject) -> tuple[Verdict, str]:
+    """When x is mirrored, left and right change places, and d_x, w_y and w_z their sign."""
+    if subject.spec.reference_point == "left" and subject.spec.needs != {"left"}:
+        return "skipped", "the mirror image of the left camera is the right one"
+    alone = subject.spec.needs == {"left"}
+    last = RIG.camera.width - 1
+
+    def flipped(matches: FloatArray, order: list[int]) -> FloatArray:
+        out = matches[:, order]
+        out[:, ::2] = last - out[:, ::2]
+        return out
+
+    def mirrored(c: Correspondences) -> Correspondences:
+        same, swap = [0, 1, 2, 3], [2, 3, 0, 1]
+        left, right = flipped(c.left, same), flipped(c.right, same)
+        if alone:  # with tracks, whose left halves are then those of the mirrored left camera
+            return Correspondences(left=left, right=right, tracks=flipped(c.tracks, [*range(8)]))
+        return Correspondences(
+            left=right,
+            right=left,
+            stereo_0=flipped(c.stereo_0, swap),
+            stereo_1=flipped(c.stereo_1, swap),
+            tracks=flipped(c.tracks, [2, 3, 0, 1, 6, 7, 4, 5]),
+        )
+
+    return _agree(subject, mirrored, np.array([1, -1, -1]), np.array([-1, 1, 1]), "of the mirrored world")
+
+
+_SAME_W, _SAME_D = 1e-6, 1e-5
+"""Radians, and share of the length: the last step of a descent that takes another way."""
+
+
+def _agree(
+    subject: Subject,
+    change: Callable[[Correspondences], Correspondences],
+    sign_w: FloatArray,
+    sign_d: FloatArray,
+    words: str,
+) -> tuple[Verdict, str]:
+    """Motions of changed matches: equal on exact data; with 0.3 px of noise, a difference is a warning."""
+    severity: dict[float, Verdict] = {0.0: "failed", 0.3: "warning"}
+    for noise_px, verdict in severity.items():
+        simulation = own_problem(subject, noise_px=noise_px)
+        c = given(subject, simulation)
+        first, second = _solved(subject, simulation, c), _solved(subject, simulation, change(c))
+        w_off = np.linalg.norm(second.w * sign_w - first.w)
+        d_off = np.linalg.norm(second.d * sign_d - first.d) / np.linalg.norm(first.d)
+        if w_off > _SAME_W or d_off > _SAME_D:
+            off = f"{np.rad2deg(w_off):.1e} deg and {100 * d_off:.1e} % of d off"
+            message = f"with {noise_px} px of noise, matches {words} give another motion: {off}"
+            return verdict, message
+    return "passed", ""
+
+
+def is_deterministic(subject: Subject) -> tuple[Verdict, str]:
+    """The same matches give the same bytes."""
+    simulation = own_problem(subject, noise_px=0.3)
+    first, second = (_solved(subject, simulation) for _ in range(2))
+    if first.w.tobytes() != second.w.tobytes() or first.d.tobytes() != second.d.tobytes():
+        off = np.rad2deg(np.linalg.norm(first.w - second.w))
+        raise BrokenContractError(f"the same matches gave two motions, {off:.1e} deg apart: seed what you draw")
+    return "passed", ""
+
+
+def fails_by_value(subject: Subject) -> tuple[Verdict, str]:
+    """Data that determine no motion give a finite motion, or a failure with a reason; too few always fail."""
+    failures = 0
+    cases = degenerate_cases()
+    for name, (c, shutter) in cases.items():
+        sets = {"": c, "pairs of ": _subset(c, "left", "right"), "tracks of ": _subset(c, "tracks")}
+        for kind, matches in sets.items():
+            try:
+                estimate = subject.estimate(matches, RIG, shutter)
+            except BrokenContractError as error:
+                raise BrokenContractError(f"{kind}{name}: {error}") from error
+            failures += not estimate.success
+            if estimate.success and name in ("two matches", "no matches"):
+                raise BrokenContractError(f"{kind}{name}: gave a motion, which they cannot determine")
+    return "passed", f"{failures} of {3 * len(cases)} problems without a motion were told"
+
+
+def _subset(c: Correspondences, *names: str) -> Correspondences:
+    return Correspondences(**{name: getattr(c, name) for name in names})
+
+
+def leaves_its_input_alone(subject: Subject) -> tuple[Verdict, str]:
+    """No call so far wrote into the matches."""
+    if subject.changed:
+        raise BrokenContractError(f"wrote into {', '.join(sorted(subject.changed))}")
+    return "passed", ""
+
+
+def is_quiet(subject: Subject) -> tuple[Verdict, str]:
+    """No call so far printed."""
+    first = subject.printed.strip().partition("\n")[0]
+    return ("warning", f"prints: {first!r}") if first else ("passed", "")
+
+
+CHECKS: Mapping[str, Callable[[Subject], tuple[Verdict, str]]] = {
+    "answers": answers,
+    "finds the truth": finds_the_truth,
+    "ignores the order of matches": ignores_the_order,
+    "is deterministic": is_deterministic,
+    "mirrors with the world": mirrors,
+    "fails by value": fails_by_value,
+    "leaves its input alone": leaves_its_input_alone,
+    "is quiet": is_quiet,
+}
+"""In this order; without the first, the others are skipped."""
+
+
+def degenerate_cases() -> dict[str, tuple[Correspondences, RollingShutter]]:
+    """Matches that determine no motion, or not all of it."""
+    rng = np.random.default_rng(2)
+
+    def seen(
+        w: FloatArray, d: FloatArray, shutter: RollingShutter = ROLLING, plane: bool = False
+    ) -> Correspondences:
+        options = SimulationOptions(pairs=30, tracks=30, shape="plane" if plane else "box")
+        motion = MOTION_MODELS["linear"](w, d)
+        return simulate(RIG, shutter, motion, options, np.random.default_rng(2)).correspondences
+
+    c = seen(W, D)
+    line = np.linspace(100.0, 800.0, 20)
+    pair = np.column_stack([line, line, line + 9.0, line + 7.0])
+    tracks = np.column_stack([line, line, line - 60, line, line + 9, line + 7, line - 51, line + 7])
+    wild = {
+        name: rng.uniform(0, 899, (30, columns)) for name, columns in (("left", 4), ("right", 4), ("tracks", 8))
+    }
+    far = {name: 1e7 * getattr(c, name) for name in ("left", "right", "tracks")}
+    first = {name: getattr(c, name)[[0] * 20] for name in ("left", "right", "tracks")}
+    two = {name: getattr(c, name)[:2] for name in ("left", "right", "tracks")}
+    zeros = {"left": np.zeros((20, 4)), "right": np.zeros((20, 4)), "tracks": np.zeros((20, 8))}
+    return {
+        "no matches": (Correspondences(), ROLLING),
+        "two matches": (Correspondences(**two), ROLLING),
+        "pure rotation": (seen(W, 0 * D), ROLLING),
+        "pure translation": (seen(0 * W, D), ROLLING),
+        "no motion": (seen(0 * W, 0 * D), ROLLING),
+        "a global shutter": (seen(W, D, GLOBAL), GLOBAL),
+        "a plane": (seen(W, D, plane=True), ROLLING),
+        "points on a line": (Correspondences(left=pair, right=pair, tracks=tracks), ROLLING),
+        "one camera": (Correspondences(left=c.left), ROLLING),
+        "the same match 20 times": (Correspondences(**first), ROLLING),
+        "matches at (0, 0)": (Correspondences(**zeros), ROLLING),
+        "negative disparity": (Correspondences(tracks=c.tracks[:, [2, 3, 0, 1, 6, 7, 4, 5]]), ROLLING),
+        "random numbers": (Correspondences(**wild), ROLLING),
+        "matches far outside": (Correspondences(**far), ROLLING),
+    }
