@@ -5,10 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from rsbench.core.rig import Side
 from rsbench.core.so3 import FloatArray
+
+BoolArray = NDArray[np.bool_]
+JOIN_TOLERANCE_PX = 0.01
+"""Two ends are one point when neither coordinate differs by more: above the rounding of float32 and of printed
+numbers, below the noise of keypoints and the distance between two of them."""
+BEYOND_PX = float(np.nextafter(JOIN_TOLERANCE_PX, 1.0))
 
 _TRACK_HALF: dict[Side, list[int]] = {"left": [0, 1, 4, 5], "right": [2, 3, 6, 7]}
 _COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8}
@@ -23,7 +30,7 @@ class Correspondences:
     """Matches in pixels, one row each; sets that do not exist are empty.
 
     The sets may hold the same points: ``tracks`` are seen in all four images, and their halves may be
-    repeated in the pairwise sets.
+    repeated in the pairwise sets, where ``JOIN_TOLERANCE_PX`` tells them. The order of matches means nothing.
     """
 
     left: FloatArray = field(default_factory=lambda: _none(4))
@@ -60,13 +67,9 @@ def track_pairs(tracks: FloatArray, side: Side) -> FloatArray:
     return tracks[:, _TRACK_HALF[side]]
 
 
-def unlinked_pairs(correspondences: Correspondences, side: Side) -> np.ndarray:
+def unlinked_pairs(correspondences: Correspondences, side: Side) -> BoolArray:
     """Mask of the left or right matches that no track repeats: the tracks know more about those that it does."""
-    pairs: FloatArray = getattr(correspondences, side)
-    if len(pairs) == 0 or len(correspondences.tracks) == 0:
-        return np.ones(len(pairs), dtype=np.bool_)
-    known = {row.tobytes() for row in np.ascontiguousarray(track_pairs(correspondences.tracks, side))}
-    return np.array([row.tobytes() not in known for row in pairs], dtype=np.bool_)
+    return ~repeated(getattr(correspondences, side), track_pairs(correspondences.tracks, side))
 
 
 def temporal_pairs(correspondences: Correspondences, side: Side) -> FloatArray:
@@ -74,3 +77,11 @@ def temporal_pairs(correspondences: Correspondences, side: Side) -> FloatArray:
     own: FloatArray = getattr(correspondences, side)
     rest = own[unlinked_pairs(correspondences, side)]
     return np.concatenate([track_pairs(correspondences.tracks, side), rest])
+
+
+def repeated(rows: FloatArray, others: FloatArray) -> BoolArray:
+    """Mask (n,) of the matches (n, c) that are also among ``others`` (m, c), within ``JOIN_TOLERANCE_PX``."""
+    if len(rows) == 0 or len(others) == 0:
+        return np.zeros(len(rows), dtype=np.bool_)
+    distance, _ = cKDTree(others).query(rows, p=np.inf, distance_upper_bound=BEYOND_PX)
+    return np.isfinite(distance)

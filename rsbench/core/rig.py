@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -25,14 +25,23 @@ class StereoRig:
     camera: PinholeCamera
     baseline: float
     """Full distance between the two cameras, metres (the paper's 2b)."""
+    origin: Literal["middle", "left", "right"] = "middle"
+    """The point whose motion is described: the body's, in the middle of the baseline, or one camera's centre."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.baseline) and self.baseline > 0):
             raise ValueError(f"baseline must be a positive number of metres, got {self.baseline}")
+        if self.origin not in ("middle", "left", "right"):
+            raise ValueError(f"origin must be middle, left or right, got {self.origin!r}")
 
     def offset(self, side: Side) -> FloatArray:
         """``x_in_cam = x_in_body + offset`` (3,): the camera stands at minus the offset."""
-        return np.array([self.baseline / 2 if side == "left" else -self.baseline / 2, 0.0, 0.0])
+        place = {"left": self.baseline / 2, "middle": 0.0, "right": -self.baseline / 2}
+        return np.array([place[side] - place[self.origin], 0.0, 0.0])
+
+    def about(self, origin: Literal["middle", "left", "right"]) -> StereoRig:
+        """The same rig whose body is another point of it."""
+        return replace(self, origin=origin)
 
     def cam_from_world(self, motion: Motion, tau: ArrayLike, side: Side) -> Pose:
         """Camera pose (..., 3, 3), (..., 3) at times ``tau`` (...)."""

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import functools
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
-from rsbench.core.correspondences import Correspondences, track_pairs, unlinked_pairs
-from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.correspondences import BoolArray, Correspondences
+from rsbench.core.joining import join_stereo
+from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.core.so3 import FloatArray
-from rsbench.robust.ransac import BoolArray, IntArray, RansacOptions, ransac
+from rsbench.pipeline.robust_problem import MatchCount, RobustProblem
+from rsbench.robust.ransac import RansacOptions, ransac
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
-from rsbench.solvers.engine.packed import Packed, pack
 
-_TRACK_FREEDOM = 5
-_SIGMAS = 2.5
 _SECOND_TRY = 3.0
 """Factor on the threshold when nothing was found."""
-_ADAPTATIONS, _FIXED_POINT_STEPS = 2, 8
+_ADAPTATIONS = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,14 +49,6 @@ class RobustOptions:
 
     def __post_init__(self) -> None:
         self.ransac()
-
-
-@dataclass(frozen=True, kw_only=True)
-class MatchCount:
-    """How many matches there were for the solver, and how many of them its motion explains."""
-
-    inliers: int
-    matches: int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,6 +85,7 @@ def estimate_motion(
     solver: Solver,
     options: RobustOptions,
     rng: np.random.Generator,
+    loop: Literal["ransac", "own"] = "ransac",
 ) -> RobustEstimate:
     """Robust motion from matches with outliers.
 
@@ -103,24 +93,82 @@ def estimate_motion(
     small ordinary one (of the camera that it describes). A track's error counts all it says about the motion,
     scaled so that one threshold rejects as many good tracks as good pairs. Too few matches or no consensus is a
     failed estimate with the reason.
+
+    Left-right matches count as parts of tracks; where no tracks are given, those are joined (``join_stereo``).
+
+    Args:
+        loop: ``own`` (``robust`` in a solver's card): the solver throws outliers out by itself. It is given all
+            matches once; its inliers are those that its motion explains.
     """
+    given, note = correspondences, ""
+    if len(given.tracks) == 0 and len(given.stereo_0) + len(given.stereo_1) > 0:
+        joined = join_stereo(given)
+        given, note = joined.correspondences, joined.note
+    run = _own if loop == "own" else _search
     start = time.perf_counter()
+    found = run(given, rig, shutter, solver, options, rng)
+    seconds = time.perf_counter() - start
+    problem, estimate = found.problem, found.estimate
+    if note and problem.linked:
+        estimate = replace(estimate, reason="; ".join(filter(None, [estimate.reason, note])))
+    masks = problem.masks(found.inliers)
+    return RobustEstimate(
+        estimate=estimate,
+        inliers={**masks, "tracks": masks["tracks"][: len(correspondences.tracks)]},
+        counts=problem.counts(found.inliers),
+        iterations=found.iterations,
+        seconds=seconds,
+        threshold_px=found.threshold_px,
+    )
+
+
+class _Found(NamedTuple):
+    """A motion of a problem, and which of its data it explains."""
+
+    problem: RobustProblem
+    estimate: MotionEstimate
+    inliers: BoolArray
+    threshold_px: float
+    iterations: int
+
+
+def _search(
+    correspondences: Correspondences,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    solver: Solver,
+    options: RobustOptions,
+    rng: np.random.Generator,
+) -> _Found:
+    """By RANSAC around the solver."""
     iterations = 0
     for problem, threshold in _attempts(correspondences, rig, shutter, solver, options):
         report = ransac(problem, replace(options, threshold_px=threshold).ransac(), rng)
         iterations += report.iterations
         if report.model is not None:
-            estimate, inliers, threshold = _conclude(problem, report.model, report.inliers, threshold, options)
-            break
-        estimate, inliers = MotionEstimate.failed(report.reason), report.inliers
-    return RobustEstimate(
-        estimate=estimate,
-        inliers=problem.masks(inliers),
-        counts=problem.counts(inliers),
-        iterations=iterations,
-        seconds=time.perf_counter() - start,
-        threshold_px=threshold,
-    )
+            return _Found(
+                problem, *_conclude(problem, report.model, report.inliers, threshold, options), iterations
+            )
+        failed = MotionEstimate.failed(problem.failure(report.reason))
+    return _Found(problem, failed, report.inliers, threshold, iterations)
+
+
+def _own(
+    correspondences: Correspondences,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    solver: Solver,
+    options: RobustOptions,
+    rng: np.random.Generator,
+) -> _Found:
+    """By the solver alone."""
+    problem, threshold = RobustProblem(correspondences, rig, shutter, solver), options.threshold_px
+    estimate = problem.on_all()
+    if not estimate.success:
+        return _Found(problem, estimate, np.zeros(sum(problem.num_data), dtype=np.bool_), threshold, 0)
+    if options.adapt_threshold:
+        threshold = _adapted(problem, estimate, threshold, options)
+    return _Found(problem, estimate, np.abs(problem.residuals(estimate)) <= threshold, threshold, 0)
 
 
 def _attempts(
@@ -129,20 +177,20 @@ def _attempts(
     shutter: RollingShutter,
     solver: Solver,
     options: RobustOptions,
-) -> Iterator[tuple[_RobustProblem, float]]:
+) -> Iterator[tuple[RobustProblem, float]]:
     """Problems and thresholds to try until one gives a motion."""
-    problem = _RobustProblem(correspondences, rig, shutter, solver)
+    problem = RobustProblem(correspondences, rig, shutter, solver)
     yield problem, options.threshold_px
     if problem.linked and len(problem.packed.pairs) > len(problem.packed.tracks):
         # Left-right matches that are mostly wrong: those over time may still be right.
-        yield _RobustProblem(correspondences, rig, shutter, solver, linked=False), options.threshold_px
-    if options.adapt_threshold and problem.enough:
+        yield RobustProblem(correspondences, rig, shutter, solver, linked=False), options.threshold_px
+    if options.adapt_threshold and not problem.shortage:
         # Noise far above the threshold scatters the inliers of any model.
         yield problem, _SECOND_TRY * options.threshold_px
 
 
 def _conclude(
-    problem: _RobustProblem,
+    problem: RobustProblem,
     model: MotionEstimate,
     inliers: BoolArray,
     threshold: float,
@@ -150,10 +198,9 @@ def _conclude(
 ) -> tuple[MotionEstimate, BoolArray, float]:
     """The solver on all inliers, the matches that this motion explains, and the threshold for them."""
     if options.adapt_threshold:
-        least, most = 0.2 * options.threshold_px, 4.0 * options.threshold_px
         for _ in range(_ADAPTATIONS):
             model = problem.refine(model, inliers) or model
-            threshold = float(np.clip(problem.noise_threshold(model, threshold), least, most))
+            threshold = _adapted(problem, model, threshold, options)
             inliers = np.abs(problem.residuals(model)) <= threshold
     final = problem.conclude(model, inliers)
     explained = np.abs(problem.residuals(final)) <= threshold
@@ -163,157 +210,7 @@ def _conclude(
     return final, explained, threshold
 
 
-class _RobustProblem:
-    """Correspondences and a solver as the estimator of the robust loop.
-
-    The data are the left pairs, the right pairs, and the tracks that the solver uses as such.
-    """
-
-    def __init__(
-        self,
-        correspondences: Correspondences,
-        rig: StereoRig,
-        shutter: RollingShutter,
-        solver: Solver,
-        linked: bool = True,
-    ) -> None:
-        self.given, self.rig, self.shutter, self.solver = correspondences, rig, shutter, solver
-        pairs = Correspondences(left=correspondences.left, right=correspondences.right)
-        sizes = solver.sample_sizes(correspondences if linked else pairs)
-        self.linked = sizes.get("tracks", 0) > 0
-        self.data = self._data()
-        self.packed = self._packed()
-        self._sizes = (sizes.get("left", 0), sizes.get("right", 0), sizes.get("tracks", 0))
-
-    def _data(self) -> Correspondences:
-        """Each measurement once: tracks as tracks or as pairs, and the pairs that no track repeats."""
-        given, needs = self.given, self.solver.spec.needs
-        pairs = {}
-        for side in SIDES:
-            own = getattr(given, side)[unlinked_pairs(given, side)]
-            halves = track_pairs(given.tracks, side)
-            pairs[side] = own if self.linked else np.concatenate([own, halves])
-            if side not in needs:
-                pairs[side] = pairs[side][:0]
-        tracks = given.tracks if self.linked else given.tracks[:0]
-        return Correspondences(left=pairs["left"], right=pairs["right"], tracks=tracks)
-
-    def _packed(self) -> Packed:
-        """The data under the shutter that the solver believes in, about the point whose motion it gives."""
-        shutter = self.shutter
-        if self.solver.spec.shutter == "global":
-            shutter = RollingShutter(height=shutter.height, readout_ratio=0.0)
-        packed = pack(self.data, self.rig, shutter, self.solver.spec.motion_model)
-        if self.solver.spec.reference_point == "left":
-            packed.pairs[:, 6] = 0.0
-        return packed
-
-    @property
-    def num_data(self) -> tuple[int, ...]:
-        return len(self.data.left), len(self.data.right), len(self.data.tracks)
-
-    @property
-    def sample_size(self) -> tuple[int, ...]:
-        return self._sizes
-
-    def generate(self, samples: IntArray) -> Iterable[list[MotionEstimate]]:
-        return self.solver.propose_all([self._subset(sample) for sample in samples], self.rig, self.shutter)
-
-    def residuals(self, model: MotionEstimate) -> FloatArray:
-        theta = self.packed.theta(model.w, model.d)
-        tracks = np.sqrt(self.packed.track_squares(theta)) * _track_scale()
-        return np.concatenate([self.packed.pair_residuals(theta), tracks])
-
-    @property
-    def enough(self) -> bool:
-        """Whether there is more than a minimal sample."""
-        return all(count >= size for count, size in zip(self.num_data, self.sample_size, strict=True))
-
-    def noise_threshold(self, model: MotionEstimate, threshold: float) -> float:
-        """Threshold at 2.5 standard deviations of the noise that the residuals below it show.
-
-        A fixed point of: noise from the residuals below the threshold (a truncated distribution), threshold from
-        the noise. Outliers are spread too thinly to disturb it.
-        """
-        squares = self.residuals(model) ** 2
-        moments = np.repeat([_moment(1), _moment(1), _moment(_TRACK_FREEDOM)], self.num_data)
-        for _ in range(_FIXED_POINT_STEPS):
-            below = squares <= threshold**2
-            if not np.any(below):
-                break
-            threshold = _SIGMAS * float(np.sqrt(np.sum(squares[below]) / np.sum(moments[below])))
-        return threshold
-
-    def refine(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate | None:
-        subset = self._subset(np.flatnonzero(inliers))
-        estimate = self.solver.improve(model, subset, self.rig, self.shutter, quick=True)
-        return estimate if estimate.success else None
-
-    def conclude(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate:
-        """The solver on all inliers; the model itself when the solver fails there."""
-        subset = self._subset(np.flatnonzero(inliers))
-        estimate = self.solver.improve(model, subset, self.rig, self.shutter)
-        return estimate if estimate.success else model
-
-    def _subset(self, indices: IntArray) -> Correspondences:
-        left, right, _ = self.num_data
-        return Correspondences(
-            left=self.data.left[indices[indices < left]],
-            right=self.data.right[indices[(indices >= left) & (indices < left + right)] - left],
-            tracks=self.data.tracks[indices[indices >= left + right] - left - right],
-        )
-
-    def counts(self, inliers: BoolArray) -> dict[MatchSet, MatchCount]:
-        """Inliers and matches of each group of data."""
-        names: tuple[MatchSet, ...] = ("left", "right", "tracks")
-        parts = np.split(inliers, np.cumsum(self.num_data)[:-1])
-        return {
-            name: MatchCount(inliers=int(np.count_nonzero(part)), matches=len(part))
-            for name, part in zip(names, parts, strict=True)
-        }
-
-    def masks(self, inliers: BoolArray) -> dict[MatchSet, BoolArray]:
-        """Inliers over the sets as they were given."""
-        split = np.split(inliers, np.cumsum(self.num_data)[:-1])
-        data = {"left": self.data.left, "right": self.data.right}
-        good: dict[str, set[bytes]] = {}
-        for side, mask in zip(SIDES, split, strict=False):
-            halves = track_pairs(self.data.tracks, side)[split[2]]
-            good[side] = _keys(data[side][mask]) | _keys(halves)
-        out: dict[MatchSet, BoolArray] = {side: _found(getattr(self.given, side), good[side]) for side in SIDES}
-        out["tracks"] = split[2]
-        if not self.linked:
-            sides = [side for side in SIDES if side in self.solver.spec.needs]
-            halves_good = [_found(track_pairs(self.given.tracks, side), good[side]) for side in sides]
-            out["tracks"] = (
-                np.all(halves_good, axis=0) if sides else np.zeros(len(self.given.tracks), dtype=np.bool_)
-            )
-        return out
-
-
-def _keys(rows: FloatArray) -> set[bytes]:
-    return {row.tobytes() for row in np.ascontiguousarray(rows)}
-
-
-def _found(rows: FloatArray, keys: set[bytes]) -> BoolArray:
-    return np.array([row.tobytes() in keys for row in np.ascontiguousarray(rows)], dtype=np.bool_)
-
-
-@functools.cache
-def _quantile(freedom: int) -> float:
-    """Of chi-squared, with the probability that a normal variable lies within 2.5 standard deviations."""
-    return float(chi2.ppf(chi2.cdf(_SIGMAS**2, 1), freedom))
-
-
-@functools.cache
-def _track_scale() -> float:
-    """Factor that gives the root of a track's squared error the quantile of a pair's error at 2.5 sigma."""
-    return _SIGMAS / float(np.sqrt(_quantile(_TRACK_FREEDOM)))
-
-
-@functools.cache
-def _moment(freedom: int) -> float:
-    """Mean square of a scaled residual below its threshold, at a noise of 1 px."""
-    quantile = _quantile(freedom)
-    truncated = freedom * chi2.cdf(quantile, freedom + 2) / chi2.cdf(quantile, freedom)
-    return float(truncated) * _SIGMAS**2 / quantile
+def _adapted(problem: RobustProblem, model: MotionEstimate, threshold: float, options: RobustOptions) -> float:
+    """The threshold that fits the noise of a model's inliers, between a fifth and four times the one asked for."""
+    least, most = 0.2 * options.threshold_px, 4.0 * options.threshold_px
+    return float(np.clip(problem.noise_threshold(model, threshold), least, most))

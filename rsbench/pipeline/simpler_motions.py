@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from rsbench.core.correspondences import Correspondences, temporal_pairs
@@ -14,9 +16,6 @@ from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.refined import RefinedSolver
 
-_NO_BASELINE = 1e-9
-"""Metres: the rig of one camera, which turns about itself."""
-
 
 def global_shutter_motion(
     matches: Correspondences, rig: StereoRig, options: RobustOptions, rng: np.random.Generator
@@ -27,20 +26,15 @@ def global_shutter_motion(
     """
     shutter = RollingShutter(height=rig.camera.height, readout_ratio=0.0)
     # Rolling-shutter matches miss a global-shutter motion by pixels: the threshold must let them in.
-    loose = RobustOptions(threshold_px=4.0 * options.threshold_px, max_iterations=options.max_iterations)
+    loose = replace(options, threshold_px=4.0 * options.threshold_px)
     estimate = estimate_motion(matches, rig, shutter, RefinedSolver(), loose, rng).estimate
     return LinearMotion(estimate.w, estimate.d) if estimate.success else None
-
-
-def single_camera(rig: StereoRig) -> StereoRig:
-    """The rig that one camera alone is: its body is its own centre."""
-    return StereoRig(camera=rig.camera, baseline=_NO_BASELINE)
 
 
 def monocular_motion(
     inliers: Correspondences, rig: StereoRig, shutter: RollingShutter, side: Side, start: Motion
 ) -> Motion | None:
-    """Constant-velocity motion of one camera alone, in the frame of ``single_camera``; None when there is none.
+    """Constant-velocity motion of one camera alone, about its own centre (``rig.about(side)``); None for none.
 
     Maximum likelihood on the matches over time of one side, which must be free of outliers, descending from the
     rig's motion ``start``: the most that one camera can know, spared the false minima that its own search may end
@@ -50,7 +44,7 @@ def monocular_motion(
     d = translation_of_offset(start.w, start.d, rig.offset(side))
     pairs = Correspondences(**{side: temporal_pairs(inliers, side)})
     first = MotionEstimate(w=start.w, d=_unit(d), success=True)
-    estimate = RefinedSolver(use_tracks=False).improve(first, pairs, single_camera(rig), shutter)
+    estimate = RefinedSolver(use_tracks=False).improve(first, pairs, rig.about(side), shutter)
     if not estimate.success or not np.any(estimate.d):
         return None
     return LinearMotion(estimate.w, _unit(estimate.d))

@@ -58,7 +58,9 @@ class PoselibPnpSolver(Solver):
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
         poselib, tracks = poselib_module(), _with_depth(sample.tracks)
-        if poselib is None or len(tracks) < 3:
+        if poselib is None:
+            return [MotionEstimate.failed(MISSING)]
+        if len(tracks) < 3:
             return []
         rays = rig.camera.unproject(tracks[:3, 4:6])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 from rsbench.core import so3
@@ -60,7 +60,7 @@ class PoselibStereoSolver(Solver):
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
         length = 0.5 * rig.baseline
         return [
-            MotionEstimate(w=motion.w, d=length * motion.d, success=True)
+            replace(motion, d=length * motion.d)
             for motion in five_point_motions(temporal_pairs(sample, "left"), rig)
         ]
 

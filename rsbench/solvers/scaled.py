@@ -54,6 +54,11 @@ class FlowScaledSolver(Solver):
     def __post_init__(self) -> None:
         if self._entry.solver.spec.shutter != "global":
             raise RsbenchError(f"solver = {self.solver!r}: must be a global-shutter solver")
+        if "stereo" in self._entry.solver.spec.needs:
+            raise RsbenchError(
+                f"solver = {self.solver!r}: needs left-right matches, which take no time that could be scaled; "
+                "must be one of matches over time or tracks"
+            )
 
     @cached_property
     def _entry(self) -> SolverEntry:

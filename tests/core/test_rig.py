@@ -43,6 +43,17 @@ def test_rotations_are_shared_and_centres_stay_a_baseline_apart() -> None:
     np.testing.assert_allclose(np.linalg.norm(centres, axis=1), 0.2, rtol=1e-14)
 
 
+def test_a_rig_about_a_camera_has_that_camera_for_its_body() -> None:
+    still = LinearMotion(np.zeros(3), np.zeros(3))
+    for origin, centres in (("left", [0.0, 0.2]), ("right", [-0.2, 0.0]), ("middle", [-0.1, 0.1])):
+        rig = RIG.about(origin)  # type: ignore[arg-type]
+        found = [inverse(Pose(*rig.cam_from_world(still, 0.0, side))).t[0] for side in SIDES]
+        np.testing.assert_allclose(found, centres, atol=1e-15)
+    assert RIG.about("left").about("middle") == RIG
+    with pytest.raises(ValueError, match="origin"):
+        RIG.about("top")  # type: ignore[arg-type]
+
+
 def test_depth_and_disparity_of_nothing_are_nan() -> None:
     assert np.all(np.isnan(RIG.depth([0.0, -1.0, np.nan])))
     assert np.all(np.isnan(RIG.disparity([0.0, -1.0, np.nan])))

@@ -31,7 +31,7 @@ from rsbench.pipeline.chain import (
 from rsbench.pipeline.footage import VIEWS, View
 from rsbench.pipeline.readout import select
 from rsbench.pipeline.robust_motion import RobustEstimate, estimate_motion
-from rsbench.pipeline.simpler_motions import global_shutter_motion, monocular_motion, single_camera
+from rsbench.pipeline.simpler_motions import global_shutter_motion, monocular_motion
 from rsbench.vision.correction import correct_frame, correction_flow
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.fusion import Origin, inpaint
@@ -187,7 +187,7 @@ class Bench:
             w = true.w if key == "gyro" else self.motion.w
             far = np.full((self.rig.camera.height, self.rig.camera.width), np.inf, dtype=np.float32)
             turning = LinearMotion(w, np.zeros(3))
-            return {view: self._alone(view, far, single_camera(self.rig), turning) for view in VIEWS}
+            return {view: self._alone(view, far, self.rig.about(view[0]), turning) for view in VIEWS}
         if key == "plane":
             planes = {(s, f): plane_depth(self.sgm[f].depth[s]) for s, f in VIEWS}
             return {view: self._alone(view, planes[view], self.rig, self.motion) for view in VIEWS}
@@ -211,13 +211,14 @@ class Bench:
         return Attempt(image=inpaint(corrected.image, ~corrected.mask), covered=corrected.mask, flow=flow)
 
     def _mono(self) -> dict[View, Attempt] | None:
-        rig, inliers = single_camera(self.rig), select(self.matches, self.robust)
+        inliers = select(self.matches, self.robust)
         out: dict[View, Attempt] = {}
         for side, frame in VIEWS:
             motion = monocular_motion(inliers, self.rig, self.shutter, side, self.motion)
             if motion is None:
                 return None
             flow = dense_flow(self.images[side, frame], self.images[side, 1 - frame])
+            rig = self.rig.about(side)
             depth = monocular_depth(flow, rig, self.shutter, motion, side, frame)
             out[side, frame] = self._alone((side, frame), depth, rig, motion)
         return out

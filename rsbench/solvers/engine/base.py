@@ -147,9 +147,8 @@ class Solver(ABC):
         return self.spec.minimum
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
-        """Motions that may explain a minimal sample; failures are left out."""
-        estimate = self.estimate(sample, rig, shutter)
-        return [estimate] if estimate.success else []
+        """Motions that may explain a minimal sample; failures give the reason when nothing else is found."""
+        return [self.estimate(sample, rig, shutter)]
 
     def propose_all(
         self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter

@@ -174,6 +174,8 @@ def pack_pairs(matches: FloatArray, side: Side, rig: StereoRig, shutter: Rolling
 
 def pack_tracks(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
     """(n, 8) for ``track_kernels.track_terms`` from tracks (n, 8)."""
+    if len(tracks) and rig.origin != "middle":
+        raise ValueError(f"tracks are measured about the middle of the baseline, not the {rig.origin} camera")
     camera = rig.camera
     middle = 0.5 * (tracks[:, [0, 1, 4, 5]] + tracks[:, [2, 3, 6, 7]])
     out = np.zeros((len(tracks), 8))

@@ -75,7 +75,9 @@ def left_start(matches: FloatArray, rig: StereoRig) -> tuple[FloatArray, FloatAr
 def five_point_motions(matches: FloatArray, rig: StereoRig) -> list[MotionEstimate]:
     """Motions of the camera of matches (5, 4): PoseLib's five-point solver, points in front."""
     poselib = poselib_module()
-    if poselib is None or len(matches) < 5:
+    if poselib is None:
+        return [MotionEstimate.failed(MISSING)]
+    if len(matches) < 5:
         return []
     rays = [rig.camera.unproject(matches[:5, k : k + 2]) for k in (0, 2)]
     unit = [ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays]

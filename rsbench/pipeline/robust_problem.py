@@ -1,0 +1,238 @@
+"""Correspondences and a solver as the estimator of the robust loop: samples, residuals, inliers."""
+
+from __future__ import annotations
+
+import functools
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from rsbench.core.correspondences import BoolArray, Correspondences, repeated, track_pairs, unlinked_pairs
+from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.robust.ransac import IntArray
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.packed import Packed, pack, pack_pairs
+
+SIGMAS = 2.5
+"""Standard deviations of the noise at which a match is an outlier."""
+_TRACK_FREEDOM = 5
+_FIXED_POINT_STEPS = 8
+_GROUPS: tuple[MatchSet, ...] = ("left", "right", "tracks")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchCount:
+    """How many matches there were for the solver, and how many of them its motion explains."""
+
+    inliers: int
+    matches: int
+
+
+class RobustProblem:
+    """The data are the left pairs, the right pairs, and the tracks that the solver uses as such.
+
+    Each measurement is in them once. To a solver that needs left-right matches, a track is a match over time with
+    a left-right match at both ends; it draws them together.
+    """
+
+    def __init__(
+        self,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        solver: Solver,
+        linked: bool = True,
+    ) -> None:
+        self.given, self.rig, self.shutter, self.solver = correspondences, rig, shutter, solver
+        self.spec = solver.spec
+        self._stereo = "stereo" in self.spec.needs
+        self.reasons: Counter[str] = Counter()
+        """Why the solver gave no motion of a sample, in its own words."""
+        self._sizes, self.linked = self._plan(linked)
+        self._unlinked = {side: unlinked_pairs(correspondences, side) for side in SIDES}
+        self.data = self._data()
+        self.packed = self._packed()
+
+    def _plan(self, linked: bool) -> tuple[tuple[int, int, int], bool]:
+        """How many data of each group a sample takes, and whether tracks are used as such."""
+        given = self.given
+        if not self._stereo:
+            pairs = Correspondences(left=given.left, right=given.right)
+            sizes = self.solver.sample_sizes(given if linked else pairs)
+            return (sizes.get("left", 0), sizes.get("right", 0), sizes.get("tracks", 0)), sizes.get(
+                "tracks", 0
+            ) > 0
+        sizes = self.solver.sample_sizes(self._handed(given.left, given.right, given.tracks))
+        temporal = {side: sizes.get(side, 0) for side in SIDES}
+        least = max(sizes.get("stereo", 0), sizes.get("tracks", 0))
+        if len(given.tracks) >= max(least, *temporal.values()):
+            return (0, 0, max(least, *temporal.values())), True
+        return (max(temporal["left"] - least, 0), max(temporal["right"] - least, 0), least), True
+
+    def _data(self) -> Correspondences:
+        """Each measurement once: tracks as tracks or as pairs, and the pairs that no track repeats."""
+        given = self.given
+        pairs = {}
+        for side in SIDES:
+            own = getattr(given, side)[self._unlinked[side]]
+            pairs[side] = own if self.linked else np.concatenate([own, track_pairs(given.tracks, side)])
+            if side not in self.spec.needs:
+                pairs[side] = pairs[side][:0]
+        tracks = given.tracks if self.linked else given.tracks[:0]
+        return Correspondences(left=pairs["left"], right=pairs["right"], tracks=tracks)
+
+    def _packed(self) -> Packed:
+        """The data under the shutter that the solver believes in, about the point whose motion it gives."""
+        data, rig, shutter, model = self.data, self.rig, self.shutter, self.spec.motion_model
+        if self.spec.shutter == "global":
+            shutter = RollingShutter(height=shutter.height, readout_ratio=0.0)
+        if self.spec.reference_point == "body":
+            return pack(data, rig, shutter, model)
+        # The errors of tracks are about the body: the left camera's motion is judged by what that camera sees.
+        rig = rig.about("left")
+        packed = pack(Correspondences(left=data.left, right=data.right), rig, shutter, model)
+        halves = pack_pairs(track_pairs(data.tracks, "left"), "left", rig, shutter)
+        return replace(packed, pairs=np.concatenate([packed.pairs, halves]))
+
+    @property
+    def num_data(self) -> tuple[int, ...]:
+        return len(self.data.left), len(self.data.right), len(self.data.tracks)
+
+    @property
+    def sample_size(self) -> tuple[int, ...]:
+        return self._sizes
+
+    def generate(self, samples: IntArray) -> Iterator[list[MotionEstimate]]:
+        subsets = [self._subset(sample) for sample in samples]
+        for models in self.solver.propose_all(subsets, self.rig, self.shutter):
+            found = [model for model in models if model.success]
+            if not found:
+                self.reasons.update({model.reason for model in models})
+            yield found
+
+    def residuals(self, model: MotionEstimate) -> FloatArray:
+        theta = self.packed.theta(model.w, model.d)
+        tracks = np.sqrt(self.packed.track_squares(theta)) * _track_scale()
+        return np.concatenate([self.packed.pair_residuals(theta), tracks])
+
+    @property
+    def shortage(self) -> str:
+        """What is missing for a minimal sample; empty when nothing is."""
+        names = dict(zip(_GROUPS, ("left matches", "right matches", "tracks"), strict=True))
+        if self._stereo:
+            names["tracks"] = "matches over time with left-right matches at both ends"
+        groups = zip(_GROUPS, self.num_data, self.sample_size, strict=True)
+        short = [f"{count} {names[name]}, a sample needs {size}" for name, count, size in groups if count < size]
+        return "; ".join(short)
+
+    def failure(self, reason: str) -> str:
+        """Why there is no motion, with what the solver said of the samples most often."""
+        said = "".join(f"; the solver said most often: {text}" for text, _ in self.reasons.most_common(1))
+        return f"{self.shortage or reason}{said}"
+
+    def noise_threshold(self, model: MotionEstimate, threshold: float) -> float:
+        """Threshold at 2.5 standard deviations of the noise that the residuals below it show.
+
+        A fixed point of: noise from the residuals below the threshold (a truncated distribution), threshold from
+        the noise. Outliers are spread too thinly to disturb it.
+        """
+        squares = self.residuals(model) ** 2
+        tracks = len(self.packed.tracks)
+        moments = np.repeat([_moment(1), _moment(_TRACK_FREEDOM)], [len(squares) - tracks, tracks])
+        for _ in range(_FIXED_POINT_STEPS):
+            below = squares <= threshold**2
+            if not np.any(below):
+                break
+            threshold = SIGMAS * float(np.sqrt(np.sum(squares[below]) / np.sum(moments[below])))
+        return threshold
+
+    def refine(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate | None:
+        subset = self._subset(np.flatnonzero(inliers))
+        estimate = self.solver.improve(model, subset, self.rig, self.shutter, quick=True)
+        return estimate if estimate.success else None
+
+    def conclude(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate:
+        """The solver on all inliers; the model itself when the solver fails there."""
+        subset = self._subset(np.flatnonzero(inliers))
+        estimate = self.solver.improve(model, subset, self.rig, self.shutter)
+        return estimate if estimate.success else model
+
+    def on_all(self) -> MotionEstimate:
+        """What the solver itself makes of all matches."""
+        given = self.given
+        everything = self._handed(given.left, given.right, given.tracks) if self._stereo else given
+        return self.solver.estimate(everything, self.rig, self.shutter)
+
+    def _subset(self, indices: IntArray) -> Correspondences:
+        left, right, _ = self.num_data
+        return self._handed(
+            self.data.left[indices[indices < left]],
+            self.data.right[indices[(indices >= left) & (indices < left + right)] - left],
+            self.data.tracks[indices[indices >= left + right] - left - right],
+        )
+
+    def _handed(self, left: FloatArray, right: FloatArray, tracks: FloatArray) -> Correspondences:
+        """Matches as the solver wants them: tracks as they are, or as matches that end in left-right matches."""
+        if not self._stereo:
+            return Correspondences(left=left, right=right, tracks=tracks)
+        needs, halves = self.spec.needs, {side: track_pairs(tracks, side) for side in SIDES}
+        return Correspondences(
+            left=np.concatenate([halves["left"], left]) if "left" in needs else left,
+            right=np.concatenate([halves["right"], right]) if "right" in needs else right,
+            stereo_0=tracks[:, :4],
+            stereo_1=tracks[:, 4:],
+            tracks=tracks if "tracks" in needs else tracks[:0],
+        )
+
+    def counts(self, inliers: BoolArray) -> dict[MatchSet, MatchCount]:
+        """Inliers and matches of each group of data."""
+        parts = np.split(inliers, np.cumsum(self.num_data)[:-1])
+        return {
+            name: MatchCount(inliers=int(np.count_nonzero(part)), matches=len(part))
+            for name, part in zip(_GROUPS, parts, strict=True)
+        }
+
+    def masks(self, inliers: BoolArray) -> dict[MatchSet, BoolArray]:
+        """Inliers over the sets as they were given: what a track repeats is one as the track is."""
+        *pairs, tracks = np.split(inliers, np.cumsum(self.num_data)[:-1])
+        out: dict[MatchSet, BoolArray] = {}
+        as_pairs = np.ones(len(self.given.tracks), dtype=np.bool_)
+        for side, mask in zip(SIDES, pairs, strict=True):
+            own = self._unlinked[side]
+            out[side] = np.zeros(len(own), dtype=np.bool_)
+            halves = tracks
+            if side in self.spec.needs:
+                out[side][own] = mask[: np.count_nonzero(own)]
+                halves = tracks if self.linked else mask[np.count_nonzero(own) :]
+                as_pairs &= self.linked | halves
+            elif not self.linked:
+                continue
+            good = track_pairs(self.given.tracks[halves], side)
+            out[side][~own] = repeated(getattr(self.given, side)[~own], good)
+        out["tracks"] = tracks if self.linked else as_pairs & bool(self.spec.needs & set(SIDES))
+        return out
+
+
+@functools.cache
+def _quantile(freedom: int) -> float:
+    """Of chi-squared, with the probability that a normal variable lies within 2.5 standard deviations."""
+    return float(chi2.ppf(chi2.cdf(SIGMAS**2, 1), freedom))
+
+
+@functools.cache
+def _track_scale() -> float:
+    """Factor that gives the root of a track's squared error the quantile of a pair's error at 2.5 sigma."""
+    return SIGMAS / float(np.sqrt(_quantile(_TRACK_FREEDOM)))
+
+
+@functools.cache
+def _moment(freedom: int) -> float:
+    """Mean square of a scaled residual below its threshold, at a noise of 1 px."""
+    quantile = _quantile(freedom)
+    truncated = freedom * chi2.cdf(quantile, freedom + 2) / chi2.cdf(quantile, freedom)
+    return float(truncated) * SIGMAS**2 / quantile
