@@ -115,19 +115,24 @@ def estimate_motion(
 
     Returns:
         ``estimate``, a ``MotionEstimate`` whose ``success`` is False, with a ``reason``, when there is none; and
-        ``inliers``, a mask for each of ``left``, ``right`` and ``tracks``.
+        ``inliers``, a mask for each of ``left``, ``right`` and ``tracks``; ``inlier_count`` of ``match_count``
+        count each match once.
 
     Raises:
         RsbenchError: no such solver.
     """
     from rsbench.pipeline.robust_motion import RobustOptions
     from rsbench.pipeline.robust_motion import estimate_motion as estimate_robustly
+    from rsbench.solvers.engine.registry import load_solver_entry
 
     options = RobustOptions()
     if threshold_px is not None:
         options = RobustOptions(threshold_px=threshold_px, adapt_threshold=False)
     rng = np.random.default_rng(seed)
-    return estimate_robustly(correspondences, rig, shutter, _solver(solver), options, rng)
+    if not isinstance(solver, str | Path):
+        return estimate_robustly(correspondences, rig, shutter, solver, options, rng)
+    entry = load_solver_entry(solver)
+    return estimate_robustly(correspondences, rig, shutter, entry.solver, options, rng, entry.options.robust)
 
 
 def pose_errors(

@@ -23,7 +23,8 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolation import EntryFailure, IsolatedWorker, Outcome, one_line
-from rsbench.pipeline.robust_motion import MatchCount, RobustEstimate, RobustOptions, estimate_motion
+from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions, estimate_motion
+from rsbench.pipeline.robust_problem import MatchCount
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 from rsbench.solvers.refined import RefinedSolver
@@ -56,10 +57,11 @@ class SolverRunner:
         rng: np.random.Generator,
     ) -> RobustEstimate:
         """``estimate_motion``, all of it in the child; ``rng`` then stays as it is here."""
+        loop = entry.options.robust
         if entry.built_in:
-            return estimate_motion(correspondences, rig, shutter, entry.solver, options, rng)
+            return estimate_motion(correspondences, rig, shutter, entry.solver, options, rng, loop)
         start = time.perf_counter()
-        outcome = self._call(entry, "robust", correspondences, rig, shutter, options, rng)
+        outcome = self._call(entry, "robust", correspondences, rig, shutter, options, rng, loop)
         if outcome.success and isinstance(outcome.value, RobustEstimate):
             return outcome.value
         names: tuple[MatchSet, ...] = ("left", "right", "tracks")
@@ -122,8 +124,8 @@ def _serve_solver(place: str) -> Callable[..., object]:
     def answer(what: str, *arguments: Any) -> object:
         if what == "bare":
             return _timed(solver, *arguments)
-        correspondences, rig, shutter, options, rng = arguments
-        return estimate_motion(correspondences, rig, shutter, solver, options, rng)
+        correspondences, rig, shutter, options, rng, loop = arguments
+        return estimate_motion(correspondences, rig, shutter, solver, options, rng, loop)
 
     return answer
 
