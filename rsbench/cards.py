@@ -125,11 +125,15 @@ def choices(value: str, names: Iterable[str]) -> str:
     return f"{hint}; there are: {', '.join(known) or 'none'}"
 
 
-def _card_folder(kind: CardKind) -> Path:
-    """Top-level folder of a checkout, or the package data that a wheel carries."""
+def shipped_folder(in_checkout: str, in_wheel: str) -> Path:
+    """A folder that comes with rsbench: below the top of a checkout, or in the package data of a wheel."""
     package = Path(str(resources.files("rsbench")))
     checkout = package.parent
-    return checkout / kind if (checkout / "pyproject.toml").is_file() else package / "_cards" / kind
+    return checkout / in_checkout if (checkout / "pyproject.toml").is_file() else package / in_wheel
+
+
+def _card_folder(kind: CardKind) -> Path:
+    return shipped_folder(kind, f"_cards/{kind}")
 
 
 def _not_finite(value: Any, field: str = "") -> Iterator[str]:

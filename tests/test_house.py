@@ -244,7 +244,7 @@ def test_the_documented_entry_point_is_found(documented_solver: Path) -> None:
 # Packaging
 
 
-def test_the_wheel_carries_cards_and_type_marker(tmp_path: Path) -> None:
+def test_the_wheel_carries_cards_documents_and_type_marker(tmp_path: Path) -> None:
     build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=60)
     (wheel,) = tmp_path.glob("*.whl")
@@ -255,6 +255,8 @@ def test_the_wheel_carries_cards_and_type_marker(tmp_path: Path) -> None:
     }
     expected |= {str(path.relative_to(ROOT)) for path in SOURCES} | {"rsbench/py.typed"}
     expected |= {str(path.relative_to(ROOT)) for path in (ROOT / "rsbench").rglob("*.j2")}
+    expected |= {f"rsbench/_docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
+    expected |= {f"rsbench/_docs/examples/{path.name}" for path in (ROOT / "examples").iterdir()}
     assert expected <= names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not any("__pycache__" in name or name.startswith("tests/") for name in names)

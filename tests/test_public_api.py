@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -178,3 +179,25 @@ def test_other_than_four_images_are_refused(count: int) -> None:
     for call in (rsbench.match, lambda four: rsbench.correct(four, RIG)):
         with pytest.raises(ValueError, match=f"got {count}; four are needed"):
             call(images)
+
+
+# The document
+
+
+def test_the_overview_has_every_name_with_its_parameters() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "api.md").read_text("utf-8")
+    cells = "\n".join(line.split("|")[1] for line in page.splitlines() if line.startswith("|"))
+    named = dict(re.findall(r"`(\w+)(?:\(([\w, ]*)\))?`", cells))
+    assert "`RsbenchError`" in page
+    assert sorted([*named, "RsbenchError"]) == NAMES
+    for name, given in named.items():
+        value = getattr(rsbench, name)
+        if inspect.isfunction(value) and name not in ("list_solvers", "load_solver"):
+            assert given.split(", ") == list(inspect.signature(value).parameters), name
+
+
+def test_the_overview_s_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "api.md").read_text("utf-8")
+    (code,) = re.findall(r"^```python\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE)
+    exec(compile(code, "api.md", "exec"), {})
+    assert "e_R_deg" in capsys.readouterr().out

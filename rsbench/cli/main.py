@@ -9,7 +9,19 @@ from typing import Annotated
 import typer
 
 from rsbench import __version__
-from rsbench.cli import check_solver, correct, demo, doctor, evaluate, generate, reproduce, simulate, solve, verify
+from rsbench.cli import (
+    check_solver,
+    correct,
+    demo,
+    docs,
+    doctor,
+    evaluate,
+    generate,
+    reproduce,
+    simulate,
+    solve,
+    verify,
+)
 from rsbench.cli import list_cards as cards
 from rsbench.errors import RsbenchError
 
@@ -39,7 +51,20 @@ def _root(
     pass
 
 
-for module in (demo, cards, doctor, generate, verify, solve, check_solver, evaluate, correct, simulate, reproduce):
+for module in (
+    demo,
+    cards,
+    doctor,
+    generate,
+    verify,
+    solve,
+    check_solver,
+    evaluate,
+    correct,
+    simulate,
+    reproduce,
+    docs,
+):
     module.register(app)
 
 

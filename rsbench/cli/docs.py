@@ -1,0 +1,60 @@
+"""``rsbench docs``: the documents and examples that are installed with the package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+EPILOG = """[bold]Examples[/bold]
+
+  rsbench docs                              [dim](what there is)[/dim]
+
+  less "$(rsbench docs conventions)"
+
+  cp "$(rsbench docs tour.ipynb)" . && jupyter lab tour.ipynb"""
+
+
+def docs(
+    name: Annotated[str | None, typer.Argument(help="A document or example; its path is printed.")] = None,
+) -> None:
+    """List the documents and examples that come with rsbench, or print where one of them is."""
+    from rsbench.cards import choices
+    from rsbench.errors import RsbenchError
+
+    documents = list_documents()
+    if name is not None:
+        if name not in documents:
+            raise RsbenchError(f"document {name!r} does not exist{choices(name, documents)}")
+        typer.echo(documents[name])
+        return
+    import pandas as pd
+
+    from rsbench.cli.console import print_table
+
+    rows = [{"name": known, "about": _title(path)} for known, path in documents.items()]
+    print_table("documents and examples", pd.DataFrame(rows))
+    typer.echo("rsbench docs NAME prints the path of one")
+
+
+def list_documents() -> dict[str, Path]:
+    """Paths by name, sorted: documents without their ending, examples with it."""
+    from rsbench.cards import shipped_folder
+
+    documents = {path.stem: path for path in shipped_folder("docs", "_docs").glob("*.md") if path.stem != "index"}
+    examples = shipped_folder("examples", "_docs/examples").glob("*.*")
+    return dict(sorted(documents.items())) | {path.name: path for path in sorted(examples)}
+
+
+def _title(path: Path) -> str:
+    """The first heading of a document or notebook."""
+    for line in path.read_text("utf-8").splitlines():
+        text = line.strip().lstrip('"').removesuffix(",").removesuffix('"').removesuffix("\\n")
+        if text.startswith("# "):
+            return text[2:]
+    return ""
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog=EPILOG)(docs)
