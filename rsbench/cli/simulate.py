@@ -18,8 +18,9 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench simulate rotation --set points=9 --trials 100 --solver gs-8pt --solver rs-stereo-linear --out /tmp/nine
 
-DIR gets [bold]summary.csv[/bold] (median, mean, p90 with 95 % bootstrap intervals, success share, failures),
-[bold]trials/*.npz[/bold] (truth and every prediction) and [bold]sweep.json[/bold] (the card)."""
+DIR gets [bold]summary.csv[/bold] (median, mean, p90 with 95 % bootstrap intervals, success share, failures and
+their reasons), [bold]trials/*.npz[/bold] (truth and every prediction) and [bold]sweep.json[/bold] (the card).
+Solvers of other packages run in processes of their own: what they do wrong is a failed trial."""
 
 
 def simulate(
@@ -34,6 +35,13 @@ def simulate(
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of every trial instead of the card's.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
+    time_limit: Annotated[
+        float | None,
+        typer.Option(
+            min=0.001, help="Seconds per problem for solvers of other packages, instead of their cards'."
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Do all again, whatever DIR holds.")] = False,
 ) -> None:
     """Simulate points seen by a moving rolling-shutter rig, solve for its motion, and tabulate the errors."""
     from rsbench.benchmark.simulated.sweep_card import load_sweep, with_options
@@ -41,23 +49,39 @@ def simulate(
     card = with_options(load_sweep(sweep), solver, trials, seed)
     if change:
         card = card.with_setting(**_changes(change))
-    table = run_and_summarise(card, out, workers, f"rsbench simulate {sweep} --out {out}")
+    command = f"rsbench simulate {sweep} --out {out}"
+    table = run_and_summarise(card, out, workers, command, time_limit_s=time_limit, force=force)
     show(card, table)
     typer.echo(f"table: {(out / 'summary.csv').resolve()}")
 
 
-def run_and_summarise(card: SweepCard, out: Path, workers: int | None, command: str) -> pd.DataFrame:
+def run_and_summarise(
+    card: SweepCard,
+    out: Path,
+    workers: int | None,
+    command: str,
+    *,
+    time_limit_s: float | None = None,
+    force: bool = False,
+) -> pd.DataFrame:
     """Run a sweep with a progress bar and write its summary and provenance; returns the summary."""
     import os
 
     from rsbench.benchmark.provenance import provenance
     from rsbench.benchmark.simulated.run_sweep import run_sweep, sweep_steps
     from rsbench.benchmark.simulated.sweep_summary import summarise_sweep
-    from rsbench.cli.console import progress_bar
+    from rsbench.cli.console import progress_bar, stoppable
     from rsbench.dataset.files import write_json
 
-    with progress_bar(f"simulating {card.name}", sweep_steps(card)) as advance:
-        run_sweep(card, out, workers=workers or os.cpu_count() or 1, progress=advance)
+    with stoppable(), progress_bar(f"simulating {card.name}", sweep_steps(card)) as advance:
+        run_sweep(
+            card,
+            out,
+            workers=workers or os.cpu_count() or 1,
+            progress=advance,
+            time_limit_s=time_limit_s,
+            force=force,
+        )
     table = summarise_sweep(out)
     write_json(out / "provenance.json", provenance(command, sweep=card.name, seed=card.seed, trials=card.trials))
     return table
@@ -82,6 +106,8 @@ def show(card: SweepCard, table: pd.DataFrame) -> None:
     for variant, rows in table.groupby("variant", sort=False):
         title = f"{card.name}, {variant}: median errors in degrees, {card.trials} trials"
         print_table(title, rows[list(columns)].rename(columns=columns), digits)
+        for row in rows[rows.failures > 0].to_dict("records"):
+            typer.echo(f"{row['solver']}, {card.axis} = {row['value']:g}, failed: {row['failure_reasons']}")
     typer.echo(
         "given: matches over time of the left camera (L) or of both (L+R), or tracks through all four images"
     )

@@ -17,17 +17,23 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
-from rsbench.pipeline.isolation import EntryFailure, IsolatedWorker, Outcome, one_line
+from rsbench.pipeline.isolation import (
+    THREAD_VARIABLES,
+    EntryFailure,
+    IsolatedWorker,
+    Outcome,
+    one_line,
+    use_one_thread,
+)
 from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.pipeline.robust_problem import MatchCount
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
-from rsbench.solvers.refined import RefinedSolver
+from rsbench.solvers.engine.warm_up import warm_up
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -38,12 +44,14 @@ T = TypeVar("T")
 class SolverRunner:
     """Runs solvers with a limit of time for those of other packages; use as a context manager."""
 
-    def __init__(self, *, time_limit_s: float | None = None) -> None:
+    def __init__(self, *, time_limit_s: float | None = None, single_thread: bool = False) -> None:
         """
         Args:
             time_limit_s: for one problem, instead of what each solver's card says.
+            single_thread: whether children compute with one thread, as results that must not depend on the
+                machine need.
         """
-        self._time_limit_s = time_limit_s
+        self._time_limit_s, self._single_thread = time_limit_s, single_thread
         self._workers: dict[str, IsolatedWorker] = {}
         self._stack = ExitStack()
 
@@ -85,7 +93,13 @@ class SolverRunner:
     def _call(self, entry: SolverEntry, *arguments: object) -> Outcome:
         place = os.fspath(entry.path.resolve()) if entry.path is not None else entry.name
         if place not in self._workers:
-            worker = IsolatedWorker(_serve_solver, place, classes=(MotionEstimate, RobustEstimate, MatchCount))
+            worker = IsolatedWorker(
+                _serve_solver,
+                place,
+                self._single_thread,
+                classes=(MotionEstimate, RobustEstimate, MatchCount),
+                environment=dict.fromkeys(THREAD_VARIABLES, "1") if self._single_thread else None,
+            )
             self._workers[place] = self._stack.enter_context(worker)
         limit_s = entry.options.time_limit_s if self._time_limit_s is None else self._time_limit_s
         return self._workers[place].call(*arguments, limit_s=limit_s)
@@ -113,13 +127,15 @@ def _timed(
 # In the child
 
 
-def _serve_solver(place: str) -> Callable[..., object]:
+def _serve_solver(place: str, single_thread: bool) -> Callable[..., object]:
     """What answers calls to a solver."""
+    if single_thread:
+        use_one_thread()
     with _entrys_own():
         solver = GuardedSolver(load_solver_entry(place).solver)
-    _compile()  # not in the entry's time
     if not isinstance(solver.spec, SolverSpec):
         raise EntryFailure(f"declares a {type(solver.spec).__name__}, not a SolverSpec")
+    warm_up([solver.spec.motion_model])  # not in the entry's time
 
     def answer(what: str, *arguments: Any) -> object:
         if what == "bare":
@@ -128,15 +144,6 @@ def _serve_solver(place: str) -> Callable[..., object]:
         return estimate_motion(correspondences, rig, shutter, solver, options, rng, loop)
 
     return answer
-
-
-def _compile() -> None:
-    """Run a small problem, so that the robust loop's kernels are there."""
-    rig = StereoRig(camera=PinholeCamera.centred(640, 480, 500.0), baseline=0.2)
-    points = np.random.default_rng(0).uniform(0.0, 480.0, (20, 8))
-    given = Correspondences(left=points[:, :4], right=points[:, 4:], tracks=points)
-    shutter, options = RollingShutter(height=480, readout_ratio=0.5), RobustOptions(max_iterations=10)
-    estimate_motion(given, rig, shutter, RefinedSolver(iterations=1), options, np.random.default_rng(0))
 
 
 class GuardedSolver(Solver):

@@ -20,7 +20,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from multiprocessing.reduction import ForkingPickler
 from types import TracebackType
@@ -28,6 +28,8 @@ from typing import Any, BinaryIO, NoReturn
 
 from rsbench.pipeline.plain_data import decode, encode, receive, send
 
+THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+"""Of a process that computes with as many threads as they say."""
 START_LIMIT_S = 300.0
 """Loading a module, and compiling what it needs, once."""
 _POLL_S = 0.1
@@ -56,10 +58,16 @@ class Outcome:
     """Why there is none; empty after a success."""
     output: str
     """The end of what the child has printed so far."""
+    ended: bool = False
+    """Whether the process has ended by itself, or was killed by others: not what the call was about, perhaps."""
 
     @property
     def success(self) -> bool:
         return not self.reason
+
+
+class Cancelled(Exception):  # noqa: N818
+    """Raised by a call whose worker was told to stop."""
 
 
 class IsolatedWorker:
@@ -71,6 +79,8 @@ class IsolatedWorker:
         *arguments: object,
         classes: tuple[type, ...] = (),
         start_limit_s: float = START_LIMIT_S,
+        environment: Mapping[str, str] | None = None,
+        cancel: threading.Event | None = None,
     ) -> None:
         """
         Args:
@@ -79,10 +89,14 @@ class IsolatedWorker:
             arguments: picklable.
             classes: the dataclasses that answers may hold.
             start_limit_s: time for ``factory``.
+            environment: variables that the child has besides those of this process.
+            cancel: once set, perhaps by another thread, calls end with ``Cancelled``.
         """
         self._start = (factory, arguments)
         self._classes = {cls.__name__: cls for cls in classes}
         self._start_limit_s = start_limit_s
+        self._environment = {**os.environ, **(environment or {})}
+        self._cancel = cancel or threading.Event()
         self._child: _Child | None = None
 
     def call(self, *arguments: object, limit_s: float) -> Outcome:
@@ -90,10 +104,11 @@ class IsolatedWorker:
 
         Raises:
             RuntimeError: rsbench's own code in the child is at fault.
+            Cancelled: see ``cancel``.
         """
         try:
             if self._child is None:
-                self._child = _Child()
+                self._child = _Child(self._environment)
                 started = self._exchange(self._start, self._start_limit_s)
                 if not started.success:
                     self.close()
@@ -118,7 +133,7 @@ class IsolatedWorker:
     def _exchange(self, message: object, limit_s: float) -> Outcome:
         assert self._child is not None
         child = self._child
-        data, reason = child.exchange(bytes(ForkingPickler.dumps(message)), limit_s)
+        data, reason = child.exchange(bytes(ForkingPickler.dumps(message)), limit_s, self._cancel)
         value = None
         if data is not None:
             value, reason = self._read(data)
@@ -126,7 +141,8 @@ class IsolatedWorker:
             self.close()
             last = child.output.strip().rpartition("\n")[2]
             reason += f"; it last printed: {_short(last)}" if last else ""
-        return Outcome(value=value, reason=reason, output=child.output)
+        ended = data is None and not child.overdue
+        return Outcome(value=value, reason=reason, output=child.output, ended=ended)
 
     def _read(self, data: bytes) -> tuple[Any, str]:
         """Value and reason of a message of the child."""
@@ -145,7 +161,9 @@ class IsolatedWorker:
 class _Child:
     """The process, its pipes, and the threads that read them."""
 
-    def __init__(self) -> None:
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        self.overdue = False
+        """Whether an answer has not come in time."""
         self._printed = b""
         self._lifeline: int | None = None
         lifeline_end = -1
@@ -158,6 +176,7 @@ class _Child:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 start_new_session=True,  # its own process group; a terminal's Ctrl-C is the parent's alone
+                env=environment,
                 pass_fds=(lifeline_end,) if _POSIX else (),
             )
         finally:
@@ -174,12 +193,14 @@ class _Child:
     def output(self) -> str:
         return self._printed.decode("utf-8", errors="replace")
 
-    def exchange(self, request: bytes, limit_s: float) -> tuple[bytes | None, str]:
+    def exchange(self, request: bytes, limit_s: float, cancel: threading.Event) -> tuple[bytes | None, str]:
         """The answer to a request, or None and what became of the process."""
         # A child that does not read must not hold up its parent.
         threading.Thread(target=self._send, args=(request,), daemon=True).start()
         end = time.monotonic() + limit_s
         while (left := end - time.monotonic()) > 0.0:
+            if cancel.is_set():
+                raise Cancelled
             ended = self._process.poll() is not None  # its own children may keep the pipe open
             try:
                 answer = self._answers.get(timeout=0.0 if ended else min(left, _POLL_S))
@@ -188,6 +209,7 @@ class _Child:
                     return None, self._ending()
                 continue
             return (answer, "") if answer is not None else (None, self._ending())
+        self.overdue = True
         return None, f"took longer than {limit_s:g} s"
 
     def kill(self) -> None:
@@ -253,6 +275,13 @@ def _short(text: str) -> str:
 
 
 # In the child
+
+
+def use_one_thread() -> None:
+    """For OpenCV what ``THREAD_VARIABLES`` are for the others."""
+    import cv2
+
+    cv2.setNumThreads(1)
 
 
 def serve_parent(lifeline: int) -> NoReturn:

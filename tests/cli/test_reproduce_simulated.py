@@ -12,6 +12,7 @@ import pytest
 
 from rsbench.benchmark.simulated import run_sweep, sweep_card
 from rsbench.cli.reproduce import Target, reproduce
+from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.report.fig3 import SWEEPS
 
 
@@ -22,10 +23,11 @@ def test_claims_and_figure_come_from_the_stored_tables(tmp_path: Path, monkeypat
         card = complete(name)
         return replace(card, trials=3, values=(card.values[0], card.values[-1]))
 
-    def run_here(todo: list[run_sweep._Job], workers: int) -> Iterator[run_sweep._Part]:
-        for job in todo:
-            run_sweep._run_job(job)
-            yield job.part
+    def run_here(todo: list[run_sweep._Job], workers: int, limit: float | None) -> Iterator[run_sweep._Part]:
+        with SolverRunner() as runner:
+            for job in todo:
+                run_sweep.run_job(job, runner)
+                yield job.part
 
     monkeypatch.setattr(sweep_card, "load_sweep", short)
     monkeypatch.setattr(run_sweep, "_run_all", run_here)  # starting processes would take most of the time

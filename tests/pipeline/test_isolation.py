@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import math
 import os
 import signal
 import subprocess
@@ -294,15 +296,11 @@ def test_nothing_outlives_its_parent(tmp_path: Path, end: signal.Signals) -> Non
 
 
 def test_our_own_mistakes_stop(simulation: Simulation) -> None:
-    with IsolatedWorker(_factory_of_ours) as worker:
+    with IsolatedWorker(functools.partial, math.sqrt) as worker:
         assert worker.call(4.0, limit_s=20.0).value == 2.0
         with pytest.raises(RuntimeError, match="in a child process"):
             worker.call("four", limit_s=20.0)
         assert worker.call(9.0, limit_s=20.0).value == 3.0
-
-
-def _factory_of_ours() -> Any:
-    return np.sqrt
 
 
 @pytest.mark.parametrize(

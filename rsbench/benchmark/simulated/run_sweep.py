@@ -10,15 +10,13 @@ A folder holds
 
 from __future__ import annotations
 
-import multiprocessing
-import os
+import hashlib
+import json
 import shutil
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing
 from dataclasses import asdict
-from functools import lru_cache
+from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -27,15 +25,20 @@ import numpy as np
 from rsbench import __version__
 from rsbench.benchmark.simulated.sweep_card import Cell, SweepCard
 from rsbench.benchmark.simulated.trials import Arrays, Entrant, entrant, run_bounds, run_trials
+from rsbench.core.motion import MOTION_MODELS
 from rsbench.dataset.files import load_arrays, read_json, save_arrays, write_json
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.isolated_jobs import run_jobs
+from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.solvers.engine.warm_up import warm_up
 
 FORMAT = 1
 CHUNK = 50
 """Trials of one job."""
 Progress = Callable[[str], None]
 """Called with the name of the variant after each chunk."""
-_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+_SIMULATOR = ("bound.py", "simulation.py", "sweep_card.py", "trials.py")
 
 
 class _Part(NamedTuple):
@@ -56,6 +59,14 @@ class _Job(NamedTuple):
     first: int
     trials: int
     path: Path
+
+    @property
+    def cell(self) -> str:
+        """Its cell in words."""
+        return f"sweep {self.card.name}, {self.part.cell.variant}, {self.card.axis} = {self.part.cell.value:g}"
+
+    def __str__(self) -> str:
+        return f"{self.cell}, {self.part.kind} {self.first} to {self.first + self.trials - 1}"
 
 
 def sweep_steps(card: SweepCard) -> int:
@@ -79,20 +90,32 @@ def geometry_of(card: SweepCard, cell: Cell) -> Cell:
     return next(other for other in card.cells() if other.setting.exact() == exact)
 
 
-def run_sweep(card: SweepCard, out: Path, *, workers: int = 1, progress: Progress | None = None) -> None:
+def run_sweep(
+    card: SweepCard,
+    out: Path,
+    *,
+    workers: int = 1,
+    progress: Progress | None = None,
+    time_limit_s: float | None = None,
+    force: bool = False,
+) -> None:
     """Run what ``out`` does not hold yet.
+
+    An exception that passes through, such as Ctrl-C, ends all processes at once; what is done stays.
 
     Args:
         card: the experiment.
         out: folder, made if missing.
         workers: processes, each with one thread.
         progress: see ``Progress``.
+        time_limit_s: for one problem of another package's solver, instead of what its card says.
+        force: whether to do all again, whatever ``out`` holds.
 
     Raises:
-        RsbenchError: no such solver; ``out`` holds another sweep; a motion leaves too few points in view; a
-            worker was killed.
+        RsbenchError: no such solver, or two of one name; ``out`` holds another sweep; a motion leaves too few
+            points in view; a worker was killed twice over the same trials.
     """
-    _open_folder(card, {name: entrant(name) for name in card.solvers}, out)
+    _open_folder(card, entrants(card), out, force)
     step = progress or (lambda word: None)
     chunks = out / ".chunks"
     chunks.mkdir(exist_ok=True)
@@ -104,7 +127,9 @@ def run_sweep(card: SweepCard, out: Path, *, workers: int = 1, progress: Progres
                 step(part.cell.variant)
             else:
                 todo.append(_Job(card, part, first, min(CHUNK, card.trials - first), path))
-    for part in _run_all(todo, workers):
+    if todo:
+        _compile(card)
+    for part in _run_all(todo, workers, time_limit_s):
         step(part.cell.variant)
     for part in _parts(card):
         _collect(card, part, out)
@@ -133,99 +158,141 @@ def read_sweep(folder: Path) -> dict[str, Any]:
     return content
 
 
-def _plan(card: SweepCard, entrants: dict[str, Entrant]) -> dict[str, Any]:
+def entrants(card: SweepCard) -> list[Entrant]:
+    """The solvers of a card.
+
+    Raises:
+        RsbenchError: no such solver, or two of one name, which tables and seeds could not tell apart.
+    """
+    found: dict[str, Entrant] = {}
+    for given in card.solvers:
+        new = entrant(given)
+        if (old := found.get(new.name)) is not None:
+            both = " and ".join(str(e.entry.path or f"entry point {e.name}") for e in (old, new))
+            raise RsbenchError(f"sweep {card.name}: {both}: two solvers of the name {new.name!r}; rename one card")
+        found[new.name] = new
+    return list(found.values())
+
+
+def _plan(card: SweepCard, solvers: list[Entrant]) -> dict[str, Any]:
     """All that decides the bytes of a run."""
-    solvers = [
-        {
-            "name": e.name,
-            "key": e.entry.key,
-            "information": e.information,
-            "shutter": e.solver.spec.shutter,
-            "motion_model": e.solver.spec.motion_model,
-            "reference_point": e.solver.spec.reference_point,
-            "reference": e.solver.spec.reference,
-        }
-        for e in entrants.values()
-    ]
-    names = [solver["name"] for solver in solvers]
-    if len(set(names)) < len(names):
-        raise RsbenchError(f"sweep {card.name}: two solvers have one name: {', '.join(names)}")
-    cells = [asdict(cell) for cell in card.cells()]
-    return {"format": FORMAT, "rsbench": __version__, "card": asdict(card), "solvers": solvers, "cells": cells}
+    content = {
+        "format": FORMAT,
+        "rsbench": __version__,
+        "code": simulator_version(),
+        "card": asdict(card),
+        "solvers": [_identity(e) for e in solvers],
+        "cells": [asdict(cell) for cell in card.cells()],
+    }
+    return json.loads(json.dumps(content))  # as it will be read
 
 
-def _open_folder(card: SweepCard, entrants: dict[str, Entrant], out: Path) -> None:
-    import json
+def _identity(e: Entrant) -> dict[str, Any]:
+    spec = e.solver.spec
+    return {
+        "name": e.name,
+        "key": e.entry.key,
+        "information": e.information,
+        "shutter": spec.shutter,
+        "motion_model": spec.motion_model,
+        "reference_point": spec.reference_point,
+        "reference": spec.reference,
+    }
 
-    plan = json.loads(json.dumps(_plan(card, entrants)))
-    if (out / "sweep.json").is_file():
-        stored = read_sweep(out)
-        other = [key for key in plan["card"] if stored["card"].get(key) != plan["card"][key]]
-        other += [key for key in plan if key != "card" and stored.get(key) != plan[key]]
+
+def simulator_version() -> str:
+    """Hash of the sources that decide what is simulated: the keys of solvers hold the rest."""
+    package = resources.files("rsbench.benchmark")
+    files = [package / "seeds.py", *(package / "simulated" / name for name in _SIMULATOR)]
+    return hashlib.sha256(b"\n".join(file.read_bytes() for file in files)).hexdigest()
+
+
+def _open_folder(card: SweepCard, solvers: list[Entrant], out: Path, force: bool) -> None:
+    plan = _plan(card, solvers)
+    if force:
+        for kind in ("trials", "bounds", "seconds", ".chunks"):
+            shutil.rmtree(out / kind, ignore_errors=True)
+    elif (out / "sweep.json").is_file():
+        other = _differences(read_sweep(out), plan)
         if other:
+            what = "; ".join(other)
             raise RsbenchError(
-                f"{out}: holds another sweep (differs in {', '.join(other)}); choose another --out or delete it"
+                f"{out}: holds another sweep ({what}); choose another --out, or remake with --force"
             )
     for kind in ("trials", "bounds", "seconds"):
         (out / kind).mkdir(parents=True, exist_ok=True)
     write_json(out / "sweep.json", plan)
 
 
-def _run_all(todo: list[_Job], workers: int) -> Iterator[_Part]:
+def _differences(stored: dict[str, Any], plan: dict[str, Any]) -> list[str]:
+    """What keeps a stored run from being continued, in words."""
+    fields = [key for key in plan["card"] if stored.get("card", {}).get(key) != plan["card"][key]]
+    if fields:
+        return [f"differs in {', '.join(fields)}"]
+    old = {solver["name"]: solver for solver in stored.get("solvers", [])}
+    changed = [solver["name"] for solver in plan["solvers"] if old.get(solver["name"]) != solver]
+    words = [f"{', '.join(changed)} made by other code or another card"] if changed else []
+    words += [
+        f"{key} was {stored.get(key)}, is {plan[key]}" for key in ("rsbench",) if stored.get(key) != plan[key]
+    ]
+    if stored.get("code") != plan["code"]:
+        words.append("simulated by other code")
+    return words or (["differs in cells"] if stored.get("cells") != plan["cells"] else [])
+
+
+def _compile(card: SweepCard) -> None:
+    """Once, before the workers would each do it."""
+    models = {e.solver.spec.motion_model for e in entrants(card)} | {c.setting.motion_model for c in card.cells()}
+    warm_up(sorted(models & set(MOTION_MODELS)))
+
+
+def _run_all(todo: list[_Job], workers: int, time_limit_s: float | None) -> Iterator[_Part]:
     """Always in children, so that BLAS has one thread and one summation order whatever the parent has loaded."""
-    if not todo:
-        return
-    with _environment({name: "1" for name in _ONE_THREAD}):
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(max(1, min(workers, len(todo))), mp_context=context) as pool:
-            jobs = {pool.submit(_run_job, job): job for job in todo}
-            try:
-                for done in as_completed(jobs):
-                    done.result()
-                    yield jobs[done].part
-            except BrokenProcessPool as error:
+    one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
+    with closing(run_jobs(_serve_jobs, todo, workers, one_thread, time_limit_s)) as outcomes:
+        for job, outcome in outcomes:
+            if outcome.ended:
                 raise RsbenchError(
-                    "a worker process was killed, perhaps for want of memory; the same command resumes"
-                ) from error
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
+                    f"{job}: {outcome.reason}, twice; perhaps for want of memory: what is done is kept, and the "
+                    "same command resumes"
+                )
+            if not outcome.success:
+                raise RsbenchError(outcome.reason)
+            yield job.part
 
 
-@contextmanager
-def _environment(changes: dict[str, str]) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in changes}
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+def _serve_jobs(time_limit_s: float | None) -> Callable[[_Job], None]:
+    """What does jobs, in a child."""
+    use_one_thread()
+    warm_up()
+    runner = SolverRunner(time_limit_s=time_limit_s, single_thread=True)  # as long as this process
+
+    def run(job: _Job) -> None:
+        try:
+            run_job(job, runner)
+        except RsbenchError as error:
+            raise EntryFailure(str(error)) from error
+
+    return run
 
 
-def _run_job(job: _Job) -> None:
-    """One chunk, in a child."""
-    _single_thread()
+def run_job(job: _Job, runner: SolverRunner) -> None:
+    """Simulate, solve and store one chunk.
+
+    Raises:
+        RsbenchError: a motion leaves too few points in view.
+    """
     card, cell = job.card, job.part.cell
     try:
         if job.part.kind == "bounds":
             arrays = run_bounds(cell.setting, card.solvers, card.seed, job.first, job.trials)
         else:
-            arrays = run_trials(cell.setting, card.solvers, card.seed, job.first, job.trials, card.robust)
+            arrays = run_trials(
+                cell.setting, card.solvers, card.seed, job.first, job.trials, robust=card.robust, runner=runner
+            )
     except RsbenchError as error:
-        where = f"sweep {card.name}, {cell.variant}, {card.axis} = {cell.value:g}"
-        raise RsbenchError(f"{where}: {error}") from error
+        raise RsbenchError(f"{job.cell}: {error}") from error
     save_arrays(job.path, arrays)
-
-
-@lru_cache(maxsize=1)
-def _single_thread() -> None:
-    import cv2
-
-    cv2.setNumThreads(1)
 
 
 def _collect(card: SweepCard, part: _Part, out: Path) -> None:

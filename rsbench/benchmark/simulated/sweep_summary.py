@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ SUCCESS_DEG = (1.0, 5.0)
 OBSERVABLE = 0.5
 """Standard deviation of the direction of d (radians), or of its relative length, above which it is not known."""
 RESAMPLES = 1000
+SHOWN_REASONS = 3
 COVERAGE = 0.95
 Statistic = Callable[[FloatArray], FloatArray]
 """Reduces the axis of trials of resampled values (resamples, trials, ...)."""
@@ -61,7 +63,11 @@ def summarise_sweep(folder: Path) -> pd.DataFrame:
                 "information": solver["information"],
                 "ransac": card.robust,
             }
-            rows.append(identity | summary_row(scores, trials["success"][:, number], limit, card.seed))
+            row = identity | summary_row(scores, trials["success"][:, number], limit, card.seed)
+            row["motion_model"] = cell.setting.motion_model
+            row["assumed_motion"] = solver["motion_model"]
+            row["failure_reasons"] = failure_reasons(trials, number)
+            rows.append(row)
     table = pd.DataFrame(rows)
     write_table(folder / "summary.csv", table)
     return table
@@ -85,6 +91,16 @@ def score_trials(arrays: Arrays, solver: int, reference_point: str, cell: Cell) 
         metric=arrays["metric"][:, solver],
         reference_point=reference_point,
     )
+
+
+def failure_reasons(arrays: Arrays, solver: int) -> str:
+    """Why trials of a solver failed, the most frequent reasons first: ``3 x took longer than 60 s``."""
+    codes = arrays["reason_code"][~arrays["success"][:, solver], solver]
+    counts = Counter(str(arrays["reasons"][code]) for code in codes)
+    ranked = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    words = [f"{count} x {reason}" for reason, count in ranked[:SHOWN_REASONS]]
+    rest = sum(count for _, count in ranked[SHOWN_REASONS:])
+    return "; ".join([*words, *([f"{rest} x others"] if rest else [])])
 
 
 def summary_row(

@@ -18,7 +18,9 @@ from rsbench.core.correspondences import Correspondences, track_pairs
 from rsbench.core.metrics import translation_of_offset
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
+from rsbench.pipeline.isolated_solver import GuardedSolver, SolverRunner
+from rsbench.pipeline.isolation import EntryFailure
+from rsbench.pipeline.robust_motion import RobustOptions
 from rsbench.solvers.engine.base import MotionEstimate, Solver
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 
@@ -48,12 +50,16 @@ def entrant(name_or_path: str) -> Entrant:
     """The solver of a card with the least information that it can use fully.
 
     Raises:
-        RsbenchError: no such solver.
+        RsbenchError: no such solver, or it does not say how many matches it needs.
     """
     entry = load_solver_entry(name_or_path)
     solver, needs = entry.solver, entry.solver.spec.needs
     probe = Correspondences(left=np.ones((50, 4)), right=np.ones((50, 4)), tracks=np.ones((50, 8)))
-    if "tracks" in needs or solver.sample_sizes(probe).get("tracks", 0) > 0:
+    try:
+        sizes = (solver if entry.built_in else GuardedSolver(solver)).sample_sizes(probe)
+    except EntryFailure as error:
+        raise RsbenchError(f"solver {entry.name!r}: sample_sizes: {error}") from error
+    if "tracks" in needs or sizes.get("tracks", 0) > 0:
         return Entrant(entry=entry, information="tracks")
     if "stereo" in needs:
         return Entrant(entry=entry, information="linked pairs")
@@ -76,12 +82,20 @@ def given_matches(simulation: Simulation, information: Information) -> Correspon
 
 
 def run_trials(
-    setting: Setting, solvers: tuple[str, ...], seed: int, first: int, count: int, robust: bool
+    setting: Setting,
+    solvers: tuple[str, ...],
+    seed: int,
+    first: int,
+    count: int,
+    *,
+    robust: bool,
+    runner: SolverRunner,
 ) -> Arrays:
     """Trials ``first`` to ``first + count - 1`` of a setting.
 
     A trial's scene, motion and noise depend on its number and the seed alone, so that all solvers, values and
-    sweeps share them as far as their settings allow.
+    sweeps share them as far as their settings allow. Whatever another package's solver does wrong is a failed
+    trial; an exception of a solver of rsbench's own is raised.
 
     Returns:
         ``w``, ``d`` (trials, 3), the truth; ``w_est``, ``d_est`` (trials, solvers, 3), ``success``, ``metric``,
@@ -95,7 +109,7 @@ def run_trials(
     for trial in range(first, first + count):
         simulation = _simulation(setting, entrants, seed, trial)
         truth.append((simulation.motion.w, simulation.motion.d))
-        timed = [_timed(e, simulation, setting, seed, trial, robust) for e in entrants]
+        timed = [_timed(e, simulation, setting, seed, trial, robust, runner) for e in entrants]
         answers.append([estimate for estimate, _ in timed])
         seconds.append([duration for _, duration in timed])
     return {
@@ -173,17 +187,21 @@ def _of_left_camera(information: FloatArray, simulation: Simulation) -> Bound:
 
 
 def _timed(
-    e: Entrant, simulation: Simulation, setting: Setting, seed: int, trial: int, robust: bool
+    e: Entrant,
+    simulation: Simulation,
+    setting: Setting,
+    seed: int,
+    trial: int,
+    robust: bool,
+    runner: SolverRunner,
 ) -> tuple[MotionEstimate, float]:
+    """An answer and its seconds: of the processor, since solvers have one thread and others shall not count."""
     matches, rig, shutter = given_matches(simulation, e.information), setting.rig(), setting.told_shutter()
-    # Processor time: solvers have one thread here, and other processes shall not count.
+    if not robust:
+        return runner.bare(e.entry, matches, rig, shutter)
+    rng = generator(seed, "simulate", "robust", e.name, trial)
     start = time.process_time()
-    try:
-        if robust:
-            rng = generator(seed, "simulate", "robust", e.name, trial)
-            estimate = estimate_motion(matches, rig, shutter, e.solver, RobustOptions(), rng).estimate
-        else:
-            estimate = e.solver.estimate(matches, rig, shutter)
-    except Exception as error:  # a plug-in that breaks the contract must not end a run of hours
-        estimate = MotionEstimate.failed(f"raised {type(error).__name__}: {error}")
-    return estimate, time.process_time() - start
+    answer = runner.robust(e.entry, matches, rig, shutter, RobustOptions(), rng)
+    # Another process's time is not this one's: wall-clock time of the robust loop there.
+    seconds = time.process_time() - start if e.entry.built_in else answer.seconds
+    return answer.estimate, seconds

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
+import json
+import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +16,12 @@ import pytest
 from rsbench.benchmark.simulated import run_sweep as module
 from rsbench.benchmark.simulated.run_sweep import geometry_of, read_bounds, read_trials, run_sweep, sweep_steps
 from rsbench.benchmark.simulated.sweep_card import Setting, SweepCard, Variant
-from rsbench.benchmark.simulated.sweep_summary import summarise_sweep
-from rsbench.benchmark.simulated.trials import entrant, run_bounds, run_trials
+from rsbench.benchmark.simulated.sweep_summary import failure_reasons, summarise_sweep
+from rsbench.benchmark.simulated.trials import Arrays, entrant, run_bounds, run_trials
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.motion import LinearMotion
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.solvers.eight_point import EightPointSolver
 
 SETTING = Setting(
@@ -94,37 +99,118 @@ def test_a_motion_that_loses_the_scene_names_its_cell(tmp_path: Path) -> None:
         run_sweep(card, tmp_path / "lost")
 
 
-FATAL = """
+DEADLY = """
 import os
-from rsbench.solvers.engine.base import Solver
-from rsbench.solvers.engine.registry import load_solver
 
-class Fatal(Solver):
-    spec = load_solver("gs-8pt").spec
-
-    def estimate(self, correspondences, rig, shutter):
-        os._exit(1)
+def serve(limit):
+    return lambda job: os._exit(9)
 """
 
 
-def test_a_killed_worker_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A solver that ends its process, as a want of memory would."""
-    (tmp_path / "fatal_plugin.py").write_text(FATAL)
-    (tmp_path / "fatal.toml").write_text('class = "fatal_plugin:Fatal"\n')
+def test_a_worker_killed_twice_is_one_line_that_names_its_trials(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "deadly.py").write_text(DEADLY)
     monkeypatch.syspath_prepend(tmp_path)
-    card = replace(CARD, solvers=(str(tmp_path / "fatal.toml"),))
-    with pytest.raises(RsbenchError, match=r"worker process was killed.*resumes"):
-        run_sweep(card, tmp_path / "killed")
+    monkeypatch.setattr(module, "_serve_jobs", importlib.import_module("deadly").serve)
+    with pytest.raises(
+        RsbenchError,
+        match=r"small, low, rotation_deg = 1, trials 0 to 6: ended its process with exit code 9, twice.*resumes",
+    ):
+        run_sweep(CARD, tmp_path / "killed")
+    sys.modules.pop("deadly")
+
+
+MISCHIEF = """
+import os, sys, time
+from rsbench.solvers.engine.base import Solver
+from rsbench.solvers.engine.registry import load_solver
+
+EIGHT_POINT = load_solver("gs-8pt")
+
+class Mischief(Solver):
+    spec = EIGHT_POINT.spec
+
+    def __init__(self):
+        self.seen = 0
+
+    def estimate(self, correspondences, rig, shutter):
+        self.seen += 1
+        if self.seen == 2:
+            raise ArithmeticError("no luck")
+        if self.seen == 3:
+            print("overboard")
+            os._exit(1)
+        return EIGHT_POINT.estimate(correspondences, rig, shutter)
+"""
+
+
+def test_another_packages_solver_fails_alone(tmp_path: Path) -> None:
+    """By trials that fail with their reasons, and nothing else changes."""
+    (tmp_path / "mischief_in_sweeps.py").write_text(MISCHIEF)
+    card = tmp_path / "mischief.toml"
+    card.write_text('class = "mischief_in_sweeps:Mischief"')
+    with SolverRunner() as runner:
+        arrays = run_trials(SETTING, (str(card), "gs-8pt"), 0, 0, 5, robust=False, runner=runner)
+    sys.modules.pop("mischief_in_sweeps", None)
+    assert arrays["success"][:, 1].all()
+    # The process that ended in the third trial took its count along.
+    assert list(arrays["success"][:, 0]) == [True, False, False, True, False]
+    assert list(arrays["reason"][[1, 2, 4], 0]) == [
+        "raised ArithmeticError: no luck",
+        "ended its process with exit code 1; it last printed: overboard",
+        "raised ArithmeticError: no luck",
+    ]
+    good = arrays["success"][:, 0]
+    np.testing.assert_array_equal(arrays["w_est"][good, 0], arrays["w_est"][good, 1])
+    assert np.isnan(arrays["w_est"][~good, 0]).all()
+
+
+def test_reasons_of_failures_are_counted() -> None:
+    reasons = np.array(["", "a", "b", "c", "d"])
+    codes = np.array([[0], [1], [2], [2], [3], [4], [0]])
+    content = {"reasons": reasons, "reason_code": codes, "success": codes == 0}
+    assert failure_reasons(content, 0) == "2 x b; 1 x a; 1 x c; 1 x others"
+    assert failure_reasons(content | {"success": codes >= 0}, 0) == ""
+
+
+def test_two_solvers_of_one_name_are_refused(tmp_path: Path) -> None:
+    same = tmp_path / "gs-8pt.toml"
+    same.write_text('class = "rsbench.solvers.linear:LinearSolver"')
+    with pytest.raises(RsbenchError, match=r"gs-8pt.toml and .*gs-8pt.toml: two solvers of the name 'gs-8pt'"):
+        run_sweep(replace(CARD, solvers=("gs-8pt", str(same))), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_of_other_code_are_refused_by_name_and_remade_by_force(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "old"
+    shutil.copytree(finished, folder)
+    stored = json.loads((folder / "sweep.json").read_text())
+    stored["solvers"][1]["key"] = "0" * 64
+    (folder / "sweep.json").write_text(json.dumps(stored))
+    (folder / "trials" / "001.npz").write_bytes(b"stale")
+    with pytest.raises(
+        RsbenchError, match=r"rs-stereo-linear made by other code or another card.*remake with --force"
+    ):
+        run_sweep(CARD, folder)
+    run_sweep(CARD, folder, force=True)
+    summarise_sweep(folder)
+    assert contents(folder) == contents(finished)
+
+
+def trials(setting: Setting, solvers: tuple[str, ...], seed: int, first: int, count: int) -> Arrays:
+    with SolverRunner() as runner:
+        return run_trials(setting, solvers, seed, first, count, robust=False, runner=runner)
 
 
 def test_trials_depend_on_their_number_alone() -> None:
-    whole = run_trials(SETTING, CARD.solvers, 0, 0, 4, robust=False)
-    part = run_trials(SETTING, CARD.solvers, 0, 2, 2, robust=False)
+    whole = trials(SETTING, CARD.solvers, 0, 0, 4)
+    part = trials(SETTING, CARD.solvers, 0, 2, 2)
     for name in ("w", "d", "w_est", "d_est", "success"):
         np.testing.assert_array_equal(whole[name][2:], part[name])
-    alone = run_trials(SETTING, ("rs-stereo-linear",), 0, 0, 4, robust=False)
+    alone = trials(SETTING, ("rs-stereo-linear",), 0, 0, 4)
     np.testing.assert_array_equal(alone["w_est"][:, 0], whole["w_est"][:, 1])
-    other_seed = run_trials(SETTING, CARD.solvers, 1, 0, 4, robust=False)
+    other_seed = trials(SETTING, CARD.solvers, 1, 0, 4)
     assert not np.any(other_seed["w"] == whole["w"])
 
 
@@ -145,20 +231,19 @@ def test_noise_and_told_readout_share_exact_matches(finished: Path) -> None:
     )
 
 
-def test_a_solver_that_raises_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mistake_in_our_own_solver_stops(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise FloatingPointError("overflow")
 
     monkeypatch.setattr(EightPointSolver, "estimate", broken)
-    arrays = run_trials(SETTING, ("gs-8pt",), 0, 0, 1, robust=False)
-    assert not arrays["success"].any() and np.isnan(arrays["w_est"]).all()
-    assert arrays["reason"][0, 0] == "raised FloatingPointError: overflow"
+    with pytest.raises(FloatingPointError):
+        trials(SETTING, ("gs-8pt",), 0, 0, 1)
 
 
 def test_a_wrong_readout_ratio_reaches_the_solver_only() -> None:
     told = replace(SETTING, readout_ratio_error=-0.3, noise_px=0.0)
     assert told.shutter().readout_ratio == 0.8 and told.told_shutter().readout_ratio == pytest.approx(0.5)
-    right, wrong = (run_trials(s, ("rs-stereo-linear",), 0, 0, 3, robust=False) for s in (SETTING, told))
+    right, wrong = (trials(s, ("rs-stereo-linear",), 0, 0, 3) for s in (SETTING, told))
     np.testing.assert_array_equal(right["w"], wrong["w"])
     assert not np.any(right["w_est"] == wrong["w_est"])
 

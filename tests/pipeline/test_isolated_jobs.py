@@ -1,0 +1,61 @@
+"""Jobs over processes: all are done, each once, and all can be stopped."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from rsbench.pipeline.isolated_jobs import run_jobs
+
+ASK = "__import__('os').getpid()"
+
+
+def test_all_jobs_are_done_by_few_processes() -> None:
+    jobs = [float(k * k) for k in range(20)]
+    done = {job: outcome.value for job, outcome in run_jobs(functools.partial, jobs, 2, {}, math.sqrt)}
+    assert done == {float(k * k): float(k) for k in range(20)}
+    pids = {outcome.value for _, outcome in run_jobs(functools.partial, [ASK] * 6, 2, {}, eval)}
+    assert 1 <= len(pids) <= 2 and os.getpid() not in pids
+
+
+def test_the_environment_reaches_the_children() -> None:
+    given = {"RSBENCH_TEST_WORD": "yes"}
+    ((_, outcome),) = run_jobs(functools.partial, ["RSBENCH_TEST_WORD"], 1, given, os.getenv)
+    assert outcome.value == "yes" and "RSBENCH_TEST_WORD" not in os.environ
+
+
+def test_a_job_that_ends_its_process_is_tried_twice_and_the_others_are_done(tmp_path: Path) -> None:
+    """Each try appends a letter; the shell's parent is the child that serves the job."""
+    note = tmp_path / "tries"
+    deadly, good = f"printf x >> {note}; kill -9 $PPID", "true"
+    outcomes = dict(run_jobs(functools.partial, [deadly, good], 1, {}, os.system))
+    assert outcomes[deadly].ended and outcomes[deadly].reason == "killed by signal 9 (SIGKILL)"
+    assert outcomes[good].value == 0 and note.read_text() == "xx"
+
+
+def test_a_job_that_was_killed_once_is_done(tmp_path: Path) -> None:
+    mark = tmp_path / "mark"
+    ((_, outcome),) = run_jobs(
+        functools.partial, [f"test -e {mark} || {{ touch {mark}; kill -9 $PPID; }}"], 1, {}, os.system
+    )
+    assert outcome.success and outcome.value == 0
+
+
+def test_leaving_early_ends_everything_at_once() -> None:
+    jobs = [0.0, *[1000.0] * 9]
+    outcomes = run_jobs(functools.partial, jobs, 2, {}, time.sleep)
+    assert next(outcomes)[1].success
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        outcomes.throw(KeyboardInterrupt())
+    assert time.monotonic() - start < 2.0
+
+
+def test_our_own_mistake_in_a_child_stops() -> None:
+    with pytest.raises(RuntimeError, match="in a child process"):
+        list(run_jobs(functools.partial, ["four"], 1, {}, math.sqrt))
