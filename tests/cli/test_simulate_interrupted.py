@@ -1,0 +1,126 @@
+"""``rsbench simulate`` stopped and killed for real: at once, with nothing left, and resumed to the same bytes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+
+SLOW = """
+import os, time
+from rsbench.solvers.engine.base import Solver
+from rsbench.solvers.engine.registry import load_solver
+
+EIGHT_POINT = load_solver("gs-8pt")
+
+class Slow(Solver):
+    spec = EIGHT_POINT.spec
+
+    def estimate(self, correspondences, rig, shutter):
+        time.sleep(float(os.environ["RSBENCH_TEST_PAUSE"]))
+        return EIGHT_POINT.estimate(correspondences, rig, shutter)
+"""
+CARD = """
+name = "long"
+axis = "noise_px"
+values = [0.0, 0.5, 1.0]
+solvers = ["gs-8pt", "{slow}"]
+trials = 100
+[setting]
+width = 640
+height = 480
+focal = 500.0
+baseline = 0.2
+readout_ratio = 0.5
+points = 30
+depth = [2.0, 5.0]
+rotation_deg = 1.0
+translation = 0.1
+noise_px = 0.0
+"""
+STOP_S = 3.0
+"""What the command promises."""
+
+
+class Run:
+    """The command, and the processes that belong to it."""
+
+    def __init__(self, card: Path, out: Path, pause: float) -> None:
+        self.mark = f"RSBENCH_TEST_MARK={out}-{time.monotonic_ns()}"
+        name, _, value = self.mark.partition("=")
+        environment = {**os.environ, "RSBENCH_TEST_PAUSE": str(pause), name: value}
+        command = [sys.executable, "-m", "rsbench", "simulate", str(card), "--out", str(out), "--workers", "2"]
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True)
+
+    def processes(self) -> set[int]:
+        """All that carry the mark."""
+        found = set()
+        for path in Path("/proc").glob("[0-9]*/environ"):
+            try:
+                alive = path.with_name("stat").read_text().rpartition(")")[2].split()[0] != "Z"
+                if alive and self.mark.encode() in path.read_bytes():
+                    found.add(int(path.parent.name))
+            except OSError:  # gone meanwhile
+                continue
+        return found
+
+    def worker(self) -> int:
+        """One of its direct children."""
+        for pid in self.processes():
+            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1] == str(self.process.pid):
+                return pid
+        raise AssertionError("no worker")
+
+    def wait_for(self, chunks: Path, count: int) -> None:
+        end = time.monotonic() + 120.0
+        while len(list(chunks.glob("trials-*.npz"))) < count:
+            assert self.process.poll() is None and time.monotonic() < end
+            time.sleep(0.02)
+
+    def finish(self) -> str:
+        """What it said on standard error."""
+        return self.process.communicate(timeout=300.0)[1]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.parent.name != "seconds"]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths if path.name != "provenance.json"}
+
+
+def test_stopped_terminated_and_killed_it_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+    (tmp_path / "slow_plugin.py").write_text(SLOW)
+    (tmp_path / "slow.toml").write_text('class = "slow_plugin:Slow"')
+    card = tmp_path / "long.toml"
+    card.write_text(CARD.format(slow=tmp_path / "slow.toml"))
+    undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
+    run = Run(card, undisturbed, 0.0)
+    errors = run.finish()
+    assert run.process.returncode == 0, errors
+
+    for stop, code, chunks in ((signal.SIGINT, 130, 1), (signal.SIGTERM, 143, 3)):
+        run = Run(card, out, 0.03)
+        run.wait_for(out / ".chunks", chunks)
+        assert len(run.processes()) == 1 + 2 + 2  # workers, and the solver's own process of each
+        start = time.monotonic()
+        run.process.send_signal(stop)
+        errors = run.finish()
+        assert time.monotonic() - start < STOP_S
+        assert run.process.returncode == code
+        assert "interrupted; the same command resumes" in errors and "Traceback" not in errors
+        assert not run.processes()
+        assert not (out / "summary.csv").exists()
+
+    run = Run(card, out, 0.03)
+    run.wait_for(out / ".chunks", 4)
+    os.kill(run.worker(), signal.SIGKILL)
+    errors = run.finish()
+    assert run.process.returncode == 0, errors
+    assert contents(out) == contents(undisturbed)
