@@ -135,7 +135,10 @@ def _serve_solver(place: str, single_thread: bool) -> Callable[..., object]:
         solver = GuardedSolver(load_solver_entry(place).solver)
     if not isinstance(solver.spec, SolverSpec):
         raise EntryFailure(f"declares a {type(solver.spec).__name__}, not a SolverSpec")
-    warm_up([solver.spec.motion_model])  # not in the entry's time
+    try:
+        warm_up([solver.spec.motion_model])  # not in the entry's time
+    except RsbenchError as error:  # it assumes a motion that does not exist
+        raise EntryFailure(str(error)) from error
 
     def answer(what: str, *arguments: Any) -> object:
         if what == "bare":
