@@ -22,17 +22,11 @@ from typing import Any
 
 import numpy as np
 
+from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.pipeline.chain import (
-    CorrectionOptions,
-    complete_depth,
-    correct_frames,
-    frame_pairs,
-    match_frames,
-    motion_of,
-    solve_frames,
-)
-from rsbench.pipeline.footage import VIEWS
+from rsbench.pipeline.chain import correct_frames, find_depth
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_motion import match_frames, solve_frames
 
 BOUND_S = 3.0
 STEPS = ("match", "solve", "depth", "correct")
@@ -50,12 +44,9 @@ def run(sequence: Sequence, options: CorrectionOptions) -> dict[str, tuple[float
         return result
 
     matches = timed("match", lambda: match_frames(images, options))
-    robust, shutter, _ = timed(
-        "solve", lambda: solve_frames(matches, rig, sequence.shutter.readout_ratio, options)
-    )
-    motion = motion_of(robust, options)
-    pairs = timed("depth", lambda: complete_depth(frame_pairs(images, rig, options), rig, shutter, motion))
-    timed("correct", lambda: correct_frames(pairs, rig, shutter, motion, options))
+    found, shutter, _ = timed("solve", lambda: solve_frames(matches, rig, sequence.shutter.readout_ratio, options))
+    pairs = timed("depth", lambda: find_depth(images, rig, shutter, found.motion, options))
+    timed("correct", lambda: correct_frames(images, pairs, rig, shutter, found.motion, options))
     return times
 
 

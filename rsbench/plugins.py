@@ -56,6 +56,18 @@ def _anything_goes(component: Any) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """What a card may say of how its component is run."""
+
+    time_limit_s: float = 300.0
+    """Wall-clock time for one problem, after which a component of another package has failed."""
+
+    def __post_init__(self) -> None:
+        if not self.time_limit_s > 0.0:
+            raise ValueError(f"time_limit_s = {self.time_limit_s}: must be a positive number of seconds")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Kind(Generic[Component, Options]):
     """One kind of component."""
 
@@ -121,6 +133,21 @@ class _Content:
     class_: str
     description: str = ""
     parameters: dict[str, Any] = field(default_factory=dict)
+
+
+@contextmanager
+def blame(kind: Kind[Any, Any], entry: Entry[Any, Any]) -> Iterator[None]:
+    """Run a component's code: what another package's raises becomes one line that names the component.
+
+    Raises:
+        RsbenchError: its kind, its name and what it raised. Errors in our own code pass as they are.
+    """
+    try:
+        yield
+    except Exception as error:
+        if entry.built_in or isinstance(error, RsbenchError):
+            raise
+        raise RsbenchError(f"{kind.singular} {entry.name!r}: raised {_in_words(error)}") from error
 
 
 def list_names(kind: Kind[Any, Any]) -> list[str]:

@@ -9,10 +9,11 @@ import typer
 
 if TYPE_CHECKING:
     from rsbench.core.shutter import RollingShutter
-    from rsbench.pipeline.chain import CorrectionOptions
+    from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import FrameSource, RigCard
     from rsbench.pipeline.readout import ReadoutEstimate
     from rsbench.pipeline.sliding import CorrectedMoment
+    from rsbench.vision.corrector import CorrectorEntry
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -52,22 +53,38 @@ def correct(
     sky: Annotated[bool, typer.Option(help="Look for sky, which moves by rotation alone.")] = True,
     fill: Annotated[bool, typer.Option(help="Fill what a frame did not see from the other frames.")] = True,
     solver: Annotated[
-        str, typer.Option(help="Card of a refined solver: rs-stereo-refined or rs-stereo-refined-twist.")
+        str, typer.Option(help="Solver of the motion: any that gives metres; see: rsbench list solvers.")
     ] = "rs-stereo-refined",
-    matcher: Annotated[str, typer.Option(help="Card of the stereo matcher that finds depth.")] = "sgm",
+    matcher: Annotated[str, typer.Option(help="Stereo matcher that finds depth: a name or a card.")] = "sgm",
+    features: Annotated[
+        str, typer.Option(help="Feature matcher that finds the matches of the motion: a name or a card.")
+    ] = "sift",
+    corrector: Annotated[
+        str, typer.Option(help="What makes the corrected frames: a name or a card; see: rsbench list correctors.")
+    ] = "fusion",
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
 ) -> None:
     """Correct your own rolling-shutter stereo frames: two times of a rig, or a whole sequence."""
     from rsbench.errors import RsbenchError
-    from rsbench.pipeline.chain import CorrectionOptions, NoMotionError
+    from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import read_rig_card
-    from rsbench.vision.matcher_card import load_matcher
+    from rsbench.pipeline.frame_motion import NoMotionError
+    from rsbench.solvers.engine.registry import load_solver_entry
+    from rsbench.vision.feature_matcher import load_features
+    from rsbench.vision.stereo_matcher import load_matcher
 
     if rig is None or out is None:
         raise RsbenchError(f"--{'rig' if rig is None else 'out'}: is required")
     card = read_rig_card(rig)
-    cards = {"solver": _solver(solver), "sgm": load_matcher(matcher)}
-    options = CorrectionOptions(use_other_views=fill, find_sky=sky, inpaint=inpaint, seed=seed, **cards)
+    options = CorrectionOptions(
+        features=load_features(features),
+        solver=load_solver_entry(solver),
+        matcher=load_matcher(matcher),
+        corrector=_corrector(corrector, fill),
+        find_sky=sky,
+        inpaint=inpaint,
+        seed=seed,
+    )
     four = frames is not None and len(frames) == 4 and not (left or right)
     if not four and (frames or not (left and right)):
         count = f"{len(frames)} images; " if frames else ""
@@ -82,15 +99,22 @@ def correct(
         raise typer.Exit(1) from None
 
 
-def _solver(name: str) -> Any:
-    from rsbench.errors import RsbenchError
-    from rsbench.solvers.engine.registry import load_solver
-    from rsbench.solvers.refined import RefinedSolver
+def _corrector(name: str, fill: bool) -> CorrectorEntry:
+    """The corrector; ``--no-fill`` turns the filling of ours off."""
+    from dataclasses import replace
 
-    solver = load_solver(name)
-    if not isinstance(solver, RefinedSolver):
-        raise RsbenchError(f"--solver {name}: a card of rsbench.solvers.refined:RefinedSolver is needed")
-    return solver
+    from rsbench.errors import RsbenchError
+    from rsbench.plugins import component_key
+    from rsbench.vision.corrector import load_corrector
+    from rsbench.vision.correctors import FusionCorrector
+
+    entry = load_corrector(name)
+    if fill:
+        return entry
+    if not isinstance(entry.component, FusionCorrector):
+        raise RsbenchError(f"--no-fill: corrector {name!r} fills nothing that could be turned off; leave it out")
+    component = replace(entry.component, use_other_views=False)
+    return replace(entry, component=component, key=component_key(component, {}))
 
 
 def _target_row(target: str, height: int) -> float:
@@ -128,7 +152,7 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
         for (side, frame), fused in result.frames.items():
             write_frame(folder, f"{side}_{frame}", fused)
         record = rig_record(rig, result.shutter, result.readout, options.target_row)
-        record["motion"] = motion_record(result.robust, options.solver.motion_model)
+        record["motion"] = None if result.found is None else motion_record(result.found)
         record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in result.frames.items()}
         record["seconds"] = result.seconds
         write_record(folder, record)
@@ -151,20 +175,29 @@ def _page(
     if motion is not None:
         facts += [("rotation", f"{motion['rotation_deg']:.4f} deg per frame period")]
         facts += [("translation", f"{motion['translation']:.4f} m per frame period")]
-        facts += [("matches that agree", ", ".join(f"{n} {name}" for name, n in motion["inliers"].items()))]
+        facts += [("matches that agree", _agreeing(motion))]
         facts += [("noise of a match", f"{motion['noise_px'] or float('nan'):.2f} px")]
     write_page(folder, f"rsbench correct: {out.name}", "Rolling shutter to global shutter", facts, cards)
+
+
+def _agreeing(motion: dict[str, Any]) -> str:
+    """Of each set, such as "312 of 340 tracks"; sets that the solver did not use are left out."""
+    sets = ((name, inliers, motion["matches"][name]) for name, inliers in motion["inliers"].items())
+    return ", ".join(f"{inliers} of {matches} {name}" for name, inliers, matches in sets if matches)
 
 
 def _readout(shutter: RollingShutter, readout: ReadoutEstimate | None) -> str:
     return f"{shutter.readout_ratio:.3f} (given)" if readout is None else f"{readout} (estimated)"
 
 
-def _say(out: Path, shutter: RollingShutter, readout: ReadoutEstimate | None, motion: dict[str, Any]) -> None:
+def _say(
+    out: Path, shutter: RollingShutter, readout: ReadoutEstimate | None, motion: dict[str, Any] | None
+) -> None:
     typer.echo(f"readout ratio {_readout(shutter, readout)}")
-    typer.echo(f"motion {motion['rotation_deg']:.4f} deg, {motion['translation']:.4f} m per frame period")
-    if motion["note"]:
-        typer.echo(f"note: {motion['note']}")
+    if motion is not None:
+        typer.echo(f"motion {motion['rotation_deg']:.4f} deg, {motion['translation']:.4f} m per frame period")
+        if motion["note"]:
+            typer.echo(f"note: {motion['note']}")
     typer.echo(f"report: {(out / 'report.html').resolve()}")
 
 
@@ -192,10 +225,10 @@ def _correct_sequence(
         record = rig_record(rig, shutter, readout, options.target_row)
         with progress_bar("correcting", max(left.count, 1)) as advance:
             moments = correct_sequence(left, right, rig, ratio, options)
-            record["frames"], cards = _write_moments(folder, moments, left, options, advance)
+            record["frames"], cards = _write_moments(folder, moments, left, advance)
         write_record(folder, record)
         _page(folder, out, shutter, readout, None, cards)
-    failed = [f"{frame['number']} ({frame['reason']})" for frame in record["frames"] if "motion" not in frame]
+    failed = [f"{frame['number']} ({frame['reason']})" for frame in record["frames"] if "reason" in frame]
     typer.echo(f"readout ratio {_readout(shutter, readout)}")
     typer.echo(f"{len(record['frames']) - len(failed)} of {len(record['frames'])} times corrected")
     typer.echo(f"report: {(out / 'report.html').resolve()}")
@@ -205,7 +238,7 @@ def _correct_sequence(
 
 
 def _write_moments(
-    folder: Path, moments: Any, left: FrameSource, options: CorrectionOptions, advance: Any
+    folder: Path, moments: Any, left: FrameSource, advance: Any
 ) -> tuple[list[dict[str, Any]], list[Any]]:
     """Write every corrected time; returns what motion.json says of each, and some for the page."""
     from rsbench.dataset.corrected_frames import motion_record, write_frame
@@ -220,10 +253,11 @@ def _write_moments(
         for side, fused in moment.frames.items():
             write_frame(folder, f"{side}_{moment.number:06d}", fused)
             entry[side] = fused.shares()
-        if moment.robust is None:
+        if not moment.frames:
             entry["reason"] = moment.reason
         else:
-            entry["motion"] = motion_record(moment.robust, options.solver.motion_model)
+            if moment.found is not None:
+                entry["motion"] = motion_record(moment.found)
             if moment.number % every == 0 and len(cards) < _PAGE_FRAMES:
                 title = f"left, frame {moment.number}"
                 cards.append(card_of(title, moment.images["left"], moment.frames["left"]))

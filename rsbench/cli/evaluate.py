@@ -46,13 +46,13 @@ def evaluate_dataset(
     from rsbench.cli.console import print_table, progress_bar
     from rsbench.report.evaluation_page import summary_tables, write_report
     from rsbench.solvers.engine.registry import list_solvers
-    from rsbench.vision.matcher_card import load_matcher
+    from rsbench.vision.stereo_matcher import load_matcher
 
     # rs-stereo is another name of rs-stereo-refined: one row of it is enough.
     everything = [name for name in list_solvers() if name != "rs-stereo"]
     chosen = tuple(dict.fromkeys([*(solvers or everything), correct_with]))
     options = EvaluationOptions(
-        solvers=chosen, correction_solver=correct_with, seed=seed, sgm=load_matcher(matcher)
+        solvers=chosen, correction_solver=correct_with, seed=seed, sgm=load_matcher(matcher).component
     )
     command = command or f"rsbench evaluate {folder} --out {out}"
     with progress_bar(f"evaluating {folder.name}", evaluation_steps(folder, options)) as advance:

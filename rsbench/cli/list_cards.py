@@ -17,10 +17,12 @@ class Kind(StrEnum):
     datasets = "datasets"
     sweeps = "sweeps"
     matchers = "matchers"
+    features = "features"
+    correctors = "correctors"
 
 
 def list_(kind: Annotated[Kind, typer.Argument(help="What to list.")]) -> None:
-    """List scenes, renderers, solvers, datasets, sweeps or matchers, with the files to copy and edit."""
+    """List the cards of a kind, with the files to copy and edit."""
     import pandas as pd
 
     from rsbench.cards import list_cards, read_toml

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -16,6 +17,10 @@ from rsbench.core.so3 import FloatArray
 
 Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
+View = tuple[Side, int]
+"""Side and frame, 0 or 1."""
+FRAMES = (0, 1)
+VIEWS: tuple[View, ...] = tuple(product(SIDES, FRAMES))
 
 
 @dataclass(frozen=True, kw_only=True)

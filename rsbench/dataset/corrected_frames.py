@@ -15,8 +15,8 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.files import write_depth, write_json, write_png
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.frame_motion import FoundMotion
 from rsbench.pipeline.readout import ReadoutEstimate
-from rsbench.pipeline.robust_motion import RobustEstimate
 from rsbench.vision.fusion import Fused, Origin
 
 MASK_VALUES = {
@@ -68,21 +68,25 @@ def write_frame(folder: Path, name: str, fused: Fused) -> None:
     write_depth(folder / "depth" / f"{name}.exr", depth)
 
 
-def motion_record(robust: RobustEstimate, model: str) -> dict[str, Any]:
-    """The motion of one window, ready for JSON."""
-    estimate = robust.estimate
-    covariance = None if estimate.covariance is None else estimate.covariance.tolist()
+def motion_record(found: FoundMotion) -> dict[str, Any]:
+    """The body's motion of one window, metres, ready for JSON."""
+    estimate, motion = found.robust.estimate, found.motion
+    # A covariance holds about the point that the solver solved for.
+    known = estimate.covariance is not None and found.reference_point == "body"
     return {
-        "model": model,
-        "w": estimate.w.tolist(),
-        "d": estimate.d.tolist(),
-        "rotation_deg": float(np.rad2deg(np.linalg.norm(estimate.w))),
-        "translation": float(np.linalg.norm(estimate.d)),
+        "solver": found.solver,
+        "model": motion.name,
+        "reference_point": "body",
+        "w": motion.w.tolist(),
+        "d": motion.d.tolist(),
+        "rotation_deg": float(np.rad2deg(np.linalg.norm(motion.w))),
+        "translation": float(np.linalg.norm(motion.d)),
         "metric": estimate.metric,
         "note": estimate.reason,
         "noise_px": estimate.noise_px,
-        "covariance_w_d": covariance,
-        "inliers": {str(name): int(np.count_nonzero(mask)) for name, mask in robust.inliers.items()},
+        "covariance_w_d": np.asarray(estimate.covariance).tolist() if known else None,
+        "inliers": {str(name): count.inliers for name, count in found.robust.counts.items()},
+        "matches": {str(name): count.matches for name, count in found.robust.counts.items()},
     }
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +17,9 @@ from numpy.typing import NDArray
 
 from rsbench.cards import parse_card, read_toml
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.rig import StereoRig, View
 from rsbench.errors import RsbenchError
 
-View = tuple[Side, int]
-"""Side and frame, 0 or 1."""
-FRAMES = (0, 1)
-VIEWS: tuple[View, ...] = tuple(product(SIDES, FRAMES))
 _SMALLEST = 32
 """Pixels of the shorter side; below that there is nothing to match."""
 _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm"}

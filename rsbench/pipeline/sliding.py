@@ -10,24 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
-from rsbench.pipeline.chain import (
-    CorrectionOptions,
-    FramePair,
-    NoMotionError,
-    complete_depth,
-    correct_frames,
-    frame_pair,
-    match_frames,
-    motion_of,
-    solve_frames,
-)
+from rsbench.pipeline.chain import correct_frames, find_depth
+from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, check_alike
-from rsbench.pipeline.readout import ReadoutEstimate, estimate_readout_ratio
-from rsbench.pipeline.robust_motion import RobustEstimate
+from rsbench.pipeline.frame_depth import Images, Pairs, frame_pair
+from rsbench.pipeline.frame_motion import FoundMotion, NoMotionError, find_readout, match_frames, solve_frames
+from rsbench.pipeline.readout import ReadoutEstimate
 from rsbench.vision.fusion import Fused
 
 _READOUT_WINDOWS = 5
@@ -36,10 +27,12 @@ _READOUT_WINDOWS = 5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Window:
-    """What was found for two consecutive frames; ``robust`` is None and ``reason`` says why when no motion was."""
+    """What was found for two consecutive frames; ``found`` is None and ``reason`` says why when no motion was."""
 
-    pairs: tuple[FramePair, FramePair]
-    robust: RobustEstimate | None
+    images: Images
+    pairs: Pairs | None
+    """With depth from the other camera; None when the corrector needs none."""
+    found: FoundMotion | None
     reason: str = ""
 
 
@@ -51,8 +44,8 @@ class CorrectedMoment:
     images: dict[Side, NDArray[Any]]
     """As they were read."""
     frames: dict[Side, Fused]
-    """Corrected; empty when no motion was found."""
-    robust: RobustEstimate | None
+    """Corrected; empty when a motion was needed and not found."""
+    found: FoundMotion | None
     reason: str
 
 
@@ -62,14 +55,14 @@ def estimate_sequence_readout(
     """Readout ratio of a sequence: the weighted mean of its first windows.
 
     Raises:
-        RsbenchError: as ``rsbench.pipeline.chain.match_frames``.
+        RsbenchError: as ``rsbench.pipeline.frame_motion.match_frames``.
         NoMotionError: no window determines it.
     """
     estimates = []
     for first, second in itertools.islice(itertools.pairwise(_both(left, right)), _READOUT_WINDOWS):
         images = {(side, frame): pair[side] for frame, pair in enumerate((first, second)) for side in SIDES}
         matches = match_frames(images, options)
-        estimate = estimate_readout_ratio(matches, rig, options.solver, options.robust, options.seed)
+        estimate = find_readout(matches, rig, options)
         if estimate is not None and np.isfinite(estimate.sigma):
             estimates.append(estimate)
     if not estimates:
@@ -98,46 +91,57 @@ def correct_sequence(
     last: Window | None = None
     number = -1
     for number, window in enumerate(_windows(left, right, rig, readout_ratio, options)):
-        yield _moment(number, window, last, rig, shutter, options)
+        yield _moment(number, 0, [window] if last is None else [window, last], rig, shutter, options)
         last = window
     if last is not None:
-        yield _moment(number + 1, None, last, rig, shutter, options)
+        yield _moment(number + 1, 1, [last], rig, shutter, options)
 
 
 def _windows(
     left: FrameSource, right: FrameSource, rig: StereoRig, readout_ratio: float, options: CorrectionOptions
 ) -> Iterator[Window]:
-    pairs = (frame_pair(images["left"], images["right"], rig, options) for images in _both(left, right))
-    for first, second in itertools.pairwise(pairs):
-        robust, reason = None, ""
-        images = {(side, frame): pair.images[side] for frame, pair in enumerate((first, second)) for side in SIDES}
-        try:
-            robust, _, _ = solve_frames(match_frames(images, options), rig, readout_ratio, options)
-        except NoMotionError as error:
-            reason = str(error)
-        yield Window(pairs=(first, second), robust=robust, reason=reason)
+    needs = options.corrector.component.spec.needs
+    times = (
+        (images, frame_pair(images["left"], images["right"], rig, options) if "depth" in needs else None)
+        for images in _both(left, right)
+    )
+    for (first, pair_0), (second, pair_1) in itertools.pairwise(times):
+        images = {(side, frame): both[side] for frame, both in enumerate((first, second)) for side in SIDES}
+        pairs = (pair_0, pair_1) if pair_0 is not None and pair_1 is not None else None
+        found, reason = None, ""
+        if "motion" in needs:
+            try:
+                found, _, _ = solve_frames(match_frames(images, options), rig, readout_ratio, options)
+            except NoMotionError as error:
+                reason = str(error)
+        yield Window(images=images, pairs=pairs, found=found, reason=reason)
 
 
 def _moment(
     number: int,
-    window: Window | None,
-    last: Window | None,
+    frame: int,
+    windows: list[Window],
     rig: StereoRig,
     shutter: RollingShutter,
     options: CorrectionOptions,
 ) -> CorrectedMoment:
-    """The first frame of ``window``, or the second of ``last`` when only that knows a motion."""
-    use, frame = (window, 0) if window is not None and window.robust is not None else (last, 1)
-    pair = window.pairs[0] if window is not None else last.pairs[1]  # type: ignore[union-attr]
-    if use is None or use.robust is None:
-        reason = window.reason if window is not None else (last.reason if last is not None else "")
-        return CorrectedMoment(number=number, images=pair.images, frames={}, robust=None, reason=reason)
-    motion: Motion = motion_of(use.robust, options)
-    views = tuple((side, frame) for side in SIDES)
-    pairs = complete_depth(use.pairs, rig, shutter, motion) if options.depth_from_motion else use.pairs
-    fused = correct_frames(pairs, rig, shutter, motion, options, views)
-    frames = {side: fused[side, frame] for side in SIDES}
-    return CorrectedMoment(number=number, images=pair.images, frames=frames, robust=use.robust, reason="")
+    """Frame 0 or 1 of the first window; as frame 1 of the second one when only that knows a motion."""
+    here = windows[0]
+    images = {side: here.images[side, frame] for side in SIDES}
+    places = list(zip(windows, (frame, 1), strict=False))
+    if "motion" in options.corrector.component.spec.needs:
+        places = [(window, place) for window, place in places if window.found is not None]
+    if not places:
+        return CorrectedMoment(number=number, images=images, frames={}, found=None, reason=here.reason)
+    window, place = places[0]
+    motion = None if window.found is None else window.found.motion
+    pairs = window.pairs
+    if pairs is not None:
+        pairs = find_depth(window.images, rig, shutter, motion, options, pairs)
+    views = tuple((side, place) for side in SIDES)
+    fused = correct_frames(window.images, pairs, rig, shutter, motion, options, views)
+    frames = {side: fused[side, place] for side in SIDES}
+    return CorrectedMoment(number=number, images=images, frames=frames, found=window.found, reason="")
 
 
 def _both(left: FrameSource, right: FrameSource) -> Iterator[dict[Side, NDArray[Any]]]:

@@ -9,16 +9,19 @@ Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
+from rsbench.vision.feature_matcher import FeatureMatcher
 from rsbench.vision.images import grey_u8
 from rsbench.vision.nearest import best_two
 
@@ -55,6 +58,17 @@ class MatchOptions:
             value = getattr(self, name)
             if value is not None and not value > 0.0:
                 raise ValueError(f"{name} must be positive, got {value}")
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class SiftMatcher(MatchOptions, FeatureMatcher):
+    """SIFT features, matched by ``match_stereo_frames``."""
+
+    def match(self, images: Mapping[View, NDArray[np.uint8]]) -> Correspondences:
+        return match_stereo_frames(
+            images["left", 0], images["right", 0], images["left", 1], images["right", 1], self
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

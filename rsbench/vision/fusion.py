@@ -60,13 +60,17 @@ class Fused:
     """A corrected frame with its holes filled as far as anything is known."""
 
     image: NDArray[Any]
-    """(H, W) or (H, W, C), type of the sources; 0 where the origin is NOBODY."""
+    """(H, W) or (H, W, C), type of the sources; 0 where the origin is NOBODY, unless invented."""
     origin: NDArray[np.uint8]
     """(H, W) of ``Origin``."""
     depth: NDArray[np.float32]
-    """(H, W) z in the target camera, metres; inf at infinity, NaN where the origin is NOBODY."""
-    corrected: Corrected
-    """The frame itself, before filling."""
+    """(H, W) z in the target camera, metres; inf at infinity, NaN where it is unknown or the origin is NOBODY."""
+
+    @classmethod
+    def seen(cls, image: NDArray[Any], mask: Mask) -> Fused:
+        """A corrected frame (H, W[, C]) drawn from the frame itself where ``mask`` (H, W) is True; no depth."""
+        origin = np.where(mask, np.uint8(Origin.HERE), np.uint8(Origin.NOBODY))
+        return cls(image=image, origin=origin, depth=np.full(mask.shape, np.nan, dtype=np.float32))
 
     def shares(self) -> dict[str, float]:
         """Share of the pixels of each origin, by its name in lower case."""
@@ -107,7 +111,7 @@ def fuse(
             take = candidate.mask & holes & ((origin == Origin.NOBODY) | nearer)
             image[take], depth[take] = candidate.image[take], candidate.depth[take]
             origin[take] = view.origin
-    return Fused(image=image, origin=origin, depth=depth, corrected=corrected)
+    return Fused(image=image, origin=origin, depth=depth)
 
 
 def _warp_into(

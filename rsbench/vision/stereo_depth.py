@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, final
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.vision.disparity_refinement import refine_disparity
 from rsbench.vision.images import grey_u8
+from rsbench.vision.stereo_matcher import StereoMatcher
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
@@ -82,6 +83,15 @@ class SgmOptions:
             raise ValueError(f"p1 and p2 must satisfy 0 < p1 <= p2, got {self.p1} and {self.p2}")
         if self.refine_iterations < 0:
             raise ValueError(f"refine_iterations must be at least 0, got {self.refine_iterations}")
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class SgmMatcher(SgmOptions, StereoMatcher):
+    """Semi-global matching by ``stereo_disparities``."""
+
+    def disparities(self, left: NDArray[Any], right: NDArray[Any], rig: StereoRig) -> tuple[F32, F32]:
+        return stereo_disparities(left, right, rig, self)
 
 
 def stereo_disparity(

@@ -128,7 +128,7 @@ def test_bad_calls_are_refused_and_leave_nothing(tmp_path: Path, frames: list[Pa
     assert_refused(rsbench(*[flat] * 4, *common), "no texture")
     assert_refused(rsbench(*frames, *common, "--target", "500"), "--target 500", "95")
     assert_refused(rsbench(*frames, "--out", out), "--rig")
-    assert_refused(rsbench(*frames, *common, "--solver", "gs-8pt"), "gs-8pt", "RefinedSolver")
+    assert_refused(rsbench(*frames, *common, "--solver", "nobody"), "nobody", "does not exist")
     assert_refused(rsbench(*frames, "--rig", tmp_path / "no.toml", "--out", out), "no.toml")
     assert {path.name for path in tmp_path.iterdir()} == {"rig.toml", "small.png", "flat.png"}
 

@@ -52,7 +52,7 @@ def run_evaluation(dataset: Path, out: Path, options: EvaluationOptions, command
         write_bytes(out / "scores" / f"{table}.csv", text.encode())
     record = provenance(
         command, **dataset_record(dataset), seed=options.seed, solvers=list(options.solvers),
-        correction_solver=options.correction_solver, matcher=asdict(options.sgm),
+        correction_solver=options.correction_solver, matcher=asdict(options.sgm),  # type: ignore[call-overload]
     )  # fmt: skip
     write_json(out / "provenance.json", record)
 

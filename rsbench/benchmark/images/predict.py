@@ -28,7 +28,8 @@ from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.registry import load_solver_entry
 from rsbench.vision.correction import correct_frame
 from rsbench.vision.features import MatchOptions, match_stereo_frames
-from rsbench.vision.stereo_depth import SgmOptions, stereo_disparities
+from rsbench.vision.stereo_depth import SgmMatcher
+from rsbench.vision.stereo_matcher import StereoMatcher
 
 Step = Callable[[str], None]
 VIEWS: tuple[tuple[Side, int], ...] = tuple(product(SIDES, FRAMES))
@@ -45,7 +46,7 @@ class EvaluationOptions:
     seed: int = 0
     matching: MatchOptions = field(default_factory=MatchOptions)
     robust: RobustOptions = field(default_factory=RobustOptions)
-    sgm: SgmOptions = field(default_factory=SgmOptions)
+    sgm: StereoMatcher = field(default_factory=SgmMatcher)
 
     def steps(self) -> int:
         """Progress steps of one sequence: matching, solvers, and depth and correction of each view."""
@@ -80,7 +81,7 @@ def predict_sequence(sequence: Sequence, options: EvaluationOptions, folder: Pat
     depth_s = 0.0
     for frame in FRAMES:
         started = time.perf_counter()
-        both = stereo_disparities(images["left", frame], images["right", frame], sequence.rig, options.sgm)
+        both = options.sgm.disparities(images["left", frame], images["right", frame], sequence.rig)
         depth_s += time.perf_counter() - started
         for side, disparity in zip(SIDES, both, strict=True):
             disparities[f"{side}_{frame}"] = disparity

@@ -1,40 +1,38 @@
 """The correction study: every way to correct a frame, on the same frames, matches and pixels.
 
-A method is a depth and a motion. Those that know a scene fill what a frame did not see from the other frames; what
-remains is invented (inpainted), so that every method gives a whole picture, which 'all' scores. 'Covered' scores
-the pixels that every method of a view draws from the frame itself: nothing there is filled or invented.
+A method is a depth, a motion and a corrector of the chain that users have. Those that know a scene fill what a
+frame did not see from the other frames; what remains is invented (inpainted), so that every method gives a whole
+picture, which 'all' scores. 'Covered' scores the pixels that every method of a view draws from the frame itself:
+nothing there is filled or invented. A method that finds no motion leaves the frames as they are, and is scored and
+counted as that.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
-from rsbench.core.metrics import rotation_error, translation_error
-from rsbench.core.motion import LinearMotion, Motion
-from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.motion import Motion
+from rsbench.core.rig import SIDES, VIEWS, View
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.pipeline.chain import (
-    CorrectionOptions,
-    FramePair,
-    complete_depth,
-    correct_frames,
-    frame_pairs,
-    match_frames,
-)
-from rsbench.pipeline.footage import VIEWS, View
+from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import Pairs, frame_pairs, known_depth
+from rsbench.pipeline.frame_motion import FoundMotion, NoMotionError, find_matches, find_motion
 from rsbench.pipeline.readout import select
-from rsbench.pipeline.robust_motion import RobustEstimate, estimate_motion
 from rsbench.pipeline.simpler_motions import global_shutter_motion, monocular_motion
-from rsbench.vision.correction import correct_frame, correction_flow
+from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.vision.correction import correction_flow
+from rsbench.vision.corrector import load_corrector
 from rsbench.vision.flow import dense_flow
-from rsbench.vision.fusion import Origin, inpaint
+from rsbench.vision.fusion import Fused, Origin
 from rsbench.vision.legacy_quality import flip, ssim_deepunroll, ssim_uniform
 from rsbench.vision.quality import psnr, ssim
 from rsbench.vision.simpler_depths import monocular_depth, plane_depth
@@ -100,6 +98,8 @@ class Attempt:
     """(H, W) pixels drawn from the frame itself at a depth that was not guessed."""
     flow: NDArray[np.float32]
     """(H, W, 2) where it moves the pixels of the rolling-shutter frame, px; NaN where it does not know."""
+    success: bool = True
+    """Whether the method found what it needs; the frame is as it was otherwise."""
 
 
 def study_steps(dataset: Path) -> int:
@@ -108,18 +108,20 @@ def study_steps(dataset: Path) -> int:
 
 
 def study_dataset(
-    dataset: Path, step: Callable[[str], None], seed: int = 0
+    dataset: Path, step: Callable[[str], None], seed: int = 0, solver: str = "rs-stereo-refined"
 ) -> tuple[list[Row], list[Row], list[Row]]:
     """Scores of every method on every view, errors by row band, and the motion errors, of all sequences.
 
+    ``solver`` names the solver of "our" motion, whose model the corrections take.
+
     Raises:
-        RsbenchError: the dataset cannot be read.
+        RsbenchError: the dataset cannot be read, or there is no such solver.
     """
     images: list[Row] = []
     bands: list[Row] = []
     motions: list[Row] = []
     for sequence in read_dataset(dataset):
-        bench = Bench(sequence, seed)
+        bench = Bench(sequence, seed, solver)
         motions.append({"sequence": sequence.name, **bench.motion_errors()})
         step(sequence.name)
         attempts = {}
@@ -127,7 +129,7 @@ def study_dataset(
             attempts[method.key] = bench.attempt(method.key)
             step(sequence.name)
         for view in VIEWS:
-            found = {key: attempt[view] for key, attempt in attempts.items() if attempt is not None}
+            found = {key: attempt[view] for key, attempt in attempts.items()}
             identity = {"sequence": sequence.name, "side": view[0], "frame": view[1]}
             images += [identity | row for row in _image_rows(sequence, view, found)]
             bands += [identity | row for row in _band_rows(found)]
@@ -137,103 +139,122 @@ def study_dataset(
 class Bench:
     """Everything the methods share on one sequence."""
 
-    def __init__(self, sequence: Sequence, seed: int) -> None:
+    def __init__(self, sequence: Sequence, seed: int, solver: str = "rs-stereo-refined") -> None:
         self.sequence = sequence
-        self.options = CorrectionOptions(inpaint=True)
+        self.options = CorrectionOptions(inpaint=True, solver=load_solver_entry(solver))
         self.images = {view: sequence.image("rs", *view) for view in VIEWS}
         self.rig, self.shutter = sequence.rig, sequence.shutter
-        self.matches = match_frames(self.images, self.options)
-        self.robust = self._robust(generator(seed, "study", sequence.name))
-        self.motion = LinearMotion(self.robust.estimate.w, self.robust.estimate.d)
+        self.matches = find_matches(self.images, self.options)
+        self.found = self._found(generator(seed, "study", sequence.name))
         rng = generator(seed, "study", sequence.name, "gs")
         self.gs_motion = global_shutter_motion(self.matches, self.rig, self.options.robust, rng)
         self.sgm = frame_pairs(self.images, self.rig, self.options)
-        self.true = (self._true_pair(0), self._true_pair(1))
+        true = {view: sequence.depth("rs", *view) for view in VIEWS}
+        self.true = known_depth(
+            self.images, {view: np.where(z > 0, z, np.float32(np.inf)) for view, z in true.items()}
+        )
 
-    def _robust(self, rng: np.random.Generator) -> RobustEstimate:
-        options = self.options
-        result = estimate_motion(self.matches, self.rig, self.shutter, options.solver, options.robust, rng)
-        if not result.estimate.success:
-            raise RuntimeError(f"{self.sequence.name}: no motion: {result.estimate.reason}")
-        return result
+    def _found(self, rng: np.random.Generator) -> FoundMotion | None:
+        try:
+            return find_motion(self.matches, self.rig, self.shutter, self.options, rng)
+        except NoMotionError:
+            return None
 
-    def _true_pair(self, frame: int) -> FramePair:
-        depth = {}
-        for side in SIDES:
-            z = self.sequence.depth("rs", side, frame)
-            depth[side] = np.where(z > 0, z, np.float32(np.inf))
-        nothing = np.zeros((self.rig.camera.height, self.rig.camera.width), dtype=np.float32)
-        images = {side: self.images[side, frame] for side in SIDES}
-        return FramePair(images=images, depth=depth, guess=dict.fromkeys(SIDES, nothing))
+    @property
+    def motion(self) -> Motion | None:
+        """Ours, of the model that the solver assumes; None when there is none."""
+        return None if self.found is None else self.found.motion
 
     def motion_errors(self) -> Row:
-        """e_R and e_T, degrees, of our motion and of the global-shutter one; NaN for a failure."""
-        true = self.sequence.motion
+        """e_R and e_T, degrees, of our motion and of the global-shutter one; a failure scores the worst."""
+        true, nothing = self.sequence.motion, np.full(3, np.nan)
         row: Row = {}
         for name, motion in (("ours", self.motion), ("gs", self.gs_motion)):
-            e_R, e_T = np.full(2, np.nan)
-            if motion is not None:
-                e_R, e_T = rotation_error(motion.w, true.w), translation_error(motion.d, true.d)
-            row[f"e_R_deg_{name}"] = float(np.rad2deg(e_R))
-            row[f"e_T_deg_{name}"] = float(np.rad2deg(e_T))
+            w, d = (nothing, nothing) if motion is None else (motion.w, motion.d)
+            errors = pose_errors(w, d, true_w=true.w, true_d=true.d, rig=self.rig)
+            row |= {f"{error}_{name}": float(errors[error]) for error in ("e_R_deg", "e_T_deg")}
         return row
 
-    def attempt(self, key: str) -> dict[View, Attempt] | None:
-        """What one method makes of the four views; None when it found no motion."""
+    def attempt(self, key: str) -> dict[View, Attempt]:
+        """What one method makes of the four views."""
         true = self.sequence.motion
         if key == "none":
-            return {view: self._uncorrected(view) for view in VIEWS}
-        if key in ("gyro", "rotation"):
-            w = true.w if key == "gyro" else self.motion.w
-            far = np.full((self.rig.camera.height, self.rig.camera.width), np.inf, dtype=np.float32)
-            turning = LinearMotion(w, np.zeros(3))
-            return {view: self._alone(view, far, self.rig.about(view[0]), turning) for view in VIEWS}
-        if key == "plane":
-            planes = {(s, f): plane_depth(self.sgm[f].depth[s]) for s, f in VIEWS}
-            return {view: self._alone(view, planes[view], self.rig, self.motion) for view in VIEWS}
+            return self._nothing(success=True)
         if key == "mono":
             return self._mono()
+        motion = {"gs": self.gs_motion, "gyro": true, "true-motion": true, "truth": true}.get(key, self.motion)
+        if motion is None:
+            return self._nothing(success=False)
         pairs = self.true if key in ("true-depth", "truth") else self.sgm
-        motion = {"gs": self.gs_motion, "true-motion": true, "truth": true}.get(key, self.motion)
-        return None if motion is None else self._whole(pairs, motion)
+        frames, pairs = self.corrected(pairs, motion, _CORRECTORS.get(key, "fusion"))
+        out = {}
+        for (side, frame), fused in frames.items():
+            depth = _DEPTHS.get(key, _as_it_is)(pairs[frame].depth[side])
+            flow = correction_flow(depth, self.rig, self.shutter, motion, side, frame)
+            out[side, frame] = _attempt(fused, flow)
+        return out
 
-    def _uncorrected(self, view: View) -> Attempt:
-        image = self.images[view]
-        size = image.shape[:2]
-        flow = np.zeros((*size, 2), dtype=np.float32)
-        return Attempt(image=image, covered=np.ones(size, dtype=np.bool_), flow=flow)
+    def corrected(
+        self, pairs: Pairs, motion: Motion, corrector: str = "fusion", views: tuple[View, ...] = VIEWS
+    ) -> tuple[dict[View, Fused], Pairs]:
+        """Frames by the chain from a depth and a motion, and the depth that the corrector was given."""
+        # Simpler corrections know one camera's frame, and no depth from two of them.
+        options = replace(
+            self.options, corrector=load_corrector(corrector), depth_from_motion=corrector == "fusion"
+        )
+        given = Given(matches=self.matches, motion=motion, pairs=pairs)
+        ratio = self.shutter.readout_ratio
+        result = correct_four(self.images, self.rig, ratio, options, given=given, views=views)
+        return result.frames, result.pairs or pairs
 
-    def _alone(self, view: View, depth: Depth, rig: StereoRig, motion: Motion) -> Attempt:
-        """A correction that knows one frame only."""
-        geometry = rig, self.shutter, motion
-        corrected = correct_frame(self.images[view], depth, *geometry, *view)
-        flow = correction_flow(depth, *geometry, *view)
-        return Attempt(image=inpaint(corrected.image, ~corrected.mask), covered=corrected.mask, flow=flow)
+    def _nothing(self, success: bool) -> dict[View, Attempt]:
+        flow = np.zeros((self.rig.camera.height, self.rig.camera.width, 2), dtype=np.float32)
+        return {view: _attempt(fused, flow, success) for view, fused in uncorrected(self.images).items()}
 
-    def _mono(self) -> dict[View, Attempt] | None:
-        inliers = select(self.matches, self.robust)
-        out: dict[View, Attempt] = {}
-        for side, frame in VIEWS:
-            motion = monocular_motion(inliers, self.rig, self.shutter, side, self.motion)
+    def _mono(self) -> dict[View, Attempt]:
+        """Each camera by itself: its motion from its own matches, depth from its own flow in the same unit."""
+        if self.found is None:
+            return self._nothing(success=False)
+        inliers = select(self.matches, self.found.robust)
+        motions: dict[str, Motion] = {}
+        for side in SIDES:
+            motion = monocular_motion(inliers, self.rig, self.shutter, side, self.found.motion)
             if motion is None:
-                return None
+                return self._nothing(success=False)
+            motions[side] = motion
+        depth = {}
+        for side, frame in VIEWS:
             flow = dense_flow(self.images[side, frame], self.images[side, 1 - frame])
             rig = self.rig.about(side)
-            depth = monocular_depth(flow, rig, self.shutter, motion, side, frame)
-            out[side, frame] = self._alone((side, frame), depth, rig, motion)
+            depth[side, frame] = monocular_depth(flow, rig, self.shutter, motions[side], side, frame)
+        options = replace(self.options, corrector=load_corrector("single-view"))
+        out: dict[View, Attempt] = {}
+        for view in VIEWS:
+            geometry = self.rig.about(view[0]), self.shutter, motions[view[0]]
+            frames = correct_frames(self.images, known_depth(self.images, depth), *geometry, options, (view,))
+            out[view] = _attempt(frames[view], correction_flow(depth[view], *geometry, *view))
         return out
 
-    def _whole(self, pairs: tuple[FramePair, FramePair], motion: Motion) -> dict[View, Attempt]:
-        """Depth and motion of the whole rig: holes are filled from the other frames."""
-        pairs = complete_depth(pairs, self.rig, self.shutter, motion)
-        fused = correct_frames(pairs, self.rig, self.shutter, motion, self.options)
-        out = {}
-        for (side, frame), result in fused.items():
-            depth = pairs[frame].depth[side]
-            flow = correction_flow(depth, self.rig, self.shutter, motion, side, frame)
-            covered = result.origin == Origin.HERE
-            out[side, frame] = Attempt(image=result.image, covered=covered, flow=flow)
-        return out
+
+def _infinitely_far(depth: Depth) -> Depth:
+    return np.full_like(depth, np.inf)
+
+
+def _as_it_is(depth: Depth) -> Depth:
+    return depth
+
+
+_CORRECTORS = {"gyro": "rotation-only", "rotation": "rotation-only", "plane": "one-plane"}
+_DEPTHS: dict[str, Callable[[Depth], Depth]] = {
+    "gyro": _infinitely_far,
+    "rotation": _infinitely_far,
+    "plane": plane_depth,
+}
+"""The depth with which a method's corrector moves pixels, from the depth that it is given."""
+
+
+def _attempt(fused: Fused, flow: NDArray[np.float32], success: bool = True) -> Attempt:
+    return Attempt(image=fused.image, covered=fused.origin == Origin.HERE, flow=flow, success=success)
 
 
 def _image_rows(sequence: Sequence, view: View, attempts: dict[str, Attempt]) -> list[Row]:
@@ -246,6 +267,7 @@ def _image_rows(sequence: Sequence, view: View, attempts: dict[str, Attempt]) ->
         rows.append(
             {
                 "method": key,
+                "success": attempt.success,
                 "psnr_covered": psnr(attempt.image, truth, common),
                 "ssim_covered": ssim(attempt.image, truth, common),
                 "psnr_all": psnr(attempt.image, truth),

@@ -39,16 +39,17 @@ def numbers_table(numbers: dict[tuple[str, str], dict[str, Any]]) -> pd.DataFram
 
 
 def by_sequence(images: pd.DataFrame) -> pd.DataFrame:
-    """Mean of the views: one row per stratum, sequence and method."""
+    """Mean of the views: one row per stratum, sequence and method; ``success`` is the share of views."""
     keys = ["stratum", "sequence", "method"]
-    return images[[*keys, *SCORES, "common"]].groupby(keys, as_index=False, sort=False).mean()
+    return images[[*keys, *SCORES, "common", "success"]].groupby(keys, as_index=False, sort=False).mean()
 
 
 def summarise(images: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
     """One row per stratum and method: median over sequences of each score with its 95 % interval.
 
     ``gain`` is the paired difference of the covered PSNR, ours minus the method, and ``gain_all`` that of all
-    pixels. ``images`` has the rows of ``study_dataset`` and a column ``stratum``.
+    pixels. ``failures`` counts the sequences of which a method left frames as they were; they are scored so.
+    ``images`` has the rows of ``study_dataset`` and a column ``stratum``.
     """
     table = by_sequence(images)
     rows = []
@@ -57,7 +58,7 @@ def summarise(images: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
         for method in METHODS:
             own = group[group["method"] == method.key].set_index("sequence")
             row: dict[str, Any] = {"stratum": stratum, "method": method.key, "kind": method.kind}
-            row |= {"sequences": len(own), "failures": len(ours) - len(own)}
+            row |= {"sequences": len(own), "failures": int(np.count_nonzero(own["success"] < 1.0))}
             for score in SCORES:
                 row |= _interval(score, own[score].to_numpy(), seed)
             for name, score in (("gain", "psnr_covered"), ("gain_all", "psnr_all")):

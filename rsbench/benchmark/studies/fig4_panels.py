@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.benchmark.studies.correction_study import Bench
-from rsbench.core.metrics import rotation_error, translation_error
 from rsbench.core.rig import Side
 from rsbench.dataset.files import load_arrays, read_json, save_arrays, write_json
 from rsbench.dataset.sequence import Sequence
-from rsbench.pipeline.chain import complete_depth, correct_frames
+from rsbench.pipeline.chain import uncorrected
 from rsbench.vision.correction import correct_frame
 from rsbench.vision.fusion import Origin
 from rsbench.vision.quality import psnr
@@ -43,13 +42,14 @@ class Panels:
 def make_panels(sequence: Sequence, seed: int = 0) -> Panels:
     """Match, solve, find depth and correct with the estimates; compare with the truth.
 
-    Raises:
-        RuntimeError: no motion was found.
+    Where no motion is found, the corrected frame is the one given, and the errors of the motion are the worst.
     """
     bench = Bench(sequence, seed)
     view = SIDE, FRAME
-    pairs = complete_depth(bench.sgm, bench.rig, bench.shutter, bench.motion)
-    fused = correct_frames(pairs, bench.rig, bench.shutter, bench.motion, bench.options, (view,))[view]
+    frames = uncorrected(bench.images, (view,))
+    if bench.motion is not None:
+        frames, _ = bench.corrected(bench.sgm, bench.motion, views=(view,))
+    fused = frames[view]
     rolling, truth = bench.images[view], sequence.image("gs", *view)
     true_depth = sequence.depth("rs", *view)
     depth = np.where(np.isfinite(bench.sgm[FRAME].depth[SIDE]), bench.sgm[FRAME].depth[SIDE], np.float32(0.0))
@@ -59,13 +59,12 @@ def make_panels(sequence: Sequence, seed: int = 0) -> Panels:
     oracle = correct_frame(
         rolling, bench.true[FRAME].depth[SIDE], bench.rig, bench.shutter, sequence.motion, *view
     )
-    true = sequence.motion
+    true, errors = sequence.motion, bench.motion_errors()
     numbers = {
         "rotation_deg": float(np.rad2deg(np.linalg.norm(true.w))),
         "translation": float(np.linalg.norm(true.d)),
         "readout_ratio": sequence.shutter.readout_ratio,
-        "e_R_deg": float(np.rad2deg(rotation_error(bench.motion.w, true.w))),
-        "e_T_deg": float(np.rad2deg(translation_error(bench.motion.d, true.d))),
+        **{name: errors[f"{name}_ours"] for name in ("e_R_deg", "e_T_deg")},
         "psnr_rolling": psnr(rolling, truth, here),
         "psnr_corrected": psnr(fused.image, truth, here),
         "psnr_oracle": psnr(oracle.image, truth, here & oracle.mask),

@@ -17,7 +17,9 @@ from rsbench.benchmark.studies.correction_summary import (
     summarise_bands,
     verdict,
 )
+from rsbench.pipeline.robust_motion import RobustEstimate
 from rsbench.report.correction_page import study_page, write_study
+from rsbench.solvers.engine.base import MotionEstimate
 
 Tables = tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]
 
@@ -92,7 +94,7 @@ def _synthetic(ours: list[float], other: list[float]) -> pd.DataFrame:
     for k, values in enumerate(zip(ours, other, strict=True)):
         for method in METHODS:
             row = {"stratum": "s", "sequence": f"q{k}", "side": "left", "frame": 0, "method": method.key}
-            row |= dict.fromkeys(SCORES, 1.0) | {"common": 1.0}
+            row |= dict.fromkeys(SCORES, 1.0) | {"common": 1.0, "success": True}
             row["psnr_covered"] = row["psnr_all"] = values[0] if method.kind in ("ours", "oracle") else values[1]
             rows.append(row)
     return pd.DataFrame(rows)
@@ -120,11 +122,30 @@ def test_the_loss_to_the_true_motion_is_paired_by_view() -> None:
     np.testing.assert_allclose([loss["median_loss_db"], loss["largest_loss_db"]], [0.2, 0.3])
 
 
-def test_a_failed_method_is_counted(tables: Tables) -> None:
-    images = tables[0]
-    kept = images[~((images["method"] == "mono") & (images["sequence"] == "castle"))]
-    summary = summarise(kept).set_index("method")
-    assert summary.loc["mono", "failures"] == 1 and summary.loc["ours", "failures"] == 0
+def test_a_failed_method_is_scored_as_the_frames_as_they_are_and_counted(
+    smoke_dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No motion at all: what knows none is unharmed, the rest leaves the frames alone, and the study goes on."""
+    failed = MotionEstimate.failed("nothing moves")
+
+    def nothing(*_: object) -> RobustEstimate:
+        return RobustEstimate(estimate=failed, iterations=0, seconds=0.0, threshold_px=1.0)
+
+    for module in ("frame_motion", "simpler_motions"):
+        monkeypatch.setattr(f"rsbench.pipeline.{module}.estimate_motion", nothing)
+    rows, _, motions = study_dataset(smoke_dataset, lambda word: None)
+    images = pd.DataFrame(rows)
+    images.insert(0, "stratum", "small")
+    unharmed = {"none", "gyro", "true-motion", "truth"}
+    assert set(images[images["success"]]["method"]) == unharmed
+    scores = images.drop(columns=["method", "success"]).groupby(images["method"], sort=False)
+    none = scores.get_group("none").reset_index(drop=True)
+    for method in {each.key for each in METHODS} - unharmed:
+        pd.testing.assert_frame_equal(scores.get_group(method).reset_index(drop=True), none)
+    summary = summarise(images).set_index("method")
+    assert summary.loc["ours", "failures"] == 2 and summary.loc["truth", "failures"] == 0
+    for row in motions:
+        assert [row[f"{name}_{of}"] for name in ("e_R_deg", "e_T_deg") for of in ("ours", "gs")] == [180.0] * 4
 
 
 def test_the_page_and_the_figure_come_from_the_stored_tables(tables: Tables, tmp_path: Path) -> None:

@@ -1,0 +1,42 @@
+"""What decides the correction of four frames, apart from the frames and the rig."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field, fields
+
+from rsbench.pipeline.robust_motion import RobustOptions
+from rsbench.plugins import Entry
+from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.vision.corrector import CorrectorEntry, load_corrector
+from rsbench.vision.feature_matcher import FeatureEntry, load_features
+from rsbench.vision.stereo_matcher import MatcherEntry, load_matcher
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectionOptions:
+    """The four components of the chain, each of which may be anybody's, and what happens between them."""
+
+    features: FeatureEntry = field(default_factory=lambda: load_features("sift"))
+    """Finds the matches that the motion is solved from."""
+    solver: SolverEntry = field(default_factory=lambda: load_solver_entry("rs-stereo-refined"))
+    """Any solver that gives the length of d."""
+    matcher: MatcherEntry = field(default_factory=lambda: load_matcher("sgm"))
+    """Finds depth."""
+    corrector: CorrectorEntry = field(default_factory=lambda: load_corrector("fusion"))
+    robust: RobustOptions = field(default_factory=RobustOptions)
+    target_row: float = 0.0
+    """The time of this row of the frame is the time of its corrected image."""
+    depth_from_motion: bool = True
+    """Where the other camera gives no depth, take it from the flow to the other frame and the motion."""
+    find_sky: bool = True
+    inpaint: bool = False
+    """Invent what nobody saw; it stays marked."""
+    seed: int = 0
+
+    @property
+    def key(self) -> str:
+        """Hash of all that decides a result: options of equal keys give equal frames."""
+        values = {name: getattr(self, name) for name in sorted(option.name for option in fields(self))}
+        parts = [f"{name}={value.key if isinstance(value, Entry) else value!r}" for name, value in values.items()]
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()

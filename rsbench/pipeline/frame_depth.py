@@ -1,0 +1,132 @@
+"""Depth of the frames of a rig: from the other camera, sky, from the motion, and guesses for the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.motion import Motion
+from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig, View
+from rsbench.core.shutter import RollingShutter
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.vision.flow import depth_from_motion
+from rsbench.vision.sky import sky_mask
+from rsbench.vision.stereo_depth import fill_holes
+from rsbench.vision.stereo_matcher import find_disparities
+
+Images = Mapping[View, NDArray[Any]]
+_BRIGHT = 99.9
+"""Percentile of a 16-bit image that becomes white for matching."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FramePair:
+    """One time of the rig: both images with their depth."""
+
+    images: dict[Side, NDArray[Any]]
+    depth: dict[Side, NDArray[np.float32]]
+    """(H, W) metres in each row's own camera; inf in the sky and at no disparity, 0 unknown."""
+    guess: dict[Side, NDArray[np.float32]]
+    """(H, W) the same where ``depth`` is unknown, from the neighbours; 0 elsewhere."""
+
+
+Pairs = tuple[FramePair, FramePair]
+"""Frame 0 and frame 1."""
+
+
+def frame_pair(left: NDArray[Any], right: NDArray[Any], rig: StereoRig, options: CorrectionOptions) -> FramePair:
+    """Depth of both images (H, W[, 3]), uint8 or uint16, of one time.
+
+    Raises:
+        RsbenchError: another package's matcher failed, see ``find_disparities``.
+    """
+    levels = eight_bit([left, right])
+    both = find_disparities(options.matcher, levels[0], levels[1], rig)
+    return depth_of_pair(left, right, both, rig, find_sky=options.find_sky)
+
+
+def depth_of_pair(
+    left: NDArray[Any],
+    right: NDArray[Any],
+    both: Sequence[NDArray[np.float32]],
+    rig: StereoRig,
+    *,
+    find_sky: bool,
+) -> FramePair:
+    """Depth from the disparities (H, W), NaN where unknown, of both images (H, W[, 3]) of one time.
+
+    ``find_sky``: put at infinity what looks like the sky.
+    """
+    images = dict(zip(SIDES, (left, right), strict=True))
+    levels = dict(zip(SIDES, eight_bit([left, right]), strict=True))
+    disparities = dict(zip(SIDES, both, strict=True))
+    depth, guess = {}, {}
+    for side in SIDES:
+        sky = sky_mask(levels[side], disparities[side]) if find_sky else np.zeros(left.shape[:2], np.bool_)
+        disparity = np.where(sky, np.float32(0.0), disparities[side])
+        depth[side] = _depth(disparity, rig)
+        filled = fill_holes(disparity)
+        guess[side] = np.where(np.isnan(disparity), _depth(filled, rig), np.float32(0.0))
+    return FramePair(images=images, depth=depth, guess=guess)
+
+
+def frame_pairs(images: Images, rig: StereoRig, options: CorrectionOptions) -> Pairs:
+    """``frame_pair`` of frame 0 and of frame 1, side by side: the matcher itself keeps one core busy."""
+    with ThreadPoolExecutor(len(FRAMES)) as pool:
+        first, second = pool.map(
+            lambda frame: frame_pair(images["left", frame], images["right", frame], rig, options), FRAMES
+        )
+    return first, second
+
+
+def known_depth(images: Images, depth: Mapping[View, NDArray[np.float32]]) -> Pairs:
+    """Frames with a given depth (H, W) of every view: metres, inf at infinity, 0 unknown; no guesses."""
+    first, second = (
+        FramePair(
+            images={side: images[side, frame] for side in SIDES},
+            depth={side: depth[side, frame] for side in SIDES},
+            guess={side: np.zeros_like(depth[side, frame]) for side in SIDES},
+        )
+        for frame in FRAMES
+    )
+    return first, second
+
+
+def complete_depth(pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion: Motion) -> Pairs:
+    """The same frames with depth from the motion where the other camera gave none."""
+
+    def side_depths(side: Side) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        first, second = eight_bit([pair.images[side] for pair in pairs])
+        unknown = pairs[0].depth[side] == 0.0, pairs[1].depth[side] == 0.0
+        return depth_from_motion((first, second), unknown, rig, shutter, motion, side)
+
+    with ThreadPoolExecutor(len(SIDES)) as pool:
+        found = dict(zip(SIDES, pool.map(side_depths, SIDES), strict=True))
+    first, second = (_completed(pair, {side: found[side][k] for side in SIDES}) for k, pair in enumerate(pairs))
+    return first, second
+
+
+def _completed(pair: FramePair, found: dict[Side, NDArray[np.float32]]) -> FramePair:
+    depth = {side: np.where(found[side] > 0.0, found[side], pair.depth[side]) for side in SIDES}
+    guess = {side: np.where(found[side] > 0.0, np.float32(0.0), pair.guess[side]) for side in SIDES}
+    return FramePair(images=pair.images, depth=depth, guess=guess)
+
+
+def _depth(disparity: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:
+    """Metres (H, W): inf where there is no disparity, 0 where it is unknown."""
+    depth = np.where(np.isnan(disparity), 0.0, rig.depth(disparity))
+    return np.nan_to_num(depth, nan=np.inf, posinf=np.inf).astype(np.float32)
+
+
+def eight_bit(images: list[NDArray[Any]]) -> list[NDArray[np.uint8]]:
+    """Images for matching; 16-bit ones are brought to 8 bits by one factor, for they may use few of their bits."""
+    if images[0].dtype == np.uint8:
+        return images
+    top = max(float(np.percentile(image, _BRIGHT)) for image in images)
+    scale = np.float32(255.0 / max(top, 1.0))
+    return [np.clip(image * scale + np.float32(0.5), 0.0, 255.0).astype(np.uint8) for image in images]

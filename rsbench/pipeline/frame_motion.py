@@ -1,0 +1,207 @@
+"""Matches, motion and shutter of four frames: found, or refused with the reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsbench import plugins
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.motion import Motion
+from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.body_motion import body_motion
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import Images, eight_bit
+from rsbench.pipeline.readout import ReadoutEstimate, estimate_readout_ratio, reversed_in_time, runs_backwards
+from rsbench.pipeline.robust_motion import RobustEstimate, estimate_motion
+from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.engine.registry import SOLVERS, SolverEntry
+from rsbench.solvers.refined import RefinedSolver
+from rsbench.vision.feature_matcher import find_correspondences
+
+_FEW_STEREO = 0.1
+"""Left-right matches per temporal match below which the images may be swapped or not rectified."""
+_FEWEST_MATCHES = 12
+_MAX_READOUT_SIGMA = 0.25
+
+
+class NoMotionError(Exception):
+    """The frames are in order, but no motion explains their matches; the message says why."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FoundMotion:
+    """The motion of the rig's body, and the solver's answer that it comes from."""
+
+    motion: Motion
+    """Of the model that the solver assumes, metres."""
+    robust: RobustEstimate
+    """As the solver gave it: about its own reference point."""
+    solver: str
+    """Name of the solver's entry."""
+    reference_point: str
+    """The point whose translation ``robust.estimate.d`` is."""
+
+
+def find_matches(images: Images, options: CorrectionOptions, sides: tuple[Side, Side] = SIDES) -> Correspondences:
+    """Correspondences of the four frames, whatever they are; ``sides`` says which images are taken for the left's.
+
+    Raises:
+        RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
+    """
+    order = [(side, frame) for frame in (0, 1) for side in sides]
+    levels = eight_bit([images[view] for view in order])
+    names = [(side, frame) for frame in (0, 1) for side in SIDES]
+    return find_correspondences(options.features, dict(zip(names, levels, strict=True)))
+
+
+def match_frames(images: Images, options: CorrectionOptions) -> Correspondences:
+    """``find_matches`` of frames that a user says to be those of a rig.
+
+    Raises:
+        RsbenchError: no texture, sides exchanged, or not rectified.
+    """
+    matches = find_matches(images, options)
+    temporal = max(len(matches.left) + len(matches.right), 2 * len(matches.tracks))
+    if temporal < _FEWEST_MATCHES:
+        raise RsbenchError(
+            f"frames: only {temporal} matches between frame 0 and frame 1; {_FEWEST_MATCHES} are needed: the "
+            "frames show no texture, or not the same scene"
+        )
+    stereo = _stereo_count(matches)
+    if stereo < _FEW_STEREO * temporal / 2:
+        swapped = find_matches(images, options, (SIDES[1], SIDES[0]))
+        if _stereo_count(swapped) > 3 * stereo:
+            raise RsbenchError("frames: the left and the right images are exchanged; give the left ones first")
+        raise RsbenchError(
+            f"frames: only {stereo} of about {temporal // 2} features are found on the same row of the left and "
+            "the right image; the frames must be rectified and in the order LEFT_0 RIGHT_0 LEFT_1 RIGHT_1"
+        )
+    return matches
+
+
+def _stereo_count(matches: Correspondences) -> int:
+    """Left-right matches in the frame that has fewer."""
+    return max(min(len(matches.stereo_0), len(matches.stereo_1)), len(matches.tracks))
+
+
+def find_motion(
+    matches: Correspondences,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    options: CorrectionOptions,
+    rng: np.random.Generator | None = None,
+) -> FoundMotion:
+    """The body's motion by the solver of the options; ``rng`` draws RANSAC's samples, by default from the seed.
+
+    Raises:
+        RsbenchError: another package's solver raised: one line with its name.
+        NoMotionError: the solver found none, or only the direction of the translation.
+    """
+    entry = options.solver
+    rng = np.random.default_rng(options.seed) if rng is None else rng
+    with plugins.blame(SOLVERS, entry):
+        robust = estimate_motion(matches, rig, shutter, entry.solver, options.robust, rng)
+    motion = motion_of(robust.estimate, entry, rig)
+    return FoundMotion(
+        motion=motion, robust=robust, solver=entry.name, reference_point=entry.solver.spec.reference_point
+    )
+
+
+def motion_of(estimate: MotionEstimate, entry: SolverEntry, rig: StereoRig) -> Motion:
+    """The body's motion, metres, that a solver's answer means, in the model that the solver assumes.
+
+    Raises:
+        NoMotionError: the answer is a failure, or has no length.
+    """
+    motion = body_motion(estimate, entry.solver.spec, rig)
+    if isinstance(motion, Motion):
+        return motion
+    if not estimate.success:
+        raise NoMotionError(f"no motion found: {motion}")
+    raise NoMotionError(f"solver {entry.name!r}: {motion}; a correction needs metres, as rs-stereo-refined finds")
+
+
+def find_readout(matches: Correspondences, rig: StereoRig, options: CorrectionOptions) -> ReadoutEstimate | None:
+    """The readout ratio that explains the matches best, by ``referee``; None when no motion does at any."""
+    return estimate_readout_ratio(matches, rig, referee(options.solver), options.robust, options.seed)
+
+
+def referee(entry: SolverEntry) -> RefinedSolver:
+    """The solver that finds an unknown readout ratio and the direction of time: the chosen one, or else ours.
+
+    Both need residuals that hold for any readout ratio, and a fit as good as the matches allow: a solver that is
+    off by pixels would blame the shutter.
+    """
+    return entry.solver if isinstance(entry.solver, RefinedSolver) else RefinedSolver()
+
+
+def solve_frames(
+    matches: Correspondences, rig: StereoRig, readout_ratio: float | None, options: CorrectionOptions
+) -> tuple[FoundMotion, RollingShutter, ReadoutEstimate | None]:
+    """Motion and shutter from matches; the readout ratio is estimated when it is None.
+
+    Raises:
+        RsbenchError: the frames fit better in the opposite order, or another package's solver raised.
+        NoMotionError: no motion explains the matches, or they do not determine the readout ratio.
+    """
+    shutter, readout = solve_shutter(matches, rig, readout_ratio, options)
+    found = find_motion(matches, rig, shutter, options)
+    if _runs_backwards(matches, rig, found.robust, shutter, readout, options):
+        raise RsbenchError(
+            "frames: time runs backwards in them: frame 0 and frame 1 are exchanged, or rows are read from the "
+            "bottom up (turn the images by 180 degrees then, and exchange left and right)"
+        )
+    return found, shutter, readout
+
+
+def solve_shutter(
+    matches: Correspondences, rig: StereoRig, readout_ratio: float | None, options: CorrectionOptions
+) -> tuple[RollingShutter, ReadoutEstimate | None]:
+    """The shutter, from its readout ratio or, when that is None, from the matches.
+
+    Raises:
+        NoMotionError: no motion explains the matches, or they do not determine the readout ratio.
+    """
+    readout = None
+    if readout_ratio is None:
+        readout = find_readout(matches, rig, options)
+        if readout is None:
+            raise NoMotionError("no motion explains the matches at any readout ratio")
+        if not readout.sigma <= _MAX_READOUT_SIGMA:
+            raise NoMotionError(
+                f"the matches do not determine the readout ratio ({readout}): the motion is too small; put "
+                "readout_ratio into the rig's card"
+            )
+        readout_ratio = readout.readout_ratio
+    return RollingShutter(height=rig.camera.height, readout_ratio=readout_ratio), readout
+
+
+def _runs_backwards(
+    matches: Correspondences,
+    rig: StereoRig,
+    robust: RobustEstimate,
+    shutter: RollingShutter,
+    readout: ReadoutEstimate | None,
+    options: CorrectionOptions,
+) -> bool:
+    """Whether time runs backwards in the frames: they then fit a negative readout ratio."""
+    judge = referee(options.solver)
+    ratio = backward_ratio = shutter.readout_ratio
+    if readout is not None:
+        if ratio > 3.0 * readout.sigma:
+            return False
+        # Backwards, the best ratio is negative, so the search ended near 0.
+        backward = estimate_readout_ratio(reversed_in_time(matches), rig, judge, options.robust, options.seed)
+        if backward is None:
+            return False
+        backward_ratio = backward.readout_ratio
+    if judge is not options.solver.solver:
+        rng = np.random.default_rng(options.seed)
+        robust = estimate_motion(matches, rig, shutter, judge, options.robust, rng)
+        if not robust.estimate.success:
+            return False
+    return runs_backwards(matches, rig, ratio, backward_ratio, judge, options.robust, robust, options.seed)

@@ -1,0 +1,151 @@
+"""The contract of correctors, rolling-shutter frames to global-shutter ones, and how they are found by name."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench import plugins
+from rsbench.core import projection
+from rsbench.core.motion import Motion
+from rsbench.core.rig import StereoRig, View
+from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter
+from rsbench.errors import RsbenchError
+from rsbench.plugins import Entry, Kind, RunOptions
+from rsbench.vision.fusion import Fused, Origin
+
+Knowledge = Literal["motion", "depth"]
+Depths = Mapping[View, NDArray[np.float32]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectorSpec:
+    """What a corrector declares, checked when it is made. Raises ValueError on what does not exist."""
+
+    needs: Set[Knowledge]
+    """What the chain must find for it first; what nobody needs is not looked for."""
+    reference: str
+    """Where it was published."""
+    assumes: str
+    """What must hold for it to work, in words."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "needs", frozenset(self.needs))
+        allowed = get_args(Knowledge)
+        for value in self.needs:
+            if value not in allowed:
+                raise ValueError(f"needs: {value!r} is nothing that is known; there are: {', '.join(allowed)}")
+        for field in ("reference", "assumes"):
+            if not isinstance(getattr(self, field), str) or not getattr(self, field):
+                raise ValueError(f"{field} = {getattr(self, field)!r}: must be a text")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CorrectionProblem:
+    """Four frames and what is known of them."""
+
+    images: Mapping[View, NDArray[Any]]
+    """(H, W) grey or (H, W, 3) RGB of one size and type, uint8 or uint16."""
+    rig: StereoRig
+    shutter: RollingShutter
+    target_row: float
+    """A corrected frame shows the time at which its rolling-shutter frame read this row."""
+    motion: Motion | None
+    """Of the rig's body, metres; None when the corrector does not need it."""
+    depth: Depths | None
+    """(H, W) metres in each row's own camera; inf at infinity, 0 unknown. None when the corrector does not need
+    it."""
+    guess: Depths | None
+    """(H, W) the same, guessed from the neighbours where ``depth`` is unknown; 0 elsewhere."""
+
+    def row_poses(self, view: View) -> Pose:
+        """``cam_from_world`` (H, 3, 3), (H, 3) of every row of a frame. Raises ValueError without a motion."""
+        return projection.row_poses(self.rig, self.shutter, self._motion(), *view)
+
+    def target_pose(self, view: View) -> Pose:
+        """``cam_from_world`` of the corrected frame. Raises ValueError without a motion."""
+        side, frame = view
+        tau = self.shutter.row_time(self.target_row, frame)
+        return self.rig.cam_from_world(self._motion(), tau, side)
+
+    def _motion(self) -> Motion:
+        if self.motion is None:
+            raise ValueError("the motion is not known: 'motion' must be among the needs of the corrector")
+        return self.motion
+
+
+class Corrector(ABC):
+    """Four frames to corrected ones; a frozen dataclass, whose fields a card may set."""
+
+    @property
+    @abstractmethod
+    def spec(self) -> CorrectorSpec:
+        """What it declares; a class attribute where the parameters do not change it."""
+
+    @abstractmethod
+    def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
+        """The corrected frames of the views asked for, with where each pixel comes from.
+
+        Images keep the shape and type of the given ones.
+        """
+
+
+CorrectorEntry = Entry[Corrector, RunOptions]
+CORRECTORS: Kind[Corrector, RunOptions] = Kind(
+    singular="corrector",
+    cards="correctors",
+    base=Corrector,  # type: ignore[type-abstract]
+    options=RunOptions,
+)
+
+
+def load_corrector(name_or_path: str | Path) -> CorrectorEntry:
+    """A corrector by the name of a card or entry point, or by the path of a card.
+
+    Raises:
+        RsbenchError: no such corrector, two of that name, or its card or class is wrong.
+    """
+    return plugins.load_entry(CORRECTORS, name_or_path)
+
+
+def find_corrected(entry: CorrectorEntry, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
+    """What a corrector makes of four frames, checked.
+
+    Raises:
+        RsbenchError: another package's corrector raised, or answered something else: one line with its name.
+    """
+    where = f"{CORRECTORS.singular} {entry.name!r}"
+    with plugins.blame(CORRECTORS, entry):
+        found = entry.component.correct(problem, views)
+    if not isinstance(found, dict) or set(found) != set(views):
+        raise RsbenchError(f"{where}: must return a dict of the views asked for, {', '.join(map(str, views))}")
+    for view, fused in found.items():
+        _check(fused, problem.images[view], f"{where}: {view[0]} {view[1]}")
+    return {view: found[view] for view in views}
+
+
+def _check(fused: object, image: NDArray[Any], where: str) -> None:
+    if not isinstance(fused, Fused):
+        raise RsbenchError(f"{where}: must be a Fused, got {type(fused).__name__}")
+    for name, dtype, shape in (
+        ("image", image.dtype, image.shape),
+        ("origin", np.dtype(np.uint8), image.shape[:2]),
+        ("depth", np.dtype(np.float32), image.shape[:2]),
+    ):
+        value = getattr(fused, name)
+        if not isinstance(value, np.ndarray) or value.dtype != dtype or value.shape != shape:
+            got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+            raise RsbenchError(f"{where}: {name} must be {dtype} {shape}, got {got}")
+    if np.any(fused.origin >= len(Origin)):
+        raise RsbenchError(
+            f"{where}: origin must hold values from 0 to {len(Origin) - 1}, got {fused.origin.max()}"
+        )
+    if np.any(fused.depth <= 0.0):  # NaN is unknown
+        raise RsbenchError(f"{where}: depth must be above 0 or NaN, got {np.nanmin(fused.depth)}")

@@ -1,0 +1,114 @@
+"""Our correctors: the whole fusion, and what simpler assumptions leave of it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.rig import VIEWS, Side, View
+from rsbench.core.se3 import Pose
+from rsbench.vision.correction import WarpOptions
+from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
+from rsbench.vision.fusion import Fused, Origin, SourceView, fuse
+from rsbench.vision.simpler_depths import plane_depth
+
+F32 = NDArray[np.float32]
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class FusionCorrector(Corrector):
+    """Every pixel moved by its depth and its row's pose; holes filled from the other frames."""
+
+    use_other_views: bool = True
+    """Fill what the frame did not see from the other three."""
+    guess_depth: bool = True
+    """Where no depth was found, take that of the farther neighbour in the row."""
+    warp: WarpOptions = field(default_factory=WarpOptions)
+
+    spec = CorrectorSpec(
+        needs={"motion", "depth"},
+        reference="Wang, Fan, Dai, eq. 11, with the holes filled (rsbench)",
+        assumes="a scene that stands still; sharp edges of depth are as good as the depth",
+    )
+
+    def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
+        poses = {view: problem.row_poses(view) for view in VIEWS}
+
+        def corrected(view: View) -> Fused:
+            sources = self._sources(problem, view, poses)
+            return fuse(sources, problem.rig.camera, problem.target_pose(view), self.warp)
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            return dict(zip(views, pool.map(corrected, views), strict=True))
+
+    def _sources(self, problem: CorrectionProblem, view: View, poses: Mapping[View, Pose]) -> list[SourceView]:
+        """The images that a corrected view is made of, in the order in which they are trusted."""
+        side, frame = view
+        other: Side = "right" if side == "left" else "left"
+        order = [(view, Origin.HERE)]
+        if self.use_other_views:
+            order += [
+                ((other, frame), Origin.OTHER_CAMERA),
+                ((side, 1 - frame), Origin.OTHER_FRAME),
+                ((other, 1 - frame), Origin.OTHER_FRAME),
+            ]
+        if self.guess_depth:
+            order.append((view, Origin.GUESSED))
+        return [_source(problem, source, poses[source], origin) for source, origin in order]
+
+
+def _source(problem: CorrectionProblem, view: View, poses: Pose, origin: Origin) -> SourceView:
+    depth = problem.guess if origin is Origin.GUESSED else problem.depth
+    if depth is None:
+        raise ValueError("the depth is not known: 'depth' must be among the needs of the corrector")
+    return SourceView(image=problem.images[view], depth=depth[view], poses=poses, origin=origin)
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class RotationCorrector(Corrector):
+    """Everything at infinity, which moves by the rotation alone: one homography per row."""
+
+    warp: WarpOptions = field(default_factory=WarpOptions)
+
+    spec = CorrectorSpec(
+        needs={"motion"},
+        reference="Forssen, Ringaby, Rectifying rolling shutter video from hand-held devices, CVPR 2010",
+        assumes="a scene so far away that translation moves no pixel",
+    )
+
+    def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
+        far = np.full((problem.rig.camera.height, problem.rig.camera.width), np.inf, dtype=np.float32)
+        return {view: _alone(problem, view, far, self.warp) for view in views}
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class PlaneCorrector(Corrector):
+    """Everything on the plane that fits the depth of the frame best: one homography per row."""
+
+    warp: WarpOptions = field(default_factory=WarpOptions)
+
+    spec = CorrectorSpec(
+        needs={"motion", "depth"},
+        reference="Wang, Fan, Dai, eq. 11, at the depth of one plane (rsbench)",
+        assumes="a scene that is one plane",
+    )
+
+    def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
+        if problem.depth is None:
+            raise ValueError("the depth is not known: 'depth' must be among the needs of the corrector")
+        depth = problem.depth
+        return {view: _alone(problem, view, plane_depth(depth[view]), self.warp) for view in views}
+
+
+def _alone(problem: CorrectionProblem, view: View, depth: F32, options: WarpOptions) -> Fused:
+    source = SourceView(image=problem.images[view], depth=depth, poses=problem.row_poses(view), origin=Origin.HERE)
+    return fuse([source], problem.rig.camera, problem.target_pose(view), options)

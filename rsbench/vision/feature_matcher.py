@@ -1,0 +1,74 @@
+"""The contract of feature matchers, point correspondences of four images, and how they are found by name."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench import plugins
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import View
+from rsbench.errors import RsbenchError
+from rsbench.plugins import Entry, Kind, RunOptions
+
+_OUTSIDE_PX = 1.0
+"""How far beyond the centre of the outermost pixel a sub-pixel position may lie."""
+
+
+class FeatureMatcher(ABC):
+    """Correspondences of a rig over two frames; a frozen dataclass, whose fields a card may set."""
+
+    @abstractmethod
+    def match(self, images: Mapping[View, NDArray[np.uint8]]) -> Correspondences:
+        """Matches between ``images["left", 0]``, ``["right", 0]``, ``["left", 1]`` and ``["right", 1]``.
+
+        Images (H, W) or (H, W, 3) RGB of one size; positions in pixels, the centre of the top-left one (0, 0).
+        Sets may come out empty; the solver says what it needs. ``tracks`` are points seen in all four images.
+        """
+
+
+FeatureEntry = Entry[FeatureMatcher, RunOptions]
+FEATURE_MATCHERS: Kind[FeatureMatcher, RunOptions] = Kind(
+    singular="feature matcher",
+    cards="features",
+    base=FeatureMatcher,  # type: ignore[type-abstract]
+    options=RunOptions,
+)
+
+
+def load_features(name_or_path: str | Path) -> FeatureEntry:
+    """A feature matcher by the name of a card or entry point, or by the path of a card.
+
+    Raises:
+        RsbenchError: no such feature matcher, two of that name, or its card or class is wrong.
+    """
+    return plugins.load_entry(FEATURE_MATCHERS, name_or_path)
+
+
+def find_correspondences(entry: FeatureEntry, images: Mapping[View, NDArray[np.uint8]]) -> Correspondences:
+    """What a feature matcher finds in four images, checked: finite positions inside the images.
+
+    Raises:
+        RsbenchError: another package's matcher raised, or answered something else: one line with its name.
+    """
+    where = f"{FEATURE_MATCHERS.singular} {entry.name!r}"
+    with plugins.blame(FEATURE_MATCHERS, entry):
+        found = entry.component.match(images)
+    if not isinstance(found, Correspondences):
+        raise RsbenchError(f"{where}: must return Correspondences, got {type(found).__name__}")
+    height, width = images["left", 0].shape[:2]
+    most = np.array([width, height]) - 1.0 + _OUTSIDE_PX
+    for field in fields(found):
+        points = getattr(found, field.name).reshape(-1, 2)
+        outside = np.any((points < -_OUTSIDE_PX) | (points > most), axis=1)
+        if np.any(outside):
+            raise RsbenchError(
+                f"{where}: {field.name}: {np.count_nonzero(outside)} positions lie outside the {width} x {height} "
+                f"image, such as {points[outside][0].tolist()}"
+            )
+    return found

@@ -1,0 +1,152 @@
+"""Stereo and feature matchers by card, and what they may answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rsbench.cards import list_cards
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import VIEWS, StereoRig
+from rsbench.errors import RsbenchError
+from rsbench.plugins import Entry, RunOptions
+from rsbench.vision.feature_matcher import FeatureMatcher, find_correspondences, load_features
+from rsbench.vision.features import MatchOptions, SiftMatcher
+from rsbench.vision.stereo_depth import SgmMatcher, SgmOptions
+from rsbench.vision.stereo_matcher import StereoMatcher, find_disparities, load_matcher
+
+RIG = StereoRig(camera=PinholeCamera.centred(40, 30, 50.0), baseline=0.2)
+IMAGES = {view: np.zeros((30, 40), np.uint8) for view in VIEWS}
+
+
+@pytest.mark.parametrize("name", list_cards("matchers"))
+def test_matcher_cards_load(name: str) -> None:
+    entry = load_matcher(name)
+    assert isinstance(entry.component, SgmMatcher) and entry.description
+
+
+@pytest.mark.parametrize("name", list_cards("features"))
+def test_feature_cards_load(name: str) -> None:
+    assert load_features(name).description
+
+
+def test_the_default_cards_state_the_defaults() -> None:
+    sgm, sift = load_matcher("sgm").component, load_features("sift").component
+    assert sgm == SgmMatcher() and sift == SiftMatcher()
+    # What the functions take for themselves is what the cards say.
+    assert vars(sgm) == vars(SgmOptions()) and vars(sift) == vars(MatchOptions())
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("block_size = 4", "block_size must be odd"),
+        ("consistency_px = -1.0", "consistency_px must be positive"),
+        ("uniqueness_percent = 500", "uniqueness_percent must lie in"),
+        ("prefilter_cap = -3", "prefilter_cap must be at least 0"),
+        ("speckle_window = -5", "speckle_window must be at least 0"),
+        ("speckle_range = -5", "speckle_range must be at least 0"),
+        ("consistency_px = nan", "must be finite"),
+        ("blok_size = 3", "unknown key"),
+    ],
+)
+def test_a_wrong_value_is_named(tmp_path: Path, line: str, message: str) -> None:
+    card = tmp_path / "wrong.toml"
+    card.write_text(f'class = "rsbench.vision.stereo_depth:SgmMatcher"\n[parameters]\n{line}\n', "utf-8")
+    with pytest.raises(RsbenchError, match=message) as caught:
+        load_matcher(card)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("line", ["time_limit_s = 0.0", "time_limit = 3.0"])
+def test_wrong_options_of_a_card_are_named(tmp_path: Path, line: str) -> None:
+    card = tmp_path / "wrong.toml"
+    card.write_text(f'class = "rsbench.vision.stereo_depth:SgmMatcher"\n{line}\n', "utf-8")
+    with pytest.raises(RsbenchError, match="time_limit"):
+        load_matcher(card)
+
+
+# What other packages' components may answer. This module is not rsbench's, so they count as such.
+
+
+@dataclass(frozen=True)
+class Says(StereoMatcher):
+    answer: Any
+
+    def disparities(self, left: Any, right: Any, rig: StereoRig) -> Any:
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+
+@dataclass(frozen=True)
+class Finds(FeatureMatcher):
+    answer: Any
+
+    def match(self, images: Mapping[Any, Any]) -> Any:
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+
+def entry_of(component: Any) -> Entry[Any, RunOptions]:
+    return Entry(name="mine", path=None, description="", component=component, options=RunOptions(), key="k")
+
+
+def flat(value: float, dtype: Any = np.float64, shape: tuple[int, int] = (30, 40)) -> np.ndarray:
+    return np.full(shape, value, dtype)
+
+
+def test_good_disparities_pass_as_float32() -> None:
+    left, right = flat(3.0), flat(float("nan"), np.float32)
+    both = find_disparities(entry_of(Says((left, right))), IMAGES["left", 0], IMAGES["right", 0], RIG)
+    assert [disparity.dtype for disparity in both] == [np.float32, np.float32]
+    np.testing.assert_array_equal(both, (left, right))
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (flat(1.0), ("two arrays",)),
+        ((flat(1.0), flat(1.0, shape=(40, 30))), ("right disparity", "(30, 40)", "(40, 30)")),
+        ((flat(1, np.int64), flat(1.0)), ("left disparity", "int64")),
+        ((flat(1.0), [1.0]), ("right disparity", "list")),
+        ((flat(-2.0), flat(1.0)), ("left disparity", "-2.0", "x_left - x_right")),
+        ((flat(1.0), flat(float("inf"))), ("right disparity", "inf")),
+        (KeyError("weights"), ("raised KeyError", "weights")),
+    ],
+)
+def test_wrong_disparities_are_refused_in_one_line(answer: Any, words: tuple[str, ...]) -> None:
+    with pytest.raises(RsbenchError) as caught:
+        find_disparities(entry_of(Says(answer)), IMAGES["left", 0], IMAGES["right", 0], RIG)
+    text = str(caught.value)
+    assert "matcher 'mine'" in text and "\n" not in text
+    assert all(word in text for word in words), text
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (None, ("Correspondences", "NoneType")),
+        (Correspondences(left=np.full((3, 4), 900.0)), ("left", "outside", "40 x 30")),
+        (Correspondences(tracks=np.full((1, 8), -5.0)), ("tracks", "outside")),
+        (ValueError("no descriptors"), ("raised ValueError: no descriptors",)),
+    ],
+)
+def test_wrong_matches_are_refused_in_one_line(answer: Any, words: tuple[str, ...]) -> None:
+    with pytest.raises(RsbenchError) as caught:
+        find_correspondences(entry_of(Finds(answer)), IMAGES)
+    text = str(caught.value)
+    assert "feature matcher 'mine'" in text and "\n" not in text
+    assert all(word in text for word in words), text
+
+
+def test_sub_pixel_positions_at_the_border_pass() -> None:
+    corner = Correspondences(left=np.array([[-0.4, -0.4, 39.4, 29.4]]))
+    assert find_correspondences(entry_of(Finds(corner)), IMAGES) is corner
