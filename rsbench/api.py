@@ -18,9 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.projection import RSProjection, rs_project
-from rsbench.core.rig import Side, StereoRig
+from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.errors import RsbenchError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -188,10 +187,9 @@ def stereo_depth(
         ValueError: the images do not fit each other or the rig.
         RsbenchError: no such matcher.
     """
-    from rsbench.vision.matcher_card import load_matcher
-    from rsbench.vision.stereo_depth import stereo_disparity
+    from rsbench.vision.stereo_matcher import find_disparities, load_matcher
 
-    disparity = stereo_disparity(left, right, rig, side, load_matcher(str(matcher)))
+    disparity = find_disparities(load_matcher(matcher), left, right, rig)[SIDES.index(side)]
     return np.nan_to_num(rig.depth(disparity), nan=0.0).astype(np.float32)
 
 
@@ -202,6 +200,8 @@ def correct(
     *,
     solver: str | Path | Solver = "rs-stereo",
     matcher: str | Path = "sgm",
+    features: str | Path = "sift",
+    corrector: str | Path = "fusion",
     target_row: float = 0.0,
     inpaint: bool = False,
     seed: int = 0,
@@ -212,8 +212,10 @@ def correct(
         images: four images, rectified and as the sensor read them.
         rig: the cameras.
         readout_ratio: readout time over frame period; None has it estimated.
-        solver: finds the motion; as in ``estimate_motion``.
-        matcher: card of the stereo matcher that finds depth.
+        solver: finds the motion, in metres; as in ``estimate_motion``.
+        matcher: name or card of the stereo matcher that finds depth.
+        features: name or card of the feature matcher that finds the matches of the motion.
+        corrector: name or card of what makes the corrected frames.
         target_row: the time of this row of a frame is the time of its corrected image.
         inpaint: invent what nobody saw.
         seed: of the samples that the robust loop draws.
@@ -222,22 +224,28 @@ def correct(
         ``frames["left", 0]`` and so on, each with ``image``, ``depth`` and ``origin``; ``motion``, ``shutter``.
 
     Raises:
-        RsbenchError: frames that cannot be what they are said to be, or no such solver or matcher.
-        NoMotionError: the matches determine no motion or readout ratio.
+        RsbenchError: frames that cannot be what they are said to be, or no such component.
+        NoMotionError: the matches determine no motion or readout ratio, or the solver no metres.
     """
-    from rsbench.pipeline.chain import CorrectionOptions, correct_four
+    from rsbench.pipeline.chain import correct_four
+    from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import check_alike
-    from rsbench.solvers.refined import RefinedSolver
-    from rsbench.vision.matcher_card import load_matcher
+    from rsbench.solvers.engine.registry import load_solver_entry, wrap_solver
+    from rsbench.vision.corrector import load_corrector
+    from rsbench.vision.feature_matcher import load_features
+    from rsbench.vision.stereo_matcher import load_matcher
 
     left_0, right_0, left_1, right_1 = _four(images)
     views = {("left", 0): left_0, ("right", 0): right_0, ("left", 1): left_1, ("right", 1): right_1}
     check_alike({f"{side} {frame}": image for (side, frame), image in views.items()})
-    found = _solver(solver)
-    if not isinstance(found, RefinedSolver):
-        raise RsbenchError(f"solver {solver}: a card of rsbench.solvers.refined:RefinedSolver is needed")
     options = CorrectionOptions(
-        solver=found, sgm=load_matcher(str(matcher)), target_row=target_row, inpaint=inpaint, seed=seed
+        features=load_features(features),
+        solver=load_solver_entry(solver) if isinstance(solver, str | Path) else wrap_solver(solver),
+        matcher=load_matcher(matcher),
+        corrector=load_corrector(corrector),
+        target_row=target_row,
+        inpaint=inpaint,
+        seed=seed,
     )
     return correct_four(views, rig, readout_ratio, options)  # type: ignore[arg-type]
 
@@ -320,11 +328,11 @@ def evaluate(
     """
     from rsbench.benchmark.images.evaluation import TABLES, read_scores, run_evaluation
     from rsbench.benchmark.images.predict import EvaluationOptions
-    from rsbench.vision.matcher_card import load_matcher
+    from rsbench.vision.stereo_matcher import load_matcher
 
     chosen = tuple(dict.fromkeys([*solvers, correct_with]))
     options = EvaluationOptions(
-        solvers=chosen, correction_solver=correct_with, seed=seed, sgm=load_matcher(matcher)
+        solvers=chosen, correction_solver=correct_with, seed=seed, sgm=load_matcher(matcher).component
     )
     run_evaluation(Path(folder), Path(out), options, "rsbench.evaluate", lambda word: None)
     return {table: read_scores(Path(out), table) for table in TABLES}

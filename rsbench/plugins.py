@@ -15,6 +15,7 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -31,6 +32,8 @@ __all__ = [
     "Entry",
     "Kind",
     "Offer",
+    "RunOptions",
+    "blame",
     "component_key",
     "list_names",
     "load_class",
@@ -39,6 +42,7 @@ __all__ = [
     "offers",
     "own_source_version",
     "source_version",
+    "wrap",
 ]
 
 Component = TypeVar("Component")
@@ -135,19 +139,27 @@ class _Content:
     parameters: dict[str, Any] = field(default_factory=dict)
 
 
-@contextmanager
-def blame(kind: Kind[Any, Any], entry: Entry[Any, Any]) -> Iterator[None]:
+def blame(kind: Kind[Any, Any], entry: Entry[Any, Any]) -> AbstractContextManager[None]:
     """Run a component's code: what another package's raises becomes one line that names the component.
 
     Raises:
         RsbenchError: its kind, its name and what it raised. Errors in our own code pass as they are.
     """
-    try:
-        yield
-    except Exception as error:
-        if entry.built_in or isinstance(error, RsbenchError):
-            raise
-        raise RsbenchError(f"{kind.singular} {entry.name!r}: raised {_in_words(error)}") from error
+    if entry.built_in:
+        return contextlib.nullcontext()
+    return blaming(f"{kind.singular} {entry.name!r}", "failed")
+
+
+def wrap(kind: Kind[Component, Options], component: Component) -> Entry[Component, Options]:
+    """The entry of a component that was made without a card; its class names it."""
+    return Entry(
+        name=type(component).__name__,
+        path=None,
+        description="",
+        component=component,
+        options=kind.options(),
+        key=component_key(component, {}),
+    )
 
 
 def list_names(kind: Kind[Any, Any]) -> list[str]:

@@ -76,8 +76,9 @@ def depth_of_pair(
 
 
 def frame_pairs(images: Images, rig: StereoRig, options: CorrectionOptions) -> Pairs:
-    """``frame_pair`` of frame 0 and of frame 1, side by side: the matcher itself keeps one core busy."""
-    with ThreadPoolExecutor(len(FRAMES)) as pool:
+    """``frame_pair`` of frame 0 and of frame 1; ours side by side, for it keeps one core busy."""
+    # Nothing is known of whether another package's matcher may run twice at a time.
+    with ThreadPoolExecutor(len(FRAMES) if options.matcher.built_in else 1) as pool:
         first, second = pool.map(
             lambda frame: frame_pair(images["left", frame], images["right", frame], rig, options), FRAMES
         )

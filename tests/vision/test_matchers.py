@@ -119,7 +119,7 @@ def test_good_disparities_pass_as_float32() -> None:
         ((flat(1.0), [1.0]), ("right disparity", "list")),
         ((flat(-2.0), flat(1.0)), ("left disparity", "-2.0", "x_left - x_right")),
         ((flat(1.0), flat(float("inf"))), ("right disparity", "inf")),
-        (KeyError("weights"), ("raised KeyError", "weights")),
+        (KeyError("weights"), ("failed: KeyError", "weights")),
     ],
 )
 def test_wrong_disparities_are_refused_in_one_line(answer: Any, words: tuple[str, ...]) -> None:
@@ -136,7 +136,7 @@ def test_wrong_disparities_are_refused_in_one_line(answer: Any, words: tuple[str
         (None, ("Correspondences", "NoneType")),
         (Correspondences(left=np.full((3, 4), 900.0)), ("left", "outside", "40 x 30")),
         (Correspondences(tracks=np.full((1, 8), -5.0)), ("tracks", "outside")),
-        (ValueError("no descriptors"), ("raised ValueError: no descriptors",)),
+        (ValueError("no descriptors"), ("failed: ValueError: no descriptors",)),
     ],
 )
 def test_wrong_matches_are_refused_in_one_line(answer: Any, words: tuple[str, ...]) -> None:

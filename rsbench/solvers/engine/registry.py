@@ -65,3 +65,8 @@ def load_solver(name_or_path: str | Path) -> Solver:
 def load_solver_entry(name_or_path: str | Path) -> SolverEntry:
     """Like ``load_solver``, with its name, its card's options and its key."""
     return SolverEntry(**vars(plugins.load_entry(SOLVERS, name_or_path)))
+
+
+def wrap_solver(solver: Solver) -> SolverEntry:
+    """The entry of a solver that was made without a card; its class names it."""
+    return SolverEntry(**vars(plugins.wrap(SOLVERS, solver)))
