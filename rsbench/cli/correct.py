@@ -31,11 +31,14 @@ RIG.toml, for rectified images (pixels, metres; without readout_ratio it is esti
   cx = 479.5
   cy = 269.5
 
+Names: rsbench list solvers, matchers, features or correctors; a card's path ends in .toml.
+
 DIR gets [bold]report.html[/bold] (before and after), [bold]corrected/*.png[/bold], [bold]depth/*.exr[/bold]
 (of the corrected frames, metres), [bold]mask/*.png[/bold] (255 seen in the frame, 192 at a guessed depth, 128 from
 the other camera, 64 from the other frame, 0 seen by nobody) and [bold]motion.json[/bold]."""
 
 _PAGE_FRAMES = 6
+_SOLVER = "rs-stereo-refined"
 
 
 def correct(
@@ -52,39 +55,21 @@ def correct(
     inpaint: Annotated[bool, typer.Option("--inpaint", help="Invent what nobody saw; it stays marked.")] = False,
     sky: Annotated[bool, typer.Option(help="Look for sky, which moves by rotation alone.")] = True,
     fill: Annotated[bool, typer.Option(help="Fill what a frame did not see from the other frames.")] = True,
-    solver: Annotated[
-        str, typer.Option(help="Solver of the motion: any that gives metres; see: rsbench list solvers.")
-    ] = "rs-stereo-refined",
-    matcher: Annotated[str, typer.Option(help="Stereo matcher that finds depth: a name or a card.")] = "sgm",
-    features: Annotated[
-        str, typer.Option(help="Feature matcher that finds the matches of the motion: a name or a card.")
-    ] = "sift",
-    corrector: Annotated[
-        str, typer.Option(help="What makes the corrected frames: a name or a card; see: rsbench list correctors.")
-    ] = "fusion",
+    solver: Annotated[str, typer.Option(help="Finds the motion, in metres: a name or a card.")] = _SOLVER,
+    matcher: Annotated[str, typer.Option(help="Finds depth: a name or a card.")] = "sgm",
+    features: Annotated[str, typer.Option(help="Finds the motion's matches: a name or a card.")] = "sift",
+    corrector: Annotated[str, typer.Option(help="Makes the corrected frames: a name or a card.")] = "fusion",
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
 ) -> None:
     """Correct your own rolling-shutter stereo frames: two times of a rig, or a whole sequence."""
     from rsbench.errors import RsbenchError
-    from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import read_rig_card
     from rsbench.pipeline.frame_motion import NoMotionError
-    from rsbench.solvers.engine.registry import load_solver_entry
-    from rsbench.vision.feature_matcher import load_features
-    from rsbench.vision.stereo_matcher import load_matcher
 
     if rig is None or out is None:
         raise RsbenchError(f"--{'rig' if rig is None else 'out'}: is required")
     card = read_rig_card(rig)
-    options = CorrectionOptions(
-        features=load_features(features),
-        solver=load_solver_entry(solver),
-        matcher=load_matcher(matcher),
-        corrector=_corrector(corrector, fill),
-        find_sky=sky,
-        inpaint=inpaint,
-        seed=seed,
-    )
+    options = _options(features, solver, matcher, corrector, fill, find_sky=sky, inpaint=inpaint, seed=seed)
     four = frames is not None and len(frames) == 4 and not (left or right)
     if not four and (frames or not (left and right)):
         count = f"{len(frames)} images; " if frames else ""
@@ -97,6 +82,23 @@ def correct(
     except NoMotionError as error:
         typer.echo(f"rsbench: not corrected: {error}", err=True)
         raise typer.Exit(1) from None
+
+
+def _options(
+    features: str, solver: str, matcher: str, corrector: str, fill: bool, **others: Any
+) -> CorrectionOptions:
+    from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.solvers.engine.registry import load_solver_entry
+    from rsbench.vision.feature_matcher import load_features
+    from rsbench.vision.stereo_matcher import load_matcher
+
+    return CorrectionOptions(
+        features=load_features(features),
+        solver=load_solver_entry(solver),
+        matcher=load_matcher(matcher),
+        corrector=_corrector(corrector, fill),
+        **others,
+    )
 
 
 def _corrector(name: str, fill: bool) -> CorrectorEntry:

@@ -104,7 +104,7 @@ def find_motion(
     entry = options.solver
     rng = np.random.default_rng(options.seed) if rng is None else rng
     with plugins.blame(SOLVERS, entry):
-        robust = estimate_motion(matches, rig, shutter, entry.solver, options.robust, rng)
+        robust = estimate_motion(matches, rig, shutter, entry.solver, options.robust, rng, entry.options.robust)
     motion = motion_of(robust.estimate, entry, rig)
     return FoundMotion(
         motion=motion, robust=robust, solver=entry.name, reference_point=entry.solver.spec.reference_point
