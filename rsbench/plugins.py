@@ -35,6 +35,7 @@ __all__ = [
     "RunOptions",
     "blame",
     "component_key",
+    "description_of",
     "list_names",
     "load_class",
     "load_entry",
@@ -215,6 +216,16 @@ def load_class(kind: Kind[Component, Any], name: str, card: Path) -> type[Compon
     if ":" in name:
         return _checked(kind, import_target(name, card.parent, f"{card}: {kind.singular} = {name!r}"), str(card))
     return _offered_class(kind, _only_offer(kind, name, "", f"{card}: "))[0]
+
+
+def description_of(kind: Kind[Any, Any], offer: Offer) -> str:
+    """First line of the class of an offer without a card.
+
+    Raises:
+        RsbenchError: its name is that of another too, it cannot be loaded or is not of this kind.
+    """
+    _only_offer(kind, offer.name, "")
+    return (inspect.getdoc(_offered_class(kind, offer)[0]) or "").partition("\n")[0]
 
 
 def _only_offer(kind: Kind[Any, Any], name: str, advice: str, where: str = "") -> Offer:

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from rsbench.cli.kinds import complete
+
 EPILOG = """[bold]Examples[/bold]
 
   rsbench check-solver gs-8pt
@@ -16,7 +18,12 @@ Other packages' solvers run in a child process. Exit code 1 when a check fails; 
 
 
 def check_solver(
-    solver: Annotated[str, typer.Argument(metavar="NAME|CARD", help="Name of a solver or path to its card.")],
+    solver: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME|CARD", help="Name of a solver or path to its card.", autocompletion=complete("solvers")
+        ),
+    ],
     time_limit: Annotated[
         float | None, typer.Option(min=0.1, help="Seconds for one problem; by default what the card says.")
     ] = None,
@@ -29,7 +36,7 @@ def check_solver(
     import pandas as pd
 
     from rsbench.benchmark.simulated.contract import check_solver as find
-    from rsbench.cli.console import print_table
+    from rsbench.cli.console import print_table, say
     from rsbench.solvers.engine.registry import load_solver_entry
 
     entry = load_solver_entry(solver)
@@ -40,7 +47,7 @@ def check_solver(
         typer.echo(json_module.dumps(content))
     else:
         print_table(f"{entry.name} and the contract of solvers", pd.DataFrame([asdict(each) for each in findings]))
-        typer.echo(f"{entry.name}: {failed} of {len(findings)} checks failed")
+        say(f"{entry.name}: {failed} of {len(findings)} checks failed")
     if failed:
         raise typer.Exit(1)
 

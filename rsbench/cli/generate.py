@@ -7,18 +7,24 @@ from typing import Annotated
 
 import typer
 
+from rsbench.cli.kinds import complete
+
 EPILOG = """[bold]Examples[/bold]
 
   rsbench generate paper --out data/paper
 
-  rsbench generate datasets/smoke.toml --out data/smoke --sequence castle
+  rsbench generate smoke --out data/smoke --sequence castle
 
   rsbench generate smoke --out data/stack --full-frames    [dim](keeps every row's whole image)[/dim]"""
 
 
 def generate(
     card: Annotated[
-        str, typer.Argument(help="Name of a dataset card (see: rsbench list datasets) or path to one.")
+        str,
+        typer.Argument(
+            help="Name of a dataset card (see: rsbench list datasets) or path to one.",
+            autocompletion=complete("datasets"),
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder of the dataset; an interrupted run resumes there.")],
     sequence: Annotated[list[str] | None, typer.Option(help="Only this sequence of the card; repeatable.")] = None,

@@ -18,6 +18,7 @@ from rsbench.cli import (
     evaluate,
     generate,
     reproduce,
+    show,
     simulate,
     solve,
     verify,
@@ -29,7 +30,6 @@ app = typer.Typer(
     name="rsbench",
     no_args_is_help=True,
     rich_markup_mode="rich",
-    add_completion=False,
     pretty_exceptions_enable=False,
     help="Rolling-shutter stereo: render data with exact ground truth, solve, correct and score.",
     epilog="Start with: [bold]rsbench demo[/bold]   Exit codes: 0 done, 1 ran but failed, 2 bad input.",
@@ -47,13 +47,20 @@ def _root(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
+    quiet: Annotated[
+        bool,
+        typer.Option("--quiet", "-q", help="Before a command: no progress, no tables; results and errors only."),
+    ] = False,
 ) -> None:
-    pass
+    from rsbench.cli.console import be_quiet
+
+    be_quiet(quiet)
 
 
 for module in (
     demo,
     cards,
+    show,
     doctor,
     generate,
     verify,

@@ -1,0 +1,255 @@
+"""Names: listed, shown and completed; and what holds for every command."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import re
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsbench.cli import console
+from rsbench.cli.kinds import COMPONENTS, kind_names, names_of
+from rsbench.cli.main import app
+from rsbench.parameters import parameters_of
+from rsbench.solvers.engine.registry import list_solvers, load_solver_entry
+
+RUN = "import sys; sys.argv[0] = 'rsbench'; from rsbench.cli.main import run; run()"
+
+
+def rsbench(*arguments: str, path: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
+    env = os.environ | environment
+    if path is not None:
+        env["PYTHONPATH"] = f"{path}{os.pathsep}{env.get('PYTHONPATH', '')}"
+    command = [sys.executable, "-c", RUN, *arguments]
+    return subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=False)
+
+
+def answer(*arguments: str, path: Path | None = None) -> Any:
+    result = rsbench(*arguments, "--json", path=path)
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+def rows(kind: str, path: Path | None = None) -> list[dict[str, Any]]:
+    found = answer("list", kind, path=path)
+    assert isinstance(found, list)
+    return found
+
+
+def install(folder: Path, name: str, points: str, module: str = "") -> None:
+    info = folder / f"{name}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n", "utf-8")
+    (info / "entry_points.txt").write_text(points, "utf-8")
+    (folder / f"{name}.py").write_text(module, "utf-8")
+
+
+# list
+
+
+@pytest.mark.parametrize("kind", kind_names())
+def test_every_kind_is_listed(kind: str) -> None:
+    listed = rows(kind)
+    assert [row["name"] for row in listed] == names_of(kind) and listed
+    for row in listed:
+        assert row["description"] and row["broken"] is None
+        assert row["origin"] == "rsbench"
+
+
+def test_the_kinds_are_listed_without_one() -> None:
+    found = answer("list")
+    assert isinstance(found, list)
+    assert {row["kind"] for row in found} == set(kind_names())
+    assert set(COMPONENTS) <= set(kind_names())
+
+
+def test_a_kind_that_does_not_exist_is_refused() -> None:
+    for command in (("list", "solver"), ("show", "castle", "--kind", "solver")):
+        result = rsbench(*command)
+        assert result.returncode == 2 and "did you mean 'solvers'" in result.stderr
+
+
+def test_others_are_listed_with_their_package_and_what_is_wrong_with_them(tmp_path: Path) -> None:
+    module = "from rsbench.solvers.linear import LinearSolver as Base\n\n\nclass Mine(Base):\n    '''My own.'''\n"
+    points = "[rsbench.solvers]\nmine = good_package:Mine\ngs-8pt = good_package:Mine\n"
+    install(tmp_path, "good_package", points, module)
+    install(tmp_path, "bad_package", "[rsbench.solvers]\nworse = bad_package:Mine\n", "raise OSError('no disk')")
+    install(tmp_path, "mad_package", "[rsbench.solvers\nno header", "")
+    listed = rows("solvers", tmp_path)
+    mine = [row for row in listed if row["name"] == "mine"]
+    assert [(row["origin"], row["description"], row["card"]) for row in mine] == [
+        ("good_package", "My own.", None)
+    ]
+    (worse,) = [row for row in listed if row["name"] == "worse"]
+    assert worse["origin"] == "bad_package" and "no disk" in worse["broken"]
+    both = [row for row in listed if row["name"] == "gs-8pt"]
+    assert {row["origin"] for row in both} == {"rsbench", "good_package"}
+    assert any("rename one of them" in (row["broken"] or "") for row in both)
+    assert len(listed) == len(list_solvers()) + 3
+    assert "broken: " in rsbench("list", "solvers", path=tmp_path, COLUMNS="200").stdout
+
+
+# show
+
+
+@pytest.mark.parametrize("name", list_solvers())
+def test_a_solver_is_shown_as_it_declares_itself(name: str) -> None:
+    from rsbench.cli.show import _about
+
+    about, entry = _about(name, "solvers"), load_solver_entry(name)
+    spec = entry.solver.spec
+    assert about["needs"] == sorted(spec.needs) and about["minimum"] == dict(spec.minimum)
+    for key in ("metric", "motion_model", "shutter", "reference_point", "reference", "assumes"):
+        assert about[key] == getattr(spec, key)
+    assert about["robust"] == entry.options.robust and about["time_limit_s"] == entry.options.time_limit_s
+    assert about["key"] == entry.key and about["card"] == str(entry.path)
+    values = {row["parameter"]: row["value"] for row in about["parameters"]}
+    for parameter, value in entry.parameters.items():
+        assert values[parameter] == value
+    json.dumps(about)
+
+
+def test_every_name_of_every_kind_can_be_shown() -> None:
+    from rsbench.cli.show import _about, _print
+
+    for kind in kind_names():
+        for name in names_of(kind):
+            about = _about(name, kind)
+            assert about["name"] == name and about["kind"] == kind
+            json.dumps(about, default=str)
+            _print(about)
+
+
+def test_show_prints_for_people_and_for_programs(tmp_path: Path) -> None:
+    text = rsbench("show", "rs-stereo", COLUMNS="150").stdout
+    for word in ("needs", "left = 7, right = 7", "reference point", "iterations", "60", "time limit"):
+        assert word in text
+    both = answer("show", "castle")
+    assert isinstance(both, list) and [about["kind"] for about in both] == ["builders", "scenes"]
+    one = answer("show", "castle", "--kind", "scenes")
+    assert isinstance(one, dict) and one["content"]["parameters"]["trees"] == 26
+    assert "# on the hills around" in rsbench("show", "castle", "--kind", "scenes").stdout
+    card = tmp_path / "mine.toml"
+    card.write_text(
+        'class = "rsbench.solvers.linear:LinearSolver"\n[parameters]\nextraction = "symmetric"', "utf-8"
+    )
+    assert "--kind" in rsbench("show", str(card)).stderr
+    mine = answer("show", str(card), "--kind", "solvers")
+    assert isinstance(mine, dict) and mine["parameters"][0]["value"] == "symmetric"
+    assert "did you mean 'castle'" in rsbench("show", "casle").stderr
+
+
+@dataclass(frozen=True)
+class Base:
+    first: int
+    """What comes
+    first."""
+
+
+@dataclass(frozen=True)
+class Whole(Base):
+    second: tuple[float, float] = (1.0, 2.0)
+    third: Base = field(default_factory=lambda: Base(3))
+    """The third."""
+
+
+def test_parameters_have_defaults_values_and_meanings() -> None:
+    told = {row["parameter"]: row for row in parameters_of(Whole, Whole(7))}
+    assert list(told) == ["first", "second", "third"]
+    assert told["first"]["meaning"] == "What comes first." and told["first"]["default"] == "required"
+    assert told["first"]["value"] == 7 and told["second"]["default"] == [1.0, 2.0]
+    assert told["third"]["default"] == {"first": 3} and told["third"]["meaning"] == "The third."
+
+
+# Every command
+
+
+def commands() -> list[str]:
+    return sorted(str(each.name or each.callback.__name__).replace("_", "-") for each in app.registered_commands)  # type: ignore[union-attr]
+
+
+def test_help_is_quick() -> None:
+    """Processor time, which a busy machine does not lengthen: 0.2 s measured; imports of numbers cost 0.5 s."""
+    start = os.times()
+    assert rsbench("--help").returncode == 0
+    end = os.times()
+    assert end.children_user + end.children_system - start.children_user - start.children_system < 0.6
+
+
+@pytest.mark.parametrize("command", commands())
+def test_examples_work_away_from_the_repository(command: str) -> None:
+    """Names of cards in examples exist, and no path leads into the repository."""
+    text = rsbench(command, "--help", COLUMNS="300", NO_COLOR="1").stdout
+    examples = re.findall(r"^\W*(?:Examples?)?\W*(rsbench .*?)\W*$", text, flags=re.MULTILINE)
+    examples = [example for example in examples if not example.startswith("rsbench " + command + " [OPTIONS]")]
+    assert examples, "help shows an example"
+    folders = {*kind_names(), "docs", "tests", "results", "rsbench", "benchmarks"}
+    known = {name for kind in kind_names() for name in names_of(kind)}
+    options = {"--solver": "solvers", "--matcher": "matchers", "--correct-with": "solvers", "--kind": None}
+    options |= {"--features": "features", "--corrector": "correctors", "--metric": "metrics"}
+    for example in examples:
+        words = example.split("(")[0].split()
+        assert words[1] in commands(), example
+        for option, word in itertools.pairwise(words):
+            assert word.split("/")[0] not in folders or "/" not in word or word.startswith("results/"), example
+            if (kind := options.get(option)) is not None and not word.endswith(".toml"):
+                assert word in names_of(kind), example
+        if words[1] in ("generate", "simulate", "show", "check-solver") and not words[2].endswith(".toml"):
+            assert words[2] in known, example
+
+
+def test_quiet_leaves_results_alone() -> None:
+    loud, quiet = rsbench("list", "scenes"), rsbench("--quiet", "list", "scenes")
+    assert "castle" in loud.stdout and quiet.stdout == quiet.stderr == ""
+    assert rsbench("-q", "list", "scenes", "--json").stdout == rsbench("list", "scenes", "--json").stdout
+    assert "does not exist" in rsbench("-q", "list", "nothing").stderr
+
+
+def test_progress_is_never_on_stdout_and_quiet_ends_it(capsys: pytest.CaptureFixture[str]) -> None:
+    for quiet in (False, True):
+        console.be_quiet(quiet)
+        try:
+            with console.progress_bar("working", 2) as advance:
+                advance("one")
+                advance("two")
+        finally:
+            console.be_quiet(False)
+        captured = capsys.readouterr()
+        assert captured.out == "" and ("working" in captured.err) != quiet
+
+
+def test_colours_are_left_out_where_they_are_not_wanted() -> None:
+    colour = re.compile(r"\x1b\[[0-9;]*3[0-9]m")
+    for arguments in (("--help",), ("list", "--help"), ("list", "scenes"), ("list", "nothing")):
+        result = rsbench(*arguments, NO_COLOR="1", FORCE_COLOR="1")
+        assert not colour.search(result.stdout + result.stderr)
+    assert colour.search(rsbench("--help", FORCE_COLOR="1").stdout)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("rsbench show rs-stereo-l", {"rs-stereo-linear", "rs-stereo-linear-symmetric"}),
+        ("rsbench list so", {"solvers"}),
+        ("rsbench generate smo", {"smoke"}),
+        ("rsbench check-solver gs-8", {"gs-8pt", "gs-8pt-scaled"}),
+    ],
+)
+def test_a_shell_completes_names(words: str, expected: set[str]) -> None:
+    count = str(len(words.split()) - 1)
+    result = rsbench(_RSBENCH_COMPLETE="complete_bash", COMP_WORDS=words, COMP_CWORD=count)
+    assert set(result.stdout.split()) == expected, result.stderr
+
+
+def test_completion_offers_what_packages_offer(tmp_path: Path) -> None:
+    install(tmp_path, "some_package", "[rsbench.solvers]\nzz-mine = nowhere:Nothing\n")
+    environment = {"_RSBENCH_COMPLETE": "complete_bash", "COMP_WORDS": "rsbench show zz-", "COMP_CWORD": "2"}
+    assert rsbench(path=tmp_path, **environment).stdout.split() == ["zz-mine"]
+    assert "complete" in rsbench("--show-completion", "bash").stdout
