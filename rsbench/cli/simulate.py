@@ -73,16 +73,17 @@ def run_and_summarise(
     from rsbench.cli.console import progress_bar, stoppable
     from rsbench.dataset.files import write_json
 
-    with stoppable(), progress_bar(f"simulating {card.name}", sweep_steps(card)) as advance:
-        run_sweep(
-            card,
-            out,
-            workers=workers or os.cpu_count() or 1,
-            progress=advance,
-            time_limit_s=time_limit_s,
-            force=force,
-        )
-    table = summarise_sweep(out)
+    with stoppable():
+        with progress_bar(f"simulating {card.name}", sweep_steps(card)) as advance:
+            run_sweep(
+                card,
+                out,
+                workers=workers or os.cpu_count() or 1,
+                progress=advance,
+                time_limit_s=time_limit_s,
+                force=force,
+            )
+        table = summarise_sweep(out)
     write_json(out / "provenance.json", provenance(command, sweep=card.name, seed=card.seed, trials=card.trials))
     return table
 
@@ -108,6 +109,10 @@ def show(card: SweepCard, table: pd.DataFrame) -> None:
         print_table(title, rows[list(columns)].rename(columns=columns), digits)
         for row in rows[rows.failures > 0].to_dict("records"):
             typer.echo(f"{row['solver']}, {card.axis} = {row['value']:g}, failed: {row['failure_reasons']}")
+    for (solver, assumed), rows in table.groupby(["solver", "assumed_motion"], sort=False):
+        others = sorted(set(rows.motion_model) - {assumed})
+        if others:
+            typer.echo(f"{solver} assumes {assumed} motion; the data are of {' and '.join(others)} motion")
     typer.echo(
         "given: matches over time of the left camera (L) or of both (L+R), or tracks through all four images"
     )

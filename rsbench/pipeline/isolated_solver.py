@@ -52,7 +52,7 @@ class SolverRunner:
                 machine need.
         """
         self._time_limit_s, self._single_thread = time_limit_s, single_thread
-        self._workers: dict[str, IsolatedWorker] = {}
+        self._workers: dict[tuple[str, str], IsolatedWorker] = {}
         self._stack = ExitStack()
 
     def robust(
@@ -92,7 +92,8 @@ class SolverRunner:
 
     def _call(self, entry: SolverEntry, *arguments: object) -> Outcome:
         place = os.fspath(entry.path.resolve()) if entry.path is not None else entry.name
-        if place not in self._workers:
+        known = (place, entry.key)  # a card may be edited meanwhile
+        if known not in self._workers:
             worker = IsolatedWorker(
                 _serve_solver,
                 place,
@@ -100,9 +101,9 @@ class SolverRunner:
                 classes=(MotionEstimate, RobustEstimate, MatchCount),
                 environment=dict.fromkeys(THREAD_VARIABLES, "1") if self._single_thread else None,
             )
-            self._workers[place] = self._stack.enter_context(worker)
+            self._workers[known] = self._stack.enter_context(worker)
         limit_s = entry.options.time_limit_s if self._time_limit_s is None else self._time_limit_s
-        return self._workers[place].call(*arguments, limit_s=limit_s)
+        return self._workers[known].call(*arguments, limit_s=limit_s)
 
     def close(self) -> None:
         """End all children."""

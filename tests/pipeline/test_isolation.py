@@ -18,6 +18,7 @@ import pytest
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, simulate
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -44,14 +45,13 @@ EIGHT_POINT = load_solver("gs-8pt")
 class Mischief(Solver):
     spec = EIGHT_POINT.spec
 
-    def __init__(self, what, note=""):
-        self.what, self.note = what, note
+    def __init__(self, acts, note=""):
+        self.acts, self.note = acts, note
 
     def estimate(self, correspondences, rig, shutter):
         good = EIGHT_POINT.estimate(correspondences, rig, shutter)
-        if os.environ.get("MISCHIEF_SPARES_FEW") and len(correspondences.left) < 20:
-            return good
-        return getattr(self, "_" + self.what)(good)
+        act = self.acts[len(correspondences.left) % len(self.acts)]
+        return getattr(self, "_" + act)(good)
 
     def _nothing(self, good):
         return good
@@ -137,7 +137,7 @@ SHUTTER = RollingShutter(height=480, readout_ratio=0.0)
 @pytest.fixture
 def simulation() -> Simulation:
     motion = LinearMotion(np.array([0.01, -0.02, 0.015]), np.array([0.1, -0.05, 0.12]))
-    return simulate(RIG, SHUTTER, motion, SimulationOptions(pairs=40, noise_px=0.1), np.random.default_rng(0))
+    return simulate(RIG, SHUTTER, motion, SimulationOptions(pairs=60, noise_px=0.1), np.random.default_rng(0))
 
 
 @pytest.fixture
@@ -146,101 +146,117 @@ def runner() -> Iterator[SolverRunner]:
         yield runner
 
 
-def mischief(folder: Path, what: str, **parameters: str) -> SolverEntry:
-    """An entry of a solver that does something wrong."""
-    (folder / "mischief_plugin.py").write_text(PLUGIN)
-    sys.modules.pop("mischief_plugin", None)
-    lines = [f"{key} = '{value}'" for key, value in {"what": what, **parameters}.items()]
-    card = folder / f"{what}.toml"
-    card.write_text('class = "mischief_plugin:Mischief"\ntime_limit_s = 20\n[parameters]\n' + "\n".join(lines))
-    entry = load_solver_entry(card)
-    sys.modules.pop("mischief_plugin", None)
-    return entry
+def mischief(folder: Path, *acts: str, note: str = "") -> SolverEntry:
+    """An entry of a solver that does ``acts[n % len(acts)]`` when it is given n left pairs."""
+    module = f"mischief_of_{folder.name}"  # a name of its own: a process keeps the modules that it has imported
+    (folder / f"{module}.py").write_text(PLUGIN)
+    card = folder / "mischief.toml"
+    parameters = f'[parameters]\nacts = {list(acts)}\nnote = "{note}"'
+    card.write_text(f'class = "{module}:Mischief"\ntime_limit_s = 60\n{parameters}')
+    return load_solver_entry(card)
+
+
+def first(simulation: Simulation, count: int) -> Correspondences:
+    """So many left pairs, which choose the act."""
+    return Correspondences(left=simulation.correspondences.left[:count])
 
 
 WRONG = {
+    "nothing": "",
     "raise": "raised ValueError: a matrix is singular",
     "tuple": "returned a tuple, not a MotionEstimate",
     "none": "returned a NoneType, not a MotionEstimate",
     "nan": "raised ValueError: w of a motion estimate must be 3 finite numbers, got [nan nan nan]",
     "smuggled_nan": "returned w of a motion estimate must be 3 finite numbers, got [nan nan nan]",
+    "shape": "raised ValueError: w of a motion estimate must be 3 finite numbers, got",
     "covariance": "returned a covariance that is not 6 x 6 finite numbers",
     "reason": "returned reason = 3",
     "sys_exit": "raised SystemExit: 3",
+    "interrupt": "raised KeyboardInterrupt",
+    "print": "",
+    "read": "",
+}
+DEADLY = {
     "os_exit": "ended its process with exit code 1; it last printed: the end is near",
     "crash": "killed by signal 11 (SIGSEGV)",
     "kill": "killed by signal 9 (SIGKILL)",
-    "interrupt": "raised KeyboardInterrupt",
     "fork": "ended its process with exit code 7",
+    "close": "closed its connection",
 }
+SLOW = ("loop", "hold", "breed")
 
 
-@pytest.mark.parametrize("what", WRONG)
 def test_whatever_goes_wrong_is_a_failure_with_its_reason(
-    tmp_path: Path, simulation: Simulation, runner: SolverRunner, what: str
-) -> None:
-    estimate, _ = runner.bare(mischief(tmp_path, what), simulation.correspondences, RIG, SHUTTER)
-    assert not estimate.success and np.all(np.isnan(estimate.w))
-    assert estimate.reason == WRONG[what]
-
-
-@pytest.mark.parametrize("what", ["raise", "tuple", "os_exit"])
-def test_inside_ransac_too(tmp_path: Path, simulation: Simulation, runner: SolverRunner, what: str) -> None:
-    entry = mischief(tmp_path, what)
-    rng = np.random.default_rng(0)
-    answer = runner.robust(entry, simulation.correspondences, RIG, SHUTTER, RobustOptions(), rng)
-    assert not answer.estimate.success and answer.estimate.reason == WRONG[what]
-    assert not answer.inliers["left"].any() and len(answer.inliers["left"]) == 40
-
-
-def test_a_good_solver_answers_as_it_does_at_home(
     tmp_path: Path, simulation: Simulation, runner: SolverRunner, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """The built-in eight-point algorithm, called by another package, and run without any child."""
-    c = simulation.correspondences
-    expected = EightPointSolver().estimate(c, RIG, SHUTTER)
-    for what in ("nothing", "print", "read"):
-        entry = mischief(tmp_path, what)
-        estimate, seconds = runner.bare(entry, c, RIG, SHUTTER)
-        assert estimate.success, estimate.reason
-        assert estimate.w.tobytes() == expected.w.tobytes() and estimate.d.tobytes() == expected.d.tobytes()
-        assert 0.0 <= seconds < 10.0
-        robust = runner.robust(entry, c, RIG, SHUTTER, RobustOptions(), np.random.default_rng(4))
-        home = estimate_motion(c, RIG, SHUTTER, EightPointSolver(), RobustOptions(), np.random.default_rng(4))
-        assert robust.estimate.w.tobytes() == home.estimate.w.tobytes()
-        assert robust.iterations == home.iterations and robust.threshold_px == home.threshold_px
-        for name, mask in home.inliers.items():
-            np.testing.assert_array_equal(robust.inliers[name], mask)
+    """And what goes right is what the eight-point algorithm, which the plug-in calls, answers here."""
+    entry = mischief(tmp_path, *WRONG)
+    for k, (act, reason) in enumerate(WRONG.items()):
+        given = first(simulation, 3 * len(WRONG) + k)
+        estimate, seconds = runner.bare(entry, given, RIG, SHUTTER)
+        assert estimate.success == (reason == ""), act
+        assert estimate.reason.startswith(reason), act
+        if estimate.success:
+            expected = EightPointSolver().estimate(given, RIG, SHUTTER)
+            assert estimate.reason == expected.reason
+            assert estimate.w.tobytes() == expected.w.tobytes() and estimate.d.tobytes() == expected.d.tobytes()
+            assert 0.0 <= seconds < 10.0
+        else:
+            assert np.all(np.isnan(estimate.w)) and np.isnan(seconds)
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_process_that_ends_is_a_failure_of_that_problem_alone(
+    tmp_path: Path, simulation: Simulation, runner: SolverRunner
+) -> None:
+    acts = ("nothing", *DEADLY)
+    entry = mischief(tmp_path, *acts)
+    for k, (act, reason) in enumerate(DEADLY.items(), start=1):
+        assert runner.bare(entry, first(simulation, 5 * len(acts)), RIG, SHUTTER)[0].success
+        estimate, _ = runner.bare(entry, first(simulation, 5 * len(acts) + k), RIG, SHUTTER)
+        assert not estimate.success and estimate.reason.startswith(reason), act
+
+
+def test_a_limit_of_time_ends_it_with_its_children(tmp_path: Path, simulation: Simulation) -> None:
+    note = tmp_path / "pids"
+    entry = mischief(tmp_path, *SLOW, note=str(note))
+    with SolverRunner(time_limit_s=1.0) as runner:
+        for k in range(len(SLOW)):  # a fresh child serves the next one
+            estimate, _ = runner.bare(entry, first(simulation, 10 * len(SLOW) + k), RIG, SHUTTER)
+            assert estimate.reason == "took longer than 1 s"
+    assert len(note.read_text().split()) == 2 and not alive(note)
+
+
+def test_the_robust_loop_runs_there_as_it_does_here(
+    tmp_path: Path, simulation: Simulation, runner: SolverRunner
+) -> None:
+    c = simulation.correspondences
+    there = runner.robust(
+        mischief(tmp_path, "nothing"), c, RIG, SHUTTER, RobustOptions(), np.random.default_rng(4)
+    )
+    here = estimate_motion(c, RIG, SHUTTER, EightPointSolver(), RobustOptions(), np.random.default_rng(4))
+    assert there.estimate.w.tobytes() == here.estimate.w.tobytes()
+    assert there.iterations == here.iterations and there.threshold_px == here.threshold_px
+    assert there.counts == here.counts
+    for name, mask in here.inliers.items():
+        np.testing.assert_array_equal(there.inliers[name], mask)
+
+
+def test_what_goes_wrong_inside_the_robust_loop_is_a_failure_too(
+    tmp_path: Path, simulation: Simulation, runner: SolverRunner
+) -> None:
+    """Whether it does so in a minimal sample, of eight pairs, or later."""
+    for acts in (("tuple",), ("os_exit", "nothing", *["os_exit"] * 5)):
+        entry = mischief(tmp_path, *acts)
+        rng = np.random.default_rng(0)
+        answer = runner.robust(entry, simulation.correspondences, RIG, SHUTTER, RobustOptions(), rng)
+        assert not answer.estimate.success and answer.estimate.reason == (WRONG | DEADLY)[acts[0]]
+        assert not answer.inliers["left"].any() and len(answer.inliers["left"]) == 60
 
 
 def test_built_in_solvers_run_here(simulation: Simulation, runner: SolverRunner) -> None:
     estimate, _ = runner.bare(load_solver_entry("gs-8pt"), simulation.correspondences, RIG, SHUTTER)
     assert estimate.success and not runner._workers
-
-
-@pytest.mark.parametrize("what", ["loop", "hold", "breed"])
-def test_a_limit_of_time_ends_it_with_its_children(tmp_path: Path, simulation: Simulation, what: str) -> None:
-    note = tmp_path / "pids"
-    entry = mischief(tmp_path, what, note=str(note))
-    with SolverRunner(time_limit_s=1.0) as runner:
-        for _ in range(2):  # a fresh child serves the next call
-            estimate, _ = runner.bare(entry, simulation.correspondences, RIG, SHUTTER)
-            assert estimate.reason == "took longer than 1 s"
-            assert not note.exists() or not alive(note)
-
-
-def test_a_failure_does_not_touch_the_next_problem(
-    tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("MISCHIEF_SPARES_FEW", "1")
-    c = simulation.correspondences
-    few = type(c)(left=c.left[:15])
-    entry = mischief(tmp_path, "os_exit")
-    with SolverRunner() as runner:
-        assert runner.bare(entry, few, RIG, SHUTTER)[0].success
-        assert not runner.bare(entry, c, RIG, SHUTTER)[0].success
-        assert runner.bare(entry, few, RIG, SHUTTER)[0].success
 
 
 def alive(note: Path) -> list[int]:
@@ -280,7 +296,7 @@ with SolverRunner() as runner:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
 def test_nothing_outlives_its_parent(tmp_path: Path, end: signal.Signals) -> None:
     note = tmp_path / "pids"
     entry = mischief(tmp_path, "breed", note=str(note))

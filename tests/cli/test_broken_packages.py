@@ -1,0 +1,87 @@
+"""Installed packages that are broken: every command that does not use them works."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CARD = """
+name = "mine"
+axis = "noise_px"
+values = [0.5]
+solvers = ["gs-8pt"]
+trials = 2
+[setting]
+width = 640
+height = 480
+focal = 500.0
+baseline = 0.2
+readout_ratio = 0.5
+points = 30
+depth = [2.0, 5.0]
+rotation_deg = 1.0
+translation = 0.1
+noise_px = 0.0
+"""
+BROKEN = {
+    "raises": "raise RuntimeError('half installed')",
+    "exits": "raise SystemExit(3)",
+    "prints": "print('hello from a package')\nraise ImportError('no such library')",
+}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with packages whose modules fail, one that is gone, and one that claims a card's name."""
+    folder = tmp_path_factory.mktemp("site")
+    targets = {name: f"broken_{name}:Solver" for name in BROKEN} | {"gone": "not_there:Solver"}
+    for name, text in BROKEN.items():
+        (folder / f"broken_{name}.py").write_text(text + "\n")
+    for name, target in {**targets, "gs-8pt-scaled": "broken_raises:Solver"}.items():
+        info = folder / f"broken_{name.replace('-', '_')}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: broken-{name}\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(f"[rsbench.solvers]\n{name} = {target}\n")
+    return folder
+
+
+def rsbench(site: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+    path = os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, "-m", "rsbench", *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": path}
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
+
+
+def test_listing_names_them(site: Path) -> None:
+    result = rsbench(site, "list", "solvers")
+    assert result.returncode == 0, result.stderr
+    for name in (*BROKEN, "gone", "gs-8pt", "rs-stereo-refined"):
+        assert name in result.stdout
+
+
+def test_built_in_solvers_simulate(site: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text(CARD)
+    result = rsbench(site, "simulate", tmp_path / "mine.toml", "--out", tmp_path / "out", "--workers", 1)
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "out" / "summary.csv").is_file()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("exits", ["SystemExit: 3", "broken-exits"]),
+        ("prints", ["no such library", "broken-prints"]),
+        ("gs-8pt-scaled", ["card gs-8pt-scaled.toml", "broken-gs-8pt-scaled"]),
+    ],
+)
+def test_who_uses_one_is_told_its_name(site: Path, tmp_path: Path, name: str, words: list[str]) -> None:
+    result = rsbench(site, "simulate", "noise", "--solver", name, "--out", tmp_path / "out")
+    assert result.returncode == 2 and result.stdout == ""
+    assert "Traceback" not in result.stderr
+    (line,) = [line for line in result.stderr.splitlines() if "rsbench: error:" in line]
+    assert all(word in line for word in words), line
+    assert not (tmp_path / "out").exists()
