@@ -109,7 +109,8 @@ def show(card: SweepCard, table: pd.DataFrame) -> None:
         print_table(title, rows[list(columns)].rename(columns=columns), digits)
         for row in rows[rows.failures > 0].to_dict("records"):
             typer.echo(f"{row['solver']}, {card.axis} = {row['value']:g}, failed: {row['failure_reasons']}")
-    for (solver, assumed), rows in table.groupby(["solver", "assumed_motion"], sort=False):
+    rolling = table[table.shutter == "rolling"]  # the others know no time between the rows
+    for (solver, assumed), rows in rolling.groupby(["solver", "assumed_motion"], sort=False):
         others = sorted(set(rows.motion_model) - {assumed})
         if others:
             typer.echo(f"{solver} assumes {assumed} motion; the data are of {' and '.join(others)} motion")
