@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.projection import RSProjection, rs_project
-from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rsbench.pipeline.chain import CorrectedFrames
     from rsbench.pipeline.robust_motion import RobustEstimate
     from rsbench.solvers.engine.base import MotionEstimate, Solver
+    from rsbench.solvers.engine.registry import SolverEntry
 
 AnyPath: TypeAlias = str | PathLike[str]
 Image: TypeAlias = NDArray[Any]
@@ -135,22 +136,33 @@ def estimate_motion(
 
 
 def pose_errors(
-    estimate: MotionEstimate, motion: Motion, rig: StereoRig, *, reference_point: Literal["body", "left"] = "body"
+    found: RobustEstimate | MotionEstimate,
+    motion: Motion,
+    rig: StereoRig,
+    *,
+    reference_point: Literal["body", "left"] | None = None,
 ) -> dict[str, float]:
     """Errors of an estimate against the true motion, as docs/conventions.md defines them.
 
     Args:
-        estimate: the answer of a solver.
+        found: what ``estimate_motion`` returned, or a solver itself.
         motion: the truth.
         rig: whose left camera ``reference_point`` may mean.
-        reference_point: the point whose translation the estimate gives, as its solver's ``spec`` says.
+        reference_point: the point whose translation ``found`` gives. None is what ``estimate_motion`` says, and
+            the body for an answer of a solver itself, whose ``spec`` knows better.
 
     Returns:
         ``e_R_deg``, ``e_T_deg`` (degrees) and ``e_s``. A failure scores 180, 180 and infinity. NaN where there is
         nothing to compare: e_s of an estimate without metres, e_T and e_s where the true translation is zero.
+
+    Raises:
+        ValueError: no such reference point.
     """
     from rsbench.benchmark import scoring
+    from rsbench.solvers.engine.base import MotionEstimate
 
+    estimate = found if isinstance(found, MotionEstimate) else found.estimate
+    point = "body" if isinstance(found, MotionEstimate) else found.reference_point
     errors = scoring.pose_errors(
         estimate.w,
         estimate.d,
@@ -159,21 +171,27 @@ def pose_errors(
         rig=rig,
         success=estimate.success,
         metric=estimate.metric,
-        reference_point=reference_point,
+        reference_point=reference_point or point,
     )
     return {name: float(value) for name, value in errors.items()}
 
 
-def match(images: Series[Image]) -> Correspondences:
+def match(images: Series[Image], *, features: str | Path = "sift") -> Correspondences:
     """Matches of the four images of a rig over two frames: over time, left to right, and through all four.
 
-    Raises:
-        ValueError: not four images of one size and of a type that can be matched.
-    """
-    from rsbench.vision.features import match_stereo_frames
+    Args:
+        images: four images.
+        features: name or card of the feature matcher.
 
-    left_0, right_0, left_1, right_1 = _four(images)
-    return match_stereo_frames(left_0, right_0, left_1, right_1)
+    Raises:
+        ValueError: not four images.
+        RsbenchError: images of several sizes or types, or no such feature matcher.
+    """
+    from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.pipeline.frame_motion import find_matches
+    from rsbench.vision.feature_matcher import load_features
+
+    return find_matches(_views(images), CorrectionOptions(features=load_features(features)))
 
 
 def stereo_depth(
@@ -224,30 +242,25 @@ def correct(
         ``frames["left", 0]`` and so on, each with ``image``, ``depth`` and ``origin``; ``motion``, ``shutter``.
 
     Raises:
-        RsbenchError: frames that cannot be what they are said to be, or no such component.
-        NoMotionError: the matches determine no motion or readout ratio, or the solver no metres.
+        RsbenchError: frames that cannot be what they are said to be, or no such component. As its subclass
+            NoMotionError: the matches determine no motion or readout ratio, or the solver no metres.
     """
     from rsbench.pipeline.chain import correct_four
     from rsbench.pipeline.correction_options import CorrectionOptions
-    from rsbench.pipeline.footage import check_alike
-    from rsbench.solvers.engine.registry import load_solver_entry, wrap_solver
     from rsbench.vision.corrector import load_corrector
     from rsbench.vision.feature_matcher import load_features
     from rsbench.vision.stereo_matcher import load_matcher
 
-    left_0, right_0, left_1, right_1 = _four(images)
-    views = {("left", 0): left_0, ("right", 0): right_0, ("left", 1): left_1, ("right", 1): right_1}
-    check_alike({f"{side} {frame}": image for (side, frame), image in views.items()})
     options = CorrectionOptions(
         features=load_features(features),
-        solver=load_solver_entry(solver) if isinstance(solver, str | Path) else wrap_solver(solver),
+        solver=_entry(solver),
         matcher=load_matcher(matcher),
         corrector=load_corrector(corrector),
         target_row=target_row,
         inpaint=inpaint,
         seed=seed,
     )
-    return correct_four(views, rig, readout_ratio, options)  # type: ignore[arg-type]
+    return correct_four(_views(images), rig, readout_ratio, options)
 
 
 def read_dataset(folder: AnyPath) -> list[Sequence]:
@@ -338,13 +351,18 @@ def evaluate(
     return {table: read_scores(Path(out), table) for table in TABLES}
 
 
-def _solver(solver: str | Path | Solver) -> Solver:
-    from rsbench.solvers.engine.registry import load_solver
+def _entry(solver: str | Path | Solver) -> SolverEntry:
+    from rsbench.solvers.engine.registry import load_solver_entry, wrap_solver
 
-    return load_solver(solver) if isinstance(solver, str | Path) else solver
+    return load_solver_entry(solver) if isinstance(solver, str | Path) else wrap_solver(solver)
 
 
-def _four(images: Series[Image]) -> Series[Image]:
+def _views(images: Series[Image]) -> dict[View, Image]:
+    """The four images by side and frame, all of one size and type."""
+    from rsbench.pipeline.footage import check_alike
+
     if len(images) != 4:
         raise ValueError(f"images: got {len(images)}; four are needed: left 0, right 0, left 1, right 1")
-    return images
+    views = dict(zip(((side, frame) for frame in FRAMES for side in SIDES), images, strict=True))
+    check_alike({f"{side} {frame}": image for (side, frame), image in views.items()})
+    return views

@@ -18,6 +18,7 @@ import rsbench
 from rsbench.benchmark.simulated.simulation import Simulation
 from rsbench.core.projection import RSProjection
 from rsbench.dataset.sequence import Sequence
+from rsbench.pipeline.frame_motion import NoMotionError
 from rsbench.pipeline.robust_motion import RobustEstimate
 
 NAMES = [
@@ -116,7 +117,7 @@ def test_a_simulated_motion_is_found_and_scored() -> None:
     # Few outliers are kept, fewer than one in ten good matches lost.
     assert not np.any(found.inliers["tracks"] & data.outliers["tracks"])
     assert np.mean(found.inliers["tracks"][~data.outliers["tracks"]]) > 0.9
-    errors = rsbench.pose_errors(found.estimate, MOTION, RIG)
+    errors = rsbench.pose_errors(found, MOTION, RIG)
     assert_type(errors, dict[str, float])
     # Three standard deviations of this noise at this size, rounded up.
     assert errors["e_R_deg"] < 0.05 and errors["e_T_deg"] < 1.0 and errors["e_s"] < 0.02
@@ -147,6 +148,13 @@ def test_the_left_cameras_translation_is_scored_as_such() -> None:
     errors = rsbench.pose_errors(answer, MOTION, RIG, reference_point="left")
     assert errors["e_R_deg"] < 1e-9 and errors["e_T_deg"] < 1e-9  # rounding
     assert np.isnan(errors["e_s"])
+    # What comes out of the robust loop says itself that it is the left camera's: far from the body's direction.
+    still = rsbench.RollingShutter(height=900, readout_ratio=0.0)
+    data = rsbench.simulate(RIG, still, MOTION, pairs=40, tracks=0, noise_px=0.0)
+    found = rsbench.estimate_motion(data.correspondences, RIG, still, "gs-8pt")
+    assert found.reference_point == "left"
+    assert rsbench.pose_errors(found, MOTION, RIG)["e_T_deg"] < 1e-4
+    assert rsbench.pose_errors(found, MOTION, RIG, reference_point="body")["e_T_deg"] > 0.5
 
 
 def test_a_failure_scores_the_worst() -> None:
@@ -171,6 +179,16 @@ def test_a_dataset_is_read_matched_and_measured(smoke_dataset: Path) -> None:
     # At 128 x 96 a tenth of a pixel of disparity is some percent of depth.
     assert both.mean() > 0.3 and np.median(np.abs(depth[both] / truth[both] - 1)) < 0.05
     assert not any(report.faults for report in rsbench.verify(smoke_dataset, stride=4))
+
+
+def test_frames_without_a_motion_raise_what_a_notebook_can_catch() -> None:
+    """Bad frames and frames without a motion have one base class among the public names."""
+    flat = [np.full((96, 128), 90, np.uint8)] * 4
+    with pytest.raises(rsbench.RsbenchError, match="no texture"):
+        rsbench.correct(
+            flat, rsbench.StereoRig(camera=rsbench.PinholeCamera.centred(128, 96, 150.0), baseline=0.3)
+        )
+    assert issubclass(NoMotionError, rsbench.RsbenchError)
 
 
 @pytest.mark.parametrize("count", [3, 5])

@@ -28,7 +28,7 @@ _FEWEST_MATCHES = 12
 _MAX_READOUT_SIGMA = 0.25
 
 
-class NoMotionError(Exception):
+class NoMotionError(RsbenchError):
     """The frames are in order, but no motion explains their matches; the message says why."""
 
 

@@ -66,6 +66,8 @@ class RobustEstimate:
     seconds: float
     threshold_px: float
     """The threshold that the inliers have passed."""
+    reference_point: Literal["body", "left"] = "body"
+    """The point of the rig whose translation the estimate gives: that of its solver's spec."""
 
     @property
     def inlier_count(self) -> int:
@@ -119,6 +121,7 @@ def estimate_motion(
         iterations=found.iterations,
         seconds=seconds,
         threshold_px=found.threshold_px,
+        reference_point=solver.spec.reference_point,
     )
 
 
