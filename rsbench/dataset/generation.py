@@ -11,7 +11,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from functools import lru_cache
 from importlib.metadata import version
-from itertools import product
+from itertools import groupby, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str], None]
 """Called with the name of the sequence after each of its ``STEPS``."""
+LoadScene = Callable[[str], Scene]
 STEPS = 1 + 2 * len(SIDES) * len(FRAMES)
 """Per sequence: building the scene, and four rolling-shutter and four global-shutter renders."""
 
@@ -68,7 +69,9 @@ def generate_dataset(
     options = load_card(RendererOptions, "renderers", card.renderer)
     if full_frames:
         options = replace(options, method="stitched", full_frames=True)
-    plans = {sequence.name: _plan(card, sequence, options) for sequence in card.sequence}
+    # Of this run alone, and the last one only: a scene takes hundreds of MB, and its card may change between runs.
+    load = lru_cache(maxsize=1)(load_scene)
+    plans = _plans(card, options, load)
     _open_folder(out)
     todo = []
     for sequence in card.sequence:
@@ -77,16 +80,30 @@ def generate_dataset(
                 progress(sequence.name)  # type: ignore[misc]
         else:
             todo.append(sequence)
-    for name in _render_all(card, todo, options, out, workers):
+    for name in _render_all(card, sorted(todo, key=_scene_name), options, plans, load, out, workers):
         if progress:
             progress(name)
     _write_manifest(card, out)
     return [sequence.name for sequence in todo]
 
 
-def _plan(card: DatasetCard, sequence: SequenceCard, options: RendererOptions) -> dict[str, Any]:
+def _scene_name(sequence: SequenceCard) -> str:
+    return sequence.scene
+
+
+def _plans(card: DatasetCard, options: RendererOptions, load: LoadScene) -> dict[str, dict[str, Any]]:
+    """The plan of each sequence by its name; each scene is loaded once, the one rendered first last."""
+    plans: dict[str, dict[str, Any]] = {}
+    for name, sequences in groupby(sorted(card.sequence, key=_scene_name, reverse=True), _scene_name):
+        digest = _scene_digest(load(name))
+        plans |= {sequence.name: _plan(card, sequence, options, load(name), digest) for sequence in sequences}
+    return plans
+
+
+def _plan(
+    card: DatasetCard, sequence: SequenceCard, options: RendererOptions, scene: Scene, digest: str
+) -> dict[str, Any]:
     """All that decides the bytes of a sequence, as it stands in its sequence.json."""
-    scene = _scene(sequence.scene)
     if sequence.viewpoint not in scene.viewpoints:
         names = ", ".join(scene.viewpoints)
         raise RsbenchError(f"scene {sequence.scene}: no viewpoint {sequence.viewpoint!r}; there are: {names}")
@@ -101,7 +118,7 @@ def _plan(card: DatasetCard, sequence: SequenceCard, options: RendererOptions) -
     return manifest | {
         "scene": {
             "name": scene.name,
-            "sha256": _scene_digest(sequence.scene),
+            "sha256": digest,
             "viewpoint": sequence.viewpoint,
             **_listed(asdict(viewpoint)),
         },
@@ -114,16 +131,9 @@ def _listed(values: dict[str, Any]) -> dict[str, Any]:
     return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
 
-@lru_cache(maxsize=2)
-def _scene(name: str) -> Scene:
-    return load_scene(name)
-
-
-@lru_cache(maxsize=64)
-def _scene_digest(name: str) -> str:
+def _scene_digest(scene: Scene) -> str:
     """Hash of all that is rendered of a scene: geometry, materials and light."""
     digest = hashlib.sha256()
-    scene = _scene(name)
     digest.update(repr(scene.light).encode())
     for mesh in scene.meshes:
         digest.update(f"{mesh.name}/{mesh.material.name}/{mesh.material.colour}".encode())
@@ -163,11 +173,17 @@ def _is_complete(folder: Path, plan: dict[str, Any]) -> bool:
 
 
 def _render_all(
-    card: DatasetCard, todo: list[SequenceCard], options: RendererOptions, out: Path, workers: int
+    card: DatasetCard,
+    todo: list[SequenceCard],
+    options: RendererOptions,
+    plans: dict[str, dict[str, Any]],
+    load: LoadScene,
+    out: Path,
+    workers: int,
 ) -> Iterator[str]:
     if workers <= 1 or len(todo) <= 1:
         for sequence in todo:
-            for _ in _render_sequence(card, sequence, options, out):
+            for _ in _render_sequence(card, sequence, options, plans[sequence.name], load(sequence.scene), out):
                 yield sequence.name
         return
     # Spawned, because Dr.Jit's threads do not survive a fork; one task each, so memory goes back to the system.
@@ -175,7 +191,8 @@ def _render_all(
     threads = max(1, (os.cpu_count() or 1) // workers)
     with ProcessPoolExecutor(workers, mp_context=context, max_tasks_per_child=1) as pool:
         jobs = {
-            pool.submit(_render_in_child, card, sequence, options, out, threads): sequence for sequence in todo
+            pool.submit(_render_in_child, card, sequence, options, plans[sequence.name], out, threads): sequence
+            for sequence in todo
         }
         for job in as_completed(jobs):
             job.result()
@@ -184,26 +201,34 @@ def _render_all(
 
 
 def _render_in_child(
-    card: DatasetCard, sequence: SequenceCard, options: RendererOptions, out: Path, threads: int
+    card: DatasetCard,
+    sequence: SequenceCard,
+    options: RendererOptions,
+    plan: dict[str, Any],
+    out: Path,
+    threads: int,
 ) -> None:
     from rsbench.renderers.backend import set_threads, start_backend
 
     start_backend()
     set_threads(threads)
-    for _ in _render_sequence(card, sequence, options, out):
+    for _ in _render_sequence(card, sequence, options, plan, load_scene(sequence.scene), out):
         pass
 
 
 def _render_sequence(
-    card: DatasetCard, sequence: SequenceCard, options: RendererOptions, out: Path
+    card: DatasetCard,
+    sequence: SequenceCard,
+    options: RendererOptions,
+    plan: dict[str, Any],
+    scene: Scene,
+    out: Path,
 ) -> Iterator[None]:
     """Render into a temporary folder and rename it when complete; yields after each step."""
     from rsbench.renderers.backend import start_backend
     from rsbench.renderers.scene import MitsubaScene
 
     backend = start_backend()
-    plan = _plan(card, sequence, options)
-    scene = _scene(sequence.scene)
     mitsuba_scene = MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint]))
     partial = out / f".{sequence.name}.partial"
     for folder in {Path(name).parent for name in RELATIVE_FILES}:

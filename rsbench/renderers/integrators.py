@@ -43,13 +43,21 @@ def path_integrator(max_depth: int) -> Any:
     return mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000})
 
 
-@cache
 def lane_sampler() -> Any:
     """A Mitsuba sampler whose numbers depend on seed, pixel and sample alone, not on the place in the wavefront.
 
     Mitsuba's own samplers number the lanes of a launch, so a row rendered by itself would draw other numbers than
-    the same row of a whole image.
+    the same row of a whole image. A new one each time: what it would draw next depends on the path so far, and so
+    keeps the whole scene alive.
     """
+    import mitsuba as mi
+
+    _register_lane_sampler()
+    return mi.load_dict({"type": "rsbench_lanes"})
+
+
+@cache
+def _register_lane_sampler() -> None:
     import mitsuba as mi
 
     class LaneSampler(mi.Sampler):  # type: ignore[misc,name-defined,unused-ignore]
@@ -74,4 +82,3 @@ def lane_sampler() -> Any:
             return "LaneSampler[]"
 
     mi.register_sampler("rsbench_lanes", LaneSampler)
-    return mi.load_dict({"type": "rsbench_lanes"})

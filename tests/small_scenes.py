@@ -1,0 +1,61 @@
+"""Dataset cards of scenes that load and render in a moment: a textured box around the rig, from a mesh file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+SCENE = """
+name = "{name}"
+builder = "mesh"
+[parameters]
+file = "{name}.glb"
+up_axis = "z"
+[viewpoints.default]
+eye = [0.0, -3.0, 0.2]
+target = [0.3, 3.0, 0.0]
+"""
+DATASET = """
+name = "small"
+baseline = 0.3
+readout_ratio = 0.8
+renderer = "preview"
+seed = 1
+[camera]
+width = 96
+height = 64
+focal = 80
+[motion]
+rotation_deg = 1.5
+rotation_axis = [0.4, 1.0, -0.6]
+translation = 0.2
+translation_axis = [-0.7, 0.3, -0.6]
+"""
+
+
+def write_box_scene(folder: Path, name: str, texture: tuple[int, int] = (64, 64)) -> Path:
+    """Write name.toml and name.glb: a box of 6 x 10 x 4 m from inside, its image of (rows, columns)."""
+    y, x = np.mgrid[: texture[0], : texture[1]]
+    image = Image.fromarray(np.stack([x * 5 % 256, y * 3 % 256, (x + 2 * y) % 256], axis=-1).astype(np.uint8))
+    box = trimesh.creation.box((6.0, 10.0, 4.0))
+    corners = np.asarray(box.triangles).reshape(-1, 3)
+    uv = np.tile([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], (12, 1))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image, name="paper")
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    faces = np.arange(36).reshape(12, 3)[:, ::-1]
+    trimesh.Trimesh(vertices=corners, faces=faces, visual=visual, process=False).export(folder / f"{name}.glb")
+    card = folder / f"{name}.toml"
+    card.write_text(SCENE.format(name=name))
+    return card
+
+
+def write_small_card(folder: Path, scenes: Sequence[Path]) -> Path:
+    """Write small.toml: a dataset of one sequence for each of these scene cards, named as they are."""
+    sequences = [f'[[sequence]]\nname = "{scene.stem}"\nscene = "{scene}"\n' for scene in scenes]
+    card = folder / "small.toml"
+    card.write_text("\n".join([DATASET, *sequences]))
+    return card
