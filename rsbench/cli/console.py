@@ -84,6 +84,39 @@ def stoppable(resume: str = "the same command resumes where it stopped") -> Iter
         signal.signal(signal.SIGTERM, before)
 
 
+@contextmanager
+def late_progress(label: str) -> Iterator[Callable[[str], None]]:
+    """A count of steps on a terminal's stderr, for work of more than two seconds; stdout stays free."""
+    import time
+
+    from rich.console import Console
+    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[word]}"),
+    )
+    # Redirected, what a command prints would go where the bar is.
+    progress = Progress(
+        *columns, console=Console(stderr=True), transient=True, redirect_stdout=False, redirect_stderr=False
+    )
+    task = progress.add_task(label, total=None, word="")
+    start = time.monotonic()
+
+    def advance(word: str) -> None:
+        progress.update(task, advance=1, word=word)
+        if progress.console.is_terminal and time.monotonic() - start > 2.0:
+            progress.start()
+
+    try:
+        yield advance
+    finally:
+        if progress.live.is_started:
+            progress.stop()
+
+
 def print_table(title: str, frame: pd.DataFrame, digits: dict[str, int] | None = None) -> None:
     """A data frame as a terminal table; ``digits`` gives decimals per column."""
     numeric = {str(column) for column in frame.columns if frame[column].dtype.kind in "fiu"}

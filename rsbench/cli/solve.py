@@ -1,67 +1,203 @@
-"""``rsbench solve``: one problem, for people with their own correspondences."""
+"""``rsbench solve``: problems of people with their own correspondences, one or many in one process."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rsbench.errors import RsbenchError
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rsbench.pipeline.answer import Extra
+    from rsbench.pipeline.robust_motion import RobustOptions
+    from rsbench.solvers.engine.registry import SolverEntry
+
 EPILOG = """[bold]Examples[/bold]
 
-  rsbench solve problem.json
+  rsbench solve --example > problem.json
 
   rsbench solve problem.json --solver rs-stereo-linear --json
 
-PROBLEM.json holds [bold]camera[/bold] (width, height, fx, fy, cx, cy), [bold]baseline[/bold] (m),
+  rsbench solve problem.json --solver rs-stereo --solver gs-8pt
+
+  cat problems.jsonl | rsbench solve - --json --with covariance,inliers
+
+A problem holds [bold]camera[/bold] (width, height, fx, fy, cx, cy), [bold]baseline[/bold] (m),
 [bold]readout_ratio[/bold] and matches in pixels: [bold]left[/bold] and [bold]right[/bold] (x0, y0, x1, y1),
 [bold]stereo_0[/bold] and [bold]stereo_1[/bold] (xl, yl, xr, yr), [bold]tracks[/bold] (xl0, yl0, xr0, yr0,
-xl1, yl1, xr1, yr1); absent sets are empty. The centre of the top-left pixel is (0, 0)."""
+xl1, yl1, xr1, yr1); absent sets are empty. The centre of the top-left pixel is (0, 0). Exit codes: 0 all solved,
+1 one without a motion, 2 one that is
+wrong (the others are solved all the same)."""
 
 
 def solve(
-    problem: Annotated[Path, typer.Argument(metavar="PROBLEM.json", help="Camera, rig, shutter and matches.")],
+    problems: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="PROBLEM",
+            help="Files (.json; .jsonl, one problem per line; .npz), folders of such, or - for standard input.",
+        ),
+    ] = None,
     solver: Annotated[
-        str, typer.Option(help="Name of a solver card (rsbench list solvers) or path.")
-    ] = "rs-stereo",
+        list[str] | None,
+        typer.Option(
+            help="Name of a solver (rsbench list solvers) or path of a card; repeatable. Default: rs-stereo"
+        ),
+    ] = None,
     threshold_px: Annotated[
         float | None, typer.Option(help="Largest Sampson error of an inlier, px. Default: follows the noise.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
-    json: Annotated[bool, typer.Option("--json", help="Answer as one JSON object.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object per line and answer.")] = False,
+    extras: Annotated[
+        str,
+        typer.Option("--with", help="More in each JSON answer: covariance, noise, inliers; with commas between."),
+    ] = "",
+    time_limit: Annotated[
+        float | None, typer.Option(help="Seconds that another package's solver may take for a problem.")
+    ] = None,
+    example: Annotated[
+        bool, typer.Option("--example", help="Print a sample problem and do nothing else.")
+    ] = False,
 ) -> None:
     """Estimate the motion of a stereo rig from your own matches."""
+    from rsbench.pipeline.problem import EXAMPLE
+    from rsbench.solvers.engine.registry import load_solver_entries
+
+    if example:
+        typer.echo(EXAMPLE.read_text(encoding="utf-8"), nl=False)
+        return
+    if not problems:
+        raise RsbenchError("PROBLEM: none given; give files, folders or -, or have a sample made by --example")
+    wanted = _extras(extras, json)
+    entries = load_solver_entries(solver or ["rs-stereo"])
+    options = _options(threshold_px)
+    answers: list[dict[str, Any]] = []
+    wrong = 0
+    for answer in _answers(problems, entries, options, seed, wanted, _limit(time_limit)):
+        if isinstance(answer, RsbenchError):
+            wrong += 1
+            typer.echo(f"rsbench: error: {' '.join(str(answer).split())}", err=True)
+        else:
+            _keep(answer, answers, json)
+    if not json:
+        _show(answers)
+    if wrong or not all(answer["success"] for answer in answers):
+        raise typer.Exit(2 if wrong else 1)
+
+
+def _answers(
+    problems: list[str],
+    entries: list[SolverEntry],
+    options: RobustOptions,
+    seed: int,
+    extras: list[Extra],
+    time_limit: float | None,
+) -> Iterator[dict[str, Any] | RsbenchError]:
+    """One answer per problem and solver, or the error that a problem is."""
+    import sys
+
+    from rsbench.cli.console import late_progress
+    from rsbench.pipeline.answer import solve_problem
+    from rsbench.pipeline.isolated_solver import SolverRunner
+    from rsbench.pipeline.problem import read_problems
+
+    with SolverRunner(time_limit_s=time_limit) as runner, late_progress("solving") as advance:
+        for source in problems:
+            for problem in read_problems(source, sys.stdin):
+                if isinstance(problem, RsbenchError):
+                    yield problem
+                    continue
+                for entry in entries:
+                    yield solve_problem(problem, entry, options, runner, seed, extras)
+                advance(problem.name)
+
+
+def _keep(answer: dict[str, Any], answers: list[dict[str, Any]], json: bool) -> None:
+    """Print at once what is a line of its own; of that only the success is still needed."""
     import json as json_module
 
-    import numpy as np
-
-    from rsbench.pipeline.problem import read_problem, solve_problem
-    from rsbench.pipeline.robust_motion import RobustOptions
-    from rsbench.solvers.engine.registry import load_solver_entry
-
-    chosen = load_solver_entry(solver)
-    options = RobustOptions()
-    if threshold_px is not None:
-        if not threshold_px > 0.0:
-            raise RsbenchError(f"--threshold-px = {threshold_px}: must be a positive number of pixels")
-        options = RobustOptions(threshold_px=threshold_px, adapt_threshold=False)
-    answer = solve_problem(read_problem(problem), chosen, options, seed)
     if json:
         typer.echo(json_module.dumps(answer, allow_nan=False))
-    elif answer["success"]:
-        angle = np.rad2deg(np.linalg.norm(answer["w"]))
-        unit = "m" if answer["metric"] else "(length unknown)"
-        typer.echo(f"w  {_vector(answer['w'])} rad per frame ({angle:.4f} deg)")
-        typer.echo(f"d  {_vector(answer['d'])} {unit} per frame")
-        typer.echo(f"inliers: {answer['inliers_left']} left, {answer['inliers_right']} right")
-        if answer["reason"]:
-            typer.echo(f"note: {answer['reason']}")
-    else:
-        typer.echo(f"no estimate: {answer['reason']}", err=True)
+    answers.append({"success": answer["success"]} if json else answer)
+
+
+def _show(answers: list[dict[str, Any]]) -> None:
+    import pandas as pd
+
+    from rsbench.cli.console import print_table
+
+    if len(answers) == 1:
+        _show_one(answers[0])
+    elif answers:
+        print_table("", pd.DataFrame([_row(answer) for answer in answers]))
+
+
+def _show_one(answer: dict[str, Any]) -> None:
     if not answer["success"]:
-        raise typer.Exit(1)
+        typer.echo(f"no estimate: {answer['reason']}", err=True)
+        return
+    whose = {"body": "the middle of the baseline", "left": "the left camera"}[answer["reference_point"]]
+    unit = "m per frame" if answer["metric"] else "(direction only)"
+    typer.echo(f"w  {_vector(answer['w'])} rad per frame ({_degrees(answer['w']):.4f} deg)")
+    typer.echo(f"d  {_vector(answer['d'])} {unit}, of {whose}")
+    typer.echo(f"inliers: {answer['inliers']} of {answer['matches']} matches")
+    typer.echo(f"assumes: {answer['motion_model']} motion, {answer['shutter']} shutter; {answer['assumes']}")
+    if answer["reason"]:
+        typer.echo(f"note: {answer['reason']}")
+
+
+def _row(answer: dict[str, Any]) -> dict[str, Any]:
+    found, metric = answer["success"], answer["metric"]
+    length = " m" if metric else ""
+    return {
+        "problem": answer["name"],
+        "solver": answer["solver"],
+        "rotation": f"{_degrees(answer['w']):.3f} deg" if found else "-",
+        "d": " ".join(f"{value:.3f}" for value in answer["d"]) + length if found else "-",
+        "of the": answer["reference_point"],
+        "inliers": f"{answer['inliers']}/{answer['matches']}",
+        "ms": f"{1e3 * answer['seconds']:.0f}",
+        "note": answer["reason"],
+    }
+
+
+def _extras(text: str, json: bool) -> list[Extra]:
+    from rsbench.cards import choices
+    from rsbench.pipeline.answer import EXTRAS
+
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    for name in names:
+        if name not in EXTRAS:
+            raise RsbenchError(f"--with {text}: {name!r} is unknown{choices(name, EXTRAS)}")
+    if names and not json:
+        raise RsbenchError(f"--with {text}: is part of JSON answers only; add --json")
+    return [extra for extra in EXTRAS if extra in names]
+
+
+def _options(threshold_px: float | None) -> RobustOptions:
+    from rsbench.pipeline.robust_motion import RobustOptions
+
+    if threshold_px is None:
+        return RobustOptions()
+    if not 0.0 < threshold_px < float("inf"):
+        raise RsbenchError(f"--threshold-px = {threshold_px}: must be a positive number of pixels")
+    return RobustOptions(threshold_px=threshold_px, adapt_threshold=False)
+
+
+def _limit(seconds: float | None) -> float | None:
+    if seconds is not None and not seconds > 0.0:
+        raise RsbenchError(f"--time-limit = {seconds}: must be a positive number of seconds")
+    return seconds
+
+
+def _degrees(w: list[float]) -> float:
+    import numpy as np
+
+    return float(np.rad2deg(np.linalg.norm(w)))
 
 
 def _vector(values: list[float]) -> str:

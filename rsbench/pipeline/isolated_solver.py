@@ -29,6 +29,7 @@ from rsbench.pipeline.isolation import (
     one_line,
     use_one_thread,
 )
+from rsbench.pipeline.problem import EXAMPLE, read_problem
 from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.pipeline.robust_problem import MatchCount
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
@@ -54,6 +55,7 @@ class SolverRunner:
         self._time_limit_s, self._single_thread = time_limit_s, single_thread
         self._workers: dict[tuple[str, str], IsolatedWorker] = {}
         self._stack = ExitStack()
+        self._warm: set[str] = set()
 
     def robust(
         self,
@@ -67,6 +69,9 @@ class SolverRunner:
         """``estimate_motion``, all of it in the child; ``rng`` then stays as it is here."""
         loop = entry.options.robust
         if entry.built_in:
+            if entry.key not in self._warm:
+                self._warm.add(entry.key)
+                _compile(entry.solver)  # not in the seconds of its first problem
             return estimate_motion(correspondences, rig, shutter, entry.solver, options, rng, loop)
         start = time.perf_counter()
         outcome = self._call(entry, "robust", correspondences, rig, shutter, options, rng, loop)
@@ -148,6 +153,13 @@ def _serve_solver(place: str, single_thread: bool) -> Callable[..., object]:
         return estimate_motion(correspondences, rig, shutter, solver, options, rng, loop)
 
     return answer
+
+
+def _compile(solver: Solver) -> None:
+    """Run a small problem, so that what a solver of ours compiles and loads is there."""
+    problem, options = read_problem(EXAMPLE), RobustOptions(max_iterations=10)
+    given = problem.correspondences
+    estimate_motion(given, problem.rig, problem.shutter, solver, options, np.random.default_rng(0))
 
 
 class GuardedSolver(Solver):

@@ -1,23 +1,23 @@
-"""One problem in a JSON file, for people with correspondences of their own, and its answer."""
+"""Problems in files, for people with correspondences of their own; the format is docs/problem-format.md."""
 
 from __future__ import annotations
 
 import json
+import zipfile
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rsbench.cards import parse_card
+from rsbench.cards import choices, parse_card, shipped_folder
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.correspondences import Correspondences, track_pairs
-from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
-from rsbench.solvers.engine.registry import SolverEntry
 
 _COLUMNS = {
     "left": "x0, y0, x1, y1",
@@ -26,6 +26,11 @@ _COLUMNS = {
     "stereo_1": "xl, yl, xr, yr",
     "tracks": "xl0, yl0, xr0, yr0, xl1, yl1, xr1, yr1",
 }
+_CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
+_LINES = (".jsonl", ".ndjson")
+SUFFIXES = (".json", *_LINES, ".npz")
+EXAMPLE = shipped_folder("examples", "_docs/examples") / "problem.json"
+"""A small problem that every installation has."""
 _Rows = tuple[tuple[float, ...], ...]
 
 
@@ -33,7 +38,9 @@ _Rows = tuple[tuple[float, ...], ...]
 class Problem:
     """What a solver is given."""
 
+    name: str
     correspondences: Correspondences
+    """As in the file: left-right matches are not joined yet."""
     rig: StereoRig
     shutter: RollingShutter
 
@@ -43,40 +50,105 @@ class _Content:
     camera: PinholeCamera
     baseline: float
     readout_ratio: float
-    left: _Rows
-    right: _Rows
+    name: str = ""
+    left: _Rows = ()
+    right: _Rows = ()
     stereo_0: _Rows = ()
     stereo_1: _Rows = ()
     tracks: _Rows = ()
 
 
+def read_problems(source: str | Path, stdin: TextIO) -> Iterator[Problem | RsbenchError]:
+    """The problems of a file, of all files of a folder, or of ``stdin`` for ``-``, one by one.
+
+    A problem that is wrong is an error in its place, and the rest follows; the error names the file and, where a
+    file holds many, the line.
+    """
+    if str(source) == "-":
+        try:
+            yield from _parsed(stdin, "stdin", "stdin", lines=None)
+        except UnicodeDecodeError:
+            yield RsbenchError("stdin: not UTF-8 text")
+        return
+    path = Path(source)
+    if not path.is_dir():
+        yield from _read_file(path)
+        return
+    files = sorted(file for file in path.iterdir() if file.suffix in SUFFIXES)
+    if not files:
+        yield RsbenchError(f"{path}: holds no problem: no file ends in {', '.join(SUFFIXES)}")
+    for file in files:
+        yield from _read_file(file)
+
+
 def read_problem(path: str | Path) -> Problem:
-    """Problem in a JSON file (format: ``parse_problem``).
+    """The one problem of a file.
 
     Raises:
-        RsbenchError: the file cannot be read or is wrong.
+        RsbenchError: the file cannot be read, is wrong, or holds more than one.
     """
+    problems = list(_read_file(Path(path)))
+    if len(problems) != 1:
+        raise RsbenchError(f"{path}: holds {len(problems)} problems, not one")
+    if isinstance(problems[0], RsbenchError):
+        raise problems[0]
+    return problems[0]
+
+
+def _read_file(path: Path) -> Iterator[Problem | RsbenchError]:
     try:
-        text = Path(path).read_bytes().decode("utf-8")
+        if path.suffix == ".npz":
+            yield _from_npz(path)
+            return
+        with path.open(encoding="utf-8") as file:
+            yield from _parsed(file, str(path), path.stem, lines=path.suffix in _LINES)
     except OSError as error:
-        raise RsbenchError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise RsbenchError(
-            f"{path}: not valid JSON: not UTF-8 text ({error.reason} at byte {error.start})"
-        ) from error
-    return parse_problem(text, str(path))
+        yield RsbenchError(f"{path}: cannot be read: {error.strerror}")
+    except UnicodeDecodeError:
+        yield RsbenchError(f"{path}: not UTF-8 text")
+    except RsbenchError as error:
+        yield error
 
 
-def parse_problem(text: str, where: str) -> Problem:
-    """Problem from JSON text.
+def _parsed(file: TextIO, where: str, name: str, lines: bool | None) -> Iterator[Problem | RsbenchError]:
+    """One problem of a text, or one per line; None: the first line tells, for it is a problem of its own."""
+    first = ""
+    if lines is None:
+        first = next((line for line in file if line.strip()), "")
+        lines = _is_object(first)
+    if not lines:
+        yield _attempt(first + file.read(), where, name)
+        return
+    number = 1 if first else 0
+    if first:
+        yield _attempt(first, f"{where}:1", f"{name}:1")
+    for line in file:
+        number += 1
+        if line.strip():
+            yield _attempt(line, f"{where}:{number}", f"{name}:{number}")
 
-    ``{"camera": {"width", "height", "fx", "fy", "cx", "cy"}, "baseline", "readout_ratio", "left", "right"}``, and
-    where there are any ``"stereo_0", "stereo_1", "tracks"``; matches are lists of numbers in pixels. Left matches
-    whose two ends both have a left-right match at exactly the same left pixel become tracks.
+
+def _is_object(line: str) -> bool:
+    try:
+        return isinstance(json.loads(line), dict)
+    except (ValueError, RecursionError):
+        return False
+
+
+def _attempt(text: str, where: str, name: str) -> Problem | RsbenchError:
+    try:
+        return parse_problem(text, where, name)
+    except RsbenchError as error:
+        return error
+
+
+def parse_problem(text: str, where: str, name: str = "") -> Problem:
+    """A problem in JSON.
 
     Args:
         text: JSON.
         where: file name, for messages.
+        name: of the problem, where the text gives it none.
 
     Raises:
         RsbenchError: one line with the file, the field, the value and what is allowed.
@@ -92,15 +164,19 @@ def parse_problem(text: str, where: str) -> Problem:
     if not isinstance(data, dict):
         raise RsbenchError(f"{where}: must be a JSON object with camera, baseline, ..., got {type(data).__name__}")
     content = parse_card(_Content, data, where)
-    for name, columns in _COLUMNS.items():
-        _check_widths(getattr(content, name), name, columns, where)
-    try:
-        rig = StereoRig(camera=content.camera, baseline=content.baseline)
-        shutter = RollingShutter(height=content.camera.height, readout_ratio=content.readout_ratio)
-    except ValueError as error:
-        raise RsbenchError(f"{where}: {error}") from error
-    matches = {name: np.array(getattr(content, name), dtype=np.float64) for name in _COLUMNS}
-    return Problem(correspondences=link_tracks(Correspondences(**matches)), rig=rig, shutter=shutter)
+    _check_sets(data, where)
+    for key, columns in _COLUMNS.items():
+        _check_widths(getattr(content, key), key, columns, where)
+    sets = {key: getattr(content, key) for key in _COLUMNS}
+    return _problem(
+        content.camera, content.baseline, content.readout_ratio, sets, content.name or name or where, where
+    )
+
+
+def _check_sets(data: Mapping[str, Any], where: str) -> None:
+    """Empty sets are a problem without an answer; none at all is a slip."""
+    if not any(key in data for key in _COLUMNS):
+        raise RsbenchError(f"{where}: no matches: at least one of {', '.join(_COLUMNS)} is required")
 
 
 def _check_widths(rows: _Rows, name: str, columns: str, where: str) -> None:
@@ -110,51 +186,55 @@ def _check_widths(rows: _Rows, name: str, columns: str, where: str) -> None:
             raise RsbenchError(f"{where}: {name}[{k}] = {list(row)}: must be {width} numbers in pixels: {columns}")
 
 
-def link_tracks(correspondences: Correspondences) -> Correspondences:
-    """Join left matches with the left-right matches of both frames at exactly the same pixels into tracks."""
-    ends = []
-    for stereo in (correspondences.stereo_0, correspondences.stereo_1):
-        ends.append({(row[0], row[1]): row[2:] for row in stereo})
-    known = {row.tobytes() for row in track_pairs(correspondences.tracks, "left")}
-    found: list[FloatArray] = []
-    for row in correspondences.left:
-        right0, right1 = ends[0].get((row[0], row[1])), ends[1].get((row[2], row[3]))
-        if right0 is not None and right1 is not None and row.tobytes() not in known:
-            found.append(np.concatenate([row[:2], right0, row[2:], right1]))
-    if not found:
-        return correspondences
-    return Correspondences(
-        left=correspondences.left,
-        right=correspondences.right,
-        stereo_0=correspondences.stereo_0,
-        stereo_1=correspondences.stereo_1,
-        tracks=np.concatenate([correspondences.tracks, np.array(found)]),
-    )
+def _problem(
+    camera: PinholeCamera, baseline: float, ratio: float, sets: Mapping[str, Any], name: str, where: str
+) -> Problem:
+    try:
+        rig = StereoRig(camera=camera, baseline=baseline)
+        shutter = RollingShutter(height=camera.height, readout_ratio=ratio)
+        matches = Correspondences(**{key: np.array(rows, dtype=np.float64) for key, rows in sets.items()})
+    except ValueError as error:
+        raise RsbenchError(f"{where}: {error}") from error
+    return Problem(name=name, correspondences=matches, rig=rig, shutter=shutter)
 
 
-def solve_problem(problem: Problem, entry: SolverEntry, options: RobustOptions, seed: int = 0) -> dict[str, Any]:
-    """Answer to a problem, ready for JSON; a failure has ``w`` and ``d`` null and the reason."""
-    solver = entry.solver
-    result = estimate_motion(
-        problem.correspondences, problem.rig, problem.shutter, solver, options, np.random.default_rng(seed)
-    )
-    estimate = result.estimate
-    counts: dict[str, int] = {}
-    for side in SIDES:
-        if not solver.spec.needs & {side, "tracks"}:
-            counts[side] = 0
-            continue
-        own = getattr(problem.correspondences, side)[result.inliers[side]]
-        halves = track_pairs(problem.correspondences.tracks, side)[result.inliers["tracks"]]
-        counts[side] = len({row.tobytes() for row in np.concatenate([own, halves])})
-    return {
-        "solver": entry.name,
-        "success": estimate.success,
-        "reason": estimate.reason,
-        "w": estimate.w.tolist() if estimate.success else None,
-        "d": estimate.d.tolist() if estimate.success else None,
-        "metric": estimate.metric,
-        "inliers_left": counts["left"],
-        "inliers_right": counts["right"],
-        "seconds": result.seconds,
-    }
+def _from_npz(path: Path) -> Problem:
+    """A problem in arrays: ``camera`` (6,) as width, height, fx, fy, cx, cy, and the other keys as in JSON."""
+    arrays = _load(path)
+    known = ("camera", "baseline", "readout_ratio", "name", *_COLUMNS)
+    for key in arrays:
+        if key not in known:
+            raise RsbenchError(f"{path}: unknown key {key!r}{choices(key, known)}")
+    for key in known[:3]:
+        if key not in arrays:
+            raise RsbenchError(f"{path}: {key!r} is required")
+    _check_sets(arrays, str(path))
+    for key, array in arrays.items():
+        if array.dtype.kind not in ("U" if key == "name" else "fiu"):
+            raise RsbenchError(f"{path}: {key}: must be {'a text' if key == 'name' else 'numbers'}")
+    size = arrays["camera"]
+    if size.shape != (6,) or np.any(size[:2] != np.round(size[:2])):
+        raise RsbenchError(f"{path}: camera = {size.tolist()}: must be {', '.join(_CAMERA)}, the first two whole")
+    for key in ("baseline", "readout_ratio"):
+        if arrays[key].size != 1:
+            raise RsbenchError(f"{path}: {key} has shape {arrays[key].shape}: must be one number")
+    width, height, *rest = size.tolist()
+    values = {"width": int(width), "height": int(height), **dict(zip(_CAMERA[2:], rest, strict=True))}
+    camera = parse_card(PinholeCamera, values, f"{path}: camera")
+    sets = {key: arrays[key] for key in _COLUMNS if key in arrays}
+    baseline, ratio = float(arrays["baseline"].item()), float(arrays["readout_ratio"].item())
+    name = str(arrays["name"]) if "name" in arrays else path.stem
+    return _problem(camera, baseline, ratio, sets, name, str(path))
+
+
+def _load(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        with path.open("rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            if not isinstance(loaded, np.lib.npyio.NpzFile):
+                raise ValueError("one array without a name")
+            return {key: loaded[key] for key in loaded.files}
+    except OSError as error:
+        raise RsbenchError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise RsbenchError(f"{path}: not an npz file of plain arrays: {error}") from error

@@ -111,7 +111,7 @@ def estimate_motion(
     found = run(given, rig, shutter, solver, options, rng)
     seconds = time.perf_counter() - start
     problem, estimate = found.problem, found.estimate
-    if note and problem.linked:
+    if note:
         estimate = replace(estimate, reason="; ".join(filter(None, [estimate.reason, note])))
     masks = problem.masks(found.inliers)
     return RobustEstimate(

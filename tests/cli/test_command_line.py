@@ -106,12 +106,13 @@ def test_solve_answers_in_json_near_the_truth(tmp_path: Path, problem: dict[str,
     result = rsbench("solve", write_problem(tmp_path, problem), "--json")
     assert result.returncode == 0, result.stderr
     answer = json.loads(result.stdout)
-    fields = "solver success reason w d metric inliers_left inliers_right seconds"
+    fields = "name solver success reason w d d_unit reference_point inliers matches seconds"
     assert set(fields.split()) <= set(answer)
     # Five times the bound of 240 pairs and 120 tracks at 0.3 px: about 0.01 deg and 0.6 % of 0.3 m.
     np.testing.assert_allclose(answer["w"], problem["truth"]["w"], atol=np.deg2rad(0.05))
     np.testing.assert_allclose(answer["d"], problem["truth"]["d"], atol=0.01)
-    assert answer["metric"] is True
+    assert answer["metric"] is True and answer["d_unit"] == "m" and answer["reference_point"] == "body"
+    assert answer["inliers"] <= answer["matches"] == 240  # 60 pairs of each camera and 120 tracks, each once
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from rsbench import plugins
+from rsbench.errors import RsbenchError
 from rsbench.plugins import Entry, Kind
 from rsbench.solvers.engine.base import Solver, SolverSpec
 
@@ -60,6 +62,25 @@ def load_solver(name_or_path: str | Path) -> Solver:
         RsbenchError: no such solver, two of that name, or its card or class is wrong.
     """
     return load_solver_entry(name_or_path).solver
+
+
+def load_solver_entries(names_or_paths: Sequence[str]) -> list[SolverEntry]:
+    """Several solvers that go into one table.
+
+    Raises:
+        RsbenchError: see ``load_solver``; or two of them have one name, by which nobody could tell them apart.
+    """
+    entries: dict[str, SolverEntry] = {}
+    given: dict[str, str] = {}
+    for text in names_or_paths:
+        entry = load_solver_entry(text)
+        if entry.name in entries:
+            raise RsbenchError(
+                f"solver {text!r} and solver {given[entry.name]!r} are both named {entry.name!r}: "
+                "leave one out, or rename its card"
+            )
+        entries[entry.name], given[entry.name] = entry, text
+    return list(entries.values())
 
 
 def load_solver_entry(name_or_path: str | Path) -> SolverEntry:

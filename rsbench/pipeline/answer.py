@@ -1,0 +1,77 @@
+"""The answer to a problem, as ``rsbench solve --json`` prints it: docs/problem-format.md."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any, Literal
+
+import numpy as np
+
+from rsbench.core.joining import join_stereo
+from rsbench.pipeline.body_motion import body_motion
+from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.problem import Problem
+from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions
+from rsbench.solvers.engine.registry import SolverEntry
+
+Answer = dict[str, Any]
+Extra = Literal["covariance", "noise", "inliers"]
+EXTRAS: tuple[Extra, ...] = ("covariance", "noise", "inliers")
+NO_LENGTH = "none: direction only"
+
+
+def solve_problem(
+    problem: Problem,
+    entry: SolverEntry,
+    options: RobustOptions,
+    runner: SolverRunner,
+    seed: int = 0,
+    extras: Collection[Extra] = (),
+) -> Answer:
+    """Answer to a problem, ready for JSON; a failure has null for every motion, and the reason."""
+    joined = join_stereo(problem.correspondences)
+    result = runner.robust(
+        entry, joined.correspondences, problem.rig, problem.shutter, options, np.random.default_rng(seed)
+    )
+    estimate, spec = result.estimate, entry.solver.spec
+    body = body_motion(estimate, spec, problem.rig)
+    notes = [estimate.reason] if joined.note in estimate.reason else [estimate.reason, joined.note]
+    return {
+        "name": problem.name,
+        "solver": entry.name,
+        "success": estimate.success,
+        "reason": "; ".join(filter(None, notes)),
+        "w": estimate.w.tolist() if estimate.success else None,
+        "d": estimate.d.tolist() if estimate.success else None,
+        "d_unit": "m" if estimate.metric else NO_LENGTH,
+        "metric": estimate.metric,
+        "direction_known": estimate.direction_known,
+        "reference_point": spec.reference_point,
+        "d_body": None if isinstance(body, str) else body.d.tolist(),
+        "motion_model": spec.motion_model,
+        "shutter": spec.shutter,
+        "assumes": spec.assumes,
+        "inliers": result.inlier_count,
+        "matches": result.match_count,
+        "stereo_alone": joined.alone,
+        "threshold_px": result.threshold_px,
+        "iterations": result.iterations,
+        "seconds": result.seconds,
+        **_extras(problem, result, extras),
+    }
+
+
+def _extras(problem: Problem, result: RobustEstimate, extras: Collection[Extra]) -> Answer:
+    estimate, out = result.estimate, Answer()
+    if "covariance" in extras:
+        out["covariance"] = None if estimate.covariance is None else estimate.covariance.tolist()
+    if "noise" in extras:
+        out["noise_px"] = estimate.noise_px
+    if "inliers" in extras:
+        # Tracks that were joined come after those of the file; their ends are in the file's pairs.
+        tracks = len(problem.correspondences.tracks)
+        out["inlier_indices"] = {
+            str(name): np.flatnonzero(mask[:tracks] if name == "tracks" else mask).tolist()
+            for name, mask in result.inliers.items()
+        }
+    return out

@@ -1,0 +1,146 @@
+"""``rsbench solve`` as users meet it: many problems, several solvers, and solvers that misbehave."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsbench.pipeline.problem import EXAMPLE
+
+PLUGIN = """
+import os, sys, time
+from dataclasses import dataclass
+from rsbench.solvers.eight_point import EightPointSolver
+from rsbench.solvers.engine.base import MotionEstimate, Solver
+
+print("imported")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Odd(Solver):
+    what: str
+    spec = EightPointSolver.spec
+
+    def estimate(self, correspondences, rig, shutter):
+        print("estimating", flush=True)
+        if self.what == "exit":
+            sys.exit(3)
+        if self.what == "crash":
+            os.abort()
+        if self.what == "hang":
+            time.sleep(1000)
+        return EightPointSolver().estimate(correspondences, rig, shutter)
+"""
+
+
+NOTHING: dict[str, list[float]] = {name: [] for name in ("left", "right", "stereo_0", "stereo_1", "tracks")}
+
+
+def solve(
+    *arguments: object, cwd: Path | None = None, text: str | None = None
+) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "rsbench", "solve", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, cwd=cwd, input=text)
+
+
+def answers(result: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in result.stdout.splitlines()]
+
+
+def odd_card(folder: Path, what: str, extra: str = "") -> Path:
+    (folder / "odd_plugin.py").write_text(PLUGIN)
+    card = folder / f"{what}.toml"
+    card.write_text(f"class = 'odd_plugin:Odd'\n{extra}\n[parameters]\nwhat = '{what}'\n")
+    return card
+
+
+def test_the_sample_is_printed_and_solved_away_from_the_checkout(tmp_path: Path) -> None:
+    sample = solve("--example", cwd=tmp_path)
+    assert sample.returncode == 0 and json.loads(sample.stdout)["name"] == "example"
+    (tmp_path / "problem.json").write_text(sample.stdout)
+    result = solve("problem.json", cwd=tmp_path)
+    assert result.returncode == 0 and result.stderr == ""
+    assert "m per frame, of the middle of the baseline" in result.stdout
+    assert "of 80 matches" in result.stdout
+
+
+def test_many_problems_and_two_solvers_give_one_line_each(tmp_path: Path) -> None:
+    sample = json.loads(EXAMPLE.read_text())
+    lines = [json.dumps(sample | {"name": f"p{k}"}) for k in range(3)]
+    lines[1] = json.dumps(sample | {"baseline": -1.0})
+    few = sample | {"name": "few"} | NOTHING
+    many = "\n".join([*lines, json.dumps(few)])
+    result = solve("-", "--solver", "rs-stereo", "--solver", "gs-8pt", "--json", "--with", "noise", text=many)
+    assert result.returncode == 2
+    assert result.stderr == "rsbench: error: stdin:2: baseline must be a positive number of metres, got -1.0\n"
+    found = answers(result)
+    pairs = [(answer["name"], answer["solver"]) for answer in found]
+    assert pairs == [(name, solver) for name in ("p0", "p2", "few") for solver in ("rs-stereo", "gs-8pt")]
+    assert [answer["success"] for answer in found] == [True] * 4 + [False] * 2
+    assert all("noise_px" in answer and "covariance" not in answer for answer in found)
+    # The same seed for each: neither the problems nor the solvers beside one change its answer.
+    (tmp_path / "p0.json").write_text(lines[0])
+    (alone,) = answers(solve(tmp_path / "p0.json", "--solver", "gs-8pt", "--json", "--with", "noise"))
+    assert {**alone, "seconds": 0.0} == {**found[1], "seconds": 0.0}
+    assert [found[0]["d"], found[1]["w"]] == [found[2]["d"], found[3]["w"]]
+
+
+def test_a_problem_without_an_answer_is_exit_code_1(tmp_path: Path) -> None:
+    sample = json.loads(EXAMPLE.read_text()) | NOTHING
+    (tmp_path / "few.json").write_text(json.dumps(sample))
+    result = solve(tmp_path, EXAMPLE)
+    assert result.returncode == 1
+    assert "few" in result.stdout or "example" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--solver", "gs-8pt", "--solver", "{folder}/gs-8pt.toml"], ("'gs-8pt'", "{folder}/gs-8pt.toml", "both")),
+        (["--with", "noise"], ("--json",)),
+        (["--json", "--with", "nois"], ("did you mean 'noise'",)),
+        (["--threshold-px", "nan"], ("--threshold-px",)),
+        (["--time-limit", "0"], ("--time-limit",)),
+    ],
+)
+def test_wrong_options_are_refused_in_one_line(
+    tmp_path: Path, arguments: list[str], words: tuple[str, ...]
+) -> None:
+    (tmp_path / "gs-8pt.toml").write_text("class = 'rsbench.solvers.eight_point:EightPointSolver'\n")
+    result = solve(EXAMPLE, *(argument.format(folder=tmp_path) for argument in arguments))
+    assert result.returncode == 2 and result.stdout == ""
+    assert len(result.stderr.splitlines()) == 1 and result.stderr.startswith("rsbench: error: ")
+    for word in words:
+        assert word.format(folder=tmp_path) in result.stderr
+
+
+def test_no_problem_is_refused() -> None:
+    result = solve()
+    assert result.returncode == 2 and "--example" in result.stderr
+
+
+def test_a_solver_that_misbehaves_fails_alone_and_leaves_the_answers_clean(tmp_path: Path) -> None:
+    cards = [odd_card(tmp_path, what) for what in ("print", "exit", "crash")]
+    cards.append(odd_card(tmp_path, "hang", "time_limit_s = 1.0"))
+    options = [part for card in cards for part in ("--solver", card)]
+    result = solve(EXAMPLE, *options, "--solver", "gs-8pt", "--json")
+    assert result.returncode == 1, result.stderr
+    fine, left, crashed, hung, ours = answers(result)  # every line is an answer, whatever was printed
+    assert fine["success"] and fine["w"] == ours["w"] and fine["inliers"] == ours["inliers"]
+    assert not (left["success"] or crashed["success"] or hung["success"])
+    assert "SystemExit" in left["reason"]
+    assert "SIGABRT" in crashed["reason"] or "signal" in crashed["reason"]
+    assert "1 s" in hung["reason"]
+
+
+def test_a_solver_with_a_loop_of_its_own_is_not_wrapped(tmp_path: Path) -> None:
+    card = odd_card(tmp_path, "own", "robust = 'own'")
+    (answer,) = answers(solve(EXAMPLE, "--solver", card, "--json"))
+    # Eight points on all matches, wrong ones too: one call, no samples.
+    assert answer["success"] and answer["iterations"] == 0
+    assert answer["inliers"] < answer["matches"] == 60
