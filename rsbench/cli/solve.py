@@ -64,29 +64,40 @@ def solve(
     ] = False,
 ) -> None:
     """Estimate the motion of a stereo rig from your own matches."""
-    from rsbench.pipeline.problem import EXAMPLE
-    from rsbench.solvers.engine.registry import load_solver_entries
-
     if example:
+        from rsbench.pipeline.problem import EXAMPLE
+
         typer.echo(EXAMPLE.read_text(encoding="utf-8"), nl=False)
         return
     if not problems:
         raise RsbenchError("PROBLEM: none given; give files, folders or -, or have a sample made by --example")
-    wanted = _extras(extras, json)
+    from rsbench.solvers.engine.registry import load_solver_entries
+
+    wanted, options, limit = _extras(extras, json), _options(threshold_px), _limit(time_limit)
     entries = load_solver_entries(solver or ["rs-stereo"])
-    options = _options(threshold_px)
+    code = _tell(_answers(problems, entries, options, seed, wanted, limit), json)
+    if code:
+        raise typer.Exit(code)
+
+
+def _tell(found: Iterator[dict[str, Any] | RsbenchError], json: bool) -> int:
+    """Print answers, as they come or as one table, and errors; the exit code."""
+    import json as json_module
+
     answers: list[dict[str, Any]] = []
-    wrong = 0
-    for answer in _answers(problems, entries, options, seed, wanted, _limit(time_limit)):
+    wrong = failed = 0
+    for answer in found:
         if isinstance(answer, RsbenchError):
             wrong += 1
             typer.echo(f"rsbench: error: {' '.join(str(answer).split())}", err=True)
+            continue
+        failed += not answer["success"]
+        if json:
+            typer.echo(json_module.dumps(answer, allow_nan=False))
         else:
-            _keep(answer, answers, json)
-    if not json:
-        _show(answers)
-    if wrong or not all(answer["success"] for answer in answers):
-        raise typer.Exit(2 if wrong else 1)
+            answers.append(answer)
+    _show(answers)
+    return 2 if wrong else int(failed > 0)
 
 
 def _answers(
@@ -114,15 +125,6 @@ def _answers(
                 for entry in entries:
                     yield solve_problem(problem, entry, options, runner, seed, extras)
                 advance(problem.name)
-
-
-def _keep(answer: dict[str, Any], answers: list[dict[str, Any]], json: bool) -> None:
-    """Print at once what is a line of its own; of that only the success is still needed."""
-    import json as json_module
-
-    if json:
-        typer.echo(json_module.dumps(answer, allow_nan=False))
-    answers.append({"success": answer["success"]} if json else answer)
 
 
 def _show(answers: list[dict[str, Any]]) -> None:

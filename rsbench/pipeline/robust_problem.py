@@ -164,8 +164,8 @@ class RobustProblem:
 
     def on_all(self) -> MotionEstimate:
         """What the solver itself makes of all matches."""
-        given = self.given
-        everything = self._handed(given.left, given.right, given.tracks) if self._stereo else given
+        data = self.data
+        everything = self._handed(data.left, data.right, data.tracks) if self._stereo else self.given
         return self.solver.estimate(everything, self.rig, self.shutter)
 
     def _subset(self, indices: IntArray) -> Correspondences:
