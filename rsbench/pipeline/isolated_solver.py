@@ -10,10 +10,10 @@ import dataclasses
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cached_property
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolation import (
+    NO_ANSWER,
     THREAD_VARIABLES,
     EntryFailure,
     IsolatedWorker,
@@ -39,7 +40,7 @@ from rsbench.solvers.engine.warm_up import warm_up
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-T = TypeVar("T")
+_MASKS: tuple[MatchSet, ...] = ("left", "right", "tracks")
 
 
 class SolverRunner:
@@ -75,12 +76,11 @@ class SolverRunner:
             return estimate_motion(correspondences, rig, shutter, entry.solver, options, rng, loop)
         start = time.perf_counter()
         outcome = self._call(entry, "robust", correspondences, rig, shutter, options, rng, loop)
-        if outcome.success and isinstance(outcome.value, RobustEstimate):
+        if outcome.success and _fits(outcome.value, correspondences):
             return outcome.value
-        names: tuple[MatchSet, ...] = ("left", "right", "tracks")
         return RobustEstimate(
-            estimate=MotionEstimate.failed(outcome.reason),
-            inliers={name: np.zeros(len(getattr(correspondences, name)), dtype=np.bool_) for name in names},
+            estimate=MotionEstimate.failed(outcome.reason or NO_ANSWER),
+            inliers={name: np.zeros(len(getattr(correspondences, name)), dtype=np.bool_) for name in _MASKS},
             iterations=0,
             seconds=time.perf_counter() - start,
             threshold_px=options.threshold_px,
@@ -93,12 +93,17 @@ class SolverRunner:
         if entry.built_in:
             return _timed(entry.solver, correspondences, rig, shutter)
         outcome = self._call(entry, "bare", correspondences, rig, shutter)
-        return outcome.value if outcome.success else (MotionEstimate.failed(outcome.reason), float("nan"))
+        match outcome.value:
+            case (MotionEstimate() as estimate, float() as seconds):
+                return estimate, seconds
+        return MotionEstimate.failed(outcome.reason or NO_ANSWER), float("nan")
 
     def _call(self, entry: SolverEntry, *arguments: object) -> Outcome:
         place = os.fspath(entry.path.resolve()) if entry.path is not None else entry.name
         known = (place, entry.key)  # a card may be edited meanwhile
         if known not in self._workers:
+            with suppress(RsbenchError):  # of a motion that does not exist, as the child will tell
+                warm_up([entry.solver.spec.motion_model])  # here, where it is said that this takes a while
             worker = IsolatedWorker(
                 _serve_solver,
                 place,
@@ -120,6 +125,14 @@ class SolverRunner:
 
     def __exit__(self, kind: type[BaseException] | None, value: object, trace: TracebackType | None) -> None:
         self.close()
+
+
+def _fits(answer: object, correspondences: Correspondences) -> bool:
+    """Whether it is an answer with masks over these matches."""
+    return isinstance(answer, RobustEstimate) and all(
+        mask.dtype == np.bool_ and mask.shape == (len(getattr(correspondences, name, ())),)
+        for name, mask in answer.inliers.items()
+    )
 
 
 def _timed(

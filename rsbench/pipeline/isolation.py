@@ -21,7 +21,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.reduction import ForkingPickler
 from types import TracebackType
 from typing import Any, BinaryIO, NoReturn
@@ -32,6 +32,7 @@ THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"
 """Of a process that computes with as many threads as they say."""
 START_LIMIT_S = 300.0
 """Loading a module, and compiling what it needs, once."""
+NO_ANSWER = "gave no valid answer"
 _POLL_S = 0.1
 _KEPT_BYTES = 8192
 _LONGEST_REASON = 300
@@ -112,7 +113,7 @@ class IsolatedWorker:
                 started = self._exchange(self._start, self._start_limit_s)
                 if not started.success:
                     self.close()
-                    return started
+                    return replace(started, reason=f"did not start: {started.reason}")
             return self._exchange(arguments, limit_s)
         except BaseException:
             self.close()  # an answer that nobody waits for must not be taken for the next one
@@ -149,9 +150,9 @@ class IsolatedWorker:
         try:
             message = decode(data, self._classes)
         except ValueError as error:
-            return None, f"gave no valid answer: {one_line(error)}"
+            return None, f"{NO_ANSWER}: {one_line(error)}"
         if not (isinstance(message, tuple) and len(message) == 3 and isinstance(message[2], str)):
-            return None, "gave no valid answer"
+            return None, NO_ANSWER
         status, value, reason = message
         if status == "bug":
             raise RuntimeError(f"in a child process:\n{reason}")
@@ -171,7 +172,14 @@ class _Child:
             lifeline_end, self._lifeline = os.pipe()
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-u", "-c", _COMMAND, json.dumps(sys.path), str(lifeline_end)],
+                [
+                    sys.executable,
+                    "-u",
+                    "-c",
+                    _COMMAND,
+                    json.dumps([str(entry) for entry in sys.path]),
+                    str(lifeline_end),
+                ],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,

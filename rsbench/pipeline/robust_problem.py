@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtr, gammaincinv
 
 from rsbench.core.correspondences import BoolArray, Correspondences, repeated, track_pairs, unlinked_pairs
 from rsbench.core.rig import SIDES, StereoRig
@@ -221,7 +221,7 @@ class RobustProblem:
 @functools.cache
 def _quantile(freedom: int) -> float:
     """Of chi-squared, with the probability that a normal variable lies within 2.5 standard deviations."""
-    return float(chi2.ppf(chi2.cdf(SIGMAS**2, 1), freedom))
+    return float(2.0 * gammaincinv(0.5 * freedom, float(chdtr(1, SIGMAS**2))))
 
 
 @functools.cache
@@ -234,5 +234,5 @@ def _track_scale() -> float:
 def _moment(freedom: int) -> float:
     """Mean square of a scaled residual below its threshold, at a noise of 1 px."""
     quantile = _quantile(freedom)
-    truncated = freedom * chi2.cdf(quantile, freedom + 2) / chi2.cdf(quantile, freedom)
+    truncated = freedom * chdtr(freedom + 2, quantile) / chdtr(freedom, quantile)
     return float(truncated) * SIGMAS**2 / quantile

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.core.camera import PinholeCamera
@@ -14,6 +15,7 @@ from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions, estimate_motion
+from rsbench.pipeline.robust_problem import _moment, _quantile
 from rsbench.solvers.engine.base import MatchSet
 from rsbench.solvers.engine.registry import list_solvers, load_solver
 
@@ -204,3 +206,11 @@ def test_reported_inliers_are_those_of_the_reported_motion() -> None:
 def test_options_refuse_nonsense(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad)).removesuffix("_px")):
         RobustOptions(**bad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("freedom", [1, 5])
+def test_quantile_and_truncated_mean_are_those_of_chi_squared(freedom: int) -> None:
+    quantile = chi2.ppf(chi2.cdf(2.5**2, 1), freedom)
+    assert _quantile(freedom) == pytest.approx(quantile, rel=1e-12)
+    mean = chi2.expect(args=(freedom,), lb=0.0, ub=quantile, conditional=True)  # by numerical integration
+    assert _moment(freedom) == pytest.approx(mean * 2.5**2 / quantile, rel=1e-6)
