@@ -38,5 +38,30 @@ def _link_to_the_repository(app: Sphinx, docname: str, content: list[str]) -> No
     content[0] = _OUTSIDE.sub(rf"]({_REPOSITORY}\g<path>)", content[0])
 
 
+# napoleon takes "length, metres: of what" in the docstring of an attribute for a type and its text.
+_attributes: dict[str, list[str]] = {}
+
+
+def _keep_attribute(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    if what in ("attribute", "property"):
+        _attributes[name] = list(lines)
+
+
+def _restore_attribute(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    if name in _attributes:
+        lines[:] = _attributes.pop(name)
+
+
+def _name_aliases(
+    app: Sphinx, what: str, name: str, obj: object, options: object, signature: str | None, returns: str | None
+) -> tuple[str | None, str | None]:
+    """Aliases inside other types by their names, which autodoc writes for whole types alone."""
+    alias = re.compile(r"TypeAliasForwardRef\('(\w+)'\)")
+    return alias.sub(r"\1", signature or "") or None, alias.sub(r"\1", returns or "") or None
+
+
 def setup(app: Sphinx) -> None:
     app.connect("source-read", _link_to_the_repository)
+    app.connect("autodoc-process-docstring", _keep_attribute, priority=400)
+    app.connect("autodoc-process-docstring", _restore_attribute, priority=600)
+    app.connect("autodoc-process-signature", _name_aliases)
