@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import itertools
 import re
 import subprocess
 import sys
@@ -178,6 +179,19 @@ def test_links_between_documents_lead_somewhere() -> None:
             if "://" not in target and not (document.parent / target).exists():
                 broken.append(f"{document.name}: {target}")
     assert not broken
+
+
+def test_the_table_of_layers_has_the_layers_in_their_order() -> None:
+    contract = read_toml(ROOT / "pyproject.toml")["tool"]["importlinter"]["contracts"][0]
+    layers = [re.findall(r"rsbench\.(\w+)", line) for line in contract["layers"]]
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    table = [
+        name for row in re.findall(r"^\| (`.*?`) \|", text, re.MULTILINE) for name in re.findall(r"`(\w+)`", row)
+    ]
+    order = {name: table.index(name) for names in layers for name in names}
+    assert len(order) == len(table)
+    for above, below in itertools.pairwise(layers):
+        assert min(order[name] for name in above) > max(order[name] for name in below), (above, below)
 
 
 def test_the_conversion_to_the_papers_axes_holds() -> None:
