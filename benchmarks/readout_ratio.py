@@ -24,6 +24,7 @@ from rsbench.pipeline.readout import estimate_readout_ratio
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 ALLOWED = 0.02
 OPTIONS = CorrectionOptions()
+_, JUDGE = referee(OPTIONS.solver)
 
 
 def simulated(tracks: int, degrees: float, trials: int) -> str:
@@ -36,7 +37,7 @@ def simulated(tracks: int, degrees: float, trials: int) -> str:
         matches = simulate(
             RIG, RollingShutter(height=900, readout_ratio=ratio), motion, options, rng
         ).correspondences
-        found = estimate_readout_ratio(matches, RIG, referee(OPTIONS.solver), OPTIONS.robust, trial)
+        found = estimate_readout_ratio(matches, RIG, JUDGE, OPTIONS.robust, trial)
         errors.append(np.inf if found is None else abs(found.readout_ratio - ratio))
         scaled.append(np.inf if found is None else errors[-1] / found.sigma)
     return (
@@ -51,7 +52,7 @@ def rendered(data: Path) -> list[str]:
     lines = []
     for sequence in read_dataset(data):
         matches = match_frames({view: sequence.image("rs", *view) for view in VIEWS}, OPTIONS)
-        found = estimate_readout_ratio(matches, sequence.rig, referee(OPTIONS.solver), OPTIONS.robust)
+        found = estimate_readout_ratio(matches, sequence.rig, JUDGE, OPTIONS.robust)
         true = sequence.shutter.readout_ratio
         error = (
             "none found" if found is None else f"error {found.readout_ratio - true:+.4f}, stated {found.sigma:.4f}"

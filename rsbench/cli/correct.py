@@ -153,7 +153,7 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
             result = correct_four(images, rig, card.readout_ratio, options, advance)
         for (side, frame), fused in result.frames.items():
             write_frame(folder, f"{side}_{frame}", fused)
-        record = rig_record(rig, result.shutter, result.readout, options.target_row)
+        record = rig_record(rig, result.shutter, result.readout, options)
         record["motion"] = None if result.found is None else motion_record(result.found)
         record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in result.frames.items()}
         record["seconds"] = result.seconds
@@ -224,7 +224,7 @@ def _correct_sequence(
             readout = estimate_sequence_readout(left, right, rig, options)
             ratio = readout.readout_ratio
         shutter = RollingShutter(height=height, readout_ratio=ratio)
-        record = rig_record(rig, shutter, readout, options.target_row)
+        record = rig_record(rig, shutter, readout, options)
         with progress_bar("correcting", max(left.count, 1)) as advance:
             moments = correct_sequence(left, right, rig, ratio, options)
             record["frames"], cards = _write_moments(folder, moments, left, advance)

@@ -15,7 +15,8 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.files import write_depth, write_json, write_png
 from rsbench.errors import RsbenchError
-from rsbench.pipeline.frame_motion import FoundMotion
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_motion import FoundMotion, referee
 from rsbench.pipeline.readout import ReadoutEstimate
 from rsbench.vision.fusion import Fused, Origin
 
@@ -91,10 +92,11 @@ def motion_record(found: FoundMotion) -> dict[str, Any]:
 
 
 def rig_record(
-    rig: StereoRig, shutter_: RollingShutter, readout: ReadoutEstimate | None, target_row: float
+    rig: StereoRig, shutter_: RollingShutter, readout: ReadoutEstimate | None, options: CorrectionOptions
 ) -> dict[str, Any]:
-    """What the correction assumed, ready for JSON."""
+    """What the correction assumed and which components it was made with, ready for JSON."""
     camera = rig.camera
+    components = {name: {"name": entry.name, "key": entry.key} for name, entry in options.components.items()}
     return {
         "units": {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = infinite or unknown"},
         "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
@@ -102,7 +104,9 @@ def rig_record(
         "readout_ratio": shutter_.readout_ratio,
         "readout_ratio_sigma": readout.sigma if readout is not None and np.isfinite(readout.sigma) else None,
         "readout_ratio_estimated": readout is not None,
-        "target_row": target_row,
+        "readout_ratio_by": referee(options.solver)[0] if readout is not None else None,
+        "target_row": options.target_row,
+        "components": components,
         "mask_values": {origin.name.lower(): value for origin, value in MASK_VALUES.items()},
     }
 

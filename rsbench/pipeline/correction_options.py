@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 from rsbench.pipeline.robust_motion import RobustOptions
 from rsbench.plugins import Entry
@@ -33,6 +34,12 @@ class CorrectionOptions:
     inpaint: bool = False
     """Invent what nobody saw; it stays marked."""
     seed: int = 0
+
+    @property
+    def components(self) -> dict[str, Entry[Any, Any]]:
+        """The four components by the name of their option."""
+        values = {option.name: getattr(self, option.name) for option in fields(self)}
+        return {name: value for name, value in values.items() if isinstance(value, Entry)}
 
     @property
     def key(self) -> str:

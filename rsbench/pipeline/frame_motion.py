@@ -26,6 +26,8 @@ _FEW_STEREO = 0.1
 """Left-right matches per temporal match below which the images may be swapped or not rectified."""
 _FEWEST_MATCHES = 12
 _MAX_READOUT_SIGMA = 0.25
+_REFEREE = "rs-stereo-refined"
+"""Name of the card with the default parameters of ``RefinedSolver``."""
 
 
 class NoMotionError(RsbenchError):
@@ -127,16 +129,17 @@ def motion_of(estimate: MotionEstimate, entry: SolverEntry, rig: StereoRig) -> M
 
 def find_readout(matches: Correspondences, rig: StereoRig, options: CorrectionOptions) -> ReadoutEstimate | None:
     """The readout ratio that explains the matches best, by ``referee``; None when no motion does at any."""
-    return estimate_readout_ratio(matches, rig, referee(options.solver), options.robust, options.seed)
+    _, judge = referee(options.solver)
+    return estimate_readout_ratio(matches, rig, judge, options.robust, options.seed)
 
 
-def referee(entry: SolverEntry) -> RefinedSolver:
-    """The solver that finds an unknown readout ratio and the direction of time: the chosen one, or else ours.
+def referee(entry: SolverEntry) -> tuple[str, RefinedSolver]:
+    """The solver that finds an unknown readout ratio and the direction of time, with its name.
 
-    Both need residuals that hold for any readout ratio, and a fit as good as the matches allow: a solver that is
-    off by pixels would blame the shutter.
+    The chosen one when it is a refined one, else rs-stereo-refined. Both need residuals that hold for any readout
+    ratio, and a fit as good as the matches allow: a solver that is off by pixels would blame the shutter.
     """
-    return entry.solver if isinstance(entry.solver, RefinedSolver) else RefinedSolver()
+    return (entry.name, entry.solver) if isinstance(entry.solver, RefinedSolver) else (_REFEREE, RefinedSolver())
 
 
 def solve_frames(
@@ -189,7 +192,7 @@ def _runs_backwards(
     options: CorrectionOptions,
 ) -> bool:
     """Whether time runs backwards in the frames: they then fit a negative readout ratio."""
-    judge = referee(options.solver)
+    _, judge = referee(options.solver)
     ratio = backward_ratio = shutter.readout_ratio
     if readout is not None:
         if ratio > 3.0 * readout.sigma:

@@ -98,11 +98,19 @@ class Corrector(ABC):
 
 
 CorrectorEntry = Entry[Corrector, RunOptions]
+
+
+def _check_spec(corrector: Corrector) -> None:
+    if not isinstance(corrector.spec, CorrectorSpec):
+        raise ValueError(f"spec = {corrector.spec!r}: must be a CorrectorSpec")
+
+
 CORRECTORS: Kind[Corrector, RunOptions] = Kind(
     singular="corrector",
     cards="correctors",
     base=Corrector,  # type: ignore[type-abstract]
     options=RunOptions,
+    check=_check_spec,
 )
 
 

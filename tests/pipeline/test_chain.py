@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +11,23 @@ import cv2
 import numpy as np
 import pytest
 
+from rsbench.core import so3
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.errors import RsbenchError
-from rsbench.pipeline.chain import correct_four
+from rsbench.pipeline.chain import Given, correct_four, uncorrected
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, check_alike, read_frame, read_rig_card
 from rsbench.pipeline.frame_depth import eight_bit
-from rsbench.pipeline.frame_motion import NoMotionError, solve_frames
+from rsbench.pipeline.frame_motion import NoMotionError, motion_of, solve_frames
 from rsbench.pipeline.sliding import correct_sequence, estimate_sequence_readout
-from rsbench.vision.fusion import Origin
+from rsbench.plugins import wrap
+from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, Corrector, CorrectorSpec, load_corrector
+from rsbench.vision.fusion import Fused, Origin
 from rsbench.vision.quality import psnr
+from rsbench.vision.stereo_matcher import load_matcher
 
 Images = dict[Any, np.ndarray]
 Folders = tuple[FrameSource, FrameSource]
@@ -112,6 +119,88 @@ def test_inpainting_leaves_no_pixel_empty_and_keeps_the_marks(castle: Sequence) 
         np.testing.assert_array_equal(plain[view].origin, painted[view].origin)
         known = plain[view].origin != Origin.NOBODY
         np.testing.assert_array_equal(plain[view].image[known], painted[view].image[known])
+
+
+@pytest.mark.parametrize("name", ["gs-stereo-tracks-scaled", "gs-stereo-pnp-scaled"])
+def test_any_metric_solver_corrects_in_its_own_model(castle: Sequence, name: str) -> None:
+    """Other solvers, of another motion model than the data's; the shutter's direction is still judged by ours."""
+    images = _frames(castle)
+    entry = load_solver_entry(name)
+    result = correct_four(images, castle.rig, castle.shutter.readout_ratio, CorrectionOptions(solver=entry))
+    assert result.motion is not None and result.motion.name == entry.solver.spec.motion_model
+    assert result.found is not None and result.found.solver == name
+    # Ours gains 6 dB; theirs are a tenth of a degree off, which is a quarter of a pixel here.
+    assert _gain(castle, result.frames, images, lambda image: image) > 3.0
+
+
+def test_a_left_cameras_metric_answer_is_moved_to_the_body(castle: Sequence) -> None:
+    """A solver that answers the true motion of the left camera corrects like the true motion of the body."""
+    images, ratio = _frames(castle), castle.shutter.readout_ratio
+    offset = castle.rig.offset("left")
+    w, d = castle.motion.w, castle.motion.d
+    of_left = MotionEstimate(w=w, d=d + offset - so3.exp(w) @ offset, success=True, metric=True)
+    motion = motion_of(of_left, load_solver_entry("gs-8pt"), castle.rig)
+    np.testing.assert_allclose(motion.d, d, atol=1e-15)
+    found = correct_four(images, castle.rig, ratio, CorrectionOptions(), given=Given(motion=motion))
+    true = correct_four(images, castle.rig, ratio, CorrectionOptions(), given=Given(motion=castle.motion))
+    for view in VIEWS:
+        difference = found.frames[view].image.astype(int) - true.frames[view].image
+        assert np.quantile(np.abs(difference), 0.99) <= 1  # the last digit of a motion may round a grey level
+
+
+def test_what_is_given_is_not_looked_for(castle: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The chain from its own results gives the same frames, with no matcher and no solver called."""
+    images, ratio, options = _frames(castle), castle.shutter.readout_ratio, CorrectionOptions()
+    first = correct_four(images, castle.rig, ratio, options)
+
+    def never(*_: object) -> None:
+        raise AssertionError("not needed")
+
+    for name in ("chain.match_frames", "chain.solve_frames", "frame_motion.estimate_motion", "chain.frame_pairs"):
+        monkeypatch.setattr(f"rsbench.pipeline.{name}", never)
+    given = Given(matches=first.matches, motion=first.motion, pairs=first.pairs)
+    again = correct_four(images, castle.rig, ratio, options, given=given, views=(("right", 1),))
+    assert list(again.frames) == [("right", 1)] and again.found is None
+    np.testing.assert_array_equal(again.frames["right", 1].image, first.frames["right", 1].image)
+    with pytest.raises(ValueError, match="readout_ratio"):
+        correct_four(images, castle.rig, None, options, given=given)
+
+
+def test_a_corrector_gets_what_it_needs_and_no_more(castle: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rotation alone needs no depth; a corrector that needs nothing works where there is no motion to find."""
+    images, ratio = _frames(castle), castle.shutter.readout_ratio
+    turned = correct_four(images, castle.rig, ratio, CorrectionOptions(corrector=load_corrector("rotation-only")))
+    assert turned.motion is not None and turned.pairs is None
+    flat = {view: np.full_like(image, 128) for view, image in images.items()}
+    options = CorrectionOptions(corrector=wrap(CORRECTORS, Nothing()))
+    still = correct_four(flat, castle.rig, ratio, options)
+    assert still.motion is None and still.matches is None and still.pairs is None
+    for view in VIEWS:
+        np.testing.assert_array_equal(still.frames[view].image, flat[view])
+
+
+@dataclass(frozen=True)
+class Nothing(Corrector):
+    """The frames as they are."""
+
+    spec = CorrectorSpec(needs=set(), reference="here", assumes="nothing")
+
+    def correct(self, problem: CorrectionProblem, views: Any) -> dict[Any, Fused]:
+        assert problem.motion is None and problem.depth is None
+        return uncorrected(problem.images, tuple(views))
+
+
+def test_equal_keys_mean_equal_options() -> None:
+    key = CorrectionOptions().key
+    assert key == CorrectionOptions().key
+    others = [
+        CorrectionOptions(inpaint=True),
+        CorrectionOptions(seed=1),
+        CorrectionOptions(matcher=load_matcher("sgm-plain")),
+        CorrectionOptions(solver=load_solver_entry("rs-stereo-refined-twist")),
+        CorrectionOptions(corrector=load_corrector("single-view")),
+    ]
+    assert len({key, *(options.key for options in others)}) == 1 + len(others)
 
 
 def test_an_unknown_readout_ratio_is_estimated_or_declared_open(castle: Sequence) -> None:
