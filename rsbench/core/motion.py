@@ -8,9 +8,10 @@ rolling shutter itself when data and solver disagree: a dataset names its model.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import ClassVar, final
+from typing import Any, ClassVar, Self, final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,7 +31,11 @@ def _vector(value: ArrayLike, name: str) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, init=False)
 class Motion(ABC):
-    """Rigid motion of the body (the centre of the baseline)."""
+    """Rigid motion of the body (the centre of the baseline).
+
+    A model is a frozen dataclass below this one, made as ``Model(w, d, **parameters)``; its fields are its own
+    parameters, which have defaults, so that the name, w and d are enough.
+    """
 
     w: FloatArray
     """Rotation vector of one frame period, radians."""
@@ -45,11 +50,38 @@ class Motion(ABC):
 
     @abstractmethod
     def body_from_world(self, tau: ArrayLike) -> Pose:
-        """Pose (..., 3, 3), (..., 3) at times ``tau`` (...)."""
+        """Pose (..., 3, 3), (..., 3) at times ``tau`` (...): the identity at 0, (exp([w]x), d) at 1."""
 
     @abstractmethod
     def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """``(w', t')`` (..., 3) with dR/dtau = [w']x R and dt/dtau = t'."""
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """What the model has beside w and d, as JSON holds it: ``type(m)(m.w, m.d, **m.parameters)`` is m."""
+        return {field.name: getattr(self, field.name) for field in fields(self) if field.name not in ("w", "d")}
+
+    def with_endpoint(self, w: ArrayLike, d: ArrayLike) -> Self:
+        """The same model with the same parameters and another pose after one period."""
+        return type(self)(w, d, **self.parameters)
+
+    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
+        """What |w'| and |t'| do not exceed at times from ``first`` to ``last``; None when that is not known."""
+        return None
+
+    @classmethod
+    def endpoint(cls, parameters: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
+        """``(w, d)`` where the parameters alone fix them; None where they are free, as in most models.
+
+        Raises:
+            ValueError: such parameters are not possible.
+        """
+        return None
+
+    @classmethod
+    def drawn(cls, parameters: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+        """The parameters, with those drawn that are random by default; ``rng`` is used for nothing else."""
+        return dict(parameters)
 
 
 @final
@@ -66,6 +98,9 @@ class LinearMotion(Motion):
     def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
         shape = (*np.shape(tau), 3)
         return np.broadcast_to(self.w, shape), np.broadcast_to(self.d, shape)
+
+    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
+        return float(np.linalg.norm(self.w)), float(np.linalg.norm(self.d))
 
 
 @final
@@ -88,7 +123,50 @@ class TwistMotion(Motion):
         R, _ = self.body_from_world(tau)
         return np.broadcast_to(self.w, (*np.shape(tau), 3)), R @ self.v
 
+    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
+        return float(np.linalg.norm(self.w)), float(np.linalg.norm(self.v))
 
-MOTION_MODELS: dict[str, type[LinearMotion] | type[TwistMotion]] = {
-    model.name: model for model in (LinearMotion, TwistMotion)
-}
+
+@final
+@dataclass(frozen=True, eq=False, init=False)
+class AcceleratedMotion(Motion):
+    """Constant acceleration along the paper's path: R(tau) = exp(beta [w]x), t(tau) = beta d, with
+
+        beta(tau) = (tau + k tau^2 / 2) 2 / (2 + k),   so that beta(1) = 1.
+
+    B. Zhuang, L.-F. Cheong, G. H. Lee, Rolling-Shutter-Aware Differential SfM and Image Rectification, ICCV 2017,
+    for the differential model; here the displacement is that of the exact one.
+    """
+
+    name: ClassVar[str] = "accelerated"
+    acceleration: float = 0.2
+    """k, per frame period: the speed grows by k times its value at time 0 in each period; above -1/2, or the rig
+    would stop and turn back before time 2, when the last row of frame 1 is read at the latest."""
+
+    def __init__(self, w: ArrayLike, d: ArrayLike, acceleration: float = 0.2) -> None:
+        super().__init__(w, d)
+        if not (np.isfinite(acceleration) and acceleration > -0.5):
+            raise ValueError(f"acceleration must be a finite number above -0.5, got {acceleration}")
+        object.__setattr__(self, "acceleration", float(acceleration))
+
+    def share(self, tau: ArrayLike) -> FloatArray:
+        """beta (...) of the displacement of one period, at times ``tau`` (...)."""
+        tau, k = np.asarray(tau, dtype=np.float64), self.acceleration
+        return np.asarray((tau + 0.5 * k * tau * tau) * (2.0 / (2.0 + k)))
+
+    def speed(self, tau: ArrayLike) -> FloatArray:
+        """Derivative (...) of ``share``."""
+        tau, k = np.asarray(tau, dtype=np.float64), self.acceleration
+        return np.asarray((1.0 + k * tau) * (2.0 / (2.0 + k)))
+
+    def body_from_world(self, tau: ArrayLike) -> Pose:
+        beta = self.share(tau)[..., None]
+        return Pose(so3.exp(beta * self.w), beta * self.d)
+
+    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        speed = self.speed(tau)[..., None]
+        return speed * self.w, speed * self.d
+
+    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
+        speed = float(np.max(np.abs(self.speed([first, last]))))
+        return speed * float(np.linalg.norm(self.w)), speed * float(np.linalg.norm(self.d))

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from rsbench.core import so3
 from rsbench.core.so3 import FloatArray
 
 
@@ -30,3 +32,24 @@ def inverse(pose: Pose) -> Pose:
 def compose(c_from_b: Pose, b_from_a: Pose) -> Pose:
     """``c_from_a``."""
     return Pose(c_from_b.R @ b_from_a.R, transform(c_from_b, b_from_a.t))
+
+
+def exp(xi: ArrayLike) -> Pose:
+    """Transform (..., 3, 3), (..., 3) of the twist ``xi`` = (w, v) (..., 6): R = exp([w]x), t = J(w) v."""
+    xi = np.asarray(xi, dtype=np.float64)
+    w, v = xi[..., :3], xi[..., 3:]
+    return Pose(so3.exp(w), (so3.left_jacobian(w) @ v[..., None])[..., 0])
+
+
+def log(pose: Pose) -> FloatArray:
+    """Twist (..., 6) of a transform whose rotation is below a half turn."""
+    w = so3.log(pose.R)
+    v = np.linalg.solve(so3.left_jacobian(w), pose.t[..., None])[..., 0]
+    return np.concatenate([w, v], axis=-1)
+
+
+def adjoint_apply(pose: Pose, xi: FloatArray) -> FloatArray:
+    """Twist (..., 6) of the motion ``xi`` seen after ``pose``: exp(Ad xi) = pose exp(xi) pose^-1."""
+    w = (pose.R @ xi[..., :3, None])[..., 0]
+    v = (pose.R @ xi[..., 3:, None])[..., 0]
+    return np.concatenate([w, v + np.cross(pose.t, w)], axis=-1)

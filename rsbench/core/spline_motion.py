@@ -1,0 +1,254 @@
+"""A shaken rig: a cumulative cubic B-spline on SE(3) through given or drawn control poses.
+
+S. Lovegrove, A. Patron-Perez, G. Sibley, Spline Fusion: a continuous-time representation for visual-inertial
+fusion with application to rolling shutter cameras, BMVC 2013, for the spline; C. Sommer, V. Usenko, D. Schubert,
+N. Demmel, D. Cremers, Efficient derivative computation for cumulative B-splines on Lie groups, CVPR 2020, for its
+velocity. They write world_from_body; the poses here are its inverse, so that the factors stand the other way round:
+
+    P(u) = exp(b3 O[i+3]) exp(b2 O[i+2]) exp(b1 O[i+1]) C[i],   O[k] = log(C[k] C[k-1]^-1)
+
+    b1 = (5 + 3u - 3u^2 + u^3) / 6,  b2 = (1 + 3u + 3u^2 - 2u^3) / 6,  b3 = u^3 / 6
+
+in the interval i, u in [0, 1]. It is twice continuously differentiable.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rsbench.core import se3, so3
+from rsbench.core.motion import Motion
+from rsbench.core.se3 import Pose, compose, inverse
+from rsbench.core.so3 import FloatArray
+
+LAST = 2.0
+"""Rows of frame 1 are read until then, at the latest."""
+_TOLERANCE = 1e-12
+_SAME = 1e-9
+"""Largest difference of w and d that are still those of given poses."""
+_MAX_ITERATIONS = 100
+
+
+class Shake(NamedTuple):
+    """How control poses leave the smooth path: independent normal draws, of these standard deviations."""
+
+    interval: float
+    """Frame periods between two control poses: shakes of up to 1 / (2 interval) cycles per period."""
+    rotation_deg: tuple[float, float, float]
+    """About x (pitch), y (yaw), z (roll)."""
+    translation: tuple[float, float, float]
+    """Along x, y (heave), z, metres."""
+
+
+PRESETS = {
+    "handheld": Shake(0.25, (0.15, 0.15, 0.15), (0.002, 0.002, 0.002)),
+    "drone": Shake(0.1, (0.06, 0.04, 0.06), (0.0005, 0.001, 0.0005)),
+    "driving": Shake(0.5, (0.3, 0.05, 0.15), (0.005, 0.015, 0.005)),
+}
+"""Chosen, not measured: a hand trembles at about the frame rate, rotors shake a frame faster and by less, a road
+slower and by more, in pitch and heave above all."""
+
+
+@final
+@dataclass(frozen=True, eq=False, init=False)
+class SplineMotion(Motion):
+    """Constant twist with a shake: control pose k is exp(shake[k]) exp(tau_k xi), tau_k = (k - 1) interval.
+
+    The twist xi is such that the spline, seen from its own pose at time 0, is (exp([w]x), d) at time 1. Without a
+    shake it is ``TwistMotion``. Before time 0 and after the last interval it goes on at the velocity it has there.
+
+    The shake comes from a preset and a seed, or is given; or the control poses are, which fix w and d.
+    """
+
+    name: ClassVar[str] = "spline"
+    interval: float
+    """Frame periods between two control poses."""
+    shake: FloatArray
+    """(n, 6) twists (w, v), radians and metres, by which each control pose leaves the path."""
+
+    def __init__(
+        self,
+        w: ArrayLike,
+        d: ArrayLike,
+        preset: str | None = None,
+        seed: int | None = None,
+        interval: float | None = None,
+        shake: ArrayLike | None = None,
+        poses: ArrayLike | None = None,
+    ) -> None:
+        """From ``preset`` ("handheld") and ``seed`` (0), or ``interval`` and ``shake``, or ``interval`` and ``poses``.
+
+        Args:
+            poses: (n, 6) rotation vectors (radians) and translations (metres) of the body's control poses;
+                w and d must be their ``endpoint``.
+
+        Raises:
+            ValueError: another combination, too few control poses, a half turn or more, or a shake so strong
+                that no path leads to (w, d).
+        """
+        super().__init__(w, d)
+        if float(np.linalg.norm(self.w)) >= np.pi:
+            raise ValueError(f"w of a spline must be below a half turn, got {self.w.tolist()}")
+        given = {"preset": preset, "seed": seed, "interval": interval, "shake": shake, "poses": poses}
+        parameters = {key: value for key, value in given.items() if value is not None}
+        fixed = self.endpoint(parameters)
+        if fixed is not None and np.max(np.abs(np.concatenate(fixed) - [*self.w, *self.d])) > _SAME:
+            raise ValueError("w and d of a spline with poses are those of its poses, and were given otherwise")
+        step, offsets = _shake(parameters)
+        offsets.setflags(write=False)
+        object.__setattr__(self, "interval", step)
+        object.__setattr__(self, "shake", offsets)
+        object.__setattr__(self, "_spline", _through(step, offsets, Pose(so3.exp(self.w), self.d)))
+
+    def body_from_world(self, tau: ArrayLike) -> Pose:
+        return self._spline.at(tau)[0]
+
+    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        (_, t), twist = self._spline.at(tau)
+        w = twist[..., :3]
+        return w, np.cross(w, t) + twist[..., 3:]
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        return {"interval": self.interval, "shake": self.shake.tolist()}
+
+    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
+        return self._spline.fastest(first, last)
+
+    @classmethod
+    def endpoint(cls, parameters: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
+        if parameters.get("poses") is None:
+            return None
+        R, t = _given_spline(parameters).from_start(1.0)
+        return so3.log(R), t
+
+    @classmethod
+    def drawn(cls, parameters: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+        if any(key in parameters for key in ("seed", "shake", "poses")):
+            return dict(parameters)
+        return {**parameters, "seed": int(rng.integers(2**32))}
+
+
+class _Spline:
+    """The spline of control poses (n); the first stands one interval before time 0."""
+
+    def __init__(self, interval: float, control: Pose) -> None:
+        self.interval, self.control = interval, control
+        later, earlier = Pose(control.R[1:], control.t[1:]), Pose(control.R[:-1], control.t[:-1])
+        self.steps = se3.log(compose(later, inverse(earlier)))
+
+    def at(self, tau: ArrayLike) -> tuple[Pose, FloatArray]:
+        """Pose and spatial twist (..., 6) at times (...): dP/dtau = [twist] P."""
+        tau = np.asarray(tau, dtype=np.float64)
+        i = np.clip(np.floor(tau / self.interval), 0, len(self.steps) - 3).astype(np.int64)
+        u = np.clip(tau / self.interval - i, 0.0, 1.0)
+        b = ((5 + u * (3 + u * (u - 3))) / 6, (1 + u * (3 + u * (3 - 2 * u))) / 6, u**3 / 6)
+        rate = (0.5 + u * (0.5 * u - 1), 0.5 + u * (1 - u), 0.5 * u * u)
+        pose, twist = Pose(self.control.R[i], self.control.t[i]), np.zeros((*tau.shape, 6))
+        for j in range(3):
+            step = self.steps[i + j]
+            factor = se3.exp(b[j][..., None] * step)
+            pose = compose(factor, pose)
+            twist = se3.adjoint_apply(factor, twist) + (rate[j] / self.interval)[..., None] * step
+        beyond = tau - (i + u) * self.interval
+        return compose(se3.exp(np.where(u % 1.0 == 0.0, beyond, 0.0)[..., None] * twist), pose), twist
+
+    def from_start(self, tau: float) -> Pose:
+        """Pose at a time from that at time 0."""
+        return compose(self.at(tau)[0], inverse(self.at(0.0)[0]))
+
+    def fastest(self, first: float, last: float) -> tuple[float, float]:
+        """Bounds of |w'| and |t'|: the rates of the three factors are positive and add up to 1 / interval."""
+        ends = np.clip(np.floor(np.array([first, last]) / self.interval), 0, len(self.steps) - 3).astype(np.int64)
+        steps = np.stack([self.steps[ends[0] + j : ends[1] + j + 1] for j in range(3)], axis=1)
+        turn, shift = np.linalg.norm(steps[..., :3], axis=-1), np.linalg.norm(steps[..., 3:], axis=-1)
+        # No partial product brings the origin farther out than the sum of all that its factors shift.
+        reach = np.linalg.norm(self.control.t[ends[0] : ends[1] + 1], axis=-1) + np.sum(shift, axis=-1)
+        speed = np.max(shift + turn * reach[:, None])
+        return float(np.max(turn)) / self.interval, float(speed) / self.interval
+
+
+def _shake(parameters: Mapping[str, Any]) -> tuple[float, FloatArray]:
+    """Interval and shake (n, 6) that the parameters of ``SplineMotion`` mean."""
+    if "poses" in parameters:
+        spline = _given_spline(parameters)
+        xi = se3.log(spline.from_start(1.0))
+        anchored = compose(spline.control, inverse(spline.at(0.0)[0]))
+        return spline.interval, se3.log(compose(anchored, se3.exp(-_times(spline.interval, anchored) * xi)))
+    if "shake" in parameters:
+        _only(parameters, "shake")
+        return _interval(parameters), _twists(parameters["shake"], _interval(parameters), "shake")
+    preset, seed = parameters.get("preset", "handheld"), parameters.get("seed", 0)
+    if preset not in PRESETS:
+        raise ValueError(f"preset = {preset!r}: must be one of {', '.join(PRESETS)}")
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ValueError(f"seed = {seed!r}: must be a whole number, not negative")
+    if "interval" in parameters:
+        raise ValueError("interval goes with shake or poses; a preset has its own")
+    interval, rotation_deg, translation = PRESETS[preset]
+    digest = hashlib.sha256(f"{preset}/{seed}".encode()).digest()
+    rng = np.random.default_rng(int.from_bytes(digest[:16], "little"))
+    sigma = np.concatenate([np.deg2rad(rotation_deg), translation])
+    return interval, sigma * rng.standard_normal((_least(interval), 6))
+
+
+def _given_spline(parameters: Mapping[str, Any]) -> _Spline:
+    _only(parameters, "poses")
+    interval = _interval(parameters)
+    poses = _twists(parameters["poses"], interval, "poses")
+    return _Spline(interval, Pose(so3.exp(poses[:, :3]), poses[:, 3:]))
+
+
+def _only(parameters: Mapping[str, Any], name: str) -> None:
+    others = set(parameters) - {"interval", name}
+    if others:
+        raise ValueError(f"{name} and {', '.join(sorted(others))} exclude each other")
+
+
+def _interval(parameters: Mapping[str, Any]) -> float:
+    value = parameters.get("interval")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= LAST:
+        raise ValueError(f"interval = {value!r}: must be a number of frame periods above 0, at most {LAST:g}")
+    return float(value)
+
+
+def _least(interval: float) -> int:
+    """Control poses that reach time 2."""
+    return int(np.ceil(LAST / interval - 1e-9)) + 3
+
+
+def _twists(value: ArrayLike, interval: float, name: str) -> FloatArray:
+    rows = np.array(value, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != 6 or not np.all(np.isfinite(rows)):
+        raise ValueError(f"{name} must be rows of 6 finite numbers: rotation vector and translation")
+    if len(rows) < _least(interval):
+        raise ValueError(f"{name} has {len(rows)} rows; an interval of {interval:g} needs {_least(interval)}")
+    return rows
+
+
+def _times(interval: float, control: Pose) -> FloatArray:
+    """Times (n, 1) of control poses."""
+    return interval * (np.arange(len(control.t)) - 1.0)[:, None]
+
+
+def _through(interval: float, shake: FloatArray, end: Pose) -> _Spline:
+    """The spline from the identity at 0 to ``end`` at 1: a fixed point of the path's twist."""
+    offsets = se3.exp(shake)
+    times, xi, before = _times(interval, offsets), se3.log(end), np.inf
+    for _ in range(_MAX_ITERATIONS):
+        control = compose(offsets, se3.exp(times * xi))
+        spline = _Spline(interval, control)
+        missing = compose(end, inverse(spline.from_start(1.0)))
+        error = float(np.linalg.norm(se3.log(missing)))
+        # Until rounding: who takes differences of w and d wants more than the tolerance.
+        if error == 0.0 or (error <= _TOLERANCE and error >= 0.5 * before):
+            return _Spline(interval, compose(control, inverse(spline.at(0.0)[0])))
+        before = error
+        xi = se3.log(compose(missing, se3.exp(xi)))
+    raise ValueError("shake: too strong: no smooth path leads to w and d")
