@@ -206,16 +206,18 @@ def load_entry(kind: Kind[Component, Options], name_or_path: str | Path) -> Entr
     )
 
 
-def load_class(kind: Kind[Component, Any], name: str, card: Path) -> type[Component]:
+def load_class(kind: Kind[Component, Any], name: str, card: Path | None = None) -> type[Component]:
     """The class that a card names: by the name of a class of rsbench's own or of an entry point, or as
-    ``package.module:Class``, where the module may lie beside the card.
+    ``package.module:Class``, where the module may lie beside the card (without one, in the current folder).
 
     Raises:
         RsbenchError: no such class, two of that name, or it cannot be loaded or is not of this kind.
     """
+    card_is = f"{card}: " if card is not None else ""
     if ":" in name:
-        return _checked(kind, import_target(name, card.parent, f"{card}: {kind.singular} = {name!r}"), str(card))
-    return _offered_class(kind, _only_offer(kind, name, "", f"{card}: "))[0]
+        where, folder = f"{card_is}{kind.singular} = {name!r}", card.parent if card is not None else Path.cwd()
+        return _checked(kind, import_target(name, folder, where), str(card) if card is not None else where)
+    return _offered_class(kind, _only_offer(kind, name, "", card_is))[0]
 
 
 def description_of(kind: Kind[Any, Any], offer: Offer) -> str:

@@ -16,7 +16,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.engine import five_point, kernels, minimal, track_kernels
+from rsbench.solvers.engine import five_point, kernels, minimal, motion_kernels, track_kernels, vectors
 from rsbench.solvers.engine.registry import list_solvers, load_solver
 from rsbench.solvers.engine.warm_up import warm_up
 
@@ -146,7 +146,7 @@ def test_every_source_with_compiled_code_decides_the_version() -> None:
 
 def signatures() -> set[tuple[str, str]]:
     found = set()
-    for module in (kernels, track_kernels, minimal, five_point):
+    for module in (vectors, motion_kernels, kernels, track_kernels, minimal, five_point):
         for name, function in vars(module).items():
             found |= {(name, str(signature)) for signature in getattr(function, "signatures", [])}
     return found

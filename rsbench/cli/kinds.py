@@ -8,6 +8,7 @@ from typing import Any, get_args
 COMPONENTS = {
     "solvers": "rsbench.solvers.engine.registry:SOLVERS",
     "builders": "rsbench.scenes.load:BUILDERS",
+    "motions": "rsbench.motions:MOTIONS",
     "matchers": "rsbench.vision.stereo_matcher:STEREO_MATCHERS",
     "features": "rsbench.vision.feature_matcher:FEATURE_MATCHERS",
     "correctors": "rsbench.vision.corrector:CORRECTORS",

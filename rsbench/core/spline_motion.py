@@ -3,7 +3,7 @@
 S. Lovegrove, A. Patron-Perez, G. Sibley, Spline Fusion: a continuous-time representation for visual-inertial
 fusion with application to rolling shutter cameras, BMVC 2013, for the spline; C. Sommer, V. Usenko, D. Schubert,
 N. Demmel, D. Cremers, Efficient derivative computation for cumulative B-splines on Lie groups, CVPR 2020, for its
-velocity. They write world_from_body; the poses here are its inverse, so that the factors stand the other way round:
+velocity. They write world_from_body; here the poses are its inverse, so the factors stand the other way round:
 
     P(u) = exp(b3 O[i+3]) exp(b2 O[i+2]) exp(b1 O[i+1]) C[i],   O[k] = log(C[k] C[k-1]^-1)
 
@@ -17,6 +17,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
@@ -82,7 +83,7 @@ class SplineMotion(Motion):
         shake: ArrayLike | None = None,
         poses: ArrayLike | None = None,
     ) -> None:
-        """From ``preset`` ("handheld") and ``seed`` (0), or ``interval`` and ``shake``, or ``interval`` and ``poses``.
+        """From ``preset`` ("handheld") and ``seed`` (0), or ``interval`` and one of ``shake`` and ``poses``.
 
         Args:
             poses: (n, 6) rotation vectors (radians) and translations (metres) of the body's control poses;
@@ -104,7 +105,11 @@ class SplineMotion(Motion):
         offsets.setflags(write=False)
         object.__setattr__(self, "interval", step)
         object.__setattr__(self, "shake", offsets)
-        object.__setattr__(self, "_spline", _through(step, offsets, Pose(so3.exp(self.w), self.d)))
+        _ = self._spline  # a shake that no path carries is refused here, not at the first use
+
+    @cached_property
+    def _spline(self) -> _Spline:
+        return _through(self.interval, self.shake, Pose(so3.exp(self.w), self.d))
 
     def body_from_world(self, tau: ArrayLike) -> Pose:
         return self._spline.at(tau)[0]
@@ -229,12 +234,12 @@ def _twists(value: ArrayLike, interval: float, name: str) -> FloatArray:
         raise ValueError(f"{name} must be rows of 6 finite numbers: rotation vector and translation")
     if len(rows) < _least(interval):
         raise ValueError(f"{name} has {len(rows)} rows; an interval of {interval:g} needs {_least(interval)}")
-    return rows
+    return np.asarray(rows, dtype=np.float64)
 
 
 def _times(interval: float, control: Pose) -> FloatArray:
     """Times (n, 1) of control poses."""
-    return interval * (np.arange(len(control.t)) - 1.0)[:, None]
+    return np.asarray(interval * (np.arange(len(control.t)) - 1.0)[:, None], dtype=np.float64)
 
 
 def _through(interval: float, shake: FloatArray, end: Pose) -> _Spline:

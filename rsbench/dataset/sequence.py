@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import MOTION_MODELS, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.files import read_depth, read_json, read_png, read_poses
 from rsbench.errors import RsbenchError
+from rsbench.motions import motion_record, read_motion
 
 FORMAT = 1
 FRAMES = (0, 1)
@@ -101,7 +102,7 @@ def sequence_manifest(
         "frame_period_s": frame_period_s,
         "readout_time_s": readout_s,
         "row_time_s": readout_s / shutter.height,
-        "motion": {"model": motion.name, "w": motion.w.tolist(), "d": motion.d.tolist()},
+        "motion": motion_record(motion),
     }
 
 
@@ -117,17 +118,16 @@ def read_sequence(folder: Path) -> Sequence:
         raise RsbenchError(f"{path}: format = {manifest.get('format')!r}; this version reads {FORMAT}")
     try:
         camera = PinholeCamera(**manifest["camera"])
-        model = MOTION_MODELS[manifest["motion"]["model"]]
         return Sequence(
             folder=folder,
             name=str(manifest["name"]),
             rig=StereoRig(camera=camera, baseline=manifest["baseline"]),
             shutter=RollingShutter(height=camera.height, readout_ratio=manifest["readout_ratio"]),
-            motion=model(manifest["motion"]["w"], manifest["motion"]["d"]),
+            motion=read_motion(manifest["motion"]),
             frame_period_s=float(manifest["frame_period_s"]),
             manifest=manifest,
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RsbenchError) as error:
         what = f"{error} is missing or unknown" if isinstance(error, KeyError) else str(error)
         raise RsbenchError(f"{path}: {what}") from error
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from rsbench.core import so3
-from rsbench.core.motion import MOTION_MODELS, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
+from rsbench.motions import make_motion
 from rsbench.solvers.engine.base import MotionEstimate, SolverSpec
 
 
@@ -29,4 +30,4 @@ def body_motion(estimate: MotionEstimate, spec: SolverSpec, rig: StereoRig) -> M
     if spec.reference_point == "left":
         offset = rig.offset("left")
         d = d - offset + so3.exp(estimate.w) @ offset
-    return MOTION_MODELS[spec.motion_model](estimate.w, d)
+    return make_motion(spec.motion_model, estimate.w, d, spec.motion_parameters)

@@ -93,7 +93,7 @@ class _Profile:
 
     def _packed(self, ratio: float) -> Packed:
         shutter = RollingShutter(height=self.rig.camera.height, readout_ratio=ratio)
-        return pack(self.inliers, self.rig, shutter, self.solver.motion_model, self.solver.use_tracks)
+        return _measurements(self.inliers, self.rig, shutter, self.solver)
 
     def __call__(self, ratio: float) -> float:
         packed = self._packed(float(ratio))
@@ -138,7 +138,7 @@ def truncated_cost(
     if not result.estimate.success:
         return float("inf")
     shutter = RollingShutter(height=rig.camera.height, readout_ratio=ratio)
-    packed = pack(correspondences, rig, shutter, solver.motion_model, solver.use_tracks)
+    packed = _measurements(correspondences, rig, shutter, solver)
     theta = packed.theta(result.estimate.w, result.estimate.d)
     limit = options.threshold_px**2
     pairs = np.minimum(packed.pair_residuals(theta) ** 2, limit)
@@ -186,3 +186,11 @@ def runs_backwards(
     in_reverse = truncated_cost(turned, rig, backward_ratio, solver, options, backward)
     variance = max(backward.estimate.noise_px or 0.0, _LEAST_NOISE_PX) ** 2
     return as_given - in_reverse > _CLEARLY * variance
+
+
+def _measurements(
+    correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter, solver: RefinedSolver
+) -> Packed:
+    """All matches, of few tracks too, under the solver's motion model."""
+    model, parameters = solver.motion_model, solver.motion_parameters
+    return pack(correspondences, rig, shutter, model, solver.use_tracks, motion_parameters=parameters)

@@ -88,14 +88,16 @@ class RobustProblem:
 
     def _packed(self) -> Packed:
         """The data under the shutter that the solver believes in, about the point whose motion it gives."""
-        data, rig, shutter, model = self.data, self.rig, self.shutter, self.spec.motion_model
+        data, rig, shutter = self.data, self.rig, self.shutter
+        model, own = self.spec.motion_model, self.spec.motion_parameters
         if self.spec.shutter == "global":
             shutter = RollingShutter(height=shutter.height, readout_ratio=0.0)
         if self.spec.reference_point == "body":
-            return pack(data, rig, shutter, model)
+            return pack(data, rig, shutter, model, motion_parameters=own)
         # The errors of tracks are about the body: the left camera's motion is judged by what that camera sees.
         rig = rig.about("left")
-        packed = pack(Correspondences(left=data.left, right=data.right), rig, shutter, model)
+        alone = Correspondences(left=data.left, right=data.right)
+        packed = pack(alone, rig, shutter, model, motion_parameters=own)
         halves = pack_pairs(track_pairs(data.tracks, "left"), "left", rig, shutter)
         return replace(packed, pairs=np.concatenate([packed.pairs, halves]))
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Literal, final
+from dataclasses import dataclass, field
+from typing import Any, Literal, final
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.solvers.eight_point import decompose_essential, eight_point
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.five_point import five_point
+from rsbench.solvers.engine.kernel_type import load_kernel
 from rsbench.solvers.engine.minimal import solve_triples
 from rsbench.solvers.engine.optimise import Minimum, levenberg_marquardt
 from rsbench.solvers.engine.packed import Packed, pack
@@ -46,7 +47,9 @@ class RefinedSolver(Solver):
     """
 
     motion_model: str = "linear"
-    """Interpolation between the rows: the paper's, or a constant twist."""
+    """Interpolation between the rows: a motion model that has a kernel."""
+    motion_parameters: dict[str, Any] = field(default_factory=dict, hash=False)
+    """Of the motion model; absent ones have its defaults."""
     use_tracks: bool = True
     """Off: tracks count as unlinked left and right matches, for a fair comparison with solvers of pairs."""
     use_pairs: bool = True
@@ -64,8 +67,7 @@ class RefinedSolver(Solver):
     """Standard deviation of the rotation (radians) above which there is no estimate."""
 
     def __post_init__(self) -> None:
-        if self.motion_model not in ("linear", "twist"):
-            raise ValueError(f"motion_model must be 'linear' or 'twist', got {self.motion_model!r}")
+        load_kernel(self.motion_model, self.motion_parameters)
         if not (self.use_tracks or self.use_pairs):
             raise ValueError("use_tracks and use_pairs cannot both be off")
 
@@ -77,6 +79,7 @@ class RefinedSolver(Solver):
             minimum=minimum,
             metric=True,
             motion_model=self.motion_model,
+            motion_parameters=self.motion_parameters,
             shutter=self.shutter,
             reference_point="body",
             reference="rsbench; maximum likelihood of Wang, Fan, Dai, eq. 1-6 without linearisation",
@@ -90,7 +93,14 @@ class RefinedSolver(Solver):
         if not self.use_pairs:
             correspondences = Correspondences(tracks=correspondences.tracks)
         linked = self.use_tracks and len(correspondences.tracks) >= 3
-        return pack(correspondences, rig, shutter, self.motion_model, use_tracks=linked)
+        return pack(
+            correspondences,
+            rig,
+            shutter,
+            self.motion_model,
+            use_tracks=linked,
+            motion_parameters=self.motion_parameters,
+        )
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from rsbench import __version__
 from rsbench.benchmark.seeds import generator
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import MOTION_MODELS, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.dataset.files import MATCH_SETS, read_json, save_arrays, save_matches, sha256, write_json, write_png
 from rsbench.dataset.sequence import FRAMES, Sequence
+from rsbench.motions import make_motion
 from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.registry import load_solver_entry
 from rsbench.vision.correction import correct_frame
@@ -108,6 +109,7 @@ def _predict_motion(
         "d": estimate.d.tolist() if estimate.success else None,
         "metric": estimate.metric,
         "motion_model": spec.motion_model,
+        **({"motion_parameters": dict(spec.motion_parameters)} if spec.motion_parameters else {}),
         "reference_point": spec.reference_point,
         "shutter": spec.shutter,
         "uses": sorted(spec.needs | {name for name, size in solver.sample_sizes(matches).items() if size}),
@@ -145,7 +147,9 @@ def depth_of(disparity: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float
 def read_motion(folder: Path, solver: str) -> Motion | None:
     """Motion that a solver predicted, or None when it found none."""
     answer = read_json(folder / "motion" / f"{load_solver_entry(solver).name}.json")
-    return MOTION_MODELS[answer["motion_model"]](answer["w"], answer["d"]) if answer["success"] else None
+    if not answer["success"]:
+        return None
+    return make_motion(answer["motion_model"], answer["w"], answer["d"], answer.get("motion_parameters"))
 
 
 def _identity(sequence: Sequence, options: EvaluationOptions) -> str:

@@ -74,7 +74,7 @@ def motion_bound(
 
     Args:
         correspondences: left and right pairs, and tracks; no match may be in two sets.
-        motion: the true motion.
+        motion: the true motion; its model and the model's own parameters count as known.
         views: what a solver sees of the tracks.
     """
     F = np.zeros((6, 6))
@@ -196,12 +196,12 @@ def _projection_jacobian(
     x = rotated + t
     w_rate, t_rate = motion.velocity(tau)
     velocity = np.cross(w_rate, rotated) + t_rate
-    model = type(motion)
     columns = []
     for k in range(6):
         shift = _STEP * np.eye(6)[k]
         ends = [
-            model(motion.w + s * shift[:3], motion.d + s * shift[3:]).body_from_world(tau) for s in (1.0, -1.0)
+            motion.with_endpoint(motion.w + s * shift[:3], motion.d + s * shift[3:]).body_from_world(tau)
+            for s in (1.0, -1.0)
         ]
         moved = [(end.R @ points[:, :, None])[:, :, 0] + end.t for end in ends]
         columns.append((moved[0] - moved[1]) / (2 * _STEP))

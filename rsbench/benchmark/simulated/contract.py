@@ -18,10 +18,11 @@ from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.metrics import rotation_error, scale_error, translation_error, translation_of_offset
-from rsbench.core.motion import MOTION_MODELS
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.errors import RsbenchError
+from rsbench.motions import make_motion
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.registry import SolverEntry
 
@@ -82,12 +83,10 @@ def _found(name: str, check: Callable[[Subject], tuple[Verdict, str]], subject: 
 def own_problem(subject: Subject, size: float = 1.0, seed: int = 5, noise_px: float = 0.0) -> Simulation:
     """60 + 60 matches and 60 tracks that satisfy what the solver assumes, under ``size`` times the motion."""
     shutter = ROLLING if subject.spec.shutter == "rolling" else GLOBAL
-    if subject.spec.motion_model not in MOTION_MODELS:
-        known = ", ".join(MOTION_MODELS)
-        raise BrokenContractError(
-            f"motion_model = {subject.spec.motion_model!r} does not exist; there are: {known}"
-        )
-    motion = MOTION_MODELS[subject.spec.motion_model](size * W, size * D)
+    try:
+        motion = make_motion(subject.spec.motion_model, size * W, size * D, subject.spec.motion_parameters)
+    except RsbenchError as error:
+        raise BrokenContractError(str(error)) from error
     options = SimulationOptions(pairs=60, tracks=60, noise_px=noise_px)
     return simulate(RIG, shutter, motion, options, np.random.default_rng(seed))
 
@@ -315,7 +314,7 @@ def degenerate_cases() -> dict[str, tuple[Correspondences, RollingShutter]]:
         w: FloatArray, d: FloatArray, shutter: RollingShutter = ROLLING, plane: bool = False
     ) -> Correspondences:
         options = SimulationOptions(pairs=30, tracks=30, shape="plane" if plane else "box")
-        motion = MOTION_MODELS["linear"](w, d)
+        motion = make_motion("linear", w, d)
         return simulate(RIG, shutter, motion, options, np.random.default_rng(2)).correspondences
 
     c = seen(W, D)

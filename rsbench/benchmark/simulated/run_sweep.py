@@ -25,7 +25,6 @@ import numpy as np
 from rsbench import __version__
 from rsbench.benchmark.simulated.sweep_card import Cell, SweepCard
 from rsbench.benchmark.simulated.trials import Arrays, Entrant, entrant, run_bounds, run_trials
-from rsbench.core.motion import MOTION_MODELS
 from rsbench.dataset.files import load_arrays, read_json, save_arrays, write_json
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_jobs import run_jobs
@@ -243,7 +242,7 @@ def _differences(stored: dict[str, Any], plan: dict[str, Any]) -> list[str]:
 def _compile(card: SweepCard) -> None:
     """Once, before the workers would each do it."""
     models = {e.solver.spec.motion_model for e in entrants(card)} | {c.setting.motion_model for c in card.cells()}
-    warm_up(sorted(models & set(MOTION_MODELS)))
+    warm_up(sorted(models))
 
 
 def _run_all(todo: list[_Job], workers: int, time_limit_s: float | None) -> Iterator[_Part]:

@@ -11,11 +11,12 @@ from typing import Literal
 import numpy as np
 
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import MOTION_MODELS, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.projection import ROW_TOLERANCE_PX, ProjectionStatus, back_project, project_at, rs_project
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.motions import make_motion
 
 SceneShape = Literal["box", "plane"]
 
@@ -60,7 +61,7 @@ def random_direction(rng: np.random.Generator) -> FloatArray:
 
 def random_motion(rng: np.random.Generator, angle: float, distance: float, model: str = "linear") -> Motion:
     """Motion that turns by ``angle`` (radians) and shifts by ``distance`` (metres) per frame period."""
-    return MOTION_MODELS[model](angle * random_direction(rng), distance * random_direction(rng))
+    return make_motion(model, angle * random_direction(rng), distance * random_direction(rng))
 
 
 def simulate(
@@ -185,14 +186,17 @@ def _slower_than_readout(
 ) -> np.ndarray:
     """Mask (n,) of points whose image provably never moves as fast as half the speed of the readout.
 
-    Then the row equation falls at every crossing, so it has at most one. Both motion models have constant
-    rates; half the speed leaves room for others.
+    Then the row equation falls at every crossing, so it has at most one. Of a motion that knows no bound of its
+    speed over the frame, none is.
     """
     camera = rig.camera
-    tau = shutter.row_time(0.5 * shutter.height, frame)
-    w_rate, t_rate = motion.velocity(tau)
-    speed = np.linalg.norm(w_rate) * np.linalg.norm(points, axis=-1) + np.linalg.norm(t_rate)
-    depth = project_at(rig, motion, side, tau, points)[:, 2]
+    rows = (-0.5, 0.5 * shutter.height, shutter.height - 0.5)
+    first, middle, last = (float(shutter.row_time(row, frame)) for row in rows)
+    fastest = motion.fastest(first, last)
+    if fastest is None:
+        return np.zeros(len(points), dtype=np.bool_)
+    speed = fastest[0] * np.linalg.norm(points, axis=-1) + fastest[1]
+    depth = project_at(rig, motion, side, middle, points)[:, 2]
     nearest = depth - 0.5 * speed * shutter.readout_ratio
     steepest = np.hypot(1.0, max(camera.cy + 0.5, camera.height - 0.5 - camera.cy) / camera.fy)
     return (nearest > 0.0) & (shutter.h * camera.fy * speed * steepest < 0.5 * nearest)

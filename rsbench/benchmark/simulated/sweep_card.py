@@ -12,10 +12,11 @@ import numpy as np
 from rsbench.benchmark.simulated.simulation import SceneShape, SimulationOptions, random_direction
 from rsbench.cards import load_card, parse_card
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import MOTION_MODELS, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
+from rsbench.motions import drawn_parameters, fixed_endpoint, make_motion
 
 Axis = Literal[
     "noise_px",
@@ -56,6 +57,9 @@ class Setting:
     translation_axis: Vector | None = None
     """Likewise."""
     motion_model: str = "linear"
+    """Name of a motion model; what a solver assumes is its own affair."""
+    motion_parameters: dict[str, Any] = field(default_factory=dict)
+    """Of the motion model; absent ones have its defaults, or are drawn for every trial (a shake's seed)."""
     shape: SceneShape = "box"
     outlier_ratio: float = 0.0
     outlier_px: float = 80.0
@@ -63,8 +67,6 @@ class Setting:
     """What the solver is told minus what is true."""
 
     def __post_init__(self) -> None:
-        if self.motion_model not in MOTION_MODELS:
-            raise ValueError(f"motion_model = {self.motion_model!r}: must be one of {', '.join(MOTION_MODELS)}")
         for name in ("rotation_deg", "translation", "noise_px", "outlier_px"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
@@ -80,6 +82,9 @@ class Setting:
         self.rig()
         self.shutter()
         self.told_shutter()
+        if fixed_endpoint(self.motion_model, self.motion_parameters) is not None:
+            raise ValueError("motion_parameters must leave the motion free: rotation_deg and translation set it")
+        self.motion(np.random.default_rng(0))
 
     def rig(self) -> StereoRig:
         return StereoRig(camera=PinholeCamera.centred(self.width, self.height, self.focal), baseline=self.baseline)
@@ -100,7 +105,8 @@ class Setting:
             axis = drawn if given is None else np.asarray(given, dtype=np.float64)
             axes.append(axis / np.linalg.norm(axis))
         w, d = np.deg2rad(self.rotation_deg) * axes[0], self.translation * axes[1]
-        return MOTION_MODELS[self.motion_model](w, d)
+        parameters = drawn_parameters(self.motion_model, self.motion_parameters, rng)
+        return make_motion(self.motion_model, w, d, parameters)
 
     def options(self, tracks: bool) -> SimulationOptions:
         """What ``simulate`` needs; ``tracks`` asks for points in all four images besides the pairs."""

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.errors import RsbenchError
+from rsbench.motions import check_parameters
 
 MatchSet = Literal["left", "right", "stereo", "tracks"]
 
@@ -86,10 +88,13 @@ class SolverSpec:
     """Where it was published: paper and equation."""
     assumes: str
     """What must hold for it to work, in words."""
+    motion_parameters: Mapping[str, Any] = field(default_factory=dict)
+    """The motion model's own parameters that it assumes; absent ones have the model's defaults."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "needs", frozenset(self.needs))
-        object.__setattr__(self, "minimum", MappingProxyType(dict(self.minimum)))
+        for name in ("minimum", "motion_parameters"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
         sets = get_args(MatchSet)
         for name, given in (("needs", self.needs), ("minimum", self.minimum)):
             for value in given:
@@ -103,17 +108,21 @@ class SolverSpec:
         self._check_values()
 
     def _check_values(self) -> None:
-        for name, count in self.minimum.items():
+        for key, count in self.minimum.items():
             if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-                raise ValueError(f"minimum[{name!r}] = {count!r}: must be a whole number above 0")
-        for field, allowed in (("shutter", ("rolling", "global")), ("reference_point", ("body", "left"))):
-            if getattr(self, field) not in allowed:
-                raise ValueError(f"{field} = {getattr(self, field)!r}: must be one of {', '.join(allowed)}")
+                raise ValueError(f"minimum[{key!r}] = {count!r}: must be a whole number above 0")
+        for name, allowed in (("shutter", ("rolling", "global")), ("reference_point", ("body", "left"))):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name} = {getattr(self, name)!r}: must be one of {', '.join(allowed)}")
         if not isinstance(self.metric, bool):
             raise ValueError(f"metric = {self.metric!r}: must be True or False")
-        for field in ("motion_model", "reference", "assumes"):
-            if not isinstance(getattr(self, field), str) or not getattr(self, field):
-                raise ValueError(f"{field} = {getattr(self, field)!r}: must be a text")
+        for name in ("motion_model", "reference", "assumes"):
+            if not isinstance(getattr(self, name), str) or not getattr(self, name):
+                raise ValueError(f"{name} = {getattr(self, name)!r}: must be a text")
+        try:
+            check_parameters(self.motion_model, self.motion_parameters)
+        except RsbenchError as error:
+            raise ValueError(str(error)) from error
 
     def shortage(self, counts: Mapping[MatchSet, int]) -> MotionEstimate | None:
         """The failure that too few matches are; None when there are enough."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench.compiled import compiled
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.kernels import cross, dot
+from rsbench.solvers.engine.vectors import cross, dot
 
 IntArray = NDArray[np.int64]
 

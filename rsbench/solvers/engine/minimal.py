@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rsbench.compiled import compiled
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.kernel_type import MotionKernel
 from rsbench.solvers.engine.packed import Packed
 from rsbench.solvers.engine.track_kernels import track_terms
 
@@ -22,7 +23,7 @@ def solve_triples(packed: Packed, samples: NDArray[np.int64], iterations: int = 
     A step that does not lower the cost is not taken and the damping grows.
     """
     out = np.zeros((len(samples), 6))
-    _descend(packed.tracks, samples, packed.twist, packed.focal, packed.h, packed.baseline, iterations, out)
+    _descend(packed.tracks, samples, packed.kernel, packed.focal, packed.h, packed.baseline, iterations, out)
     return out
 
 
@@ -30,7 +31,7 @@ def solve_triples(packed: Packed, samples: NDArray[np.int64], iterations: int = 
 def _descend(
     tracks: FloatArray,
     samples: NDArray[np.int64],
-    twist: bool,
+    kernel: MotionKernel,
     focal: FloatArray,
     h: float,
     baseline: float,
@@ -45,7 +46,7 @@ def _descend(
         for k in range(size):
             chosen[k] = tracks[samples[s, k]]
         theta[:], H[:], gradient[:], damping = 0.0, 0.0, 0.0, _DAMPING
-        track_terms(theta, twist, chosen, focal, h, baseline, squares, H, gradient, True)
+        track_terms(theta, kernel, chosen, focal, h, baseline, squares, H, gradient, True)
         cost = squares.sum()
         for _ in range(iterations):
             if not damped_step(H, gradient, damping, step):
@@ -53,7 +54,7 @@ def _descend(
                 break
             trial = theta + step
             trial_H[:], trial_gradient[:] = 0.0, 0.0
-            track_terms(trial, twist, chosen, focal, h, baseline, squares, trial_H, trial_gradient, True)
+            track_terms(trial, kernel, chosen, focal, h, baseline, squares, trial_H, trial_gradient, True)
             if squares.sum() <= cost:
                 cost = squares.sum()
                 theta[:], H[:], gradient[:] = trial, trial_H, trial_gradient

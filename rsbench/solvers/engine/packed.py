@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from rsbench.core import so3
+import rsbench.solvers.engine.motion_kernels  # noqa: F401  (gives the models their kernels)
 from rsbench.core.correspondences import Correspondences, temporal_pairs, unlinked_pairs
-from rsbench.core.motion import MOTION_MODELS, Motion, TwistMotion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.kernel_type import MotionKernel, load_kernel
 from rsbench.solvers.engine.kernels import BEHIND, count_in_front, pair_terms
 from rsbench.solvers.engine.track_kernels import track_terms
 
@@ -29,7 +31,8 @@ class Packed:
     focal: FloatArray
     h: float
     baseline: float
-    twist: bool
+    kernel: MotionKernel
+    """Of the motion model."""
 
     @property
     def constraints(self) -> int:
@@ -64,22 +67,22 @@ class Packed:
             focal=self.focal,
             h=self.h,
             baseline=self.baseline,
-            twist=self.twist,
+            kernel=self.kernel,
         )
 
     def normal_equations(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Half the sum of squares in px^2, its gradient (6,) and Gauss-Newton Hessian (6, 6)."""
         residuals, squares = np.zeros(len(self.pairs)), np.zeros(len(self.tracks))
         H, gradient = np.zeros((6, 6)), np.zeros(6)
-        pair_terms(theta, self.twist, self.pairs, self.focal, self.h, residuals, H, gradient, True)
-        track_terms(theta, self.twist, self.tracks, self.focal, self.h, self.baseline, squares, H, gradient, True)
+        pair_terms(theta, self.kernel, self.pairs, self.focal, self.h, residuals, H, gradient, True)
+        track_terms(theta, self.kernel, self.tracks, self.focal, self.h, self.baseline, squares, H, gradient, True)
         return 0.5 * float(residuals @ residuals + np.sum(squares)), gradient, H
 
     def pair_residuals(self, theta: FloatArray) -> FloatArray:
         """Sampson errors (n,) of the pairs, px."""
         residuals = np.zeros(len(self.pairs))
         pair_terms(
-            theta, self.twist, self.pairs, self.focal, self.h, residuals, np.zeros((6, 6)), np.zeros(6), False
+            theta, self.kernel, self.pairs, self.focal, self.h, residuals, np.zeros((6, 6)), np.zeros(6), False
         )
         return residuals
 
@@ -88,7 +91,7 @@ class Packed:
         squares = np.zeros(len(self.tracks))
         track_terms(
             theta,
-            self.twist,
+            self.kernel,
             self.tracks,
             self.focal,
             self.h,
@@ -102,33 +105,19 @@ class Packed:
 
     def in_front(self, theta: FloatArray) -> int:
         """Number of pairs whose point lies in front of both cameras."""
-        return count_in_front(theta, self.twist, self.pairs)
+        return count_in_front(theta, self.kernel, self.pairs)
 
     def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
         """Parameters (6,) of the motion (w, d)."""
-        v = np.linalg.solve(so3.left_jacobian(w), d) if self.twist else d
-        return np.concatenate([w, v])
+        return self.kernel.theta(w, d)
 
     def motion(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """``(w, d)`` of the parameters."""
-        w, v = theta[:3], theta[3:]
-        return w, so3.left_jacobian(w) @ v if self.twist else v
+        return self.kernel.motion(theta)
 
     def motion_jacobian(self, theta: FloatArray) -> FloatArray:
         """Derivative (6, 6) of (w, d) by the parameters."""
-        out = np.eye(6)
-        if self.twist:
-            step = 1e-6
-            for j in range(3):
-                shift = step * np.eye(6)[j]
-                out[3:, j] = (self.motion(theta + shift)[1] - self.motion(theta - shift)[1]) / (2 * step)
-            out[3:, 3:] = so3.left_jacobian(theta[:3])
-        return out
-
-
-def theta_of(motion: Motion) -> FloatArray:
-    """Parameters (6,) of a motion of either model."""
-    return np.concatenate([motion.w, motion.v if isinstance(motion, TwistMotion) else motion.d])
+        return self.kernel.motion_jacobian(theta)
 
 
 def pack(
@@ -137,10 +126,20 @@ def pack(
     shutter: RollingShutter,
     motion_model: str = "linear",
     use_tracks: bool = True,
+    *,
+    motion_parameters: Mapping[str, Any] | None = None,
 ) -> Packed:
-    """Measurements of a problem; without ``use_tracks`` the tracks count as independent left and right pairs."""
-    if motion_model not in MOTION_MODELS:
-        raise ValueError(f"motion_model must be one of {', '.join(MOTION_MODELS)}, got {motion_model!r}")
+    """Measurements of a problem.
+
+    Args:
+        motion_model: by name; the residuals are those of this model's kernel.
+        use_tracks: without it, tracks count as independent left and right pairs.
+        motion_parameters: the model's own.
+
+    Raises:
+        RsbenchError: no such model, or it has no kernel.
+    """
+    kernel = load_kernel(motion_model, motion_parameters)
     tracks = correspondences.tracks if use_tracks else correspondences.tracks[:0]
     pairs = [np.zeros((0, 7))]
     for side in SIDES:
@@ -158,7 +157,7 @@ def pack(
         focal=np.array([camera.fx, camera.fy]),
         h=shutter.h,
         baseline=rig.baseline,
-        twist=motion_model == TwistMotion.name,
+        kernel=kernel,
     )
 
 

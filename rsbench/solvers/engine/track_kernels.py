@@ -9,7 +9,8 @@ independent of m and of the motion. The body's motion then predicts m of frame 1
     x1 = fx p_x / p_z + cx,  y1 = fy p_y / p_z + cy,  disparity1 = disparity0 / p_z
 
 Whitened with the noise of both frames (multi-constraint Sampson error), these three equations are the reprojection
-error of the best point, to first order. They stay regular without motion and for points at infinity.
+error of the best point, to first order. They stay regular without motion and for points at infinity. Their NumPy
+form is ``rsbench.core.epipolar.rs_stereo_transfer``.
 """
 
 from __future__ import annotations
@@ -18,17 +19,16 @@ import numpy as np
 
 from rsbench.compiled import compiled
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.kernels import (
-    BEHIND,
+from rsbench.solvers.engine.kernel_type import MotionKernel
+from rsbench.solvers.engine.kernels import BEHIND
+from rsbench.solvers.engine.vectors import (
     Vector,
     apply,
     apply_transposed,
     cross,
     dot,
-    move,
     plus,
     times,
-    translation_jacobian,
 )
 
 _VARIANCE = (0.5, 0.5, 2.0)
@@ -63,7 +63,7 @@ def _predict(p: Vector, disparity: float, focal: FloatArray, by_p: FloatArray) -
 @compiled
 def track_terms(
     theta: FloatArray,
-    twist: bool,
+    kernel: MotionKernel,
     tracks: FloatArray,
     focal: FloatArray,
     h: float,
@@ -86,11 +86,10 @@ def track_terms(
     R, A, by_p, S, W = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     D0, D1, T_w, T_v = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     C, WC = np.zeros((3, 6)), np.zeros((3, 6))
-    w = (theta[0], theta[1], theta[2])
     for k in range(len(tracks)):
         x, disparity, tau0, tau1 = (tracks[k, 0], tracks[k, 1], 1.0), tracks[k, 2], tracks[k, 6], tracks[k, 7]
         rho = disparity / (focal[0] * baseline)
-        T, rate0, rate1 = move(theta, twist, tau0, tau1, R, A)
+        T, rate0, rate1, spin0, spin1 = kernel.move(theta, tau0, tau1, R, A)
         turned = apply(R, x)
         p = plus(turned, rho, T)
         if p[2] <= NEAREST:
@@ -98,8 +97,8 @@ def track_terms(
             continue
         m = _predict(p, disparity, focal, by_p)
         c = (tracks[k, 3] - m[0], tracks[k, 4] - m[1], tracks[k, 5] - m[2])
-        turn = cross(w, turned)
-        rate0, rate1 = plus(times(rho, rate0), -1.0, turn), plus(times(rho, rate1), 1.0, turn)
+        rate0 = plus(times(rho, rate0), 1.0, cross(spin0, turned))
+        rate1 = plus(times(rho, rate1), 1.0, cross(spin1, turned))
         _track_gradients(R, T, rate0, rate1, p[2], by_p, focal, h, baseline, D0, D1)
         _whitening(D0, D1, S, W)
         lam = apply(W, c)
@@ -108,7 +107,7 @@ def track_terms(
             continue
         step = apply_variance(apply_transposed(D0, lam))
         x, disparity = (x[0] - step[0] / focal[0], x[1] - step[1] / focal[1], 1.0), disparity - step[2]
-        translation_jacobian(theta, twist, tau0, tau1, R, A, T_w, T_v)
+        kernel.translation_jacobian(theta, tau0, tau1, R, A, T_w, T_v)
         if _track_jacobian(x, disparity, R, A, T, T_w, T_v, focal, baseline, by_p, C):
             _add_normal(C, WC, W, lam, H, gradient)
 

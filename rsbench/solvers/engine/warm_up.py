@@ -11,8 +11,9 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.solvers.engine.five_point import five_point
+from rsbench.solvers.engine.kernel_type import has_kernel
 from rsbench.solvers.engine.minimal import solve_triples
-from rsbench.solvers.engine.packed import pack
+from rsbench.solvers.engine.packed import pack, pack_pairs
 
 
 def warm_up(motion_models: Iterable[str] = ("linear",)) -> None:
@@ -21,7 +22,7 @@ def warm_up(motion_models: Iterable[str] = ("linear",)) -> None:
     Call it before workers start, so that they find the code on disk, and in each of them before a clock starts.
 
     Raises:
-        RsbenchError: a motion model that does not exist or has no kernel.
+        RsbenchError: a motion model that does not exist. Of one without a kernel there is nothing to compile.
     """
     rig = StereoRig(camera=PinholeCamera.centred(64, 64, 60.0), baseline=1.0)
     shutter = RollingShutter(height=64, readout_ratio=0.5)
@@ -30,9 +31,9 @@ def warm_up(motion_models: Iterable[str] = ("linear",)) -> None:
     pairs = tracks[:, [0, 1, 4, 5]] + 0.25
     matches = Correspondences(left=pairs, right=pairs, tracks=tracks)
     theta = np.array([0.01, 0.0, 0.0, 0.1, 0.0, 0.0])
-    for model in motion_models:
+    for model in [name for name in motion_models if has_kernel(name)]:
         packed = pack(matches, rig, shutter, model)
         packed.normal_equations(theta)
         packed.in_front(theta)
         solve_triples(packed, np.arange(6).reshape(2, 3))
-    five_point(packed.pairs[:5])
+    five_point(pack_pairs(pairs, "left", rig, shutter)[:5])

@@ -12,10 +12,11 @@ from rsbench.benchmark.simulated import simulation
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.epipolar import rs_sampson_error
-from rsbench.core.motion import MOTION_MODELS, LinearMotion, Motion
+from rsbench.core.motion import LinearMotion, Motion
 from rsbench.core.projection import ProjectionStatus, back_project, rs_project
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
+from rsbench.motions import make_motion
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
@@ -23,9 +24,9 @@ MOTION = LinearMotion(w=np.deg2rad([0.8, -1.5, 1.0]), d=np.array([0.2, -0.1, 0.2
 OPTIONS = SimulationOptions(pairs=40, tracks=30)
 
 
-@pytest.mark.parametrize("model", ["linear", "twist"])
+@pytest.mark.parametrize("model", ["linear", "twist", "accelerated", "spline"])
 def test_without_noise_all_matches_satisfy_the_exact_constraint(model: str) -> None:
-    motion = MOTION_MODELS[model](MOTION.w, MOTION.d)
+    motion = make_motion(model, MOTION.w, MOTION.d)
     c = simulate(RIG, SHUTTER, motion, OPTIONS, np.random.default_rng(1)).correspondences
     assert len(c.left) == len(c.right) == 40 and len(c.tracks) == 30
     for side, halves in zip(SIDES, ([0, 1, 4, 5], [2, 3, 6, 7]), strict=True):

@@ -1,0 +1,170 @@
+"""The kernels of rsbench's own motion models; see ``kernel_type.MotionKernel``.
+
+Their NumPy forms are the models in ``rsbench.core.motion``, through ``rsbench.core.epipolar.row_pair_pose``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from rsbench.compiled import compiled
+from rsbench.core import so3
+from rsbench.core.motion import AcceleratedMotion, LinearMotion, TwistMotion
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.kernel_type import MotionKernel, Moved, kernel_for
+from rsbench.solvers.engine.vectors import (
+    Vector,
+    apply,
+    coefficients,
+    cross,
+    dot,
+    fill_rotation,
+    plus,
+    times,
+)
+
+
+@compiled
+def rotate(w: Vector, a: float, R: FloatArray, A: FloatArray) -> None:
+    """Fill R = exp(a [w]x) (the paper's (2) and (3), Rodrigues) and A = a J(a w), so that dR = [A dw]x R."""
+    phi = times(a, w)
+    s = dot(phi, phi)
+    c0, c1, c2, _, _ = coefficients(s)
+    fill_rotation(phi, 1.0 - c1 * s, c0, c1, R)
+    fill_rotation(phi, a * (1.0 - c2 * s), a * c1, a * c2, A)
+
+
+@compiled
+def linear_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+    """T = tau1 d - tau0 R d: the paper's (6) with R exact. NumPy: ``epipolar.row_pair_pose`` of LinearMotion."""
+    w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
+    rotate(w, tau1 - tau0, R, A)
+    Rv = apply(R, v)
+    turn = cross(w, Rv)
+    T = plus(times(tau1, v), -tau0, Rv)
+    return T, plus(times(-1.0, Rv), tau0, turn), plus(v, -tau0, turn), times(-1.0, w), w
+
+
+@compiled
+def linear_translation_jacobian(
+    theta: FloatArray, tau0: float, R: FloatArray, A: FloatArray, tau1: float, T_w: FloatArray, T_v: FloatArray
+) -> None:
+    """dT/dw_j = -tau0 [A_j]x R d and dT/dd = tau1 I - tau0 R. NumPy: ``epipolar.rs_sampson_jacobian``."""
+    Rv = apply(R, (theta[3], theta[4], theta[5]))
+    for j in range(3):
+        column = cross((A[0, j], A[1, j], A[2, j]), Rv)
+        for i in range(3):
+            T_w[i, j] = -tau0 * column[i]
+            T_v[i, j] = -tau0 * R[i, j]
+        T_v[j, j] += tau1
+
+
+@final
+@kernel_for(LinearMotion)
+@dataclass(frozen=True)
+class LinearKernel(MotionKernel):
+    """The paper's motion; v is d."""
+
+    def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+        return linear_move(theta, tau0, tau1, R, A)
+
+    def translation_jacobian(
+        self,
+        theta: FloatArray,
+        tau0: float,
+        tau1: float,
+        R: FloatArray,
+        A: FloatArray,
+        T_w: FloatArray,
+        T_v: FloatArray,
+    ) -> None:
+        linear_translation_jacobian(theta, tau0, R, A, tau1, T_w, T_v)
+
+
+@final
+@kernel_for(AcceleratedMotion)
+@dataclass(frozen=True)
+class AcceleratedKernel(MotionKernel):
+    """Constant acceleration: the paper's motion at the times beta(tau) of Zhuang et al., ICCV 2017; v is d."""
+
+    acceleration: float
+
+    def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+        k = self.acceleration
+        scale = 2.0 / (2.0 + k)
+        beta0, beta1 = scale * (tau0 + 0.5 * k * tau0 * tau0), scale * (tau1 + 0.5 * k * tau1 * tau1)
+        speed0, speed1 = scale * (1.0 + k * tau0), scale * (1.0 + k * tau1)
+        T, rate0, rate1, spin0, spin1 = linear_move(theta, beta0, beta1, R, A)
+        return T, times(speed0, rate0), times(speed1, rate1), times(speed0, spin0), times(speed1, spin1)
+
+    def translation_jacobian(
+        self,
+        theta: FloatArray,
+        tau0: float,
+        tau1: float,
+        R: FloatArray,
+        A: FloatArray,
+        T_w: FloatArray,
+        T_v: FloatArray,
+    ) -> None:
+        k = self.acceleration
+        scale = 2.0 / (2.0 + k)
+        beta0, beta1 = scale * (tau0 + 0.5 * k * tau0 * tau0), scale * (tau1 + 0.5 * k * tau1 * tau1)
+        linear_translation_jacobian(theta, beta0, R, A, beta1, T_w, T_v)
+
+
+@final
+@kernel_for(TwistMotion)
+@dataclass(frozen=True)
+class TwistKernel(MotionKernel):
+    """Constant twist; v is its linear part: T = a J(a w) v, a = tau1 - tau0."""
+
+    def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+        w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
+        rotate(w, tau1 - tau0, R, A)
+        Rv = apply(R, v)
+        return apply(A, v), times(-1.0, Rv), Rv, times(-1.0, w), w
+
+    def translation_jacobian(
+        self,
+        theta: FloatArray,
+        tau0: float,
+        tau1: float,
+        R: FloatArray,
+        A: FloatArray,
+        T_w: FloatArray,
+        T_v: FloatArray,
+    ) -> None:
+        a = tau1 - tau0
+        twist_by_w(a, times(a, (theta[0], theta[1], theta[2])), (theta[3], theta[4], theta[5]), T_w)
+        T_v[:] = A
+
+    def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
+        return np.concatenate([w, np.linalg.solve(so3.left_jacobian(w), d)])
+
+    def motion(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return theta[:3], so3.left_jacobian(theta[:3]) @ theta[3:]
+
+    def motion_jacobian(self, theta: FloatArray) -> FloatArray:
+        out, step = np.eye(6), 1e-6
+        for j in range(3):
+            shift = step * np.eye(6)[j]
+            out[3:, j] = (self.motion(theta + shift)[1] - self.motion(theta - shift)[1]) / (2 * step)
+        out[3:, 3:] = so3.left_jacobian(theta[:3])
+        return out
+
+
+@compiled
+def twist_by_w(a: float, phi: Vector, v: Vector, T_w: FloatArray) -> None:
+    """dT/dw of T = a (v + b phi x v + c phi x (phi x v)), phi = a w."""
+    _, b, c, db, dc = coefficients(dot(phi, phi))
+    once = cross(phi, v)
+    along = plus(times(db, once), dc, cross(phi, once))
+    pv = dot(phi, v)
+    fill_rotation(v, a * a * c * pv, -a * a * b, 0.0, T_w)
+    for i in range(3):
+        for j in range(3):
+            T_w[i, j] += a * a * (c * (phi[i] * v[j] - 2 * v[i] * phi[j]) + along[i] * phi[j])
