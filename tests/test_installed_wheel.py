@@ -72,13 +72,11 @@ def test_the_package_comes_from_the_wheel(installed: Path, tmp_path: Path) -> No
     assert installed in document.parents
 
 
-def test_the_sample_problem_has_its_motion(installed: Path, tmp_path: Path) -> None:
-    answer = json.loads(
-        _run(["bash", "-c", 'rsbench solve "$(rsbench docs problem.json)" --json'], tmp_path, installed)
-    )
-    # The motion that made it; three standard deviations of 50 matches per camera at 0.3 px, rounded up.
-    assert max(abs(a - b) for a, b in zip(answer["w"], [0.012, -0.02, 0.016], strict=True)) < 1e-3
-    assert max(abs(a - b) for a, b in zip(answer["d"], [0.2, -0.12, 0.18], strict=True)) < 1e-2
+def test_the_sample_problem_is_solved(installed: Path, tmp_path: Path) -> None:
+    """Its motion is checked in tests/pipeline/test_problem.py; here, that it is found and read."""
+    command = 'rsbench solve "$(rsbench docs problem.json)" --json'
+    answer = json.loads(_run(["bash", "-c", command], tmp_path, installed))
+    assert answer["success"] and answer["reference_point"] == "body" and answer["d_unit"] == "m"
 
 
 def test_the_sample_rig_is_that_of_the_castle(installed: Path, tmp_path: Path) -> None:
