@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from rsbench.core.rig import Side
 from rsbench.core.so3 import FloatArray
@@ -83,5 +82,7 @@ def repeated(rows: FloatArray, others: FloatArray) -> BoolArray:
     """Mask (n,) of the matches (n, c) that are also among ``others`` (m, c), within ``JOIN_TOLERANCE_PX``."""
     if len(rows) == 0 or len(others) == 0:
         return np.zeros(len(rows), dtype=np.bool_)
+    from scipy.spatial import cKDTree  # takes as long to load as all else that a solver needs
+
     distance, _ = cKDTree(others).query(rows, p=np.inf, distance_upper_bound=BEYOND_PX)
     return np.isfinite(distance)

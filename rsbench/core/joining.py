@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from rsbench.core.correspondences import BEYOND_PX, JOIN_TOLERANCE_PX, Correspondences, repeated, unlinked_pairs
 from rsbench.core.rig import SIDES, Side
@@ -96,6 +95,8 @@ def _assign(pairs: FloatArray, stereo_0: FloatArray, stereo_1: FloatArray) -> ND
 
 def _nearest(points: FloatArray, ends: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
     """Distances and indices (n, k) of the ends (m, 2) within the tolerance of points (n, 2); infinite for none."""
+    from scipy.spatial import cKDTree  # see ``repeated``
+
     rivals = np.arange(1, min(_RIVALS, len(ends)) + 1)
     distance, index = cKDTree(ends).query(points, k=rivals, p=np.inf, distance_upper_bound=BEYOND_PX)
     return np.asarray(distance), np.asarray(index, dtype=np.int64)
