@@ -50,6 +50,8 @@ def _keep_attribute(app: Sphinx, what: str, name: str, obj: object, options: obj
 def _restore_attribute(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
     if name in _attributes:
         lines[:] = _attributes.pop(name)
+    # |d| is a length in our docstrings and a substitution in reStructuredText.
+    lines[:] = [re.sub(r"(``.*?``)|\|", lambda match: match.group(1) or r"\|", line) for line in lines]
 
 
 def _name_aliases(

@@ -24,9 +24,10 @@ if TYPE_CHECKING:
     )
     from rsbench.core.camera import PinholeCamera
     from rsbench.core.correspondences import Correspondences
-    from rsbench.core.motion import LinearMotion, TwistMotion
+    from rsbench.core.motion import AcceleratedMotion, LinearMotion, TwistMotion
     from rsbench.core.rig import StereoRig
     from rsbench.core.shutter import RollingShutter
+    from rsbench.core.spline_motion import SplineMotion
     from rsbench.errors import RsbenchError
     from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
     from rsbench.solvers.engine.registry import list_solvers, load_solver
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "AcceleratedMotion",
     "Correspondences",
     "LinearMotion",
     "MotionEstimate",
@@ -42,6 +44,7 @@ __all__ = [
     "RsbenchError",
     "Solver",
     "SolverSpec",
+    "SplineMotion",
     "StereoRig",
     "TwistMotion",
     "correct",
@@ -60,6 +63,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "AcceleratedMotion": "rsbench.core.motion",
     "Correspondences": "rsbench.core.correspondences",
     "LinearMotion": "rsbench.core.motion",
     "MotionEstimate": "rsbench.solvers.engine.base",
@@ -68,6 +72,7 @@ _HOMES = {
     "RsbenchError": "rsbench.errors",
     "Solver": "rsbench.solvers.engine.base",
     "SolverSpec": "rsbench.solvers.engine.base",
+    "SplineMotion": "rsbench.core.spline_motion",
     "StereoRig": "rsbench.core.rig",
     "TwistMotion": "rsbench.core.motion",
     "list_solvers": "rsbench.solvers.engine.registry",

@@ -22,6 +22,7 @@ from rsbench.pipeline.frame_motion import NoMotionError
 from rsbench.pipeline.robust_motion import RobustEstimate
 
 NAMES = [
+    "AcceleratedMotion",
     "Correspondences",
     "LinearMotion",
     "MotionEstimate",
@@ -30,6 +31,7 @@ NAMES = [
     "RsbenchError",
     "Solver",
     "SolverSpec",
+    "SplineMotion",
     "StereoRig",
     "TwistMotion",
     "correct",
@@ -121,6 +123,23 @@ def test_a_simulated_motion_is_found_and_scored() -> None:
     assert_type(errors, dict[str, float])
     # Three standard deviations of this noise at this size, rounded up.
     assert errors["e_R_deg"] < 0.05 and errors["e_T_deg"] < 1.0 and errors["e_s"] < 0.02
+
+
+def test_every_public_motion_can_be_simulated_and_solved_with_its_own_name_in_the_answer() -> None:
+    """A motion that a solver does not assume is simulated all the same: that is the wrong-model test."""
+    w, d = MOTION.w, MOTION.d
+    motions = (
+        rsbench.TwistMotion(w, d),
+        rsbench.AcceleratedMotion(w, d, acceleration=0.1),
+        rsbench.SplineMotion(w, d, preset="driving", seed=1),
+    )
+    for motion in motions:
+        data = rsbench.simulate(RIG, SHUTTER, motion, pairs=0, tracks=60, noise_px=0.0)
+        found = rsbench.estimate_motion(data.correspondences, RIG, SHUTTER)
+        assert found.estimate.success
+        errors = rsbench.pose_errors(found, motion, RIG)
+        # The linear model's own error on these motions: far above that of exact linear data, far below a failure.
+        assert 1e-6 < errors["e_R_deg"] < 1.0, motion
 
 
 def test_a_solver_is_taken_by_name_by_card_and_as_it_is(tmp_path: Path) -> None:
