@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import rsbench
+from rsbench.cli.docs import docs, list_documents
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
@@ -41,3 +42,23 @@ def test_notebooks_use_public_names_alone(notebook: Path) -> None:
             modules.add(str(node.module))
     assert modules == {"pathlib", "matplotlib.pyplot", "numpy", "rsbench"}
     assert set(re.findall(r"\brsbench\.(\w+)", code)) <= set(rsbench.__all__)
+
+
+def test_documents_and_examples_are_listed_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+    documents = list_documents()
+    assert {path for path in documents.values() if path.suffix == ".md"} == {
+        path for path in (ROOT / "docs").glob("*.md") if path.name != "index.md"
+    }
+    assert documents["tour.ipynb"] == ROOT / "examples" / "tour.ipynb"
+    docs()
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in documents) and "A tour of rsbench" in listed
+    docs("conventions")
+    assert capsys.readouterr().out == f"{ROOT / 'docs' / 'conventions.md'}\n"
+
+
+def test_a_document_that_does_not_exist_is_named_with_the_nearest() -> None:
+    with pytest.raises(
+        rsbench.RsbenchError, match=r"document 'convention' does not exist \(did you mean 'conventions'"
+    ):
+        docs("convention")
