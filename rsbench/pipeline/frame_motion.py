@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from rsbench.pipeline.robust_motion import RobustEstimate, estimate_motion
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.registry import SOLVERS, SolverEntry
 from rsbench.solvers.refined import RefinedSolver
-from rsbench.vision.feature_matcher import find_correspondences
+from rsbench.vision.feature_matcher import find_correspondences, load_features
 
 _FEW_STEREO = 0.1
 """Left-right matches per temporal match below which the images may be swapped or not rectified."""
@@ -73,7 +73,13 @@ def match_frames(images: Images, options: CorrectionOptions) -> Correspondences:
             f"frames: only {temporal} matches between frame 0 and frame 1; {_FEWEST_MATCHES} are needed: the "
             "frames show no texture, or not the same scene"
         )
-    stereo = _stereo_count(matches)
+    if not any(len(found) for found in (matches.stereo_0, matches.stereo_1, matches.tracks)):
+        # Some look for matches over time alone; whether the frames are in order is then for ours to judge.
+        options = replace(options, features=load_features("sift"))
+        judged = find_matches(images, options)
+        temporal, stereo = len(judged.left) + len(judged.right), _stereo_count(judged)
+    else:
+        stereo = _stereo_count(matches)
     if stereo < _FEW_STEREO * temporal / 2:
         swapped = find_matches(images, options, (SIDES[1], SIDES[0]))
         if _stereo_count(swapped) > 3 * stereo:
@@ -124,6 +130,8 @@ def motion_of(estimate: MotionEstimate, entry: SolverEntry, rig: StereoRig) -> M
         return motion
     if not estimate.success:
         raise NoMotionError(f"no motion found: {motion}")
+    if entry.solver.spec.metric:
+        raise NoMotionError(f"solver {entry.name!r}: {motion}: more matches must be seen by both cameras")
     raise NoMotionError(f"solver {entry.name!r}: {motion}; a correction needs metres, as rs-stereo-refined finds")
 
 

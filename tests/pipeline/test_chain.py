@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.errors import RsbenchError
@@ -19,12 +20,14 @@ from rsbench.pipeline.chain import Given, correct_four, uncorrected
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, check_alike, read_frame, read_rig_card
 from rsbench.pipeline.frame_depth import eight_bit
-from rsbench.pipeline.frame_motion import NoMotionError, motion_of, solve_frames
+from rsbench.pipeline.frame_motion import NoMotionError, match_frames, motion_of, solve_frames
 from rsbench.pipeline.sliding import correct_sequence, estimate_sequence_readout
 from rsbench.plugins import wrap
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.registry import load_solver_entry
 from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, Corrector, CorrectorSpec, load_corrector
+from rsbench.vision.feature_matcher import FEATURE_MATCHERS, FeatureMatcher
+from rsbench.vision.features import SiftMatcher
 from rsbench.vision.fusion import Fused, Origin
 from rsbench.vision.quality import psnr
 from rsbench.vision.stereo_matcher import load_matcher
@@ -240,10 +243,30 @@ def test_frames_of_one_side_are_refused(castle: Sequence) -> None:
     _refused(shifted, castle.rig, "same row")
 
 
+@dataclass(frozen=True)
+class OverTimeOnly(FeatureMatcher):
+    """SIFT without matches between the cameras."""
+
+    def match(self, images: Any) -> Correspondences:
+        found = SiftMatcher().match(images)
+        return Correspondences(left=found.left, right=found.right)
+
+
+def test_features_without_stereo_matches_are_no_sign_of_wrong_frames(castle: Sequence) -> None:
+    """They go through to the solver, which says what it lacks; exchanged frames are still found out."""
+    images = _frames(castle)
+    options = CorrectionOptions(features=wrap(FEATURE_MATCHERS, OverTimeOnly()))
+    assert len(match_frames(images, options).stereo_0) == 0
+    other = {"left": "right", "right": "left"}
+    with pytest.raises(RsbenchError, match="exchanged"):
+        match_frames({(s, f): images[other[s], f] for s, f in VIEWS}, options)
+    few = CorrectionOptions(features=options.features, solver=load_solver_entry("gs-stereo-tracks"))
+    with pytest.raises(NoMotionError, match="tracks"):
+        correct_four(images, castle.rig, castle.shutter.readout_ratio, few)
+
+
 def test_matches_without_a_motion_say_why(castle: Sequence) -> None:
     rng = np.random.default_rng(0)
-    from rsbench.core.correspondences import Correspondences
-
     noise = Correspondences(left=rng.uniform(0, 90, (8, 4)), right=rng.uniform(0, 90, (8, 4)))
     with pytest.raises(NoMotionError, match="no motion found: "):
         solve_frames(noise, castle.rig, 0.8, CorrectionOptions())

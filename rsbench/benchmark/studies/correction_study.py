@@ -3,8 +3,8 @@
 A method is a depth, a motion and a corrector of the chain that users have. Those that know a scene fill what a
 frame did not see from the other frames; what remains is invented (inpainted), so that every method gives a whole
 picture, which 'all' scores. 'Covered' scores the pixels that every method of a view draws from the frame itself:
-nothing there is filled or invented. A method that finds no motion leaves the frames as they are, and is scored and
-counted as that.
+nothing there is filled or invented. A method that finds no motion has failed: it scores the worst values, and
+takes no pixels from the others.
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ Depth = NDArray[np.float32]
 Row = dict[str, Any]
 ROW_BANDS = 9
 """Bands of rows in which the flow error is reported; their distance from row 0 is the distance in time."""
+WORST = {"psnr": 0.0, "ssim": -1.0, "flip": 1.0}
+"""Scores of a failure."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,8 +100,6 @@ class Attempt:
     """(H, W) pixels drawn from the frame itself at a depth that was not guessed."""
     flow: NDArray[np.float32]
     """(H, W, 2) where it moves the pixels of the rolling-shutter frame, px; NaN where it does not know."""
-    success: bool = True
-    """Whether the method found what it needs; the frame is as it was otherwise."""
 
 
 def study_steps(dataset: Path) -> int:
@@ -129,7 +129,7 @@ def study_dataset(
             attempts[method.key] = bench.attempt(method.key)
             step(sequence.name)
         for view in VIEWS:
-            found = {key: attempt[view] for key, attempt in attempts.items()}
+            found = {key: None if attempt is None else attempt[view] for key, attempt in attempts.items()}
             identity = {"sequence": sequence.name, "side": view[0], "frame": view[1]}
             images += [identity | row for row in _image_rows(sequence, view, found)]
             bands += [identity | row for row in _band_rows(found)]
@@ -175,16 +175,16 @@ class Bench:
             row |= {f"{error}_{name}": float(errors[error]) for error in ("e_R_deg", "e_T_deg")}
         return row
 
-    def attempt(self, key: str) -> dict[View, Attempt]:
-        """What one method makes of the four views."""
+    def attempt(self, key: str) -> dict[View, Attempt] | None:
+        """What one method makes of the four views; None when it found no motion."""
         true = self.sequence.motion
         if key == "none":
-            return self._nothing(success=True)
+            return self._nothing()
         if key == "mono":
             return self._mono()
         motion = {"gs": self.gs_motion, "gyro": true, "true-motion": true, "truth": true}.get(key, self.motion)
         if motion is None:
-            return self._nothing(success=False)
+            return None
         pairs = self.true if key in ("true-depth", "truth") else self.sgm
         frames, pairs = self.corrected(pairs, motion, _CORRECTORS.get(key, "fusion"))
         out = {}
@@ -207,20 +207,20 @@ class Bench:
         result = correct_four(self.images, self.rig, ratio, options, given=given, views=views)
         return result.frames, result.pairs or pairs
 
-    def _nothing(self, success: bool) -> dict[View, Attempt]:
+    def _nothing(self) -> dict[View, Attempt]:
         flow = np.zeros((self.rig.camera.height, self.rig.camera.width, 2), dtype=np.float32)
-        return {view: _attempt(fused, flow, success) for view, fused in uncorrected(self.images).items()}
+        return {view: _attempt(fused, flow) for view, fused in uncorrected(self.images).items()}
 
-    def _mono(self) -> dict[View, Attempt]:
+    def _mono(self) -> dict[View, Attempt] | None:
         """Each camera by itself: its motion from its own matches, depth from its own flow in the same unit."""
         if self.found is None:
-            return self._nothing(success=False)
+            return None
         inliers = select(self.matches, self.found.robust)
         motions: dict[str, Motion] = {}
         for side in SIDES:
             motion = monocular_motion(inliers, self.rig, self.shutter, side, self.found.motion)
             if motion is None:
-                return self._nothing(success=False)
+                return None
             motions[side] = motion
         depth = {}
         for side, frame in VIEWS:
@@ -253,21 +253,21 @@ _DEPTHS: dict[str, Callable[[Depth], Depth]] = {
 """The depth with which a method's corrector moves pixels, from the depth that it is given."""
 
 
-def _attempt(fused: Fused, flow: NDArray[np.float32], success: bool = True) -> Attempt:
-    return Attempt(image=fused.image, covered=fused.origin == Origin.HERE, flow=flow, success=success)
+def _attempt(fused: Fused, flow: NDArray[np.float32]) -> Attempt:
+    return Attempt(image=fused.image, covered=fused.origin == Origin.HERE, flow=flow)
 
 
-def _image_rows(sequence: Sequence, view: View, attempts: dict[str, Attempt]) -> list[Row]:
-    truth = sequence.image("gs", *view)
-    common = np.logical_and.reduce([attempt.covered for attempt in attempts.values()])
+def _image_rows(sequence: Sequence, view: View, attempts: dict[str, Attempt | None]) -> list[Row]:
+    truth, found = sequence.image("gs", *view), _found(attempts)
+    common = np.logical_and.reduce([attempt.covered for attempt in found.values()])
     rows = []
     for key, attempt in attempts.items():
-        error = flow_error(attempt.flow, attempts["truth"].flow)
-        known = np.isfinite(error)
-        rows.append(
-            {
-                "method": key,
-                "success": attempt.success,
+        if attempt is None:
+            scores = _worst_scores(truth, view == VIEWS[0])
+        else:
+            error = flow_error(attempt.flow, found["truth"].flow)
+            known = np.isfinite(error)
+            scores = {
                 "psnr_covered": psnr(attempt.image, truth, common),
                 "ssim_covered": ssim(attempt.image, truth, common),
                 "psnr_all": psnr(attempt.image, truth),
@@ -276,11 +276,29 @@ def _image_rows(sequence: Sequence, view: View, attempts: dict[str, Attempt]) ->
                 "flow_median_px": float(np.median(error[known])) if np.any(known) else float("nan"),
                 "flow_known": float(np.mean(known)),
                 "coverage": float(np.mean(attempt.covered)),
-                "common": float(np.mean(common)),
                 **_extra_scores(attempt.image, truth, common, view == VIEWS[0]),
             }
-        )
+        rows.append({"method": key, "success": attempt is not None, **scores, "common": float(np.mean(common))})
     return rows
+
+
+def _found(attempts: dict[str, Attempt | None]) -> dict[str, Attempt]:
+    """The attempts that did not fail."""
+    return {key: attempt for key, attempt in attempts.items() if attempt is not None}
+
+
+def _worst_scores(image: NDArray[Any], extra: bool) -> dict[str, float]:
+    """What a failed method scores on an image: the rule of failures of docs/conventions.md."""
+    scores = {f"{name}_{part}": WORST[name] for part in ("covered", "all") for name in ("psnr", "ssim")}
+    scores |= {name: worst_flow(image) for name in ("flow_mean_px", "flow_median_px")}
+    slow = {"flip_covered": "flip", "flip_all": "flip", "ssim_deepunroll": "ssim", "ssim_uniform": "ssim"}
+    scores |= {name: WORST[kind] if extra else float("nan") for name, kind in slow.items()}
+    return scores | {"flow_known": 0.0, "coverage": 0.0}
+
+
+def worst_flow(image: NDArray[Any]) -> float:
+    """The diagonal of an image (H, W[, C]), px: a pixel that stays in the image cannot be farther off."""
+    return float(np.hypot(*image.shape[:2]))
 
 
 def _extra_scores(image: NDArray[Any], truth: NDArray[Any], common: Mask, wanted: bool) -> dict[str, float]:
@@ -296,10 +314,12 @@ def _extra_scores(image: NDArray[Any], truth: NDArray[Any], common: Mask, wanted
     return dict(zip(names, scores, strict=True))
 
 
-def _band_rows(attempts: dict[str, Attempt]) -> list[Row]:
-    rows = []
+def _band_rows(attempts: dict[str, Attempt | None]) -> list[Row]:
+    truth, rows = _found(attempts)["truth"], []
     for key, attempt in attempts.items():
-        error = flow_error(attempt.flow, attempts["truth"].flow)
+        error = np.full(truth.covered.shape, worst_flow(truth.image))
+        if attempt is not None:
+            error = flow_error(attempt.flow, truth.flow)
         for band, part in enumerate(np.array_split(error, ROW_BANDS)):
             known = np.isfinite(part)
             mean = float(np.mean(part[known])) if np.any(known) else float("nan")

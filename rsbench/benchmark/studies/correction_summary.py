@@ -48,7 +48,7 @@ def summarise(images: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
     """One row per stratum and method: median over sequences of each score with its 95 % interval.
 
     ``gain`` is the paired difference of the covered PSNR, ours minus the method, and ``gain_all`` that of all
-    pixels. ``failures`` counts the sequences of which a method left frames as they were; they are scored so.
+    pixels. ``failures`` counts the sequences on which a method failed; they are in the scores, with the worst.
     ``images`` has the rows of ``study_dataset`` and a column ``stratum``.
     """
     table = by_sequence(images)

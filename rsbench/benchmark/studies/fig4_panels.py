@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.benchmark.studies.correction_study import Bench
+from rsbench.benchmark.studies.correction_study import WORST, Bench
 from rsbench.core.rig import Side
 from rsbench.dataset.files import load_arrays, read_json, save_arrays, write_json
 from rsbench.dataset.sequence import Sequence
@@ -42,14 +42,14 @@ class Panels:
 def make_panels(sequence: Sequence, seed: int = 0) -> Panels:
     """Match, solve, find depth and correct with the estimates; compare with the truth.
 
-    Where no motion is found, the corrected frame is the one given, and the errors of the motion are the worst.
+    Where no motion is found, the frame is shown as it was, and the numbers of the correction are the worst.
     """
     bench = Bench(sequence, seed)
     view = SIDE, FRAME
     frames = uncorrected(bench.images, (view,))
     if bench.motion is not None:
         frames, _ = bench.corrected(bench.sgm, bench.motion, views=(view,))
-    fused = frames[view]
+    fused, success = frames[view], bench.motion is not None
     rolling, truth = bench.images[view], sequence.image("gs", *view)
     true_depth = sequence.depth("rs", *view)
     depth = np.where(np.isfinite(bench.sgm[FRAME].depth[SIDE]), bench.sgm[FRAME].depth[SIDE], np.float32(0.0))
@@ -66,9 +66,9 @@ def make_panels(sequence: Sequence, seed: int = 0) -> Panels:
         "readout_ratio": sequence.shutter.readout_ratio,
         **{name: errors[f"{name}_ours"] for name in ("e_R_deg", "e_T_deg")},
         "psnr_rolling": psnr(rolling, truth, here),
-        "psnr_corrected": psnr(fused.image, truth, here),
+        "psnr_corrected": psnr(fused.image, truth, here) if success else WORST["psnr"],
         "psnr_oracle": psnr(oracle.image, truth, here & oracle.mask),
-        "psnr_corrected_all": psnr(fused.image, truth),
+        "psnr_corrected_all": psnr(fused.image, truth) if success else WORST["psnr"],
         "psnr_rolling_all": psnr(rolling, truth),
         **{f"share_{name}": share for name, share in fused.shares().items()},
         **{f"depth_{name}": value for name, value in depth_metrics(depth, true_depth, bench.rig).items()},

@@ -122,10 +122,10 @@ def test_the_loss_to_the_true_motion_is_paired_by_view() -> None:
     np.testing.assert_allclose([loss["median_loss_db"], loss["largest_loss_db"]], [0.2, 0.3])
 
 
-def test_a_failed_method_is_scored_as_the_frames_as_they_are_and_counted(
-    smoke_dataset: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_failed_method_scores_the_worst_and_the_study_goes_on(
+    smoke_dataset: Path, tables: Tables, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No motion at all: what knows none is unharmed, the rest leaves the frames alone, and the study goes on."""
+    """No motion at all: what knows the truth is unharmed; the rest is counted and takes nothing from others."""
     failed = MotionEstimate.failed("nothing moves")
 
     def nothing(*_: object) -> RobustEstimate:
@@ -133,17 +133,26 @@ def test_a_failed_method_is_scored_as_the_frames_as_they_are_and_counted(
 
     for module in ("frame_motion", "simpler_motions"):
         monkeypatch.setattr(f"rsbench.pipeline.{module}.estimate_motion", nothing)
-    rows, _, motions = study_dataset(smoke_dataset, lambda word: None)
+    rows, bands, motions = study_dataset(smoke_dataset, lambda word: None)
     images = pd.DataFrame(rows)
     images.insert(0, "stratum", "small")
     unharmed = {"none", "gyro", "true-motion", "truth"}
     assert set(images[images["success"]]["method"]) == unharmed
-    scores = images.drop(columns=["method", "success"]).groupby(images["method"], sort=False)
-    none = scores.get_group("none").reset_index(drop=True)
-    for method in {each.key for each in METHODS} - unharmed:
-        pd.testing.assert_frame_equal(scores.get_group(method).reset_index(drop=True), none)
+    lost = images[~images["success"]]
+    for name, worst in (("psnr", 0.0), ("ssim", -1.0)):
+        assert np.all(lost[[f"{name}_covered", f"{name}_all"]] == worst)
+    assert np.all(lost["coverage"] == 0.0) and np.all(images["common"] > 0.5)
+    diagonal = np.hypot(128, 96)
+    assert np.all(lost[["flow_mean_px", "flow_median_px"]] == diagonal)
+    assert {row["flow_mean_px"] for row in bands if row["method"] == "ours"} == {diagonal}
+    # Whole pictures do not depend on what the others cover.
+    before = tables[0].set_index(["sequence", "side", "frame", "method"])["psnr_all"]
+    after = images.set_index(["sequence", "side", "frame", "method"])["psnr_all"]
+    kept = after.index.get_level_values("method").isin(unharmed)
+    pd.testing.assert_series_equal(after[kept], before.loc[after.index[kept]])
     summary = summarise(images).set_index("method")
     assert summary.loc["ours", "failures"] == 2 and summary.loc["truth", "failures"] == 0
+    assert summary.loc["ours", "psnr_all"] == 0.0 and summary.loc["ours", "psnr_all_high"] == 0.0
     for row in motions:
         assert [row[f"{name}_{of}"] for name in ("e_R_deg", "e_T_deg") for of in ("ours", "gs")] == [180.0] * 4
 
