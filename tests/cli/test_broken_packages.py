@@ -1,4 +1,4 @@
-"""Installed packages that are broken: every command that does not use them works."""
+"""Installed packages: a good one is used by its name; broken ones stop no command that does not use them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 CARD = """
@@ -33,6 +34,22 @@ BROKEN = {
     "prints": "print('hello from a package')\nraise ImportError('no such library')",
 }
 
+GOOD = """
+from rsbench.solvers.engine.base import Solver
+from rsbench.solvers.engine.registry import load_solver
+
+EIGHT_POINT = load_solver("gs-8pt")
+
+class Solver(Solver):
+    '''Eight points in a hurry.'''
+
+    spec = EIGHT_POINT.spec
+
+    def estimate(self, correspondences, rig, shutter):
+        print("in a hurry")
+        return EIGHT_POINT.estimate(correspondences, rig, shutter)
+"""
+
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -41,7 +58,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     targets = {name: f"broken_{name}:Solver" for name in BROKEN} | {"gone": "not_there:Solver"}
     for name, text in BROKEN.items():
         (folder / f"broken_{name}.py").write_text(text + "\n")
-    for name, target in {**targets, "gs-8pt-scaled": "broken_raises:Solver"}.items():
+    (folder / "hasty_solver.py").write_text(GOOD)
+    targets |= {"gs-8pt-scaled": "broken_raises:Solver", "hasty": "hasty_solver:Solver"}
+    for name, target in targets.items():
         info = folder / f"broken_{name.replace('-', '_')}-1.0.dist-info"
         info.mkdir()
         (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: broken-{name}\nVersion: 1.0\n")
@@ -63,11 +82,15 @@ def test_listing_names_them(site: Path) -> None:
         assert name in result.stdout
 
 
-def test_built_in_solvers_simulate(site: Path, tmp_path: Path) -> None:
+def test_built_in_solvers_and_a_good_package_simulate(site: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(CARD)
-    result = rsbench(site, "simulate", tmp_path / "mine.toml", "--out", tmp_path / "out", "--workers", 1)
+    chosen = ("--solver", "gs-8pt", "--solver", "hasty", "--workers", 1)
+    result = rsbench(site, "simulate", tmp_path / "mine.toml", "--out", tmp_path / "out", *chosen)
     assert result.returncode == 0, result.stderr
-    assert (tmp_path / "out" / "summary.csv").is_file()
+    assert "in a hurry" not in result.stdout + result.stderr
+    table = pd.read_csv(tmp_path / "out" / "summary.csv", index_col="solver")
+    assert list(table.failures) == [0, 0]
+    assert table.e_T_median["hasty"] == table.e_T_median["gs-8pt"] < 90.0
 
 
 @pytest.mark.parametrize(

@@ -24,12 +24,13 @@ import numpy as np
 
 from rsbench import __version__
 from rsbench.benchmark.simulated.sweep_card import Cell, SweepCard
-from rsbench.benchmark.simulated.trials import Arrays, Entrant, entrant, run_bounds, run_trials
+from rsbench.benchmark.simulated.trials import Arrays, Entrant, enter, run_bounds, run_trials
 from rsbench.dataset.files import load_arrays, read_json, save_arrays, write_json
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_jobs import run_jobs
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.solvers.engine.registry import load_solver_entries
 from rsbench.solvers.engine.warm_up import warm_up
 
 FORMAT = 1
@@ -163,14 +164,7 @@ def entrants(card: SweepCard) -> list[Entrant]:
     Raises:
         RsbenchError: no such solver, or two of one name, which tables and seeds could not tell apart.
     """
-    found: dict[str, Entrant] = {}
-    for given in card.solvers:
-        new = entrant(given)
-        if (old := found.get(new.name)) is not None:
-            both = " and ".join(str(e.entry.path or f"entry point {e.name}") for e in (old, new))
-            raise RsbenchError(f"sweep {card.name}: {both}: two solvers of the name {new.name!r}; rename one card")
-        found[new.name] = new
-    return list(found.values())
+    return [enter(entry) for entry in load_solver_entries(card.solvers)]
 
 
 def _plan(card: SweepCard, solvers: list[Entrant]) -> dict[str, Any]:

@@ -46,13 +46,12 @@ class Entrant:
         return self.entry.solver
 
 
-def entrant(name_or_path: str) -> Entrant:
-    """The solver of a card with the least information that it can use fully.
+def enter(entry: SolverEntry) -> Entrant:
+    """A solver with the least information that it can use fully.
 
     Raises:
-        RsbenchError: no such solver, or it does not say how many matches it needs.
+        RsbenchError: another package's solver does not say how many matches it needs.
     """
-    entry = load_solver_entry(name_or_path)
     solver, needs = entry.solver, entry.solver.spec.needs
     probe = Correspondences(left=np.ones((50, 4)), right=np.ones((50, 4)), tracks=np.ones((50, 8)))
     try:
@@ -104,7 +103,7 @@ def run_trials(
     Raises:
         RsbenchError: no such solver; the motion of the setting leaves too few points in view.
     """
-    entrants = [entrant(name) for name in solvers]
+    entrants = [enter(load_solver_entry(name)) for name in solvers]
     truth, answers, seconds = [], [], []
     for trial in range(first, first + count):
         simulation = _simulation(setting, entrants, seed, trial)
@@ -133,7 +132,7 @@ def run_bounds(setting: Setting, solvers: tuple[str, ...], seed: int, first: int
         and the length of d that no unbiased solver undercuts, given what each solver is given; infinite where the
         matches do not tell.
     """
-    entrants = [entrant(name) for name in solvers]
+    entrants = [enter(load_solver_entry(name)) for name in solvers]
     rows = []
     for trial in range(first, first + count):
         simulation = _simulation(setting.exact(), entrants, seed, trial)

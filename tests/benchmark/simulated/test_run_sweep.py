@@ -17,12 +17,13 @@ from rsbench.benchmark.simulated import run_sweep as module
 from rsbench.benchmark.simulated.run_sweep import geometry_of, read_bounds, read_trials, run_sweep, sweep_steps
 from rsbench.benchmark.simulated.sweep_card import Setting, SweepCard, Variant
 from rsbench.benchmark.simulated.sweep_summary import failure_reasons, summarise_sweep
-from rsbench.benchmark.simulated.trials import Arrays, entrant, run_bounds, run_trials
+from rsbench.benchmark.simulated.trials import Arrays, enter, run_bounds, run_trials
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.motion import LinearMotion
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.solvers.eight_point import EightPointSolver
+from rsbench.solvers.engine.registry import load_solver_entry
 
 SETTING = Setting(
     width=900,
@@ -177,7 +178,7 @@ def test_reasons_of_failures_are_counted() -> None:
 def test_two_solvers_of_one_name_are_refused(tmp_path: Path) -> None:
     same = tmp_path / "gs-8pt.toml"
     same.write_text('class = "rsbench.solvers.linear:LinearSolver"')
-    with pytest.raises(RsbenchError, match=r"gs-8pt.toml and .*gs-8pt.toml: two solvers of the name 'gs-8pt'"):
+    with pytest.raises(RsbenchError, match=r"gs-8pt.toml' and solver 'gs-8pt' are both named 'gs-8pt'"):
         run_sweep(replace(CARD, solvers=("gs-8pt", str(same))), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -215,10 +216,10 @@ def test_trials_depend_on_their_number_alone() -> None:
 
 
 def test_solvers_get_what_they_need_and_no_more() -> None:
-    assert entrant("gs-8pt").information == "left pairs"
-    assert entrant("rs-stereo-linear").information == "left and right pairs"
-    assert entrant("rs-stereo-refined-pairs").information == "left and right pairs"
-    assert entrant("rs-stereo-refined").information == "tracks"
+    assert enter(load_solver_entry("gs-8pt")).information == "left pairs"
+    assert enter(load_solver_entry("rs-stereo-linear")).information == "left and right pairs"
+    assert enter(load_solver_entry("rs-stereo-refined-pairs")).information == "left and right pairs"
+    assert enter(load_solver_entry("rs-stereo-refined")).information == "tracks"
 
 
 def test_noise_and_told_readout_share_exact_matches(finished: Path) -> None:
@@ -253,7 +254,7 @@ def test_bound_of_the_left_camera_agrees_with_finite_differences_of_its_residual
     bounds = run_bounds(SETTING, ("gs-8pt",), 0, 0, 1)
     from rsbench.benchmark.simulated.trials import _simulation
 
-    simulation = _simulation(SETTING.exact(), [entrant("gs-8pt")], 0, 0)
+    simulation = _simulation(SETTING.exact(), [enter(load_solver_entry("gs-8pt"))], 0, 0)
     rig, shutter, motion = simulation.rig, simulation.shutter, simulation.motion
     left = simulation.correspondences.left
 
