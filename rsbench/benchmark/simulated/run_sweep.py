@@ -27,6 +27,8 @@ from rsbench.benchmark.simulated.sweep_card import Cell, SweepCard
 from rsbench.benchmark.simulated.trials import Arrays, Entrant, enter, run_bounds, run_trials
 from rsbench.dataset.files import load_arrays, read_json, save_arrays, write_json
 from rsbench.errors import RsbenchError
+from rsbench.identity import source_version
+from rsbench.motions import motion_model
 from rsbench.pipeline.isolated_jobs import run_jobs
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
@@ -175,9 +177,15 @@ def _plan(card: SweepCard, solvers: list[Entrant]) -> dict[str, Any]:
         "code": simulator_version(),
         "card": asdict(card),
         "solvers": [_identity(e) for e in solvers],
+        "motions": {name: source_version(motion_model(name)) for name in _motions(card, solvers)},
         "cells": [asdict(cell) for cell in card.cells()],
     }
     return json.loads(json.dumps(content))  # as it will be read
+
+
+def _motions(card: SweepCard, solvers: list[Entrant]) -> list[str]:
+    """Motion models of the data and of the solvers."""
+    return sorted({e.solver.spec.motion_model for e in solvers} | {c.setting.motion_model for c in card.cells()})
 
 
 def _identity(e: Entrant) -> dict[str, Any]:
@@ -228,15 +236,14 @@ def _differences(stored: dict[str, Any], plan: dict[str, Any]) -> list[str]:
     words += [
         f"{key} was {stored.get(key)}, is {plan[key]}" for key in ("rsbench",) if stored.get(key) != plan[key]
     ]
-    if stored.get("code") != plan["code"]:
+    if any(stored.get(key) != plan[key] for key in ("code", "motions")):
         words.append("simulated by other code")
     return words or (["differs in cells"] if stored.get("cells") != plan["cells"] else [])
 
 
 def _compile(card: SweepCard) -> None:
     """Once, before the workers would each do it."""
-    models = {e.solver.spec.motion_model for e in entrants(card)} | {c.setting.motion_model for c in card.cells()}
-    warm_up(sorted(models))
+    warm_up(_motions(card, entrants(card)))
 
 
 def _run_all(todo: list[_Job], workers: int, time_limit_s: float | None) -> Iterator[_Part]:
