@@ -20,6 +20,11 @@ def be_quiet(quiet: bool) -> None:
     _quiet = quiet
 
 
+def is_quiet() -> bool:
+    """Whether ``--quiet`` was given, for a command whose table is its result."""
+    return _quiet
+
+
 def say(note: str) -> None:
     """A line on stdout that is no result."""
     import typer
@@ -107,7 +112,7 @@ def late_progress(label: str) -> Iterator[Callable[[str], None]]:
 
     def advance(word: str) -> None:
         progress.update(task, advance=1, word=word)
-        if progress.console.is_terminal and time.monotonic() - start > 2.0:
+        if not _quiet and progress.console.is_terminal and time.monotonic() - start > 2.0:
             progress.start()
 
     try:

@@ -28,9 +28,10 @@ EPILOG = """[bold]Examples[/bold]
 A problem holds [bold]camera[/bold] (width, height, fx, fy, cx, cy), [bold]baseline[/bold] (m),
 [bold]readout_ratio[/bold] and matches in pixels: [bold]left[/bold] and [bold]right[/bold] (x0, y0, x1, y1),
 [bold]stereo_0[/bold] and [bold]stereo_1[/bold] (xl, yl, xr, yr), [bold]tracks[/bold] (xl0, yl0, xr0, yr0,
-xl1, yl1, xr1, yr1); absent sets are empty. The centre of the top-left pixel is (0, 0). Exit codes: 0 all solved,
-1 one without a motion, 2 one that is
-wrong (the others are solved all the same)."""
+xl1, yl1, xr1, yr1); absent sets are empty. The centre of the top-left pixel is (0, 0).
+
+Exit codes: 0 all solved, 1 one without a motion, 2 one that is wrong; the others are solved all the same.
+More: [bold]rsbench docs problem-format[/bold]"""
 
 
 def solve(
@@ -128,14 +129,16 @@ def _answers(
 
 
 def _show(answers: list[dict[str, Any]]) -> None:
-    import pandas as pd
+    from rsbench.cli.console import is_quiet, print_rows
 
-    from rsbench.cli.console import print_table
-
+    rows = [_row(answer) for answer in answers]
     if len(answers) == 1:
         _show_one(answers[0])
-    elif answers:
-        print_table("", pd.DataFrame([_row(answer) for answer in answers]))
+    elif is_quiet():
+        for row in rows:
+            typer.echo("\t".join(row.values()))
+    elif rows:
+        print_rows("", list(rows[0]), [list(row.values()) for row in rows], right=("rotation", "inliers", "ms"))
 
 
 def _show_one(answer: dict[str, Any]) -> None:
@@ -152,7 +155,7 @@ def _show_one(answer: dict[str, Any]) -> None:
         typer.echo(f"note: {answer['reason']}")
 
 
-def _row(answer: dict[str, Any]) -> dict[str, Any]:
+def _row(answer: dict[str, Any]) -> dict[str, str]:
     found, metric = answer["success"], answer["metric"]
     length = " m" if metric else ""
     return {

@@ -119,8 +119,9 @@ class RobustProblem:
 
     def residuals(self, model: MotionEstimate) -> FloatArray:
         theta = self.packed.theta(model.w, model.d)
-        tracks = np.sqrt(self.packed.track_squares(theta)) * _track_scale()
-        return np.concatenate([self.packed.pair_residuals(theta), tracks])
+        squares = self.packed.track_squares(theta)
+        squares = np.where(squares >= 0.0, squares, np.inf)  # a point next to a camera's plane overflows
+        return np.concatenate([self.packed.pair_residuals(theta), np.sqrt(squares) * _track_scale()])
 
     @property
     def shortage(self) -> str:

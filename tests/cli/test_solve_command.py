@@ -93,9 +93,19 @@ def test_many_problems_and_two_solvers_give_one_line_each(tmp_path: Path) -> Non
 def test_a_problem_without_an_answer_is_exit_code_1(tmp_path: Path) -> None:
     sample = json.loads(EXAMPLE.read_text()) | NOTHING
     (tmp_path / "few.json").write_text(json.dumps(sample))
-    result = solve(tmp_path, EXAMPLE)
+    result = solve(tmp_path, EXAMPLE, "--solver", "rs-stereo", "--solver", "gs-8pt")
     assert result.returncode == 1
-    assert "few" in result.stdout or "example" in result.stdout
+    rows = [line for line in result.stdout.splitlines() if "rs-stereo" in line or "gs-8pt" in line]
+    assert ["/80" in row or "/60" in row for row in rows] == [False, False, True, True]
+    quiet = subprocess.run(
+        [sys.executable, "-m", "rsbench", "--quiet", "solve", tmp_path, EXAMPLE],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert quiet.returncode == 1
+    first, second = (line.split("\t") for line in quiet.stdout.splitlines())
+    assert first[1:4] == ["rs-stereo", "-", "-"] and second[3].endswith(" m") and second[5].endswith("/80")
 
 
 @pytest.mark.parametrize(
