@@ -48,6 +48,11 @@ def import_target(target: str, folder: Path | None, where: str) -> object:
         return getattr(_import_beside(module, folder.resolve()), name)
 
 
+def search(card: Path) -> None:
+    """Find modules beside a card too, in child processes as well, whatever in it names them."""
+    _put_on_path(str(card.parent.resolve()))
+
+
 def _import_beside(module: str, folder: Path) -> object:
     """Import a module that is installed or lies in a folder.
 

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.cards import load_card
+from rsbench.cards import card_path, load_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
+from rsbench.imports import search
 from rsbench.motions import drawn_parameters, fixed_endpoint, make_motion
 
 Vector = tuple[float, float, float]
@@ -208,4 +209,5 @@ class DatasetCard:
 
 def load_dataset_card(name_or_path: str) -> DatasetCard:
     """Dataset card by name or path, expanded; errors as ``rsbench.cards.load_card``."""
+    search(card_path("datasets", name_or_path))
     return load_card(DatasetCard, "datasets", name_or_path).expanded()

@@ -10,12 +10,13 @@ from typing import Any, Literal
 import numpy as np
 
 from rsbench.benchmark.simulated.simulation import SceneShape, SimulationOptions, random_direction
-from rsbench.cards import load_card, parse_card
+from rsbench.cards import card_path, load_card, parse_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
+from rsbench.imports import search
 from rsbench.motions import drawn_parameters, fixed_endpoint, make_motion
 
 Axis = Literal[
@@ -202,6 +203,7 @@ class SweepCard:
 
 def load_sweep(name_or_path: str) -> SweepCard:
     """Sweep card by name or path; errors as ``rsbench.cards.load_card``."""
+    search(card_path("sweeps", name_or_path))
     return load_card(SweepCard, "sweeps", name_or_path)
 
 

@@ -1,0 +1,121 @@
+"""The motion model of docs/add-a-motion.md as an installed package: nothing in rsbench changes for it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rsbench.cards import read_toml
+
+DOCUMENT = Path(__file__).parents[1] / "docs" / "add-a-motion.md"
+SWEEP = """
+name = "mine"
+axis = "noise_px"
+values = [0.0]
+solvers = ["rs-stereo-ease.toml", "rs-stereo-refined"]
+trials = 2
+[setting]
+width = 640
+height = 480
+focal = 500.0
+baseline = 0.2
+readout_ratio = 0.8
+points = 40
+depth = [2.0, 5.0]
+rotation_deg = 1.0
+translation = 0.1
+noise_px = 0.0
+motion_model = "ease"
+"""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The files of the document, installed."""
+    folder = tmp_path_factory.mktemp("site")
+    for language in ("python", "toml"):
+        for block in re.findall(
+            rf"^```{language}\n(.*?)^```", DOCUMENT.read_text("utf-8"), re.DOTALL | re.MULTILINE
+        ):
+            name, content = block.removeprefix("# ").split("\n", 1)
+            (folder / name).write_text(content, "utf-8")
+    groups = read_toml(folder / "pyproject.toml")["project"]["entry-points"]
+    info = folder / "ease_motion-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: ease-motion\nVersion: 1.0\n")
+    lines = [f"[{group}]\n" + "\n".join(f"{k} = {v}" for k, v in table.items()) for group, table in groups.items()]
+    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    (folder / "mine.toml").write_text(SWEEP)
+    return folder
+
+
+def rsbench(site: Path, *arguments: object, installed: bool = True) -> subprocess.CompletedProcess[str]:
+    path = [str(site)] if installed else []
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*path, *filter(None, sys.path)])}
+    command = [sys.executable, "-m", "rsbench", *map(str, arguments)]
+    return subprocess.run(
+        command, cwd=site, capture_output=True, text=True, timeout=400, check=False, env=environment
+    )
+
+
+def test_it_is_listed(site: Path) -> None:
+    result = rsbench(site, "list", "motions", "--json")
+    assert result.returncode == 0, result.stderr
+    assert "ease" in result.stdout
+
+
+def test_a_simulation_follows_it_and_a_solver_assumes_it(site: Path) -> None:
+    result = rsbench(site, "simulate", "mine.toml", "--out", "out", "--workers", "1")
+    assert result.returncode == 0, result.stderr
+    assert "rs-stereo-refined assumes linear motion; the data are of ease motion" in result.stdout
+    rows = (site / "out" / "summary.csv").read_text().splitlines()
+    header = rows[0].split(",")
+    errors = {
+        row.split(",")[header.index("solver")]: float(row.split(",")[header.index("e_R_median")])
+        for row in rows[1:]
+    }
+    # Exact data: the solver of the right model stops at its own tolerance, degrees.
+    assert errors["rs-stereo-ease"] < 1e-5
+    assert errors["rs-stereo-refined"] > 1e-2
+    plan = json.loads((site / "out" / "sweep.json").read_text())
+    assert plan["card"]["setting"]["motion_model"] == "ease"
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("motion_model=eas", "motion model 'eas' does not exist"),
+        ("motion_parameters={c = 2.0}", "c must lie in [0, 1), got 2.0"),
+        ("motion_parameters={k = 2.0}", "motion model 'ease': unknown parameter 'k'"),
+    ],
+)
+def test_what_it_cannot_be_is_one_line(site: Path, setting: str, words: str) -> None:
+    result = rsbench(site, "simulate", "mine.toml", "--out", "none", "--set", setting)
+    assert result.returncode == 2
+    assert words in result.stderr and result.stderr.count("\n") == 1
+
+
+def test_a_class_beside_the_card_needs_no_package(site: Path, tmp_path: Path) -> None:
+    (tmp_path / "ease_motion.py").write_text((site / "ease_motion.py").read_text())
+    card = (Path(__file__).parents[1] / "datasets" / "smoke.toml").read_text()
+    card = card.replace("[motion]\n", '[motion]\nmodel = "ease_motion:EaseMotion"\nparameters = { c = 0.5 }\n')
+    (tmp_path / "eased.toml").write_text(card)
+    code = f"""
+from rsbench.dataset.card import load_dataset_card
+from rsbench.motions import motion_record, read_motion
+card = load_dataset_card({str(tmp_path / "eased.toml")!r})
+record = motion_record(card.motion_of(card.sequence[0]))
+assert record["model"] == "ease_motion:EaseMotion", record
+assert read_motion(record).c == 0.5
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=site.parent, capture_output=True, text=True, timeout=100, env=environment
+    )
+    assert result.returncode == 0, result.stderr
