@@ -321,33 +321,45 @@ def evaluate(
     solvers: Series[str] = ("rs-stereo-refined", "gs-8pt"),
     correct_with: str = "rs-stereo-refined",
     matcher: str = "sgm",
+    features: str = "sift",
+    corrector: str = "fusion",
+    metrics: Series[str] = (),
     seed: int = 0,
 ) -> dict[str, pd.DataFrame]:
     """Run solvers, depth and correction on a dataset and score them against its truth.
 
     Args:
         folder: of the dataset.
-        out: folder of predictions and scores; what was predicted before from the same input is kept.
+        out: folder of predictions and scores; what was predicted before from the same input is kept, and scored
+            too.
         solvers: names of ``list_solvers`` or paths of cards.
         correct_with: solver whose motion the correction uses.
-        matcher: card of the stereo matcher.
+        matcher: name or card of the stereo matcher.
+        features: name or card of the feature matcher.
+        corrector: name or card of the corrector.
+        metrics: names or cards of further metrics.
         seed: of every random choice.
 
     Returns:
-        The tables ``pose``, ``depth`` and ``correction``.
+        The tables ``pose``, ``depth``, ``correction``, ``failures`` and ``seconds``: see docs/score-files.md.
 
     Raises:
-        RsbenchError: not a dataset, or no such solver or matcher.
+        RsbenchError: not a dataset, or no such component.
     """
-    from rsbench.benchmark.images.evaluation import TABLES, read_scores, run_evaluation
-    from rsbench.benchmark.images.predict import EvaluationOptions
-    from rsbench.vision.stereo_matcher import load_matcher
+    from rsbench.benchmark.images.evaluation import open_evaluation, read_scores
+    from rsbench.benchmark.images.plan import EvaluationOptions
+    from rsbench.benchmark.images.score import TABLES
 
-    chosen = tuple(dict.fromkeys([*solvers, correct_with]))
     options = EvaluationOptions(
-        solvers=chosen, correction_solver=correct_with, seed=seed, sgm=load_matcher(matcher).component
+        solvers=tuple(solvers),
+        correction_solver=correct_with,
+        features=features,
+        matcher=matcher,
+        corrector=corrector,
+        metrics=tuple(metrics),
+        seed=seed,
     )
-    run_evaluation(Path(folder), Path(out), options, "rsbench.evaluate", lambda word: None)
+    open_evaluation(Path(folder), Path(out), options).run("rsbench.evaluate", lambda word: None)
     return {table: read_scores(Path(out), table) for table in TABLES}
 
 

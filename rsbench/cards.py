@@ -24,7 +24,9 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from rsbench.errors import RsbenchError
 
 T = TypeVar("T")
-CardKind = Literal["scenes", "renderers", "solvers", "datasets", "sweeps", "matchers", "features", "correctors"]
+CardKind = Literal[
+    "scenes", "renderers", "solvers", "datasets", "sweeps", "matchers", "features", "correctors", "metrics"
+]
 
 _CONFIG = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 _UNKNOWN_KEY = ("unexpected_keyword_argument", "extra_forbidden")

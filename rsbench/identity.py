@@ -17,6 +17,8 @@ from typing import Any
 
 _NUMERIC_ROOMS = ("core", "solvers", "robust", "vision", "pipeline")
 """Packages whose source decides what a component of ours answers."""
+_NUMERIC_FILES = ("compiled.py", "motions.py", "parameters.py")
+"""Modules beside them of which that is true too."""
 
 
 def component_key(component: object, parameters: Mapping[str, Any]) -> str:
@@ -98,7 +100,8 @@ def _imported(file: Path) -> set[str]:
 def own_source_version() -> str:
     """Hash of rsbench's own sources that decide what solvers, matchers and correctors answer."""
     package = Path(str(resources.files("rsbench")))
-    return _hash_of(package, sorted(path for room in _NUMERIC_ROOMS for path in (package / room).rglob("*.py")))
+    rooms = [path for room in _NUMERIC_ROOMS for path in (package / room).rglob("*.py")]
+    return _hash_of(package, sorted([*rooms, *(package / name for name in _NUMERIC_FILES)]))
 
 
 def _hash_of(folder: Path, files: list[Path]) -> str:

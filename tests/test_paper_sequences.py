@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rsbench.benchmark.images.evaluation import read_scores, run_evaluation
-from rsbench.benchmark.images.predict import EvaluationOptions
+from rsbench.benchmark.images.evaluation import open_evaluation, read_scores
+from rsbench.benchmark.images.plan import EvaluationOptions
 from rsbench.cards import load_card
 from rsbench.core.projection import row_poses
 from rsbench.dataset.card import load_dataset_card
@@ -36,7 +36,7 @@ def paper(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def scores(paper: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, pd.DataFrame]:
     out = tmp_path_factory.mktemp("evaluation")
     options = EvaluationOptions(solvers=("rs-stereo-refined",))
-    run_evaluation(paper, out, options, "test", lambda name: None)
+    open_evaluation(paper, out, options).run("test", lambda name: None)
     return {table: read_scores(out, table).set_index("sequence") for table in ("pose", "correction")}
 
 
@@ -59,11 +59,13 @@ def test_correction_loses_little_to_true_motion_and_gains_much_over_none(
     scores: dict[str, pd.DataFrame], scene: str
 ) -> None:
     rows = scores["correction"].loc[scene]
-    sgm = rows[rows.depth == "SGM"].groupby("motion").psnr.mean()
-    assert sgm["estimated"] > sgm["true"] - 0.5
-    estimated = rows[(rows.depth == "SGM") & (rows.motion == "estimated")]
-    assert len(estimated) == 4
-    assert np.all(estimated.psnr > estimated.psnr_uncorrected + 6.0)
+    visible = rows[rows.pixels == "visible"]
+    sgm = visible[visible.matcher == "sgm"].groupby("solver").psnr.mean()
+    assert sgm["rs-stereo-refined"] > sgm["true"] - 0.5
+    estimated = visible[(visible.matcher == "sgm") & (visible.solver == "rs-stereo-refined")]
+    uncorrected = visible[visible.corrector == "none"]
+    assert len(estimated) == len(uncorrected) == 4
+    assert np.all(estimated.psnr.to_numpy() > uncorrected.psnr.to_numpy() + 6.0)
 
 
 @pytest.mark.parametrize("scene_name", ["castle", "room"])

@@ -11,7 +11,10 @@ from typing import Any
 
 from rsbench import __version__
 from rsbench.dataset.files import sha256
+from rsbench.plugins import own_source_version
 
+_NUMERIC = ("numpy", "scipy", "opencv-python-headless", "numba", "poselib")
+"""Packages whose version may change the last digit of a prediction."""
 _PACKAGES = ("numpy", "scipy", "opencv-python-headless", "mitsuba", "drjit", "numba", "poselib", "pandas")
 
 
@@ -21,11 +24,32 @@ def provenance(command: str, **inputs: Any) -> dict[str, Any]:
         "command": command,
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "rsbench": __version__,
+        "source": own_source_version(),
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in _PACKAGES},
-        "machine": {"system": platform.system(), "architecture": platform.machine(), "cores": os.cpu_count()},
+        "machine": {
+            "system": platform.system(),
+            "architecture": platform.machine(),
+            "processor": processor(),
+            "cores": os.cpu_count(),
+        },
         "inputs": inputs,
     }
+
+
+def numeric_version() -> dict[str, str]:
+    """What decides predictions beside the components and the data: our own source and the packages below it."""
+    return {"source": own_source_version(), **{name: _version(name) for name in _NUMERIC}}
+
+
+def processor() -> str:
+    """The processor's name, as far as the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
+    except OSError:  # not Linux
+        lines = []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(named, "") or platform.processor() or "unknown"
 
 
 def _version(name: str) -> str:

@@ -1,14 +1,19 @@
-"""The one scorer of motions: an estimate and the truth into errors, and the only rule of what a failure scores.
+"""The one scorer: predictions and the truth into scores, and the only rule of what a failure scores.
 
-Simulated trials, image sequences and the studies all score here. A failure is an estimate that says so, or that
-is not finite: it scores the worst value of every error, is counted, and is never replaced by "no motion".
+Simulated trials, image sequences and the studies all score here. A failure is a prediction that says so, that is
+not finite, or that is not there: it scores the worst value of everything, is counted, and is never replaced by "no
+motion".
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rsbench import plugins
+from rsbench.benchmark.metric_plugins import METRICS, Case, MetricEntry
 from rsbench.core.metrics import (
     WORST_ANGLE,
     WORST_SCALE,
@@ -19,8 +24,10 @@ from rsbench.core.metrics import (
 )
 from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
+from rsbench.errors import RsbenchError
 
-POSE_ERRORS = ("e_R_deg", "e_T_deg", "e_s")
+WORST_POSE = {"e_R_deg": 180.0, "e_T_deg": 180.0, "e_s": WORST_SCALE}
+"""What a failed motion scores, by the name of each error."""
 
 
 def answered(w: ArrayLike, d: ArrayLike, success: ArrayLike = True) -> NDArray[np.bool_]:
@@ -70,4 +77,24 @@ def pose_errors(
     e_T = np.where(good | ~exists, translation_error(d, true_d), WORST_ANGLE)
     claimed = np.where(np.asarray(metric, dtype=np.bool_), scale_error(d, true_d), np.nan)
     e_s = np.where(good, claimed, WORST_SCALE)
-    return dict(zip(POSE_ERRORS, (np.rad2deg(e_R), np.rad2deg(e_T), e_s), strict=True))
+    return dict(zip(WORST_POSE, (np.rad2deg(e_R), np.rad2deg(e_T), e_s), strict=True))
+
+
+def score(metric: MetricEntry, case: Case | None) -> dict[str, float]:
+    """The columns of a metric for a prediction, or what a failed one (None) scores in them.
+
+    Raises:
+        RsbenchError: another package's metric raised or answered something else: one line with its name.
+    """
+    columns = metric.component.columns
+    if case is None:
+        return {column.name: column.worst for column in columns}
+    with plugins.blame(METRICS, metric):
+        found = metric.component.compute(case)
+    names = [column.name for column in columns]
+    if not isinstance(found, Mapping) or sorted(map(str, found)) != sorted(names):
+        raise RsbenchError(f"metric {metric.name!r}: must return a value for each of {', '.join(names)}")
+    try:
+        return {name: float(found[name]) for name in names}
+    except (TypeError, ValueError) as error:
+        raise RsbenchError(f"metric {metric.name!r}: must return numbers: {error}") from error

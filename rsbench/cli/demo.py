@@ -13,12 +13,13 @@ def demo(
     scene: Annotated[str, typer.Option(help="Sequence of the card 'paper': castle, old-town or room.")] = "castle",
 ) -> None:
     """Render one sequence at the paper's setting, solve, correct and score it, and write a report."""
+    from rsbench.benchmark.images.plan import EvaluationOptions
     from rsbench.cli.evaluate import evaluate_dataset
     from rsbench.cli.generate import generate
 
     generate("paper", out / scene, [scene], workers=1)
-    solvers = ["rs-stereo-refined", "rs-stereo-linear", "gs-8pt"]
-    evaluate_dataset(out / scene, out / f"{scene}-evaluation", solvers, "rs-stereo-refined", 0, "rsbench demo")
+    options = EvaluationOptions(solvers=("rs-stereo-refined", "rs-stereo-linear", "gs-8pt"))
+    evaluate_dataset(out / scene, out / f"{scene}-evaluation", options, "rsbench demo")
 
 
 def register(app: typer.Typer) -> None:

@@ -3,62 +3,114 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from rsbench.cli.kinds import complete
+
+if TYPE_CHECKING:
+    from rsbench.benchmark.images.plan import EvaluationOptions
 
 EPILOG = """[bold]Examples[/bold]
 
   rsbench evaluate data/paper --out results/paper
 
-  rsbench evaluate data/paper --solver rs-stereo-refined --solver gs-8pt --out /tmp/two"""
+  rsbench evaluate data/paper --out results/paper --solver mine.toml     [dim](the others are kept)[/dim]
+
+  rsbench evaluate data/paper --out results/paper --only gs-8pt --force  [dim](made again alone)[/dim]
+
+DIR gets [bold]predictions/[/bold], [bold]scores/*.csv[/bold] (docs/score-files.md), [bold]pictures/[/bold],
+[bold]report.html[/bold] and [bold]provenance.json[/bold]. What was predicted before, from the same data and
+components, is kept and scored; nothing is deleted."""
+
+
+_Solvers = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Solver to score, a name or a card; repeatable. Default: all that come with rsbench.",
+        autocompletion=complete("solvers"),
+    ),
+]
+_CorrectWith = Annotated[
+    str,
+    typer.Option(help="Solver whose motion the correction uses; scored too.", autocompletion=complete("solvers")),
+]
+_Matcher = Annotated[
+    str, typer.Option(help="Stereo matcher, a name or a card.", autocompletion=complete("matchers"))
+]
+_Features = Annotated[
+    str, typer.Option(help="Feature matcher, a name or a card.", autocompletion=complete("features"))
+]
+_Corrector = Annotated[
+    str, typer.Option(help="Corrector, a name or a card.", autocompletion=complete("correctors"))
+]
+_Metrics = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Metric that adds columns, a name or a card; repeatable.", autocompletion=complete("metrics")
+    ),
+]
+_Only = Annotated[
+    list[str] | None,
+    typer.Option(metavar="SOLVER|SEQUENCE", help="Predict nothing else; repeatable. All is scored."),
+]
 
 
 def evaluate(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with a dataset.json.")],
     out: Annotated[Path, typer.Option(help="Folder for predictions, scores, pictures and the report.")],
-    solver: Annotated[
-        list[str] | None,
-        typer.Option(help="Solver card to score; repeatable. Default: all that come with rsbench."),
-    ] = None,
-    correct_with: Annotated[
-        str, typer.Option(help="Solver whose motion the correction uses.")
-    ] = "rs-stereo-refined",
-    matcher: Annotated[str, typer.Option(help="Card of the stereo matcher.")] = "sgm",
+    solver: _Solvers = None,
+    correct_with: _CorrectWith = "rs-stereo-refined",
+    matcher: _Matcher = "sgm",
+    features: _Features = "sift",
+    corrector: _Corrector = "fusion",
+    metric: _Metrics = None,
+    only: _Only = None,
+    force: Annotated[bool, typer.Option("--force", help="Predict again what is there already.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
 ) -> None:
     """Pose, depth and correction against the truth of a dataset, with a report."""
-    evaluate_dataset(folder, out, solver, correct_with, seed, matcher=matcher)
+    from rsbench.benchmark.images.plan import EvaluationOptions
+
+    options = EvaluationOptions(
+        solvers=tuple(solver or _everything()),
+        correction_solver=correct_with,
+        features=features,
+        matcher=matcher,
+        corrector=corrector,
+        metrics=tuple(metric or ()),
+        only=tuple(only or ()),
+        force=force,
+        seed=seed,
+    )
+    evaluate_dataset(folder, out, options, f"rsbench evaluate {folder} --out {out}")
 
 
-def evaluate_dataset(
-    folder: Path,
-    out: Path,
-    solvers: list[str] | None,
-    correct_with: str,
-    seed: int,
-    command: str | None = None,
-    matcher: str = "sgm",
-) -> Path:
-    """Evaluate with a progress bar, print the tables, and return the path of the report."""
-    from rsbench.benchmark.images.evaluation import evaluation_steps, run_evaluation
-    from rsbench.benchmark.images.predict import EvaluationOptions
-    from rsbench.cli.console import print_table, progress_bar
-    from rsbench.report.evaluation_page import summary_tables, write_report
+def _everything() -> list[str]:
     from rsbench.solvers.engine.registry import list_solvers
-    from rsbench.vision.stereo_matcher import load_matcher
 
     # rs-stereo is another name of rs-stereo-refined: one row of it is enough.
-    everything = [name for name in list_solvers() if name != "rs-stereo"]
-    chosen = tuple(dict.fromkeys([*(solvers or everything), correct_with]))
-    options = EvaluationOptions(
-        solvers=chosen, correction_solver=correct_with, seed=seed, sgm=load_matcher(matcher).component
-    )
-    command = command or f"rsbench evaluate {folder} --out {out}"
-    with progress_bar(f"evaluating {folder.name}", evaluation_steps(folder, options)) as advance:
-        run_evaluation(folder, out, options, command, advance)
+    return [name for name in list_solvers() if name != "rs-stereo"]
+
+
+def evaluate_dataset(folder: Path, out: Path, options: EvaluationOptions | None, command: str) -> Path:
+    """Evaluate with a progress bar, print the tables, and return the path of the report.
+
+    ``options`` None takes every solver.
+    """
+    from rsbench.benchmark.images.evaluation import open_evaluation
+    from rsbench.benchmark.images.plan import EvaluationOptions
+    from rsbench.cli.console import print_table, progress_bar
+    from rsbench.report.evaluation_page import summary_tables, write_report
+
+    evaluation = open_evaluation(folder, out, options or EvaluationOptions(solvers=tuple(_everything())))
+    with progress_bar(f"evaluating {folder.name}", evaluation.steps) as advance:
+        stale = evaluation.run(command, advance)
     for table in summary_tables(out):
         print_table(table.title, table.brief)
+    if stale:
+        typer.echo(f"not scored, made from other data, components or options: {', '.join(stale)}", err=True)
     page = write_report(folder, out)
     typer.echo(f"report: {page.resolve()}")
     return page

@@ -12,6 +12,7 @@ COMPONENTS = {
     "matchers": "rsbench.vision.stereo_matcher:STEREO_MATCHERS",
     "features": "rsbench.vision.feature_matcher:FEATURE_MATCHERS",
     "correctors": "rsbench.vision.corrector:CORRECTORS",
+    "metrics": "rsbench.benchmark.metric_plugins:METRICS",
 }
 """Kinds whose names may come from installed packages, and where their ``plugins.Kind`` is."""
 

@@ -79,7 +79,7 @@ def _images(out: Path, data: Path) -> None:
 
     generate("paper", data / "paper", None, workers=1)
     evaluation = data / "paper-evaluation"
-    evaluate_dataset(data / "paper", evaluation, None, "rs-stereo-refined", 0, "rsbench reproduce images")
+    evaluate_dataset(data / "paper", evaluation, None, "rsbench reproduce images")
     typer.echo(f"published: {publish(evaluation, out / 'images')}")
 
 

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.dataset.files import write_depth, write_json, write_png
+from rsbench.dataset.files import read_png, write_depth, write_json, write_png
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import FoundMotion, referee
@@ -62,11 +63,27 @@ def write_frame(folder: Path, name: str, fused: Fused) -> None:
     for part in ("corrected", "mask", "depth"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     write_png(folder / "corrected" / f"{name}.png", fused.image)
-    values = np.zeros(len(Origin), dtype=np.uint8)
-    values[list(MASK_VALUES)] = list(MASK_VALUES.values())
-    write_png(folder / "mask" / f"{name}.png", values[fused.origin])
+    write_origin(folder / "mask" / f"{name}.png", fused.origin)
     depth = np.where(np.isfinite(fused.depth), fused.depth, np.float32(0.0))
     write_depth(folder / "depth" / f"{name}.exr", depth)
+
+
+def write_origin(path: Path, origin: NDArray[np.uint8]) -> None:
+    """Image of the origin (H, W) of every pixel, in ``MASK_VALUES``."""
+    values = np.zeros(len(Origin), dtype=np.uint8)
+    values[list(MASK_VALUES)] = list(MASK_VALUES.values())
+    write_png(path, values[origin])
+
+
+def read_origin(path: Path) -> NDArray[np.uint8]:
+    """Origin (H, W) of every pixel, from an image of ``write_origin``.
+
+    Raises:
+        RsbenchError: missing or not an image.
+    """
+    origins = np.zeros(256, dtype=np.uint8)
+    origins[list(MASK_VALUES.values())] = list(MASK_VALUES)
+    return origins[read_png(path)[..., 0]]
 
 
 def motion_record(found: FoundMotion) -> dict[str, Any]:

@@ -150,7 +150,7 @@ def _serve_solver(place: str, single_thread: bool) -> Callable[..., object]:
     """What answers calls to a solver."""
     if single_thread:
         use_one_thread()
-    with _entrys_own():
+    with entrys_own():
         solver = GuardedSolver(load_solver_entry(place).solver)
     if not isinstance(solver.spec, SolverSpec):
         raise EntryFailure(f"declares a {type(solver.spec).__name__}, not a SolverSpec")
@@ -189,18 +189,18 @@ class GuardedSolver(Solver):
 
     @cached_property
     def spec(self) -> SolverSpec:
-        with _entrys_own():
+        with entrys_own():
             return self._solver.spec
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        with _entrys_own():
+        with entrys_own():
             estimate = self._solver.estimate(correspondences, rig, shutter)
         return checked_estimate(estimate)
 
     def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
-        with _entrys_own():
+        with entrys_own():
             sizes = dict(self._solver.sample_sizes(correspondences))
         if any(isinstance(n, bool) or not isinstance(n, int) or n < 0 for n in sizes.values()):
             raise EntryFailure(f"returned sample sizes {sizes}")
@@ -209,7 +209,7 @@ class GuardedSolver(Solver):
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
         if self._leaves("propose"):
             return super().propose(sample, rig, shutter)
-        with _entrys_own():
+        with entrys_own():
             models = list(self._solver.propose(sample, rig, shutter))
         return [checked_estimate(model) for model in models]
 
@@ -219,10 +219,10 @@ class GuardedSolver(Solver):
         if self._leaves("propose_all"):
             yield from super().propose_all(samples, rig, shutter)
             return
-        with _entrys_own():
+        with entrys_own():
             proposals = iter(self._solver.propose_all(samples, rig, shutter))
         for _ in samples:
-            with _entrys_own():
+            with entrys_own():
                 models = list(next(proposals, ()))
             yield [checked_estimate(model) for model in models]
 
@@ -236,13 +236,13 @@ class GuardedSolver(Solver):
     ) -> MotionEstimate:
         if self._leaves("improve"):
             return super().improve(motion, correspondences, rig, shutter, quick)
-        with _entrys_own():
+        with entrys_own():
             estimate = self._solver.improve(motion, correspondences, rig, shutter, quick=quick)
         return checked_estimate(estimate)
 
 
 @contextmanager
-def _entrys_own() -> Iterator[None]:
+def entrys_own() -> Iterator[None]:
     """Whatever is raised inside is the entry's fault, also an exit or an interrupt."""
     try:
         yield

@@ -11,18 +11,24 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from numpy.typing import NDArray
 
-from rsbench.benchmark.images.evaluation import read_scores
+from rsbench.benchmark.images.evaluation import read_headings, read_scores
 from rsbench.benchmark.images.predict import depth_of
+from rsbench.core.rig import View
+from rsbench.dataset.corrected_frames import read_origin
 from rsbench.dataset.files import load_arrays, load_matches, read_json, read_png, write_bytes
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.report import pictures
 from rsbench.report.pictures import Image
+from rsbench.vision.fusion import Origin
 
 _LONGEST = 640
 """Pixels of a picture in the page; enough to see a shift of two pixels at 900."""
 _OVERVIEW = 360
 """Pixels of a picture in the overview."""
+_SHOWN: View = ("left", 1)
+"""The frame that is drawn."""
 _DEPTH_ERROR_M = 2.0
 """End of the scale of depth errors: the paper's limit of a good depth."""
 
@@ -38,76 +44,88 @@ class SummaryTable:
 
 
 def summary_tables(out: Path) -> list[SummaryTable]:
-    """Pose, depth and correction in the form that people read; errors as ``read_scores``."""
-    return [_pose_table(out), _depth_table(out), _correction_table(out)]
+    """Pose, depth, correction and failures in the form that people read; errors as ``read_scores``."""
+    tables = [_pose_table(out), _depth_table(out), _correction_table(out), _failure_table(out)]
+    return [table for table in tables if len(table.frame) > 0]
 
 
 def _pose_table(out: Path) -> SummaryTable:
-    scores = read_scores(out, "pose").sort_values(["sequence", "e_R_deg", "solver"])
-    columns = {
-        "sequence": "sequence",
-        "solver": "solver",
-        "shutter": "shutter",
-        "uses": "uses",
-        "success": "success",
-        "e_R_deg": "e_R (deg)",
-        "e_T_deg": "e_T (deg)",
-        "e_s": "e_s",
-        "inliers": "inliers",
-        "iterations": "RANSAC",
-    }
+    scores = read_scores(out, "pose")
+    order = ["sequence", *[name for name in ("e_R_deg",) if name in scores], "solver"]
+    headings = read_headings(out, "pose")
+    words = {"data_model": "data", "assumed_model": "assumes", "iterations": "RANSAC"} | headings
     note = (
         "e_R and e_T against the true motion of the rig over one frame period (a monocular solver against the "
         "translation of its own camera); e_s = |log(estimated length / true length)| where a solver claims "
-        "metres. A failure scores 180 degrees. All solvers had the same matches, sampler and budget."
+        "metres. A failure scores 180 degrees. 'Data' is the motion model that the data follow, 'assumes' that of "
+        "the solver. Inliers are among the matches that the solver works on, each counted once. All solvers had "
+        "the same matches, sampler and budget."
     )
-    frame = scores[list(columns)].rename(columns=columns)
-    brief = frame[["sequence", "solver", "e_R (deg)", "e_T (deg)", "e_s", "inliers"]]
+    frame = scores.sort_values(order).drop(columns="reason").rename(columns=words)
+    brief = frame[["sequence", "solver", "assumes", *headings.values(), "inliers", "matches"]]
     return SummaryTable(title="Relative pose", note=note, frame=frame, brief=brief)
 
 
+def _mean(scores: pd.DataFrame, keys: list[str], numbers: list[str]) -> pd.DataFrame:
+    """Mean over the views, with the number of them that failed."""
+    scores = scores.assign(failures=~scores["success"].astype(bool))
+    how = dict.fromkeys(numbers, "mean") | {"failures": "sum"}
+    return scores.groupby(keys, as_index=False, sort=False).agg(how)
+
+
 def _depth_table(out: Path) -> SummaryTable:
-    scores = read_scores(out, "depth")
-    mean = (
-        scores.drop(columns=["side", "frame"]).groupby(["sequence", "pixels"], as_index=False, sort=False).mean()
-    )
+    headings = read_headings(out, "depth")
+    keys = ["sequence", "matcher", "pixels"]
+    frame = _mean(read_scores(out, "depth"), keys, list(headings)).rename(columns=headings)
     note = (
-        "SGM depth of the rolling-shutter pairs against the truth on surface pixels, mean of the four frames: "
-        "all of them, those that the other camera sees (visible), and those that it does not."
+        "Depth of the rolling-shutter pairs against the truth on surface pixels, mean of the four frames: "
+        "all of them, those that the other camera sees (visible), and those that it does not. Errors are over "
+        "the pixels that have an estimate; coverage is their share."
     )
-    names = {"median_m": "median (m)", "over_2m": "> 2 m", "bad_1px": "> 1 px", "coverage": "coverage"}
-    brief = mean[["sequence", "pixels", *names]].rename(columns=names)
-    return SummaryTable(title="Depth (SGM)", note=note, frame=mean, brief=brief)
+    hidden = {headings.get(name) for name in ("rmse_m", "bad_2px", "bad_3px")} | {"failures"}
+    brief = frame[[name for name in frame if name not in hidden]]
+    return SummaryTable(title="Depth", note=note, frame=frame, brief=brief)
 
 
 def _correction_table(out: Path) -> SummaryTable:
-    scores = read_scores(out, "correction")
-    names = {
-        "psnr": "PSNR (dB)",
-        "psnr_uncorrected": "uncorrected",
-        "ssim": "SSIM",
-        "ssim_uncorrected": "uncorrected ",
-        "psnr_common": "PSNR, common pixels",
-        "coverage": "coverage",
-    }
-    mean = scores.groupby(["sequence", "depth", "motion"], as_index=False)[list(names)].mean()
-    note = (
-        "Corrected frames against the global-shutter image at row 0's pose, mean of the four frames, on the "
-        "pixels that the method covers; 'uncorrected' is the rolling-shutter frame on the same pixels. Common "
-        "pixels are those that all methods of a frame cover. Rows with true depth or motion are oracles."
+    headings = read_headings(out, "correction")
+    keys = ["sequence", "corrector", "solver", "matcher"]
+    numbers = [*headings, "coverage"]
+    scores = _mean(read_scores(out, "correction"), [*keys, "pixels"], numbers).rename(columns=headings)
+    shown, every = (scores[scores["pixels"] == name].drop(columns="pixels") for name in ("visible", "all"))
+    columns = [*headings.values(), "coverage"]
+    wide = shown.merge(
+        every[[*keys, *columns]].rename(columns={name: f"{name}, all" for name in columns}), on=keys, how="left"
     )
-    frame = mean.rename(columns=names)
-    brief = frame[["sequence", "depth", "motion", "PSNR (dB)", "uncorrected", "SSIM", "coverage"]]
+    frame = wide[[*keys, *columns, *[f"{name}, all" for name in columns], "failures"]]
+    frame = frame.rename(columns={"solver": "motion", "matcher": "depth"})
+    note = (
+        "Corrected frames, as 'rsbench correct' makes them, against the global-shutter image at row 0's pose, "
+        "mean of the four frames, on the pixels whose place the rolling-shutter frame saw, and on all. What a "
+        "method leaves black counts as black; coverage is the share that it draws. Corrector 'none' is the "
+        "rolling-shutter frame itself; rows with true depth or motion are oracles. A failure scores 0 dB."
+    )
+    brief = frame[["sequence", "corrector", "motion", "depth", *columns]]
     return SummaryTable(title="Correction", note=note, frame=frame, brief=brief)
+
+
+def _failure_table(out: Path) -> SummaryTable:
+    frame = read_scores(out, "failures")
+    counted = frame.groupby(["kind", "name", "reason"], as_index=False, sort=False).agg(
+        sequences=("sequence", lambda names: ", ".join(sorted(set(names)))), count=("sequence", "size")
+    )
+    note = "Entries that raised, answered wrongly, took too long or found nothing; each scores the worst value."
+    frame = counted[["kind", "name", "count", "sequences", "reason"]]
+    return SummaryTable(title="Failures", note=note, frame=frame, brief=frame)
 
 
 def write_report(dataset: Path, out: Path) -> Path:
     """Write pictures/ and report.html below ``out``; returns the page, which needs no other file."""
     record = read_json(out / "provenance.json")
-    solver = record["inputs"]["correction_solver"]
+    chosen = correction_of(record)
     sections = []
     for sequence in read_dataset(dataset):
-        drawn = draw_sequence(sequence, out / "predictions" / sequence.name, solver)
+        drawn = draw_sequence(sequence, out / "predictions" / sequence.name, chosen)
         folder = out / "pictures" / sequence.name
         folder.mkdir(parents=True, exist_ok=True)
         for name, (image, _) in drawn.items():
@@ -123,7 +141,7 @@ def write_report(dataset: Path, out: Path) -> Path:
     ]
     page = environment.get_template("evaluation.html.j2").render(
         title=f"rsbench: {record['inputs']['dataset']}",
-        subtitle=f"Rolling-shutter stereo evaluation, {record['date']}; correction with {solver} and SGM depth",
+        subtitle=f"Rolling-shutter stereo evaluation, {record['date']}; pictures: {' + '.join(chosen.values())}",
         tables=tables,
         sections=sections,
         provenance=json.dumps(record, indent=2),
@@ -184,15 +202,15 @@ def markdown_table(frame: pd.DataFrame) -> str:
 Drawn = dict[str, tuple[Image, str]]
 
 
-def draw_sequence(sequence: Sequence, folder: Path, solver: str) -> Drawn:
-    """Pictures of the left camera's frame 1: name to image and caption."""
-    side, frame = "left", 1
-    rolling, truth = sequence.image("rs", "left", frame), sequence.image("gs", "left", frame)
-    true_depth = sequence.depth("rs", "left", frame)
-    depth = depth_of(load_arrays(folder / "disparity.npz")[f"{side}_{frame}"], sequence.rig)
-    surface = true_depth > 0
-    low, high = np.percentile(1.0 / true_depth[surface], [1, 99]) if np.any(surface) else (0.0, 1.0)
-    error = np.where(surface & (depth > 0), np.abs(depth - true_depth), np.nan)
+def correction_of(record: dict[str, Any]) -> dict[str, str]:
+    """Names of the corrector, solver and matcher that an evaluation's pictures show, from its provenance."""
+    inputs = record["inputs"]
+    return {name: str(inputs["correction"][name]) for name in ("corrector", "solver", "matcher")}
+
+
+def draw_sequence(sequence: Sequence, folder: Path, chosen: dict[str, str]) -> Drawn:
+    """Pictures of the left camera's frame 1, as far as there are predictions: name to image and caption."""
+    rolling, truth = sequence.image("rs", *_SHOWN), sequence.image("gs", *_SHOWN)
     drawn: Drawn = {
         "rolling": (rolling, "Rolling-shutter frame (left, frame 1); hover: global-shutter truth"),
         "global": (truth, "Global-shutter truth at row 0's pose"),
@@ -201,39 +219,62 @@ def draw_sequence(sequence: Sequence, folder: Path, solver: str) -> Drawn:
             "Rolling-shutter frame (red) over the truth (cyan): colour is distortion",
         ),
     }
-    corrected_path = folder / "corrected" / f"{side}_{frame}.png"
-    if corrected_path.is_file():
-        corrected = read_png(corrected_path)
-        mask = read_png(folder / "corrected" / f"{side}_{frame}_mask.png")[..., 0] > 0
-        drawn["corrected"] = (
+    return (
+        drawn
+        | _draw_corrected(folder, chosen, truth)
+        | _draw_motion(sequence, folder, chosen)
+        | _draw_depth(sequence, folder, chosen["matcher"])
+    )
+
+
+def _draw_corrected(folder: Path, chosen: dict[str, str], truth: Image) -> Drawn:
+    stem = folder / "corrected" / ("+".join(chosen.values()) + f"-{_SHOWN[0]}_{_SHOWN[1]}")
+    if not stem.with_name(f"{stem.name}.png").is_file():
+        return {}
+    corrected = read_png(stem.with_name(f"{stem.name}.png"))
+    mask = read_origin(stem.with_name(f"{stem.name}-origin.png")) != Origin.NOBODY
+    return {
+        "corrected": (
             pictures.masked(corrected, mask),
-            "Corrected frame (dark: not seen or no depth); hover: global-shutter truth",
-        )
-        drawn["corrected-over-global"] = (
+            "Corrected frame (dark: seen by nobody); hover: global-shutter truth",
+        ),
+        "corrected-over-global": (
             pictures.overlay(corrected, truth, mask),
             "Corrected frame (red) over the truth (cyan)",
-        )
-    matches = load_matches(folder / "matches.npz")
-    drawn["matches"] = (
-        _draw_matches(sequence, matches.left, folder, solver),
-        "Left matches over time; red: rejected",
-    )
-    inverse = [np.where(d > 0, 1.0 / np.where(d > 0, d, 1.0), np.nan) for d in (true_depth, depth)]
-    drawn["depth-truth"] = (pictures.colour_map(inverse[0], low, high), "True depth of the rolling-shutter frame")
-    drawn["depth-sgm"] = (pictures.colour_map(inverse[1], low, high), "SGM depth (dark: invalid)")
-    drawn["depth-error"] = (
-        pictures.colour_map(error, 0.0, _DEPTH_ERROR_M, "inferno"),
-        f"Depth error, 0 to {_DEPTH_ERROR_M:g} m (dark grey: no depth)",
-    )
-    return drawn
+        ),
+    }
 
 
-def _draw_matches(sequence: Sequence, matches: Any, folder: Path, solver: str) -> Image:
-    image = sequence.image("rs", "left", 0)
-    name = read_json(folder / "motion" / f"{solver}.json")["solver"]
-    inliers = load_arrays(folder / "motion" / f"{name}-inliers.npz").get("left")
+def _draw_motion(sequence: Sequence, folder: Path, chosen: dict[str, str]) -> Drawn:
+    if not (folder / "matches.npz").is_file():
+        return {}
+    matches = load_matches(folder / "matches.npz").left
+    stored = folder / "motion" / f"{chosen['solver']}-inliers.npz"
+    inliers = load_arrays(stored).get("left") if stored.is_file() else None
     keep = np.ones(len(matches), dtype=np.bool_) if inliers is None or len(inliers) != len(matches) else inliers
-    return pictures.draw_matches(image, matches, keep)
+    image = pictures.draw_matches(sequence.image("rs", "left", 0), matches, keep)
+    return {"matches": (image, "Left matches over time; red: rejected")}
+
+
+def _draw_depth(sequence: Sequence, folder: Path, matcher: str) -> Drawn:
+    truth = sequence.depth("rs", *_SHOWN)
+    surface = truth > 0
+    low, high = np.percentile(1.0 / truth[surface], [1, 99]) if np.any(surface) else (0.0, 1.0)
+
+    def inverse(depth: NDArray[np.float32]) -> Image:
+        return pictures.colour_map(np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), np.nan), low, high)
+
+    drawn: Drawn = {"depth-truth": (inverse(truth), "True depth of the rolling-shutter frame")}
+    stored = folder / "depth" / f"{matcher}.npz"
+    if stored.is_file():
+        depth = depth_of(load_arrays(stored)[f"{_SHOWN[0]}_{_SHOWN[1]}"], sequence.rig)
+        error = np.where(surface & (depth > 0), np.abs(depth - truth), np.nan)
+        drawn["depth"] = (inverse(depth), f"Depth by {matcher} (dark: invalid)")
+        drawn["depth-error"] = (
+            pictures.colour_map(error, 0.0, _DEPTH_ERROR_M, "inferno"),
+            f"Depth error, 0 to {_DEPTH_ERROR_M:g} m (dark grey: no depth)",
+        )
+    return drawn
 
 
 def _section(sequence: Sequence, folder: Path, drawn: Drawn) -> dict[str, Any]:

@@ -2,63 +2,155 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pandas as pd
 
-from rsbench.benchmark.images.predict import EvaluationOptions, Step, predict_sequence
-from rsbench.benchmark.images.score import score_correction, score_depth, score_poses
+from rsbench.benchmark.images.plan import EvaluationOptions, Places, Plan, make_plan
+from rsbench.benchmark.images.predict import Bench, Step, prediction_steps
+from rsbench.benchmark.images.score import AFTER, KEYS, TABLES, Row, Scorer
+from rsbench.benchmark.isolated_metric import isolated_metrics
+from rsbench.benchmark.metric_plugins import DepthCase, ImageCase, PoseCase
 from rsbench.benchmark.provenance import dataset_record, provenance
-from rsbench.dataset.files import write_bytes, write_json
-from rsbench.dataset.sequence import read_dataset
+from rsbench.dataset.files import read_json, write_json, write_table
+from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.isolated_parts import Isolation
+from rsbench.pipeline.isolated_solver import SolverRunner
 
-TABLES = ("pose", "depth", "correction")
+_CASES = {"pose": PoseCase, "depth": DepthCase, "correction": ImageCase}
 
 
-def evaluation_steps(dataset: Path, options: EvaluationOptions) -> int:
-    """How often ``run_evaluation`` reports progress.
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """An evaluation that is ready to run."""
+
+    dataset: Path
+    out: Path
+    options: EvaluationOptions
+    sequences: list[Sequence]
+    plan: Plan
+
+    @property
+    def steps(self) -> int:
+        """How often ``run`` reports progress."""
+        return len(self.plan.sequence_names) * prediction_steps(self.plan) + len(self.sequences)
+
+    def run(self, command: str, step: Step) -> list[str]:
+        """Predict and score; writes predictions/, scores/*.csv and provenance.json below ``out``.
+
+        Predictions made before from the same data, components and options are kept and scored, whoever asked for
+        them.
+
+        Returns:
+            Stored predictions that are not current: they are neither scored nor deleted.
+
+        Raises:
+            RsbenchError: the dataset is damaged, or a stored prediction is of another entry of the same name.
+        """
+        rows: dict[str, list[Row]] = {table: [] for table in TABLES}
+        stale = []
+        with SolverRunner() as runner, Isolation() as isolation:
+            plan = self._isolated(isolation)
+            for sequence in self.sequences:
+                if sequence.name in plan.sequence_names:
+                    Bench(sequence, self._folder(sequence), plan, runner).predict(step)
+            for sequence in self.sequences:
+                scorer = Scorer(Places(sequence, self._folder(sequence), plan.chain), plan)
+                scorer.score()
+                for table in TABLES:
+                    rows[table] += scorer.rows[table]
+                stale += scorer.stale
+                step(f"{sequence.name}: scores")
+        for table, content in rows.items():
+            write_table(self.out / "scores" / f"{table}.csv", _frame(table, content, self.plan))
+        write_json(self.out / "scores" / "columns.json", described_columns(self.plan))
+        write_json(self.out / "provenance.json", self._provenance(command))
+        return stale
+
+    def _isolated(self, isolation: Isolation) -> Plan:
+        """The plan with other packages' components in child processes."""
+        chain = self.plan.chain
+        chain = replace(
+            chain,
+            features=isolation.features(chain.features),
+            matcher=isolation.matcher(chain.matcher),
+            corrector=isolation.corrector(chain.corrector),
+        )
+        return replace(self.plan, chain=chain, metrics=isolated_metrics(isolation, self.plan.metrics))
+
+    def _folder(self, sequence: Sequence) -> Path:
+        return self.out / "predictions" / sequence.name
+
+    def _provenance(self, command: str) -> dict[str, object]:
+        chain = self.plan.chain
+        chosen = {name: getattr(chain, name) for name in ("features", "corrector", "solver", "matcher")}
+        return provenance(
+            command,
+            **dataset_record(self.dataset),
+            seed=chain.seed,
+            solvers={entry.name: entry.parameters for entry in self.plan.solvers},
+            correction={name: entry.name for name, entry in chosen.items()},
+            parameters={entry.name: entry.parameters for entry in chosen.values()},
+            metrics=[metric.name for metric in self.plan.metrics],
+        )
+
+
+def open_evaluation(dataset: Path, out: Path, options: EvaluationOptions) -> Evaluation:
+    """Read the dataset and load every component; makes the folders.
 
     Raises:
-        RsbenchError: the dataset cannot be read.
-    """
-    return len(read_dataset(dataset)) * (options.steps() + 1)
-
-
-def run_evaluation(dataset: Path, out: Path, options: EvaluationOptions, command: str, step: Step) -> None:
-    """Predict and score every sequence; writes predictions/, scores/*.csv and provenance.json below ``out``.
-
-    Predictions made before from the same data, cards and options are kept.
-
-    Raises:
-        RsbenchError: the dataset cannot be read, a solver card does not exist, or ``out`` cannot be written.
+        RsbenchError: the dataset cannot be read, a component is wrong, or ``out`` cannot be written.
     """
     sequences = read_dataset(dataset)
+    plan = make_plan(options, sequences)
     try:
         (out / "scores").mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RsbenchError(f"{out}: cannot be written: {error.strerror}; choose another --out") from error
-    rows: dict[str, list[dict[str, object]]] = {table: [] for table in TABLES}
-    for sequence in sequences:
-        folder = out / "predictions" / sequence.name
-        predict_sequence(sequence, options, folder, step)
-        rows["pose"] += score_poses(sequence, folder)
-        rows["depth"] += score_depth(sequence, folder)
-        rows["correction"] += score_correction(sequence, folder, options.correction_solver)
-        step(sequence.name)
-    for table, content in rows.items():
-        text = pd.DataFrame(content).to_csv(index=False, float_format="%.6g", lineterminator="\n")
-        write_bytes(out / "scores" / f"{table}.csv", text.encode())
-    record = provenance(
-        command, **dataset_record(dataset), seed=options.seed, solvers=list(options.solvers),
-        correction_solver=options.correction_solver, matcher=asdict(options.sgm),  # type: ignore[call-overload]
-    )  # fmt: skip
-    write_json(out / "provenance.json", record)
+    return Evaluation(dataset=dataset, out=out, options=options, sequences=sequences, plan=plan)
+
+
+def described_columns(plan: Plan) -> dict[str, list[dict[str, object]]]:
+    """What the metrics' columns of each table are, ready for JSON; an infinite worst value as a text."""
+    return {
+        table: [
+            {
+                "name": column.name,
+                "heading": column.heading,
+                "unit": column.unit,
+                "better": column.better,
+                "worst": column.worst if math.isfinite(column.worst) else str(column.worst),
+                "metric": metric.name,
+            }
+            for metric in plan.metrics
+            if metric.component.case is case
+            for column in metric.component.columns
+        ]
+        for table, case in _CASES.items()
+    }
+
+
+def columns_of(table: str, plan: Plan) -> list[str]:
+    """Columns of a score file, in their order."""
+    found = [c.name for m in plan.metrics if m.component.case is _CASES.get(table) for c in m.component.columns]
+    return [*KEYS[table], *found, *AFTER.get(table, ())]
+
+
+def _frame(table: str, rows: Iterable[Row], plan: Plan) -> pd.DataFrame:
+    return pd.DataFrame(list(rows), columns=columns_of(table, plan))
+
+
+def read_headings(out: Path, table: str) -> dict[str, str]:
+    """Headings of the metrics' columns of a score file, by their names; errors as ``read_json``."""
+    return {column["name"]: column["heading"] for column in read_json(out / "scores" / "columns.json")[table]}
 
 
 def read_scores(out: Path, table: str) -> pd.DataFrame:
-    """One of ``TABLES`` of an evaluation.
+    """One of ``TABLES`` of an evaluation, as ``columns_of`` names its columns.
 
     Raises:
         RsbenchError: the evaluation is not there.
@@ -66,4 +158,4 @@ def read_scores(out: Path, table: str) -> pd.DataFrame:
     path = out / "scores" / f"{table}.csv"
     if not path.is_file():
         raise RsbenchError(f"{path}: no such scores; make them with: rsbench evaluate DIR --out {out}")
-    return pd.read_csv(path)
+    return pd.read_csv(path, keep_default_na=False, na_values=[""])

@@ -1,164 +1,274 @@
 """Predictions on image sequences: matches, motions, disparity and corrected frames, stored before any scoring.
 
-Nothing here reads the truth of a sequence: only its rolling-shutter images, its rig and its shutter.
+Nothing here reads the truth of a sequence, but for the oracles, which are given it instead of a motion or a depth.
+Each prediction is an artefact of its own (see ``store``): what is current is kept, and one more solver redoes
+nothing else. What a component of another package does wrong is a failed prediction with the reason.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-import shutil
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
-from itertools import product
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench import __version__
+from rsbench.benchmark.images.plan import NONE, Places, Plan, Recipe, reference_of
+from rsbench.benchmark.images.store import Artefact, read_record
 from rsbench.benchmark.seeds import generator
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
-from rsbench.core.rig import SIDES, Side, StereoRig
-from rsbench.dataset.files import MATCH_SETS, read_json, save_arrays, save_matches, sha256, write_json, write_png
-from rsbench.dataset.sequence import FRAMES, Sequence
-from rsbench.motions import make_motion
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
-from rsbench.solvers.engine.registry import load_solver_entry
-from rsbench.vision.correction import correct_frame
-from rsbench.vision.features import MatchOptions, match_stereo_frames
-from rsbench.vision.stereo_depth import SgmMatcher
-from rsbench.vision.stereo_matcher import StereoMatcher
+from rsbench.core.rig import FRAMES, SIDES, VIEWS, StereoRig, View
+from rsbench.dataset.corrected_frames import write_origin
+from rsbench.dataset.files import MATCH_SETS, load_arrays, load_matches, save_arrays, save_matches, write_png
+from rsbench.dataset.sequence import Sequence
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.body_motion import body_motion
+from rsbench.pipeline.chain import Given, correct_four
+from rsbench.pipeline.frame_depth import Images, Pairs, depth_of_pair, known_depth
+from rsbench.pipeline.frame_motion import find_matches
+from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.robust_motion import RobustEstimate
+from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.engine.registry import SOLVERS, SolverEntry
+from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.vision.corrector import CORRECTORS
+from rsbench.vision.stereo_matcher import STEREO_MATCHERS, find_disparities
 
 Step = Callable[[str], None]
-VIEWS: tuple[tuple[Side, int], ...] = tuple(product(SIDES, FRAMES))
 
 
-@dataclass(frozen=True, kw_only=True)
-class EvaluationOptions:
-    """Everything that decides a prediction, apart from the dataset."""
-
-    solvers: tuple[str, ...]
-    """Names or paths of solver cards."""
-    correction_solver: str = "rs-stereo-refined"
-    """Solver whose motion the correction uses; one of ``solvers``."""
-    seed: int = 0
-    matching: MatchOptions = field(default_factory=MatchOptions)
-    robust: RobustOptions = field(default_factory=RobustOptions)
-    sgm: StereoMatcher = field(default_factory=SgmMatcher)
-
-    def steps(self) -> int:
-        """Progress steps of one sequence: matching, solvers, and depth and correction of each view."""
-        return 1 + len(self.solvers) + len(VIEWS)
+def prediction_steps(plan: Plan) -> int:
+    """How often ``Bench.predict`` reports progress on a sequence."""
+    solvers = len(plan.solver_names)
+    return 1 + solvers + (1 + len(Recipe(chain=plan.chain).variants()) if plan.corrects else 0)
 
 
-def predict_sequence(sequence: Sequence, options: EvaluationOptions, folder: Path, step: Step) -> None:
-    """Write all predictions of a sequence into ``folder``; kept when they were made from the same input before."""
-    identity = _identity(sequence, options)
-    marker = folder / "prediction.json"
-    if marker.is_file() and read_json(marker).get("identity") == identity:
-        for _ in range(options.steps()):
-            step(sequence.name)
-        return
-    if folder.exists():
-        shutil.rmtree(folder)
-    (folder / "motion").mkdir(parents=True)
-    (folder / "corrected").mkdir()
-    images = {view: sequence.image("rs", *view) for view in VIEWS}
-    started = time.perf_counter()
-    matches = match_stereo_frames(
-        images["left", 0], images["right", 0], images["left", 1], images["right", 1], options.matching
-    )
-    matching_s = time.perf_counter() - started
-    save_matches(folder / "matches.npz", matches)
-    step(sequence.name)
-    for name in options.solvers:
-        _predict_motion(sequence, matches, name, options, folder)
-        step(sequence.name)
-    motion = read_motion(folder, options.correction_solver)
-    disparities = {}
-    depth_s = 0.0
-    for frame in FRAMES:
-        started = time.perf_counter()
-        both = options.sgm.disparities(images["left", frame], images["right", frame], sequence.rig)
-        depth_s += time.perf_counter() - started
-        for side, disparity in zip(SIDES, both, strict=True):
-            disparities[f"{side}_{frame}"] = disparity
-            if motion is not None:
-                _correct(sequence, images[side, frame], disparity, motion, side, frame, folder)
-            step(sequence.name)
-    save_arrays(folder / "disparity.npz", disparities)
-    write_json(marker, {"identity": identity, "matching_s": matching_s, "depth_s": depth_s})
+class Bench:
+    """The predictions on one sequence."""
+
+    def __init__(self, sequence: Sequence, folder: Path, plan: Plan, runner: SolverRunner) -> None:
+        self.sequence, self.plan, self.runner = sequence, plan, runner
+        self.places = Places(sequence, folder, plan.chain)
+
+    @cached_property
+    def images(self) -> dict[View, NDArray[np.uint8]]:
+        return {view: self.sequence.image("rs", *view) for view in VIEWS}
+
+    def predict(self, step: Step) -> None:
+        """Make what is planned and not current."""
+        if self.plan.force and len(self.plan.solver_names) == len(self.plan.solvers):
+            self.places.matches().forget()
+        self._match()
+        step(f"{self.sequence.name}: matches")
+        for entry in self.plan.solvers:
+            if entry.name in self.plan.solver_names:
+                self._move(entry)
+                step(f"{self.sequence.name}: {entry.name}")
+        if self.plan.corrects:
+            self._find_depth()
+            step(f"{self.sequence.name}: depth")
+            for recipe in Recipe(chain=self.plan.chain).variants():
+                self._correct(recipe)
+                step(f"{self.sequence.name}: correction")
+
+    def _stands(self, artefact: Artefact) -> bool:
+        return not self.plan.force and artefact.record() is not None
+
+    # Matches
+
+    def _match(self) -> None:
+        artefact, entry = self.places.matches(), self.plan.chain.features
+        if artefact.record() is not None:
+            return
+        artefact.start()
+        images, start = self.images, time.perf_counter()
+        try:
+            matches = find_matches(images, self.plan.chain)
+        except RsbenchError as error:
+            artefact.finish({"features": entry.name, "success": False, "reason": str(error), "matches": {}})
+            return
+        seconds = time.perf_counter() - start
+        save_matches(artefact.file(".npz"), matches)
+        counts = {name: len(getattr(matches, name)) for name in MATCH_SETS}
+        record = {"features": entry.name, "success": True, "reason": "", "matches": counts}
+        artefact.finish(record, seconds)
+
+    @cached_property
+    def _matches(self) -> Correspondences | str:
+        """The matches, or why there are none."""
+        artefact = self.places.matches()
+        record = artefact.record() or {"success": False, "reason": "not made"}
+        return load_matches(artefact.file(".npz")) if record["success"] else str(record["reason"])
+
+    # Motion
+
+    def _move(self, entry: SolverEntry) -> None:
+        artefact = self.places.motion(entry)
+        if self._stands(artefact):
+            return
+        self._refuse_another(entry, artefact)
+        rng = generator(self.plan.chain.seed, "images", self.sequence.name, entry.name, 0)
+        matches = self._matches
+        artefact.start()
+        if isinstance(matches, str):
+            estimate = MotionEstimate.failed(f"no matches: {matches}")
+            robust = RobustEstimate(estimate=estimate, iterations=0, seconds=0.0, threshold_px=0.0)
+        else:
+            options = self.plan.chain.robust
+            if entry.built_in:
+                warm_up((entry.solver.spec.motion_model,))  # compiling is not in the solver's time
+            robust = self.runner.robust(entry, matches, self.sequence.rig, self.sequence.shutter, options, rng)
+        masks = {str(name): mask for name, mask in robust.inliers.items()}
+        save_arrays(artefact.file("-inliers.npz"), masks)
+        artefact.finish(_motion_record(entry, robust), robust.seconds)
+
+    def _refuse_another(self, entry: SolverEntry, artefact: Artefact) -> None:
+        """Another entry of the same name must not be overwritten in silence."""
+        stored = read_record(artefact.file(".json")) or {}
+        other, own = stored.get("entry", ""), reference_of(SOLVERS, entry)
+        if not self.plan.force and other not in ("", own) and stored.get("key") != entry.key:
+            raise RsbenchError(
+                f"{artefact.file('.json')}: is the prediction of another {entry.name!r}, {other}, not of {own}; "
+                "rename one of them, choose another --out, or replace it with --force"
+            )
+
+    # Depth
+
+    def _find_depth(self) -> None:
+        entry = self.plan.chain.matcher
+        artefact = self.places.depth(entry)
+        if self._stands(artefact):
+            return
+        artefact.start()
+        images, start = self.images, time.perf_counter()
+        found: dict[str, NDArray[np.float32]] = {}
+        record = {
+            "matcher": entry.name,
+            "entry": reference_of(STEREO_MATCHERS, entry),
+            "success": True,
+            "reason": "",
+        }
+        try:
+            for frame in FRAMES:
+                both = find_disparities(entry, images["left", frame], images["right", frame], self.sequence.rig)
+                found[f"left_{frame}"], found[f"right_{frame}"] = both
+        except RsbenchError as error:
+            artefact.finish(record | {"success": False, "reason": str(error)})
+            return
+        seconds = time.perf_counter() - start
+        save_arrays(artefact.file(".npz"), found)
+        artefact.finish(record, seconds)
+
+    # Correction
+
+    def _correct(self, recipe: Recipe) -> None:
+        artefact = self.places.corrected(recipe)
+        if self._stands(artefact):
+            return
+        artefact.start()
+        record = {**recipe.names, "entries": _references(recipe), "success": True, "reason": ""}
+        given = self._given(recipe)
+        if isinstance(given, str):
+            artefact.finish(record | {"success": False, "reason": given})
+            return
+        images, start = self.images, time.perf_counter()
+        ratio = self.sequence.shutter.readout_ratio
+        try:
+            frames = correct_four(images, self.sequence.rig, ratio, recipe.chain, given=given).frames
+        except RsbenchError as error:
+            artefact.finish(record | {"success": False, "reason": str(error)})
+            return
+        seconds = time.perf_counter() - start
+        for (side, frame), fused in frames.items():
+            write_png(artefact.file(f"-{side}_{frame}.png"), fused.image)
+            write_origin(artefact.file(f"-{side}_{frame}-origin.png"), fused.origin)
+        artefact.finish(record, seconds)
+
+    def _given(self, recipe: Recipe) -> Given | str:
+        """What the recipe says to be known, or why it is not."""
+        motion: Motion | str | None = None
+        pairs: Pairs | str | None = None
+        if recipe.names["solver"] != NONE:
+            motion = self.sequence.motion if recipe.true_motion else read_motion(self.places, recipe.chain.solver)
+        if recipe.names["matcher"] != NONE:
+            pairs = true_pairs(self.sequence, self.images) if recipe.true_depth else self._stored_pairs(recipe)
+        if isinstance(motion, str):
+            return f"no motion: {motion}"
+        if isinstance(pairs, str):
+            return f"no depth: {pairs}"
+        return Given(motion=motion, pairs=pairs)
+
+    def _stored_pairs(self, recipe: Recipe) -> Pairs | str:
+        artefact = self.places.depth(recipe.chain.matcher)
+        record = artefact.record()
+        if record is None or not record["success"]:
+            return str(record["reason"]) if record else "not made"
+        stored = load_arrays(artefact.file(".npz"))
+        first, second = (
+            depth_of_pair(
+                self.images["left", frame],
+                self.images["right", frame],
+                [stored[f"{side}_{frame}"] for side in SIDES],
+                self.sequence.rig,
+                find_sky=recipe.chain.find_sky,
+            )
+            for frame in FRAMES
+        )
+        return first, second
 
 
-def _predict_motion(
-    sequence: Sequence, matches: Correspondences, name: str, options: EvaluationOptions, folder: Path
-) -> None:
-    entry = load_solver_entry(name)
-    solver, spec = entry.solver, entry.solver.spec
-    rng = generator(options.seed, "images", sequence.name, entry.name, 0)
-    robust = estimate_motion(matches, sequence.rig, sequence.shutter, solver, options.robust, rng)
-    estimate = robust.estimate
-    answer = {
+def _motion_record(entry: SolverEntry, robust: RobustEstimate) -> dict[str, Any]:
+    estimate, spec = robust.estimate, entry.solver.spec
+    return {
         "solver": entry.name,
+        "entry": reference_of(SOLVERS, entry),
+        "key": entry.key,
         "success": estimate.success,
         "reason": estimate.reason,
         "w": estimate.w.tolist() if estimate.success else None,
         "d": estimate.d.tolist() if estimate.success else None,
         "metric": estimate.metric,
-        "motion_model": spec.motion_model,
-        **({"motion_parameters": dict(spec.motion_parameters)} if spec.motion_parameters else {}),
         "reference_point": spec.reference_point,
+        "motion_model": spec.motion_model,
+        "motion_parameters": dict(spec.motion_parameters),
         "shutter": spec.shutter,
-        "uses": sorted(spec.needs | {name for name, size in solver.sample_sizes(matches).items() if size}),
-        "inliers": {key: int(np.count_nonzero(mask)) for key, mask in robust.inliers.items()},
-        "matches": {key: len(getattr(matches, key)) for key in MATCH_SETS},
+        "uses": sorted(spec.needs | {name for name, count in robust.counts.items() if count.matches}),
+        "inliers": {str(name): count.inliers for name, count in robust.counts.items()},
+        "matches": {str(name): count.matches for name, count in robust.counts.items()},
         "iterations": robust.iterations,
-        "seconds": robust.seconds,
     }
-    write_json(folder / "motion" / f"{entry.name}.json", answer)
-    save_arrays(
-        folder / "motion" / f"{entry.name}-inliers.npz", {str(key): mask for key, mask in robust.inliers.items()}
-    )
 
 
-def _correct(
-    sequence: Sequence,
-    image: NDArray[np.uint8],
-    disparity: NDArray[np.float32],
-    motion: Motion,
-    side: Side,
-    frame: int,
-    folder: Path,
-) -> None:
-    depth = depth_of(disparity, sequence.rig)
-    corrected = correct_frame(image, depth, sequence.rig, sequence.shutter, motion, side, frame)
-    write_png(folder / "corrected" / f"{side}_{frame}.png", corrected.image)
-    write_png(folder / "corrected" / f"{side}_{frame}_mask.png", np.where(corrected.mask, 255, 0).astype(np.uint8))
+def _references(recipe: Recipe) -> dict[str, str]:
+    chain = recipe.chain
+    return {
+        "corrector": reference_of(CORRECTORS, chain.corrector),
+        "solver": reference_of(SOLVERS, chain.solver),
+        "matcher": reference_of(STEREO_MATCHERS, chain.matcher),
+    }
+
+
+def read_motion(places: Places, solver: SolverEntry) -> Motion | str:
+    """The body's motion in metres that a solver predicted, or why there is none."""
+    record = places.motion(solver).record()
+    if record is None:
+        return "not made"
+    if not record["success"]:
+        return str(record["reason"])
+    estimate = MotionEstimate(w=record["w"], d=record["d"], success=True, metric=record["metric"])
+    return body_motion(estimate, solver.solver.spec, places.sequence.rig)
+
+
+def true_pairs(sequence: Sequence, images: Images) -> Pairs:
+    """Rolling-shutter frames with their true depth; what has no surface is infinitely far."""
+    truth = {view: sequence.depth("rs", *view) for view in VIEWS}
+    return known_depth(images, {view: np.where(z > 0, z, np.float32(np.inf)) for view, z in truth.items()})
 
 
 def depth_of(disparity: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:
     """Depth (H, W), metres, 0 where the disparity is not known: the depth convention of the dataset."""
     return np.nan_to_num(rig.depth(disparity), nan=0.0).astype(np.float32)
-
-
-def read_motion(folder: Path, solver: str) -> Motion | None:
-    """Motion that a solver predicted, or None when it found none."""
-    answer = read_json(folder / "motion" / f"{load_solver_entry(solver).name}.json")
-    if not answer["success"]:
-        return None
-    return make_motion(answer["motion_model"], answer["w"], answer["d"], answer.get("motion_parameters"))
-
-
-def _identity(sequence: Sequence, options: EvaluationOptions) -> str:
-    """Hash of what decides the predictions: the sequence's bytes, the options, the cards and the version."""
-    solvers = [load_solver_entry(name).key for name in options.solvers]
-    parts = [
-        sha256(sequence.folder / "sequence.json"),
-        json.dumps(asdict(options), default=str),
-        *solvers,
-        __version__,
-    ]
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()

@@ -2,130 +2,207 @@
 
 from __future__ import annotations
 
-from itertools import product
-from pathlib import Path
+from collections.abc import Iterator
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.benchmark.images.predict import VIEWS, depth_of, read_motion
-from rsbench.benchmark.scoring import pose_errors
-from rsbench.core.motion import Motion
-from rsbench.core.rig import Side
-from rsbench.dataset.files import load_arrays, read_json
-from rsbench.dataset.sequence import Sequence
-from rsbench.vision.correction import Corrected, correct_frame
-from rsbench.vision.quality import psnr, ssim
-from rsbench.vision.stereo_depth import depth_metrics, seen_by_other
+from rsbench.benchmark.images.plan import (
+    NONE,
+    Places,
+    Plan,
+    stored_corrections,
+    stored_depths,
+    stored_motions,
+)
+from rsbench.benchmark.images.predict import depth_of, true_pairs
+from rsbench.benchmark.images.store import read_seconds
+from rsbench.benchmark.metric_plugins import Case, DepthCase, ImageCase, MetricEntry, PoseCase
+from rsbench.benchmark.scoring import answered, score
+from rsbench.core.rig import VIEWS, Side, View
+from rsbench.dataset.corrected_frames import read_origin
+from rsbench.dataset.files import load_arrays, read_png
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.chain import Given, correct_four
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.vision.corrector import load_corrector
+from rsbench.vision.fusion import Origin
+from rsbench.vision.stereo_depth import seen_by_other
 
 Row = dict[str, Any]
+TABLES = ("pose", "depth", "correction", "failures", "seconds")
+KEYS = {
+    "pose": ("sequence", "solver", "shutter", "data_model", "assumed_model", "uses", "success"),
+    "depth": ("sequence", "matcher", "side", "frame", "pixels", "success"),
+    "correction": ("sequence", "corrector", "solver", "matcher", "side", "frame", "pixels", "success", "coverage"),
+    "failures": ("sequence", "kind", "name", "reason"),
+    "seconds": ("sequence", "prediction", "seconds"),
+}
+"""First columns of each table; the columns of the metrics follow."""
+AFTER = {"pose": ("inliers", "matches", "iterations", "reason")}
+"""Columns after those of the metrics."""
 
 
-def score_poses(sequence: Sequence, folder: Path) -> list[Row]:
-    """One row per solver: e_R, e_T (degrees), e_s; a failure scores the worst value of each."""
-    rows = []
-    for path in sorted((folder / "motion").glob("*.json")):
-        answer = read_json(path)
-        rows.append(
-            {
-                "sequence": sequence.name,
-                "solver": answer["solver"],
-                "shutter": answer["shutter"],
-                "uses": "+".join(answer["uses"]),
-                "success": answer["success"],
-                **_pose_errors(sequence, answer),
-                "inliers": sum(answer["inliers"].values()),
-                "iterations": answer["iterations"],
-                "seconds": answer["seconds"],
-                "reason": answer["reason"],
-            }
-        )
-    return rows
+class Scorer:
+    """Rows of all tables for one sequence."""
 
+    def __init__(self, places: Places, plan: Plan) -> None:
+        self.places, self.plan, self.sequence = places, plan, places.sequence
+        self.rows: dict[str, list[Row]] = {table: [] for table in TABLES}
+        self.stale: list[str] = []
+        """Predictions on disk that are not current, and not scored."""
 
-def _pose_errors(sequence: Sequence, answer: Row) -> dict[str, float]:
-    nothing = [np.nan] * 3
-    errors = pose_errors(
-        answer["w"] or nothing, answer["d"] or nothing, true_w=sequence.motion.w, true_d=sequence.motion.d,
-        rig=sequence.rig, success=answer["success"], metric=answer["metric"],
-        reference_point=answer["reference_point"],
-    )  # fmt: skip
-    return {name: float(value) for name, value in errors.items()}
+    def score(self) -> None:
+        """Fill ``rows`` from what is stored and current."""
+        self._score_matches()
+        self._score_poses()
+        self._score_depth()
+        self._score_correction()
+        seconds = read_seconds(self.places.folder).items()
+        self._add("seconds", ({"prediction": name, "seconds": value} for name, value in seconds))
 
+    def _add(self, table: str, rows: Any) -> None:
+        self.rows[table] += [{"sequence": self.sequence.name, **row} for row in rows]
 
-def score_depth(sequence: Sequence, folder: Path) -> list[Row]:
-    """Rows per view: SGM depth against the truth, in the row's own camera.
+    def _fail(self, kind: str, name: str, reason: str) -> None:
+        row = {"sequence": self.sequence.name, "kind": kind, "name": name, "reason": reason}
+        if row not in self.rows["failures"]:
+            self.rows["failures"].append(row)
 
-    Over all surface pixels, those that the other camera sees, and those that it does not.
-    """
-    disparities = load_arrays(folder / "disparity.npz")
-    rows = []
-    for side, frame in VIEWS:
-        truth = sequence.depth("rs", side, frame)
-        estimate = depth_of(disparities[f"{side}_{frame}"], sequence.rig)
-        other: Side = "right" if side == "left" else "left"
-        seen = seen_by_other(truth, sequence.depth("rs", other, frame), sequence.rig, side)
-        for name, part in (("all", None), ("visible", seen), ("occluded", ~seen)):
-            scores = depth_metrics(estimate, truth, sequence.rig, part)
-            rows.append({"sequence": sequence.name, "side": side, "frame": frame, "pixels": name, **scores})
-    return rows
+    def _metrics(self, case: Case | None, kind: type[Case]) -> dict[str, float]:
+        """Columns of all metrics that read such cases; NaN where another package's metric failed."""
+        row: dict[str, float] = {}
+        for metric in self.plan.metrics:
+            if metric.component.case is kind:
+                row |= self._values(metric, case)
+        return row
 
+    def _values(self, metric: MetricEntry, case: Case | None) -> dict[str, float]:
+        try:
+            return score(metric, case)
+        except RsbenchError as error:
+            self._fail("metric", metric.name, str(error))
+            return {column.name: np.nan for column in metric.component.columns}
 
-def score_correction(sequence: Sequence, folder: Path, solver: str) -> list[Row]:
-    """Rows per view and method: the estimate, the oracles that replace depth or motion by the truth, and nothing.
+    def _score_matches(self) -> None:
+        record = self.places.matches().record()
+        if record is not None and not record["success"]:
+            self._fail("feature matcher", record["features"], record["reason"])
 
-    Every method is scored on the pixels that it covers, beside the uncorrected frame on the same pixels, and on
-    the pixels that all methods cover.
-    """
-    disparities = load_arrays(folder / "disparity.npz")
-    motions = {"estimated": read_motion(folder, solver), "true": sequence.motion}
-    rows = []
-    for side, frame in VIEWS:
-        image, truth = sequence.image("rs", side, frame), sequence.image("gs", side, frame)
-        true_depth = sequence.depth("rs", side, frame)
-        depths = {"SGM": depth_of(disparities[f"{side}_{frame}"], sequence.rig), "true": true_depth}
-        corrected = {
-            (depth, motion): _correct(
-                sequence, image, depths[depth], motions[motion], side, frame, depth == "true"
+    def _score_poses(self) -> None:
+        rows = []
+        for record, solver in stored_motions(self.places, self.plan):
+            if solver is None:
+                self.stale.append(f"{self.sequence.name}/motion/{record.get('solver')}")
+                continue
+            case = self._pose_case(record)
+            if case is None:
+                self._fail("solver", record["solver"], record["reason"])
+            rows.append(
+                {
+                    "solver": record["solver"],
+                    "shutter": record["shutter"],
+                    "data_model": self.sequence.motion.name,
+                    "assumed_model": record["motion_model"],
+                    "uses": "+".join(record["uses"]),
+                    "success": case is not None,
+                    **self._metrics(case, PoseCase),
+                    "inliers": sum(record["inliers"].values()),
+                    "matches": sum(record["matches"].values()),
+                    "iterations": record["iterations"],
+                    "reason": record["reason"],
+                }
             )
-            for depth, motion in product(depths, motions)
-        }
-        common = np.logical_and.reduce([result.mask for result in corrected.values() if result is not None])
-        for (depth, motion), result in corrected.items():
-            row = {"sequence": sequence.name, "side": side, "frame": frame, "depth": depth, "motion": motion}
-            rows.append(row | _image_scores(result, image, truth, common))
-    return rows
+        self._add("pose", rows)
 
+    def _pose_case(self, record: Row) -> PoseCase | None:
+        if not record["success"] or not answered(record["w"], record["d"]):
+            return None
+        return PoseCase(
+            w=np.array(record["w"]),
+            d=np.array(record["d"]),
+            metric=record["metric"],
+            reference_point=record["reference_point"],
+            truth=self.sequence.motion,
+            rig=self.sequence.rig,
+            shutter=self.sequence.shutter,
+        )
 
-def _correct(
-    sequence: Sequence,
-    image: NDArray[np.uint8],
-    depth: NDArray[np.float32],
-    motion: Motion | None,
-    side: Side,
-    frame: int,
-    knows_sky: bool,
-) -> Corrected | None:
-    if motion is None:
-        return None
-    sky = depth == 0 if knows_sky else None
-    return correct_frame(image, depth, sequence.rig, sequence.shutter, motion, side, frame, sky_mask=sky)
+    def _score_depth(self) -> None:
+        for record, matcher in stored_depths(self.places):
+            if matcher is None:
+                self.stale.append(f"{self.sequence.name}/depth/{record.get('matcher')}")
+                continue
+            stored = None
+            if record["success"]:
+                stored = load_arrays(self.places.depth(matcher).file(".npz"))
+            else:
+                self._fail("matcher", record["matcher"], record["reason"])
+            for view in VIEWS:
+                disparity = None if stored is None else stored[f"{view[0]}_{view[1]}"]
+                self._add("depth", self._depth_rows(record["matcher"], view, disparity))
 
+    def _depth_rows(self, matcher: str, view: View, disparity: NDArray[np.float32] | None) -> Iterator[Row]:
+        side, frame = view
+        rig, truth = self.sequence.rig, self.sequence.depth("rs", side, frame)
+        other: Side = "right" if side == "left" else "left"
+        seen = seen_by_other(truth, self.sequence.depth("rs", other, frame), rig, side)
+        for name, part in (("all", np.ones_like(seen)), ("visible", seen), ("occluded", ~seen)):
+            case = None
+            if disparity is not None:
+                case = DepthCase(depth=depth_of(disparity, rig), truth=truth, pixels=part, rig=rig)
+            keys = {"matcher": matcher, "side": side, "frame": frame, "pixels": name, "success": case is not None}
+            yield keys | self._metrics(case, DepthCase)
 
-def _image_scores(
-    result: Corrected | None, image: NDArray[np.uint8], truth: NDArray[np.uint8], common: NDArray[np.bool_]
-) -> Row:
-    if result is None:
-        names = ("psnr", "ssim", "psnr_uncorrected", "ssim_uncorrected", "psnr_common", "psnr_uncorrected_common")
-        return {"success": False, "coverage": 0.0, **dict.fromkeys(names, float("nan"))}
-    return {
-        "success": True,
-        "coverage": float(np.mean(result.mask)),
-        "psnr": psnr(result.image, truth, result.mask),
-        "ssim": ssim(result.image, truth, result.mask),
-        "psnr_uncorrected": psnr(image, truth, result.mask),
-        "ssim_uncorrected": ssim(image, truth, result.mask),
-        "psnr_common": psnr(result.image, truth, common),
-        "psnr_uncorrected_common": psnr(image, truth, common),
-    }
+    def _score_correction(self) -> None:
+        recipes = list(stored_corrections(self.places))
+        if recipes:
+            for view in VIEWS:
+                rolling = self.sequence.image("rs", *view)
+                names = dict.fromkeys(("corrector", "solver", "matcher"), NONE)
+                self._add(
+                    "correction", self._image_rows(names, view, rolling, np.ones(rolling.shape[:2], np.bool_))
+                )
+        for record, recipe in recipes:
+            names = {name: str(record.get(name)) for name in ("corrector", "solver", "matcher")}
+            if recipe is None:
+                self.stale.append(f"{self.sequence.name}/corrected/{'+'.join(names.values())}")
+                continue
+            if not record["success"]:
+                self._fail("correction", "+".join(names.values()), record["reason"])
+            artefact = self.places.corrected(recipe)
+            for view in VIEWS:
+                end = f"-{view[0]}_{view[1]}"
+                image = read_png(artefact.file(f"{end}.png")) if record["success"] else None
+                drawn = (
+                    read_origin(artefact.file(f"{end}-origin.png")) != Origin.NOBODY if record["success"] else None
+                )
+                self._add("correction", self._image_rows(names, view, image, drawn))
+
+    def _image_rows(
+        self, names: Row, view: View, image: NDArray[np.uint8] | None, drawn: NDArray[np.bool_] | None
+    ) -> Iterator[Row]:
+        truth, visible = self._truths[view], self._visible[view]
+        for name, part in (("visible", visible), ("all", np.ones_like(visible))):
+            case, coverage = None, 0.0
+            if image is not None and drawn is not None:
+                case = ImageCase(image=image, truth=truth, pixels=part)
+                coverage = float(np.mean(drawn[part])) if np.any(part) else np.nan
+            keys = {**names, "side": view[0], "frame": view[1], "pixels": name, "success": case is not None}
+            yield keys | {"coverage": coverage} | self._metrics(case, ImageCase)
+
+    @cached_property
+    def _truths(self) -> dict[View, NDArray[np.uint8]]:
+        return {view: self.sequence.image("gs", *view) for view in VIEWS}
+
+    @cached_property
+    def _visible(self) -> dict[View, NDArray[np.bool_]]:
+        """Pixels of the corrected frame whose place the rolling-shutter frame saw, by true depth and motion."""
+        images = {view: self.sequence.image("rs", *view) for view in VIEWS}
+        given = Given(motion=self.sequence.motion, pairs=true_pairs(self.sequence, images))
+        options = CorrectionOptions(corrector=load_corrector("single-view"), depth_from_motion=False)
+        ratio = self.sequence.shutter.readout_ratio
+        found = correct_four(images, self.sequence.rig, ratio, options, given=given)
+        return {view: fused.origin == Origin.HERE for view, fused in found.frames.items()}

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from rsbench.benchmark.images.predict import VIEWS
-from rsbench.benchmark.images.score import score_correction, score_depth, score_poses
+from rsbench.benchmark.images.plan import EvaluationOptions, Places, Plan, Recipe, make_plan
+from rsbench.benchmark.images.predict import Bench
+from rsbench.benchmark.images.score import Row, Scorer
+from rsbench.core.rig import VIEWS
 from rsbench.dataset.files import MATCH_SETS, save_arrays
 from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.pipeline.isolated_solver import SolverRunner
 
 
 @pytest.fixture(scope="module")
@@ -20,63 +22,91 @@ def sequence(smoke_dataset: Path) -> Sequence:
     return read_dataset(smoke_dataset)[0]
 
 
-def answer_of(sequence: Sequence, **changes: Any) -> dict[str, Any]:
-    answer = {
-        "solver": "gs-8pt",
+@pytest.fixture(scope="module")
+def plan(sequence: Sequence) -> Plan:
+    return make_plan(EvaluationOptions(solvers=("gs-8pt",)), [sequence])
+
+
+def store_truth(places: Places, plan: Plan, **changes: Any) -> None:
+    """The truth as the prediction of rs-stereo-refined and of sgm; ``changes`` of the motion's record."""
+    motion = places.sequence.motion
+    record = {
+        "solver": plan.chain.solver.name,
+        "entry": plan.chain.solver.name,
         "success": True,
         "reason": "",
-        "w": sequence.motion.w.tolist(),
-        "d": sequence.motion.d.tolist(),
+        "w": motion.w.tolist(),
+        "d": motion.d.tolist(),
         "metric": True,
-        "motion_model": sequence.motion.name,
+        "motion_model": motion.name,
         "reference_point": "body",
         "shutter": "rolling",
         "uses": ["left"],
-        "inliers": {"left": 10},
+        "inliers": {"left": 9},
         "matches": dict.fromkeys(MATCH_SETS, 10),
         "iterations": 1,
-        "seconds": 0.1,
     }
-    return answer | changes
-
-
-def write_prediction(folder: Path, sequence: Sequence, answer: dict[str, Any]) -> Path:
-    (folder / "motion").mkdir()
-    (folder / "motion" / "gs-8pt.json").write_text(json.dumps(answer))
+    artefact = places.motion(plan.chain.solver)
+    artefact.start()
+    artefact.finish(record | changes)
     disparities = {}
     for side, frame in VIEWS:
-        disparity = sequence.rig.disparity(sequence.depth("rs", side, frame))
+        disparity = places.sequence.rig.disparity(places.sequence.depth("rs", side, frame))
         disparities[f"{side}_{frame}"] = disparity.astype(np.float32)
-    save_arrays(folder / "disparity.npz", disparities)
-    return folder
+    artefact = places.depth(plan.chain.matcher)
+    artefact.start()
+    save_arrays(artefact.file(".npz"), disparities)
+    artefact.finish({"matcher": "sgm", "entry": "sgm", "success": True, "reason": ""})
 
 
-def test_truth_scores_the_best_of_everything(sequence: Sequence, tmp_path: Path) -> None:
-    folder = write_prediction(tmp_path, sequence, answer_of(sequence))
-    (pose,) = score_poses(sequence, folder)
+def scored(sequence: Sequence, plan: Plan, folder: Path, **changes: Any) -> dict[str, list[Row]]:
+    with SolverRunner() as runner:
+        bench = Bench(sequence, folder, plan, runner)
+        store_truth(bench.places, plan, **changes)
+        for recipe in Recipe(chain=plan.chain).variants():
+            bench._correct(recipe)
+    scorer = Scorer(Places(sequence, folder, plan.chain), plan)
+    scorer.score()
+    assert scorer.stale == []
+    return scorer.rows
+
+
+def test_truth_scores_the_best_of_everything(sequence: Sequence, plan: Plan, tmp_path: Path) -> None:
+    rows = scored(sequence, plan, tmp_path)
+    (pose,) = rows["pose"]
     assert max(pose["e_R_deg"], pose["e_T_deg"], pose["e_s"]) < 1e-12
-    for depth in score_depth(sequence, folder):
+    assert (pose["inliers"], pose["data_model"], pose["assumed_model"]) == (9, "linear", "linear")
+    for depth in rows["depth"]:
         # float32 holds a disparity to 6e-8 relative.
         if depth["pixels"] != "occluded" or np.isfinite(depth["rmse_m"]):
             assert depth["rmse_m"] < 1e-5
             assert depth["coverage"] == 1.0
             assert depth["over_2m"] == depth["bad_1px"] == 0.0
-    rows = score_correction(sequence, folder, "gs-8pt")
-    psnr = {(row["side"], row["frame"], row["depth"], row["motion"]): row["psnr_common"] for row in rows}
+    psnr = {
+        (row["side"], row["frame"], row["solver"], row["matcher"]): row["psnr"]
+        for row in rows["correction"]
+        if row["pixels"] == "visible"
+    }
+    assert len(psnr) == 4 * 5
     for side, frame in VIEWS:
         best = psnr[side, frame, "true", "true"]
-        # The same map but for float32 rounding of depth, which moves no pixel by 1e-3 px.
-        assert psnr[side, frame, "SGM", "estimated"] == pytest.approx(best, abs=0.05)
+        # The same map but for float32 rounding of depth, which moves no pixel by 1e-3 px, and for the sky, which
+        # the oracle knows and the chain has to find.
+        assert psnr[side, frame, "rs-stereo-refined", "sgm"] == pytest.approx(best, abs=0.5)
+        assert best > psnr[side, frame, "none", "none"] + 6.0
+    assert rows["failures"] == []
 
 
-def test_failure_scores_the_worst_and_is_told_apart(sequence: Sequence, tmp_path: Path) -> None:
-    failed = answer_of(sequence, success=False, w=None, d=None, reason="no consensus")
-    folder = write_prediction(tmp_path, sequence, failed)
-    (pose,) = score_poses(sequence, folder)
+def test_failure_scores_the_worst_and_is_told_apart(sequence: Sequence, plan: Plan, tmp_path: Path) -> None:
+    rows = scored(sequence, plan, tmp_path, success=False, w=None, d=None, reason="no consensus")
+    (pose,) = rows["pose"]
     assert (pose["e_R_deg"], pose["e_T_deg"], pose["e_s"]) == (180.0, 180.0, np.inf)
     assert not pose["success"]
-    rows = score_correction(sequence, folder, "gs-8pt")
-    estimated = [row for row in rows if row["motion"] == "estimated"]
-    assert len(estimated) == 8
-    assert all(not row["success"] and np.isnan(row["psnr"]) and row["coverage"] == 0.0 for row in estimated)
-    assert all(row["success"] for row in rows if row["motion"] == "true")
+    estimated = [row for row in rows["correction"] if row["solver"] == "rs-stereo-refined"]
+    assert len(estimated) == 2 * 4 * 2  # two depths, four views, two sets of pixels
+    for row in estimated:
+        assert (row["success"], row["coverage"], row["psnr"], row["ssim"]) == (False, 0.0, 0.0, -1.0)
+    assert all(row["success"] for row in rows["correction"] if row["solver"] == "true")
+    reasons = {(row["kind"], row["name"]): row["reason"] for row in rows["failures"]}
+    assert reasons["solver", "rs-stereo-refined"] == "no consensus"
+    assert "no consensus" in reasons["correction", "fusion+rs-stereo-refined+sgm"]

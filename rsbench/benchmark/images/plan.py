@@ -1,0 +1,287 @@
+"""What an evaluation runs, and the identity of every prediction: the artefacts, current or to be made."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from rsbench.benchmark.images.store import Artefact, identity_of, records_below
+from rsbench.benchmark.metric_plugins import MetricEntry, load_metrics
+from rsbench.benchmark.provenance import numeric_version
+from rsbench.cards import choices, list_cards
+from rsbench.dataset.files import sha256
+from rsbench.dataset.sequence import Sequence
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.plugins import Entry, Kind
+from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.vision.corrector import load_corrector
+from rsbench.vision.feature_matcher import load_features
+from rsbench.vision.stereo_matcher import MatcherEntry, load_matcher
+
+Component = TypeVar("Component")
+STANDARD_METRICS = ("pose", "depth", "psnr", "ssim")
+TRUE = "true"
+"""Stands for a solver or a matcher where an oracle is given the truth instead; no entry may have this name."""
+NONE = "none"
+"""Stands for a component that nothing was taken from; no entry may have this name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationOptions:
+    """What a user asks for, apart from the dataset; components by name or by the path of a card."""
+
+    solvers: tuple[str, ...]
+    correction_solver: str = "rs-stereo-refined"
+    """Whose motion the correction uses; scored like the others."""
+    features: str = "sift"
+    matcher: str = "sgm"
+    corrector: str = "fusion"
+    metrics: tuple[str, ...] = ()
+    """Beside ``STANDARD_METRICS``."""
+    only: tuple[str, ...] = ()
+    """Names of solvers and sequences to which predicting is limited; all when empty."""
+    force: bool = False
+    """Make again what is current."""
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plan:
+    """An evaluation with its components loaded and checked."""
+
+    solvers: tuple[SolverEntry, ...]
+    chain: CorrectionOptions
+    metrics: tuple[MetricEntry, ...]
+    solver_names: frozenset[str]
+    """Solvers to be run."""
+    sequence_names: frozenset[str]
+    """Sequences to be worked on."""
+    force: bool
+
+    @property
+    def corrects(self) -> bool:
+        """Whether depth and correction are to be predicted too."""
+        return self.chain.solver.name in self.solver_names
+
+
+def make_plan(options: EvaluationOptions, sequences: list[Sequence]) -> Plan:
+    """Load every component.
+
+    Raises:
+        RsbenchError: a component does not exist or is wrong; two solvers of one name; a solver that gives no
+            metres is to correct; ``only`` names nothing that is there.
+    """
+    references = dict.fromkeys([*options.solvers, options.correction_solver])
+    solvers = _distinct({reference: load_solver_entry(reference) for reference in references})
+    chain = CorrectionOptions(
+        features=load_features(options.features),
+        solver=load_solver_entry(options.correction_solver),
+        matcher=load_matcher(options.matcher),
+        corrector=load_corrector(options.corrector),
+        seed=options.seed,
+    )
+    for name in (*(entry.name for entry in solvers), chain.matcher.name, chain.corrector.name):
+        if name in (TRUE, NONE):
+            raise RsbenchError(f"{name!r} is the name of no entry: tables use it for oracles; rename it")
+    _check_metres(chain, solvers)
+    chosen = _chosen(options.only, [s.name for s in sequences], [s.name for s in solvers])
+    return Plan(
+        solvers=solvers,
+        chain=chain,
+        metrics=load_metrics(dict.fromkeys([*STANDARD_METRICS, *options.metrics])),
+        sequence_names=chosen[0],
+        solver_names=chosen[1],
+        force=options.force,
+    )
+
+
+def _distinct(entries: Mapping[str, SolverEntry]) -> tuple[SolverEntry, ...]:
+    found: dict[str, tuple[str, SolverEntry]] = {}
+    for reference, entry in entries.items():
+        other, same = found.setdefault(entry.name, (reference, entry))
+        if same is not entry and same.path != entry.path:
+            raise RsbenchError(
+                f"--solver {other} and --solver {reference}: both have the name {entry.name!r}; rename one"
+            )
+    return tuple(entry for _, entry in found.values())
+
+
+def _check_metres(chain: CorrectionOptions, solvers: tuple[SolverEntry, ...]) -> None:
+    if "motion" in chain.corrector.component.spec.needs and not chain.solver.solver.spec.metric:
+        able = [entry.name for entry in solvers if entry.solver.spec.metric] or ["rs-stereo-refined"]
+        raise RsbenchError(
+            f"--correct-with {chain.solver.name}: gives no length of d in metres, which a correction needs; "
+            f"such as {able[0]} does"
+        )
+
+
+def _chosen(
+    only: tuple[str, ...], sequences: list[str], solvers: list[str]
+) -> tuple[frozenset[str], frozenset[str]]:
+    """Names of the sequences and of the solvers to work on."""
+    for name in only:
+        if name not in (*sequences, *solvers):
+            raise RsbenchError(
+                f"--only {name}: is neither a sequence nor a solver{choices(name, [*sequences, *solvers])}"
+            )
+    return (
+        frozenset(name for name in sequences if name in only) or frozenset(sequences),
+        frozenset(name for name in solvers if name in only) or frozenset(solvers),
+    )
+
+
+def reference_of(kind: Kind[Any, Any], entry: Entry[Any, Any]) -> str:
+    """The name or path by which an entry is loaded again."""
+    if entry.path is None or kind.cards is None or list_cards(kind.cards).get(entry.name) == entry.path:
+        return entry.name
+    return os.fspath(entry.path.resolve())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Recipe:
+    """What a correction is made of."""
+
+    chain: CorrectionOptions
+    true_motion: bool = False
+    true_depth: bool = False
+
+    @property
+    def names(self) -> dict[str, str]:
+        """Of corrector, solver and matcher, as in tables."""
+        needs = self.chain.corrector.component.spec.needs
+        solver = TRUE if self.true_motion else self.chain.solver.name
+        matcher = TRUE if self.true_depth else self.chain.matcher.name
+        return {
+            "corrector": self.chain.corrector.name,
+            "solver": solver if "motion" in needs else NONE,
+            "matcher": matcher if "depth" in needs else NONE,
+        }
+
+    def variants(self) -> list[Recipe]:
+        """This one, and the oracles that have its motion, its depth or both replaced by the truth."""
+        needs = self.chain.corrector.component.spec.needs
+        motions = (False, True) if "motion" in needs else (False,)
+        depths = (False, True) if "depth" in needs else (False,)
+        return [replace(self, true_motion=m, true_depth=d) for d in depths for m in motions]
+
+
+class Places:
+    """Where the predictions on a sequence are, with the identity that each must have to be current.
+
+    Components other than those of ``chain`` may be given; ``chain`` says everything else that decides.
+    """
+
+    def __init__(self, sequence: Sequence, folder: Path, chain: CorrectionOptions) -> None:
+        self.sequence, self.folder, self.chain = sequence, folder, chain
+
+    @cached_property
+    def data(self) -> str:
+        """Identity of what predictions may know: rig, shutter and rolling-shutter images."""
+        return self._hash_of("rs")
+
+    @cached_property
+    def truth(self) -> str:
+        """Identity of what oracles know."""
+        return self._hash_of("rs", "rs_depth")
+
+    def _hash_of(self, *channels: str) -> str:
+        folder = self.sequence.folder
+        paths = [
+            folder / "sequence.json",
+            *sorted(path for name in channels for path in (folder / name).iterdir()),
+        ]
+        return hashlib.sha256("".join(sha256(path) for path in paths).encode()).hexdigest()
+
+    def matches(self) -> Artefact:
+        return self._artefact("matches", data=self.data, features=self.chain.features.key)
+
+    def motion(self, solver: SolverEntry) -> Artefact:
+        return self._artefact(
+            f"motion/{solver.name}",
+            matches=self.matches().identity,
+            solver=solver.key,
+            options=asdict(solver.options),
+            robust=asdict(self.chain.robust),
+            seed=self.chain.seed,
+        )
+
+    def depth(self, matcher: MatcherEntry) -> Artefact:
+        return self._artefact(f"depth/{matcher.name}", data=self.data, matcher=matcher.key)
+
+    def corrected(self, recipe: Recipe) -> Artefact:
+        chain, needs = recipe.chain, recipe.chain.corrector.component.spec.needs
+        motion = self.truth if recipe.true_motion else self.motion(chain.solver).identity
+        depth = self.truth if recipe.true_depth else self.depth(chain.matcher).identity
+        return self._artefact(
+            "corrected/" + "+".join(recipe.names.values()),
+            data=self.data,
+            corrector=chain.corrector.key,
+            motion=motion if "motion" in needs else None,
+            depth=depth if "depth" in needs else None,
+            target_row=chain.target_row,
+            steps=[chain.depth_from_motion, chain.find_sky, chain.inpaint],
+        )
+
+    def _artefact(self, name: str, **parts: object) -> Artefact:
+        identity = identity_of(source=numeric_version(), name=name, **parts)
+        return Artefact(folder=self.folder, name=name, identity=identity)
+
+
+class Stored(NamedTuple):
+    """A record that is on disk, and the entries that made it."""
+
+    record: dict[str, Any]
+    made_by: Any
+    """A ``SolverEntry``, ``MatcherEntry`` or ``Recipe``; None when the record is not current."""
+
+
+def stored_motions(places: Places, plan: Plan) -> Iterator[Stored]:
+    """Of every solver, planned or not."""
+    chosen = {solver.name: solver for solver in plan.solvers}
+    for name, record in records_below(places.folder, "motion"):
+        entry = chosen.get(name) or _again(load_solver_entry, record.get("entry"))
+        yield Stored(record, entry if _current(entry, places.motion, record) else None)
+
+
+def stored_depths(places: Places) -> Iterator[Stored]:
+    """Of every stereo matcher."""
+    for name, record in records_below(places.folder, "depth"):
+        chosen = places.chain.matcher
+        entry = chosen if chosen.name == name else _again(load_matcher, record.get("entry"))
+        yield Stored(record, entry if _current(entry, places.depth, record) else None)
+
+
+def stored_corrections(places: Places) -> Iterator[Stored]:
+    """Of every recipe."""
+    for _, record in records_below(places.folder, "corrected"):
+        recipe = _again(partial(_recipe, places.chain), record)
+        yield Stored(record, recipe if _current(recipe, places.corrected, record) else None)
+
+
+def _recipe(chain: CorrectionOptions, record: Mapping[str, Any]) -> Recipe:
+    entries = record["entries"]
+    loaded = replace(
+        chain,
+        corrector=load_corrector(entries["corrector"]),
+        solver=load_solver_entry(entries["solver"]),
+        matcher=load_matcher(entries["matcher"]),
+    )
+    return Recipe(chain=loaded, true_motion=record["solver"] == TRUE, true_depth=record["matcher"] == TRUE)
+
+
+def _again(load: Callable[[Any], Component], source: Any) -> Component | None:
+    """What made a record, as it is today; None when it is gone."""
+    try:
+        return load(source)
+    except (RsbenchError, KeyError, TypeError):
+        return None
+
+
+def _current(made_by: Component | None, place: Callable[[Component], Artefact], record: Mapping[str, Any]) -> bool:
+    return made_by is not None and place(made_by).identity == record.get("identity")

@@ -1,0 +1,87 @@
+"""Stored predictions: each artefact carries the identity of what it was made from, and is kept while that stands.
+
+An artefact is a record, ``NAME.json``, and the files beside it that begin with ``NAME``. The record is removed
+before the files change and written when all are complete, so an artefact with a record is whole and is what its
+record says.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rsbench.dataset.files import read_json, write_json
+from rsbench.errors import RsbenchError
+
+SECONDS = "seconds.json"
+"""Times of a sequence's artefacts: no two runs agree on them, so no other file holds any."""
+
+
+def identity_of(**parts: object) -> str:
+    """Hash of what decides an artefact; the values must be JSON-ready."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Artefact:
+    """A prediction on disk, or the place for it."""
+
+    folder: Path
+    """Of the sequence."""
+    name: str
+    """Such as ``motion/gs-8pt``."""
+    identity: str
+
+    @property
+    def stem(self) -> Path:
+        """Path of its files, but for their ends."""
+        return self.folder / self.name
+
+    def file(self, end: str) -> Path:
+        """One of its files, such as the one that ends in ``-inliers.npz``."""
+        return self.stem.with_name(self.stem.name + end)
+
+    def record(self) -> dict[str, Any] | None:
+        """What was stored, when it is current; None otherwise."""
+        record = read_record(self.file(".json"))
+        return record if record is not None and record.get("identity") == self.identity else None
+
+    def forget(self) -> None:
+        """Make it stale: the next run makes it again."""
+        self.file(".json").unlink(missing_ok=True)
+
+    def start(self) -> None:
+        """Before its files are written."""
+        self.stem.parent.mkdir(parents=True, exist_ok=True)
+        self.forget()
+
+    def finish(self, record: Mapping[str, Any], seconds: float | None = None) -> None:
+        """When its files are complete: write the record, JSON-ready, and how long it took."""
+        if seconds is not None:
+            write_json(self.folder / SECONDS, read_seconds(self.folder) | {self.name: round(seconds, 4)})
+        write_json(self.file(".json"), {"identity": self.identity, **record})
+
+
+def read_record(path: Path) -> dict[str, Any] | None:
+    """A stored record of whatever identity; None when there is none that can be read."""
+    try:
+        return read_json(path)
+    except RsbenchError:
+        return None
+
+
+def records_below(folder: Path, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Names and records of all artefacts of a kind, such as ``motion``, in the order of their names."""
+    for path in sorted((folder / kind).glob("*.json")):
+        record = read_record(path)
+        if record is not None:
+            yield path.stem, record
+
+
+def read_seconds(folder: Path) -> dict[str, float]:
+    """Seconds by the name of the artefact."""
+    return read_record(folder / SECONDS) or {}
