@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -154,3 +155,17 @@ def test_a_solver_with_a_loop_of_its_own_is_not_wrapped(tmp_path: Path) -> None:
     # Eight points on all matches, wrong ones too: one call, no samples.
     assert answer["success"] and answer["iterations"] == 0
     assert answer["inliers"] < answer["matches"] == 60
+
+
+def test_an_interrupt_keeps_what_was_answered_and_ends_the_solvers_process(tmp_path: Path) -> None:
+    card = odd_card(tmp_path, "hang")
+    options = [EXAMPLE, "--solver", "gs-8pt", "--solver", card, "--json"]
+    command = [sys.executable, "-m", "rsbench", "solve", *map(str, options)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stderr is not None
+        assert json.loads(process.stdout.readline())["solver"] == "gs-8pt"  # then the one that hangs
+        process.send_signal(signal.SIGINT)
+        # Both ends close only when no child holds them any more; the hanging solver would for 1000 s.
+        assert process.stdout.read() == ""
+        assert "interrupted; nothing is kept" in process.stderr.read()
+        assert process.wait(60) == 130
