@@ -79,6 +79,12 @@ class Run:
                 return pid
         raise AssertionError("no worker")
 
+    def wait_for_worker(self) -> None:
+        end = time.monotonic() + 120.0
+        while len(self.processes()) < 2:
+            assert self.process.poll() is None and time.monotonic() < end
+            time.sleep(0.02)
+
     def wait_for(self, chunks: Path, count: int) -> None:
         end = time.monotonic() + 120.0
         while len(list(chunks.glob("trials-*.npz"))) < count:
@@ -105,22 +111,30 @@ def test_stopped_terminated_and_killed_it_goes_on_to_the_same_bytes(tmp_path: Pa
     errors = run.finish()
     assert run.process.returncode == 0, errors
 
-    for stop, code, chunks in ((signal.SIGINT, 130, 1), (signal.SIGTERM, 143, 3)):
-        run = Run(card, out, 0.03)
-        run.wait_for(out / ".chunks", chunks)
-        assert len(run.processes()) == 1 + 2 + 2  # workers, and the solver's own process of each
-        start = time.monotonic()
-        run.process.send_signal(stop)
-        errors = run.finish()
-        assert time.monotonic() - start < STOP_S
-        assert run.process.returncode == code
-        assert "interrupted; the same command resumes" in errors and "Traceback" not in errors
-        assert not run.processes()
-        assert not (out / "summary.csv").exists()
+    run = Run(card, out, 0.03)
+    run.wait_for(out / ".chunks", 1)
+    assert len(run.processes()) == 1 + 2 + 2  # workers, and the solver's own process of each
+    os.kill(run.worker(), signal.SIGKILL)
+    run.wait_for(out / ".chunks", 3)  # more than the other worker had begun
+    stop(run, signal.SIGINT, 130)
+    assert not (out / "summary.csv").exists()
 
     run = Run(card, out, 0.03)
-    run.wait_for(out / ".chunks", 4)
-    os.kill(run.worker(), signal.SIGKILL)
+    run.wait_for_worker()
+    stop(run, signal.SIGTERM, 143)
+
+    run = Run(card, out, 0.0)
     errors = run.finish()
     assert run.process.returncode == 0, errors
     assert contents(out) == contents(undisturbed)
+
+
+def stop(run: Run, how: signal.Signals, code: int) -> None:
+    """It ends at once, says how to go on, and leaves no process."""
+    start = time.monotonic()
+    run.process.send_signal(how)
+    errors = run.finish()
+    assert time.monotonic() - start < STOP_S
+    assert run.process.returncode == code
+    assert "interrupted; the same command resumes" in errors and "Traceback" not in errors
+    assert not run.processes()
