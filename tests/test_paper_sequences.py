@@ -12,7 +12,9 @@ import pytest
 from rsbench.benchmark.images.evaluation import open_evaluation, read_scores
 from rsbench.benchmark.images.plan import EvaluationOptions
 from rsbench.cards import load_card
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.projection import row_poses
+from rsbench.core.se3 import Pose
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.verification import verify_dataset
@@ -68,19 +70,27 @@ def test_correction_loses_little_to_true_motion_and_gains_much_over_none(
     assert np.all(estimated.psnr.to_numpy() > uncorrected.psnr.to_numpy() + 6.0)
 
 
-@pytest.mark.parametrize("scene_name", ["castle", "room"])
-@pytest.mark.parametrize("integrator", ["sunsky", "path"])
-def test_single_pass_equals_stitched_on_the_paper_frame(scene_name: str, integrator: str) -> None:
+Shot = tuple[MitsubaScene, PinholeCamera, Pose]
+
+
+@pytest.fixture(scope="module", params=["castle", "room"])
+def shot(request: pytest.FixtureRequest) -> Shot:
+    """A scene and the rows of its second right frame; of module scope, so that one scene goes before the next."""
     card = load_dataset_card("paper")
-    (sequence,) = card.only([scene_name]).sequence
+    (sequence,) = card.only([str(request.param)]).sequence
     scene = load_scene(sequence.scene)
-    mitsuba_scene = MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint]))
     rig = card.rig_of(sequence)
     poses = row_poses(rig, card.shutter(), card.motion_of(sequence), "right", 1)
+    return MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint])), rig.camera, poses
+
+
+@pytest.mark.parametrize("integrator", ["sunsky", "path"])
+def test_single_pass_equals_stitched_on_the_paper_frame(shot: Shot, integrator: str) -> None:
+    scene, camera, poses = shot
     preset = "default" if integrator == "sunsky" else "path"
     options = replace(load_card(RendererOptions, "renderers", preset), samples=4 if integrator == "path" else 16)
     rows = np.linspace(0, 899, 20).astype(int).tolist()
-    geometry = mitsuba_scene, rig.camera, poses.R, poses.t
+    geometry = scene, camera, poses.R, poses.t
     whole = render(*geometry, replace(options, method="single-pass"))
     stitched = render(*geometry, replace(options, method="stitched"), rows=rows)
     np.testing.assert_array_equal(whole.image[rows], stitched.image)

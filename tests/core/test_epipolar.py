@@ -237,8 +237,57 @@ def test_in_front_needs_both_depths_positive(depth: float) -> None:
     assert epipolar.in_front(pose, x0, x1) == (depth > 0)
 
 
+@pytest.mark.parametrize("depth", [3.0, -2.0])
+def test_in_front_needs_both_depths_positive_when_they_differ(depth: float) -> None:
+    """Five metres along the axis: a point 3 m ahead of one camera is 2 m behind the other, either way round."""
+    pose = Pose(np.eye(3), np.array([0.0, 0.0, -np.copysign(5.0, depth)]))
+    point = np.array([0.1, 0.2, depth])
+    moved = transform(pose, point)
+    x0, x1 = point / point[2], moved / moved[2]
+    np.testing.assert_allclose(epipolar.ray_depths(pose, x0, x1), [depth, moved[2]], rtol=1e-12)
+    assert depth * moved[2] < 0.0
+    assert not epipolar.in_front(pose, x0, x1)
+
+
 def test_parallel_rays_have_no_depth_and_are_not_in_front() -> None:
     pose = Pose(np.eye(3), np.array([1.0, 0.0, 0.0]))
     ray = np.array([0.1, 0.2, 1.0])
     assert np.all(np.isnan(epipolar.ray_depths(pose, ray, ray)))
     assert not epipolar.in_front(pose, ray, ray)
+
+
+def _stereo_matches(motion: Motion, X: FloatArray) -> tuple[list[FloatArray], np.ndarray]:
+    """Matches (n, 3) x, y, disparity halfway between the cameras, of both frames, and which points have both."""
+    out, ok = [], np.ones(len(X), dtype=bool)
+    for frame in (0, 1):
+        left, right = (rs_project(RIG, SHUTTER, motion, side, frame, X) for side in SIDES)
+        ok &= (left.status == ProjectionStatus.SEEN) & (right.status == ProjectionStatus.SEEN)
+        np.testing.assert_allclose(left.pixels[ok, 1], right.pixels[ok, 1], rtol=0, atol=1e-8)
+        middle, disparity = (left.pixels + right.pixels) / 2, left.pixels[:, 0] - right.pixels[:, 0]
+        out.append(np.column_stack([middle, disparity]))
+    return out, ok
+
+
+@pytest.mark.parametrize("motion", MOTIONS, ids=lambda motion: motion.name)
+def test_stereo_transfer_of_exact_matches_is_zero_and_of_shifted_ones_the_shift(motion: Motion) -> None:
+    X = np.random.default_rng(6).uniform([-2, -2, 5], [2, 2, 15], size=(120, 3))
+    (first, second), ok = _stereo_matches(motion, X)
+    first, second = first[ok], second[ok]
+    assert len(first) > 40
+    # The row equation is solved to 1e-9 px.
+    exact = epipolar.rs_stereo_transfer(RIG, SHUTTER, motion, first, second)
+    np.testing.assert_allclose(exact, 0.0, rtol=0, atol=1e-8)
+    # x and disparity of frame 1 are compared only; its y is compared and dates the match.
+    shift = np.array([0.3, 0.0, -0.2])
+    shifted = epipolar.rs_stereo_transfer(RIG, SHUTTER, motion, first, second + shift)
+    np.testing.assert_allclose(shifted, np.broadcast_to(shift, shifted.shape), rtol=0, atol=1e-8)
+
+
+def test_stereo_transfer_at_infinity_turns_only() -> None:
+    motion = MOTIONS[0]
+    match = np.array([[300.0, 200.0, 0.0]])
+    other = epipolar.rs_stereo_transfer(RIG, SHUTTER, motion, match, np.array([[0.0, 250.0, 0.0]]))
+    tau = 0.8 * 200 / 800, 1 + 0.8 * 250 / 800
+    ray = so3.exp((tau[1] - tau[0]) * motion.w) @ [(300 - 440.0) / 1384.6, (200 - 405.0) / 1300.0, 1.0]
+    seen = [1384.6 * ray[0] / ray[2] + 440.0, 1300.0 * ray[1] / ray[2] + 405.0, 0.0]
+    np.testing.assert_allclose(other, [np.array([0.0, 250.0, 0.0]) - seen], rtol=0, atol=1e-9)

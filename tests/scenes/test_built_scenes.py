@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -22,12 +21,16 @@ from rsbench.scenes.surfaces import Surface
 BUILT_IN = ("castle", "old-town", "room")
 FOCAL, SIZE = 1384.6, 900  # the paper's camera, 36 degrees
 
-scene_named = cache(load_scene)
+
+@pytest.fixture(scope="module", params=BUILT_IN)
+def name(request: pytest.FixtureRequest) -> str:
+    """Of module scope, so that pytest runs all tests of one scene, and drops it, before the next."""
+    return str(request.param)
 
 
-@pytest.fixture(params=BUILT_IN)
-def scene(request: pytest.FixtureRequest) -> Scene:
-    return scene_named(str(request.param))
+@pytest.fixture(scope="module")
+def scene(name: str) -> Scene:
+    return load_scene(name)
 
 
 def test_every_card_parses_and_every_builder_has_one() -> None:
@@ -112,14 +115,13 @@ def test_viewpoints_are_several_and_leave_room_for_the_rig(scene: Scene) -> None
         assert first_hits(scene, view, pixel_rays(3)).min() > 1.0, view
 
 
-@pytest.mark.parametrize(
-    ("name", "nearest", "middle", "farthest"),
-    [("castle", 4.0, (8, 27), 70.0), ("old-town", 4.0, (8, 25), 70.0), ("room", 1.2, (2.5, 5.5), 6.5)],
-)
-def test_default_views_have_depths_a_stereo_rig_can_use(
-    name: str, nearest: float, middle: tuple[float, float], farthest: float
-) -> None:
-    depths = first_hits(scene_named(name), "default", pixel_rays(9))
+DEPTHS = {"castle": (4.0, (8, 27), 70.0), "old-town": (4.0, (8, 25), 70.0), "room": (1.2, (2.5, 5.5), 6.5)}
+"""Of the default view, metres: the nearest, the range of the median, the farthest."""
+
+
+def test_default_views_have_depths_a_stereo_rig_can_use(scene: Scene, name: str) -> None:
+    nearest, middle, farthest = DEPTHS[name]
+    depths = first_hits(scene, "default", pixel_rays(9))
     seen = depths[np.isfinite(depths)]
     assert len(seen) / depths.size > 0.85  # little sky
     assert seen.min() > nearest and seen.max() < farthest
@@ -141,16 +143,15 @@ def unpainted(names: Iterable[str], seed: int) -> dict[str, Surface]:
     return {n: Surface(Material(name=n), None if size is None else (size, size)) for n, size in sizes.items()}
 
 
-@pytest.mark.parametrize("name", BUILT_IN)
-def test_the_seed_decides_the_arrays(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_seed_decides_the_arrays(scene: Scene, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     module, build = BUILD[name]
     monkeypatch.setattr(module, "paint_palette", unpainted)
     card, _ = read_scene_card(card_path("scenes", name))
-    for mesh, again in zip(scene_named(name).meshes, build(card.seed), strict=True):
+    for mesh, again in zip(scene.meshes, build(card.seed), strict=True):
         assert mesh.uv is not None and again.uv is not None
         assert np.array_equal(mesh.vertices, again.vertices)
         assert np.array_equal(mesh.uv, again.uv)
-    before = {mesh.name: mesh.vertices for mesh in scene_named(name).meshes}
+    before = {mesh.name: mesh.vertices for mesh in scene.meshes}
     after = {mesh.name: mesh.vertices for mesh in build(card.seed + 1)}
     assert any(not np.array_equal(before[key], after[key]) for key in before.keys() & after.keys())
 
@@ -164,7 +165,7 @@ def write(folder: Path, name: str, old: str, new: str) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "old", "new", "message"),
+    ("card", "old", "new", "message"),
     [
         (
             "castle",
@@ -204,8 +205,8 @@ def write(folder: Path, name: str, old: str, new: str) -> Path:
         ),
     ],
 )
-def test_bad_cards_are_refused_in_one_line(tmp_path: Path, name: str, old: str, new: str, message: str) -> None:
-    path = write(tmp_path, name, old, new)
+def test_bad_cards_are_refused_in_one_line(tmp_path: Path, card: str, old: str, new: str, message: str) -> None:
+    path = write(tmp_path, card, old, new)
     with pytest.raises(RsbenchError) as caught:
         load_scene(path)
     assert message in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)

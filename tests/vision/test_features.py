@@ -123,10 +123,20 @@ def test_loops_close_or_open_or_contradict() -> None:
 
 
 def test_search_radius_bounds_temporal_matches(images: Four) -> None:
-    found = match_stereo_frames(*images, MatchOptions(search_radius=6.0, max_disparity=30.0))
-    for matches in (found.left, found.right):
-        assert np.abs(matches[:, 2:] - matches[:, :2]).max(initial=0.0) <= 6.0
-    assert np.max(found.stereo_0[:, 0] - found.stereo_0[:, 2], initial=0.0) <= 30.0
+    """Points move by 11 to 20 px and have disparities of 17 to 46 px: the bounds keep some and cut some off."""
+    found = match_stereo_frames(*images, MatchOptions(search_radius=14.0, max_disparity=20.0))
+    free = match_stereo_frames(*images)
+
+    def shifts(matches: np.ndarray) -> np.ndarray:
+        return np.abs(matches[:, 2:] - matches[:, :2])
+
+    for name in ("left", "right"):
+        bounded, unbounded = shifts(getattr(found, name)), shifts(getattr(free, name))
+        assert len(bounded) > 100
+        assert bounded.max() <= 14.0 < unbounded.max()
+    bounded, unbounded = shifts(found.stereo_0)[:, 0], shifts(free.stereo_0)[:, 0]
+    assert len(bounded) > 100
+    assert bounded.max() <= 20.0 < unbounded.max()
 
 
 def test_the_same_images_give_the_same_matches(images: Four) -> None:
