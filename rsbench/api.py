@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rsbench import arguments
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.projection import RSProjection, rs_project
-from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig, View
+from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 
 if TYPE_CHECKING:
@@ -52,7 +53,10 @@ def project(
         ``pixels`` (..., 2), ``depth`` (...) z in the camera of that row, ``tau`` (...) its time, ``status`` (...):
         0 seen, 1 never seen, 2 seen twice (the first is given), 3 not converged. NaN where nothing was seen.
     """
-    return rs_project(rig, shutter, motion, side, frame, points)
+    arguments.check_one_of("side", side, SIDES)
+    arguments.check_one_of("frame", frame, FRAMES)
+    arguments.check_rows(rig, shutter)
+    return rs_project(rig, shutter, motion, side, frame, arguments.world_points(points))
 
 
 def simulate(
@@ -84,7 +88,7 @@ def simulate(
         ``correspondences``, and ``outliers`` with a mask for each of ``left``, ``right`` and ``tracks``.
 
     Raises:
-        ValueError: the motion leaves too few points in view.
+        ValueError: an argument out of its range, or a motion that leaves too few points in view.
     """
     from rsbench.benchmark.simulated.simulation import SimulationOptions
     from rsbench.benchmark.simulated.simulation import simulate as simulate_points
@@ -92,6 +96,8 @@ def simulate(
     options = SimulationOptions(
         pairs=pairs, tracks=tracks, noise_px=noise_px, outlier_ratio=outlier_ratio, depth=depth, shape=shape
     )
+    arguments.check_rows(rig, shutter)
+    arguments.check_whole("seed", seed, 0)
     return simulate_points(rig, shutter, motion, options, np.random.default_rng(seed))
 
 
@@ -120,18 +126,19 @@ def estimate_motion(
 
     Raises:
         RsbenchError: no such solver.
+        ValueError: an argument of another type or out of its range.
     """
     from rsbench.pipeline.robust_motion import RobustOptions
     from rsbench.pipeline.robust_motion import estimate_motion as estimate_robustly
-    from rsbench.solvers.engine.registry import load_solver_entry
 
+    if not isinstance(correspondences, Correspondences):
+        raise ValueError(f"correspondences: must be rsbench.Correspondences, got {type(correspondences).__name__}")
+    arguments.check_rows(rig, shutter)
+    arguments.check_whole("seed", seed, 0)
     options = RobustOptions()
     if threshold_px is not None:
         options = RobustOptions(threshold_px=threshold_px, adapt_threshold=False)
-    rng = np.random.default_rng(seed)
-    if not isinstance(solver, str | Path):
-        return estimate_robustly(correspondences, rig, shutter, solver, options, rng)
-    entry = load_solver_entry(solver)
+    entry, rng = _entry(solver), np.random.default_rng(seed)
     return estimate_robustly(correspondences, rig, shutter, entry.solver, options, rng, entry.options.robust)
 
 
@@ -159,8 +166,11 @@ def pose_errors(
         ValueError: no such reference point.
     """
     from rsbench.benchmark import scoring
+    from rsbench.pipeline.robust_motion import RobustEstimate
     from rsbench.solvers.engine.base import MotionEstimate
 
+    if not isinstance(found, RobustEstimate | MotionEstimate):
+        raise ValueError(f"found: must be what estimate_motion returned or a MotionEstimate, got {type(found)}")
     estimate = found if isinstance(found, MotionEstimate) else found.estimate
     point = "body" if isinstance(found, MotionEstimate) else found.reference_point
     errors = scoring.pose_errors(
@@ -184,14 +194,14 @@ def match(images: Series[Image], *, features: str | Path = "sift") -> Correspond
         features: name or card of the feature matcher.
 
     Raises:
-        ValueError: not four images.
-        RsbenchError: images of several sizes or types, or no such feature matcher.
+        ValueError: not four images that are alike, uint8 or uint16.
+        RsbenchError: no such feature matcher.
     """
     from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.frame_motion import find_matches
     from rsbench.vision.feature_matcher import load_features
 
-    return find_matches(_views(images), CorrectionOptions(features=load_features(features)))
+    return find_matches(arguments.four_images(images), CorrectionOptions(features=load_features(features)))
 
 
 def stereo_depth(
@@ -207,6 +217,8 @@ def stereo_depth(
     """
     from rsbench.vision.stereo_matcher import find_disparities, load_matcher
 
+    arguments.check_one_of("side", side, SIDES)
+    left, right = arguments.check_image("left", left, rig), arguments.check_image("right", right, rig)
     disparity = find_disparities(load_matcher(matcher), left, right, rig)[SIDES.index(side)]
     return np.nan_to_num(rig.depth(disparity), nan=0.0).astype(np.float32)
 
@@ -242,6 +254,7 @@ def correct(
         ``frames["left", 0]`` and so on, each with ``image``, ``depth`` and ``origin``; ``motion``, ``shutter``.
 
     Raises:
+        ValueError: images of another type or size than the rig's cameras, a ratio or row out of its range.
         RsbenchError: frames that cannot be what they are said to be, or no such component. As its subclass
             NoMotionError: the matches determine no motion or readout ratio, or the solver no metres.
     """
@@ -260,7 +273,11 @@ def correct(
         inpaint=inpaint,
         seed=seed,
     )
-    return correct_four(_views(images), rig, readout_ratio, options)
+    views = arguments.four_images(images, rig)
+    if readout_ratio is not None:
+        arguments.check_number("readout_ratio", readout_ratio, 0.0, 1.0)
+    arguments.check_number("target_row", target_row, 0.0, rig.camera.height - 1.0)
+    return correct_four(views, rig, readout_ratio, options)
 
 
 def read_dataset(folder: AnyPath) -> list[Sequence]:
@@ -289,9 +306,10 @@ def generate(card: str, out: AnyPath, *, sequences: Series[str] | None = None, w
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import generate_dataset
 
+    arguments.check_whole("workers", workers, 1)
     dataset = load_dataset_card(card)
     if sequences is not None:
-        dataset = dataset.only(list(sequences))
+        dataset = dataset.only([sequences] if isinstance(sequences, str) else list(sequences))
     generate_dataset(dataset, Path(out), workers=workers)
     return read_dataset(out)
 
@@ -311,6 +329,7 @@ def verify(folder: AnyPath, *, stride: int = 1) -> list[SequenceReport]:
     """
     from rsbench.dataset.verification import verify_dataset
 
+    arguments.check_whole("stride", stride, 1)
     return verify_dataset(Path(folder), stride)
 
 
@@ -351,7 +370,7 @@ def evaluate(
     from rsbench.benchmark.images.score import TABLES
 
     options = EvaluationOptions(
-        solvers=tuple(solvers),
+        solvers=(solvers,) if isinstance(solvers, str) else tuple(solvers),
         correction_solver=correct_with,
         features=features,
         matcher=matcher,
@@ -364,17 +383,11 @@ def evaluate(
 
 
 def _entry(solver: str | Path | Solver) -> SolverEntry:
+    from rsbench.solvers.engine.base import Solver
     from rsbench.solvers.engine.registry import load_solver_entry, wrap_solver
 
-    return load_solver_entry(solver) if isinstance(solver, str | Path) else wrap_solver(solver)
-
-
-def _views(images: Series[Image]) -> dict[View, Image]:
-    """The four images by side and frame, all of one size and type."""
-    from rsbench.pipeline.footage import check_alike
-
-    if len(images) != 4:
-        raise ValueError(f"images: got {len(images)}; four are needed: left 0, right 0, left 1, right 1")
-    views = dict(zip(((side, frame) for frame in FRAMES for side in SIDES), images, strict=True))
-    check_alike({f"{side} {frame}": image for (side, frame), image in views.items()})
-    return views
+    if isinstance(solver, str | Path):
+        return load_solver_entry(solver)
+    if not isinstance(solver, Solver):
+        raise ValueError(f"solver: must be a name, the path of a card or an rsbench.Solver, got {solver!r}")
+    return wrap_solver(solver)

@@ -7,6 +7,7 @@ import inspect
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import assert_type
 
@@ -210,12 +211,44 @@ def test_frames_without_a_motion_raise_what_a_notebook_can_catch() -> None:
     assert issubclass(NoMotionError, rsbench.RsbenchError)
 
 
-@pytest.mark.parametrize("count", [3, 5])
-def test_other_than_four_images_are_refused(count: int) -> None:
-    images = [np.zeros((64, 64), np.uint8)] * count
-    for call in (rsbench.match, lambda four: rsbench.correct(four, RIG)):
-        with pytest.raises(ValueError, match=f"got {count}; four are needed"):
-            call(images)
+FLAT = np.zeros((900, 900), np.uint8)
+EMPTY = rsbench.Correspondences()
+FEW_ROWS = rsbench.RollingShutter(height=9, readout_ratio=0.8)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: rsbench.project(np.zeros((4, 2)), RIG, SHUTTER, MOTION), "points: must have shape"),
+        (lambda: rsbench.project([1, 2, 3], RIG, SHUTTER, MOTION, "middle"), "side = 'middle': must be"),  # type: ignore[arg-type]
+        (lambda: rsbench.project([1, 2, 3], RIG, SHUTTER, MOTION, "left", 2), "frame = 2: must be one of 0, 1"),
+        (lambda: rsbench.simulate(RIG, FEW_ROWS, MOTION), "shutter.height = 9: must be .* 900 rows"),
+        (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, noise_px=-1), "noise_px = -1: must be a number at"),
+        (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, pairs=-1), "pairs = -1: must be a whole number"),
+        (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, outlier_ratio=2), "outlier_ratio = 2: must be"),
+        (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, depth=(9, 2)), r"depth = \(9, 2\): must be two positive"),
+        (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, shape="ball"), "shape = 'ball': must be one of 'box'"),  # type: ignore[arg-type]
+        (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, seed=-1), "seed = -1"),
+        (lambda: rsbench.estimate_motion(np.zeros((9, 4)), RIG, SHUTTER), "correspondences: must be rsbench.C"),  # type: ignore[arg-type]
+        (lambda: rsbench.estimate_motion(EMPTY, RIG, SHUTTER, 3), "solver: must be a name, the path of a card"),  # type: ignore[arg-type]
+        (lambda: rsbench.pose_errors({}, MOTION, RIG), "found: must be what estimate_motion returned"),  # type: ignore[arg-type]
+        (lambda: rsbench.match([FLAT] * 3), "got 3; four are needed"),
+        (lambda: rsbench.match([FLAT.astype(float)] * 4), "image left 0: must be .* got float64"),
+        (lambda: rsbench.match([FLAT, FLAT, FLAT, FLAT[:9]]), "image right 1: is .* but image left 0"),
+        (lambda: rsbench.match([FLAT[..., None]] * 4), r"image left 0: must have shape \(H, W\) or"),
+        (lambda: rsbench.stereo_depth(FLAT[:9], FLAT[:9], RIG), "left: is 900 x 9 pixels, the rig"),
+        (lambda: rsbench.correct([FLAT[:9]] * 4, RIG), "image left 0: is 900 x 9 pixels"),
+        (lambda: rsbench.correct([FLAT] * 5, RIG), "got 5; four are needed"),
+        (lambda: rsbench.correct([FLAT] * 4, RIG, 1.5), "readout_ratio = 1.5: must be a number from 0 to 1"),
+        (lambda: rsbench.correct([FLAT] * 4, RIG, target_row=900), "target_row = 900: must be .* to 899"),
+        (lambda: rsbench.generate("smoke", "unused", workers=0), "workers = 0: must be a whole"),
+        (lambda: rsbench.verify("unused", stride=0), "stride = 0: must be a whole number of at least 1"),
+    ],
+)  # fmt: skip
+def test_wrong_arguments_are_named_in_one_line(call: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        call()
+    assert "\n" not in str(caught.value)
 
 
 # The document

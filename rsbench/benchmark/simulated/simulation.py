@@ -6,10 +6,11 @@ Row times come from the true rows, solved for exactly; a solver only ever sees t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
+from rsbench.arguments import check_number, check_one_of, check_whole
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.projection import ROW_TOLERANCE_PX, ProjectionStatus, back_project, project_at, rs_project
@@ -39,6 +40,17 @@ class SimulationOptions:
     """Range of depths in frame 0, metres, uniform."""
     shape: SceneShape = "box"
     """Points at random depths, or on one slanted plane in the middle of the range."""
+
+    def __post_init__(self) -> None:
+        check_whole("pairs", self.pairs, 0)
+        check_whole("tracks", self.tracks, 0)
+        check_number("noise_px", self.noise_px, 0.0)
+        check_number("outlier_ratio", self.outlier_ratio, 0.0, 1.0)
+        check_number("outlier_px", self.outlier_px, 0.0)
+        check_one_of("shape", self.shape, get_args(SceneShape))
+        near, far = self.depth
+        if not 0.0 < near <= far < np.inf:
+            raise ValueError(f"depth = {self.depth}: must be two positive distances in metres, the nearer first")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

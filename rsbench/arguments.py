@@ -1,0 +1,83 @@
+"""Checks of what people hand to the public functions: one line with the argument, its value and what may be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rsbench.core.rig import FRAMES, SIDES, StereoRig, View
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+
+_IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16))
+
+
+def check_one_of(name: str, value: object, allowed: Collection[object]) -> None:
+    """Raises ValueError unless ``value`` is one of ``allowed``."""
+    if value not in allowed:
+        raise ValueError(f"{name} = {value!r}: must be one of {', '.join(map(repr, allowed))}")
+
+
+def check_number(name: str, value: float, least: float, most: float = math.inf) -> None:
+    """Raises ValueError unless ``value`` is a finite number from ``least`` to ``most``."""
+    if not (math.isfinite(value) and least <= value <= most):
+        allowed = f"at least {least:g}" if math.isinf(most) else f"from {least:g} to {most:g}"
+        raise ValueError(f"{name} = {value!r}: must be a number {allowed}")
+
+
+def check_whole(name: str, value: object, least: int) -> None:
+    """Raises ValueError unless ``value`` is a whole number of at least ``least``."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name} = {value!r}: must be a whole number of at least {least}")
+
+
+def check_rows(rig: StereoRig, shutter: RollingShutter) -> None:
+    """Raises ValueError unless the shutter reads as many rows as the cameras have."""
+    if shutter.height != rig.camera.height:
+        raise ValueError(
+            f"shutter.height = {shutter.height}: must be that of the camera, {rig.camera.height} rows"
+        )
+
+
+def world_points(points: ArrayLike) -> FloatArray:
+    """Points (..., 3) as float64; raises ValueError on another shape."""
+    array = np.asarray(points, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != 3:
+        raise ValueError(f"points: must have shape (..., 3), got {array.shape}")
+    return array
+
+
+def four_images(images: Sequence[NDArray[Any]], rig: StereoRig | None = None) -> dict[View, NDArray[Any]]:
+    """Images left 0, right 0, left 1, right 1 by side and frame.
+
+    Raises:
+        ValueError: not four, not uint8 or uint16, not alike, or not of the size of the rig's cameras.
+    """
+    if len(images) != 4:
+        raise ValueError(f"images: got {len(images)}; four are needed: left 0, right 0, left 1, right 1")
+    views: dict[View, NDArray[Any]] = {}
+    for (side, frame), image in zip(((s, f) for f in FRAMES for s in SIDES), images, strict=True):
+        views[side, frame] = check_image(f"image {side} {frame}", image, rig)
+    first = views["left", 0]
+    for (side, frame), image in views.items():
+        if image.shape != first.shape or image.dtype != first.dtype:
+            what = f"{image.dtype} {image.shape}, but image left 0 is {first.dtype} {first.shape}"
+            raise ValueError(f"image {side} {frame}: is {what}; all must be alike")
+    return views
+
+
+def check_image(name: str, image: NDArray[Any], rig: StereoRig | None) -> NDArray[Any]:
+    """The image; raises ValueError unless it is (H, W) or (H, W, 3), uint8 or uint16, of the cameras' size."""
+    if not isinstance(image, np.ndarray) or image.dtype not in _IMAGE_TYPES:
+        kind = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
+        raise ValueError(f"{name}: must be an array of uint8 or uint16, got {kind}")
+    if image.ndim != 2 and not (image.ndim == 3 and image.shape[2] == 3):
+        raise ValueError(f"{name}: must have shape (H, W) or (H, W, 3), got {image.shape}")
+    if rig is not None and image.shape[:2] != (rig.camera.height, rig.camera.width):
+        size = f"{image.shape[1]} x {image.shape[0]}"
+        raise ValueError(f"{name}: is {size} pixels, the rig's cameras {rig.camera.width} x {rig.camera.height}")
+    return image
