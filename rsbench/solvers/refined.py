@@ -14,6 +14,8 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.identity import source_version
+from rsbench.motions import motion_model
 from rsbench.solvers.eight_point import decompose_essential, eight_point
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.five_point import five_point
@@ -70,6 +72,12 @@ class RefinedSolver(Solver):
         load_kernel(self.motion_model, self.motion_parameters)
         if not (self.use_tracks or self.use_pairs):
             raise ValueError("use_tracks and use_pairs cannot both be off")
+
+    @property
+    def inner_keys(self) -> tuple[str, ...]:
+        """Another package's motion model is a part whose source is not ours."""
+        model = motion_model(self.motion_model)
+        return () if model.__module__.partition(".")[0] == "rsbench" else (source_version(model),)
 
     @property
     def spec(self) -> SolverSpec:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -141,9 +142,13 @@ class KernelType(types.Type):  # type: ignore[misc]
         return self.cls
 
 
+_kernel_type = functools.cache(KernelType)
+"""Asked at every call of a compiled function: making the type anew would cost more than some of the calls."""
+
+
 @typeof_impl.register(MotionKernel)  # type: ignore[untyped-decorator]
 def _typeof(value: MotionKernel, context: object) -> KernelType:
-    return KernelType(type(value))
+    return _kernel_type(type(value))
 
 
 @register_model(KernelType)
