@@ -37,7 +37,7 @@ def rotate(w: Vector, a: float, R: FloatArray, A: FloatArray) -> None:
     fill_rotation(phi, a * (1.0 - c2 * s), a * c1, a * c2, A)
 
 
-@compiled
+@compiled(inline="always")  # else LLVM keeps the call, which costs a third of the residuals
 def linear_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
     """T = tau1 d - tau0 R d: the paper's (6) with R exact. NumPy: ``epipolar.row_pair_pose`` of LinearMotion."""
     w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
