@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
+from rsbench.benchmark.standard_metrics import Flip, Psnr, Ssim
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, VIEWS, View
 from rsbench.dataset.sequence import Sequence, read_dataset
@@ -42,8 +43,8 @@ Depth = NDArray[np.float32]
 Row = dict[str, Any]
 ROW_BANDS = 9
 """Bands of rows in which the flow error is reported; their distance from row 0 is the distance in time."""
-WORST = {"psnr": 0.0, "ssim": -1.0, "flip": 1.0}
-"""Scores of a failure."""
+WORST = {column.name: column.worst for metric in (Psnr, Ssim, Flip) for column in metric.columns}
+"""Scores of a failure, as in the score tables."""
 
 
 @dataclass(frozen=True, kw_only=True)
