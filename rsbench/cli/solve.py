@@ -66,9 +66,7 @@ def solve(
 ) -> None:
     """Estimate the motion of a stereo rig from your own matches."""
     if example:
-        from rsbench.pipeline.problem import EXAMPLE
-
-        typer.echo(EXAMPLE.read_text(encoding="utf-8"), nl=False)
+        _print_example()
         return
     if not problems:
         raise RsbenchError("PROBLEM: none given; give files, folders or -, or have a sample made by --example")
@@ -81,6 +79,12 @@ def solve(
         code = _tell(_answers(problems, entries, options, seed, wanted, limit), json)
     if code:
         raise typer.Exit(code)
+
+
+def _print_example() -> None:
+    from rsbench.pipeline.problem import EXAMPLE
+
+    typer.echo(EXAMPLE.read_text(encoding="utf-8"), nl=False)
 
 
 def _tell(found: Iterator[dict[str, Any] | RsbenchError], json: bool) -> int:
