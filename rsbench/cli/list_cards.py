@@ -42,7 +42,10 @@ def list_(
         typer.echo(json_module.dumps(rows))
         return
     columns = ("kind", "names") if kind is None else ("name", "origin", "description")
-    print_rows(kind or "kinds", columns, [[row[column] for column in columns] for row in rows])
+    texts = [[row[column] for column in columns] for row in rows]
+    print_rows(
+        kind or "kinds", columns, [[", ".join(x) if isinstance(x, list) else x for x in row] for row in texts]
+    )
     if kind is None:
         say("rsbench list KIND lists them; rsbench show NAME tells more")
     elif cards := [row["card"] for row in rows if row["card"]]:
@@ -53,7 +56,7 @@ def list_(
 def _kinds(kinds: list[str]) -> list[dict[str, Any]]:
     from rsbench.cli.kinds import names_of
 
-    return [{"kind": kind, "names": ", ".join(names_of(kind))} for kind in kinds]
+    return [{"kind": kind, "names": names_of(kind)} for kind in kinds]
 
 
 def entries(kind: str) -> list[dict[str, Any]]:
