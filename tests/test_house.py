@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import rsbench
+from rsbench.benchmark.simulated.contract import CHECKS, check_solver
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.cards import CardKind, list_cards, load_card, read_toml
 from rsbench.core.camera import PinholeCamera
@@ -241,6 +242,17 @@ def test_the_documented_solver_works(documented_solver: Path) -> None:
     # Exact data: what remains is SciPy's own stopping rule.
     assert rotation_error(estimate.w, motion.w) < 1e-7
     assert translation_error(estimate.d, motion.d) < 1e-6
+
+
+def test_the_documented_solver_keeps_the_contract(documented_solver: Path) -> None:
+    entry = load_solver_entry(documented_solver / "scipy-huber.toml")
+    findings = check_solver(entry, isolated=False)
+    assert [finding for finding in findings if finding.verdict in ("failed", "skipped")] == []
+
+
+def test_the_documented_checks_are_those_that_run() -> None:
+    text = (ROOT / "docs" / "add-a-solver.md").read_text("utf-8").partition("| check | fails when |")[2]
+    assert re.findall(r"^\| ([a-z ]+) \|", text, flags=re.MULTILINE) == list(CHECKS)
 
 
 def test_the_documented_entry_point_is_found(documented_solver: Path) -> None:
