@@ -199,7 +199,7 @@ def load_entry(kind: Kind[Component, Options], name_or_path: str | Path) -> Entr
     return Entry(
         name=text,
         path=None,
-        description=(inspect.getdoc(cls) or "").partition("\n")[0],
+        description=_first_paragraph(cls),
         component=component,
         options=kind.options(),
         key=component_key(component, {}),
@@ -221,13 +221,17 @@ def load_class(kind: Kind[Component, Any], name: str, card: Path | None = None) 
 
 
 def description_of(kind: Kind[Any, Any], offer: Offer) -> str:
-    """First line of the class of an offer without a card.
+    """What the class of an offer without a card says of itself first.
 
     Raises:
         RsbenchError: its name is that of another too, it cannot be loaded or is not of this kind.
     """
     _only_offer(kind, offer.name, "")
-    return (inspect.getdoc(_offered_class(kind, offer)[0]) or "").partition("\n")[0]
+    return _first_paragraph(_offered_class(kind, offer)[0])
+
+
+def _first_paragraph(cls: type) -> str:
+    return " ".join((inspect.getdoc(cls) or "").partition("\n\n")[0].split())
 
 
 def _only_offer(kind: Kind[Any, Any], name: str, advice: str, where: str = "") -> Offer:

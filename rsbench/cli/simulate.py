@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rsbench.cli.kinds import complete
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -24,11 +26,18 @@ Solvers of other packages run in processes of their own: what they do wrong is a
 
 
 def simulate(
-    sweep: Annotated[str, typer.Argument(help="Name of a sweep card (see: rsbench list sweeps) or path to one.")],
+    sweep: Annotated[
+        str,
+        typer.Argument(
+            help="Name of a sweep card (see: rsbench list sweeps) or path to one.",
+            autocompletion=complete("sweeps"),
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="Folder of the results; an interrupted run resumes there.")],
     trials: Annotated[int | None, typer.Option(min=1, help="Repetitions per value instead of the card's.")] = None,
     solver: Annotated[
-        list[str] | None, typer.Option(help="Solver card instead of the sweep's; repeatable.")
+        list[str] | None,
+        typer.Option(help="Solver card instead of the sweep's; repeatable.", autocompletion=complete("solvers")),
     ] = None,
     change: Annotated[
         list[str] | None, typer.Option("--set", help="FIELD=VALUE to replace in the card's setting; repeatable.")
@@ -90,7 +99,7 @@ def run_and_summarise(
 
 def show(card: SweepCard, table: pd.DataFrame) -> None:
     """The medians of each variant as a terminal table."""
-    from rsbench.cli.console import print_table
+    from rsbench.cli.console import print_table, say
 
     given = {"left pairs": "L", "left and right pairs": "L+R", "linked pairs": "L+R linked", "tracks": "tracks"}
     columns = {
@@ -108,15 +117,13 @@ def show(card: SweepCard, table: pd.DataFrame) -> None:
         title = f"{card.name}, {variant}: median errors in degrees, {card.trials} trials"
         print_table(title, rows[list(columns)].rename(columns=columns), digits)
         for row in rows[rows.failures > 0].to_dict("records"):
-            typer.echo(f"{row['solver']}, {card.axis} = {row['value']:g}, failed: {row['failure_reasons']}")
+            say(f"{row['solver']}, {card.axis} = {row['value']:g}, failed: {row['failure_reasons']}")
     rolling = table[table.shutter == "rolling"]  # the others know no time between the rows
     for (solver, assumed), rows in rolling.groupby(["solver", "assumed_motion"], sort=False):
         others = sorted(set(rows.motion_model) - {assumed})
         if others:
-            typer.echo(f"{solver} assumes {assumed} motion; the data are of {' and '.join(others)} motion")
-    typer.echo(
-        "given: matches over time of the left camera (L) or of both (L+R), or tracks through all four images"
-    )
+            say(f"{solver} assumes {assumed} motion; the data are of {' and '.join(others)} motion")
+    say("given: matches over time of the left camera (L) or of both (L+R), or tracks through all four images")
 
 
 def _changes(assignments: list[str]) -> dict[str, object]:

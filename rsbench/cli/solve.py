@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rsbench.cli.kinds import complete
 from rsbench.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -45,7 +46,8 @@ def solve(
     solver: Annotated[
         list[str] | None,
         typer.Option(
-            help="Name of a solver (rsbench list solvers) or path of a card; repeatable. Default: rs-stereo"
+            help="Name of a solver (rsbench list solvers) or path of a card; repeatable. Default: rs-stereo",
+            autocompletion=complete("solvers"),
         ),
     ] = None,
     threshold_px: Annotated[
