@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 
 from rsbench.cli.kinds import COMPONENTS, component_kind
 from rsbench.plugins import load_class, load_entry
@@ -104,23 +107,55 @@ def test_a_motion_model(run: Run) -> None:
     assert (table.e_R_median > 0.01).any() and table.e_R_median.notna().all()
 
 
-def test_a_stereo_matcher(run: Run, data: Path) -> None:
+def images_of(folder: Path) -> dict[tuple[str, int], np.ndarray]:
+    return {
+        (side, frame): np.asarray(Image.open(folder / f"{side}_{frame}.png"))
+        for side in ("left", "right")
+        for frame in (0, 1)
+    }
+
+
+def installed_class(installed: Path, module: str, name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.syspath_prepend(installed)
+    return getattr(importlib.import_module(module), name)
+
+
+def test_a_stereo_matcher(run: Run, data: Path, installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     work = all_lines(run, "A stereo matcher")
-    assert "blocks" in (work / "scored" / "provenance.json").read_text("utf-8")
+    found = np.load(work / "scored" / "predictions" / "street" / "depth" / "blocks.npz")["left_0"]
+    images = images_of(data / "street" / "rs")
+    matcher = installed_class(installed, "blocks", "Blocks", monkeypatch)()
+    disparity, _ = matcher.disparities(images["left", 0], images["right", 0], None)
+    np.testing.assert_array_equal(found, disparity)
+    assert np.mean(np.isfinite(disparity)) > 0.3
 
 
-def test_a_feature_matcher(run: Run, data: Path) -> None:
+def test_a_feature_matcher(run: Run, data: Path, installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     work = all_lines(run, "A feature matcher")
-    assert "orb" in (work / "scored" / "provenance.json").read_text("utf-8")
+    found = np.load(work / "scored" / "predictions" / "street" / "matches.npz")["tracks"]
+    matcher = installed_class(installed, "orb", "Orb", monkeypatch)()
+    np.testing.assert_array_equal(found, matcher.match(images_of(data / "street" / "rs")).tracks)
+    assert len(found) > 50
 
 
 def test_a_corrector(run: Run, data: Path) -> None:
     work = all_lines(run, "A corrector")
-    assert "as-it-is" in (work / "scored" / "provenance.json").read_text("utf-8")
+    drawn = list((work / "scored" / "predictions" / "street" / "corrected").glob("as-it-is*-left_0.png"))
+    assert len(drawn) == 1
+    np.testing.assert_array_equal(Image.open(drawn[0]), images_of(data / "street" / "rs")["left", 0])
 
 
 def test_a_metric(run: Run, data: Path) -> None:
     work = all_lines(run, "A metric")
-    tables = [pd.read_csv(path) for path in (work / "scored" / "scores").glob("*.csv")]
-    (table,) = [table for table in tables if "grey_error" in table]
-    assert table.grey_error.between(0.0, 255.0).all()
+    table = pd.read_csv(work / "scored" / "scores" / "correction.csv").fillna("")
+    of_all = table[(table.corrector == "as-it-is") & (table.side == "left") & (table.frame == 0)]
+    (value,) = of_all[of_all.pixels == "all"].grey_error
+    rolling, truth = (images_of(data / "street" / kind)["left", 0].astype(float) for kind in ("rs", "gs"))
+    assert value == pytest.approx(np.abs(rolling - truth).mean(), rel=1e-5)  # six digits are stored
+
+
+def test_the_solver_is_scored_with_the_others(run: Run, data: Path) -> None:
+    work = all_lines(run, "A metric")
+    table = pd.read_csv(work / "scored" / "scores" / "pose.csv").set_index("solver")
+    assert table.success["aligned"] and table.shutter["aligned"] == "global" and table.uses["aligned"] == "tracks"
+    assert 0.0 < table.e_R_deg["aligned"] < 5.0
