@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsbench.cli.kinds import complete
+from rsbench.cli.kinds import named
 
 if TYPE_CHECKING:
     from rsbench.core.shutter import RollingShutter
@@ -57,21 +57,10 @@ def correct(
     inpaint: Annotated[bool, typer.Option("--inpaint", help="Invent what nobody saw; it stays marked.")] = False,
     sky: Annotated[bool, typer.Option(help="Look for sky, which moves by rotation alone.")] = True,
     fill: Annotated[bool, typer.Option(help="Fill what a frame did not see from the other frames.")] = True,
-    solver: Annotated[
-        str,
-        typer.Option(help="Finds the motion, in metres: a name or a card.", autocompletion=complete("solvers")),
-    ] = _SOLVER,
-    matcher: Annotated[
-        str, typer.Option(help="Finds depth: a name or a card.", autocompletion=complete("matchers"))
-    ] = "sgm",
-    features: Annotated[
-        str,
-        typer.Option(help="Finds the motion's matches: a name or a card.", autocompletion=complete("features")),
-    ] = "sift",
-    corrector: Annotated[
-        str,
-        typer.Option(help="Makes the corrected frames: a name or a card.", autocompletion=complete("correctors")),
-    ] = "fusion",
+    solver: Annotated[str, named("solvers", "Finds the motion, in metres: a name or a card.")] = _SOLVER,
+    matcher: Annotated[str, named("matchers", "Finds depth: a name or a card.")] = "sgm",
+    features: Annotated[str, named("features", "Finds the motion's matches: a name or a card.")] = "sift",
+    corrector: Annotated[str, named("correctors", "Makes the corrected frames: a name or a card.")] = "fusion",
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
 ) -> None:
     """Correct your own rolling-shutter stereo frames: two times of a rig, or a whole sequence."""

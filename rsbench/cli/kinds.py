@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, get_args
 
+import typer
+
 COMPONENTS = {
     "solvers": "rsbench.solvers.engine.registry:SOLVERS",
     "builders": "rsbench.scenes.load:BUILDERS",
@@ -54,6 +56,11 @@ def complete(kind: str) -> Callable[[str], list[str]]:
         return [name for name in _quick_names(kind) if name.startswith(incomplete)]
 
     return names
+
+
+def named(kind: str, text: str) -> Any:
+    """An option that takes a name of one kind or the path of a card; ``text`` is its help."""
+    return typer.Option(help=text, autocompletion=complete(kind))
 
 
 def complete_kind(incomplete: str) -> list[str]:
