@@ -19,7 +19,6 @@ from rsbench.scenes.load import load_scene
 
 from .conftest import SECTIONS, Run
 
-pytestmark = pytest.mark.skipif("metrics" not in COMPONENTS, reason="metrics are on their way")
 KINDS = {
     "A scene builder": ("builders", "hoardings"),
     "A solver": ("solvers", "aligned"),
