@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsbench.cli.kinds import complete
+from rsbench.cli.kinds import named
 from rsbench.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -35,6 +35,9 @@ Exit codes: 0 all solved, 1 one without a motion, 2 one that is wrong; the other
 More: [bold]rsbench docs problem-format[/bold]"""
 
 
+_SOLVER = "Name of a solver (rsbench list solvers) or path of a card; repeatable. Default: rs-stereo"
+
+
 def solve(
     problems: Annotated[
         list[str] | None,
@@ -43,13 +46,7 @@ def solve(
             help="Files (.json; .jsonl, one problem per line; .npz), folders of such, or - for standard input.",
         ),
     ] = None,
-    solver: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Name of a solver (rsbench list solvers) or path of a card; repeatable. Default: rs-stereo",
-            autocompletion=complete("solvers"),
-        ),
-    ] = None,
+    solver: Annotated[list[str] | None, named("solvers", _SOLVER)] = None,
     threshold_px: Annotated[
         float | None, typer.Option(help="Largest Sampson error of an inlier, px. Default: follows the noise.")
     ] = None,
