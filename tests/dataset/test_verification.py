@@ -91,6 +91,22 @@ def test_row_zero_must_equal_the_global_shutter_twin(dataset: Path) -> None:
     assert any("row 0 differs" in fault for fault in verify(dataset).faults)
 
 
+@pytest.mark.parametrize(("size", "found"), [(20, True), (4, False)])
+def test_a_flaw_of_a_few_hundredths_of_the_picture_is_found(dataset: Path, size: int, found: bool) -> None:
+    """A square of the wall three tolerances too far, too little to be hidden: 5 % of the pixels, then 0.2 %.
+
+    Of the small one, two rows at each side are not flat, which leaves nothing to compare.
+    """
+    path = dataset / "planes/rs_depth/right_1.exr"
+    depth = read_depth(path)
+    depth[10 : 10 + size, 30 : 30 + size] *= np.float32(1 + 3e-4)
+    write_depth(path, depth)
+    _update_checksum(dataset, "planes/rs_depth/right_1.exr")
+    report = verify(dataset)
+    assert any("right_1" in fault and "agree to" in fault for fault in report.faults) == found
+    assert all(agreement.share > 0.9 for agreement in report.agreements)
+
+
 @pytest.mark.parametrize("damage", [b"", b"not an exr", None])
 def test_damaged_depth_file_is_one_clear_line(dataset: Path, damage: bytes | None) -> None:
     path = dataset / "planes/rs_depth/left_0.exr"
