@@ -22,8 +22,8 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.engine.linear_systems import null_vector, rotation_from_essential, scaled_translation
 from rsbench.solvers.engine.packed import Packed, pack, pack_tracks
-from rsbench.solvers.linear import null_vector, rotation_from_essential
 
 _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -56,7 +56,7 @@ def solve_reduced(pairs: FloatArray, unknowns: int, passes: int) -> tuple[FloatA
     first_E = 3 + (0 if unknowns == 9 else 2)
     w = d = np.zeros(3)
     for _ in range(passes):
-        X, reason = null_vector(np.concatenate([by_d + np.cross(w, shifted), rest], axis=1))
+        X, reason = null_vector(np.concatenate([by_d + np.cross(w, shifted), rest], axis=1), unit_columns=True)
         if X is None:
             return reason
         d = X[:3]
@@ -69,29 +69,6 @@ def solve_reduced(pairs: FloatArray, unknowns: int, passes: int) -> tuple[FloatA
         if not np.linalg.norm(w) < np.pi / 2:
             return "the passes ran away: no small rotation fits"
     return w, d / np.linalg.norm(d)
-
-
-def scaled_translation(pairs: FloatArray, w: FloatArray, limit: float) -> FloatArray | None:
-    """d (3,) in metres for a known rotation; None when the pairs do not hold its length.
-
-    For a given w the exact constraint of the paper's motion is linear in d: ``m . d + beta = 0``; the smallest
-    singular vector of [m, beta] gives d with its length.
-    """
-    n = len(pairs)
-    x, y = np.column_stack([pairs[:, :2], np.ones(n)]), np.column_stack([pairs[:, 2:4], np.ones(n)])
-    R = so3.exp((pairs[:, 5] - pairs[:, 4])[:, None] * w)
-    normal = np.cross((R @ x[:, :, None])[:, :, 0], y)
-    back = (np.swapaxes(R, 1, 2) @ normal[:, :, None])[:, :, 0]
-    m = pairs[:, 5:6] * normal - pairs[:, 4:5] * back
-    beta = pairs[:, 6] * (normal[:, 0] - back[:, 0])
-    norms = np.array([np.linalg.norm(m), np.linalg.norm(beta)])
-    if not np.all(norms > 0.0):
-        return None
-    _, _, Vt = np.linalg.svd(np.column_stack([m / norms[0], beta / norms[1]]), full_matrices=n < 4)
-    d, factor = Vt[-1, :3] / norms[0], Vt[-1, 3] / norms[1]
-    if not abs(factor) * limit > np.linalg.norm(d):
-        return None
-    return d / factor
 
 
 def length_from_tracks(tracks: FloatArray, packed: Packed, w: FloatArray, u: FloatArray) -> float | None:

@@ -5,7 +5,7 @@ Nine left and nine right matches over time (or more) give a linear system A X = 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, final
 
 import numpy as np
@@ -15,11 +15,13 @@ from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.packed import pack
-
-_ROUNDING = 1e-10
-"""Below this, relative to the largest, a column norm or singular value of A is rounding. Exact data of the
-slowest and flattest scenes stay above 1e-7; singular configurations below 1e-14."""
+from rsbench.solvers.engine.linear_systems import (
+    ROUNDING,
+    null_vector,
+    rotation_from_essential,
+    scaled_translation,
+)
+from rsbench.solvers.engine.packed import Packed, pack
 
 
 def system_rows(matches: FloatArray, side: Side, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
@@ -51,44 +53,28 @@ def system_rows(matches: FloatArray, side: Side, rig: StereoRig, shutter: Rollin
     return np.concatenate([by_d, by_w, by_E.reshape(-1, 9), by_ww], axis=1)
 
 
-def null_vector(A: FloatArray) -> tuple[FloatArray | None, str]:
-    """X (columns,) with A X = 0, by the SVD of A with unit columns; or None and what makes it ambiguous."""
-    columns = A.shape[1]
-    if len(A) < columns - 1:
-        return None, f"{len(A)} equations for {columns} unknowns"
-    norms = np.linalg.norm(A, axis=0)
-    if not np.min(norms) > _ROUNDING * np.max(norms):
-        return None, "an unknown has no influence on any match: the motion or the scene is degenerate"
-    _, s, Vt = np.linalg.svd(A / norms, full_matrices=len(A) < columns)
-    if not s[columns - 2] > _ROUNDING * s[0]:
-        return None, "the linear system has more than one solution: degenerate motion, scene or readout ratio"
-    return Vt[-1] / norms, ""
-
-
-def rotation_from_essential(E: FloatArray, d: FloatArray, symmetric: bool) -> FloatArray:
-    """w (3,) from E = [d]x[w]x = w d^T - (d.w) I, by least squares over all nine entries or the symmetric part."""
-    basis = np.eye(3)
-    columns = np.stack([np.outer(e, d) - d[k] * np.eye(3) for k, e in enumerate(basis)])
-    if symmetric:
-        columns, E = columns + np.swapaxes(columns, 1, 2), E + E.T
-    w, *_ = np.linalg.lstsq(columns.reshape(3, 9).T, E.reshape(9), rcond=None)
-    return w
-
-
 @final
 @dataclass(frozen=True, kw_only=True)
 class LinearSolver(Solver):
-    """The paper's solver as published.
+    """The paper's solver, read literally; each choice that the paper leaves open is a parameter.
 
-    The paper leaves open how w, d and the scale come out of X, and how the sign is chosen. Here w is the
-    least-squares solution of E = [d]x[w]x, the scale comes from the two entries of X that hold rotation
-    alone, and the sign of d from cheirality. Known defects, kept: rotation is truncated inconsistently
-    (w2w2 and w3w3 would be inseparable otherwise), antisymmetric E is nearly collinear with d, so noise of 0.1 px
-    hides the rotation; without readout (phi = 0) or with pure translation the system is singular.
+    Literal: X is the right singular vector of the smallest singular value of A as equations 7 to 10 make it, of
+    normalised rays and a baseline in metres. The paper does not say how w, d and the scale come out of X.
+    Known defects, kept: rotation is truncated inconsistently (w2w2 and w3w3 would be inseparable otherwise);
+    antisymmetric E is nearly collinear with d, so noise reaches the rotation; without readout (phi = 0) or with
+    pure translation the system is singular.
     """
 
+    scaling: Literal["none", "unit-columns"] = "none"
+    """Of the columns of A before the singular value decomposition."""
+    baseline_unit: Literal["metre", "half-baseline"] = "metre"
+    """Unit of length in A: metres, or the paper's b."""
     extraction: Literal["full", "symmetric"] = "full"
-    """Entries of E that give w: all nine, or the symmetric part, which noise reaches less."""
+    """Entries of E = [d]x[w]x that give w: all nine, or the symmetric part, which noise reaches less."""
+    scale: Literal["rotation", "constraint"] = "rotation"
+    """What gives the length of d: the two entries of X that hold w alone, or the exact constraint at this w."""
+    sign: Literal["cheirality", "scale"] = "cheirality"
+    """What gives the sign of d: the points in front of the cameras, or the sign of the scale."""
 
     spec = SolverSpec(
         needs=frozenset({"left", "right"}),
@@ -108,25 +94,38 @@ class LinearSolver(Solver):
         short = self.spec.shortage({side: len(matches[side]) for side in SIDES})
         if short is not None:
             return short
-        A = np.concatenate([system_rows(matches[side], side, rig, shutter) for side in SIDES])
-        X, reason = null_vector(A)
+        unit = 1.0 if self.baseline_unit == "metre" else 0.5 * rig.baseline
+        scaled = replace(rig, baseline=rig.baseline / unit)
+        A = np.concatenate([system_rows(matches[side], side, scaled, shutter) for side in SIDES])
+        X, reason = null_vector(A, unit_columns=self.scaling == "unit-columns")
         if X is None:
             return MotionEstimate.failed(reason)
-        return self._extract(X, correspondences, rig, shutter)
-
-    def _extract(
-        self, X: FloatArray, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
-    ) -> MotionEstimate:
-        """w, d and scale from X, which holds them times an unknown factor."""
-        if not np.linalg.norm(X[:3]) > _ROUNDING * np.linalg.norm(X):
+        if not np.linalg.norm(X[:3]) > ROUNDING * np.linalg.norm(X):
             return MotionEstimate.failed("no translation: its direction and the rotation are not separable")
         w = rotation_from_essential(X[5:14].reshape(3, 3), X[:3], self.extraction == "symmetric")
-        factor = float(X[3:5] @ w[1:]) / max(float(w[1:] @ w[1:]), 1e-300)
-        d = X[:3] / factor if factor != 0.0 else np.full(3, np.inf)
-        if not (np.all(np.isfinite(w)) and np.all(np.isfinite(d))):
+        packed = pack(correspondences, rig, shutter, use_tracks=False)
+        d = self._translation(X, w, unit, packed)
+        if d is None or not (np.all(np.isfinite(w)) and np.all(np.isfinite(d))):
             return MotionEstimate.failed(
                 "no rotation about y or z: the scale of the translation is not determined"
             )
-        packed = pack(correspondences, rig, shutter, use_tracks=False)
+        return MotionEstimate(w=w, d=self._signed(packed, w, d), success=True, metric=True)
+
+    def _translation(self, X: FloatArray, w: FloatArray, unit: float, packed: Packed) -> FloatArray | None:
+        """d (3,) in metres from X, which holds it times an unknown factor; None when that cannot be known."""
+        factor = float(X[3:5] @ w[1:]) / max(float(w[1:] @ w[1:]), 1e-300)
+        if factor == 0.0:
+            return None
+        d = unit * X[:3] / factor
+        if self.scale == "rotation":
+            return d
+        by_constraint = scaled_translation(packed.pairs, w, np.inf)
+        if by_constraint is None:
+            return None
+        return d * (float(np.linalg.norm(by_constraint)) / float(np.linalg.norm(d)))
+
+    def _signed(self, packed: Packed, w: FloatArray, d: FloatArray) -> FloatArray:
+        if self.sign == "scale":
+            return d
         front, back = (packed.in_front(packed.theta(w, sign * d)) for sign in (1.0, -1.0))
-        return MotionEstimate(w=w, d=d if front >= back else -d, success=True, metric=True)
+        return d if front >= back else -d

@@ -20,10 +20,11 @@ from rsbench.solvers.eight_point import decompose_essential, eight_point
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.five_point import five_point
 from rsbench.solvers.engine.kernel_type import load_kernel
+from rsbench.solvers.engine.linear_systems import scaled_translation
 from rsbench.solvers.engine.minimal import solve_triples
 from rsbench.solvers.engine.optimise import Minimum, levenberg_marquardt
 from rsbench.solvers.engine.packed import Packed, pack
-from rsbench.solvers.iterated import scaled_translation, solve_reduced
+from rsbench.solvers.iterated import solve_reduced
 
 _SCREEN_ITERATIONS, _SCREEN_MATCHES = 6, 150
 _LONGEST_START = 2.0
