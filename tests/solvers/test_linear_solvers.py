@@ -210,7 +210,7 @@ def test_the_literal_reading_takes_the_null_vector_of_a_as_it_is() -> None:
 
 
 def test_scaling_columns_costs_the_rotation_at_a_tenth_of_a_pixel() -> None:
-    """A reviewer measured, with 100 + 100 matches, 0.31 and 0.41 deg literally, 1.68 and 1.95 with unit columns."""
+    """A reviewer measured, with 100 + 100 matches, 0.31, 0.41 deg literally and 1.68, 1.95 with unit columns."""
     literal = median_errors(LinearSolver(), 100, 0.1)
     scaled = median_errors(LinearSolver(scaling="unit-columns"), 100, 0.1)
     assert 0.2 < literal[0] < 0.5 and 0.25 < literal[1] < 0.65

@@ -1,0 +1,124 @@
+"""Intervals that hold as often as they say: order statistics for few values, a bootstrap of clusters for many.
+
+With few values a percentile bootstrap of the median is too narrow: it never leaves the values drawn. The order
+statistics of independent values bracket the median of what they were drawn from with a probability that the
+binomial distribution gives exactly, whatever that distribution is. Values that share a scene are not independent;
+a bootstrap then draws whole scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import binom, binomtest
+
+from rsbench.benchmark.seeds import generator
+from rsbench.core.so3 import FloatArray
+
+COVERAGE = 0.95
+FEW = 30
+"""Below this many values the interval of a median is that of order statistics."""
+RESAMPLES = 10_000
+_CHUNK = 2_000_000
+"""Numbers drawn at a time."""
+Statistic = Callable[[FloatArray], FloatArray]
+"""Reduces the axis of values of resampled values (resamples, values, ...)."""
+
+
+class Interval(NamedTuple):
+    """Ends of an interval; infinite where the values bound nothing."""
+
+    low: float
+    high: float
+
+
+def median_interval(values: ArrayLike, coverage: float = COVERAGE) -> Interval:
+    """Exact interval of the median of the distribution of independent values (n,).
+
+    The ends are order statistics x[k], x[n + 1 - k] with the largest k that still holds with ``coverage``; with
+    fewer than six values no such k exists at 95 % and the interval is infinite. Nine values: x[2], x[8].
+    """
+    ordered = np.sort(np.asarray(values, dtype=np.float64))
+    n = len(ordered)
+    # P(x[k] <= median <= x[n+1-k]) = 1 - 2 P(Binomial(n, 1/2) <= k - 1)
+    k = 0
+    while k + 1 <= n // 2 and 1.0 - 2.0 * float(binom.cdf(k, n, 0.5)) >= coverage:
+        k += 1
+    if k == 0:
+        return Interval(-np.inf, np.inf)
+    return Interval(float(ordered[k - 1]), float(ordered[n - k]))
+
+
+def share_interval(successes: int, trials: int, coverage: float = COVERAGE) -> Interval:
+    """Exact (Clopper-Pearson) interval of a share: 300 of 300 is [0.988, 1], not [1, 1]."""
+    if trials == 0:
+        return Interval(0.0, 1.0)
+    found = binomtest(successes, trials).proportion_ci(coverage, method="exact")
+    return Interval(float(found.low), float(found.high))
+
+
+def bootstrap_interval(
+    values: FloatArray,
+    statistic: Statistic,
+    seed: int,
+    clusters: Sequence[Any] | NDArray[Any] | None = None,
+    resamples: int = RESAMPLES,
+) -> Interval:
+    """Percentile interval of a statistic of values (n, ...).
+
+    Args:
+        values: n values, each a number or an array.
+        statistic: see ``Statistic``.
+        seed: all calls with the same n, clusters and seed draw the same values, so that entries are compared on
+            common draws.
+        clusters: (n,) labels; whole clusters are drawn. Clusters of unequal size give samples of unequal size.
+        resamples: how many samples.
+    """
+    rng = generator(seed, "bootstrap", len(values))
+    if clusters is None:
+        drawn = _statistics(values, statistic, rng, resamples)
+    else:
+        drawn = _clustered(values, statistic, np.asarray(clusters), rng, resamples)
+    tail = 0.5 * (1.0 - COVERAGE)
+    low, high = np.quantile(drawn, [tail, 1.0 - tail])
+    return Interval(float(low), float(high))
+
+
+def _statistics(values: FloatArray, statistic: Statistic, rng: np.random.Generator, resamples: int) -> FloatArray:
+    n = len(values)
+    step = max(1, _CHUNK // max(values.size, 1))
+    parts = [
+        statistic(values[rng.integers(0, n, (min(step, resamples - first), n))])
+        for first in range(0, resamples, step)
+    ]
+    return np.concatenate(parts)
+
+
+def _clustered(
+    values: FloatArray, statistic: Statistic, clusters: NDArray[Any], rng: np.random.Generator, resamples: int
+) -> FloatArray:
+    _, labels = np.unique(clusters, return_inverse=True)
+    members = [np.flatnonzero(labels == label) for label in range(int(labels.max()) + 1)]
+    draws = rng.integers(0, len(members), (resamples, len(members)))
+    samples = [np.concatenate([members[k] for k in draw]) for draw in draws]
+    return np.array([float(statistic(values[sample][None])[0]) for sample in samples])
+
+
+def typical_interval(values: FloatArray, seed: int, clusters: Sequence[Any] | None = None) -> Interval:
+    """Interval of the median of values (n,): exact for few, a bootstrap of clusters for many."""
+    if len(values) < FEW:
+        return median_interval(values)
+    return bootstrap_interval(values, median, seed, clusters)
+
+
+def median(values: FloatArray) -> FloatArray:
+    """Over the last axis."""
+    return np.asarray(np.median(values, axis=-1))
+
+
+def mean(values: FloatArray) -> FloatArray:
+    """Over the last axis."""
+    return np.asarray(np.mean(values, axis=-1))

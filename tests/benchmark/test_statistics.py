@@ -1,0 +1,108 @@
+"""Intervals cover the truth as often as they say, on distributions whose median and mean are known."""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+from math import comb
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import beta
+
+from rsbench.benchmark.statistics import (
+    bootstrap_interval,
+    mean,
+    median,
+    median_interval,
+    share_interval,
+    typical_interval,
+)
+
+
+def test_nine_values_give_the_second_and_the_eighth() -> None:
+    assert median_interval(np.arange(1.0, 10.0)) == (2.0, 8.0)
+
+
+@pytest.mark.parametrize("n", range(1, 40))
+def test_ends_are_the_tightest_that_hold(n: int) -> None:
+    """Against the sum over all ways in which n coin tosses fall."""
+    low, high = median_interval(np.arange(1.0, n + 1.0))
+
+    def holds(k: int) -> float:
+        return 1.0 - 2.0 * sum(comb(n, j) for j in range(k)) / 2.0**n
+
+    if n < 6:
+        assert (low, high) == (-np.inf, np.inf) and holds(1) < 0.95
+        return
+    k = int(low)
+    assert high == n + 1 - k
+    assert holds(k) >= 0.95 > holds(k + 1)
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=60))
+def test_the_median_lies_in_its_interval(values: list[float]) -> None:
+    low, high = median_interval(values)
+    assert low <= np.median(values) <= high
+
+
+@pytest.mark.parametrize("n", [9, 20])
+def test_the_exact_interval_covers_where_the_bootstrap_does_not(n: int) -> None:
+    rng = np.random.default_rng(0)
+    draws = np.exp(rng.standard_normal((2000, n)))  # the median of a log-normal variable is 1
+    exact = np.mean([low <= 1.0 <= high for low, high in map(median_interval, draws)])
+    assert exact > 0.95 - 3.0 * np.sqrt(0.95 * 0.05 / 2000)
+
+
+def test_the_bootstrap_covers_for_many_values() -> None:
+    rng = np.random.default_rng(1)
+    draws = rng.exponential(size=(400, 200))
+    hits = {"median": 0, "mean": 0}
+    for values in draws:
+        for name, statistic, truth in (("median", median, np.log(2.0)), ("mean", mean, 1.0)):
+            low, high = bootstrap_interval(values, statistic, 0, resamples=1000)
+            hits[name] += int(low <= truth <= high)
+    for name, count in hits.items():
+        # Three standard deviations of 400 tosses, and percentile intervals of a skewed mean are a little short.
+        assert 0.91 < count / 400 < 0.985, name
+
+
+def test_clusters_widen_the_interval_to_what_they_hold() -> None:
+    """Thirty values of three scenes say as much about scenes as three values, not as thirty."""
+    rng = np.random.default_rng(2)
+    scenes = np.repeat(np.arange(12), 10)
+    covered = {"clusters": 0, "alone": 0}
+    for _ in range(200):
+        values = rng.standard_normal(12)[scenes] + 0.1 * rng.standard_normal(120)
+        for name, clusters in (("clusters", scenes), ("alone", None)):
+            low, high = bootstrap_interval(values, mean, 0, clusters, resamples=400)
+            covered[name] += int(low <= 0.0 <= high)
+    # Twelve clusters: the percentile interval of their mean is a little short (t against normal quantiles).
+    assert covered["clusters"] / 200 > 0.86
+    assert covered["alone"] / 200 < 0.6
+
+
+def test_drawing_clusters_of_one_is_drawing_values() -> None:
+    """Against the exact distribution: all 27 samples of three values, each equally likely."""
+    values = np.array([0.0, 1.0, 10.0])
+    low, high = bootstrap_interval(values, mean, 0, ["a", "b", "c"])
+    means = sorted({round(sum(c) / 3.0, 9) for c in combinations_with_replacement([0.0, 1.0, 10.0], 3)})
+    assert (round(low, 9), round(high, 9)) == (means[0], means[-1])  # each end has probability 1/27 > 2.5 %
+
+
+@given(trials=st.integers(1, 400), data=st.data())
+def test_shares_against_the_beta_distribution(trials: int, data: st.DataObject) -> None:
+    successes = data.draw(st.integers(0, trials))
+    low, high = share_interval(successes, trials)
+    assert low == pytest.approx(beta.ppf(0.025, successes, trials - successes + 1) if successes else 0.0, abs=1e-9)
+    assert high == pytest.approx(
+        beta.ppf(0.975, successes + 1, trials - successes) if successes < trials else 1.0, abs=1e-9
+    )
+
+
+def test_few_values_are_exact_and_many_drawn() -> None:
+    rng = np.random.default_rng(3)
+    few, many = rng.standard_normal(9), rng.standard_normal(100)
+    assert typical_interval(few, 0) == median_interval(few)
+    assert typical_interval(many, 0) == bootstrap_interval(many, median, 0)
