@@ -155,9 +155,42 @@ def _claims(out: Path, data: Path, workers: int | None) -> None:
     )
     write_table(folder / "claims.csv", verdicts)
     page = folder / "README.md"
-    write_bytes(page, claims_page(verdicts).encode())
+    best, settings = _readings(out, data, workers)
+    write_bytes(page, claims_page(verdicts, best, settings).encode())
     write_json(folder / "provenance.json", provenance(command, sweeps=[*SWEEPS, "points"]))
     typer.echo(f"claims: {page}")
+
+
+def _readings(out: Path, data: Path, workers: int | None) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Every claim in every reading of the paper's solver, and in settings that the paper does not state."""
+    from rsbench.benchmark.simulated.sweep_card import load_sweep
+    from rsbench.benchmark.studies import readings
+    from rsbench.cli.simulate import run_and_summarise
+    from rsbench.dataset.files import write_table
+    from rsbench.report.fig3 import SWEEPS
+
+    folder, home = out / "claims", data / "simulated" / "readings"
+    cards = readings.write_cards(home / "cards", readings.SOLVER_READINGS)
+    tables: dict[str, dict[str, pd.DataFrame]] = {}
+    for matches in (100, 9):
+        sweeps = tables.setdefault(f"{matches} + {matches}", {})
+        for name in SWEEPS:
+            card = readings.readings_card(load_sweep(name).with_setting(points=matches), cards)
+            sweeps[name] = run_and_summarise(card, home / f"{name}-{matches}", workers, "rsbench reproduce claims")
+    points = readings.readings_card(load_sweep("points"), cards)
+    more = {"points": run_and_summarise(points, home / "points", workers, "rsbench reproduce claims")}
+    judged = readings.judge_readings({**tables, "9 + 9 and more": more}, cards)
+    write_table(folder / "readings.csv", judged)
+    best = readings.best_readings(judged)
+    write_table(folder / "best-readings.csv", best)
+    chosen = {path: reading for path, reading in cards.items() if str(reading) in ("literal", "symmetric")}
+    grids = {}
+    for name in SWEEPS:
+        card = readings.settings_card(load_sweep(name), chosen)
+        grids[name] = run_and_summarise(card, home / f"{name}-settings", workers, "rsbench reproduce claims")
+    settings = readings.judge_settings(grids, chosen)
+    write_table(folder / "settings.csv", settings)
+    return best, readings.holding_settings(settings)
 
 
 def register(app: typer.Typer) -> None:

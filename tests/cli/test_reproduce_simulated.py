@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from rsbench.benchmark.simulated import run_sweep, sweep_card
+from rsbench.benchmark.studies import readings
 from rsbench.cli.reproduce import Target, reproduce
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.report.fig3 import SWEEPS
@@ -30,6 +31,10 @@ def test_claims_and_figure_come_from_the_stored_tables(tmp_path: Path, monkeypat
                 yield job.part
 
     monkeypatch.setattr(sweep_card, "load_sweep", short)
+    monkeypatch.setattr(readings, "SETTINGS", {"points": (9, 20), "baseline": (0.2, 0.6)})
+    monkeypatch.setattr(readings, "GRID_TRIALS", 2)
+    chosen = tuple(one for one in readings.SOLVER_READINGS if str(one) in ("literal", "symmetric"))
+    monkeypatch.setattr(readings, "SOLVER_READINGS", chosen)
     monkeypatch.setattr(run_sweep, "_run_all", run_here)  # starting processes would take most of the time
     out, data = tmp_path / "results", tmp_path / "data"
     reproduce(Target.claims, out, data, workers=2)
@@ -48,5 +53,9 @@ def test_claims_and_figure_come_from_the_stored_tables(tmp_path: Path, monkeypat
     assert "Rule: " in page and "nan" not in page
     stored = pd.read_csv(out / "claims" / "rotation-9.csv")
     assert set(stored.trials) == {3} and set(stored.value) == {0.25, 8.0}
+    judged = pd.read_csv(out / "claims" / "readings.csv")
+    assert set(judged.groupby(["claim", "matches", "noise", "statistic"]).size()) == {2}
+    grid = pd.read_csv(out / "claims" / "settings.csv")
+    assert set(grid[grid.claim == "baseline: no impact"].setting) == {"points 9", "points 20"}
     record = json.loads((out / "claims" / "provenance.json").read_text())
     assert record["command"] == "rsbench reproduce claims"
