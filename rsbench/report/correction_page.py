@@ -81,6 +81,8 @@ def _table(summary: pd.DataFrame) -> str:
 
 def _with_interval(row: pd.Series, name: str, digits: int) -> str:
     value, low, high = (round(float(row[key]), digits) + 0.0 for key in (name, f"{name}_low", f"{name}_high"))
+    if np.isinf(low):  # fewer than six sequences bound no median
+        return f"{value:.{digits}f}"
     return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"  # + 0.0: no minus sign before zero
 
 

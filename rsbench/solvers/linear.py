@@ -56,17 +56,19 @@ def system_rows(matches: FloatArray, side: Side, rig: StereoRig, shutter: Rollin
 @final
 @dataclass(frozen=True, kw_only=True)
 class LinearSolver(Solver):
-    """The paper's solver, read literally; each choice that the paper leaves open is a parameter.
+    """The paper's solver; each choice that the paper leaves open is a parameter.
 
-    Literal: X is the right singular vector of the smallest singular value of A as equations 7 to 10 make it, of
-    normalised rays and a baseline in metres. The paper does not say how w, d and the scale come out of X.
+    Read literally, X is the right singular vector of the smallest singular value of A as equations 7 to 10 make
+    it, of normalised rays and a baseline in metres: ``scaling = "none"``. The committed results were made with
+    unit columns, which is worse wherever matches have noise; the default stays until they are made again. The
+    paper does not say how w, d and the scale come out of X.
     Known defects, kept: rotation is truncated inconsistently (w2w2 and w3w3 would be inseparable otherwise);
     antisymmetric E is nearly collinear with d, so noise reaches the rotation; without readout (phi = 0) or with
     pure translation the system is singular.
     """
 
-    scaling: Literal["none", "unit-columns"] = "none"
-    """Of the columns of A before the singular value decomposition."""
+    scaling: Literal["none", "unit-columns"] = "unit-columns"
+    """Of the columns of A before the singular value decomposition; none is the literal reading."""
     baseline_unit: Literal["metre", "half-baseline"] = "metre"
     """Unit of length in A: metres, or the paper's b."""
     extraction: Literal["full", "symmetric"] = "full"

@@ -1,7 +1,7 @@
 """Statistics of the correction study: medians over sequences with clustered intervals, and paired differences.
 
 The four views of a sequence share scene, motion and matches, so they count as one: every number is first averaged
-over them, and the bootstrap draws whole sequences.
+over them. Sequences are few, so intervals are those of order statistics.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.simulated.sweep_summary import bootstrap_interval
+from rsbench.benchmark.statistics import typical_interval
 from rsbench.benchmark.studies.correction_study import METHODS
 from rsbench.core.so3 import FloatArray
 
@@ -27,10 +27,6 @@ SCORES = (
     "coverage",
     *EXTRA,
 )
-
-
-def _median(values: FloatArray) -> FloatArray:
-    return np.asarray(np.median(values, axis=-1))
 
 
 def numbers_table(numbers: dict[tuple[str, str], dict[str, Any]]) -> pd.DataFrame:
@@ -72,7 +68,7 @@ def _interval(name: str, values: FloatArray, seed: int) -> dict[str, float]:
     known = values[np.isfinite(values)]
     if len(known) == 0:
         return {name: np.nan, f"{name}_low": np.nan, f"{name}_high": np.nan}
-    low, high = bootstrap_interval(known, _median, seed)
+    low, high = typical_interval(known, seed)
     return {name: float(np.median(known)), f"{name}_low": low, f"{name}_high": high}
 
 

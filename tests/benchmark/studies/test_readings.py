@@ -25,16 +25,17 @@ from rsbench.benchmark.studies.readings import (
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
+from rsbench.report.readings_page import readings_page
 from rsbench.solvers.engine.registry import load_solver_entry
 from rsbench.solvers.linear import LinearSolver
 
 
-def test_the_first_reading_is_the_published_card_and_all_differ(tmp_path: Path) -> None:
+def test_the_first_reading_is_the_literal_one_and_all_differ(tmp_path: Path) -> None:
     cards = write_cards(tmp_path, SOLVER_READINGS)
     assert len(set(SOLVER_READINGS)) == len(cards) == 16
     assert str(SOLVER_READINGS[0]) == "literal"
     entries = [load_solver_entry(path) for path in cards]
-    assert entries[0].solver == load_solver_entry("rs-stereo-linear").solver
+    assert entries[0].solver == LinearSolver(scaling="none")
     assert len({entry.key for entry in entries}) == 16
     for entry, reading in zip(entries, cards.values(), strict=True):
         assert isinstance(entry.solver, LinearSolver)
@@ -89,6 +90,10 @@ def test_the_best_reading_is_found_and_the_literal_one_kept() -> None:
     (row,) = best_readings(table).to_dict("records")
     assert (row["literal"], row["best"], row["best_reading"]) == ("fails", "holds", "symmetric")
     assert (row["holding"], row["readings"], row["best_statistic"]) == (1, 3, "median")
+    settings = pd.DataFrame([{"claim": "c", "reading": "literal", "holding": 1, "settings": 4}])
+    page = readings_page(best_readings(table), settings)
+    assert "| c | 9 + 9 | 1e-3 px | fails | 1 of 3 | holds | symmetric (median) |" in page
+    assert "| c | 1 of 4 |" in page
 
 
 def test_settings_are_counted_per_reading() -> None:
