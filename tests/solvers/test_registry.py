@@ -91,7 +91,7 @@ def test_parameters_come_from_the_card(tmp_path: Path) -> None:
         ('class = "rsbench.solvers.engine.base:Solver"', ["not a solver"]),
         (
             'class = "rsbench.solvers.linear:LinearSolver"\n[parameters]\nextracton = "full"',
-            ["unknown key 'extracton'", "did you mean 'extraction'", "there are: extraction"],
+            ["unknown key 'extracton'", "did you mean 'extraction'", "there are: baseline_unit, extraction"],
         ),
         (
             'class = "rsbench.solvers.linear:LinearSolver"\n[parameters]\nextraction = "best"',
