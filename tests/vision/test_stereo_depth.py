@@ -10,7 +10,7 @@ import pytest
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import Side, StereoRig
-from rsbench.vision.disparity_refinement import refine_disparity
+from rsbench.vision.disparity_refinement import _measure, refine_disparity
 from rsbench.vision.stereo_depth import (
     SgmOptions,
     depth_metrics,
@@ -155,6 +155,30 @@ def test_refinement_finds_a_constant_shift() -> None:
         assert np.nanmedian(np.abs(inner - shift)) < 0.015
         assert np.nanmax(np.abs(inner - shift)) < 0.06
     np.testing.assert_array_equal(refine_disparity(left, right, initial, iterations=0), initial)
+
+
+def test_the_images_say_what_the_formulas_say() -> None:
+    """Weight and pull of a pixel, with Keys' kernel summed over the row and its slope by central differences."""
+    rng = np.random.default_rng(4)
+    a, b = (rng.uniform(0, 255, (3, 30)).astype(np.float32) for _ in range(2))
+    disparity = rng.uniform(2.0, 6.0, (3, 30)).astype(np.float32)
+    weight, pull = np.zeros_like(a), np.zeros_like(a)
+    _measure(a, b, disparity, 0, 3, weight, pull)
+
+    def partner(y: int, at: float) -> float:
+        s = np.abs(at - np.arange(30))
+        near, far = 1.5 * s**3 - 2.5 * s**2 + 1.0, -0.5 * s**3 + 2.5 * s**2 - 4.0 * s + 2.0
+        return float(np.where(s <= 1, near, np.where(s < 2, far, 0.0)) @ b[y].astype(float))
+
+    step = 1e-5
+    for y in range(3):
+        for x in range(9, 27):
+            at = x - float(disparity[y, x])
+            slope_b = (partner(y, at + step) - partner(y, at - step)) / (2 * step)
+            slope = 0.5 * (slope_b + 0.5 * (float(a[y, x + 1]) - float(a[y, x - 1])))
+            # Float32 of grey levels up to 255 and their products; positions of 30 px hold 2e-6 px.
+            assert weight[y, x] - 4.0 == pytest.approx(slope**2, rel=1e-3, abs=0.05)
+            assert pull[y, x] == pytest.approx(slope * (partner(y, at) - float(a[y, x])), rel=1e-3, abs=0.5)
 
 
 def test_holes_are_filled_from_behind() -> None:
