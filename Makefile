@@ -18,12 +18,15 @@ SUITABLE := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
 demo: $(STAMP)
 	@$(BIN)/rsbench demo
 
+# The types are checked while the tests run, for one keeps a core busy and the other seldom both.
 test: $(STAMP)
 	@echo "== format"; $(BIN)/ruff format --check .
 	@echo "== lint";   $(BIN)/ruff check .
-	@echo "== types";  $(BIN)/mypy
 	@echo "== layers"; $(BIN)/lint-imports
-	@echo "== tests";  $(BIN)/python -m pytest
+	@echo "== types and tests"; \
+	$(BIN)/mypy >$(VENV)/types.log 2>&1 & types=$$!; \
+	$(BIN)/python -m pytest; tests=$$?; \
+	wait $$types; types=$$?; cat $(VENV)/types.log; exit $$((types | tests))
 
 docs: $(STAMP)
 	@$(BIN)/sphinx-build -W --keep-going -q -b html docs build/docs
