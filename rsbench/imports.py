@@ -3,15 +3,33 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import importlib.util
+import json
+import math
+import os
+import signal
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 from rsbench.errors import RsbenchError
 from rsbench.identity import file_hash, with_neighbours
 
+IMPORT_LIMIT = "RSBENCH_IMPORT_LIMIT_S"
+"""Variable of the environment: seconds in which another package's module must be imported."""
+_LIMIT_S = 60.0
+_POSIX = os.name == "posix"
+_IMPORTED = 173
+"""Exit code of a process in which a module was tried, that no module is likely to choose."""
+_COMMAND = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
+    "from rsbench.imports import import_and_end; import_and_end(sys.argv[2], float(sys.argv[3]))"
+)
+_expendable = False
 _beside_cards: dict[str, tuple[Path, str]] = {}
 """Modules that were imported from beside a card: file, and its hash when it was imported."""
 _folders: list[str] = []
@@ -44,8 +62,80 @@ def import_target(target: str, folder: Path | None, where: str) -> object:
         raise RsbenchError(f"{where}: must be 'package.module:Class'")
     with blaming(where, "cannot be imported"):
         if folder is None or module.partition(".")[0] == "rsbench":
+            try_import(module)
             return getattr(importlib.import_module(module), name)
         return getattr(_import_beside(module, folder.resolve()), name)
+
+
+def try_import(module: str, version: str = "") -> None:
+    """Import another package's module in a process of its own first, so that it cannot end or stop this one.
+
+    What it raises there is left to the import here. Each version of a module is tried once, and none that is
+    rsbench's own, or imported already.
+
+    Raises:
+        ImportError: what became of the process.
+    """
+    if _expendable or module.partition(".")[0] == "rsbench" or module in sys.modules:
+        return
+    if fate := _fate(module, version):
+        raise ImportError(f"importing {module} {fate}")
+
+
+@functools.cache
+def _fate(module: str, version: str) -> str:
+    limit_s = _import_limit()
+    process = subprocess.Popen(
+        [sys.executable, "-c", _COMMAND, json.dumps([str(entry) for entry in sys.path]), module, str(limit_s)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # its own process group
+    )
+    try:
+        code = process.wait(limit_s)
+    except subprocess.TimeoutExpired:
+        return f"took longer than {limit_s:g} s ({IMPORT_LIMIT} allows more)"
+    finally:
+        if _POSIX:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(process.pid, signal.SIGKILL)
+        process.kill()
+        process.wait()
+    return "" if code == _IMPORTED else ending(code)
+
+
+def _import_limit() -> float:
+    text = os.environ.get(IMPORT_LIMIT, "")
+    with contextlib.suppress(ValueError):
+        if math.isfinite(limit_s := float(text or _LIMIT_S)) and limit_s > 0.0:
+            return limit_s
+    raise RsbenchError(f"{IMPORT_LIMIT} = {text!r}: must be a positive number of seconds")
+
+
+def import_and_end(module: str, limit_s: float) -> NoReturn:
+    """In a process of its own: import a module, and say by the exit code that this came to an end."""
+    if _POSIX:
+        signal.alarm(math.ceil(limit_s) + 1)  # should the parent be gone by then
+    with contextlib.suppress(BaseException):
+        importlib.import_module(module)
+    os._exit(_IMPORTED)
+
+
+def import_untried() -> None:
+    """From now on nothing is tried first: this process is one that others' code may end."""
+    global _expendable
+    _expendable = True
+
+
+def ending(code: int) -> str:
+    """How a process ended, by its exit code."""
+    if code >= 0:
+        return f"ended its process with exit code {code}"
+    try:
+        return f"killed by signal {-code} ({signal.Signals(-code).name})"
+    except ValueError:
+        return f"killed by signal {-code}"
 
 
 def search(card: Path) -> None:
@@ -66,6 +156,7 @@ def _import_beside(module: str, folder: Path) -> object:
     beside = next((path for path in (first.with_suffix(".py"), first / "__init__.py") if path.is_file()), None)
     if beside is not None:
         _refuse_other(first.name, beside)
+    try_import(module, "".join(file_hash(file) for file in with_neighbours(beside)) if beside is not None else "")
     before = set(sys.modules)
     found = importlib.import_module(module)
     for name in set(sys.modules) - before:

@@ -26,7 +26,7 @@ from pydantic.errors import PydanticUserError
 from rsbench.cards import CardKind, card_path, check_finite, choices, list_cards, parse_card, read_toml
 from rsbench.errors import RsbenchError
 from rsbench.identity import component_key, own_source_version, source_version
-from rsbench.imports import blaming, import_target, in_words
+from rsbench.imports import blaming, import_target, in_words, try_import
 
 __all__ = [
     "Entry",
@@ -252,6 +252,7 @@ def _offered_class(kind: Kind[Component, Any], offer: Offer) -> tuple[type[Compo
         return _checked(kind, import_target(kind.built_in[offer.name], None, offer.name), offer.name), offer.name
     where = f"entry point {kind.group}:{offer.name} ({_owner(offer)})"
     with blaming(where, "cannot be loaded"):
+        try_import(offer.point.module)
         cls = offer.point.load()
     return _checked(kind, cls, where), where
 

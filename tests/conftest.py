@@ -7,9 +7,15 @@ from pathlib import Path
 
 import pytest
 
+from rsbench.imports import import_untried
+
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Started in the background of a shell without job control: the commands that tests interrupt would inherit it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Modules that tests write are not tried in a process of their own first, which takes half a second for each. The
+# command line, which tests start as others do, does it.
+import_untried()
 
 
 @pytest.fixture(scope="session")

@@ -26,6 +26,7 @@ from multiprocessing.reduction import ForkingPickler
 from types import TracebackType
 from typing import Any, BinaryIO, NoReturn
 
+from rsbench.imports import ending, import_untried
 from rsbench.pipeline.plain_data import decode, encode, receive, send
 
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
@@ -246,12 +247,7 @@ class _Child:
         except subprocess.TimeoutExpired:
             return "closed its connection"
         self._readers[1].join(_POLL_S)  # its last words
-        if code >= 0:
-            return f"ended its process with exit code {code}"
-        try:
-            return f"killed by signal {-code} ({signal.Signals(-code).name})"
-        except ValueError:
-            return f"killed by signal {-code}"
+        return ending(code)
 
     def _send(self, request: bytes) -> None:
         assert self._process.stdin is not None
@@ -296,6 +292,7 @@ def serve_parent(lifeline: int) -> NoReturn:
     """Answer the parent until it is gone."""
     if lifeline >= 0:
         _end_with(lifeline)
+    import_untried()
     requests, answers = _take_streams()
     waiting: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(requests, waiting), daemon=True).start()

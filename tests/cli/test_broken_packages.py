@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -31,6 +32,9 @@ noise_px = 0.0
 BROKEN = {
     "raises": "raise RuntimeError('half installed')",
     "exits": "raise SystemExit(3)",
+    "loops": "import time\nwhile True: time.sleep(1)",
+    "crashes": "import ctypes; ctypes.string_at(0)",
+    "ends": "import os; os._exit(0)",
     "prints": "print('hello from a package')\nraise ImportError('no such library')",
 }
 
@@ -75,11 +79,23 @@ def rsbench(site: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
 
 
-def test_listing_names_them(site: Path) -> None:
-    result = rsbench(site, "list", "solvers")
+def test_listing_names_them(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RSBENCH_IMPORT_LIMIT_S", "4")
+    result = rsbench(site, "list", "solvers", "--json")
     assert result.returncode == 0, result.stderr
-    for name in (*BROKEN, "gone", "gs-8pt", "rs-stereo-refined"):
-        assert name in result.stdout
+    rows = {row["name"]: row for row in json.loads(result.stdout)}
+    for name, words in {
+        "raises": "RuntimeError: half installed",
+        "exits": "SystemExit: 3",
+        "loops": "took longer than 4 s (RSBENCH_IMPORT_LIMIT_S allows more)",
+        "crashes": "SIGSEGV",
+        "ends": "exit code 0",
+        "prints": "no such library",
+        "gone": "not_there",
+    }.items():
+        assert words in rows[name]["broken"] and rows[name]["origin"] == f"broken-{name}"
+    for name in ("gs-8pt", "rs-stereo-refined"):
+        assert rows[name]["broken"] is None
 
 
 def test_built_in_solvers_and_a_good_package_simulate(site: Path, tmp_path: Path) -> None:
@@ -96,7 +112,7 @@ def test_built_in_solvers_and_a_good_package_simulate(site: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("exits", ["SystemExit: 3", "broken-exits"]),
+        ("ends", ["broken_ends ended its process with exit code 0", "broken-ends"]),
         ("prints", ["no such library", "broken-prints"]),
         ("gs-8pt-scaled", ["card gs-8pt-scaled.toml", "broken-gs-8pt-scaled"]),
     ],
