@@ -35,7 +35,7 @@ def generate(
     ] = False,
 ) -> None:
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
-    from rsbench.cli.console import progress_bar
+    from rsbench.cli.console import progress_bar, stoppable
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import STEPS, generate_dataset
     from rsbench.renderers.backend import start_backend
@@ -46,7 +46,8 @@ def generate(
     backend = start_backend()
     if backend.message:
         typer.echo(backend.message, err=True)
-    with progress_bar(f"rendering {dataset.name}", STEPS * len(dataset.sequence)) as advance:
+    steps = STEPS * len(dataset.sequence)
+    with stoppable(), progress_bar(f"rendering {dataset.name}", steps) as advance:
         rendered = generate_dataset(dataset, out, workers=workers, full_frames=full_frames, progress=advance)
     typer.echo(f"{out}: {len(dataset.sequence)} sequences, {len(rendered)} rendered now")
 

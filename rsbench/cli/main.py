@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from typing import Annotated
 
@@ -83,9 +82,6 @@ def run() -> None:
         _fail(str(error))
     except OSError as error:  # a full disk or a folder without permission, wherever it is met
         _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
-    except KeyboardInterrupt:
-        sys.stderr.write("interrupted; the same command resumes where it stopped\n")
-        os._exit(130)
 
 
 def _fail(message: str) -> None:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing
 from dataclasses import asdict, replace
 from functools import lru_cache
 from importlib.metadata import version
@@ -27,6 +26,8 @@ from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_png, write_poses
 from rsbench.dataset.sequence import FORMAT, FRAMES, RELATIVE_FILES, sequence_manifest
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.isolated_jobs import run_jobs
+from rsbench.pipeline.isolation import EntryFailure
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene
 from rsbench.scenes.model import Scene
@@ -186,34 +187,34 @@ def _render_all(
             for _ in _render_sequence(card, sequence, options, plans[sequence.name], load(sequence.scene), out):
                 yield sequence.name
         return
-    # Spawned, because Dr.Jit's threads do not survive a fork; one task each, so memory goes back to the system.
-    context = multiprocessing.get_context("spawn")
+    jobs = [(sequence, plans[sequence.name]) for sequence in todo]
     threads = max(1, (os.cpu_count() or 1) // workers)
-    with ProcessPoolExecutor(workers, mp_context=context, max_tasks_per_child=1) as pool:
-        jobs = {
-            pool.submit(_render_in_child, card, sequence, options, plans[sequence.name], out, threads): sequence
-            for sequence in todo
-        }
-        for job in as_completed(jobs):
-            job.result()
+    with closing(run_jobs(_serve_renders, jobs, workers, {}, card, options, out, threads)) as outcomes:
+        for (sequence, _), outcome in outcomes:
+            if not outcome.success:
+                raise RsbenchError(f"sequence {sequence.name}: {outcome.reason}")
             for _ in range(STEPS):
-                yield jobs[job].name
+                yield sequence.name
 
 
-def _render_in_child(
-    card: DatasetCard,
-    sequence: SequenceCard,
-    options: RendererOptions,
-    plan: dict[str, Any],
-    out: Path,
-    threads: int,
-) -> None:
+def _serve_renders(
+    card: DatasetCard, options: RendererOptions, out: Path, threads: int
+) -> Callable[[tuple[SequenceCard, dict[str, Any]]], None]:
+    """What renders sequences, in a child."""
     from rsbench.renderers.backend import set_threads, start_backend
 
     start_backend()
     set_threads(threads)
-    for _ in _render_sequence(card, sequence, options, plan, load_scene(sequence.scene), out):
-        pass
+
+    def render(job: tuple[SequenceCard, dict[str, Any]]) -> None:
+        sequence, plan = job
+        try:
+            for _ in _render_sequence(card, sequence, options, plan, load_scene(sequence.scene), out):
+                pass
+        except RsbenchError as error:
+            raise EntryFailure(str(error)) from error
+
+    return render
 
 
 def _render_sequence(
@@ -231,6 +232,7 @@ def _render_sequence(
     backend = start_backend()
     mitsuba_scene = MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint]))
     partial = out / f".{sequence.name}.partial"
+    shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
     for folder in {Path(name).parent for name in RELATIVE_FILES}:
         (partial / folder).mkdir(parents=True, exist_ok=True)
     yield

@@ -1,4 +1,4 @@
-"""``rsbench simulate`` stopped and killed for real: at once, with nothing left, and resumed to the same bytes."""
+"""``rsbench simulate`` and ``generate`` stopped and killed for real: at once, with nothing left, and resumed."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from small_scenes import write_box_scene, write_small_card
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
@@ -52,11 +53,11 @@ STOP_S = 20.0
 class Run:
     """The command, and the processes that belong to it."""
 
-    def __init__(self, card: Path, out: Path, pause: float) -> None:
+    def __init__(self, what: str, card: Path, out: Path, pause: float = 0.0) -> None:
         self.mark = f"RSBENCH_TEST_MARK={out}-{time.monotonic_ns()}"
         name, _, value = self.mark.partition("=")
         environment = {**os.environ, "RSBENCH_TEST_PAUSE": str(pause), name: value}
-        command = [sys.executable, "-m", "rsbench", "simulate", str(card), "--out", str(out), "--workers", "2"]
+        command = [sys.executable, "-m", "rsbench", what, str(card), "--out", str(out), "--workers", "2"]
         pipe = subprocess.PIPE
         self.process = subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True)
 
@@ -85,9 +86,9 @@ class Run:
             assert self.process.poll() is None and time.monotonic() < end
             time.sleep(0.02)
 
-    def wait_for(self, chunks: Path, count: int) -> None:
+    def wait_for(self, folder: Path, count: int, name: str = "trials-*.npz") -> None:
         end = time.monotonic() + 120.0
-        while len(list(chunks.glob("trials-*.npz"))) < count:
+        while len(list(folder.glob(name))) < count:
             assert self.process.poll() is None and time.monotonic() < end
             time.sleep(0.02)
 
@@ -107,11 +108,11 @@ def test_stopped_terminated_and_killed_it_goes_on_to_the_same_bytes(tmp_path: Pa
     card = tmp_path / "long.toml"
     card.write_text(CARD.format(slow=tmp_path / "slow.toml"))
     undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
-    run = Run(card, undisturbed, 0.0)
+    run = Run("simulate", card, undisturbed, 0.0)
     errors = run.finish()
     assert run.process.returncode == 0, errors
 
-    run = Run(card, out, 0.03)
+    run = Run("simulate", card, out, 0.03)
     run.wait_for(out / ".chunks", 1)
     assert len(run.processes()) == 1 + 2 + 2  # workers, and the solver's own process of each
     os.kill(run.worker(), signal.SIGKILL)
@@ -119,14 +120,24 @@ def test_stopped_terminated_and_killed_it_goes_on_to_the_same_bytes(tmp_path: Pa
     stop(run, signal.SIGINT, 130)
     assert not (out / "summary.csv").exists()
 
-    run = Run(card, out, 0.03)
+    run = Run("simulate", card, out, 0.03)
     run.wait_for_worker()
     stop(run, signal.SIGTERM, 143)
 
-    run = Run(card, out, 0.0)
+    run = Run("simulate", card, out, 0.0)
     errors = run.finish()
     assert run.process.returncode == 0, errors
     assert contents(out) == contents(undisturbed)
+
+
+def test_rendering_by_several_processes_stops_at_once(tmp_path: Path) -> None:
+    card = write_small_card(tmp_path, [write_box_scene(tmp_path, name) for name in "abcd"])
+    # Large enough for a minute.
+    card.write_text(card.read_text().replace("width = 96", "width = 3000").replace("height = 64", "height = 3000"))
+    run = Run("generate", card, tmp_path / "out")
+    run.wait_for(tmp_path / "out", 2, ".*.partial")
+    stop(run, signal.SIGINT, 130)
+    assert not list((tmp_path / "out").glob("[a-d]"))
 
 
 def stop(run: Run, how: signal.Signals, code: int) -> None:
