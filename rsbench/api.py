@@ -309,7 +309,7 @@ def generate(card: str, out: AnyPath, *, sequences: Series[str] | None = None, w
     arguments.check_whole("workers", workers, 1)
     dataset = load_dataset_card(card)
     if sequences is not None:
-        dataset = dataset.only([sequences] if isinstance(sequences, str) else list(sequences))
+        dataset = dataset.only(list(arguments.names(sequences)))
     generate_dataset(dataset, Path(out), workers=workers)
     return read_dataset(out)
 
@@ -343,6 +343,8 @@ def evaluate(
     features: str = "sift",
     corrector: str = "fusion",
     metrics: Series[str] = (),
+    only: Series[str] = (),
+    force: bool = False,
     seed: int = 0,
 ) -> dict[str, pd.DataFrame]:
     """Run solvers, depth and correction on a dataset and score them against its truth.
@@ -353,10 +355,10 @@ def evaluate(
             too.
         solvers: names of ``list_solvers`` or paths of cards.
         correct_with: solver whose motion the correction uses.
-        matcher: name or card of the stereo matcher.
-        features: name or card of the feature matcher.
-        corrector: name or card of the corrector.
+        matcher, features, corrector: names or cards.
         metrics: names or cards of further metrics.
+        only: names of solvers and sequences: predict nothing else. All is scored.
+        force: predict again what is there already.
         seed: of every random choice.
 
     Returns:
@@ -370,12 +372,14 @@ def evaluate(
     from rsbench.benchmark.images.score import TABLES
 
     options = EvaluationOptions(
-        solvers=(solvers,) if isinstance(solvers, str) else tuple(solvers),
+        solvers=arguments.names(solvers),
         correction_solver=correct_with,
         features=features,
         matcher=matcher,
         corrector=corrector,
-        metrics=tuple(metrics),
+        metrics=arguments.names(metrics),
+        only=arguments.names(only),
+        force=force,
         seed=seed,
     )
     open_evaluation(Path(folder), Path(out), options).run("rsbench.evaluate", lambda word: None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -81,3 +81,8 @@ def check_image(name: str, image: NDArray[Any], rig: StereoRig | None) -> NDArra
         size = f"{image.shape[1]} x {image.shape[0]}"
         raise ValueError(f"{name}: is {size} pixels, the rig's cameras {rig.camera.width} x {rig.camera.height}")
     return image
+
+
+def names(given: str | Iterable[str]) -> tuple[str, ...]:
+    """One name or many."""
+    return (given,) if isinstance(given, str) else tuple(given)

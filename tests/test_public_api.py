@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import inspect
 import re
 import subprocess
@@ -16,6 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 import rsbench
+from rsbench.benchmark.images.plan import EvaluationOptions
 from rsbench.benchmark.simulated.simulation import Simulation
 from rsbench.core.projection import RSProjection
 from rsbench.dataset.sequence import Sequence
@@ -69,6 +71,11 @@ def test_the_names_that_editors_see_are_those_that_exist() -> None:
     assert sorted(typed) == NAMES
     for name, module in typed.items():
         assert getattr(rsbench, name) is getattr(sys.modules[str(module)], name)
+
+
+def test_evaluate_takes_every_option_of_the_command() -> None:
+    command = {field.name for field in dataclasses.fields(EvaluationOptions)} - {"correction_solver"}
+    assert command | {"folder", "out", "correct_with"} == set(inspect.signature(rsbench.evaluate).parameters)
 
 
 @pytest.mark.parametrize("name", NAMES)
