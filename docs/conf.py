@@ -29,15 +29,6 @@ autodoc_type_aliases = {name: name for name in ("ArrayLike", "FloatArray", "Imag
 python_use_unqualified_type_names = True
 maximum_signature_line_length = 90
 
-_REPOSITORY = "https://github.com/rsbench/rsbench/blob/main/"
-_OUTSIDE = re.compile(r"\]\(\.\./(?P<path>[^)\s]+)\)")
-
-
-def _link_to_the_repository(app: Sphinx, docname: str, content: list[str]) -> None:
-    """Links that leave docs/ lead to files of the repository, which the site does not hold."""
-    content[0] = _OUTSIDE.sub(rf"]({_REPOSITORY}\g<path>)", content[0])
-
-
 # napoleon takes "length, metres: of what" in the docstring of an attribute for a type and its text.
 _attributes: dict[str, list[str]] = {}
 
@@ -63,7 +54,6 @@ def _name_aliases(
 
 
 def setup(app: Sphinx) -> None:
-    app.connect("source-read", _link_to_the_repository)
     app.connect("autodoc-process-docstring", _keep_attribute, priority=400)
     app.connect("autodoc-process-docstring", _restore_attribute, priority=600)
     app.connect("autodoc-process-signature", _name_aliases)
