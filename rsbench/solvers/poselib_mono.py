@@ -4,28 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
-from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.poselib_adapter import (
-    BUNDLE,
-    MISSING,
-    estimate_of,
-    five_point_motions,
-    left_start,
-    poselib_camera,
-    poselib_module,
-    poselib_pose,
-)
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, SolverSpec
+from rsbench.solvers.engine.poselib_adapter import PoselibSolver, five_point_motions, left_start, poselib_camera
 
 
 @final
 @dataclass(frozen=True, kw_only=True)
-class PoselibMonoSolver(Solver):
+class PoselibMonoSolver(PoselibSolver):
     """Left camera only: five-point proposals, then the Sampson error of all matches."""
 
     spec = SolverSpec(
@@ -47,11 +37,7 @@ class PoselibMonoSolver(Solver):
         if short is not None:
             return short
         start = left_start(matches, rig)
-        if start is None:
-            return MotionEstimate.failed(
-                "the matches fit more than one essential matrix: degenerate scene or motion"
-            )
-        return self.improve(MotionEstimate(w=start[0], d=start[1], success=True), correspondences, rig, shutter)
+        return self.improve(start, correspondences, rig, shutter) if start.success else start
 
     def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
         return {"left": 5}
@@ -59,19 +45,9 @@ class PoselibMonoSolver(Solver):
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
         return five_point_motions(temporal_pairs(sample, "left"), rig)
 
-    def improve(
-        self,
-        motion: MotionEstimate,
-        correspondences: Correspondences,
-        rig: StereoRig,
-        shutter: RollingShutter,
-        quick: bool = False,
-    ) -> MotionEstimate:
-        poselib = poselib_module()
-        if poselib is None:
-            return MotionEstimate.failed(MISSING)
+    def refined(
+        self, poselib: Any, start: Any, correspondences: Correspondences, rig: StereoRig, options: dict[str, Any]
+    ) -> Any:
         matches, camera = temporal_pairs(correspondences, "left"), poselib_camera(rig.camera)
-        start = poselib_pose(poselib, so3.exp(motion.w), motion.d)
-        options = {**BUNDLE, "max_iterations": 10} if quick else BUNDLE
         pose, _ = poselib.refine_relative_pose(matches[:, :2], matches[:, 2:], start, camera, camera, options)
-        return estimate_of(pose, metric=False)
+        return pose

@@ -13,21 +13,19 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, SolverSpec
 from rsbench.solvers.engine.poselib_adapter import (
-    BUNDLE,
     MISSING,
-    estimate_of,
+    PoselibSolver,
     poselib_camera,
     poselib_module,
-    poselib_pose,
     rig_extrinsics,
 )
 
 
 @final
 @dataclass(frozen=True, kw_only=True)
-class PoselibPnpSolver(Solver):
+class PoselibPnpSolver(PoselibSolver):
     """Points from the disparities of frame 0, then the pose of frame 1's stereo pair from them."""
 
     spec = SolverSpec(
@@ -68,20 +66,11 @@ class PoselibPnpSolver(Solver):
         poses = poselib.p3p(rays, _points(tracks[:3], rig))
         return [_shifted(pose, rig.offset("left")) for pose in poses if np.all(np.isfinite(pose.t))]
 
-    def improve(
-        self,
-        motion: MotionEstimate,
-        correspondences: Correspondences,
-        rig: StereoRig,
-        shutter: RollingShutter,
-        quick: bool = False,
-    ) -> MotionEstimate:
-        poselib, tracks = poselib_module(), _with_depth(correspondences.tracks)
-        if poselib is None:
-            return MotionEstimate.failed(MISSING)
+    def refined(
+        self, poselib: Any, start: Any, correspondences: Correspondences, rig: StereoRig, options: dict[str, Any]
+    ) -> Any:
+        tracks = _with_depth(correspondences.tracks)
         points = _points(tracks, rig)
-        start = poselib_pose(poselib, so3.exp(motion.w), motion.d)
-        options = {**BUNDLE, "max_iterations": 10} if quick else BUNDLE
         pose, _ = poselib.refine_generalized_absolute_pose(
             [tracks[:, 4:6], tracks[:, 6:8]],
             [points, points],
@@ -90,7 +79,7 @@ class PoselibPnpSolver(Solver):
             [poselib_camera(rig.camera)] * 2,
             options,
         )
-        return estimate_of(pose, metric=True)
+        return pose
 
 
 def _with_depth(tracks: FloatArray) -> FloatArray:

@@ -4,29 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import final
+from typing import Any, final
 
-from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, SolverSpec
 from rsbench.solvers.engine.poselib_adapter import (
-    BUNDLE,
-    MISSING,
-    estimate_of,
+    PoselibSolver,
     five_point_motions,
     left_start,
     poselib_camera,
-    poselib_module,
-    poselib_pose,
     rig_extrinsics,
 )
 
 
 @final
 @dataclass(frozen=True, kw_only=True)
-class PoselibStereoSolver(Solver):
+class PoselibStereoSolver(PoselibSolver):
     """Left and right pairs of the rig as one generalised camera."""
 
     spec = SolverSpec(
@@ -47,12 +42,9 @@ class PoselibStereoSolver(Solver):
         if short is not None:
             return short
         start = left_start(temporal_pairs(correspondences, "left"), rig)
-        if start is None:
-            return MotionEstimate.failed(
-                "the matches fit more than one essential matrix: degenerate scene or motion"
-            )
-        motion = MotionEstimate(w=start[0], d=0.5 * rig.baseline * start[1], success=True)
-        return self.improve(motion, correspondences, rig, shutter)
+        if not start.success:
+            return start
+        return self.improve(replace(start, d=0.5 * rig.baseline * start.d), correspondences, rig, shutter)
 
     def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
         return {"left": 5}
@@ -64,17 +56,9 @@ class PoselibStereoSolver(Solver):
             for motion in five_point_motions(temporal_pairs(sample, "left"), rig)
         ]
 
-    def improve(
-        self,
-        motion: MotionEstimate,
-        correspondences: Correspondences,
-        rig: StereoRig,
-        shutter: RollingShutter,
-        quick: bool = False,
-    ) -> MotionEstimate:
-        poselib = poselib_module()
-        if poselib is None:
-            return MotionEstimate.failed(MISSING)
+    def refined(
+        self, poselib: Any, start: Any, correspondences: Correspondences, rig: StereoRig, options: dict[str, Any]
+    ) -> Any:
         pairs = []
         for k, side in enumerate(SIDES):
             matches = temporal_pairs(correspondences, side)
@@ -83,9 +67,7 @@ class PoselibStereoSolver(Solver):
             pair.x1, pair.x2 = matches[:, :2], matches[:, 2:]
             pairs.append(pair)
         extrinsics, cameras = rig_extrinsics(poselib, rig), [poselib_camera(rig.camera)] * 2
-        start = poselib_pose(poselib, so3.exp(motion.w), motion.d)
-        options = {**BUNDLE, "max_iterations": 10} if quick else BUNDLE
         pose, _ = poselib.refine_generalized_relative_pose(
             pairs, start, extrinsics, cameras, extrinsics, cameras, options
         )
-        return estimate_of(pose, metric=True)
+        return pose

@@ -6,20 +6,48 @@ loop around it throws outliers out, the same for every solver.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Any
 
 import numpy as np
 
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.eight_point import decompose_essential, eight_point
-from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.engine.base import MotionEstimate, Solver
 
-BUNDLE = {"loss_type": "TRIVIAL", "max_iterations": 100, "gradient_tol": 1e-14, "step_tol": 1e-14}
+_BUNDLE = {"loss_type": "TRIVIAL", "max_iterations": 100, "gradient_tol": 1e-14, "step_tol": 1e-14}
 MISSING = "poselib is not installed: there is no wheel for this platform"
 _NOT_FINITE = "poselib returned no finite pose"
+
+
+class PoselibSolver(Solver):
+    """A solver whose final estimate is one of PoseLib's refinements."""
+
+    @abstractmethod
+    def refined(
+        self, poselib: Any, start: Any, correspondences: Correspondences, rig: StereoRig, options: dict[str, Any]
+    ) -> Any:
+        """The pose that PoseLib finds from a pose to start at; both are PoseLib's ``CameraPose``."""
+
+    def improve(
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        quick: bool = False,
+    ) -> MotionEstimate:
+        poselib = poselib_module()
+        if poselib is None:
+            return MotionEstimate.failed(MISSING)
+        start = poselib_pose(poselib, so3.exp(motion.w), motion.d)
+        options = {**_BUNDLE, "max_iterations": 10} if quick else _BUNDLE
+        return estimate_of(self.refined(poselib, start, correspondences, rig, options), self.spec.metric)
 
 
 def poselib_module() -> Any:
@@ -60,16 +88,14 @@ def estimate_of(pose: Any, metric: bool) -> MotionEstimate:
     return MotionEstimate(w=so3.log(R), d=t, success=True, metric=metric, reason=reason)
 
 
-def left_start(matches: FloatArray, rig: StereoRig) -> tuple[FloatArray, FloatArray] | None:
-    """(w, unit t) of the left camera by the eight-point algorithm."""
-    if len(matches) < 8:
-        return None
+def left_start(matches: FloatArray, rig: StereoRig) -> MotionEstimate:
+    """Motion of the left camera, with a unit d, by the eight-point algorithm on matches (n, 4), n >= 8."""
     x0, x1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
     E = eight_point(x0, x1)
     if E is None:
-        return None
+        return MotionEstimate.failed("the matches fit more than one essential matrix: degenerate scene or motion")
     pose, _ = decompose_essential(E, x0, x1)
-    return so3.log(pose.R), pose.t
+    return MotionEstimate(w=so3.log(pose.R), d=pose.t, success=True)
 
 
 def five_point_motions(matches: FloatArray, rig: StereoRig) -> list[MotionEstimate]:
