@@ -77,7 +77,7 @@ for module in (
 def run() -> None:
     """Entry point: known errors become one line on stderr and exit code 2."""
     try:
-        app()
+        app(prog_name="rsbench")
     except RsbenchError as error:
         _fail(str(error))
     except OSError as error:  # a full disk or a folder without permission, wherever it is met

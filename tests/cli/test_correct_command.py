@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import re
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from commands import assert_refused, run_here
 
 from rsbench.dataset.corrected_frames import MASK_VALUES, fresh_folder
 from rsbench.dataset.files import read_depth, read_png
@@ -20,17 +20,8 @@ from rsbench.dataset.sequence import Sequence, read_dataset
 ORDER = ("left_0", "right_0", "left_1", "right_1")
 
 
-def rsbench(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "rsbench", "correct", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-
-
-def assert_refused(result: subprocess.CompletedProcess[str], *words: str) -> None:
-    assert result.returncode == 2, result.stderr
-    (line,) = [line for line in result.stderr.splitlines() if "rsbench: error:" in line]
-    assert "Traceback" not in result.stderr
-    for word in words:
-        assert word in line
+def correct(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return run_here("correct", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +64,7 @@ def _check_outputs(out: Path, names: tuple[str, ...]) -> dict[str, Any]:
 
 def test_four_frames(tmp_path: Path, castle: Sequence, frames: list[Path], rig: Path) -> None:
     out = tmp_path / "out"
-    result = rsbench(*frames, "--rig", rig, "--out", out, "--target", "middle")
+    result = correct(*frames, "--rig", rig, "--out", out, "--target", "middle")
     assert result.returncode == 0, result.stderr
     assert str(out / "report.html") in result.stdout
     record = _check_outputs(out, ORDER)
@@ -84,7 +75,7 @@ def test_four_frames(tmp_path: Path, castle: Sequence, frames: list[Path], rig: 
     assert {path.name for path in tmp_path.iterdir()} == {"out", "rig.toml"}
     # The same command again replaces its own results, and gives the same.
     before = (out / "corrected" / "left_0.png").read_bytes()
-    assert rsbench(*frames, "--rig", rig, "--out", out, "--target", "middle").returncode == 0
+    assert correct(*frames, "--rig", rig, "--out", out, "--target", "middle").returncode == 0
     assert (out / "corrected" / "left_0.png").read_bytes() == before
 
 
@@ -105,7 +96,7 @@ def test_a_sequence_of_folders(tmp_path: Path, frames: list[Path], rig: Path) ->
         out,
         "--inpaint",
     )
-    result = rsbench(*arguments)
+    result = correct(*arguments)
     assert result.returncode == 0, result.stderr
     assert "2 of 2 times corrected" in result.stdout
     names = ("left_000000", "right_000000", "left_000001", "right_000001")
@@ -122,14 +113,14 @@ def test_bad_calls_are_refused_and_leave_nothing(tmp_path: Path, frames: list[Pa
     cv2.imwrite(str(small), read_png(frames[0])[:60])
     flat = tmp_path / "flat.png"
     cv2.imwrite(str(flat), np.full((96, 128), 128, np.uint8))
-    assert_refused(rsbench(*frames[:3], *common), "3 images")
-    assert_refused(rsbench(*frames[:3], small, *common), "small.png", "128 x 60", "128 x 96")
-    assert_refused(rsbench(*frames[:3], tmp_path / "none.png", *common), "none.png", "no such")
-    assert_refused(rsbench(*[flat] * 4, *common), "no texture")
-    assert_refused(rsbench(*frames, *common, "--target", "500"), "--target 500", "95")
-    assert_refused(rsbench(*frames, "--out", out), "--rig")
-    assert_refused(rsbench(*frames, *common, "--solver", "nobody"), "nobody", "does not exist")
-    assert_refused(rsbench(*frames, "--rig", tmp_path / "no.toml", "--out", out), "no.toml")
+    assert_refused(correct(*frames[:3], *common), "3 images")
+    assert_refused(correct(*frames[:3], small, *common), "small.png", "128 x 60", "128 x 96")
+    assert_refused(correct(*frames[:3], tmp_path / "none.png", *common), "none.png", "no such")
+    assert_refused(correct(*[flat] * 4, *common), "no texture")
+    assert_refused(correct(*frames, *common, "--target", "500"), "--target 500", "95")
+    assert_refused(correct(*frames, "--out", out), "--rig")
+    assert_refused(correct(*frames, *common, "--solver", "nobody"), "nobody", "does not exist")
+    assert_refused(correct(*frames, "--rig", tmp_path / "no.toml", "--out", out), "no.toml")
     assert {path.name for path in tmp_path.iterdir()} == {"rig.toml", "small.png", "flat.png"}
 
 
@@ -137,7 +128,7 @@ def test_a_folder_of_others_is_not_touched(tmp_path: Path, frames: list[Path], r
     out = tmp_path / "out"
     out.mkdir()
     (out / "precious.txt").write_text("mine")
-    assert_refused(rsbench(*frames, "--rig", rig, "--out", out), "choose another --out")
+    assert_refused(correct(*frames, "--rig", rig, "--out", out), "choose another --out")
     assert (out / "precious.txt").read_text() == "mine"
 
 
@@ -145,7 +136,7 @@ def test_matches_that_leave_the_readout_open_exit_with_1(tmp_path: Path, castle:
     """The same pair twice: no motion, so nothing tells how the rows were read."""
     left, right = (castle.folder / "gs" / f"{side}_0.png" for side in ("left", "right"))
     rig.write_text("\n".join(line for line in rig.read_text().splitlines() if "readout" not in line))
-    result = rsbench(left, right, left, right, "--rig", rig, "--out", tmp_path / "out")
+    result = correct(left, right, left, right, "--rig", rig, "--out", tmp_path / "out")
     assert result.returncode == 1, result.stderr
     assert "not corrected" in result.stderr and "readout_ratio" in result.stderr
     assert not (tmp_path / "out").exists()

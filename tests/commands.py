@@ -1,0 +1,47 @@
+"""The command line in this process: all that a new one would show, without the second or two of its start.
+
+New processes are for what needs one: packages beside it, signals, the terminal, what is imported, and what
+children print. That every command starts in one: tests/test_installed_wheel.py and tests/strangers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import subprocess
+import sys
+
+import pytest
+
+from rsbench.cli import console, main
+
+
+def run_here(*arguments: object, text: str = "", **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run ``rsbench`` with these arguments, ``text`` on standard input and these variables of the environment.
+
+    A warning is an error here, and whatever the command does not answer in one line is raised.
+    """
+    words = ["rsbench", *map(str, arguments)]
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        patch.setattr(sys, "argv", words)
+        patch.setattr(sys, "stdin", io.StringIO(text))
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        try:
+            main.run()
+        except SystemExit as end:
+            assert end.code is None or isinstance(end.code, int)
+            code = end.code or 0
+        finally:
+            console.be_quiet(False)
+    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
+
+
+def assert_refused(result: subprocess.CompletedProcess[str], *words: str) -> None:
+    """Bad input: exit code 2, and one line on standard error that holds the words."""
+    assert result.returncode == 2, result.stderr
+    assert "Traceback" not in result.stderr
+    (line,) = [line for line in result.stderr.splitlines() if "rsbench: error:" in line]
+    for word in words:
+        assert word in line, line
