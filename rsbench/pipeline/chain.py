@@ -141,7 +141,7 @@ def find_depth(
     """The frames with their depth: from the other camera unless ``pairs`` has it, then from the motion."""
     if pairs is None:
         pairs = frame_pairs(images, rig, options)
-    if options.depth_from_motion and motion is not None:
+    if options.depth_from_motion and motion is not None and not all(pair.with_motion for pair in pairs):
         pairs = complete_depth(pairs, rig, shutter, motion)
     return pairs
 
@@ -157,9 +157,13 @@ def correct_frames(
 ) -> dict[View, Fused]:
     """Corrected frames of the views asked for, at the time of ``options.target_row`` of each.
 
+    A global shutter leaves nothing to correct: at a readout ratio of 0 the frames come back as they are.
+
     Raises:
         RsbenchError: another package's corrector failed, see ``find_corrected``.
     """
+    if shutter.readout_ratio == 0.0:
+        return uncorrected(images, views, pairs)
     problem = CorrectionProblem(
         images=images,
         rig=rig,
@@ -179,9 +183,16 @@ def _finish(fused: Fused, options: CorrectionOptions) -> Fused:
     return replace(fused, image=inpaint(fused.image, fused.origin == Origin.NOBODY))
 
 
-def uncorrected(images: Images, views: tuple[View, ...] = VIEWS) -> dict[View, Fused]:
-    """The frames as they are: what a user has after a failure."""
-    return {view: Fused.seen(images[view], np.ones(images[view].shape[:2], dtype=np.bool_)) for view in views}
+def uncorrected(images: Images, views: tuple[View, ...] = VIEWS, pairs: Pairs | None = None) -> dict[View, Fused]:
+    """The frames as they are, with the depth that is known of them: what a user has after a failure."""
+    frames = {view: Fused.seen(images[view], np.ones(images[view].shape[:2], dtype=np.bool_)) for view in views}
+    if pairs is None:
+        return frames
+    depths = {(side, frame): pairs[frame].depth[side] for side, frame in views}
+    return {
+        view: replace(fused, depth=np.where(depths[view] > 0.0, depths[view], np.float32(np.nan)))
+        for view, fused in frames.items()
+    }
 
 
 class _Clock:

@@ -14,7 +14,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.vision.flow import depth_from_motion
+from rsbench.vision.motion_sweep import depth_from_motion
 from rsbench.vision.sky import sky_mask
 from rsbench.vision.stereo_depth import fill_holes
 from rsbench.vision.stereo_matcher import find_disparities
@@ -33,6 +33,8 @@ class FramePair:
     """(H, W) metres in each row's own camera; inf in the sky and at no disparity, 0 unknown."""
     guess: dict[Side, NDArray[np.float32]]
     """(H, W) the same where ``depth`` is unknown, from the neighbours; 0 elsewhere."""
+    with_motion: bool = False
+    """Whether the depth that the motion gives is in it already."""
 
 
 Pairs = tuple[FramePair, FramePair]
@@ -103,8 +105,8 @@ def complete_depth(pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion
 
     def side_depths(side: Side) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         first, second = eight_bit([pair.images[side] for pair in pairs])
-        unknown = pairs[0].depth[side] == 0.0, pairs[1].depth[side] == 0.0
-        return depth_from_motion((first, second), unknown, rig, shutter, motion, side)
+        known = pairs[0].depth[side], pairs[1].depth[side]
+        return depth_from_motion((first, second), known, rig, shutter, motion, side)
 
     with ThreadPoolExecutor(len(SIDES)) as pool:
         found = dict(zip(SIDES, pool.map(side_depths, SIDES), strict=True))
@@ -115,7 +117,7 @@ def complete_depth(pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion
 def _completed(pair: FramePair, found: dict[Side, NDArray[np.float32]]) -> FramePair:
     depth = {side: np.where(found[side] > 0.0, found[side], pair.depth[side]) for side in SIDES}
     guess = {side: np.where(found[side] > 0.0, np.float32(0.0), pair.guess[side]) for side in SIDES}
-    return FramePair(images=pair.images, depth=depth, guess=guess)
+    return FramePair(images=pair.images, depth=depth, guess=guess, with_motion=True)
 
 
 def _depth(disparity: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:

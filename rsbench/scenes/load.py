@@ -84,6 +84,7 @@ BUILDERS: Kind[SceneBuilder, NoOptions] = Kind(
         "castle": "rsbench.scenes.castle:CastleBuilder",
         "mesh": "rsbench.scenes.mesh:MeshBuilder",
         "old-town": "rsbench.scenes.old_town:OldTownBuilder",
+        "poles": "rsbench.scenes.poles:PolesBuilder",
         "room": "rsbench.scenes.room:RoomBuilder",
     },
 )

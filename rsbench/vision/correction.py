@@ -70,6 +70,12 @@ def relative_row_maps(
     return camera.K @ R @ np.linalg.inv(camera.K), t @ camera.K.T
 
 
+def warp_gain(camera: PinholeCamera, source_poses: Pose, target_pose: Pose) -> FloatArray:
+    """(H,) px m: a step of inverse depth moves a pixel of a row by about this times it, f |t|."""
+    lengths = np.linalg.norm(compose(target_pose, inverse(source_poses)).t, axis=-1)
+    return np.asarray(max(camera.fx, camera.fy) * lengths)
+
+
 def inverse_depth(depth: NDArray[Any], sky_mask: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
     """1 / depth (H, W): 0 at infinity and under ``sky_mask``, NaN where the depth is unknown (not positive)."""
     rho = np.full(depth.shape, np.nan, dtype=np.float32)
@@ -100,8 +106,7 @@ def warp(
     _check(image, depth, camera, source_poses, sky_mask)
     M, b = relative_row_maps(camera, source_poses, target_pose)
     rho = inverse_depth(depth, sky_mask)
-    # A step of inverse depth moves a pixel by about f |t| of it.
-    gain = max(camera.fx, camera.fy) * np.linalg.norm(compose(target_pose, inverse(source_poses)).t, axis=-1)
+    gain = warp_gain(camera, source_poses, target_pose)
     joined = forward_warp.connect(rho, options.tear_px / np.maximum(gain, np.finfo(np.float64).tiny))
     source_map = np.full((*rho.shape, 2), np.nan, dtype=np.float32)
     buffer = np.full(rho.shape, -1.0, dtype=np.float32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import final
 
 import numpy as np
@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 
 from rsbench.core.rig import VIEWS, Side, View
 from rsbench.core.se3 import Pose
-from rsbench.vision.correction import WarpOptions
+from rsbench.vision.correction import WarpOptions, warp_gain
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
 from rsbench.vision.fusion import Fused, Origin, SourceView, fuse
 from rsbench.vision.simpler_depths import plane_depth
 
 F32 = NDArray[np.float32]
+_NEAREST_SHARE = 0.999
+_NEARER = 0.5
+"""What has no depth may be nearer than the nearest that has: down to this share of its depth."""
 
 
 @final
@@ -43,6 +46,7 @@ class FusionCorrector(Corrector):
 
         def corrected(view: View) -> Fused:
             sources = self._sources(problem, view, poses)
+            sources[0] = self._placed(problem, view, sources[0])
             return fuse(sources, problem.rig.camera, problem.target_pose(view), self.warp)
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -62,6 +66,17 @@ class FusionCorrector(Corrector):
         if self.guess_depth:
             order.append((view, Origin.GUESSED))
         return [_source(problem, source, poses[source], origin) for source, origin in order]
+
+    def _placed(self, problem: CorrectionProblem, view: View, source: SourceView) -> SourceView:
+        """The frame with a depth in the rows where no depth would move a pixel by more than ``tear_px``."""
+        known = source.depth[source.depth > 0.0]
+        if problem.guess is None or known.size == 0:
+            return source
+        nearest = _NEARER * float(np.quantile(known, 1.0 - _NEAREST_SHARE))
+        gain = warp_gain(problem.rig.camera, source.poses, problem.target_pose(view))
+        certain = (source.depth == 0.0) & (gain[:, None] <= self.warp.tear_px * nearest)
+        guess = np.where(problem.guess[view] > 0.0, problem.guess[view], np.float32(np.inf))
+        return replace(source, depth=np.where(certain, guess, source.depth))
 
 
 def _source(problem: CorrectionProblem, view: View, poses: Pose, origin: Origin) -> SourceView:

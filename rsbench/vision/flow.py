@@ -1,4 +1,4 @@
-"""Depth from a camera's own motion: where the other camera of the rig sees nothing, its other frame often does."""
+"""Dense optical flow between two frames of a camera, and the depth that it means."""
 
 from __future__ import annotations
 
@@ -17,9 +17,6 @@ from rsbench.core.so3 import FloatArray
 from rsbench.vision.images import grey_u8
 
 F32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-_SMALLEST = 32
-"""Pixels of the shorter side below which the flow's coarsest level has nothing to match."""
 
 
 def dense_flow(first: NDArray[Any], second: NDArray[Any]) -> F32:
@@ -29,16 +26,6 @@ def dense_flow(first: NDArray[Any], second: NDArray[Any]) -> F32:
     """
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     return np.asarray(dis.calc(grey_u8(first), grey_u8(second), None), dtype=np.float32)
-
-
-def flow_returns(flow: F32, back: F32, tolerance: float) -> Mask:
-    """Pixels (H, W) that the flow (H, W, 2) and the opposite one, ``back``, bring home within ``tolerance`` px."""
-    height, width = flow.shape[:2]
-    x = np.arange(width, dtype=np.float32) + flow[..., 0]
-    y = np.arange(height, dtype=np.float32)[:, None] + flow[..., 1]
-    nowhere = (float("nan"), float("nan"))
-    returned = cv2.remap(back, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=nowhere)
-    return np.asarray(np.linalg.norm(flow + returned, axis=-1) <= tolerance)
 
 
 def flow_depth(
@@ -69,29 +56,3 @@ def flow_depth(
     ahead = moved[..., 2] > 0.0
     seen = rig.camera.project(np.where(ahead[..., None], moved, 1.0))
     return depth, np.where(ahead, np.linalg.norm(seen - targets, axis=-1), np.inf)
-
-
-def depth_from_motion(
-    images: tuple[NDArray[Any], NDArray[Any]],
-    unknown: tuple[Mask, Mask],
-    rig: StereoRig,
-    shutter: RollingShutter,
-    motion: Motion,
-    side: Side,
-    tolerance: float = 1.0,
-) -> tuple[F32, F32]:
-    """Depth (H, W), metres, of the ``unknown`` pixels of both frames of one camera; 0 where it stays unknown.
-
-    A depth counts when the flow between the frames (H, W[, 3]) returns and agrees with the motion, both within
-    ``tolerance`` px; inf is infinitely far. The warp moves such a pixel by less than its flow, so the depth is as
-    good as the correction needs it, however small the parallax.
-    """
-    depths = np.zeros((2, *images[0].shape[:2]), dtype=np.float32)
-    if min(images[0].shape[:2]) >= _SMALLEST and any(np.any(mask) for mask in unknown):
-        flows = dense_flow(*images), dense_flow(*images[::-1])
-        for frame in (0, 1):
-            y, x = np.nonzero(unknown[frame] & flow_returns(flows[frame], flows[1 - frame], tolerance))
-            pixels = np.stack([x, y], axis=-1).astype(np.float64)
-            found, error = flow_depth(pixels, flows[frame][y, x], rig, shutter, motion, side, frame)
-            depths[frame, y, x] = np.where(error <= tolerance, found, 0.0)
-    return depths[0], depths[1]

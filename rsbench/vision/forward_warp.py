@@ -177,10 +177,11 @@ def _quad(
 
 @compiled(error_model="numpy")
 def draw_cells(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F32) -> None:
-    """Draw the cells of pixels that are not joined to all their neighbours, behind ``draw_mesh``'s result.
+    """Draw the cells of pixels that are not joined to four neighbours, behind ``draw_mesh``'s result.
 
     A cell reaches half a pixel beyond the centre along its own surface: the boundary between two surfaces is
-    taken to lie halfway between the two pixel centres.
+    taken to lie halfway between the two pixel centres, and the frame to end half a pixel beyond its outermost
+    ones, so that a warp by almost nothing loses no row or column.
     """
     height, width = rho.shape
     for y in range(height):
@@ -189,9 +190,7 @@ def draw_cells(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F3
                 continue
             right, left = joined[y, x] & RIGHT, x > 0 and joined[y, x - 1] & RIGHT
             below, above = joined[y, x] & BELOW, y > 0 and joined[y - 1, x] & BELOW
-            whole_row = (right or x == width - 1) and (left or x == 0)
-            whole_column = (below or y == height - 1) and (above or y == 0)
-            if whole_row and whole_column:
+            if right and left and below and above:
                 continue
             # Steps of inverse depth along the surface, 0 where nothing is known of its slope.
             ahead = x + 1 if right else x
@@ -232,8 +231,7 @@ def _cell(
             px, py = column - ax, row - ay
             s = (px * vy - py * vx) * scale
             t = (ux * py - uy * px) * scale
-            inside = abs(s) <= half and abs(t) <= half
-            if inside and 0.0 <= x + s <= width - 1.0 and 0.0 <= y + t <= height - 1.0:
+            if abs(s) <= half and abs(t) <= half:
                 z = np.float32(max(az + s * uz + t * vz, 0.0))
                 if z > buffer[row, column] * _SAME_SURFACE or buffer[row, column] < 0.0:
                     buffer[row, column] = z

@@ -23,6 +23,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.correction import Corrected, WarpOptions, inverse_depth, relative_row_maps, warp
+from rsbench.vision.resample import resample
 
 Mask = NDArray[np.bool_]
 
@@ -33,7 +34,7 @@ class Origin(IntEnum):
     NOBODY = 0
     """No frame saw the place, as far as depth is known."""
     HERE = 1
-    """The frame itself, at a measured depth or at infinity."""
+    """The frame itself, at a measured depth, at infinity, or where its depth hardly moves it."""
     GUESSED = 2
     """The frame itself, at a depth guessed from its neighbours."""
     OTHER_CAMERA = 3
@@ -80,6 +81,11 @@ class Fused:
 
 _AGREE = 0.03
 """Relative difference of depth below which two views show the same surface."""
+_DIFFERENT = 0.06
+"""Of the full range: colours that differ by more do not show one surface."""
+_ROW_STEPS = 6
+"""Rounds until the row that sees a point is found; each leaves a share of the error below the readout ratio times
+the motion over the height of the image."""
 _MARGIN = 3
 """Pixels around a hole whose sources are drawn too, so that the mesh reaches its rim."""
 
@@ -109,9 +115,73 @@ def fuse(
             known = np.where(np.isnan(depth), np.float32(np.inf), depth)
             nearer = candidate.depth < known * (1.0 - _AGREE)
             take = candidate.mask & holes & ((origin == Origin.NOBODY) | nearer)
+            if view.origin is not Origin.GUESSED:
+                take &= ~_contradicted(first, candidate, take, camera, target_pose)
             image[take], depth[take] = candidate.image[take], candidate.depth[take]
             origin[take] = view.origin
     return Fused(image=image, origin=origin, depth=depth)
+
+
+def _contradicted(
+    frame: SourceView, found: Corrected, wanted: Mask, camera: PinholeCamera, target_pose: Pose
+) -> Mask:
+    """(H, W) where ``frame``, at the place where it would see what another view found, shows something else.
+
+    There the frame knows a surface behind it, or has no depth and another colour: something that only the frame
+    sees, often near and thin, stands before what was found, which must not be drawn over it. Where the frame knows
+    a nearer surface it was hidden, and nothing contradicts. The first view's own pixels decide, ``wanted`` (H, W)
+    says where to look.
+    """
+    M, b = relative_row_maps(camera, target_pose, frame.poses)
+    places = np.full((*wanted.shape, 2), np.nan, dtype=np.float32)
+    rho = np.zeros(wanted.shape, dtype=np.float32)
+    _find_in_rows(inverse_depth(found.depth), wanted, M, b, places, rho)
+    seen = np.isfinite(places[..., 0])
+    x, y = (np.rint(np.where(seen, places[..., k], 0.0)).astype(np.intp) for k in (0, 1))
+    there = inverse_depth(frame.depth)[y, x]
+    shown = resample(frame.image, places, "linear")
+    return seen & np.where(np.isnan(there), _differ(shown, found.image, seen), there < rho * (1.0 - _AGREE))
+
+
+def _differ(a: NDArray[Any], b: NDArray[Any], where: Mask) -> Mask:
+    """(H, W) whether images differ in the mean of 3 x 3 pixels, of those that are ``where``."""
+    levels = np.iinfo(a.dtype).max if np.issubdtype(a.dtype, np.integer) else 1.0
+    apart = np.abs(np.atleast_3d(a).astype(np.float32) - np.atleast_3d(b)).max(axis=-1) / np.float32(levels)
+    count = cv2.blur(where.astype(np.float32), (3, 3))
+    mean = cv2.blur(np.where(where, apart, np.float32(0.0)), (3, 3)) / np.maximum(count, np.float32(1e-6))
+    return np.asarray(mean > _DIFFERENT)
+
+
+@compiled(error_model="numpy")
+def _find_in_rows(
+    rho: NDArray[np.float32],
+    wanted: Mask,
+    M: FloatArray,
+    b: FloatArray,
+    places: NDArray[np.float32],
+    seen_rho: NDArray[np.float32],
+) -> None:
+    """Where a rolling-shutter frame sees points given by pixel and inverse depth ``rho`` (H, W) of the target.
+
+    Fills ``places`` (H, W, 2), px, and ``seen_rho`` (H, W), the inverse depth there, of the ``wanted`` pixels
+    whose points lie inside the frame. ``M`` (H, 3, 3) and ``b`` (H, 3) take them to the camera of each row.
+    """
+    height, width = rho.shape
+    for y in range(height):
+        for x in range(width):
+            if not wanted[y, x]:
+                continue
+            row, u, v, s = y, np.nan, np.nan, np.nan
+            for _ in range(_ROW_STEPS):
+                z = M[row, 2, 0] * x + M[row, 2, 1] * y + M[row, 2, 2] + rho[y, x] * b[row, 2]
+                s = 1.0 / z if z > 0.0 else np.nan
+                u = (M[row, 0, 0] * x + M[row, 0, 1] * y + M[row, 0, 2] + rho[y, x] * b[row, 0]) * s
+                v = (M[row, 1, 0] * x + M[row, 1, 1] * y + M[row, 1, 2] + rho[y, x] * b[row, 1]) * s
+                if not -height < v < 2 * height:  # NaN included
+                    break
+                row = min(max(int(v + 0.5), 0), height - 1)
+            if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
+                places[y, x, 0], places[y, x, 1], seen_rho[y, x] = u, v, rho[y, x] * s
 
 
 def _warp_into(

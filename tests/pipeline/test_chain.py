@@ -114,6 +114,26 @@ def test_the_last_row_stays_where_it_is_when_it_is_the_target(castle: Sequence) 
             assert np.quantile(np.abs(difference), 0.95) <= 2
 
 
+def test_a_global_shutter_leaves_the_frames_as_they_are(castle: Sequence) -> None:
+    """At a readout ratio of 0 byte for byte, whatever the motion; next to it nothing jumps.
+
+    1e-5 of a frame period moves a pixel by at most 1e-3 px: a grey level, and no pixel leaves the picture. At
+    1e-3 it is 0.1 px, still less than half a pixel.
+    """
+    images = _frames(castle)
+    first = correct_four(images, castle.rig, 0.0, CorrectionOptions(), given=Given(motion=castle.motion))
+    for view in VIEWS:
+        assert np.array_equal(first.frames[view].image, images[view])
+        assert np.all(first.frames[view].origin == Origin.HERE)
+    for ratio in (1e-5, 1e-3):
+        given = Given(motion=castle.motion, pairs=first.pairs)
+        near = correct_four(images, castle.rig, ratio, CorrectionOptions(), given=given)
+        for view in VIEWS:
+            assert np.all(near.frames[view].origin == Origin.HERE)
+            apart = np.abs(near.frames[view].image.astype(int) - images[view])
+            assert apart.max() <= (1 if ratio < 1e-4 else 40)  # an edge of 255 levels over 0.1 px and its ringing
+
+
 def test_inpainting_leaves_no_pixel_empty_and_keeps_the_marks(castle: Sequence) -> None:
     images, ratio = _frames(castle), castle.shutter.readout_ratio
     plain = correct_four(images, castle.rig, ratio, CorrectionOptions()).frames

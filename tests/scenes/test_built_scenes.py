@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from rsbench.cards import card_path, list_cards
 from rsbench.errors import RsbenchError
-from rsbench.scenes import castle, old_town, room
+from rsbench.scenes import castle, old_town, poles, room
 from rsbench.scenes.load import BUILDERS, load_scene, read_scene_card
 from rsbench.scenes.model import Material, Scene, SceneMesh
 from rsbench.scenes.palette import RECIPES
 from rsbench.scenes.surfaces import Surface
 
-BUILT_IN = ("castle", "old-town", "room")
+BUILT_IN = ("castle", "old-town", "poles", "room")
 FOCAL, SIZE = 1384.6, 900  # the paper's camera, 36 degrees
 
 
@@ -115,7 +115,12 @@ def test_viewpoints_are_several_and_leave_room_for_the_rig(scene: Scene) -> None
         assert first_hits(scene, view, pixel_rays(3)).min() > 1.0, view
 
 
-DEPTHS = {"castle": (4.0, (8, 27), 70.0), "old-town": (4.0, (8, 25), 70.0), "room": (1.2, (2.5, 5.5), 6.5)}
+DEPTHS = {
+    "castle": (4.0, (8, 27), 70.0),
+    "old-town": (4.0, (8, 25), 70.0),
+    "poles": (2.0, (4, 13), 30.0),
+    "room": (1.2, (2.5, 5.5), 6.5),
+}
 """Of the default view, metres: the nearest, the range of the median, the farthest."""
 
 
@@ -133,6 +138,7 @@ def test_default_views_have_depths_a_stereo_rig_can_use(scene: Scene, name: str)
 BUILD: dict[str, tuple[ModuleType, Callable[[int], tuple[SceneMesh, ...]]]] = {
     "castle": (castle, lambda seed: castle.CastleBuilder().build(seed, Path())),
     "old-town": (old_town, lambda seed: old_town.OldTownBuilder().build(seed, Path())),
+    "poles": (poles, lambda seed: poles.PolesBuilder().build(seed, Path())),
     "room": (room, lambda seed: room.RoomBuilder().build(seed, Path())),
 }
 
@@ -213,5 +219,7 @@ def test_bad_cards_are_refused_in_one_line(tmp_path: Path, card: str, old: str, 
 
 
 def test_unknown_scenes_are_refused_with_the_known_ones() -> None:
-    with pytest.raises(RsbenchError, match="'atlantis' does not exist; there are: castle, mesh, old-town, room"):
+    with pytest.raises(
+        RsbenchError, match="'atlantis' does not exist; there are: castle, mesh, old-town, poles, room"
+    ):
         load_scene("atlantis")

@@ -1,4 +1,4 @@
-"""Depth from a camera's own motion, against the row equation and rendered frames."""
+"""Dense flow and the depth that it means, against the row equation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from cv2 import GaussianBlur
 
 from rsbench.core.projection import back_project, rs_project_near
-from rsbench.vision.flow import dense_flow, depth_from_motion, flow_depth, flow_returns
+from rsbench.vision.flow import dense_flow, flow_depth
 
 Build = Callable[..., Any]
 
@@ -41,37 +41,6 @@ def test_flow_that_the_motion_forbids_has_its_error(world: Build, shapes: Any) -
     assert np.isfinite(depth[0]) and error[0] < 1e-9
     assert 2.5 < error[1] < 3.5  # the rows are also read at other times
     assert np.isinf(depth[2]) and error[2] == pytest.approx(2.0)
-
-
-def test_a_flow_returns_where_both_agree() -> None:
-    flow = np.full((40, 50, 2), 2.0, dtype=np.float32)
-    back = -flow
-    back[20:, :, 0] = 0.5
-    returns = flow_returns(flow, back, 1.0)
-    assert np.all(returns[:17, :47]) and not np.any(returns[18:])
-    assert not np.any(returns[:, 48:])  # leaves the picture
-
-
-def test_only_unknown_pixels_get_a_depth_and_it_is_right(world: Build, shapes: Any) -> None:
-    scene = world((shapes[0]((0.1, 0.2, 1.0), 5.0),), d=(0.3, -0.1, 0.05))
-    (first, depth), (second, _) = (scene.rolling("left", frame) for frame in (0, 1))
-    unknown = np.zeros(depth.shape, dtype=np.bool_)
-    unknown[20:-20, 20:-20] = True
-    geometry = scene.rig, scene.shutter, scene.motion
-    images = (255 * first).astype(np.uint8), (255 * second).astype(np.uint8)
-    found, nothing = depth_from_motion(images, (unknown, ~unknown & unknown), *geometry, "left")
-    assert not np.any(nothing) and not np.any(found[~unknown])
-    known = found > 0.0
-    assert np.mean(known[unknown]) > 0.7
-    # Dense flow is good to a quarter of a pixel of some 15 px of parallax.
-    assert np.median(np.abs(found[known] / depth[known] - 1.0)) < 0.03
-
-
-def test_pictures_too_small_for_flow_give_nothing(world: Build, shapes: Any) -> None:
-    scene = world((shapes[0]((0.0, 0.0, 1.0), 5.0),))
-    image, mask = np.zeros((20, 300), dtype=np.uint8), np.ones((20, 300), dtype=np.bool_)
-    found = depth_from_motion((image, image), (mask, mask), scene.rig, scene.shutter, scene.motion, "left")
-    assert not np.any(found)
 
 
 def test_dense_flow_follows_a_shift() -> None:

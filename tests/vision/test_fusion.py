@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -98,7 +99,8 @@ def test_nearer_surfaces_hide_farther_ones_among_the_fillers(scene: Any) -> None
     """Two fillers that contradict each other: the nearer one is what the target sees, in whatever order."""
     camera = scene.rig.camera
     first = _view(scene, "left", 0, Origin.HERE)
-    empty = SourceView(image=first.image, depth=np.zeros_like(first.depth), poses=first.poses, origin=Origin.HERE)
+    grey = np.full_like(first.image, 0.5)  # all images look alike, so that none contradicts another
+    empty = SourceView(image=grey, depth=np.zeros_like(first.depth), poses=first.poses, origin=Origin.HERE)
     near, far = (
         SourceView(
             image=np.full_like(first.image, value),
@@ -106,13 +108,44 @@ def test_nearer_surfaces_hide_farther_ones_among_the_fillers(scene: Any) -> None
             poses=first.poses,
             origin=origin,
         )
-        for value, depth, origin in ((0.2, 3.0, Origin.OTHER_CAMERA), (0.8, 9.0, Origin.OTHER_FRAME))
+        for value, depth, origin in ((0.48, 3.0, Origin.OTHER_CAMERA), (0.53, 9.0, Origin.OTHER_FRAME))
     )
     middle = (slice(40, camera.height - 40), slice(40, camera.width - 40))
     for order in ((near, far), (far, near)):
         fused = _fuse(scene, empty, *order)
         assert np.all(fused.origin[middle] == Origin.OTHER_CAMERA)
-        np.testing.assert_allclose(fused.image[middle], 0.2, atol=1e-6)
+        np.testing.assert_allclose(fused.image[middle], 0.48, atol=1e-6)
+
+
+@pytest.mark.parametrize("half_width", [0.03, 0.25])
+def test_what_one_frame_alone_sees_is_not_replaced_by_what_lies_behind(
+    world: Build, shapes: Any, half_width: float
+) -> None:
+    """A post of unknown depth that stands before the left camera's wall; the right camera sees wall everywhere.
+
+    Where the left frame shows the post, no other frame's wall may stand; the post's pixels are guessed at most.
+    """
+    plane = shapes[0]
+    wall = plane((0.05, 0.1, 1.0), 7.0)
+    scene = world((wall,), d=(0.25, -0.1, 0.1), baseline=0.4)
+    left, *others = _all_views(scene)
+    at = np.abs(np.arange(scene.rig.camera.width) - 90.0) < 100.0 * half_width
+    post = np.broadcast_to(at, left.depth.shape)
+    image = np.where(post[..., None], np.float32(1.0), left.image * np.float32(0.5))
+    seen = replace(left, image=image, depth=np.where(post, np.float32(0.0), left.depth))
+    darker = [replace(view, image=view.image * np.float32(0.5)) for view in others]
+    guess = replace(seen, depth=np.where(post, left.depth, np.float32(0.0)), origin=Origin.GUESSED)
+    fused = _fuse(scene, seen, *darker, guess)
+    where = warp(post.astype(np.float32), left.depth, scene.rig.camera, left.poses, _target(scene))
+    inside = where.mask & (where.image > 0.999)
+    assert np.count_nonzero(inside) > 500
+    assert np.all(fused.origin[inside] == Origin.GUESSED) and np.all(fused.image[inside] > 0.9)
+    # What the frame does not contradict is still filled: the wall outside its picture.
+    assert np.count_nonzero((fused.origin == Origin.OTHER_CAMERA) | (fused.origin == Origin.OTHER_FRAME)) > 50
+
+
+def _target(scene: Any) -> Any:
+    return scene.rig.cam_from_world(scene.motion, 0.0, "left")
 
 
 def test_guesses_come_last_and_nothing_is_kept_unmarked(scene: Any) -> None:

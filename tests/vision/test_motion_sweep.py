@@ -1,0 +1,61 @@
+"""Depth from a camera's own motion, against the closed-form world of conftest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rsbench.core.motion import LinearMotion
+from rsbench.vision.motion_sweep import _census, _ones, depth_from_motion
+
+Build = Callable[..., Any]
+
+
+def _post(X: np.ndarray) -> np.ndarray:
+    return np.abs(X[..., 0] - 0.1) < 0.06
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_thin_post_before_a_wall_gets_its_depth(world: Build, shapes: Any, u8: Any, side: Any) -> None:
+    """Ten pixels wide, none of it known to stereo; the wall behind it is known."""
+    plane = shapes[0]
+    scene = world((plane((0.05, 0.1, 1.0), 7.0), plane((0.0, 0.0, 1.0), 3.0, _post)), d=(0.25, -0.1, 0.1))
+    seen = [scene.rolling(side, frame) for frame in (0, 1)]
+    images, truth = [u8(image) for image, _ in seen], [depth for _, depth in seen]
+    posts = [depth < 4.0 for depth in truth]
+    known = [np.where(post, 0.0, depth).astype(np.float32) for post, depth in zip(posts, truth, strict=True)]
+    geometry = scene.rig, scene.shutter, scene.motion
+    for frame, found in enumerate(depth_from_motion(tuple(images), tuple(known), *geometry, side)):  # type: ignore[arg-type]
+        assert not np.any(found[~posts[frame]])
+        got = found[posts[frame]]
+        assert np.mean(got > 0.0) > 0.7
+        # Half a pixel of some 20 px of parallax is 2.5 %; a match lies within that and its neighbours' votes.
+        assert np.mean(np.abs(got[got > 0.0] / truth[frame][posts[frame]][got > 0.0] - 1.0) < 0.05) > 0.95
+
+
+def test_what_the_other_frame_does_not_confirm_has_no_depth(world: Build, shapes: Any) -> None:
+    """Noise in the second frame: nothing there looks like the first."""
+    scene = world((shapes[0]((0.0, 0.0, 1.0), 5.0),), d=(0.3, 0.0, 0.0))
+    images = tuple(np.random.default_rng(k).integers(0, 255, (160, 200), dtype=np.uint8) for k in (0, 1))
+    nothing = (np.zeros((160, 200), np.float32),) * 2
+    found = depth_from_motion(images, nothing, scene.rig, scene.shutter, scene.motion, "left")  # type: ignore[arg-type]
+    assert all(np.mean(depth > 0.0) < 0.02 for depth in found)
+
+
+def test_without_a_translation_there_is_no_depth(world: Build, shapes: Any, u8: Any) -> None:
+    scene = world((shapes[0]((0.0, 0.0, 1.0), 5.0),))
+    still = LinearMotion(np.zeros(3), np.zeros(3))
+    image, unknown = u8(scene.rolling("left", 0)[0]), np.zeros((160, 200), np.float32)
+    found = depth_from_motion((image, image), (unknown, unknown), scene.rig, scene.shutter, still, "left")
+    assert not np.any(found[0]) and not np.any(found[1])
+
+
+def test_a_census_counts_the_darker_neighbours() -> None:
+    grey = np.random.default_rng(0).integers(0, 255, (12, 14), dtype=np.uint8)
+    census = _census(grey)
+    for y, x in ((2, 2), (5, 7), (9, 11)):
+        darker = np.count_nonzero(grey[y - 2 : y + 3, x - 2 : x + 3] < grey[y, x])
+        assert _ones(census[y, x]) == bin(int(census[y, x])).count("1") == darker
