@@ -199,7 +199,12 @@ def _conclude(
     threshold: float,
     options: RobustOptions,
 ) -> tuple[MotionEstimate, BoolArray, float]:
-    """The solver on all inliers, the matches that this motion explains, and the threshold for them."""
+    """The solver on all matches near or on all inliers, those that this motion explains, and their threshold."""
+    final = problem.weigh(model, threshold)
+    if final is not None:
+        if options.adapt_threshold:
+            threshold = _adapted(problem, final, threshold, options)
+        return final, np.abs(problem.residuals(final)) <= threshold, threshold
     if options.adapt_threshold:
         for _ in range(_ADAPTATIONS):
             model = problem.refine(model, inliers) or model

@@ -20,6 +20,8 @@ from rsbench.solvers.engine.packed import Packed, pack, pack_pairs
 
 SIGMAS = 2.5
 """Standard deviations of the noise at which a match is an outlier."""
+_NEAR = 8.0
+"""Thresholds within which a solver that weighs matches itself is given them."""
 _TRACK_FREEDOM = 5
 _FIXED_POINT_STEPS = 8
 _GROUPS: tuple[MatchSet, ...] = ("left", "right", "tracks")
@@ -158,6 +160,12 @@ class RobustProblem:
         subset = self._subset(np.flatnonzero(inliers))
         estimate = self.solver.improve(model, subset, self.rig, self.shutter, quick=True)
         return estimate if estimate.success else None
+
+    def weigh(self, model: MotionEstimate, threshold: float) -> MotionEstimate | None:
+        """What a solver that weighs matches itself makes of all of them near a model."""
+        near = np.flatnonzero(np.abs(self.residuals(model)) <= _NEAR * threshold)
+        found = self.solver.weigh(model, self._subset(near), self.rig, self.shutter, threshold / SIGMAS)
+        return found if found is not None and found.success else None
 
     def conclude(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate:
         """The solver on all inliers; the model itself when the solver fails there."""

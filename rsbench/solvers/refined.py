@@ -19,6 +19,7 @@ from rsbench.motions import motion_model
 from rsbench.solvers.eight_point import decompose_essential, eight_point
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.five_point import five_point
+from rsbench.solvers.engine.heavy_tails import heavy_tailed
 from rsbench.solvers.engine.kernel_type import load_kernel
 from rsbench.solvers.engine.linear_systems import scaled_translation
 from rsbench.solvers.engine.minimal import solve_triples
@@ -29,6 +30,8 @@ from rsbench.solvers.iterated import solve_reduced
 _SCREEN_ITERATIONS, _SCREEN_MATCHES = 6, 150
 _LONGEST_START = 2.0
 """Length of d in baselines that a descent on pairs starts with at most."""
+_REWEIGHTINGS = (5, 5)
+"""Steps before the distribution of the errors is found again."""
 _LEAST_IN_FRONT = 0.75
 _AS_GOOD, _APART = 3.0, 25.0
 """Two motions fit alike within so many standard deviations, and are two beyond so many squared ones."""
@@ -170,6 +173,27 @@ class RefinedSolver(Solver):
         w, d = packed.motion(self._minimise(packed, start, _SCREEN_ITERATIONS).theta)
         return MotionEstimate(w=w, d=d, success=True)
 
+    def weigh(
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        noise_px: float,
+    ) -> MotionEstimate | None:
+        if self.shutter == "global":
+            return None  # What it leaves of a rolling shutter's matches is no noise.
+        packed = self.packed(correspondences, rig, shutter)
+        theta = packed.theta(motion.w, motion.d)
+        tailed = heavy_tailed(packed, theta, noise_px)
+        for iterations in _REWEIGHTINGS:
+            if tailed is not None:
+                theta = self._minimise(tailed, theta, iterations).theta
+                tailed = heavy_tailed(packed, theta, tailed.scale)
+        if tailed is None:
+            return None
+        return self.report(tailed, *self._settle(tailed, self._checked(tailed, theta), rig))
+
     def _minimise(self, packed: Packed, theta: FloatArray, iterations: int) -> Minimum:
         return levenberg_marquardt(
             packed.normal_equations,
@@ -209,7 +233,7 @@ class RefinedSolver(Solver):
             return best, False
         starts = [_signed_start(packed, packed.pairs, w, d, rig) for w, d in planar_motions(packed.larger_side())]
         found = sorted([best, *(self._checked(packed, start) for start in starts)], key=lambda each: each.cost)
-        lowest, variance = found[0], max(noise_variance(packed, found[0]), _LEAST_NOISE_PX**2)
+        lowest, variance = found[0], max(packed.noise_variance(found[0].cost), _LEAST_NOISE_PX**2)
         for other in found[1:]:
             step = other.theta - lowest.theta
             if step @ lowest.H @ step > _APART * variance and _as_good(packed, lowest, other):
@@ -218,12 +242,14 @@ class RefinedSolver(Solver):
 
     def report(self, packed: Packed, best: Minimum, rival: bool = False) -> MotionEstimate:
         """Estimate with covariance and what the data leave open; ``rival``: another motion fits as well."""
-        freedom = packed.constraints - 6
-        variance = noise_variance(packed, best)
+        variance = packed.noise_variance(best.cost)
         if rotation_sigma(best.H, max(variance, _LEAST_NOISE_PX**2)) > self.max_rotation_sigma:
             return MotionEstimate.failed("the rotation is not determined: degenerate matches")
         w, d = packed.motion(best.theta)
-        covariance = _covariance(packed, best, variance) if freedom > 0 else None
+        covariance = packed.covariance(best.theta, best.cost, best.H)
+        if covariance is not None:
+            J = packed.motion_jacobian(best.theta)
+            covariance = J @ covariance @ J.T
         scale_sigma, direction_sigma = _translation_sigmas(d, covariance)
         at_limit = float(np.linalg.norm(best.theta[3:])) >= 0.999 * self.max_translation_m
         # Tracks measure d in metres, however short it is; pairs only the direction of d well.
@@ -244,7 +270,7 @@ class RefinedSolver(Solver):
             direction_known=direction_known,
             reason="; ".join(reasons),
             covariance=covariance,
-            noise_px=float(np.sqrt(variance)) if freedom > 0 else None,
+            noise_px=float(np.sqrt(variance)) if packed.constraints > 6 else None,
         )
 
 
@@ -258,14 +284,8 @@ def _as_good(packed: Packed, best: Minimum, other: Minimum) -> bool:
 
     Q. Vuong, Likelihood ratio tests for model selection and non-nested hypotheses, Econometrica 1989.
     """
-    squares = packed.pair_residuals(other.theta) ** 2 - packed.pair_residuals(best.theta) ** 2
-    return float(np.sum(squares)) <= _AS_GOOD * float(np.std(squares)) * np.sqrt(len(squares))
-
-
-def noise_variance(packed: Packed, best: Minimum) -> float:
-    """Variance (px^2) of a coordinate that the residuals show; 0 without more equations than unknowns."""
-    freedom = packed.constraints - 6
-    return 2.0 * best.cost / freedom if freedom > 0 else 0.0
+    excess = packed.pair_costs(other.theta) - packed.pair_costs(best.theta)
+    return float(np.sum(excess)) <= _AS_GOOD * float(np.std(excess)) * np.sqrt(len(excess))
 
 
 def rotation_sigma(H: FloatArray, variance: float) -> float:
@@ -277,16 +297,6 @@ def rotation_sigma(H: FloatArray, variance: float) -> float:
     S = H[:3, :3] - coupling.T @ (coupling / values[keep, None])
     least = float(np.linalg.eigvalsh(S)[0])
     return float(np.sqrt(variance / least)) if least > 1e-12 * float(np.trace(H[:3, :3])) else np.inf
-
-
-def _covariance(packed: Packed, best: Minimum, variance: float) -> FloatArray | None:
-    """Covariance (6, 6) of (w, d); None when it does not exist."""
-    scale = np.sqrt(np.maximum(np.diagonal(best.H), 1e-300))
-    values, vectors = np.linalg.eigh(best.H / np.outer(scale, scale))
-    if not values[0] > 1e-12 * values[-1]:
-        return None
-    half = packed.motion_jacobian(best.theta) @ (vectors / scale[:, None] / np.sqrt(values))
-    return variance * (half @ half.T)
 
 
 def _translation_sigmas(d: FloatArray, covariance: FloatArray | None) -> tuple[float, float]:

@@ -180,3 +180,20 @@ class Solver(ABC):
             quick: a step of a search, whose result is improved again: need not be the last digit.
         """
         return self.estimate(correspondences, rig, shutter)
+
+    def weigh(
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        noise_px: float,
+    ) -> MotionEstimate | None:
+        """The end of a robust search, of a solver that weighs matches itself; None leaves it to ``improve``.
+
+        Args:
+            motion: the best of the search.
+            correspondences: all matches near it, of which some are wrong, far more than ``improve`` is given.
+            noise_px: standard deviation of a coordinate that the search has found.
+        """
+        return None

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import rsbench.solvers.engine.motion_kernels  # noqa: F401  (gives the models their kernels)
-from rsbench.core.correspondences import Correspondences, temporal_pairs, unlinked_pairs
+from rsbench.core.correspondences import BoolArray, Correspondences, temporal_pairs, unlinked_pairs
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -58,6 +58,11 @@ class Packed:
         """Without the pairs."""
         return self._of(self.pairs[:0], self.tracks, self.row_checks)
 
+    def only(self, wanted: BoolArray) -> Packed:
+        """The pairs and then the tracks of a mask (n + m,)."""
+        pairs, tracks = np.split(wanted, [len(self.pairs)])
+        return self._of(self.pairs[pairs], self.tracks[tracks], self.row_checks[tracks])
+
     def _of(self, pairs: FloatArray, tracks: FloatArray, row_checks: FloatArray) -> Packed:
         # In one piece, as they came: of other arrays the kernels would need another compilation.
         return Packed(
@@ -103,6 +108,20 @@ class Packed:
         )
         return np.where(squares >= BEHIND, BEHIND, squares + self.row_checks)
 
+    def pair_costs(self, theta: FloatArray) -> FloatArray:
+        """Twice what each of the pairs (n,) adds to the cost, px^2."""
+        return self.pair_residuals(theta) ** 2
+
+    def noise_variance(self, cost: float) -> float:
+        """Variance (px^2) of a coordinate that the residuals show; 0 without more equations than unknowns."""
+        freedom = self.constraints - 6
+        return 2.0 * cost / freedom if freedom > 0 else 0.0
+
+    def covariance(self, theta: FloatArray, cost: float, H: FloatArray) -> FloatArray | None:
+        """Covariance (6, 6) of theta at the minimum; None when it does not exist."""
+        inverse = inverse_definite(H)
+        return None if inverse is None or self.constraints <= 6 else self.noise_variance(cost) * inverse
+
     def in_front(self, theta: FloatArray) -> int:
         """Number of pairs whose point lies in front of both cameras."""
         return count_in_front(theta, self.kernel, self.pairs)
@@ -118,6 +137,16 @@ class Packed:
     def motion_jacobian(self, theta: FloatArray) -> FloatArray:
         """Derivative (6, 6) of (w, d) by the parameters."""
         return self.kernel.motion_jacobian(theta)
+
+
+def inverse_definite(H: FloatArray) -> FloatArray | None:
+    """Inverse of a positive definite matrix whose unknowns have different units; None when it is none."""
+    scale = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
+    values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
+    if not values[0] > 1e-12 * values[-1]:
+        return None
+    half = vectors / scale[:, None] / np.sqrt(values)
+    return np.asarray(half @ half.T)
 
 
 def pack(
