@@ -8,7 +8,9 @@ a bootstrap then draws whole scenes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -82,9 +84,7 @@ def bootstrap_interval(
         drawn = _statistics(values, statistic, rng, resamples)
     else:
         drawn = _clustered(values, statistic, np.asarray(clusters), rng, resamples)
-    tail = 0.5 * (1.0 - COVERAGE)
-    low, high = np.quantile(drawn, [tail, 1.0 - tail])
-    return Interval(float(low), float(high))
+    return _middle_part(drawn)
 
 
 def _statistics(values: FloatArray, statistic: Statistic, rng: np.random.Generator, resamples: int) -> FloatArray:
@@ -111,7 +111,58 @@ def typical_interval(values: FloatArray, seed: int, clusters: Sequence[Any] | No
     """Interval of the median of values (n,): exact for few, a bootstrap of clusters for many."""
     if len(values) < FEW:
         return median_interval(values)
-    return bootstrap_interval(values, median, seed, clusters)
+    if clusters is not None:
+        return bootstrap_interval(values, median, seed, clusters)
+    # The median of a sample is the value at the median of its ranks, which are the same for all values.
+    middle = _middle_ranks(len(values), seed)
+    return _middle_part(np.mean(np.sort(values)[middle], axis=1))
+
+
+def average_interval(values: FloatArray, seed: int, of: Statistic | None = None) -> Interval:
+    """Bootstrap interval of the mean of independent values (n,), or of a function ``of`` the means of (n, k).
+
+    ``of`` reduces the last axis of means (resamples, k).
+    """
+    means = _counts(len(values), seed) @ values / len(values)
+    return _middle_part(means if of is None else of(means))
+
+
+@lru_cache(maxsize=4)
+def _counts(n: int, seed: int) -> FloatArray:
+    """How often each of n values is in each sample (resamples, n)."""
+    return generator(seed, "bootstrap", n).multinomial(n, np.full(n, 1.0 / n), RESAMPLES).astype(np.float64)
+
+
+@lru_cache(maxsize=4)
+def _middle_ranks(n: int, seed: int) -> NDArray[np.intp]:
+    """Ranks (resamples, 2), from 0, of the middle one or two of n values drawn from n."""
+    drawn = np.cumsum(_counts(n, seed), axis=1)
+    return np.stack([np.argmax(drawn > k, axis=1) for k in ((n - 1) // 2, n // 2)], axis=1)
+
+
+def _middle_part(drawn: FloatArray) -> Interval:
+    tail = 0.5 * (1.0 - COVERAGE)
+    low, high = np.quantile(drawn, [tail, 1.0 - tail], method="inverted_cdf")  # between infinities lies nothing
+    return Interval(float(low), float(high))
+
+
+def in_words(value: float, low: float, high: float) -> str:
+    """``value [low, high]`` with the digits that the interval leaves: the last is below a third of half of it."""
+    if low == high or not all(map(math.isfinite, (value, low, high))):
+        return f"{value:.3g} [{low:.3g}, {high:.3g}]"
+    digits = decimals(low, high)
+    return f"{rounded(value, digits)} [{rounded(low, digits)}, {rounded(high, digits)}]"
+
+
+def decimals(low: float, high: float) -> int:
+    """Decimals that an interval leaves to its value; negative: tens, hundreds. At most 9."""
+    half = 0.5 * (high - low)
+    return 9 if half <= 0.0 else min(9, -math.floor(math.log10(half / 3.0)))
+
+
+def rounded(value: float, digits: int) -> str:
+    """A number with so many decimals, zeros kept; tens and hundreds for negative ones."""
+    return f"{round(value, digits):.{max(digits, 0)}f}"
 
 
 def median(values: FloatArray) -> FloatArray:

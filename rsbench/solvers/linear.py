@@ -24,7 +24,9 @@ from rsbench.solvers.engine.linear_systems import (
 from rsbench.solvers.engine.packed import Packed, pack
 
 
-def system_rows(matches: FloatArray, side: Side, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
+def system_rows(
+    matches: FloatArray, side: Side, rig: StereoRig, shutter: RollingShutter, third_order: bool = False
+) -> FloatArray:
     """Rows (n, 19) of A_1 (left) or A_2 (right), paper eq. 7-10, of matches (n, 4) x0, y0, x1, y1.
 
     With x, y the rays of frames 0 and 1, ``a = k3 - k1`` and s b the camera's offset, eq. 7 (s = 1) and 8
@@ -38,6 +40,9 @@ def system_rows(matches: FloatArray, side: Side, rig: StereoRig, shutter: Rollin
 
     Two identities turn the terms into these: y^T [v]x x = v . (x cross y), and
     [[w]x d]x = E^T - E with E = [d]x[w]x = w d^T - (d.w) I; likewise [[w]x b]x [w]x = w (w cross b)^T.
+
+    ``third_order`` appends the columns (n, 27) of S: of the matrix w (w cross d)^T, whose trace is zero, all
+    entries but the last.
     """
     x, y = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
     k1, k3 = shutter.row_time(matches[:, 1], 0), shutter.row_time(matches[:, 3], 1)
@@ -50,7 +55,26 @@ def system_rows(matches: FloatArray, side: Side, rig: StereoRig, shutter: Rollin
     by_E = a[..., None] ** 2 * M - (a * k1[:, None])[..., None] * (np.swapaxes(M, 1, 2) - M)
     products = (M[:, 0, 2], -M[:, 0, 1], M[:, 1, 2], M[:, 2, 2] - M[:, 1, 1], -M[:, 2, 1])
     by_ww = a**2 * sb * np.stack(products, axis=-1)
-    return np.concatenate([by_d, by_w, by_E.reshape(-1, 9), by_ww], axis=1)
+    rows = [by_d, by_w, by_E.reshape(-1, 9), by_ww]
+    if third_order:
+        traceless = M - M[:, 2:, 2:] * np.eye(3)
+        rows.append(-(a**2) * k1[:, None] * traceless.reshape(-1, 9)[:, :8])
+    return np.concatenate(rows, axis=1)
+
+
+def far_apart(matches: FloatArray, count: int) -> FloatArray:
+    """``count`` of the matches (n, 4) that stand far from each other in frame 0: each farthest from those before.
+
+    T. Gonzalez, Clustering to minimize the maximum intercluster distance, 1985.
+    """
+    points = matches[:, :2]
+    distances = np.linalg.norm(points - np.mean(points, axis=0), axis=1)
+    chosen: list[int] = []
+    for _ in range(min(count, len(matches))):
+        chosen.append(int(np.argmax(distances)))
+        to_last = np.linalg.norm(points - points[chosen[-1]], axis=1)
+        distances = to_last if len(chosen) == 1 else np.minimum(distances, to_last)
+    return matches[chosen]
 
 
 @final
@@ -58,17 +82,20 @@ def system_rows(matches: FloatArray, side: Side, rig: StereoRig, shutter: Rollin
 class LinearSolver(Solver):
     """The paper's solver; each choice that the paper leaves open is a parameter.
 
-    Read literally, X is the right singular vector of the smallest singular value of A as equations 7 to 10 make
-    it, of normalised rays and a baseline in metres: ``scaling = "none"``. The committed results were made with
-    unit columns, which is worse wherever matches have noise; the default stays until they are made again. The
-    paper does not say how w, d and the scale come out of X.
+    The defaults are the literal reading: X is the right singular vector of the smallest singular value of A as
+    equations 7 to 10 make it, of normalised rays and a baseline in metres. The paper does not say how w, d and the
+    scale come out of X.
     Known defects, kept: rotation is truncated inconsistently (w2w2 and w3w3 would be inseparable otherwise);
     antisymmetric E is nearly collinear with d, so noise reaches the rotation; without readout (phi = 0) or with
     pure translation the system is singular.
     """
 
-    scaling: Literal["none", "unit-columns"] = "unit-columns"
-    """Of the columns of A before the singular value decomposition; none is the literal reading."""
+    sampling: Literal["all", "nine-apart"] = "all"
+    """Matches that are used: all, or nine of each camera that stand far apart."""
+    terms: Literal["second", "third"] = "second"
+    """Order of the terms in the motion that A holds: 19 unknowns, or the 27 of which the paper drops eight."""
+    scaling: Literal["none", "unit-columns"] = "none"
+    """Of the columns of A before the singular value decomposition; unit columns are worse with noise."""
     baseline_unit: Literal["metre", "half-baseline"] = "metre"
     """Unit of length in A: metres, or the paper's b."""
     extraction: Literal["full", "symmetric"] = "full"
@@ -78,34 +105,39 @@ class LinearSolver(Solver):
     sign: Literal["cheirality", "scale"] = "cheirality"
     """What gives the sign of d: the points in front of the cameras, or the sign of the scale."""
 
-    spec = SolverSpec(
-        needs=frozenset({"left", "right"}),
-        minimum={"left": 9, "right": 9},
-        metric=True,
-        motion_model="linear",
-        shutter="rolling",
-        reference_point="body",
-        reference="Wang, Fan, Dai: Relative Pose Estimation for Stereo Rolling Shutter Cameras, eq. 7-10",
-        assumes="small rotation, constant velocity, readout ratio above 0, generic motion, very low noise",
-    )
+    @property
+    def spec(self) -> SolverSpec:
+        least = 9 if self.terms == "second" else 13
+        return SolverSpec(
+            needs=frozenset({"left", "right"}),
+            minimum={"left": least, "right": least},
+            metric=True,
+            motion_model="linear",
+            shutter="rolling",
+            reference_point="body",
+            reference="Wang, Fan, Dai: Relative Pose Estimation for Stereo Rolling Shutter Cameras, eq. 7-10",
+            assumes="small rotation, constant velocity, readout ratio above 0, generic motion, very low noise",
+        )
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         matches = {side: temporal_pairs(correspondences, side) for side in SIDES}
+        if self.sampling == "nine-apart":
+            matches = {side: far_apart(matches[side], 9) for side in SIDES}
         short = self.spec.shortage({side: len(matches[side]) for side in SIDES})
         if short is not None:
             return short
         unit = 1.0 if self.baseline_unit == "metre" else 0.5 * rig.baseline
-        scaled = replace(rig, baseline=rig.baseline / unit)
-        A = np.concatenate([system_rows(matches[side], side, scaled, shutter) for side in SIDES])
+        scaled, third = replace(rig, baseline=rig.baseline / unit), self.terms == "third"
+        A = np.concatenate([system_rows(matches[side], side, scaled, shutter, third) for side in SIDES])
         X, reason = null_vector(A, unit_columns=self.scaling == "unit-columns")
         if X is None:
             return MotionEstimate.failed(reason)
         if not np.linalg.norm(X[:3]) > ROUNDING * np.linalg.norm(X):
             return MotionEstimate.failed("no translation: its direction and the rotation are not separable")
         w = rotation_from_essential(X[5:14].reshape(3, 3), X[:3], self.extraction == "symmetric")
-        packed = pack(correspondences, rig, shutter, use_tracks=False)
+        packed = pack(Correspondences(**matches), rig, shutter, use_tracks=False)
         d = self._translation(X, w, unit, packed)
         if d is None or not (np.all(np.isfinite(w)) and np.all(np.isfinite(d))):
             return MotionEstimate.failed(

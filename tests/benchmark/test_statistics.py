@@ -12,10 +12,14 @@ from hypothesis import strategies as st
 from scipy.stats import beta
 
 from rsbench.benchmark.statistics import (
+    average_interval,
     bootstrap_interval,
+    decimals,
+    in_words,
     mean,
     median,
     median_interval,
+    rounded,
     share_interval,
     typical_interval,
 )
@@ -105,4 +109,56 @@ def test_few_values_are_exact_and_many_drawn() -> None:
     rng = np.random.default_rng(3)
     few, many = rng.standard_normal(9), rng.standard_normal(100)
     assert typical_interval(few, 0) == median_interval(few)
-    assert typical_interval(many, 0) == bootstrap_interval(many, median, 0)
+    # Another draw of the same bootstrap: ends differ by what 10 000 samples leave open.
+    np.testing.assert_allclose(typical_interval(many, 0), bootstrap_interval(many, median, 1), atol=0.05)
+    assert typical_interval(many, 0) == typical_interval(many[::-1].copy(), 0)
+
+
+def test_the_average_of_many_agrees_with_the_normal_interval() -> None:
+    values = np.random.default_rng(2).standard_normal(400)
+    half = 1.96 * np.std(values) / np.sqrt(400)
+    # 10 000 resamples know the ends of the interval to about 2 % of its half width.
+    expected = [np.mean(values) - half, np.mean(values) + half]
+    np.testing.assert_allclose(average_interval(values, 0), expected, atol=0.08 * half)
+    twice = average_interval(np.stack([values, values], axis=1), 0, lambda means: means[:, 0] + means[:, 1])
+    np.testing.assert_allclose(twice, 2.0 * np.array(average_interval(values, 0)), rtol=1e-12)
+
+
+def test_intervals_of_trials_cover_the_truth() -> None:
+    rng = np.random.default_rng(5)
+    experiments, hits = 300, {"mean": 0, "median": 0}
+    for _ in range(experiments):
+        values = rng.exponential(1.0, 80)
+        for name, interval, truth in (("mean", average_interval, 1.0), ("median", typical_interval, np.log(2.0))):
+            low, high = interval(values, 0)
+            hits[name] += low <= truth <= high
+    # 95 % within four standard deviations (0.0126) of 300 experiments, less what n = 80 costs such an interval.
+    assert 0.88 < hits["mean"] / experiments < 0.99
+    assert 0.88 < hits["median"] / experiments < 0.99
+
+
+def test_failures_without_end_leave_an_interval() -> None:
+    values = np.concatenate([np.arange(40.0), np.full(30, np.inf)])
+    low, high = typical_interval(values, 0)
+    assert 20.0 < low < 39.0 and np.isinf(high)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        ((8.22, 5.28, 12.1), "8 [5, 12]"),
+        ((0.0597, 0.0561, 0.0655), "0.060 [0.056, 0.066]"),
+        ((160.4, 96.0, 183.0), "160 [100, 180]"),
+        ((1.0, 1.0, 1.0), "1 [1, 1]"),
+        ((2.5, -np.inf, np.inf), "2.5 [-inf, inf]"),
+    ],
+)
+def test_digits_follow_the_interval(numbers: tuple[float, float, float], words: str) -> None:
+    assert in_words(*numbers) == words
+
+
+@given(st.floats(-1e3, 1e3), st.floats(1e-6, 1e3))
+def test_rounding_moves_a_value_by_little_of_its_interval(value: float, half: float) -> None:
+    low, high = value - half, value + half
+    # Half a unit of the last digit, which is below a third of half the interval.
+    assert abs(float(rounded(value, decimals(low, high))) - value) <= half / 6.0 * (1 + 1e-6) + 1e-9

@@ -24,7 +24,7 @@ from rsbench.solvers.engine.base import Solver
 from rsbench.solvers.engine.linear_systems import null_vector, rotation_from_essential, scaled_translation
 from rsbench.solvers.engine.packed import pack
 from rsbench.solvers.iterated import IteratedSolver, length_from_tracks, reduced_blocks
-from rsbench.solvers.linear import LinearSolver, system_rows
+from rsbench.solvers.linear import LinearSolver, far_apart, system_rows
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
@@ -39,8 +39,15 @@ def unknowns(w: FloatArray, d: FloatArray) -> FloatArray:
     return np.concatenate([d, w[1:], E.ravel(), products])
 
 
-def paper_constraint(match: FloatArray, sign: float, w: FloatArray, d: FloatArray) -> float:
-    """Eq. 7 (sign 1) and 8 (sign -1) without the last term, in the paper's axes (down, right, forward).
+def all_unknowns(w: FloatArray, d: FloatArray) -> FloatArray:
+    """X (27,) of a motion, with the eight third-order unknowns."""
+    return np.concatenate([unknowns(w, d), np.outer(w, np.cross(w, d)).ravel()[:8]])
+
+
+def paper_constraint(
+    match: FloatArray, sign: float, w: FloatArray, d: FloatArray, complete: bool = False
+) -> float:
+    """Eq. 7 (sign 1) and 8 (sign -1), with or without the last term, in the paper's axes (down, right, forward).
 
     Written out with the paper's own matrices, baseline (0, b, 0), and rays whose first component is the row.
     """
@@ -58,6 +65,8 @@ def paper_constraint(match: FloatArray, sign: float, w: FloatArray, d: FloatArra
         - a * k1 * hat(hat(w) @ d)
         - a**2 * hat(hat(w) @ b) @ hat(w)
     )
+    if complete:
+        E -= a**2 * k1 * hat(hat(w) @ d) @ hat(w)
     return float(ray1 @ E @ ray0)
 
 
@@ -69,8 +78,10 @@ def test_rows_equal_the_papers_equations_in_the_papers_axes(side: Side, sign: fl
     match = rng.uniform(0, 899, 4)
     w, d = rng.standard_normal(3), rng.standard_normal(3)
     # Swapping two axes mirrors space: a rotation vector changes sign, and so does every triple product.
-    expected = -paper_constraint(match, sign, -SWAP @ w, SWAP @ d)
-    assert system_rows(match[None], side, RIG, SHUTTER)[0] @ unknowns(w, d) == pytest.approx(expected, abs=1e-12)
+    for complete, X in ((False, unknowns(w, d)), (True, all_unknowns(w, d))):
+        expected = -paper_constraint(match, sign, -SWAP @ w, SWAP @ d, complete)
+        rows = system_rows(match[None], side, RIG, SHUTTER, complete)
+        assert rows[0] @ X == pytest.approx(expected, abs=1e-12)
 
 
 def test_rows_vanish_to_third_order_on_exact_data() -> None:
@@ -111,7 +122,7 @@ def median_errors(solver: Solver, pairs: int, noise_px: float, trials: int = 40)
         (LinearSolver, 100, 0.0, 0.033, 0.044),
         (LinearSolver, 100, 1e-2, 0.038, 0.056),
         # What the paper's algorithm does with feature noise: the rotation is lost.
-        (LinearSolver, 100, 0.81, 2.2, 3.8),
+        (LinearSolver, 100, 0.81, 2.0, 3.2),
         (EightPointSolver, 100, 0.0, 0.059, 0.88),
         (EightPointSolver, 100, 0.81, 0.112, 1.09),
         (IteratedSolver, 100, 0.0, 0.026, 0.020),
@@ -159,6 +170,58 @@ def test_the_symmetric_extraction_is_better_with_minimal_samples() -> None:
     full, symmetric = (median_errors(LinearSolver(extraction=e), 9, 0.0)[0] for e in ("full", "symmetric"))
     assert symmetric < 0.1
     assert full > 2 * symmetric
+
+
+def test_with_nine_matches_no_scaling_changes_the_solution() -> None:
+    """Eighteen equations in 19 unknowns have one solution, whatever is minimised."""
+    rng = np.random.default_rng(4)
+    motion = random_motion(rng, np.radians(2.0), 0.3)
+    c = simulate(RIG, SHUTTER, motion, SimulationOptions(pairs=9, noise_px=0.3), rng).correspondences
+    literal = LinearSolver().estimate(c, RIG, SHUTTER)
+    others = [LinearSolver(scaling="unit-columns"), LinearSolver(baseline_unit="half-baseline")]
+    for solver in others:
+        found = solver.estimate(c, RIG, SHUTTER)
+        # Rounding, times the condition of A.
+        np.testing.assert_allclose(found.w, literal.w, atol=1e-6)
+        np.testing.assert_allclose(found.d, literal.d, atol=1e-5)
+
+
+def test_all_unknowns_need_more_matches_and_leave_less_error() -> None:
+    """Without noise, what remains of the 27 is the small-angle approximation; refused below 13 + 13."""
+    rng = np.random.default_rng(0)
+    motion = random_motion(rng, np.radians(2.0), 0.3)
+    c = simulate(RIG, SHUTTER, motion, SimulationOptions(pairs=100), rng).correspondences
+    found = LinearSolver(terms="third").estimate(c, RIG, SHUTTER)
+    assert found.success and rotation_error(found.w, motion.w) < np.radians(0.2)
+    few = Correspondences(left=c.left[:12], right=c.right[:12])
+    assert "need 13" in LinearSolver(terms="third").estimate(few, RIG, SHUTTER).reason
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 40))
+def test_chosen_matches_stand_apart(seed: int, n: int) -> None:
+    """Against brute force: what is left out stands no farther from the chosen than the chosen from each other."""
+    matches = np.random.default_rng(seed).uniform(0.0, 900.0, (n, 4))
+    chosen = far_apart(matches, 9)
+    assert len(chosen) == min(n, 9) and len(np.unique(chosen, axis=0)) == len(chosen)
+    gaps = np.linalg.norm(chosen[:, None, :2] - chosen[None, :, :2], axis=2)
+    least = np.min(gaps[np.triu_indices(len(chosen), 1)], initial=np.inf)
+    left_out = np.min(np.linalg.norm(matches[:, None, :2] - chosen[None, :, :2], axis=2), axis=1)
+    assert np.max(left_out) <= least
+
+
+def test_nine_far_apart_solve_better_than_any_nine() -> None:
+    errors = []
+    for seed in range(30):
+        rng = np.random.default_rng([7, seed])
+        motion = random_motion(rng, np.radians(2.0), 0.3)
+        c = simulate(RIG, SHUTTER, motion, SimulationOptions(pairs=100, noise_px=1e-3), rng).correspondences
+        nine = Correspondences(left=c.left[:9], right=c.right[:9])
+        estimates = (LinearSolver(sampling="nine-apart").estimate(c, RIG, SHUTTER),)
+        estimates += (LinearSolver().estimate(nine, RIG, SHUTTER),)
+        errors.append([rotation_error(found.w, motion.w) for found in estimates])
+    apart, any_nine = np.median(errors, axis=0)
+    assert apart < any_nine
 
 
 def estimate_linear(w: FloatArray, d: FloatArray, shutter: RollingShutter = SHUTTER, noise_px: float = 0.0) -> str:

@@ -32,14 +32,24 @@ _FAR_M = 1e6
 class Bound:
     """Root mean square errors that no unbiased solver undercuts; infinite where the data say nothing."""
 
-    rotation: float
-    """Of e_R, radians."""
-    direction: float
-    """Of e_T, radians; meaningful while well below 1."""
+    rotation_axes: FloatArray
+    """Of the rotation (3,) along its principal axes, radians, largest first."""
+    direction_axes: FloatArray
+    """Of the direction of d (2,), radians, largest first; meaningful while well below 1."""
     scale: float
     """Of the length of d, relative to it."""
     information: FloatArray
     """(6, 6) Fisher information of (w, d)."""
+
+    @property
+    def rotation(self) -> float:
+        """Of e_R, radians."""
+        return float(np.linalg.norm(self.rotation_axes))
+
+    @property
+    def direction(self) -> float:
+        """Of e_T, radians; meaningful while well below 1."""
+        return float(np.linalg.norm(self.direction_axes))
 
     @property
     def direction_observable(self) -> bool:
@@ -94,16 +104,16 @@ def bound_from_information(F: FloatArray, w: FloatArray, d: FloatArray) -> Bound
     """Bound of the motion (w, d), of any point of the rig, from its Fisher information (6, 6)."""
     length = float(np.linalg.norm(d))
     J = so3.left_jacobian(w)
-    rotation = _marginal_rms(F, J @ np.eye(6)[:3])
+    rotation = _marginal_axes(F, J @ np.eye(6)[:3])
     if length == 0.0:
-        return Bound(rotation=rotation, direction=np.inf, scale=np.inf, information=F)
+        return Bound(rotation_axes=rotation, direction_axes=np.full(2, np.inf), scale=np.inf, information=F)
     u = d / length
     along = np.concatenate([np.zeros(3), u])[None]
     across = np.hstack([np.zeros((2, 3)), np.linalg.svd(u[None])[2][1:]])
     return Bound(
-        rotation=rotation,
-        direction=_marginal_rms(F, across) / length,
-        scale=_marginal_rms(F, along) / length,
+        rotation_axes=rotation,
+        direction_axes=_marginal_axes(F, across) / length,
+        scale=float(_marginal_axes(F, along)[0]) / length,
         information=F,
     )
 
@@ -114,17 +124,24 @@ def _scale(F: FloatArray) -> FloatArray:
     return np.sqrt(np.maximum(diagonal, max(_SINGULAR * float(np.max(diagonal)), 1e-300)))
 
 
-def _marginal_rms(F: FloatArray, target: FloatArray) -> float:
-    """Root of the trace of the covariance of ``target @ (w, d)``, infinite when it touches the null space."""
+def _marginal_axes(F: FloatArray, target: FloatArray) -> FloatArray:
+    """Standard deviations (k,) of ``target @ (w, d)`` along its principal axes; infinite when it touches the null
+    space.
+
+    Args:
+        F: (6, 6) information.
+        target: (k, 6).
+    """
     scale = _scale(F)
     values, vectors = np.linalg.eigh(F / np.outer(scale, scale))
     weights = (target / scale) @ vectors
     unknown = values <= _SINGULAR * max(values[-1], 1e-300)
     # Rounding mixes up to 1e-5 of the weakest known directions into the null space of a pure translation.
     if np.any(np.abs(weights[:, unknown]) > 1e-3 * np.linalg.norm(weights)):
-        return float(np.inf)
+        return np.full(len(target), np.inf)
     known = ~unknown
-    return float(np.sqrt(np.sum(weights[:, known] ** 2 / values[known])))
+    axes = np.linalg.svd(weights[:, known] / np.sqrt(values[known]), compute_uv=False)
+    return np.concatenate([axes, np.zeros(len(target) - len(axes))])
 
 
 def _pair_information(

@@ -128,8 +128,9 @@ def run_bounds(setting: Setting, solvers: tuple[str, ...], seed: int, first: int
     """Cramer-Rao bounds of trials for a noise of 1 px; outliers are left out.
 
     Returns:
-        ``rotation``, ``direction`` (radians) and ``scale`` (trials, solvers): root mean square errors of e_R, e_T
-        and the length of d that no unbiased solver undercuts, given what each solver is given; infinite where the
+        ``rotation`` (trials, solvers, 3), ``direction`` (trials, solvers, 2) and ``scale`` (trials, solvers): root
+        mean square errors that no unbiased solver undercuts, along the principal axes of the rotation and of the
+        direction of d (radians), and of the length of d, given what each solver is given; infinite where the
         matches do not tell.
     """
     entrants = [enter(load_solver_entry(name)) for name in solvers]
@@ -139,8 +140,8 @@ def run_bounds(setting: Setting, solvers: tuple[str, ...], seed: int, first: int
         found = _bounds(simulation, {e.information for e in entrants})
         rows.append([found[e.information] for e in entrants])
     return {
-        "rotation": np.array([[bound.rotation for bound in row] for row in rows]),
-        "direction": np.array([[bound.direction for bound in row] for row in rows]),
+        "rotation": np.array([[bound.rotation_axes for bound in row] for row in rows]),
+        "direction": np.array([[bound.direction_axes for bound in row] for row in rows]),
         "scale": np.array([[bound.scale for bound in row] for row in rows]),
     }
 

@@ -1,0 +1,136 @@
+"""What became of the paper's claims about images: verdicts by rule from stored results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from rsbench.benchmark.studies.claim_rules import Check, verdict
+from rsbench.errors import RsbenchError
+
+COINCIDES_DB, ACCURATE_PX, FAR_SHARE = 30.0, 0.1, 0.05
+PUBLISHED = ("rs-stereo-linear", "rs-stereo-linear-symmetric")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageClaim:
+    """A claim, the stored table that it is judged by, and the rule."""
+
+    key: str
+    text: str
+    table: str
+    """Below the folder of results."""
+    rule: str
+    check: Callable[[pd.DataFrame], dict[str, tuple[list[Check], str]]]
+    """Checks and figures in words, by who is judged."""
+
+
+def motion_on_images(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
+    """Per sequence: both errors of a solver below those of gs-8pt (medians where there are several runs)."""
+    errors = table.groupby(["solver", "sequence"], sort=False)[["e_R_deg", "e_T_deg"]].median()
+    baseline, found = errors.loc["gs-8pt"], {}
+    for solver in PUBLISHED:
+        own = errors.loc[solver]
+        checks = [Check(str(name), bool((own.loc[name] < baseline.loc[name]).all())) for name in own.index]
+        words = [f"{name}: {own.e_R_deg[name]:.2g}, {own.e_T_deg[name]:.2g} deg" for name in own.index]
+        others = [f"{name}: {baseline.e_R_deg[name]:.1g}, {baseline.e_T_deg[name]:.1g}" for name in own.index]
+        found[solver] = (checks, f"{'; '.join(words)} (GS: {'; '.join(others)})")
+    return found
+
+
+def sgm_is_accurate(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
+    """Per sequence and motion, cameras in step: median disparity error and share of pixels 2 m off."""
+    rows = table[(table.delay == 0.0) & ~table.opposite.astype(bool)].to_dict("records")
+    checks = [
+        Check(
+            f"{row['sequence']} ({row['stratum']})",
+            bool(row["error_px"] <= ACCURATE_PX and row["over_2m"] <= FAR_SHARE),
+        )
+        for row in rows
+    ]
+    errors, far = ([row[name] for row in rows] for name in ("error_px", "over_2m"))
+    words = f"{min(errors):.2g} to {max(errors):.2g} px; {100 * min(far):.1f} to {100 * max(far):.1f} % beyond 2 m"
+    return {"SGM": (checks, words)}
+
+
+def almost_coincides(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
+    """Per sequence: PSNR of the corrected views, from estimated motion and SGM depth."""
+    rows = table[(table.corrector == "fusion") & (table.matcher == "sgm") & (table.solver != "true")]
+    found = {}
+    for solver, own in rows.groupby("solver", sort=False):
+        for pixels, what in (("visible", "what the frame saw"), ("all", "all pixels")):
+            psnr = own[own.pixels == pixels].groupby("sequence", sort=False).psnr.mean()
+            checks = [Check(str(name), bool(value >= COINCIDES_DB)) for name, value in psnr.items()]
+            words = "; ".join(f"{name}: {value:.1f} dB" for name, value in psnr.items())
+            found[f"{solver}, {what}"] = (checks, words)
+    return found
+
+
+def stereo_corrects_better(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
+    """Per stratum: the paired gain of ours over a method, interval apart from 0."""
+    found = {}
+    for method, name in (("mono", "against one camera"), ("plane", "against one plane")):
+        rows = table[table["method"] == method].to_dict("records")
+        checks = [Check(row["stratum"], _positive(row["gain_low"], row["gain_high"])) for row in rows]
+        words = [f"{r['stratum']}: {r['gain']:.1f} [{r['gain_low']:.1f}, {r['gain_high']:.1f}] dB" for r in rows]
+        found[name] = (checks, "; ".join(words))
+    return found
+
+
+def _positive(low: float, high: float) -> bool | None:
+    return True if low > 0.0 else False if high < 0.0 else None
+
+
+IMAGE_CLAIMS = (
+    ImageClaim(
+        key="motion is estimated well on images",
+        text="Section 3.2: with SIFT and RANSAC the solver also estimates the motion well",
+        table="images/scores/pose.csv",
+        rule="e_R and e_T below those of gs-8pt in the same robust loop on the same images, in each scene",
+        check=motion_on_images,
+    ),
+    ImageClaim(
+        key="SGM is accurate on rolling-shutter pairs",
+        text="Abstract, sections 2.3 and 3.2: semi-global matching estimates the depth of RS pairs accurately",
+        table="sgm/sgm.csv",
+        rule=f"cameras in step: median disparity error at most {ACCURATE_PX:g} px, and at most "
+        f"{100 * FAR_SHARE:g} % of the pixels with a depth more than 2 m off, in each sequence",
+        check=sgm_is_accurate,
+    ),
+    ImageClaim(
+        key="the corrected image almost coincides",
+        text="Section 3.2: the corrected image almost coincides with the GS image, but for borders without depth",
+        table="images/scores/correction.csv",
+        rule=f"PSNR against the GS image at least {COINCIDES_DB:g} dB in each scene, mean of four views. "
+        "The motion is that of rs-stereo-refined, not of the paper's solver",
+        check=almost_coincides,
+    ),
+    ImageClaim(
+        key="stereo corrects without assumptions about the scene",
+        text="Abstract and section 2.3: stereo depth replaces assumptions, and corrects better than one camera",
+        table="correction/summary.csv",
+        rule="paired gain in PSNR of covered pixels over sequences, median with its 95 % interval above 0, in "
+        "each stratum. The motion is that of rs-stereo-refined",
+        check=stereo_corrects_better,
+    ),
+)
+
+
+def judge_image_claims(results: Path) -> pd.DataFrame:
+    """One row per claim and who is judged: verdict and figures.
+
+    Raises:
+        RsbenchError: a table is missing.
+    """
+    rows = []
+    for claim in IMAGE_CLAIMS:
+        path = results / claim.table
+        if not path.is_file():
+            target = claim.table.partition("/")[0]
+            raise RsbenchError(f"{path}: no such table; run: rsbench reproduce {target}")
+        for who, (checks, words) in claim.check(pd.read_csv(path)).items():
+            rows.append({"claim": claim.key, "who": who, "verdict": verdict(checks, "scene"), "figures": words})
+    return pd.DataFrame(rows)
