@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from rsbench.benchmark.simulated.sweep_card import SweepCard
-    from rsbench.benchmark.studies.readings import Reading
 
 _OTHER_SWEEPS = ("solvers", "limit", "degenerate", "planar", "outliers", "wrong-readout", "wrong-motion")
 
@@ -62,7 +61,7 @@ def claims(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.benchmark.provenance import provenance
     from rsbench.benchmark.simulated.sweep_card import load_sweep
     from rsbench.benchmark.studies.claims import best_readings, judge_claims
-    from rsbench.benchmark.studies.readings import LITERAL, SOLVER_READINGS, write_cards
+    from rsbench.benchmark.studies.readings import LITERAL, readings_of, write_cards
     from rsbench.dataset.files import write_bytes, write_json, write_table
     from rsbench.report.claims_page import claims_page
     from rsbench.report.fig3 import SWEEPS
@@ -70,17 +69,11 @@ def claims(out: Path, data: Path, workers: int | None) -> None:
     fig3(out, data, workers)
     folder, home, command = out / "claims", data / "simulated", "rsbench reproduce claims"
     folder.mkdir(parents=True, exist_ok=True)
-    tables, readings = _claim_tables(out / "fig3", folder, home, workers, command)
-    points = load_sweep("points")
-    readings |= {reading.name: reading for reading in SOLVER_READINGS}
-    cards = write_cards(home / "readings", SOLVER_READINGS)
-    summary = _confirmed(points, home / "points", workers, command)
-    write_table(folder / "points.csv", summary)
-    more = _confirmed(replace(points, solvers=cards), home / "points-readings", workers, command)
-    tables["9 + 9 and more"] = {"points": _joined(summary, more)}
+    tables = _claim_tables(out / "fig3", folder, home, workers, command)
     (literal,) = write_cards(home / "readings", (LITERAL,))
     exact = replace(load_sweep("degenerate").with_setting(points=9), solvers=(literal,))
     tables["9 + 9"]["degenerate"] = _confirmed(exact, home / "degenerate-9", workers, command)
+    readings = {reading.name: reading for name in SWEEPS for n in (9, 100) for reading in readings_of(name, n)}
     verdicts = judge_claims(tables, readings)
     write_table(folder / "claims.csv", verdicts)
     best = best_readings(verdicts)
@@ -93,29 +86,38 @@ def claims(out: Path, data: Path, workers: int | None) -> None:
 
 def _claim_tables(
     fig3_folder: Path, folder: Path, home: Path, workers: int | None, command: str
-) -> tuple[dict[str, dict[str, pd.DataFrame]], dict[str, Reading]]:
-    """Summaries of the sweeps of Figure 3 with 100 and with 9 matches per camera, and the readings in them."""
-    from rsbench.benchmark.simulated.sweep_card import load_sweep
-    from rsbench.benchmark.studies.readings import readings_of, write_cards
+) -> dict[str, dict[str, pd.DataFrame]]:
+    """Summaries of the sweeps of Figure 3 by the matches per camera, with the readings of the paper's solver."""
+    from rsbench.benchmark.studies.readings import APART
     from rsbench.dataset.files import write_table
     from rsbench.report.fig3 import SWEEPS, read_summaries
 
     hundred = read_summaries(fig3_folder, SWEEPS)
     tables: dict[str, dict[str, pd.DataFrame]] = {"100 + 100": {}, "9 + 9": {}}
-    readings: dict[str, Reading] = {}
     for name in SWEEPS:
-        found = {}
-        for points in (100, 9):
-            card, chosen = load_sweep(name).with_setting(points=points), readings_of(name, points)
-            readings.update({reading.name: reading for reading in chosen})
-            card = replace(card, solvers=write_cards(home / "readings", chosen))
-            found[points] = _confirmed(card, home / f"{name}-{points}-readings", workers, command)
-        apart = found[100].solver.isin([key for key, reading in readings.items() if reading.sampling != "all"])
-        tables["100 + 100"][name] = _joined(hundred[name], found[100][~apart])
-        nine = _confirmed(load_sweep(name).with_setting(points=9), home / f"{name}-9", workers, command)
+        nine = _with_readings(name, 9, home, workers, command)
         write_table(folder / f"{name}-9.csv", nine)
-        tables["9 + 9"][name] = _joined(nine, found[9], found[100][apart])
-    return tables, readings
+        more = _with_readings(name, 100, home, workers, command)
+        write_table(folder / f"{name}-readings.csv", more)
+        apart = more.solver.isin([reading.name for reading in APART])
+        tables["100 + 100"][name] = _joined(hundred[name], more[~apart])
+        tables["9 + 9"][name] = _joined(nine, more[apart])
+    points = _with_readings("points", None, home, workers, command)
+    write_table(folder / "points.csv", points)
+    return {**tables, "9 + 9 and more": {"points": points}}
+
+
+def _with_readings(name: str, points: int | None, home: Path, workers: int | None, command: str) -> pd.DataFrame:
+    """Summary of a sweep of the paper run with the readings of its solver; where Figure 3 has none, also with what
+    they are compared with."""
+    from rsbench.benchmark.simulated.sweep_card import load_sweep
+    from rsbench.benchmark.studies.claims import GLOBAL, OURS
+    from rsbench.benchmark.studies.readings import readings_of, write_cards
+
+    others = () if points == 100 else (OURS, GLOBAL)
+    card = replace(load_sweep(name), solvers=(*write_cards(home / "readings", readings_of(name, points)), *others))
+    folder = home / (f"{name}-readings" if points is None else f"{name}-{points}-readings")
+    return _confirmed(card if points is None else card.with_setting(points=points), folder, workers, command)
 
 
 def readings(out: Path, data: Path, workers: int | None) -> None:

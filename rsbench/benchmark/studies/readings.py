@@ -59,30 +59,27 @@ class Reading:
 LITERAL = Reading()
 _A_AND_UNIT = (("none", "metre"), ("none", "half-baseline"), ("unit-columns", "metre"))
 """Columns of unit length undo the unit of the baseline."""
-SOLVER_READINGS = tuple(
-    Reading(scaling=scaling, baseline_unit=unit, extraction=extraction, sign=sign)
-    for (scaling, unit), extraction, sign in product(_A_AND_UNIT, ("full", "symmetric"), ("cheirality", "scale"))
+_EXTRACTIONS = ("full", "symmetric")
+SOLVER_READINGS = (
+    *(Reading(scaling=a, baseline_unit=unit, extraction=e) for (a, unit), e in product(_A_AND_UNIT, _EXTRACTIONS)),
+    *(Reading(extraction=extraction, sign="scale") for extraction in _EXTRACTIONS),
 )
 """What e_R and e_T feel, given more matches than unknowns; the literal one first."""
 NINE_READINGS = tuple(r for r in SOLVER_READINGS if (r.scaling, r.baseline_unit) == _A_AND_UNIT[0])
 """With nine matches per camera A X = 0 has an exact solution, which no scaling changes."""
-APART = tuple(replace(r, sampling="nine-apart") for r in NINE_READINGS if r.sign == "cheirality")
+APART = tuple(Reading(extraction=extraction, sampling="nine-apart") for extraction in _EXTRACTIONS)
 """Nine of a hundred matches, as far apart as can be."""
 
 
 def readings_of(sweep: str, points: int | None) -> tuple[Reading, ...]:
     """The readings that a sweep is run with; ``points`` per camera, None where the sweep varies them."""
-    if points == 9:
-        extra = [replace(r, scale="constraint") for r in NINE_READINGS if r.sign == "cheirality"]
-        return (*NINE_READINGS, *extra) if sweep == "noise" else NINE_READINGS
-    if points is None:
-        return SOLVER_READINGS
-    if sweep == "rotation":
-        return (*SOLVER_READINGS, *APART, *(r.complete for r in SOLVER_READINGS))
+    found = NINE_READINGS if points == 9 else SOLVER_READINGS
+    cheirality = [reading for reading in found if reading.sign == "cheirality"]
     if sweep == "noise":
-        extra = [replace(r, scale="constraint") for r in SOLVER_READINGS if r.sign == "cheirality"]
-        return (*SOLVER_READINGS, *APART, *extra)
-    return (*SOLVER_READINGS, *APART)
+        found += tuple(replace(reading, scale="constraint") for reading in cheirality)
+    if sweep == "rotation" and points == 100:
+        found += tuple(reading.complete for reading in found)
+    return (*found, *APART) if points == 100 else found
 
 
 def write_cards(folder: Path, readings: tuple[Reading, ...]) -> tuple[str, ...]:
