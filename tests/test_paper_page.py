@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from rsbench.benchmark.studies.claims import CLAIMS
+from rsbench.benchmark.studies.image_claims import IMAGE_CLAIMS
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "paper.md").read_text("utf-8")
@@ -48,6 +49,7 @@ def test_every_equation_figure_and_claim_has_a_row() -> None:
     assert {int(n) for n in re.findall(r"\((\d+)[a-c]?\)", first)} == set(range(1, 12))
     assert set(re.findall(r"Figure (\d)", first)) == set("1234")
     assert [row[0] for row in ROWS if row[0] in {claim.key for claim in CLAIMS}] == [claim.key for claim in CLAIMS]
+    assert {claim.key for claim in IMAGE_CLAIMS} <= {row[0] for row in ROWS}
 
 
 def test_every_claim_has_a_result_that_exists() -> None:

@@ -92,7 +92,11 @@ def length_from_tracks(tracks: FloatArray, packed: Packed, w: FloatArray, u: Flo
 @final
 @dataclass(frozen=True, kw_only=True)
 class IteratedSolver(Solver):
-    """Singular value decompositions with the rotation of the last pass folded in; no descent, no starts."""
+    """Singular value decompositions with the rotation of the last pass folded in; no descent, no starts.
+
+    Columns are scaled to unit length, unlike the paper's solver read literally: the median stays the same, and the
+    mean with nine matches or at 0.8 px is a third better. This is what the refined solver starts from with pairs.
+    """
 
     unknowns: Literal[9, 11, 15] = 15
     scale: Literal["pairs", "tracks"] = "pairs"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import Any
 
 import pandas as pd
@@ -272,9 +273,10 @@ def _judge(
     claim: Claim, table: pd.DataFrame, variant: str, readings: Mapping[str, Reading]
 ) -> list[dict[str, Any]]:
     rows = []
+    found = cache(partial(series, table, variant=variant))
     for solver, opponent in contenders(claim, table, readings).items():
         for centre in claim.centres:
-            figures, other = (series(table, name, variant, centre) for name in (solver, opponent))
+            figures, other = (found(name, centre=centre) for name in (solver, opponent))
             checks = claim.check(figures, other)
             count = max(len(checks), 1)
             rows.append(
