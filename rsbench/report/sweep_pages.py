@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import Any
 
 import pandas as pd
@@ -84,6 +84,6 @@ def _wrong(table: pd.DataFrame) -> list[str]:
     return lines
 
 
-def _words(row: Mapping[str, Any], name: str) -> str:
+def _words(row: Mapping[Hashable, Any], name: str) -> str:
     value, low, high = (row[name + end] for end in ("", "_low", "_high"))
     return "-" if pd.isna(value) else in_words(value, low, high)

@@ -217,8 +217,8 @@ def test_nine_far_apart_solve_better_than_any_nine() -> None:
         motion = random_motion(rng, np.radians(2.0), 0.3)
         c = simulate(RIG, SHUTTER, motion, SimulationOptions(pairs=100, noise_px=1e-3), rng).correspondences
         nine = Correspondences(left=c.left[:9], right=c.right[:9])
-        estimates = (LinearSolver(sampling="nine-apart").estimate(c, RIG, SHUTTER),)
-        estimates += (LinearSolver().estimate(nine, RIG, SHUTTER),)
+        estimates = [LinearSolver(sampling="nine-apart").estimate(c, RIG, SHUTTER)]
+        estimates.append(LinearSolver().estimate(nine, RIG, SHUTTER))
         errors.append([rotation_error(found.w, motion.w) for found in estimates])
     apart, any_nine = np.median(errors, axis=0)
     assert apart < any_nine

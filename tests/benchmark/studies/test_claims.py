@@ -210,8 +210,8 @@ def test_every_claim_is_judged_in_every_reading() -> None:
     errors = dict.fromkeys(NAMES, 3.0) | {SYMMETRIC.name: 0.2, OURS: 0.1, GLOBAL: 1.0}
     table = judge_claims(tables(errors), NAMES)
     assert set(table.claim) == {claim.key for claim in CLAIMS}
-    best = best_readings(table).set_index(["claim", "matches", "noise"])
-    faster = best.loc[("rotation velocity: better than GS", ALL, "1e-3 px")]
+    best = {(row.claim, row.matches, row.noise): row for row in best_readings(table).itertuples()}
+    faster = best["rotation velocity: better than GS", ALL, "1e-3 px"]
     assert (faster.literal, faster.best, faster.best_reading, faster.ours) == (
         "fails",
         "holds",
@@ -219,12 +219,12 @@ def test_every_claim_is_judged_in_every_reading() -> None:
         "holds",
     )
     assert (faster.holding, faster.readings) == (1, 2)
-    enough = best.loc[("nine matches per camera suffice", MORE, "0.81 px")]
+    enough = best["nine matches per camera suffice", MORE, "0.81 px"]
     assert (enough.literal, enough.best) == ("fails", "holds")
     # 3.0 with 19 unknowns and with 27; 0.2 against 3.0.
-    assert best.loc[("omitted terms do not matter", ALL, "1e-3 px")].holding == 2
-    assert best.loc[("eighteen equations have one solution", NINE, "none")].best == "holds only for generic"
-    mono = best.loc[("stereo estimates motion better than one camera", ALL, "0.81 px")]
+    assert best["omitted terms do not matter", ALL, "1e-3 px"].holding == 2
+    assert best["eighteen equations have one solution", NINE, "none"].best == "holds only for generic"
+    mono = best["stereo estimates motion better than one camera", ALL, "0.81 px"]
     assert (mono.literal, mono.best, mono.ours) == ("fails", "holds", "holds")
     page = claims_page(table, best_readings(table))
     row = "| rotation velocity: better than GS | 100 + 100 | 1e-3 px | fails | holds | 1 of 2 hold | holds |"
@@ -276,9 +276,13 @@ def test_settings_are_counted_per_reading() -> None:
     good, bad = summary(errors, ["easy"]), summary(errors | {LITERAL.name: 2.0}, ["hard"])
     readings = {name: NAMES[name] for name in (LITERAL.name, SYMMETRIC.name)}
     judged = judge_settings({"rotation": pd.concat([good, bad])}, readings)
-    counts = holding_settings(judged).set_index(["claim", "reading"])
     key = "rotation velocity: better than GS"
-    assert list(counts.loc[(key, "literal")]) == [1, 1, 2] and list(counts.loc[(key, "symmetric")]) == [2, 0, 2]
+    counts = {
+        row["reading"]: (row["holding"], row["failing"], row["settings"])
+        for row in holding_settings(judged).to_dict("records")
+        if row["claim"] == key
+    }
+    assert counts == {"literal": (1, 1, 2), "symmetric": (2, 0, 2)}
     assert f"| {key} | 2 | 1 | 1 | 2 | 0 |" in readings_page(holding_settings(judged))
 
 
