@@ -45,26 +45,34 @@ def reproduce(
             "simulated points. claims: what became of each claim about them, in every reading of the paper's "
             "solver. readings: the claims in settings that it does not state. image-claims: those about images, "
             "from stored results. sweeps: the other simulations. "
-            "fig4: its Figure 4 in every scene, for three motions. correction: baselines, ours and oracles on the "
-            "strata mild, moderate and aggressive. sgm: stereo matching when the cameras' rows are not in step."
+            "fig4: its Figure 4 in every scene, for three motions. correction: baselines, ours and oracles on "
+            "mild, moderate, aggressive and poles. sgm: stereo matching when the cameras' rows are not in step."
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("results"),
     data: Annotated[Path, typer.Option(help="Folder for the rendered data and simulated trials.")] = Path("data"),
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes of simulations; default: one per core.")
+        int | None, typer.Option(min=1, help="Processes of simulations and corrections; default: one per core.")
     ] = None,
 ) -> None:
     """Make the committed results again: render or simulate what is missing, run, score, draw."""
     if target is Target.images:
         _images(out, data)
-    elif target in (Target.fig4, Target.correction, Target.sgm):
-        _correction(target, out, data)
+    elif target is Target.correction:
+        _correction(out, data, workers)
+    elif target in (Target.fig4, Target.sgm):
+        _depth(target, out, data)
     else:
         _simulated(target, out, data, workers)
 
 
-def _correction(target: Target, out: Path, data: Path) -> None:
+def _correction(out: Path, data: Path, workers: int | None) -> None:
+    from rsbench.cli.reproduce_correction import correction
+
+    correction(out, data, workers)
+
+
+def _depth(target: Target, out: Path, data: Path) -> None:
     from rsbench.cli import reproduce_correction
 
     getattr(reproduce_correction, target.value)(out, data)

@@ -10,7 +10,7 @@ import typer
 if TYPE_CHECKING:
     from rsbench.benchmark.studies.sgm_timing import Timing
 
-STRATA = ("mild", "moderate", "aggressive")
+STRATA = ("mild", "moderate", "aggressive", "poles")
 SCENES = ("castle", "old-town", "room")
 _FIG4 = (("paper", ""), ("moderate", "-2"), ("aggressive", "-2"))
 """Cards of the figure, and what their sequences' names add to the scene's."""
@@ -46,15 +46,16 @@ def fig4(out: Path, data: Path) -> None:
     write_json(folder / "provenance.json", provenance("rsbench reproduce fig4", datasets=records))
 
 
-def correction(out: Path, data: Path) -> None:
-    """Baselines, ours and oracles on the three strata."""
+def correction(out: Path, data: Path, workers: int | None = None) -> None:
+    """Baselines, ours and oracles on the strata; ``workers`` processes, one per core for None."""
     import pandas as pd
 
     from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.studies.correction_study import study_dataset, study_steps
-    from rsbench.benchmark.studies.correction_summary import summarise, summarise_bands
+    from rsbench.benchmark.studies.correction_study import study_dataset
+    from rsbench.benchmark.studies.correction_summary import by_scene, summarise, summarise_bands
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.files import write_json, write_table
+    from rsbench.dataset.sequence import read_dataset
     from rsbench.report.correction_page import write_study
 
     folder = out / "correction"
@@ -62,8 +63,8 @@ def correction(out: Path, data: Path) -> None:
     tables: list[list[pd.DataFrame]] = [[], [], []]
     for card in STRATA:
         _generate(card, data)
-        with progress_bar(f"correcting {card}", study_steps(data / card)) as advance:
-            for table, rows in zip(tables, study_dataset(data / card, advance), strict=True):
+        with progress_bar(f"correcting {card}", len(read_dataset(data / card))) as advance:
+            for table, rows in zip(tables, study_dataset(data / card, advance, workers=workers), strict=True):
                 frame = pd.DataFrame(rows)
                 frame.insert(0, "stratum", card)
                 table.append(frame)
@@ -71,7 +72,9 @@ def correction(out: Path, data: Path) -> None:
     write_table(folder / "views.csv", images)
     write_table(folder / "motions.csv", motions)
     # Of the stored figures, so that whoever has the file can make the summary again to the last digit.
-    write_table(folder / "summary.csv", summarise(pd.read_csv(folder / "views.csv")))
+    stored = pd.read_csv(folder / "views.csv")
+    write_table(folder / "summary.csv", summarise(stored))
+    write_table(folder / "scenes.csv", by_scene(stored))
     write_table(folder / "rows.csv", summarise_bands(bands))
     records = [dataset_record(data / card) for card in STRATA]
     write_json(folder / "provenance.json", provenance("rsbench reproduce correction", datasets=records))

@@ -13,7 +13,7 @@ from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
-from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.engine.base import MotionEstimate, Solver
 from rsbench.solvers.refined import RefinedSolver
 
 
@@ -45,6 +45,27 @@ def monocular_motion(
     pairs = Correspondences(**{side: temporal_pairs(inliers, side)})
     first = MotionEstimate(w=start.w, d=_unit(d), success=True)
     estimate = RefinedSolver(use_tracks=False).improve(first, pairs, rig.about(side), shutter)
+    if not estimate.success or not np.any(estimate.d):
+        return None
+    return LinearMotion(estimate.w, _unit(estimate.d))
+
+
+def solved_alone(
+    matches: Correspondences,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    side: Side,
+    solver: Solver,
+    options: RobustOptions,
+    rng: np.random.Generator,
+) -> Motion | None:
+    """Motion of one camera about its own centre by a solver of the left camera, from its matches over time.
+
+    The translation has length 1; None when the solver finds none. Right matches are handed over as left ones:
+    the cameras are equal.
+    """
+    pairs = Correspondences(left=temporal_pairs(matches, side))
+    estimate = estimate_motion(pairs, rig, shutter, solver, options, rng).estimate
     if not estimate.success or not np.any(estimate.d):
         return None
     return LinearMotion(estimate.w, _unit(estimate.d))

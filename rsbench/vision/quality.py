@@ -11,7 +11,7 @@ scored under the same mask.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import cv2
@@ -43,11 +43,21 @@ def ssim(estimate: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.bool_] | 
 
     NaN when no window is covered. Arguments and errors as for ``psnr``.
     """
-    windows = window_mask(truth.shape[:2], mask)
-    a, b = _pair(estimate, truth, mask)
-    if not np.any(windows):
-        return math.nan
-    return float(np.mean(ssim_map(a, b, _blur)[windows]))
+    return ssim_within(estimate, truth, (mask,))[0]
+
+
+def ssim_within(
+    estimate: NDArray[Any], truth: NDArray[Any], masks: Sequence[NDArray[np.bool_] | None]
+) -> list[float]:
+    """``ssim`` for each of several masks, at the cost of one."""
+    for mask in masks:
+        _check_pair(estimate, truth, mask)
+    a, b = to_unit(estimate), to_unit(truth)
+    chosen = [window_mask(truth.shape[:2], mask) for mask in masks]
+    if not any(np.any(windows) for windows in chosen):
+        return [math.nan for _ in chosen]
+    scores = ssim_map(a, b, _blur)
+    return [float(np.mean(scores[windows])) if np.any(windows) else math.nan for windows in chosen]
 
 
 def window_mask(size: tuple[int, ...], mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
@@ -80,11 +90,15 @@ def _blur(image: FloatArray) -> FloatArray:
 def _pair(
     estimate: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.bool_] | None
 ) -> tuple[FloatArray, FloatArray]:
+    _check_pair(estimate, truth, mask)
+    return to_unit(estimate), to_unit(truth)
+
+
+def _check_pair(estimate: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.bool_] | None) -> None:
     if estimate.shape != truth.shape or truth.ndim not in (2, 3):
         raise ValueError(f"images must have one shape (H, W) or (H, W, C), got {estimate.shape} and {truth.shape}")
     if mask is not None and (mask.shape != truth.shape[:2] or mask.dtype != np.bool_):
         raise ValueError(f"mask must be bool of shape {truth.shape[:2]}, got {mask.dtype} {mask.shape}")
-    return to_unit(estimate), to_unit(truth)
 
 
 def to_unit(image: NDArray[Any]) -> FloatArray:

@@ -9,8 +9,12 @@ takes no pixels from the others.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import multiprocessing
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +24,23 @@ from numpy.typing import NDArray
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.standard_metrics import Flip, Psnr, Ssim
+from rsbench.benchmark.studies.correction_methods import METHODS
 from rsbench.core.motion import Motion
-from rsbench.core.rig import SIDES, VIEWS, View
+from rsbench.core.rig import SIDES, VIEWS, Side, View
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Pairs, frame_pairs, known_depth
 from rsbench.pipeline.frame_motion import FoundMotion, NoMotionError, find_matches, find_motion
 from rsbench.pipeline.readout import select
-from rsbench.pipeline.simpler_motions import global_shutter_motion, monocular_motion
-from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.pipeline.simpler_motions import global_shutter_motion, monocular_motion, solved_alone
+from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 from rsbench.vision.correction import correction_flow
 from rsbench.vision.corrector import load_corrector
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.fusion import Fused, Origin
 from rsbench.vision.legacy_quality import flip, ssim_deepunroll, ssim_uniform
-from rsbench.vision.quality import psnr, ssim
+from rsbench.vision.quality import psnr, ssim_within
 from rsbench.vision.simpler_depths import monocular_depth, plane_depth
 
 Mask = NDArray[np.bool_]
@@ -47,48 +52,10 @@ WORST = {column.name: column.worst for metric in (Psnr, Ssim, Flip) for column i
 """Scores of a failure, as in the score tables."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Method:
-    """One line of the table."""
-
-    key: str
-    title: str
-    kind: str
-    """``none``, ``baseline``, ``ours`` or ``oracle``."""
-    knows: str
-    """What it assumes or is given."""
-
-
-METHODS = (
-    Method(key="none", title="uncorrected", kind="none", knows="nothing"),
-    Method(key="gyro", title="rotation only, true", kind="baseline", knows="true rotation, as of a perfect gyro"),
-    Method(key="rotation", title="rotation only, estimated", kind="baseline", knows="our rotation; no depth"),
-    Method(
-        key="gs",
-        title="GS motion, SGM depth",
-        kind="baseline",
-        knows="motion solved as if the shutter was global; depth as ours, with that motion",
-    ),
-    Method(
-        key="mono",
-        title="monocular, constant velocity",
-        kind="baseline",
-        knows="one camera, two frames: its motion up to scale (descending from ours), depth from dense flow in "
-        "the same unit",
-    ),
-    Method(
-        key="plane", title="one plane", kind="baseline", knows="our motion; the plane that fits SGM depth best"
-    ),
-    Method(
-        key="ours",
-        title="ours",
-        kind="ours",
-        knows="estimated motion; SGM depth, and depth from the motion where SGM finds none",
-    ),
-    Method(key="true-motion", title="true motion, SGM depth", kind="oracle", knows="true motion; depth as ours"),
-    Method(key="true-depth", title="our motion, true depth", kind="oracle", knows="true depth"),
-    Method(key="truth", title="true motion, true depth", kind="oracle", knows="true motion and depth"),
-)
+_SLOW = {method.key for method in METHODS if method.slow_scores}
+_SCALED, _MONOCULAR = "gs-stereo-tracks-scaled", "gs-poselib-scaled"
+Rows = tuple[list[Row], list[Row], list[Row]]
+"""Scores of every method on every view, errors by row band, motion errors."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,38 +70,48 @@ class Attempt:
     """(H, W, 2) where it moves the pixels of the rolling-shutter frame, px; NaN where it does not know."""
 
 
-def study_steps(dataset: Path) -> int:
-    """How often ``study_dataset`` reports progress."""
-    return len(read_dataset(dataset)) * (1 + len(METHODS))
-
-
 def study_dataset(
-    dataset: Path, step: Callable[[str], None], seed: int = 0, solver: str = "rs-stereo-refined"
-) -> tuple[list[Row], list[Row], list[Row]]:
+    dataset: Path,
+    step: Callable[[str], None],
+    seed: int = 0,
+    solver: str = "rs-stereo-refined",
+    workers: int | None = 1,
+) -> Rows:
     """Scores of every method on every view, errors by row band, and the motion errors, of all sequences.
 
-    ``solver`` names the solver of "our" motion, whose model the corrections take.
+    ``solver`` names the solver of "our" motion, whose model the corrections take. ``step`` is called with the name
+    of each sequence done; ``workers`` processes share them, one per core for None.
 
     Raises:
         RsbenchError: the dataset cannot be read, or there is no such solver.
     """
+    sequences = read_dataset(dataset)
+    tables: Rows = ([], [], [])
+    job = partial(study_sequence, seed=seed, solver=solver)
+    with ExitStack() as stack:
+        found: Iterable[Rows] = map(job, sequences)
+        if workers != 1:
+            context = multiprocessing.get_context("spawn")
+            found = stack.enter_context(ProcessPoolExecutor(workers, context)).map(job, sequences)
+        for sequence, rows in zip(sequences, found, strict=True):
+            for table, more in zip(tables, rows, strict=True):
+                table += more
+            step(sequence.name)
+    return tables
+
+
+def study_sequence(sequence: Sequence, seed: int = 0, solver: str = "rs-stereo-refined") -> Rows:
+    """What ``study_dataset`` says of one sequence."""
+    bench = Bench(sequence, seed, solver)
+    attempts = {method.key: bench.attempt(method.key) for method in METHODS}
     images: list[Row] = []
     bands: list[Row] = []
-    motions: list[Row] = []
-    for sequence in read_dataset(dataset):
-        bench = Bench(sequence, seed, solver)
-        motions.append({"sequence": sequence.name, **bench.motion_errors()})
-        step(sequence.name)
-        attempts = {}
-        for method in METHODS:
-            attempts[method.key] = bench.attempt(method.key)
-            step(sequence.name)
-        for view in VIEWS:
-            found = {key: None if attempt is None else attempt[view] for key, attempt in attempts.items()}
-            identity = {"sequence": sequence.name, "side": view[0], "frame": view[1]}
-            images += [identity | row for row in _image_rows(sequence, view, found)]
-            bands += [identity | row for row in _band_rows(found)]
-    return images, bands, motions
+    for view in VIEWS:
+        found = {key: None if attempt is None else attempt[view] for key, attempt in attempts.items()}
+        identity = {"sequence": sequence.name, "side": view[0], "frame": view[1]}
+        images += [identity | row for row in _image_rows(sequence, view, found)]
+        bands += [identity | row for row in _band_rows(found)]
+    return images, bands, [{"sequence": sequence.name, **bench.motion_errors()}]
 
 
 class Bench:
@@ -146,7 +123,9 @@ class Bench:
         self.images = {view: sequence.image("rs", *view) for view in VIEWS}
         self.rig, self.shutter = sequence.rig, sequence.shutter
         self.matches = find_matches(self.images, self.options)
-        self.found = self._found(generator(seed, "study", sequence.name))
+        self._seed = seed
+        self.found = self._found("rs", self.options.solver)
+        self.scaled = self._found("gs-scaled", load_solver_entry(_SCALED))
         rng = generator(seed, "study", sequence.name, "gs")
         self.gs_motion = global_shutter_motion(self.matches, self.rig, self.options.robust, rng)
         self.sgm = frame_pairs(self.images, self.rig, self.options)
@@ -155,9 +134,13 @@ class Bench:
             self.images, {view: np.where(z > 0, z, np.float32(np.inf)) for view, z in true.items()}
         )
 
-    def _found(self, rng: np.random.Generator) -> FoundMotion | None:
+    def _found(self, name: str, solver: SolverEntry) -> FoundMotion | None:
+        options, rng = (
+            replace(self.options, solver=solver),
+            generator(self._seed, "study", self.sequence.name, name),
+        )
         try:
-            return find_motion(self.matches, self.rig, self.shutter, self.options, rng)
+            return find_motion(self.matches, self.rig, self.shutter, options, rng)
         except NoMotionError:
             return None
 
@@ -167,10 +150,11 @@ class Bench:
         return None if self.found is None else self.found.motion
 
     def motion_errors(self) -> Row:
-        """e_R and e_T, degrees, of our motion and of the global-shutter one; a failure scores the worst."""
+        """e_R and e_T, degrees, of our motion and of the global-shutter ones; a failure scores the worst."""
         true, nothing = self.sequence.motion, np.full(3, np.nan)
         row: Row = {}
-        for name, motion in (("ours", self.motion), ("gs", self.gs_motion)):
+        scaled = None if self.scaled is None else self.scaled.motion
+        for name, motion in (("ours", self.motion), ("gs", self.gs_motion), ("gs_scaled", scaled)):
             w, d = (nothing, nothing) if motion is None else (motion.w, motion.d)
             errors = pose_errors(w, d, true_w=true.w, true_d=true.d, rig=self.rig)
             row |= {f"{error}_{name}": float(errors[error]) for error in ("e_R_deg", "e_T_deg")}
@@ -181,9 +165,11 @@ class Bench:
         true = self.sequence.motion
         if key == "none":
             return self._nothing()
-        if key == "mono":
-            return self._mono()
-        motion = {"gs": self.gs_motion, "gyro": true, "true-motion": true, "truth": true}.get(key, self.motion)
+        if key in ("mono", "gs-mono"):
+            return self._mono(self._velocity if key == "mono" else self._scaled_monocular)
+        motions = {"gs": self.gs_motion, "gyro": true, "true-motion": true, "truth": true}
+        motions["gs-scaled"] = None if self.scaled is None else self.scaled.motion
+        motion = motions.get(key, self.motion)
         if motion is None:
             return None
         pairs = self.true if key in ("true-depth", "truth") else self.sgm
@@ -212,14 +198,22 @@ class Bench:
         flow = np.zeros((self.rig.camera.height, self.rig.camera.width, 2), dtype=np.float32)
         return {view: _attempt(fused, flow) for view, fused in uncorrected(self.images).items()}
 
-    def _mono(self) -> dict[View, Attempt] | None:
-        """Each camera by itself: its motion from its own matches, depth from its own flow in the same unit."""
+    def _velocity(self, side: Side) -> Motion | None:
         if self.found is None:
             return None
         inliers = select(self.matches, self.found.robust)
+        return monocular_motion(inliers, self.rig, self.shutter, side, self.found.motion)
+
+    def _scaled_monocular(self, side: Side) -> Motion | None:
+        rng = generator(self._seed, "study", self.sequence.name, "gs-mono", side)
+        solver = load_solver_entry(_MONOCULAR).solver
+        return solved_alone(self.matches, self.rig, self.shutter, side, solver, self.options.robust, rng)
+
+    def _mono(self, motion_of: Callable[[Side], Motion | None]) -> dict[View, Attempt] | None:
+        """Each camera by itself: its motion from its own matches, depth from its own flow in the same unit."""
         motions: dict[str, Motion] = {}
         for side in SIDES:
-            motion = monocular_motion(inliers, self.rig, self.shutter, side, self.found.motion)
+            motion = motion_of(side)
             if motion is None:
                 return None
             motions[side] = motion
@@ -264,20 +258,21 @@ def _image_rows(sequence: Sequence, view: View, attempts: dict[str, Attempt | No
     rows = []
     for key, attempt in attempts.items():
         if attempt is None:
-            scores = _worst_scores(truth, view == VIEWS[0])
+            scores = _worst_scores(truth, view == VIEWS[0] and key in _SLOW)
         else:
             error = flow_error(attempt.flow, found["truth"].flow)
             known = np.isfinite(error)
+            ssim_covered, ssim_all = ssim_within(attempt.image, truth, (common, None))
             scores = {
                 "psnr_covered": psnr(attempt.image, truth, common),
-                "ssim_covered": ssim(attempt.image, truth, common),
+                "ssim_covered": ssim_covered,
                 "psnr_all": psnr(attempt.image, truth),
-                "ssim_all": ssim(attempt.image, truth),
+                "ssim_all": ssim_all,
                 "flow_mean_px": float(np.mean(error[known])) if np.any(known) else float("nan"),
                 "flow_median_px": float(np.median(error[known])) if np.any(known) else float("nan"),
                 "flow_known": float(np.mean(known)),
                 "coverage": float(np.mean(attempt.covered)),
-                **_extra_scores(attempt.image, truth, common, view == VIEWS[0]),
+                **_extra_scores(attempt.image, truth, common, view == VIEWS[0] and key in _SLOW),
             }
         rows.append({"method": key, "success": attempt is not None, **scores, "common": float(np.mean(common))})
     return rows
@@ -303,7 +298,7 @@ def worst_flow(image: NDArray[Any]) -> float:
 
 
 def _extra_scores(image: NDArray[Any], truth: NDArray[Any], common: Mask, wanted: bool) -> dict[str, float]:
-    """Slow scores, of one view per sequence: FLIP on covered pixels and all, SSIM by the protocols of others."""
+    """Slow scores, of one view per sequence and some methods: FLIP and SSIM by others' protocols."""
     names = ("flip_covered", "flip_all", "ssim_deepunroll", "ssim_uniform")
     if not wanted:
         return dict.fromkeys(names, float("nan"))

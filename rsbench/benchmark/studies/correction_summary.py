@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.statistics import typical_interval
-from rsbench.benchmark.studies.correction_study import METHODS
+from rsbench.benchmark.studies.correction_methods import METHODS
 from rsbench.core.so3 import FloatArray
 
 EXTRA = ("flip_covered", "flip_all", "ssim_deepunroll", "ssim_uniform")
@@ -61,6 +61,25 @@ def summarise(images: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
                 row |= _interval(name, (ours[score] - own[score]).dropna().to_numpy(), seed)
             rows.append(row)
     return pd.DataFrame(rows)
+
+
+def masks(images: pd.DataFrame) -> pd.DataFrame:
+    """Per stratum, the median and the least share of a view's pixels that every method covers."""
+    common = images.groupby(["stratum", "sequence", "side", "frame"], sort=False)["common"].first()
+    shares = common.groupby("stratum", sort=False)
+    return pd.DataFrame({"median": shares.median(), "least": shares.min()}).reset_index()
+
+
+def by_scene(images: pd.DataFrame) -> pd.DataFrame:
+    """Per stratum, scene and method: median of each score over the scene's sequences, ``sequences`` of them.
+
+    A sequence is named after its scene and its seed: ``castle-2``.
+    """
+    table = by_sequence(images)
+    scene = table["sequence"].str.replace(r"-\d+$", "", regex=True)
+    groups = table.assign(scene=scene).groupby(["stratum", "scene", "method"], sort=False)
+    medians = groups[["psnr_covered", "psnr_all", "ssim_all", "flow_median_px"]].median()
+    return medians.assign(sequences=groups.size()).reset_index()
 
 
 def _interval(name: str, values: FloatArray, seed: int) -> dict[str, float]:
