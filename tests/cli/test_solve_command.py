@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import run_here
 
 from rsbench.pipeline.problem import EXAMPLE
 
@@ -42,11 +43,8 @@ class Odd(Solver):
 NOTHING: dict[str, list[float]] = {name: [] for name in ("left", "right", "stereo_0", "stereo_1", "tracks")}
 
 
-def solve(
-    *arguments: object, cwd: Path | None = None, text: str | None = None
-) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "rsbench", "solve", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, cwd=cwd, input=text)
+def solve(*arguments: object, text: str = "") -> subprocess.CompletedProcess[str]:
+    return run_here("solve", *arguments, text=text)
 
 
 def answers(result: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
@@ -60,11 +58,14 @@ def odd_card(folder: Path, what: str, extra: str = "") -> Path:
     return card
 
 
-def test_the_sample_is_printed_and_solved_away_from_the_checkout(tmp_path: Path) -> None:
-    sample = solve("--example", cwd=tmp_path)
+def test_the_sample_is_printed_and_solved_away_from_the_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    sample = solve("--example")
     assert sample.returncode == 0 and json.loads(sample.stdout)["name"] == "example"
     (tmp_path / "problem.json").write_text(sample.stdout)
-    result = solve("problem.json", cwd=tmp_path)
+    result = solve("problem.json")
     assert result.returncode == 0 and result.stderr == ""
     assert "m per frame, of the middle of the baseline" in result.stdout
     assert "of 80 matches" in result.stdout
@@ -98,12 +99,7 @@ def test_a_problem_without_an_answer_is_exit_code_1(tmp_path: Path) -> None:
     assert result.returncode == 1
     rows = [line for line in result.stdout.splitlines() if "rs-stereo" in line or "gs-8pt" in line]
     assert ["/80" in row or "/60" in row for row in rows] == [False, False, True, True]
-    quiet = subprocess.run(
-        [sys.executable, "-m", "rsbench", "--quiet", "solve", tmp_path, EXAMPLE],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    quiet = run_here("--quiet", "solve", tmp_path, EXAMPLE)
     assert quiet.returncode == 1
     first, second = (line.split("\t") for line in quiet.stdout.splitlines())
     assert first[1:4] == ["rs-stereo", "-", "-"] and second[3].endswith(" m") and second[5].endswith("/80")
@@ -139,7 +135,9 @@ def test_a_solver_that_misbehaves_fails_alone_and_leaves_the_answers_clean(tmp_p
     cards = [odd_card(tmp_path, what) for what in ("print", "exit", "crash")]
     cards.append(odd_card(tmp_path, "hang", "time_limit_s = 1.0"))
     options = [part for card in cards for part in ("--solver", card)]
-    result = solve(EXAMPLE, *options, "--solver", "gs-8pt", "--json")
+    # In a process of its own: what its children print would not pass through this one's standard output.
+    command = [sys.executable, "-m", "rsbench", "solve", EXAMPLE, *options, "--solver", "gs-8pt", "--json"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert result.returncode == 1, result.stderr
     fine, left, crashed, hung, ours = answers(result)  # every line is an answer, whatever was printed
     assert fine["success"] and fine["w"] == ours["w"] and fine["inliers"] == ours["inliers"]
