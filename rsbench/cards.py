@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import json
 import math
 import os
@@ -94,18 +95,25 @@ def parse_card(cls: type[T], data: Mapping[str, Any], where: str) -> T:
     Raises:
         RsbenchError: one line with ``where``, the dotted field, the value and what is allowed.
     """
-    # Strict JSON validation reads arrays as tuples and tables as dataclasses, as TOML means them.
-    # pydantic takes no settings for a standard dataclass itself, but hands those of a container down to it.
-    adapter: TypeAdapter[Any] = TypeAdapter(tuple[cls], config=_CONFIG)  # type: ignore[valid-type]
     card: tuple[T]
     check_finite(data, where)
     try:
-        card = adapter.validate_json(json.dumps([data], default=str))
+        # Strict JSON validation reads arrays as tuples and tables as dataclasses, as TOML means them.
+        card = _adapter(cls).validate_json(json.dumps([data], default=str))
     except ValidationError as error:
         raise RsbenchError(f"{where}: {_first_problem(cls, error)}") from None
     except RsbenchError as error:
         raise RsbenchError(f"{where}: {error}") from error
     return card[0]
+
+
+@functools.lru_cache(maxsize=64)
+def _adapter(cls: type) -> TypeAdapter[Any]:
+    """Kept, for it takes a hundred times as long to make as to use.
+
+    pydantic takes no settings for a standard dataclass itself, but hands those of a container down to it.
+    """
+    return TypeAdapter(tuple[cls], config=_CONFIG)  # type: ignore[valid-type]
 
 
 def check_finite(data: Mapping[str, Any], where: str) -> None:

@@ -1,13 +1,21 @@
-"""Fixtures that several parts share."""
+"""Fixtures that several parts share, and how two processes share the tests."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import signal
+from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from rsbench.imports import import_untried
+
+if TYPE_CHECKING:
+    from rsbench.scenes.model import Scene
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Started in the background of a shell without job control: the commands that tests interrupt would inherit it.
@@ -17,14 +25,58 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # command line, which tests start as others do, does it.
 import_untried()
 
+LARGE_SCENES = ("test_depth_by_rays.py", "test_built_scenes.py", "test_paper_sequences.py")
+"""Files that hold a built-in scene, hundreds of MB: one process runs them all, and builds each scene once."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What takes long comes first, so that no process works alone at the end."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Whole files go to a process, as their fixtures are made once there."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):  # type: ignore[misc]
+        def _split_scope(self, nodeid: str) -> str:
+            file = str(super()._split_scope(nodeid))
+            return "large scenes" if file.endswith(LARGE_SCENES) else file
+
+    return Scheduling(config, log)
+
 
 @pytest.fixture(scope="session")
-def smoke_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The dataset of datasets/smoke.toml, rendered once per test run."""
-    # Imported here, so that a broken part does not stop the tests of the others.
-    from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.generation import generate_dataset
+def built_scene() -> Callable[[str], Scene]:
+    """``load_scene``, which takes seconds for a built-in scene, with the last three kept."""
+    from rsbench.scenes.load import load_scene
 
-    folder = tmp_path_factory.mktemp("smoke") / "smoke"
-    generate_dataset(load_dataset_card("smoke"), folder)
+    return lru_cache(maxsize=3)(load_scene)
+
+
+@pytest.fixture(scope="session")
+def smoke_dataset(tmp_path_factory: pytest.TempPathFactory, built_scene: Callable[[str], Scene]) -> Path:
+    """The dataset of datasets/smoke.toml, rendered once per test run, by whichever process needs it first."""
+    # Imported here, so that a broken part does not stop the tests of the others.
+    from rsbench.dataset import generation
+    from rsbench.dataset.card import load_dataset_card
+
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "smoke"
+    with _alone(folder.with_suffix(".lock")), pytest.MonkeyPatch.context() as patch:
+        if not (folder / "dataset.json").exists():
+            patch.setattr(generation, "load_scene", built_scene)
+            generation.generate_dataset(load_dataset_card("smoke"), folder)
     return folder
+
+
+@contextlib.contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """While this lasts no other process is in here with the same file; the system frees it when a process ends."""
+    with path.open("w") as file:
+        if os.name == "posix":
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield

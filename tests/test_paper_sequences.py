@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,25 +16,27 @@ from rsbench.cards import load_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.projection import row_poses
 from rsbench.core.se3 import Pose
+from rsbench.dataset import generation
 from rsbench.dataset.card import load_dataset_card
-from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.verification import verify_dataset
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import render
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.scenes.load import load_scene
+from rsbench.scenes.model import Scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 SCENES = ("castle", "old-town", "room")
 
 
 @pytest.fixture(scope="module")
-def paper(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def paper(tmp_path_factory: pytest.TempPathFactory, built_scene: Callable[[str], Scene]) -> Path:
     """The paper's sequences at two thirds of their size, for time; ``rsbench reproduce images`` has the whole."""
     folder = tmp_path_factory.mktemp("paper") / "paper"
     card = load_dataset_card("paper")
     camera = replace(card.camera, width=600, height=600, focal=card.camera.focal * 600 / card.camera.width)
-    generate_dataset(replace(card, camera=camera), folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(generation, "load_scene", built_scene)
+        generation.generate_dataset(replace(card, camera=camera), folder)
     return folder
 
 
@@ -77,11 +80,11 @@ Shot = tuple[MitsubaScene, PinholeCamera, Pose]
 
 
 @pytest.fixture(scope="module", params=["castle", "room"])
-def shot(request: pytest.FixtureRequest) -> Shot:
+def shot(request: pytest.FixtureRequest, built_scene: Callable[[str], Scene]) -> Shot:
     """A scene and the rows of its second right frame; of module scope, so that one scene goes before the next."""
     card = load_dataset_card("paper")
     (sequence,) = card.only([str(request.param)]).sequence
-    scene = load_scene(sequence.scene)
+    scene = built_scene(sequence.scene)
     rig = card.rig_of(sequence)
     poses = row_poses(rig, card.shutter(), card.motion_of(sequence), "right", 1)
     return MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint])), rig.camera, poses

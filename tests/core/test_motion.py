@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -169,6 +171,9 @@ def test_the_spline_is_the_cumulative_one_of_its_poses(seed: int, tau: float) ->
         M[:3, :3], M[:3, 3] = expm(so3.hat(pose[:3])), pose[3:]
         return M
 
+    matrices = [matrix(pose) for pose in poses]
+    steps = [np.real(logm(after @ np.linalg.inv(before))) for before, after in pairwise(matrices)]
+
     def raw(time: float) -> FloatArray:
         # De Boor's recursion, summed from the back, weighs the steps between control poses.
         knots, x = np.arange(-3.0, 9.0), time / interval
@@ -179,10 +184,9 @@ def test_the_spline_is_the_cumulative_one_of_its_poses(seed: int, tau: float) ->
                 for k in range(len(knots) - 1 - degree)
             ]
         weights = np.cumsum(basis[::-1])[::-1]
-        M = matrix(poses[0])
-        for k in range(1, len(poses)):
-            step = logm(matrix(poses[k]) @ np.linalg.inv(matrix(poses[k - 1])))
-            M = expm(weights[k] * np.real(step)) @ M
+        M = matrices[0]
+        for k, step in enumerate(steps, start=1):
+            M = expm(weights[k] * step) @ M
         return M
 
     expected = raw(tau) @ np.linalg.inv(raw(0.0))

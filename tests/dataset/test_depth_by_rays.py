@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.sequence import FRAMES, read_dataset
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.scenes.load import load_scene
+from rsbench.scenes.model import Scene
 
 
 def traced_depth(scene: MitsubaScene, origins: FloatArray, directions: FloatArray) -> FloatArray:
@@ -25,11 +26,14 @@ def traced_depth(scene: MitsubaScene, origins: FloatArray, directions: FloatArra
     return np.array(scene.scene.ray_intersect_preliminary(ray).t, dtype=np.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["castle", "room-twist"])
-def test_every_surface_pixel_is_where_another_frame_sees_it(smoke_dataset: Path, name: str) -> None:
+def test_every_surface_pixel_is_where_another_frame_sees_it(
+    smoke_dataset: Path, built_scene: Callable[[str], Scene], name: str
+) -> None:
     (card,) = load_dataset_card("smoke").only([name]).sequence
     sequence = next(sequence for sequence in read_dataset(smoke_dataset) if sequence.name == name)
-    built = load_scene(card.scene)
+    built = built_scene(card.scene)
     scene = MitsubaScene(built.seen_from(built.viewpoints[card.viewpoint]))
     rig, shutter, motion = sequence.rig, sequence.shutter, sequence.motion
     grid = rig.camera.pixel_grid()

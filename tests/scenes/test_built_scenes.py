@@ -18,6 +18,7 @@ from rsbench.scenes.model import Material, Scene, SceneMesh
 from rsbench.scenes.palette import RECIPES
 from rsbench.scenes.surfaces import Surface
 
+pytestmark = pytest.mark.slow
 BUILT_IN = ("castle", "old-town", "poles", "room")
 FOCAL, SIZE = 1384.6, 900  # the paper's camera, 36 degrees
 
@@ -29,8 +30,8 @@ def name(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(scope="module")
-def scene(name: str) -> Scene:
-    return load_scene(name)
+def scene(name: str, built_scene: Callable[[str], Scene]) -> Scene:
+    return built_scene(name)
 
 
 def test_every_card_parses_and_every_builder_has_one() -> None:
