@@ -99,7 +99,7 @@ def parse_card(cls: type[T], data: Mapping[str, Any], where: str) -> T:
     check_finite(data, where)
     try:
         # Strict JSON validation reads arrays as tuples and tables as dataclasses, as TOML means them.
-        card = _adapter(cls).validate_json(json.dumps([data], default=str))
+        card = _adapter(cls).validate_json(json.dumps([data], default=str))  # type: ignore[arg-type]
     except ValidationError as error:
         raise RsbenchError(f"{where}: {_first_problem(cls, error)}") from None
     except RsbenchError as error:

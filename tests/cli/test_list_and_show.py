@@ -21,6 +21,7 @@ from rsbench.cli.main import app
 from rsbench.parameters import parameters_of
 from rsbench.solvers.engine.registry import list_solvers, load_solver_entry
 
+
 def rsbench(*arguments: str, path: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
     """In this process, or in a new one that finds the packages in ``path``."""
     if path is None:
