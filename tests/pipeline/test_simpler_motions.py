@@ -15,14 +15,15 @@ from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
-from rsbench.pipeline.simpler_motions import global_shutter_motion, monocular_motion
+from rsbench.pipeline.simpler_motions import global_shutter_motion, monocular_motion, solved_alone
+from rsbench.solvers.engine.registry import load_solver_entry
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
 MOTION = LinearMotion(np.array([0.02, -0.03, 0.025]), np.array([0.2, -0.12, 0.18]))
 
 
-def camera_matches(motion: LinearMotion, count: int = 80) -> np.ndarray:
+def camera_matches(motion: LinearMotion, count: int = 80, shutter: RollingShutter = SHUTTER) -> np.ndarray:
     """Rolling-shutter matches (n, 4) of a camera that moves so about its own centre, each row at its own time."""
     camera, rng = RIG.camera, np.random.default_rng(0)
     points = rng.uniform([-2.0, -2.0, 5.0], [2.0, 2.0, 12.0], (count, 3))
@@ -32,7 +33,7 @@ def camera_matches(motion: LinearMotion, count: int = 80) -> np.ndarray:
         for _ in range(
             30
         ):  # the row decides the time and the time the row: a contraction by about h times the flow
-            tau = SHUTTER.row_time(row, frame)
+            tau = shutter.row_time(row, frame)
             R, t = motion.body_from_world(tau)
             seen = (R @ points[:, :, None])[:, :, 0] + t
             row = camera.fy * seen[:, 1] / seen[:, 2] + camera.cy
@@ -52,6 +53,20 @@ def test_one_camera_finds_its_own_motion_in_unit_length(side: Side) -> None:
     # Exact matches: what is left is where the descent stops.
     np.testing.assert_allclose(found.w, MOTION.w, atol=1e-8)
     np.testing.assert_allclose(found.d, MOTION.d / np.linalg.norm(MOTION.d), atol=1e-7)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_either_camera_alone_is_solved_about_its_own_centre(side: Side) -> None:
+    """By a solver that knows the left camera only, on exact global-shutter matches."""
+    still = RollingShutter(height=900, readout_ratio=0.0)
+    matches = Correspondences(**{side: camera_matches(MOTION, shutter=still)})
+    solver, rng = load_solver_entry("gs-8pt").solver, np.random.default_rng(0)
+    found = solved_alone(matches, RIG, still, side, solver, RobustOptions(), rng)
+    assert found is not None
+    np.testing.assert_allclose(found.w, MOTION.w, atol=1e-7)
+    np.testing.assert_allclose(found.d, MOTION.d / np.linalg.norm(MOTION.d), atol=1e-6)
+    few = Correspondences(**{side: camera_matches(MOTION, 4, still)})
+    assert solved_alone(few, RIG, still, side, solver, RobustOptions(), rng) is None
 
 
 def test_the_global_motion_of_global_shutter_matches_is_theirs() -> None:
