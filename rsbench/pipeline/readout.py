@@ -1,50 +1,83 @@
-"""The readout ratio of a rolling shutter from its own matches: one-dimensional search on the refined cost.
+"""The readout ratio of a rolling shutter from its own matches: search on the refined cost.
 
 For every candidate ratio the motion is fitted by maximum likelihood; what is left of the squared errors is a
-function of the ratio alone, whose minimum is the estimate and whose curvature gives its standard deviation.
-The search also tries the ratio's negative, which is what frames in reversed order, or rows read from the bottom,
-look like: both turn time around.
+function of the ratio alone, whose minimum is the estimate. The search includes negative ratios: what frames in
+reversed order, or rows read from the bottom, look like, for both turn time around.
+
+A constant error of the disparity, as real calibrations have, looks like a readout ratio. It is fitted with the
+ratio; how large it may be the row differences of the left-right matches tell, which come from the same
+calibration.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.readout_profile import Profile, in_order, measurements, ordered, reversed_in_time
+from rsbench.pipeline.rectification import row_pattern, without_offset
 from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions, estimate_motion
-from rsbench.solvers.engine.optimise import levenberg_marquardt
-from rsbench.solvers.engine.packed import Packed, pack
 from rsbench.solvers.refined import RefinedSolver
 
-COARSE = (0.0, 0.25, 0.5, 0.75, 1.0)
+COARSE = (-1.0, -0.5, 0.0, 0.25, 0.5, 0.75, 1.0)
 """Ratios at which outliers are sorted out; between two of them the error of a match stays within its noise."""
-_REACH = 0.3
-_STEP = 0.02
-_ITERATIONS = 30
-_FREEDOM = 7
 _LEAST_NOISE_PX = 0.02
-_CLEARLY = 25.0
+_CLEARLY = 5.0
+_EVIDENCE = 0.75
+"""Cost in the opposite order over that in the given one, below which it counts: in real frames in order at least
+0.93, for the errors of their calibration prefer either order a little."""
+_BACKWARDS = 0.25
+_SUSPECT = 25.0
+_PRIOR_FACTOR = 2.0
+"""Standard deviation of the disparity offset over the size of the row differences: rows show errors of roll and
+pitch, and the error of yaw, which shifts disparities, is of their kind."""
+_LEAST_PRIOR_PX = 0.1
+"""Below this the rows agree so well that there is no offset to fit."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ReadoutEstimate:
-    """A readout ratio and how well the matches determine it."""
+    """A readout ratio and the offset of the disparities, and how well the matches determine them."""
 
-    readout_ratio: float
-    """In [0, 1]."""
-    sigma: float
-    """Its standard deviation; inf when the matches say nothing about it."""
+    signed_ratio: float
+    """In [-1, 1]; below 0, by more than its uncertainty, time runs backwards in the frames."""
+    disparity_offset: float = 0.0
+    """Disparity as matched minus the true one, px."""
+    covariance: FloatArray
+    """(2, 2) of both; infinite where the matches say nothing of the ratio, 0 for an offset that is not fitted."""
     matches: int
     """Pairs and tracks without outliers that it rests on."""
+    windows: int = 1
+    """Pairs of times that it rests on."""
+
+    @property
+    def readout_ratio(self) -> float:
+        """In [0, 1]: the nearest that a shutter can have."""
+        return max(self.signed_ratio, 0.0)
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the ratio."""
+        return float(np.sqrt(self.covariance[0, 0]))
+
+    @property
+    def offset_sigma(self) -> float:
+        """Standard deviation of the offset, px."""
+        return float(np.sqrt(self.covariance[1, 1]))
+
+    @property
+    def backwards(self) -> bool:
+        """Whether the ratio is negative by far more than its uncertainty and the errors of real calibrations."""
+        return self.signed_ratio < -max(_BACKWARDS, _CLEARLY * self.sigma)
 
     def __str__(self) -> str:
-        return f"{self.readout_ratio:.3f} +- {self.sigma:.3f}"
+        return f"{self.signed_ratio:.3f} +- {self.sigma:.3f}"
 
 
 def estimate_readout_ratio(
@@ -53,68 +86,118 @@ def estimate_readout_ratio(
     solver: RefinedSolver,
     options: RobustOptions,
     seed: int = 0,
+    disparity_offset: float | None = None,
 ) -> ReadoutEstimate | None:
     """Readout ratio of matches with outliers; None when no motion explains them at any ratio.
 
-    ``sigma`` counts the noise that the residuals show; it says nothing about a wrong motion model.
-    """
-    height = rig.camera.height
+    ``covariance`` counts the noise that the residuals show, and that matches of one part of the image err
+    together; it says nothing about a wrong motion model.
 
-    def robust(ratio: float) -> RobustEstimate:
-        shutter = RollingShutter(height=height, readout_ratio=ratio)
+    Args:
+        disparity_offset: known, px; None has it fitted.
+    """
+    prior = 0.0
+    if disparity_offset is None:
+        pattern = row_pattern(_stereo(correspondences), rig)
+        prior = 0.0 if pattern is None else _PRIOR_FACTOR * pattern.systematic_px
+    search = _Search(
+        matches=correspondences,
+        rig=rig,
+        solver=solver,
+        options=options,
+        seed=seed,
+        prior=prior if prior > _LEAST_PRIOR_PX else 0.0,
+    )
+    found = search.from_coarse(disparity_offset or 0.0)
+    if found is not None and search.prior > 0.0:
+        # The best of the coarse ratios may have been the best for a wrong offset.
+        found = search.from_coarse(found[1])
+    profile = None if found is None else search.profile(*found)
+    if found is None or profile is None:
+        return None
+    ratio, offset = profile.minimum(*found)  # outliers sorted out at nearly the right ratio
+    return ReadoutEstimate(
+        signed_ratio=ratio,
+        disparity_offset=offset,
+        covariance=profile.covariance(ratio, offset),
+        matches=profile.matches,
+    )
+
+
+def combined(estimates: Sequence[ReadoutEstimate]) -> ReadoutEstimate:
+    """One shutter and one offset from those of several windows, at least one.
+
+    The mean weighted by what each window knows. Its covariance counts the scatter of the windows about it, when
+    that is larger than the windows say themselves, and not as if it were independent: they share the calibration.
+    """
+    weights = np.array([np.linalg.pinv(estimate.covariance) for estimate in estimates])
+    values = np.array([[estimate.signed_ratio, estimate.disparity_offset] for estimate in estimates])
+    covariance = np.linalg.pinv(np.sum(weights, axis=0))
+    mean = covariance @ np.einsum("nij,nj->i", weights, values)
+    scores = np.einsum("nij,nj->ni", weights, values - mean)
+    scatter = covariance @ (scores.T @ scores) @ covariance * len(estimates)
+    return ReadoutEstimate(
+        signed_ratio=float(np.clip(mean[0], -1.0, 1.0)),
+        disparity_offset=float(mean[1] if covariance[1, 1] > 0.0 else values[0, 1]),
+        covariance=scatter if scatter[0, 0] > covariance[0, 0] else covariance,
+        matches=sum(estimate.matches for estimate in estimates),
+        windows=len(estimates),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Search:
+    """The robust motion of matches at any signed ratio and offset."""
+
+    matches: Correspondences
+    rig: StereoRig
+    solver: RefinedSolver
+    options: RobustOptions
+    seed: int
+    prior: float
+    """Standard deviation of the offset, px; 0 leaves it where it is."""
+
+    def from_coarse(self, offset: float) -> tuple[float, float] | None:
+        """Ratio and offset of the smallest cost near the ratio of ``COARSE`` that explains the matches best."""
+        tried = {ratio: self._robust(ratio, offset) for ratio in COARSE}
+        found = {ratio: result for ratio, result in tried.items() if result[0].estimate.success}
+        if not found:
+            return None
+        # One limit for all, that of the best fit: near outliers would outweigh what the ratio changes.
+        options = replace(self.options, threshold_px=min(result.threshold_px for result, _ in found.values()))
+        costs = {
+            ratio: truncated_cost(matches, self.rig, abs(ratio), self.solver, options, result)
+            for ratio, (result, matches) in found.items()
+        }
+        best = min(costs, key=lambda ratio: costs[ratio] / (_EVIDENCE if ratio < 0.0 else 1.0))
+        profile = self.profile(best, offset)
+        return None if profile is None else profile.minimum(best, offset)
+
+    def _robust(self, ratio: float, offset: float) -> tuple[RobustEstimate, Correspondences]:
+        """The estimate, and the matches in the order of time that it is of."""
+        matches = ordered(without_offset(self.matches, offset), ratio)
+        shutter = RollingShutter(height=self.rig.camera.height, readout_ratio=abs(ratio))
+        rng = np.random.default_rng(self.seed)
         # A proposal far off may put a point next to a camera's plane, where its error overflows: an outlier.
         with np.errstate(invalid="ignore", over="ignore"):
-            return estimate_motion(correspondences, rig, shutter, solver, options, np.random.default_rng(seed))
+            return estimate_motion(matches, self.rig, shutter, self.solver, self.options, rng), matches
 
-    tried = {ratio: robust(ratio) for ratio in COARSE}
-    found = {ratio: result for ratio, result in tried.items() if result.estimate.success}
-    if not found:
-        return None
-    ratio = min(found, key=lambda r: truncated_cost(correspondences, rig, r, solver, options, found[r]))
-    profile = _Profile(correspondences, rig, solver, found[ratio])
-    ratio = profile.minimum(ratio)
-    again = robust(ratio)
-    if again.estimate.success:  # outliers sorted out at nearly the right ratio
-        profile = _Profile(correspondences, rig, solver, again)
-        ratio = profile.minimum(ratio)
-    return ReadoutEstimate(readout_ratio=ratio, sigma=profile.sigma(ratio), matches=profile.matches)
+    def profile(self, ratio: float, offset: float) -> Profile | None:
+        """The cost of the matches that a motion explains at this ratio; None when there is none."""
+        result, _ = self._robust(ratio, offset)
+        if not result.estimate.success:
+            return None
+        motion = in_order(result.estimate.w, result.estimate.d, ratio)
+        variance = max(result.estimate.noise_px or 0.0, _LEAST_NOISE_PX) ** 2
+        weight = variance / self.prior**2 if self.prior > 0.0 else np.inf
+        return Profile(select(self.matches, result), self.rig, self.solver, motion, weight)
 
 
-class _Profile:
-    """Half the squared errors of the inliers as a function of the readout ratio, the motion fitted to each."""
-
-    def __init__(
-        self, correspondences: Correspondences, rig: StereoRig, solver: RefinedSolver, result: RobustEstimate
-    ) -> None:
-        self.inliers = select(correspondences, result)
-        self.rig, self.solver = rig, solver
-        self.start = np.concatenate([result.estimate.w, result.estimate.d])
-        self.matches = len(self._packed(0.5).pairs) + len(self._packed(0.5).tracks)
-
-    def _packed(self, ratio: float) -> Packed:
-        shutter = RollingShutter(height=self.rig.camera.height, readout_ratio=ratio)
-        return _measurements(self.inliers, self.rig, shutter, self.solver)
-
-    def __call__(self, ratio: float) -> float:
-        packed = self._packed(float(ratio))
-        theta = packed.theta(self.start[:3], self.start[3:])
-        fitted = levenberg_marquardt(packed.normal_equations, theta, _ITERATIONS, self.solver.max_translation_m)
-        return fitted.cost
-
-    def minimum(self, ratio: float) -> float:
-        """The ratio of the smallest cost near ``ratio``."""
-        bounds = (max(ratio - _REACH, 0.0), min(ratio + _REACH, 1.0))
-        return float(minimize_scalar(self, bounds=bounds, method="bounded", options={"xatol": 1e-5}).x)
-
-    def sigma(self, ratio: float) -> float:
-        """Standard deviation by the curvature of the profile, with the noise that the residuals show."""
-        middle = min(max(ratio, _STEP), 1.0 - _STEP)
-        below, at, above = (self(middle + step) for step in (-_STEP, 0.0, _STEP))
-        curvature = (below - 2.0 * at + above) / _STEP**2
-        freedom = self._packed(middle).constraints - _FREEDOM
-        if freedom <= 0 or curvature <= 0.0:
-            return float("inf")
-        return float(np.sqrt(2.0 * at / freedom / curvature))
+def _stereo(correspondences: Correspondences) -> FloatArray:
+    """The left-right matches (n, 4) of both times; those of the tracks where there are no others."""
+    pairs = np.concatenate([correspondences.stereo_0, correspondences.stereo_1])
+    tracks = correspondences.tracks
+    return pairs if len(pairs) else np.concatenate([tracks[:, :4], tracks[:, 4:]])
 
 
 def select(correspondences: Correspondences, result: RobustEstimate) -> Correspondences:
@@ -138,29 +221,13 @@ def truncated_cost(
     if not result.estimate.success:
         return float("inf")
     shutter = RollingShutter(height=rig.camera.height, readout_ratio=ratio)
-    packed = _measurements(correspondences, rig, shutter, solver)
+    packed = measurements(correspondences, rig, shutter, solver)
     theta = packed.theta(result.estimate.w, result.estimate.d)
     limit = options.threshold_px**2
     pairs = np.minimum(packed.pair_residuals(theta) ** 2, limit)
     # A track has five residuals where a pair has one.
     tracks = np.minimum(packed.track_squares(theta), 5.0 * limit)
     return float(np.sum(pairs) + np.sum(tracks))
-
-
-def reversed_in_time(correspondences: Correspondences) -> Correspondences:
-    """The matches with frame 0 and frame 1 exchanged."""
-    return Correspondences(
-        left=_swapped(correspondences.left),
-        right=_swapped(correspondences.right),
-        stereo_0=correspondences.stereo_1,
-        stereo_1=correspondences.stereo_0,
-        tracks=_swapped(correspondences.tracks),
-    )
-
-
-def _swapped(matches: FloatArray) -> FloatArray:
-    half = matches.shape[1] // 2
-    return np.concatenate([matches[:, half:], matches[:, :half]], axis=1)
 
 
 def runs_backwards(
@@ -185,12 +252,4 @@ def runs_backwards(
     as_given = truncated_cost(correspondences, rig, ratio, solver, options, forward)
     in_reverse = truncated_cost(turned, rig, backward_ratio, solver, options, backward)
     variance = max(backward.estimate.noise_px or 0.0, _LEAST_NOISE_PX) ** 2
-    return as_given - in_reverse > _CLEARLY * variance
-
-
-def _measurements(
-    correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter, solver: RefinedSolver
-) -> Packed:
-    """All matches, of few tracks too, under the solver's motion model."""
-    model, parameters = solver.motion_model, solver.motion_parameters
-    return pack(correspondences, rig, shutter, model, solver.use_tracks, motion_parameters=parameters)
+    return as_given - in_reverse > _SUSPECT * variance
