@@ -43,7 +43,7 @@ def run(sequence: Sequence, options: CorrectionOptions) -> dict[str, tuple[float
         times[name] = (time.perf_counter() - wall, time.process_time() - cpu)
         return result
 
-    matches = timed("match", lambda: match_frames(images, options))
+    matches = timed("match", lambda: match_frames(images, rig, options))
     found, shutter, _ = timed("solve", lambda: solve_frames(matches, rig, sequence.shutter.readout_ratio, options))
     pairs = timed("depth", lambda: find_depth(images, rig, shutter, found.motion, options))
     timed("correct", lambda: correct_frames(images, pairs, rig, shutter, found.motion, options))

@@ -51,7 +51,7 @@ def rendered(data: Path) -> list[str]:
     """Errors on the matches of rendered frames."""
     lines = []
     for sequence in read_dataset(data):
-        matches = match_frames({view: sequence.image("rs", *view) for view in VIEWS}, OPTIONS)
+        matches = match_frames({view: sequence.image("rs", *view) for view in VIEWS}, sequence.rig, OPTIONS)
         found = estimate_readout_ratio(matches, sequence.rig, JUDGE, OPTIONS.robust)
         true = sequence.shutter.readout_ratio
         error = (

@@ -152,10 +152,12 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
     options = replace(options, target_row=_target_row(target, height))
     with fresh_folder(out) as folder:
         with progress_bar("correcting", 4) as advance:
-            result = correct_four(images, rig, card.readout_ratio, options, advance)
+            result = correct_four(
+                images, rig, card.readout_ratio, options, advance, disparity_offset=card.disparity_offset
+            )
         for (side, frame), fused in result.frames.items():
             write_frame(folder, f"{side}_{frame}", fused)
-        record = rig_record(rig, result.shutter, result.readout, options)
+        record = rig_record(rig, result.shutter, result.readout, options, card.disparity_offset)
         record["motion"] = None if result.found is None else motion_record(result.found)
         record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in result.frames.items()}
         record["seconds"] = result.seconds
@@ -191,7 +193,14 @@ def _agreeing(motion: dict[str, Any]) -> str:
 
 
 def _readout(shutter: RollingShutter, readout: ReadoutEstimate | None) -> str:
-    return f"{shutter.readout_ratio:.3f} (given)" if readout is None else f"{readout} (estimated)"
+    if readout is None:
+        return f"{shutter.readout_ratio:.3f} (given)"
+    text = f"{readout} (estimated)"
+    if readout.signed_ratio < 0.0:
+        text += ", corrected as 0"
+    if readout.offset_sigma > 0.0:
+        text += f"; disparity offset {readout.disparity_offset:+.2f} +- {readout.offset_sigma:.2f} px (estimated)"
+    return text
 
 
 def _say(
@@ -220,25 +229,33 @@ def _correct_sequence(
     height, width = next(iter(left)).shape[:2]
     rig = card.rig(width, height)
     options = replace(options, target_row=_target_row(target, height))
-    ratio, readout = card.readout_ratio, None
+    ratio, offset, readout = card.readout_ratio, card.disparity_offset, None
     with fresh_folder(out) as folder:
         if ratio is None:
-            readout = estimate_sequence_readout(left, right, rig, options)
-            ratio = readout.readout_ratio
+            readout = estimate_sequence_readout(left, right, rig, options, offset)
+            ratio, offset = readout.readout_ratio, readout.disparity_offset
         shutter = RollingShutter(height=height, readout_ratio=ratio)
-        record = rig_record(rig, shutter, readout, options)
+        record = rig_record(rig, shutter, readout, options, offset)
         with progress_bar("correcting", max(left.count, 1)) as advance:
-            moments = correct_sequence(left, right, rig, ratio, options)
+            moments = correct_sequence(left, right, rig, ratio, options, offset or 0.0)
             record["frames"], cards = _write_moments(folder, moments, left, advance)
         write_record(folder, record)
         _page(folder, out, shutter, readout, None, cards)
-    failed = [f"{frame['number']} ({frame['reason']})" for frame in record["frames"] if "reason" in frame]
+    failed = _told(record["frames"], "reason")
+    skipped = _told(record["frames"], "skipped")
     typer.echo(f"readout ratio {_readout(shutter, readout)}")
     typer.echo(f"{len(record['frames']) - len(failed)} of {len(record['frames'])} times corrected")
     typer.echo(f"report: {(out / 'report.html').resolve()}")
+    if skipped:
+        typer.echo(f"rsbench: corrected with the motion from the frame before: {skipped}", err=True)
     if failed:
-        typer.echo(f"rsbench: not corrected: frame {'; frame '.join(failed)}", err=True)
+        typer.echo(f"rsbench: not corrected: {failed}", err=True)
         raise typer.Exit(1)
+
+
+def _told(frames: list[dict[str, Any]], key: str) -> str:
+    """Which frames have a reason under ``key``, with it."""
+    return "; ".join(f"frame {frame['number']} ({frame[key]})" for frame in frames if key in frame)
 
 
 def _write_moments(
@@ -260,6 +277,8 @@ def _write_moments(
         if not moment.frames:
             entry["reason"] = moment.reason
         else:
+            if moment.reason:
+                entry["skipped"] = moment.reason
             if moment.found is not None:
                 entry["motion"] = motion_record(moment.found)
             if moment.number % every == 0 and len(cards) < _PAGE_FRAMES:

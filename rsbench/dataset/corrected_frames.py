@@ -109,9 +109,14 @@ def motion_record(found: FoundMotion) -> dict[str, Any]:
 
 
 def rig_record(
-    rig: StereoRig, shutter_: RollingShutter, readout: ReadoutEstimate | None, options: CorrectionOptions
+    rig: StereoRig,
+    shutter_: RollingShutter,
+    readout: ReadoutEstimate | None,
+    options: CorrectionOptions,
+    disparity_offset: float | None = None,
 ) -> dict[str, Any]:
     """What the correction assumed and which components it was made with, ready for JSON."""
+    offset = (disparity_offset or 0.0) if readout is None else readout.disparity_offset
     camera = rig.camera
     components = {name: {"name": entry.name, "key": entry.key} for name, entry in options.components.items()}
     return {
@@ -121,6 +126,9 @@ def rig_record(
         "readout_ratio": shutter_.readout_ratio,
         "readout_ratio_sigma": readout.sigma if readout is not None and np.isfinite(readout.sigma) else None,
         "readout_ratio_estimated": readout is not None,
+        "readout_ratio_signed": None if readout is None else readout.signed_ratio,
+        "disparity_offset": offset,
+        "disparity_offset_sigma": None if readout is None else readout.offset_sigma,
         "readout_ratio_by": referee(options.solver)[0] if readout is not None else None,
         "target_row": options.target_row,
         "components": components,

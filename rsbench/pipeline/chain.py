@@ -66,6 +66,7 @@ def correct_four(
     step: Step = lambda word: None,
     given: Given | None = None,
     views: tuple[View, ...] = VIEWS,
+    disparity_offset: float | None = None,
 ) -> CorrectedFrames:
     """Correct four frames (H, W[, 3]), uint8 or uint16, of a rig over one frame period.
 
@@ -77,6 +78,7 @@ def correct_four(
         step: called with the name of each of the 4 steps done.
         given: what is known already.
         views: the frames that are wanted.
+        disparity_offset: see ``solve_frames``.
 
     Raises:
         RsbenchError: frames that cannot be what they are said to be, or a component of another package failed.
@@ -87,9 +89,12 @@ def correct_four(
     if given.motion is not None and readout_ratio is None:
         raise ValueError("readout_ratio must be known where the motion is given: the matches would give another")
     clock, needs = _Clock(step), options.corrector.component.spec.needs
-    matches, found, shutter, readout = _solve(images, rig, readout_ratio, options, given, clock)
+    matches, found, shutter, readout = _solve(images, rig, readout_ratio, options, given, clock, disparity_offset)
+    offset = disparity_offset or 0.0 if readout is None else readout.disparity_offset
     motion = given.motion if found is None else found.motion
-    pairs = find_depth(images, rig, shutter, motion, options, given.pairs) if "depth" in needs else given.pairs
+    pairs = (
+        find_depth(images, rig, shutter, motion, options, given.pairs, offset) if "depth" in needs else given.pairs
+    )
     clock("depth")
     frames = correct_frames(images, pairs, rig, shutter, motion, options, views)
     clock("correction")
@@ -112,6 +117,7 @@ def _solve(
     options: CorrectionOptions,
     given: Given,
     clock: _Clock,
+    disparity_offset: float | None,
 ) -> tuple[Correspondences | None, FoundMotion | None, RollingShutter, ReadoutEstimate | None]:
     """Matches, motion and shutter, as far as they are needed and not given."""
     wanted = given.motion is None and "motion" in options.corrector.component.spec.needs
@@ -119,13 +125,13 @@ def _solve(
         clock("matching")
         clock("motion")
         return given.matches, None, RollingShutter(height=rig.camera.height, readout_ratio=readout_ratio), None
-    matches = match_frames(images, options) if given.matches is None else given.matches
+    matches = match_frames(images, rig, options) if given.matches is None else given.matches
     clock("matching")
     found = None
     if wanted:
-        found, shutter, readout = solve_frames(matches, rig, readout_ratio, options)
+        found, shutter, readout = solve_frames(matches, rig, readout_ratio, options, disparity_offset)
     else:
-        shutter, readout = solve_shutter(matches, rig, readout_ratio, options)
+        shutter, readout = solve_shutter(matches, rig, readout_ratio, options, disparity_offset)
     clock("motion")
     return matches, found, shutter, readout
 
@@ -137,10 +143,11 @@ def find_depth(
     motion: Motion | None,
     options: CorrectionOptions,
     pairs: Pairs | None = None,
+    disparity_offset: float = 0.0,
 ) -> Pairs:
     """The frames with their depth: from the other camera unless ``pairs`` has it, then from the motion."""
     if pairs is None:
-        pairs = frame_pairs(images, rig, options)
+        pairs = frame_pairs(images, rig, options, disparity_offset)
     if options.depth_from_motion and motion is not None and not all(pair.with_motion for pair in pairs):
         pairs = complete_depth(pairs, rig, shutter, motion)
     return pairs

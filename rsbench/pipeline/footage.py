@@ -22,6 +22,7 @@ from rsbench.errors import RsbenchError
 
 _SMALLEST = 32
 """Pixels of the shorter side; below that there is nothing to match."""
+_LARGEST_OFFSET_PX = 10.0
 _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm"}
 _READ = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -45,9 +46,16 @@ class RigCard:
     """Full distance between the cameras, metres."""
     readout_ratio: float | None = None
     """Readout time over frame period, 0 to 1; estimated from the frames when absent."""
+    disparity_offset: float | None = None
+    """What matched disparities are too large by, px; when absent, estimated with the readout ratio, else 0."""
 
     def __post_init__(self) -> None:
         self.rig(1, 1)
+        if self.disparity_offset is not None and not abs(self.disparity_offset) <= _LARGEST_OFFSET_PX:
+            raise ValueError(
+                f"disparity_offset = {self.disparity_offset}: must lie within {_LARGEST_OFFSET_PX:g} px; "
+                "calibrate the rig again"
+            )
         if self.readout_ratio is not None and not 0.0 <= self.readout_ratio <= 1.0:
             raise ValueError(f"readout_ratio = {self.readout_ratio}: must lie in [0, 1], or be absent if unknown")
 

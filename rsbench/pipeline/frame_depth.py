@@ -41,14 +41,24 @@ Pairs = tuple[FramePair, FramePair]
 """Frame 0 and frame 1."""
 
 
-def frame_pair(left: NDArray[Any], right: NDArray[Any], rig: StereoRig, options: CorrectionOptions) -> FramePair:
+def frame_pair(
+    left: NDArray[Any],
+    right: NDArray[Any],
+    rig: StereoRig,
+    options: CorrectionOptions,
+    disparity_offset: float = 0.0,
+) -> FramePair:
     """Depth of both images (H, W[, 3]), uint8 or uint16, of one time.
+
+    ``disparity_offset``: what a disparity is too large by, px.
 
     Raises:
         RsbenchError: another package's matcher failed, see ``find_disparities``.
     """
     levels = eight_bit([left, right])
     both = find_disparities(options.matcher, levels[0], levels[1], rig)
+    if disparity_offset:
+        both = (both[0] - np.float32(disparity_offset), both[1] - np.float32(disparity_offset))
     return depth_of_pair(left, right, both, rig, find_sky=options.find_sky)
 
 
@@ -77,12 +87,17 @@ def depth_of_pair(
     return FramePair(images=images, depth=depth, guess=guess)
 
 
-def frame_pairs(images: Images, rig: StereoRig, options: CorrectionOptions) -> Pairs:
+def frame_pairs(
+    images: Images, rig: StereoRig, options: CorrectionOptions, disparity_offset: float = 0.0
+) -> Pairs:
     """``frame_pair`` of frame 0 and of frame 1; ours side by side, for it keeps one core busy."""
     # Nothing is known of whether another package's matcher may run twice at a time.
     with ThreadPoolExecutor(len(FRAMES) if options.matcher.built_in else 1) as pool:
         first, second = pool.map(
-            lambda frame: frame_pair(images["left", frame], images["right", frame], rig, options), FRAMES
+            lambda frame: frame_pair(
+                images["left", frame], images["right", frame], rig, options, disparity_offset
+            ),
+            FRAMES,
         )
     return first, second
 

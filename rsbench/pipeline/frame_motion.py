@@ -15,17 +15,20 @@ from rsbench.errors import RsbenchError
 from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Images, eight_bit
-from rsbench.pipeline.readout import ReadoutEstimate, estimate_readout_ratio, reversed_in_time, runs_backwards
+from rsbench.pipeline.readout import LEAST_BACKWARDS, ReadoutEstimate, estimate_readout_ratio, runs_backwards
+from rsbench.pipeline.rectification import RefusedFramesError, check_rig, without_offset
 from rsbench.pipeline.robust_motion import RobustEstimate, estimate_motion
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.registry import SOLVERS, SolverEntry
 from rsbench.solvers.refined import RefinedSolver
-from rsbench.vision.feature_matcher import find_correspondences, load_features
+from rsbench.vision.feature_matcher import find_correspondences
 
-_FEW_STEREO = 0.1
-"""Left-right matches per temporal match below which the images may be swapped or not rectified."""
 _FEWEST_MATCHES = 12
 _MAX_READOUT_SIGMA = 0.25
+BACKWARDS = (
+    "time runs backwards in them: the two times are exchanged, or rows are read from the bottom up (turn the "
+    "images by 180 degrees then, and exchange left and right)"
+)
 _REFEREE = "rs-stereo-refined"
 """Name of the card with the default parameters of ``RefinedSolver``."""
 
@@ -46,6 +49,8 @@ class FoundMotion:
     """Name of the solver's entry."""
     reference_point: str
     """The point whose translation ``robust.estimate.d`` is."""
+    disparity_offset: float = 0.0
+    """What was taken from the disparities before, px."""
 
 
 def find_matches(images: Images, options: CorrectionOptions, sides: tuple[Side, Side] = SIDES) -> Correspondences:
@@ -60,40 +65,27 @@ def find_matches(images: Images, options: CorrectionOptions, sides: tuple[Side, 
     return find_correspondences(options.features, dict(zip(names, levels, strict=True)))
 
 
-def match_frames(images: Images, options: CorrectionOptions) -> Correspondences:
+def match_frames(
+    images: Images, rig: StereoRig, options: CorrectionOptions, *, judge_rig: bool = True
+) -> Correspondences:
     """``find_matches`` of frames that a user says to be those of a rig.
 
+    Args:
+        judge_rig: whether to look if frame 0 is a rectified pair in the right order.
+
     Raises:
-        RsbenchError: no texture, sides exchanged, or not rectified.
+        RefusedFramesError: no texture, sides exchanged, not rectified, or not of one time.
     """
+    if judge_rig:
+        check_rig(images["left", 0], images["right", 0], rig)
     matches = find_matches(images, options)
     temporal = max(len(matches.left) + len(matches.right), 2 * len(matches.tracks))
     if temporal < _FEWEST_MATCHES:
-        raise RsbenchError(
-            f"frames: only {temporal} matches between frame 0 and frame 1; {_FEWEST_MATCHES} are needed: the "
-            "frames show no texture, or not the same scene"
-        )
-    if not any(len(found) for found in (matches.stereo_0, matches.stereo_1, matches.tracks)):
-        # Some look for matches over time alone; whether the frames are in order is then for ours to judge.
-        options = replace(options, features=load_features("sift"))
-        judged = find_matches(images, options)
-        temporal, stereo = len(judged.left) + len(judged.right), _stereo_count(judged)
-    else:
-        stereo = _stereo_count(matches)
-    if stereo < _FEW_STEREO * temporal / 2:
-        swapped = find_matches(images, options, (SIDES[1], SIDES[0]))
-        if _stereo_count(swapped) > 3 * stereo:
-            raise RsbenchError("frames: the left and the right images are exchanged; give the left ones first")
-        raise RsbenchError(
-            f"frames: only {stereo} of about {temporal // 2} features are found on the same row of the left and "
-            "the right image; the frames must be rectified and in the order LEFT_0 RIGHT_0 LEFT_1 RIGHT_1"
+        raise RefusedFramesError(
+            f"only {temporal} matches between the two times; {_FEWEST_MATCHES} are needed: the frames show no "
+            "texture, or not the same scene"
         )
     return matches
-
-
-def _stereo_count(matches: Correspondences) -> int:
-    """Left-right matches in the frame that has fewer."""
-    return max(min(len(matches.stereo_0), len(matches.stereo_1)), len(matches.tracks))
 
 
 def find_motion(
@@ -135,10 +127,12 @@ def motion_of(estimate: MotionEstimate, entry: SolverEntry, rig: StereoRig) -> M
     raise NoMotionError(f"solver {entry.name!r}: {motion}; a correction needs metres, as rs-stereo-refined finds")
 
 
-def find_readout(matches: Correspondences, rig: StereoRig, options: CorrectionOptions) -> ReadoutEstimate | None:
+def find_readout(
+    matches: Correspondences, rig: StereoRig, options: CorrectionOptions, disparity_offset: float | None = None
+) -> ReadoutEstimate | None:
     """The readout ratio that explains the matches best, by ``referee``; None when no motion does at any."""
     _, judge = referee(options.solver)
-    return estimate_readout_ratio(matches, rig, judge, options.robust, options.seed)
+    return estimate_readout_ratio(matches, rig, judge, options.robust, options.seed, disparity_offset)
 
 
 def referee(entry: SolverEntry) -> tuple[str, RefinedSolver]:
@@ -151,44 +145,69 @@ def referee(entry: SolverEntry) -> tuple[str, RefinedSolver]:
 
 
 def solve_frames(
-    matches: Correspondences, rig: StereoRig, readout_ratio: float | None, options: CorrectionOptions
+    matches: Correspondences,
+    rig: StereoRig,
+    readout_ratio: float | None,
+    options: CorrectionOptions,
+    disparity_offset: float | None = None,
 ) -> tuple[FoundMotion, RollingShutter, ReadoutEstimate | None]:
     """Motion and shutter from matches; the readout ratio is estimated when it is None.
 
+    Args:
+        disparity_offset: what a disparity is too large by, px; None has it estimated with the readout ratio,
+            and is 0 where that is known.
+
     Raises:
-        RsbenchError: the frames fit better in the opposite order, or another package's solver raised.
+        RefusedFramesError: time runs backwards in the frames.
+        RsbenchError: another package's solver raised.
         NoMotionError: no motion explains the matches, or they do not determine the readout ratio.
     """
-    shutter, readout = solve_shutter(matches, rig, readout_ratio, options)
-    found = find_motion(matches, rig, shutter, options)
-    if _runs_backwards(matches, rig, found.robust, shutter, readout, options):
-        raise RsbenchError(
-            "frames: time runs backwards in them: frame 0 and frame 1 are exchanged, or rows are read from the "
-            "bottom up (turn the images by 180 degrees then, and exchange left and right)"
-        )
+    shutter, readout = solve_shutter(matches, rig, readout_ratio, options, disparity_offset)
+    offset = (disparity_offset or 0.0) if readout is None else readout.disparity_offset
+    matches = without_offset(matches, offset)
+    found = replace(find_motion(matches, rig, shutter, options), disparity_offset=offset)
+    if readout is None and _runs_backwards(matches, rig, found.robust, shutter, options):
+        raise RefusedFramesError(BACKWARDS)
     return found, shutter, readout
 
 
 def solve_shutter(
-    matches: Correspondences, rig: StereoRig, readout_ratio: float | None, options: CorrectionOptions
+    matches: Correspondences,
+    rig: StereoRig,
+    readout_ratio: float | None,
+    options: CorrectionOptions,
+    disparity_offset: float | None = None,
 ) -> tuple[RollingShutter, ReadoutEstimate | None]:
     """The shutter, from its readout ratio or, when that is None, from the matches.
 
     Raises:
+        RefusedFramesError: time runs backwards in the frames.
         NoMotionError: no motion explains the matches, or they do not determine the readout ratio.
     """
     readout = None
     if readout_ratio is None:
-        readout = find_readout(matches, rig, options)
+        readout = find_readout(matches, rig, options, disparity_offset)
         if readout is None:
             raise NoMotionError("no motion explains the matches at any readout ratio")
-        if not readout.sigma <= _MAX_READOUT_SIGMA:
-            raise NoMotionError(
-                f"the matches do not determine the readout ratio ({readout}): the motion is too small; put "
-                "readout_ratio into the rig's card"
-            )
+        check_readout(readout)
         readout_ratio = readout.readout_ratio
     return RollingShutter(height=rig.camera.height, readout_ratio=readout_ratio), readout
+
+
+def check_readout(readout: ReadoutEstimate) -> None:
+    """Whether frames can be corrected with this estimate.
+
+    Raises:
+        RefusedFramesError: time runs backwards in the frames.
+        NoMotionError: the matches do not determine the readout ratio.
+    """
+    if readout.backwards:
+        raise RefusedFramesError(BACKWARDS)
+    if not readout.sigma <= _MAX_READOUT_SIGMA:
+        raise NoMotionError(
+            f"the matches do not determine the readout ratio ({readout}): the motion is too small; put "
+            "readout_ratio into the rig's card"
+        )
 
 
 def _runs_backwards(
@@ -196,23 +215,22 @@ def _runs_backwards(
     rig: StereoRig,
     robust: RobustEstimate,
     shutter: RollingShutter,
-    readout: ReadoutEstimate | None,
     options: CorrectionOptions,
 ) -> bool:
-    """Whether time runs backwards in the frames: they then fit a negative readout ratio."""
+    """Whether time runs backwards in the frames: they then fit a negative readout ratio.
+
+    At a ratio near 0 there is no order to see, and a wrong ratio or focal length is no wrong order: what counts is
+    the ratio that fits best.
+    """
     _, judge = referee(options.solver)
-    ratio = backward_ratio = shutter.readout_ratio
-    if readout is not None:
-        if ratio > 3.0 * readout.sigma:
-            return False
-        # Backwards, the best ratio is negative, so the search ended near 0.
-        backward = estimate_readout_ratio(reversed_in_time(matches), rig, judge, options.robust, options.seed)
-        if backward is None:
-            return False
-        backward_ratio = backward.readout_ratio
+    if shutter.readout_ratio < LEAST_BACKWARDS:
+        return False
     if judge is not options.solver.solver:
         rng = np.random.default_rng(options.seed)
         robust = estimate_motion(matches, rig, shutter, judge, options.robust, rng)
         if not robust.estimate.success:
             return False
-    return runs_backwards(matches, rig, ratio, backward_ratio, judge, options.robust, robust, options.seed)
+    if not runs_backwards(matches, rig, shutter.readout_ratio, judge, options.robust, robust, options.seed):
+        return False
+    best = find_readout(matches, rig, options)
+    return best is not None and best.backwards

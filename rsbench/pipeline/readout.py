@@ -12,7 +12,7 @@ calibration.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,10 +30,10 @@ COARSE = (-1.0, -0.5, 0.0, 0.25, 0.5, 0.75, 1.0)
 _LEAST_NOISE_PX = 0.02
 _CLEARLY = 5.0
 _EVIDENCE = 0.75
-"""Cost in the opposite order over that in the given one, below which it counts: in real frames in order at least
-0.93, for the errors of their calibration prefer either order a little."""
-_BACKWARDS = 0.25
-_SUSPECT = 25.0
+"""Squared errors in the opposite order over those in the given one, below which they count: at least 0.83 in real
+frames in order, whose calibration errors may prefer either a little; at most 0.7 in rendered ones in reverse."""
+LEAST_BACKWARDS = 0.25
+"""Readout ratio from which on the order of the frames can be told: smaller ones are within the errors of rigs."""
 _PRIOR_FACTOR = 2.0
 """Standard deviation of the disparity offset over the size of the row differences: rows show errors of roll and
 pitch, and the error of yaw, which shifts disparities, is of their kind."""
@@ -74,7 +74,7 @@ class ReadoutEstimate:
     @property
     def backwards(self) -> bool:
         """Whether the ratio is negative by far more than its uncertainty and the errors of real calibrations."""
-        return self.signed_ratio < -max(_BACKWARDS, _CLEARLY * self.sigma)
+        return self.signed_ratio < -max(LEAST_BACKWARDS, _CLEARLY * self.sigma)
 
     def __str__(self) -> str:
         return f"{self.signed_ratio:.3f} +- {self.sigma:.3f}"
@@ -164,12 +164,15 @@ class _Search:
         if not found:
             return None
         # One limit for all, that of the best fit: near outliers would outweigh what the ratio changes.
-        options = replace(self.options, threshold_px=min(result.threshold_px for result, _ in found.values()))
-        costs = {
-            ratio: truncated_cost(matches, self.rig, abs(ratio), self.solver, options, result)
+        threshold = min(result.threshold_px for result, _ in found.values())
+        losses = {
+            ratio: truncated_losses(matches, self.rig, abs(ratio), self.solver, threshold, result)
             for ratio, (result, matches) in found.items()
         }
-        best = min(costs, key=lambda ratio: costs[ratio] / (_EVIDENCE if ratio < 0.0 else 1.0))
+        best, backward = (_least(losses, backward) for backward in (False, True))
+        if best is None or (backward is not None and fits_far_better(losses[backward], losses[best])):
+            best = backward
+        assert best is not None
         profile = self.profile(best, offset)
         return None if profile is None else profile.minimum(best, offset)
 
@@ -200,6 +203,12 @@ def _stereo(correspondences: Correspondences) -> FloatArray:
     return pairs if len(pairs) else np.concatenate([tracks[:, :4], tracks[:, 4:]])
 
 
+def _least(losses: dict[float, FloatArray], backward: bool) -> float | None:
+    """The ratio of the smallest sum of losses, among the negative ones or the others; None when there are none."""
+    ratios = [ratio for ratio in losses if (ratio < 0.0) == backward]
+    return min(ratios, key=lambda ratio: float(np.sum(losses[ratio])), default=None)
+
+
 def select(correspondences: Correspondences, result: RobustEstimate) -> Correspondences:
     """The temporal matches and tracks that a robust estimate kept."""
     return Correspondences(
@@ -209,47 +218,48 @@ def select(correspondences: Correspondences, result: RobustEstimate) -> Correspo
     )
 
 
-def truncated_cost(
+def truncated_losses(
     correspondences: Correspondences,
     rig: StereoRig,
     ratio: float,
     solver: RefinedSolver,
-    options: RobustOptions,
+    threshold_px: float,
     result: RobustEstimate,
-) -> float:
-    """Sum over all matches of the squared error, px^2, cut off at the inlier threshold; inf after a failure."""
-    if not result.estimate.success:
-        return float("inf")
+) -> FloatArray:
+    """Squared errors (n,) of all matches, px^2, cut off where an outlier begins, pairs before tracks."""
     shutter = RollingShutter(height=rig.camera.height, readout_ratio=ratio)
     packed = measurements(correspondences, rig, shutter, solver)
     theta = packed.theta(result.estimate.w, result.estimate.d)
-    limit = options.threshold_px**2
-    pairs = np.minimum(packed.pair_residuals(theta) ** 2, limit)
+    limit = threshold_px**2
     # A track has five residuals where a pair has one.
-    tracks = np.minimum(packed.track_squares(theta), 5.0 * limit)
-    return float(np.sum(pairs) + np.sum(tracks))
+    pairs = np.minimum(packed.pair_residuals(theta) ** 2, limit)
+    return np.concatenate([pairs, np.minimum(packed.track_squares(theta), 5.0 * limit)])
+
+
+def fits_far_better(losses: FloatArray, others: FloatArray) -> bool:
+    """Whether truncated losses (n,) are far below others of the same matches; outliers of both say nothing."""
+    told = losses != others
+    return float(np.sum(losses[told])) < _EVIDENCE * float(np.sum(others[told]))
 
 
 def runs_backwards(
     correspondences: Correspondences,
     rig: StereoRig,
     ratio: float,
-    backward_ratio: float,
     solver: RefinedSolver,
     options: RobustOptions,
     forward: RobustEstimate,
     seed: int = 0,
 ) -> bool:
-    """Whether the frames in the opposite order, at ``backward_ratio``, fit clearly better than ``forward``.
+    """Whether the frames in the opposite order fit far better than ``forward``, both at a readout ratio.
 
-    Clearly: a likelihood ratio of 5 standard deviations.
+    That alone is no proof: at a wrong ratio either order may fit better.
     """
     turned = reversed_in_time(correspondences)
-    shutter = RollingShutter(height=rig.camera.height, readout_ratio=backward_ratio)
+    shutter = RollingShutter(height=rig.camera.height, readout_ratio=ratio)
     backward = estimate_motion(turned, rig, shutter, solver, options, np.random.default_rng(seed))
     if not backward.estimate.success:
         return False
-    as_given = truncated_cost(correspondences, rig, ratio, solver, options, forward)
-    in_reverse = truncated_cost(turned, rig, backward_ratio, solver, options, backward)
-    variance = max(backward.estimate.noise_px or 0.0, _LEAST_NOISE_PX) ** 2
-    return as_given - in_reverse > _SUSPECT * variance
+    threshold = min(forward.threshold_px, backward.threshold_px)
+    as_given = truncated_losses(correspondences, rig, ratio, solver, threshold, forward)
+    return fits_far_better(truncated_losses(turned, rig, ratio, solver, threshold, backward), as_given)

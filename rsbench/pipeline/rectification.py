@@ -26,8 +26,8 @@ _SAME_ROW = 0.68
 """Share of matches on the same row: at least 0.80 in real rectified pairs, at most 0.56 in those of two times."""
 _OPPOSITE = 0.5
 """Share of negative disparities: at most 0.03 in real pairs in order, at least 0.86 in exchanged ones."""
-_BACK_PX = 2.0
-"""Disparities below minus this are negative: beyond noise and the errors of real calibrations."""
+_BACK_PX = 1.0
+"""Disparities above this have a sign: it is beyond noise and the errors of most calibrations."""
 _DISTORTED = 0.1
 """Coefficient of radial distortion of no rectified pair: at most 0.03 in real ones, -1/3 in f-theta lenses."""
 _CLEARLY = 5.0
@@ -119,7 +119,9 @@ def judge_stereo(stereo: FloatArray, rig: StereoRig, row_tolerance: float) -> No
             f"only {share:.0%} of the left-right matches lie on the same row; the frames must be rectified, in "
             "the order LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, and left and right of one time (is one camera a frame late?)"
         )
-    if np.mean(stereo[:, 0] - stereo[:, 2] < -_BACK_PX) > _OPPOSITE:
+    disparity = stereo[:, 0] - stereo[:, 2]
+    clear = disparity[np.abs(disparity) > _BACK_PX]
+    if len(clear) >= _FEWEST // 2 and np.mean(clear < 0.0) > _OPPOSITE:
         raise RefusedFramesError("the left and the right images are exchanged; give the left ones first")
 
 

@@ -17,12 +17,20 @@ from rsbench.pipeline.chain import correct_frames, find_depth
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, check_alike
 from rsbench.pipeline.frame_depth import Images, Pairs, frame_pair
-from rsbench.pipeline.frame_motion import FoundMotion, NoMotionError, find_readout, match_frames, solve_frames
-from rsbench.pipeline.readout import ReadoutEstimate
+from rsbench.pipeline.frame_motion import (
+    FoundMotion,
+    NoMotionError,
+    check_readout,
+    find_readout,
+    match_frames,
+    solve_frames,
+)
+from rsbench.pipeline.readout import ReadoutEstimate, combined
+from rsbench.pipeline.rectification import RefusedFramesError
 from rsbench.vision.fusion import Fused
 
-_READOUT_WINDOWS = 5
-"""Windows from which an unknown readout ratio is estimated."""
+_JUDGED = 3
+"""First windows whose rig is looked at; when all of them are refused, so is the sequence."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,74 +55,125 @@ class CorrectedMoment:
     """Corrected; empty when a motion was needed and not found."""
     found: FoundMotion | None
     reason: str
+    """Why no motion leads from here to the next frame; empty when one does, or when this is the last frame."""
 
 
 def estimate_sequence_readout(
-    left: FrameSource, right: FrameSource, rig: StereoRig, options: CorrectionOptions
+    left: FrameSource,
+    right: FrameSource,
+    rig: StereoRig,
+    options: CorrectionOptions,
+    disparity_offset: float | None = None,
 ) -> ReadoutEstimate:
-    """Readout ratio of a sequence: the weighted mean of its first windows.
+    """Readout ratio and disparity offset of a sequence, from all of its windows.
+
+    Args:
+        disparity_offset: see ``solve_frames``.
 
     Raises:
-        RsbenchError: as ``rsbench.pipeline.frame_motion.match_frames``.
-        NoMotionError: no window determines it.
+        RefusedFramesError: the first windows cannot be what they are said to be, or time runs backwards.
+        NoMotionError: the windows do not determine the ratio.
     """
-    estimates = []
-    for first, second in itertools.islice(itertools.pairwise(_both(left, right)), _READOUT_WINDOWS):
-        images = {(side, frame): pair[side] for frame, pair in enumerate((first, second)) for side in SIDES}
-        matches = match_frames(images, options)
-        estimate = find_readout(matches, rig, options)
+    estimates, refusals = [], _Refusals(left)
+    for number, images in enumerate(_window_images(left, right)):
+        try:
+            matches = match_frames(images, rig, options, judge_rig=number < _JUDGED)
+        except RefusedFramesError as error:
+            refusals.add(number, error)
+            continue
+        estimate = find_readout(matches, rig, options, disparity_offset)
         if estimate is not None and np.isfinite(estimate.sigma):
             estimates.append(estimate)
+    refusals.end(number + 1)
     if not estimates:
-        raise NoMotionError("no window of the sequence determines the readout ratio")
-    weights = np.array([1.0 / max(estimate.sigma, 1e-6) ** 2 for estimate in estimates])
-    ratios = np.array([estimate.readout_ratio for estimate in estimates])
-    return ReadoutEstimate(
-        readout_ratio=float(np.sum(weights * ratios) / np.sum(weights)),
-        sigma=float(np.sum(weights) ** -0.5),
-        matches=sum(estimate.matches for estimate in estimates),
-    )
+        raise NoMotionError("no window of the sequence determines the readout ratio: put it into the rig's card")
+    found = combined(estimates)
+    check_readout(found)
+    return found
 
 
 def correct_sequence(
-    left: FrameSource, right: FrameSource, rig: StereoRig, readout_ratio: float, options: CorrectionOptions
+    left: FrameSource,
+    right: FrameSource,
+    rig: StereoRig,
+    readout_ratio: float,
+    options: CorrectionOptions,
+    disparity_offset: float = 0.0,
 ) -> Iterator[CorrectedMoment]:
     """Every frame of a sequence corrected, in order; the last one with the motion from the one before.
 
     A frame from which no motion leads to the next uses the motion that led to it; without either it is given
-    back uncorrected.
+    back uncorrected. Both say why.
+
+    Args:
+        disparity_offset: what a disparity is too large by, px.
 
     Raises:
-        RsbenchError: frames that differ in size, cannot be read, or run backwards in time.
+        RefusedFramesError: the first three windows, or all, cannot be what they are said to be.
+        RsbenchError: frames that differ in size, or cannot be read.
     """
     shutter = RollingShutter(height=rig.camera.height, readout_ratio=readout_ratio)
     last: Window | None = None
     number = -1
-    for number, window in enumerate(_windows(left, right, rig, readout_ratio, options)):
+    for number, window in enumerate(_windows(left, right, rig, readout_ratio, options, disparity_offset)):
         yield _moment(number, 0, [window] if last is None else [window, last], rig, shutter, options)
         last = window
     if last is not None:
         yield _moment(number + 1, 1, [last], rig, shutter, options)
 
 
+class _Refusals:
+    """Windows that were refused; when these are all that were seen first, or all, so is the sequence."""
+
+    def __init__(self, source: FrameSource) -> None:
+        self._source, self._count = source, 0
+        self._last: RefusedFramesError | None = None
+
+    def add(self, number: int, error: RefusedFramesError) -> None:
+        """Window ``number`` was refused."""
+        self._count, self._last = self._count + 1, error
+        if number + 1 == _JUDGED:
+            self.end(_JUDGED)
+
+    def end(self, windows: int) -> None:
+        """There are no more than ``windows``."""
+        if self._last is not None and self._count == windows:
+            raise RefusedFramesError(self._last.reason, f"{self._source.path}, frames 0 to {windows}")
+
+
+def _window_images(left: FrameSource, right: FrameSource) -> Iterator[Images]:
+    for pair in itertools.pairwise(_both(left, right)):
+        yield {(side, frame): both[side] for frame, both in enumerate(pair) for side in SIDES}
+
+
 def _windows(
-    left: FrameSource, right: FrameSource, rig: StereoRig, readout_ratio: float, options: CorrectionOptions
+    left: FrameSource,
+    right: FrameSource,
+    rig: StereoRig,
+    readout_ratio: float,
+    options: CorrectionOptions,
+    offset: float,
 ) -> Iterator[Window]:
-    needs = options.corrector.component.spec.needs
-    times = (
-        (images, frame_pair(images["left"], images["right"], rig, options) if "depth" in needs else None)
-        for images in _both(left, right)
-    )
-    for (first, pair_0), (second, pair_1) in itertools.pairwise(times):
-        images = {(side, frame): both[side] for frame, both in enumerate((first, second)) for side in SIDES}
-        pairs = (pair_0, pair_1) if pair_0 is not None and pair_1 is not None else None
+    needs, refusals, second = options.corrector.component.spec.needs, _Refusals(left), None
+    number = -1
+    for number, images in enumerate(_window_images(left, right)):
+        pairs = None
+        if "depth" in needs:
+            first = second or frame_pair(images["left", 0], images["right", 0], rig, options, offset)
+            second = frame_pair(images["left", 1], images["right", 1], rig, options, offset)
+            pairs = first, second
         found, reason = None, ""
         if "motion" in needs:
             try:
-                found, _, _ = solve_frames(match_frames(images, options), rig, readout_ratio, options)
+                matches = match_frames(images, rig, options, judge_rig=number < _JUDGED)
+                found, _, _ = solve_frames(matches, rig, readout_ratio, options, offset)
             except NoMotionError as error:
                 reason = str(error)
+            except RefusedFramesError as error:
+                refusals.add(number, error)
+                reason = error.reason
         yield Window(images=images, pairs=pairs, found=found, reason=reason)
+    refusals.end(number + 1)
 
 
 def _moment(
@@ -141,7 +200,9 @@ def _moment(
     views = tuple((side, place) for side in SIDES)
     fused = correct_frames(window.images, pairs, rig, shutter, motion, options, views)
     frames = {side: fused[side, place] for side in SIDES}
-    return CorrectedMoment(number=number, images=images, frames=frames, found=window.found, reason="")
+    return CorrectedMoment(
+        number=number, images=images, frames=frames, found=window.found, reason=here.reason if frame == 0 else ""
+    )
 
 
 def _both(left: FrameSource, right: FrameSource) -> Iterator[dict[Side, NDArray[Any]]]:

@@ -276,10 +276,10 @@ def test_features_without_stereo_matches_are_no_sign_of_wrong_frames(castle: Seq
     """They go through to the solver, which says what it lacks; exchanged frames are still found out."""
     images = _frames(castle)
     options = CorrectionOptions(features=wrap(FEATURE_MATCHERS, OverTimeOnly()))
-    assert len(match_frames(images, options).stereo_0) == 0
+    assert len(match_frames(images, castle.rig, options).stereo_0) == 0
     other = {"left": "right", "right": "left"}
     with pytest.raises(RsbenchError, match="exchanged"):
-        match_frames({(s, f): images[other[s], f] for s, f in VIEWS}, options)
+        match_frames({(s, f): images[other[s], f] for s, f in VIEWS}, castle.rig, options)
     few = CorrectionOptions(features=options.features, solver=load_solver_entry("gs-stereo-tracks"))
     with pytest.raises(NoMotionError, match="tracks"):
         correct_four(images, castle.rig, castle.shutter.readout_ratio, few)
