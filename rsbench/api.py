@@ -345,20 +345,21 @@ def evaluate(
     metrics: Series[str] = (),
     only: Series[str] = (),
     force: bool = False,
+    seeds: int = 1,
     seed: int = 0,
 ) -> dict[str, pd.DataFrame]:
     """Run solvers, depth and correction on a dataset and score them against its truth.
 
     Args:
         folder: of the dataset.
-        out: folder of predictions and scores; what was predicted before from the same input is kept, and scored
-            too.
+        out: folder of predictions and scores; current predictions that it holds are kept, and scored too.
         solvers: names of ``list_solvers`` or paths of cards.
         correct_with: solver whose motion the correction uses.
         matcher, features, corrector: names or cards.
         metrics: names or cards of further metrics.
         only: names of solvers and sequences: predict nothing else. All is scored.
         force: predict again what is there already.
+        seeds: runs of each solver, with other RANSAC samples: one row each in ``pose``.
         seed: of every random choice.
 
     Returns:
@@ -380,6 +381,7 @@ def evaluate(
         metrics=arguments.names(metrics),
         only=arguments.names(only),
         force=force,
+        seeds=seeds,
         seed=seed,
     )
     open_evaluation(Path(folder), Path(out), options).run("rsbench.evaluate", lambda word: None)

@@ -68,13 +68,14 @@ def evaluate(
     metric: _Metrics = None,
     only: _Only = None,
     force: Annotated[bool, typer.Option("--force", help="Predict again what is there already.")] = False,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each solver, with other RANSAC samples.")] = 1,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
 ) -> None:
     """Pose, depth and correction against the truth of a dataset, with a report."""
     from rsbench.benchmark.images.plan import EvaluationOptions
 
     options = EvaluationOptions(
-        solvers=tuple(solver or _everything()),
+        solvers=tuple(solver or every_solver()),
         correction_solver=correct_with,
         features=features,
         matcher=matcher,
@@ -82,12 +83,14 @@ def evaluate(
         metrics=tuple(metric or ()),
         only=tuple(only or ()),
         force=force,
+        seeds=seeds,
         seed=seed,
     )
     evaluate_dataset(folder, out, options, f"rsbench evaluate {folder} --out {out}")
 
 
-def _everything() -> list[str]:
+def every_solver() -> list[str]:
+    """Names of those that come with rsbench or are installed, each solver once."""
     from rsbench.solvers.engine.registry import list_solvers
 
     # rs-stereo is another name of rs-stereo-refined: one row of it is enough.
@@ -104,7 +107,7 @@ def evaluate_dataset(folder: Path, out: Path, options: EvaluationOptions | None,
     from rsbench.cli.console import print_table, progress_bar, stoppable
     from rsbench.report.evaluation_page import summary_tables, write_report
 
-    evaluation = open_evaluation(folder, out, options or EvaluationOptions(solvers=tuple(_everything())))
+    evaluation = open_evaluation(folder, out, options or EvaluationOptions(solvers=tuple(every_solver())))
     with stoppable(), progress_bar(f"evaluating {folder.name}", evaluation.steps) as advance:
         stale = evaluation.run(command, advance)
     for table in summary_tables(out):

@@ -54,10 +54,11 @@ def reproduce(
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes of simulations and corrections; default: one per core.")
     ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Of images: runs of each solver, with other samples.")] = 20,
 ) -> None:
     """Make the committed results again: render or simulate what is missing, run, score, draw."""
     if target is Target.images:
-        _images(out, data)
+        _images(out, data, seeds)
     elif target is Target.correction:
         _correction(out, data, workers)
     elif target in (Target.fig4, Target.sgm):
@@ -87,14 +88,16 @@ def _simulated(target: Target, out: Path, data: Path, workers: int | None) -> No
         getattr(reproduce_simulated, target.value)(out, data, workers)
 
 
-def _images(out: Path, data: Path) -> None:
-    from rsbench.cli.evaluate import evaluate_dataset
+def _images(out: Path, data: Path, seeds: int) -> None:
+    from rsbench.benchmark.images.plan import EvaluationOptions
+    from rsbench.cli.evaluate import evaluate_dataset, every_solver
     from rsbench.cli.generate import generate
     from rsbench.report.evaluation_page import publish
 
     generate("paper", data / "paper", None, workers=1)
     evaluation = data / "paper-evaluation"
-    evaluate_dataset(data / "paper", evaluation, None, "rsbench reproduce images")
+    options = EvaluationOptions(solvers=tuple(every_solver()), seeds=seeds)
+    evaluate_dataset(data / "paper", evaluation, options, "rsbench reproduce images")
     typer.echo(f"published: {publish(evaluation, out / 'images')}")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,20 +51,61 @@ def summary_tables(out: Path) -> list[SummaryTable]:
 
 
 def _pose_table(out: Path) -> SummaryTable:
-    scores = read_scores(out, "pose")
-    order = ["sequence", *[name for name in ("e_R_deg",) if name in scores], "solver"]
+    scores = read_scores(out, "pose").drop(columns="reason")
     headings = read_headings(out, "pose")
     words = {"data_model": "data", "assumed_model": "assumes", "iterations": "RANSAC"} | headings
+    if scores["seed"].nunique() > 1:
+        frame, about = _over_seeds(scores, list(headings))
+    else:
+        order = ["sequence", *[name for name in ("e_R_deg",) if name in scores], "solver"]
+        frame, about = scores.sort_values(order).drop(columns="seed"), ""
     note = (
-        "e_R and e_T against the true motion of the rig over one frame period (a monocular solver against the "
-        "translation of its own camera); e_s = |log(estimated length / true length)| where a solver claims "
+        f"{about}e_R and e_T against the true motion of the rig over one frame period (a monocular solver against "
+        "the translation of its own camera); e_s = |log(estimated length / true length)| where a solver claims "
         "metres. A failure scores 180 degrees. 'Data' is the motion model that the data follow, 'assumes' that of "
         "the solver. Inliers are among the matches that the solver works on, each counted once. All solvers had "
         "the same matches, sampler and budget."
     )
-    frame = scores.sort_values(order).drop(columns="reason").rename(columns=words)
-    brief = frame[["sequence", "solver", "assumes", *headings.values(), "inliers", "matches"]]
+    frame = frame.rename(columns=words)
+    counts = [name for name in ("runs", "failures") if name in frame]
+    brief = frame[["sequence", "solver", "assumes", *headings.values(), "inliers", "matches", *counts]]
     return SummaryTable(title="Relative pose", note=note, frame=frame, brief=brief)
+
+
+def _over_seeds(scores: pd.DataFrame, metrics: list[str]) -> tuple[pd.DataFrame, str]:
+    """Medians with quartiles over the runs of each solver, and what the note says of them."""
+    numbers = [*metrics, "inliers", "matches", "iterations"]
+    runs = scores.assign(failures=~scores["success"].astype(bool)).groupby(["sequence", "solver"], sort=False)
+    medians = runs[numbers].median()
+    frame = runs[["shutter", "data_model", "assumed_model", "uses"]].first().join(medians)
+    frame = frame.assign(runs=runs.size(), failures=runs["failures"].sum())
+    order = ["sequence", *[name for name in ("e_R_deg",) if name in frame], "solver"]
+    frame = frame.reset_index().sort_values(order).set_index(["sequence", "solver"])
+    for name in metrics:
+        frame[name] = runs[name].agg(median_and_quartiles)
+    counts = ["inliers", "matches", "iterations"]
+    frame[counts] = frame[counts].round().astype(int)
+    note = "Median [lower quartile, upper quartile] over the runs of each solver with other RANSAC samples. "
+    return frame.reset_index(), note
+
+
+def median_and_quartiles(values: pd.Series) -> str:
+    """``median [lower, upper]`` with as many digits as their distance allows, and at most three that count."""
+    found = np.asarray(values.dropna(), dtype=np.float64)
+    if not found.size:
+        return "–"
+    low, middle, high = np.quantile(found, [0.25, 0.5, 0.75], method="inverted_cdf")
+    if not np.isfinite(middle):
+        return "inf"
+    size = _exponent(middle)
+    width = size if np.isinf(high) else _exponent(high - low) if high > low else size - 2
+    places = max(0, 1 - width if width >= size - 1 else 2 - size)
+    return f"{middle:.{places}f} [{low:.{places}f}, {high:.{places}f}]"
+
+
+def _exponent(value: float) -> int:
+    """The place of the first digit that counts: 0 for ones, -1 for tenths."""
+    return math.floor(math.log10(abs(value))) if value else 0
 
 
 def _mean(scores: pd.DataFrame, keys: list[str], numbers: list[str]) -> pd.DataFrame:
@@ -80,7 +122,8 @@ def _depth_table(out: Path) -> SummaryTable:
     note = (
         "Depth of the rolling-shutter pairs against the truth on surface pixels, mean of the four frames: "
         "all of them, those that the other camera sees (visible), and those that it does not. Errors are over "
-        "the pixels that have an estimate; coverage is their share."
+        "the pixels that have an estimate; coverage is their share. 'On sky' is the share of the pixels without a "
+        "surface that the matcher gives a depth; a correction takes those for sky that look like it."
     )
     hidden = {headings.get(name) for name in ("rmse_m", "bad_2px", "bad_3px")} | {"failures"}
     brief = frame[[name for name in frame if name not in hidden]]
@@ -153,12 +196,20 @@ def write_report(dataset: Path, out: Path) -> Path:
 
 def write_overview(out: Path) -> Path:
     """One picture of all sequences of a report: frame, frame over the truth, corrected frame over the truth."""
-    columns = ("rolling", "rolling-over-global", "corrected-over-global")
+    columns = {
+        "rolling": "{}: rolling shutter (RS)",
+        "rolling-over-global": "RS over truth",
+        "corrected-over-global": "corrected over truth",
+    }
     rows = []
     for folder in sorted((out / "pictures").iterdir()):
-        images = [read_png(folder / f"{name}.jpg") for name in columns if (folder / f"{name}.jpg").is_file()]
-        if len(images) == len(columns):
-            rows.append(np.concatenate([pictures.shrink(image, _OVERVIEW) for image in images], axis=1))
+        paths = {text: folder / f"{name}.jpg" for name, text in columns.items()}
+        if all(path.is_file() for path in paths.values()):
+            images = [
+                pictures.label(pictures.shrink(read_png(path), _OVERVIEW), text.format(folder.name))
+                for text, path in paths.items()
+            ]
+            rows.append(np.concatenate(images, axis=1))
     path = out / "overview.jpg"
     write_bytes(path, pictures.encode_jpeg(np.concatenate(rows)))
     return path
@@ -253,7 +304,7 @@ def _draw_motion(sequence: Sequence, folder: Path, chosen: dict[str, str]) -> Dr
     inliers = load_arrays(stored).get("left") if stored.is_file() else None
     keep = np.ones(len(matches), dtype=np.bool_) if inliers is None or len(inliers) != len(matches) else inliers
     image = pictures.draw_matches(sequence.image("rs", "left", 0), matches, keep)
-    return {"matches": (image, "Left matches over time; red: rejected")}
+    return {"matches": (image, "Left matches over time; orange: rejected")}
 
 
 def _draw_depth(sequence: Sequence, folder: Path, matcher: str) -> Drawn:

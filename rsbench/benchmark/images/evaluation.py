@@ -11,6 +11,7 @@ import pandas as pd
 
 from rsbench.benchmark.images.plan import EvaluationOptions, Places, Plan, make_plan
 from rsbench.benchmark.images.predict import Bench, Step, prediction_steps
+from rsbench.benchmark.images.repeats import repeat, repeats_of
 from rsbench.benchmark.images.score import AFTER, KEYS, TABLES, Row, Scorer
 from rsbench.benchmark.isolated_metric import isolated_metrics
 from rsbench.benchmark.metric_plugins import DepthCase, ImageCase, PoseCase
@@ -37,7 +38,8 @@ class Evaluation:
     @property
     def steps(self) -> int:
         """How often ``run`` reports progress."""
-        return len(self.plan.sequence_names) * prediction_steps(self.plan) + len(self.sequences)
+        own = len(self.plan.sequence_names) * prediction_steps(self.plan)
+        return own + len(repeats_of(self.plan)) + len(self.sequences)
 
     def run(self, command: str, step: Step) -> list[str]:
         """Predict and score; writes predictions/, scores/*.csv and provenance.json below ``out``.
@@ -58,6 +60,7 @@ class Evaluation:
             for sequence in self.sequences:
                 if sequence.name in plan.sequence_names:
                     Bench(sequence, self._folder(sequence), plan, runner).predict(step)
+            repeat(self.dataset, self.out, self.options, plan, self.sequences, step)
             for sequence in self.sequences:
                 scorer = Scorer(Places(sequence, self._folder(sequence), plan.chain), plan)
                 scorer.score()
@@ -92,6 +95,7 @@ class Evaluation:
             command,
             **dataset_record(self.dataset),
             seed=chain.seed,
+            seeds=self.plan.seeds,
             solvers={entry.name: entry.parameters for entry in self.plan.solvers},
             correction={name: entry.name for name, entry in chosen.items()},
             parameters={entry.name: entry.parameters for entry in chosen.values()},

@@ -6,7 +6,7 @@ import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -30,6 +30,8 @@ TRUE = "true"
 """Stands for a solver or a matcher where an oracle is given the truth instead; no entry may have this name."""
 NONE = "none"
 """Stands for a component that nothing was taken from; no entry may have this name."""
+_SEEDS = "seeds"
+"""Folder of the motions by all samples of the robust loop but the first."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +50,8 @@ class EvaluationOptions:
     """Names of solvers and sequences to which predicting is limited; all when empty."""
     force: bool = False
     """Make again what is current."""
+    seeds: int = 1
+    """How often each solver's robust loop is run, with other samples; the correction uses the first motion."""
     seed: int = 0
 
 
@@ -63,6 +67,7 @@ class Plan:
     sequence_names: frozenset[str]
     """Sequences to be worked on."""
     force: bool
+    seeds: int
 
     @property
     def corrects(self) -> bool:
@@ -75,8 +80,10 @@ def make_plan(options: EvaluationOptions, sequences: list[Sequence]) -> Plan:
 
     Raises:
         RsbenchError: a component does not exist or is wrong; two solvers of one name; a solver that gives no
-            metres is to correct; ``only`` names nothing that is there.
+            metres is to correct; ``only`` names nothing that is there; no seed.
     """
+    if options.seeds < 1:
+        raise RsbenchError(f"--seeds {options.seeds}: must be at least 1")
     references = dict.fromkeys([*options.solvers, options.correction_solver])
     solvers = _distinct({reference: load_solver_entry(reference) for reference in references})
     chain = CorrectionOptions(
@@ -98,6 +105,7 @@ def make_plan(options: EvaluationOptions, sequences: list[Sequence]) -> Plan:
         sequence_names=chosen[0],
         solver_names=chosen[1],
         force=options.force,
+        seeds=options.seeds,
     )
 
 
@@ -201,9 +209,10 @@ class Places:
     def matches(self) -> Artefact:
         return self._artefact("matches", data=self.data, features=self.chain.features.key)
 
-    def motion(self, solver: SolverEntry) -> Artefact:
+    def motion(self, solver: SolverEntry, seed: int = 0) -> Artefact:
+        """By the samples number ``seed`` of the robust loop."""
         return self._artefact(
-            f"motion/{solver.name}",
+            f"motion/{solver.name}" if seed == 0 else f"{_SEEDS}/{seed}/{solver.name}",
             matches=self.matches().identity,
             solver=solver.key,
             options=asdict(solver.options),
@@ -242,11 +251,14 @@ class Stored(NamedTuple):
 
 
 def stored_motions(places: Places, plan: Plan) -> Iterator[Stored]:
-    """Of every solver, planned or not."""
+    """Of every solver and seed, planned or not."""
     chosen = {solver.name: solver for solver in plan.solvers}
-    for name, record in records_below(places.folder, "motion"):
-        entry = chosen.get(name) or _again(load_solver_entry, record.get("entry"))
-        yield Stored(record, entry if _current(entry, places.motion, record) else None)
+    again = cache(partial(_again, load_solver_entry))
+    numbers = sorted(int(path.name) for path in (places.folder / _SEEDS).glob("[1-9]*"))
+    for seed, kind in [(0, "motion"), *((k, f"{_SEEDS}/{k}") for k in numbers)]:
+        for name, record in records_below(places.folder, kind):
+            entry = chosen.get(name) or again(record.get("entry"))
+            yield Stored(record, entry if _current(entry, partial(places.motion, seed=seed), record) else None)
 
 
 def stored_depths(places: Places) -> Iterator[Stored]:

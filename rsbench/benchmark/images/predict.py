@@ -66,7 +66,7 @@ class Bench:
         step(f"{self.sequence.name}: matches")
         for entry in self.plan.solvers:
             if entry.name in self.plan.solver_names:
-                self._move(entry)
+                self.move(entry)
                 step(f"{self.sequence.name}: {entry.name}")
         if self.plan.corrects:
             self._find_depth()
@@ -75,7 +75,8 @@ class Bench:
                 self._correct(recipe)
                 step(f"{self.sequence.name}: correction")
 
-    def _stands(self, artefact: Artefact) -> bool:
+    def stands(self, artefact: Artefact) -> bool:
+        """Whether it need not be made."""
         return not self.plan.force and artefact.record() is not None
 
     # Matches
@@ -106,12 +107,13 @@ class Bench:
 
     # Motion
 
-    def _move(self, entry: SolverEntry) -> None:
-        artefact = self.places.motion(entry)
-        if self._stands(artefact):
+    def move(self, entry: SolverEntry, seed: int = 0) -> None:
+        """Estimate the motion with the samples number ``seed``; of the first, time and inliers are kept too."""
+        artefact = self.places.motion(entry, seed)
+        if self.stands(artefact):
             return
         self._refuse_another(entry, artefact)
-        rng = generator(self.plan.chain.seed, "images", self.sequence.name, entry.name, 0)
+        rng = generator(self.plan.chain.seed, "images", self.sequence.name, entry.name, seed)
         matches = self._matches
         artefact.start()
         if isinstance(matches, str):
@@ -122,9 +124,11 @@ class Bench:
             if entry.built_in:
                 warm_up((entry.solver.spec.motion_model,))  # compiling is not in the solver's time
             robust = self.runner.robust(entry, matches, self.sequence.rig, self.sequence.shutter, options, rng)
-        masks = {str(name): mask for name, mask in robust.inliers.items()}
-        save_arrays(artefact.file("-inliers.npz"), masks)
-        artefact.finish(_motion_record(entry, robust), robust.seconds)
+        if seed == 0:
+            masks = {str(name): mask for name, mask in robust.inliers.items()}
+            save_arrays(artefact.file("-inliers.npz"), masks)
+        record = {**_motion_record(entry, robust), "seed": seed}
+        artefact.finish(record, robust.seconds if seed == 0 else None)
 
     def _refuse_another(self, entry: SolverEntry, artefact: Artefact) -> None:
         """Another entry of the same name must not be overwritten in silence."""
@@ -141,7 +145,7 @@ class Bench:
     def _find_depth(self) -> None:
         entry = self.plan.chain.matcher
         artefact = self.places.depth(entry)
-        if self._stands(artefact):
+        if self.stands(artefact):
             return
         artefact.start()
         images, start = self.images, time.perf_counter()
@@ -167,7 +171,7 @@ class Bench:
 
     def _correct(self, recipe: Recipe) -> None:
         artefact = self.places.corrected(recipe)
-        if self._stands(artefact):
+        if self.stands(artefact):
             return
         artefact.start()
         record = {**recipe.names, "entries": _references(recipe), "success": True, "reason": ""}

@@ -34,7 +34,7 @@ from rsbench.vision.stereo_depth import seen_by_other
 Row = dict[str, Any]
 TABLES = ("pose", "depth", "correction", "failures", "seconds")
 KEYS = {
-    "pose": ("sequence", "solver", "shutter", "data_model", "assumed_model", "uses", "success"),
+    "pose": ("sequence", "solver", "seed", "shutter", "data_model", "assumed_model", "uses", "success"),
     "depth": ("sequence", "matcher", "side", "frame", "pixels", "success"),
     "correction": ("sequence", "corrector", "solver", "matcher", "side", "frame", "pixels", "success", "coverage"),
     "failures": ("sequence", "kind", "name", "reason"),
@@ -103,6 +103,7 @@ class Scorer:
             rows.append(
                 {
                     "solver": record["solver"],
+                    "seed": record["seed"],
                     "shutter": record["shutter"],
                     "data_model": self.sequence.motion.name,
                     "assumed_model": record["motion_model"],
