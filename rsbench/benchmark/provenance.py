@@ -5,6 +5,9 @@ from __future__ import annotations
 import datetime
 import os
 import platform
+import subprocess
+from functools import partial
+from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,7 @@ def provenance(command: str, **inputs: Any) -> dict[str, Any]:
         "command": command,
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "rsbench": __version__,
+        "commit": commit(),
         "source": own_source_version(),
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in _PACKAGES},
@@ -40,6 +44,24 @@ def provenance(command: str, **inputs: Any) -> dict[str, Any]:
 def numeric_version() -> dict[str, str]:
     """What decides predictions beside the components and the data: our own source and the packages below it."""
     return {"source": own_source_version(), **{name: _version(name) for name in _NUMERIC}}
+
+
+def commit() -> str:
+    """Commit of the checkout that this code lies in, with ``-dirty`` when a file differs from it; else empty.
+
+    Results and the page that shows them do not count: they are what is being made.
+    """
+    root = Path(str(resources.files("rsbench"))).parent
+    if not (root / ".git").exists():
+        return ""
+    git = partial(subprocess.run, cwd=root, capture_output=True, text=True, check=True)
+    try:
+        name = git(["git", "rev-parse", "HEAD"]).stdout.strip()
+        others = (":!results", ":!README.md")
+        changed = git(["git", "status", "--porcelain", "--untracked-files=no", "--", ".", *others]).stdout
+    except (OSError, subprocess.CalledProcessError):  # no git, or a folder that it does not trust
+        return ""
+    return f"{name}-dirty" if changed else name
 
 
 def processor() -> str:
