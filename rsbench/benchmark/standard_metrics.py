@@ -61,6 +61,7 @@ class DepthErrors(DepthMetric):
         Column(name="bad_1px", better="lower", worst=1.0, title="> 1 px"),
         Column(name="bad_2px", better="lower", worst=1.0, title="> 2 px"),
         Column(name="bad_3px", better="lower", worst=1.0, title="> 3 px"),
+        Column(name="on_sky", better="lower", worst=1.0, title="on sky"),
         Column(name="coverage", better="higher", worst=0.0),
     )
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +21,14 @@ TITLES = (
     "(e) corrected over GS",
     "(f) depth error",
 )
-DEPTH_ERROR_M = 2.0
-"""End of the scale of depth errors, as in the paper."""
+ERROR_M = (0.001, 2.0)
+"""Ends of the logarithmic scale of depth errors, metres: less than is usual indoors, and the paper's limit."""
+INVENTED = (0, 190, 255)
+"""Colour of depth where there is no surface; none of the scale's."""
 _COLOURS = 256
 _PIXELS = {"pdf": 210, "jpg": 250}
 _JPEG = {"quality": 84, "subsampling": 0, "optimize": True}
-_WIDTH_IN, _TEXT_IN, _HEAD_IN, _BAR_IN, _GAP_IN = 7.2, 0.43, 0.2, 0.42, 0.03
+_WIDTH_IN, _TEXT_IN, _HEAD_IN, _BAR_IN, _GAP_IN = 7.2, 0.56, 0.2, 0.2, 0.03
 
 
 def draw_fig4(rows: list[tuple[str, Panels]], stem: Path) -> list[Path]:
@@ -43,11 +47,12 @@ def draw_fig4(rows: list[tuple[str, Panels]], stem: Path) -> list[Path]:
 def _draw(rows: list[tuple[str, Panels]], path: Path, pixels: int) -> None:
     from matplotlib.figure import Figure
 
-    side = (_WIDTH_IN - _BAR_IN - 5 * _GAP_IN) / len(TITLES)
-    height = _HEAD_IN + len(rows) * (side + _TEXT_IN)
+    side = (_WIDTH_IN - 5 * _GAP_IN) / len(TITLES)
+    row = side + _BAR_IN + _TEXT_IN
+    height = _HEAD_IN + len(rows) * row
     figure = Figure(figsize=(_WIDTH_IN, height), facecolor="white")
     for r, (name, panels) in enumerate(rows):
-        bottom = height - _HEAD_IN - r * (side + _TEXT_IN) - side
+        bottom = height - _HEAD_IN - r * row - side
         for c, (title, image) in enumerate(zip(TITLES, panel_images(panels), strict=True)):
             left = c * (side + _GAP_IN)
             axes = figure.add_axes((left / _WIDTH_IN, bottom / height, side / _WIDTH_IN, side / height))
@@ -56,37 +61,73 @@ def _draw(rows: list[tuple[str, Panels]], path: Path, pixels: int) -> None:
             axes.set_axis_off()
             if r == 0:
                 axes.set_title(title, fontsize=7, pad=3)
+        for c, scale in ((2, depth_scale(panels)), (5, _error_scale())):
+            left = c * (side + _GAP_IN) + 0.08 * side
+            _draw_scale(figure, (left, bottom - 0.06, 0.84 * side, 0.04), scale)
         for line, text in enumerate(caption(name, panels.numbers)):
-            y = (bottom - 0.04 - 0.115 * line) / height
+            y = (bottom - _BAR_IN - 0.04 - 0.115 * line) / height
             figure.text(0.0, y, text, fontsize=6, va="top", color="0.15" if line else "0.0")
-    _colour_bar(figure, (height - _HEAD_IN - side) / height, side / height)
     if path.suffix == ".pdf":
         figure.savefig(path, metadata={"CreationDate": None})
     else:
         figure.savefig(path, dpi=pixels / side, pil_kwargs=_JPEG)
 
 
-def _colour_bar(figure: Any, bottom: float, height: float) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """A colour scale: its ends in what is drawn, and the ticks there."""
+
+    low: float
+    high: float
+    ticks: dict[str, float]
+    colours: str
+
+
+def depth_scale(panels: Panels) -> Scale:
+    """Of inverse depth, 1/m, over all but the nearest and farthest hundredth of the surfaces; ticks in metres."""
+    low, high = np.nanpercentile(1.0 / panels.true_depth, [1, 99])
+    even = (low + np.linspace(0.0, 1.0, 4) * (high - low)).tolist()
+    texts = [f"{1.0 / value:.2g} m" if k == 0 else f"{1.0 / value:.2g}" for k, value in enumerate(even)]
+    return Scale(low=float(low), high=float(high), ticks=dict(zip(texts, even, strict=True)), colours="viridis")
+
+
+def _error_scale() -> Scale:
+    """Of the decimal logarithm of the depth error, metres."""
+    low, high = (math.log10(end) for end in ERROR_M)
+    ticks = {"1 mm": -3.0, "1 cm": -2.0, "10 cm": -1.0, "1 m": 0.0}
+    return Scale(low=low, high=high, ticks=ticks, colours="inferno")
+
+
+def _draw_scale(figure: Any, place_in: tuple[float, float, float, float], scale: Scale) -> None:
+    """A bar with ticks below; left, bottom, width and height in inches."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    axes = figure.add_axes((1.0 - (_BAR_IN - 0.06) / _WIDTH_IN, bottom + 0.05 * height, 0.012, 0.9 * height))
-    bar = figure.colorbar(ScalarMappable(Normalize(0.0, DEPTH_ERROR_M), "inferno"), cax=axes)
-    bar.set_ticks([0.0, 1.0, DEPTH_ERROR_M], labels=["0", "1", f"{DEPTH_ERROR_M:g} m"])
-    bar.ax.tick_params(labelsize=6, length=2, pad=1)
+    width, height = figure.get_size_inches()
+    left, bottom, wide, high = place_in
+    axes = figure.add_axes((left / width, bottom / height, wide / width, high / height))
+    colours = ScalarMappable(Normalize(scale.low, scale.high), scale.colours)
+    bar = figure.colorbar(colours, cax=axes, orientation="horizontal")
+    bar.set_ticks(list(scale.ticks.values()), labels=list(scale.ticks))
+    bar.outline.set_linewidth(0.3)
+    bar.ax.tick_params(labelsize=5, length=1.5, width=0.3, pad=1)
+    bar.minorticks_off()
 
 
 def panel_images(panels: Panels) -> list[Image]:
     """The six panels as RGB images."""
-    inverse = 1.0 / panels.true_depth
-    low, high = np.nanpercentile(inverse, [1, 99])
+    depth, error = depth_scale(panels), _error_scale()
+    # No error at all is below the scale, as its smallest value is.
+    size = np.log10(np.maximum(panels.depth_error, ERROR_M[0]))
+    errors = pictures.colour_map(size, error.low, error.high, error.colours)
+    errors[np.isinf(panels.depth_error)] = INVENTED
     return [
         panels.rolling,
         pictures.masked(panels.corrected, panels.known),
-        pictures.colour_map(inverse, low, high),
+        pictures.colour_map(1.0 / panels.true_depth, depth.low, depth.high, depth.colours),
         pictures.overlay(panels.rolling, panels.truth),
         pictures.overlay(panels.corrected, panels.truth, panels.known),
-        pictures.colour_map(panels.depth_error, 0.0, DEPTH_ERROR_M, "inferno"),
+        errors,
     ]
 
 
@@ -95,16 +136,20 @@ def caption(name: str, n: dict[str, Any]) -> tuple[str, ...]:
     filled = n["share_other_camera"] + n["share_other_frame"]
     return (
         f"{name}: {n['rotation_deg']:.2g} deg and {n['translation']:.2g} m per frame, readout ratio "
-        f"{n['readout_ratio']:g}. Error of the motion: {_small(n['e_R_deg'])} deg (rotation), "
-        f"{_small(n['e_T_deg'])} deg (direction).",
+        f"{n['readout_ratio']:g}; seed {n['seed']}, RANSAC seed {n['ransac_seed']}. Error of the motion: "
+        f"{_small(n['e_R_deg'])} deg (rotation), {_small(n['e_T_deg'])} deg (direction).",
         f"PSNR of what the frame saw: {n['psnr_rolling']:.1f} dB before, {n['psnr_corrected']:.1f} dB after, "
-        f"{n['psnr_oracle']:.1f} dB with true depth and motion. Depth: median error "
-        f"{100 * n['depth_median_m']:.1f} cm, {_percent(n['depth_over_2m'])} above 2 m, "
-        f"{_percent(n['depth_coverage'])} known.",
+        f"{n['psnr_oracle']:.1f} dB with true depth and motion.",
+        f"SGM depth: median error {100 * n['depth_median_m']:.1f} cm, {_percent(n['depth_over_2m'])} above 2 m, "
+        f"{_percent(n['depth_coverage'])} known{_sky(n['depth_on_sky'])}.",
         f"Corrected frame: {_percent(n['share_here'])} its own pixels, {_percent(n['share_guessed'])} at a "
         f"guessed depth, {_percent(filled)} from the other frames, {_percent(n['share_nobody'])} seen by nobody "
         "(dark).",
     )
+
+
+def _sky(share: float | None) -> str:
+    return "" if share is None else f"; {_percent(share)} of the sky has a depth (blue)"
 
 
 def _small(value: float) -> str:

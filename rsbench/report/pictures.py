@@ -13,7 +13,8 @@ from rsbench.core.so3 import FloatArray
 
 Image = NDArray[np.uint8]
 
-INLIER, OUTLIER, INVALID = (40, 200, 90), (230, 60, 40), (60, 60, 66)
+INLIER, OUTLIER, INVALID = (70, 160, 255), (255, 150, 0), (60, 60, 66)
+"""Blue, orange and dark grey: told apart by colour-blind readers too."""
 
 
 def overlay(first: Image, second: Image, mask: NDArray[np.bool_] | None = None) -> Image:
@@ -34,7 +35,7 @@ def masked(image: Image, mask: NDArray[np.bool_]) -> Image:
 
 
 def colour_map(values: ArrayLike, low: float, high: float, name: str = "viridis") -> Image:
-    """Values (H, W) in a matplotlib colour map between ``low`` and ``high``; NaN is dark grey."""
+    """Values (H, W) in a matplotlib colour map between ``low`` and ``high``; what is not finite is dark grey."""
     from matplotlib import colormaps
 
     v = np.asarray(values, dtype=np.float64)
@@ -43,7 +44,7 @@ def colour_map(values: ArrayLike, low: float, high: float, name: str = "viridis"
 
 
 def draw_matches(image: Image, matches: FloatArray, inliers: NDArray[np.bool_], most: int = 400) -> Image:
-    """Arrows of matches (n, 4) from frame 0 to frame 1 on the image of frame 0: inliers green, outliers red."""
+    """Arrows of matches (n, 4) from frame 0 to frame 1 on the image of frame 0: inliers blue, outliers orange."""
     grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) // 2 + 64
     out = np.ascontiguousarray(grey.astype(np.uint8))
     chosen = np.linspace(0, len(matches) - 1, min(most, len(matches))).astype(int)
@@ -51,6 +52,15 @@ def draw_matches(image: Image, matches: FloatArray, inliers: NDArray[np.bool_], 
         start, end = np.round(matches[k, :2]).astype(int), np.round(matches[k, 2:]).astype(int)
         colour = INLIER if inliers[k] else OUTLIER
         cv2.arrowedLine(out, start.tolist(), end.tolist(), colour, 1, cv2.LINE_AA, tipLength=0.25)
+    return out
+
+
+def label(image: Image, text: str) -> Image:
+    """The image with a word or two in its upper left corner, light on a dark bar."""
+    out, font = np.ascontiguousarray(image), cv2.FONT_HERSHEY_SIMPLEX
+    (width, height), below = cv2.getTextSize(text, font, 0.45, 1)
+    out[: height + below + 8, : width + 12] = INVALID
+    cv2.putText(out, text, (6, height + 5), font, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return out
 
 

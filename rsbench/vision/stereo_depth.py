@@ -267,15 +267,17 @@ def depth_metrics(
     ``part`` (H, W) restricts it to some of them.
     ``coverage`` is the share of surface pixels with an estimate (finite and positive); the errors are over these:
     ``median_m`` and ``rmse_m`` of the absolute depth error, ``over_2m`` the share beyond 2 m (the paper's figure),
-    ``bad_1px`` .. ``bad_3px`` the share beyond that disparity error. NaN where no pixel counts. Raises ValueError
-    when the shapes differ.
+    ``bad_1px`` .. ``bad_3px`` the share beyond that disparity error. ``on_sky`` is the share of all pixels without
+    a surface, in any part, that have an estimate: depth that was invented. NaN where no pixel counts. Raises
+    ValueError when the shapes differ.
     """
     if estimate.shape != truth.shape:
         raise ValueError(f"estimate must have the shape of truth, {truth.shape}, got {estimate.shape}")
-    surface = np.isfinite(truth) & (truth > 0.0)
+    surface, given = (np.isfinite(depth) & (depth > 0.0) for depth in (truth, estimate))
+    sky = ~surface
     if part is not None:
         surface &= part
-    known = surface & np.isfinite(estimate) & (estimate > 0.0)
+    known = surface & given
     depth, true_depth = estimate[known].astype(np.float64), truth[known].astype(np.float64)
     error = np.abs(depth - true_depth)
     shift = np.abs(rig.disparity(depth) - rig.disparity(true_depth))
@@ -285,5 +287,6 @@ def depth_metrics(
         "rmse_m": float(np.sqrt(np.mean(error * error))) if some else math.nan,
         "over_2m": float(np.mean(error > 2.0)) if some else math.nan,
         **{f"bad_{n}px": float(np.mean(shift > n)) if some else math.nan for n in (1, 2, 3)},
+        "on_sky": float(np.mean(given[sky])) if np.any(sky) else math.nan,
         "coverage": int(np.count_nonzero(known)) / max(int(np.count_nonzero(surface)), 1),
     }

@@ -193,10 +193,11 @@ def test_holes_are_filled_from_behind() -> None:
 
 
 def test_metrics_of_known_errors() -> None:
-    """Ten surface pixels at 10 m (10.4 px), one of each fault; depth by hand."""
-    truth = np.full((1, 12), 10.0)
-    truth[0, 10:] = 0.0, np.inf  # sky either way
+    """Ten surface pixels at 10 m (10.4 px), one of each fault, and three of sky; depth by hand."""
+    truth = np.full((1, 13), 10.0)
+    truth[0, 10:] = 0.0, np.inf, 0.0  # sky either way
     estimate = truth.copy()
+    estimate[0, 12] = 5.0
     estimate[0, :6] = np.nan, 0.0, 13.0, 10.5, 7.0, np.inf
     scores = depth_metrics(estimate, truth, RIG)
     assert scores["coverage"] == pytest.approx(0.7)
@@ -207,13 +208,19 @@ def test_metrics_of_known_errors() -> None:
     assert scores["bad_1px"] == pytest.approx(2 / 7)
     assert scores["bad_2px"] == pytest.approx(2 / 7)
     assert scores["bad_3px"] == pytest.approx(1 / 7)
+    assert scores["on_sky"] == pytest.approx(1 / 3)
+    # The sky is no part of what can be seen by both cameras.
+    part = depth_metrics(estimate, truth, RIG, np.isfinite(truth) & (truth > 0.0))
+    assert part == scores
 
 
 def test_metrics_without_pixels() -> None:
     for truth in (np.zeros((2, 2)), np.ones((2, 2))):
         scores = depth_metrics(np.full((2, 2), np.nan), truth, RIG)
         assert scores["coverage"] == 0.0
-        assert all(math.isnan(value) for name, value in scores.items() if name != "coverage")
+        assert scores["on_sky"] == 0.0 if truth[0, 0] == 0.0 else math.isnan(scores["on_sky"])
+        errors = {name: value for name, value in scores.items() if name not in ("coverage", "on_sky")}
+        assert all(math.isnan(value) for value in errors.values())
     with pytest.raises(ValueError, match="shape of truth"):
         depth_metrics(np.ones((2, 2)), np.ones((2, 3)), RIG)
 

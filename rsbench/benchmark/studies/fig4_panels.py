@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,7 @@ class Panels:
     """The global-shutter image at row 0's pose."""
     true_depth: NDArray[np.float32]
     depth_error: NDArray[np.float32]
-    """Absolute, of SGM against ``true_depth``."""
+    """Absolute, of SGM against ``true_depth``; infinite where there is no surface, but a depth all the same."""
     numbers: dict[str, Any]
 
 
@@ -54,13 +55,16 @@ def make_panels(sequence: Sequence, seed: int = 0) -> Panels:
     true_depth = sequence.depth("rs", *view)
     depth = np.where(np.isfinite(bench.sgm[FRAME].depth[SIDE]), bench.sgm[FRAME].depth[SIDE], np.float32(0.0))
     surface = true_depth > 0
-    error = np.where(surface & (depth > 0), np.abs(depth - true_depth), np.float32(np.nan))
+    error = np.where(surface, np.abs(depth - true_depth), np.float32(np.inf))
+    error = np.where(depth > 0, error, np.float32(np.nan))
     here = fused.origin == Origin.HERE
     oracle = correct_frame(
         rolling, bench.true[FRAME].depth[SIDE], bench.rig, bench.shutter, sequence.motion, *view
     )
     true, errors = sequence.motion, bench.motion_errors()
     numbers = {
+        "seed": sequence.manifest["seed"],
+        "ransac_seed": seed,
         "rotation_deg": float(np.rad2deg(np.linalg.norm(true.w))),
         "translation": float(np.linalg.norm(true.d)),
         "readout_ratio": sequence.shutter.readout_ratio,
@@ -71,7 +75,10 @@ def make_panels(sequence: Sequence, seed: int = 0) -> Panels:
         "psnr_corrected_all": psnr(fused.image, truth) if success else WORST["psnr"],
         "psnr_rolling_all": psnr(rolling, truth),
         **{f"share_{name}": share for name, share in fused.shares().items()},
-        **{f"depth_{name}": value for name, value in depth_metrics(depth, true_depth, bench.rig).items()},
+        **{
+            f"depth_{name}": None if math.isnan(value) else value  # without sky, or without any depth
+            for name, value in depth_metrics(depth, true_depth, bench.rig).items()
+        },
     }
     return Panels(
         rolling=rolling,
