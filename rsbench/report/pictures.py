@@ -51,7 +51,7 @@ def draw_matches(image: Image, matches: FloatArray, inliers: NDArray[np.bool_], 
     for k in chosen:
         start, end = np.round(matches[k, :2]).astype(int), np.round(matches[k, 2:]).astype(int)
         colour = INLIER if inliers[k] else OUTLIER
-        cv2.arrowedLine(out, start.tolist(), end.tolist(), colour, 1, cv2.LINE_AA, tipLength=0.25)
+        cv2.arrowedLine(out, start.tolist(), end.tolist(), colour, 2, cv2.LINE_AA, tipLength=0.25)
     return out
 
 

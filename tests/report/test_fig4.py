@@ -31,7 +31,7 @@ def test_the_numbers_describe_the_pictures(panels: Panels) -> None:
     # The sky has no depth error, but a depth there is invented.
     assert not np.any(known & sky)
     assert n["depth_on_sky"] == pytest.approx(np.mean(np.isinf(panels.depth_error[sky])))
-    assert (n["seed"], n["ransac_seed"]) == (7, 0)
+    assert (n["seed"], n["ransac_seed"]) == (1, 0)
 
 
 def test_panels_survive_storage(panels: Panels, tmp_path: Path) -> None:
