@@ -85,12 +85,15 @@ def _over_seeds(scores: pd.DataFrame, metrics: list[str]) -> tuple[pd.DataFrame,
         frame[name] = runs[name].agg(median_and_quartiles)
     counts = ["inliers", "matches", "iterations"]
     frame[counts] = frame[counts].round().astype(int)
-    note = "Median [lower quartile, upper quartile] over the runs of each solver with other RANSAC samples. "
+    note = (
+        "Median [lower quartile, upper quartile] over the runs of each solver with other RANSAC samples; one number "
+        "where the three agree in its digits. "
+    )
     return frame.reset_index(), note
 
 
 def median_and_quartiles(values: pd.Series) -> str:
-    """``median [lower, upper]`` with as many digits as their distance allows, and at most three that count."""
+    """``median [lower, upper]`` with as many digits as their distance allows, at most three; one if they agree."""
     found = np.asarray(values.dropna(), dtype=np.float64)
     if not found.size:
         return "–"
@@ -100,7 +103,8 @@ def median_and_quartiles(values: pd.Series) -> str:
     size = _exponent(middle)
     width = size if np.isinf(high) else _exponent(high - low) if high > low else size - 2
     places = max(0, 1 - width if width >= size - 1 else 2 - size)
-    return f"{middle:.{places}f} [{low:.{places}f}, {high:.{places}f}]"
+    texts = [f"{value:.{places}f}" for value in (middle, low, high)]
+    return texts[0] if len(set(texts)) == 1 else f"{texts[0]} [{texts[1]}, {texts[2]}]"
 
 
 def _exponent(value: float) -> int:

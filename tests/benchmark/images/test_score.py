@@ -33,6 +33,7 @@ def store_truth(places: Places, plan: Plan, **changes: Any) -> None:
     record = {
         "solver": plan.chain.solver.name,
         "entry": plan.chain.solver.name,
+        "seed": 0,
         "success": True,
         "reason": "",
         "w": motion.w.tolist(),
