@@ -87,15 +87,14 @@ def first_hits(scene: Scene, view: str, rays: NDArray[np.float64]) -> NDArray[np
     seen = scene.seen_from(scene.viewpoints[view])
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in seen.meshes])
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    out = np.cross(a, ab)
+    # Triple products of a ray and two edges are products of the ray with what only the triangle decides.
+    by_det, by_u, by_v = np.cross(ac, ab), np.cross(ac, a), np.cross(a, ab)
+    by_t = np.einsum("nc,nc->n", ac, by_v)
     distances = np.full(len(rays), np.inf)
     for k, ray in enumerate(rays):
-        normal = np.cross(ray, ac)
         with np.errstate(divide="ignore", invalid="ignore"):
-            inverse = 1 / np.einsum("nc,nc->n", ab, normal)
-            u = -np.einsum("nc,nc->n", a, normal) * inverse
-            v = -(out @ ray) * inverse
-            t = -np.einsum("nc,nc->n", ac, out) * inverse
+            inverse = -1 / (by_det @ ray)
+            u, v, t = (by_u @ ray) * inverse, (by_v @ ray) * inverse, by_t * inverse
             hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-6)
         distances[k] = t[hit].min(initial=np.inf)
     return distances
