@@ -25,7 +25,7 @@ test: $(STAMP)
 	@echo "== lint";   $(BIN)/ruff check .
 	@echo "== layers"; $(BIN)/lint-imports
 	@echo "== types, and compiling"; \
-	$(BIN)/python -c "$(COMPILE)" & compiled=$$!; \
+	$(BIN)/python -c '$(COMPILE)' & compiled=$$!; \
 	$(BIN)/mypy; types=$$?; wait $$compiled && exit $$types
 	@echo "== tests"; OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --no-loadscope-reorder
 
