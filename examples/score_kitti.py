@@ -1,0 +1,125 @@
+"""Score the motion that rsbench finds on a folder in the layout of KITTI odometry.
+
+python examples/score_kitti.py FOLDER [--left image_0 --right image_1] [--ratio 0] [--every 1]
+
+FOLDER holds calib.txt (projection matrices, the first two of the left and the right camera), poses.txt (3 x 4
+matrices world_from_left, one line a frame) and two folders of rectified images. Global-shutter footage has the
+readout ratio 0; --ratio none has it estimated, with the disparity offset, from all windows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rsbench.core import so3
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.metrics import rotation_error, translation_error
+from rsbench.core.rig import StereoRig
+from rsbench.core.so3 import FloatArray
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.footage import FrameSource, read_frame
+from rsbench.pipeline.frame_motion import match_frames, solve_frames
+from rsbench.pipeline.sliding import estimate_sequence_readout
+
+
+def read_matrices(path: Path) -> FloatArray:
+    """(n, 3, 4) from lines of twelve numbers, with or without a name before them.
+
+    Raises:
+        RsbenchError: no such file, or a line of another length.
+    """
+    if not path.is_file():
+        raise RsbenchError(f"{path}: no such file")
+    lines = [line.rpartition(":")[2].split() for line in path.read_text("utf-8").splitlines() if line.strip()]
+    try:
+        return np.array(lines, dtype=np.float64).reshape(-1, 3, 4)
+    except ValueError:
+        raise RsbenchError(f"{path}: every line must hold twelve numbers") from None
+
+
+def read_rig(folder: Path, image: Path) -> StereoRig:
+    """Rig of a folder whose images are like this one."""
+    matrices = read_matrices(folder / "calib.txt")
+    if len(matrices) < 2:
+        raise RsbenchError(f"{folder / 'calib.txt'}: {len(matrices)} matrices; those of both cameras are needed")
+    left, right = matrices[:2]
+    height, width = read_frame(image).shape[:2]
+    camera = PinholeCamera(width=width, height=height, fx=left[0, 0], fy=left[1, 1], cx=left[0, 2], cy=left[1, 2])
+    return StereoRig(camera=camera, baseline=float(left[0, 3] - right[0, 3]) / camera.fx)
+
+
+def true_motion(before: FloatArray, after: FloatArray, rig: StereoRig) -> tuple[FloatArray, FloatArray]:
+    """Rotation (3, 3) and the body's translation (3,), metres, between two poses (3, 4) of the left camera."""
+    R = after[:, :3].T @ before[:, :3]
+    t = after[:, :3].T @ (before[:, 3] - after[:, 3])
+    offset = rig.offset("left")
+    return R, t - offset + R @ offset
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--left", default="image_0")
+    parser.add_argument("--right", default="image_1")
+    parser.add_argument("--ratio", default="0", help="readout ratio, or none")
+    parser.add_argument("--every", type=int, default=1, help="score every n-th window")
+    given = parser.parse_args(arguments)
+    try:
+        sys.stdout.writelines(f"{line}\n" for line in score(given))
+    except RsbenchError as error:
+        sys.stderr.write(f"score_kitti: error: {error}\n")
+        return 2
+    return 0
+
+
+def score(given: argparse.Namespace) -> list[str]:
+    """Lines of the table, one a window, and the summary."""
+    sources = [FrameSource(given.folder / name) for name in (given.left, given.right)]
+    files = [sorted(path for path in source.path.iterdir() if path.is_file()) for source in sources]
+    rig, options = read_rig(given.folder, files[0][0]), CorrectionOptions()
+    poses = read_matrices(given.folder / "poses.txt")
+    if not len(files[0]) == len(files[1]) == len(poses):
+        raise RsbenchError(
+            f"{given.folder}: {len(files[0])} left and {len(files[1])} right images, {len(poses)} poses"
+        )
+    ratio, offset, lines = 0.0, 0.0, []
+    if given.ratio == "none":
+        found = estimate_sequence_readout(sources[0], sources[1], rig, options)
+        ratio, offset = found.readout_ratio, found.disparity_offset
+        lines.append(f"readout ratio {found}, disparity offset {offset:+.2f} +- {found.offset_sigma:.2f} px")
+    else:
+        ratio = float(given.ratio)
+    rows, refused = [], 0
+    for k in range(0, len(poses) - 1, given.every):
+        images = {
+            (side, n): read_frame(files[i][k + n]) for n in (0, 1) for i, side in enumerate(("left", "right"))
+        }
+        try:
+            motion, _, _ = solve_frames(match_frames(images, rig, options), rig, ratio, options, offset)
+        except RsbenchError as error:
+            refused += 1
+            lines.append(f"{k:4d}  {error}")
+            continue
+        R, d = true_motion(poses[k], poses[k + 1], rig)
+        w_est, d_est = motion.motion.w, motion.motion.d
+        rows.append(
+            (
+                np.rad2deg(rotation_error(w_est, so3.log(R))),
+                np.rad2deg(translation_error(d_est, d)),
+                np.linalg.norm(d_est) / np.linalg.norm(d) - 1.0,
+            )
+        )
+        lines.append("{:4d}  e_R {:.3f} deg  e_T {:.2f} deg  length {:+.1%}".format(k, *rows[-1]))
+    if rows:
+        lines.append("median  e_R {:.3f} deg  e_T {:.2f} deg  length {:+.1%}".format(*np.median(rows, axis=0)))
+    return [*lines, f"{refused} of {len(rows) + refused} windows refused"]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
