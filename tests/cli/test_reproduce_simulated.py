@@ -15,6 +15,7 @@ from rsbench.benchmark.studies import readings
 from rsbench.benchmark.studies.claims import CLAIMS
 from rsbench.cli.reproduce import Target, reproduce
 from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.report import fig3
 from rsbench.report.fig3 import SWEEPS
 
 
@@ -23,8 +24,14 @@ def test_claims_and_figure_come_from_the_stored_tables(tmp_path: Path, monkeypat
 
     def short(name: str) -> sweep_card.SweepCard:
         card = complete(name)
-        values = (card.values[0], card.values[-1]) if name != "noise" else (1e-4, 1e-3, 0.81)
+        values = {"noise": (1e-4, 1e-3, 0.81), "points": (9, 20)}.get(name, (card.values[0], card.values[-1]))
         return replace(card, trials=3, values=values)
+
+    def touch(tables: object, variant: str, centre: str, stem: Path) -> list[Path]:
+        paths = [stem.with_suffix(ending) for ending in (".pdf", ".png")]
+        for path in paths:
+            path.touch()
+        return paths
 
     def run_here(todo: list[run_sweep._Job], workers: int, limit: float | None) -> Iterator[run_sweep._Part]:
         with SolverRunner() as runner:
@@ -38,6 +45,7 @@ def test_claims_and_figure_come_from_the_stored_tables(tmp_path: Path, monkeypat
     for name in ("SOLVER_READINGS", "NINE_READINGS"):
         chosen = tuple(one for one in getattr(readings, name) if str(one) in ("literal", "symmetric"))
         monkeypatch.setattr(readings, name, chosen)
+    monkeypatch.setattr(fig3, "_draw", touch)  # test_fig3 draws: it takes seconds
     monkeypatch.setattr(run_sweep, "_run_all", run_here)  # starting processes would take most of the time
     out, data = tmp_path / "results", tmp_path / "data"
     reproduce(Target.claims, out, data, workers=2)
