@@ -137,7 +137,9 @@ def _contradicted(
     rho = np.zeros(wanted.shape, dtype=np.float32)
     _find_in_rows(inverse_depth(found.depth), wanted, M, b, places, rho)
     seen = np.isfinite(places[..., 0])
-    x, y = (np.rint(np.where(seen, places[..., k], 0.0)).astype(np.intp) for k in (0, 1))
+    # Half a pixel past the last centre still belongs to the frame, and rounds beyond it in float32.
+    nearest = np.rint(np.where(seen[..., None], places, 0.0)).astype(np.intp)
+    x, y = np.moveaxis(np.clip(nearest, 0, (camera.width - 1, camera.height - 1)), -1, 0)
     there = inverse_depth(frame.depth)[y, x]
     shown = resample(frame.image, places, "linear")
     return seen & np.where(np.isnan(there), _differ(shown, found.image, seen), there < rho * (1.0 - _AGREE))

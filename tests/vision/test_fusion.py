@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.projection import row_poses
+from rsbench.core.se3 import Pose
 from rsbench.vision.correction import warp
 from rsbench.vision.fusion import Origin, SourceView, fuse, inpaint
 from rsbench.vision.quality import psnr
@@ -146,6 +148,19 @@ def test_what_one_frame_alone_sees_is_not_replaced_by_what_lies_behind(
 
 def _target(scene: Any) -> Any:
     return scene.rig.cam_from_world(scene.motion, 0.0, "left")
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_point_half_a_pixel_past_the_last_centre_is_the_frame_s_own(axis: int) -> None:
+    """19.4999999999 is inside a frame of 20 pixels, and 19.5 in float32, which rounds to 20."""
+    camera = PinholeCamera.centred(20, 20, 10.0)
+    here, target = Pose(R=np.tile(np.eye(3), (20, 1, 1)), t=np.zeros((20, 3))), Pose(R=np.eye(3), t=np.zeros(3))
+    here.t[:, axis] = (0.5 - 1e-10) / 10.0
+    grey = np.full((20, 20), 100.0, dtype=np.float32)
+    blank = SourceView(image=grey, depth=np.zeros_like(grey), poses=here, origin=Origin.HERE)
+    there = Pose(R=here.R, t=np.zeros((20, 3)))
+    other = SourceView(image=grey, depth=np.ones_like(grey), poses=there, origin=Origin.OTHER_CAMERA)
+    assert np.all(fuse([blank, other], camera, target).origin == Origin.OTHER_CAMERA)
 
 
 def test_guesses_come_last_and_nothing_is_kept_unmarked(scene: Any) -> None:
