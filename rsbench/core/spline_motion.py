@@ -21,7 +21,7 @@ from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core import se3, so3
 from rsbench.core.motion import Motion
@@ -151,9 +151,8 @@ class _Spline:
     def at(self, tau: ArrayLike) -> tuple[Pose, FloatArray]:
         """Pose and spatial twist (..., 6) at times (...): dP/dtau = [twist] P."""
         tau = np.asarray(tau, dtype=np.float64)
-        i = np.clip(np.floor(tau / self.interval), 0, len(self.steps) - 3).astype(np.int64)
-        u = np.clip(tau / self.interval - i, 0.0, 1.0)
-        b = ((5 + u * (3 + u * (u - 3))) / 6, (1 + u * (3 + u * (3 - 2 * u))) / 6, u**3 / 6)
+        i, u = _place(tau, self.interval, len(self.steps) + 1)
+        b = _cumulative(u)
         rate = (0.5 + u * (0.5 * u - 1), 0.5 + u * (1 - u), 0.5 * u * u)
         pose, twist = Pose(self.control.R[i], self.control.t[i]), np.zeros((*tau.shape, 6))
         for j in range(3):
@@ -200,7 +199,7 @@ def _shake(parameters: Mapping[str, Any]) -> tuple[float, FloatArray]:
     digest = hashlib.sha256(f"{preset}/{seed}".encode()).digest()
     rng = np.random.default_rng(int.from_bytes(digest[:16], "little"))
     sigma = np.concatenate([np.deg2rad(rotation_deg), translation])
-    return interval, sigma * rng.standard_normal((_least(interval), 6))
+    return interval, sigma * rng.standard_normal((least_poses(interval), 6))
 
 
 def _given_spline(parameters: Mapping[str, Any]) -> _Spline:
@@ -223,7 +222,28 @@ def _interval(parameters: Mapping[str, Any]) -> float:
     return float(value)
 
 
-def _least(interval: float) -> int:
+def blending(tau: ArrayLike, interval: float, count: int) -> FloatArray:
+    """Shares (..., count) of the control poses in the pose at times (...); each row adds up to 1."""
+    tau = np.asarray(tau, dtype=np.float64)
+    i, u = _place(tau, interval, count)
+    b1, b2, b3 = _cumulative(u)
+    out = np.zeros((*tau.shape, count))
+    for j, share in enumerate((1 - b1, b1 - b2, b2 - b3, b3)):
+        np.put_along_axis(out, (i + j)[..., None], share[..., None], axis=-1)
+    return out
+
+
+def _place(tau: FloatArray, interval: float, count: int) -> tuple[NDArray[np.int64], FloatArray]:
+    """Interval (...) of times (...), and where in it they are, from 0 to 1."""
+    i = np.clip(np.floor(tau / interval), 0, count - 4).astype(np.int64)
+    return i, np.clip(tau / interval - i, 0.0, 1.0)
+
+
+def _cumulative(u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return (5 + u * (3 + u * (u - 3))) / 6, (1 + u * (3 + u * (3 - 2 * u))) / 6, u**3 / 6
+
+
+def least_poses(interval: float) -> int:
     """Control poses that reach time 2."""
     return int(np.ceil(LAST / interval - 1e-9)) + 3
 
@@ -232,8 +252,8 @@ def _twists(value: ArrayLike, interval: float, name: str) -> FloatArray:
     rows = np.array(value, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] != 6 or not np.all(np.isfinite(rows)):
         raise ValueError(f"{name} must be rows of 6 finite numbers: rotation vector and translation")
-    if len(rows) < _least(interval):
-        raise ValueError(f"{name} has {len(rows)} rows; an interval of {interval:g} needs {_least(interval)}")
+    if len(rows) < least_poses(interval):
+        raise ValueError(f"{name} has {len(rows)} rows; an interval of {interval:g} needs {least_poses(interval)}")
     return np.asarray(rows, dtype=np.float64)
 
 
