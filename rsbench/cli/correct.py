@@ -23,6 +23,8 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench correct --left left.mp4 --right right.mp4 --rig rig.toml --out corrected --target middle
 
+  rsbench correct l0.png r0.png l1.png r1.png --rig rig.toml --out corrected --motion-model auto
+
 RIG.toml, for rectified images (pixels, metres; without readout_ratio it is estimated):
 
   baseline = 0.12
@@ -58,6 +60,12 @@ def correct(
     sky: Annotated[bool, typer.Option(help="Look for sky, which moves by rotation alone.")] = True,
     fill: Annotated[bool, typer.Option(help="Fill what a frame did not see from the other frames.")] = True,
     solver: Annotated[str, named("solvers", "Finds the motion, in metres: a name or a card.")] = _SOLVER,
+    motion_model: Annotated[
+        str | None,
+        typer.Option(
+            metavar="auto|NAME", help="Model that the matches prefer, or by name. Default: the solver's."
+        ),
+    ] = None,
     matcher: Annotated[str, named("matchers", "Finds depth: a name or a card.")] = "sgm",
     features: Annotated[str, named("features", "Finds the motion's matches: a name or a card.")] = "sift",
     corrector: Annotated[str, named("correctors", "Makes the corrected frames: a name or a card.")] = "fusion",
@@ -72,6 +80,7 @@ def correct(
         raise RsbenchError(f"--{'rig' if rig is None else 'out'}: is required")
     card = read_rig_card(rig)
     options = _options(features, solver, matcher, corrector, fill, find_sky=sky, inpaint=inpaint, seed=seed)
+    options = _with_model(options, motion_model)
     four = frames is not None and len(frames) == 4 and not (left or right)
     if not four and (frames or not (left and right)):
         count = f"{len(frames)} images; " if frames else ""
@@ -101,6 +110,16 @@ def _options(
         corrector=_corrector(corrector, fill),
         **others,
     )
+
+
+def _with_model(options: CorrectionOptions, motion_model: str | None) -> CorrectionOptions:
+    from dataclasses import replace
+
+    from rsbench.pipeline.model_choice import check_asked
+
+    if motion_model is not None:
+        check_asked(motion_model, options.solver)
+    return replace(options, motion_model=motion_model)
 
 
 def _corrector(name: str, fill: bool) -> CorrectorEntry:
@@ -181,6 +200,8 @@ def _page(
     if motion is not None:
         facts += [("rotation", f"{motion['rotation_deg']:.4f} deg per frame period")]
         facts += [("translation", f"{motion['translation']:.4f} m per frame period")]
+        if motion["model_choice"]:
+            facts += [("motion model", motion["model_choice"]["text"])]
         facts += [("matches that agree", _agreeing(motion))]
         facts += [("noise of a match", f"{motion['noise_px'] or float('nan'):.2f} px")]
     write_page(folder, f"rsbench correct: {out.name}", "Rolling shutter to global shutter", facts, cards)
@@ -209,6 +230,8 @@ def _say(
     typer.echo(f"readout ratio {_readout(shutter, readout)}")
     if motion is not None:
         typer.echo(f"motion {motion['rotation_deg']:.4f} deg, {motion['translation']:.4f} m per frame period")
+        if motion["model_choice"]:
+            typer.echo(f"motion model: {motion['model_choice']['text']}")
         if motion["note"]:
             typer.echo(f"note: {motion['note']}")
     typer.echo(f"report: {(out / 'report.html').resolve()}")

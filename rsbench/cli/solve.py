@@ -24,6 +24,8 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench solve problem.json --solver rs-stereo --solver gs-8pt
 
+  rsbench solve problem.json --motion-model auto
+
   cat problems.jsonl | rsbench solve - --json --with covariance,inliers
 
 A problem holds [bold]camera[/bold] (width, height, fx, fy, cx, cy), [bold]baseline[/bold] (m),
@@ -56,6 +58,12 @@ def solve(
         str,
         typer.Option("--with", help="More in each JSON answer: covariance, noise, inliers; with commas between."),
     ] = "",
+    motion_model: Annotated[
+        str | None,
+        typer.Option(
+            metavar="auto|NAME", help="Model that the matches prefer, or by name. Default: the solver's."
+        ),
+    ] = None,
     time_limit: Annotated[
         float | None, typer.Option(help="Seconds that another package's solver may take for a problem.")
     ] = None,
@@ -74,8 +82,9 @@ def solve(
 
     wanted, options, limit = _extras(extras, json), _options(threshold_px), _limit(time_limit)
     entries = load_solver_entries(solver or ["rs-stereo"])
+    _check_model(motion_model, entries)
     with stoppable("nothing is kept; what was answered stays answered"):
-        code = _tell(_answers(problems, entries, options, seed, wanted, limit), json)
+        code = _tell(_answers(problems, entries, options, seed, wanted, limit, motion_model), json)
     if code:
         raise typer.Exit(code)
 
@@ -113,6 +122,7 @@ def _answers(
     seed: int,
     extras: list[Extra],
     time_limit: float | None,
+    motion_model: str | None,
 ) -> Iterator[dict[str, Any] | RsbenchError]:
     """One answer per problem and solver, or the error that a problem is."""
     import sys
@@ -129,7 +139,7 @@ def _answers(
                     yield problem
                     continue
                 for entry in entries:
-                    yield solve_problem(problem, entry, options, runner, seed, extras)
+                    yield solve_problem(problem, entry, options, runner, seed, extras, motion_model)
                 advance(problem.name)
 
 
@@ -156,6 +166,8 @@ def _show_one(answer: dict[str, Any]) -> None:
     typer.echo(f"d  {_vector(answer['d'])} {unit}, of {whose}")
     typer.echo(f"inliers: {answer['inliers']} of {answer['matches']} matches")
     typer.echo(f"assumes: {answer['motion_model']} motion, {answer['shutter']} shutter; {answer['assumes']}")
+    if answer.get("model_choice"):
+        typer.echo(f"motion model: {answer['model_choice']['text']}")
     if answer["reason"]:
         typer.echo(f"note: {answer['reason']}")
 
@@ -196,6 +208,13 @@ def _options(threshold_px: float | None) -> RobustOptions:
     if not 0.0 < threshold_px < float("inf"):
         raise RsbenchError(f"--threshold-px = {threshold_px}: must be a positive number of pixels")
     return RobustOptions(threshold_px=threshold_px, adapt_threshold=False)
+
+
+def _check_model(motion_model: str | None, entries: list[SolverEntry]) -> None:
+    from rsbench.pipeline.model_choice import check_asked
+
+    for entry in entries if motion_model is not None else []:
+        check_asked(str(motion_model), entry)
 
 
 def _limit(seconds: float | None) -> float | None:

@@ -94,6 +94,8 @@ def motion_record(found: FoundMotion) -> dict[str, Any]:
     return {
         "solver": found.solver,
         "model": motion.name,
+        "parameters": motion.parameters,
+        "model_choice": None if found.choice is None else found.choice.record(),
         "reference_point": "body",
         "w": motion.w.tolist(),
         "d": motion.d.tolist(),

@@ -10,6 +10,7 @@ import numpy as np
 from rsbench.core.joining import join_stereo
 from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.model_choice import settle_model
 from rsbench.pipeline.problem import Problem
 from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions
 from rsbench.solvers.engine.registry import SolverEntry
@@ -27,13 +28,22 @@ def solve_problem(
     runner: SolverRunner,
     seed: int = 0,
     extras: Collection[Extra] = (),
+    motion_model: str | None = None,
 ) -> Answer:
-    """Answer to a problem, ready for JSON; a failure has null for every motion, and the reason."""
-    joined = join_stereo(problem.correspondences)
-    result = runner.robust(
-        entry, joined.correspondences, problem.rig, problem.shutter, options, np.random.default_rng(seed)
-    )
-    estimate, spec = result.estimate, entry.solver.spec
+    """Answer to a problem, ready for JSON; a failure has null for every motion, and the reason.
+
+    Args:
+        motion_model: ``auto`` or a model to use instead of the solver's, see ``settle_model``.
+
+    Raises:
+        RsbenchError: there is no such motion model, or the solver can take no other than its own.
+    """
+    joined, spec, choice = join_stereo(problem.correspondences), entry.solver.spec, None
+    given = (joined.correspondences, problem.rig, problem.shutter, options, np.random.default_rng(seed))
+    result = runner.robust(entry, *given)
+    if motion_model is not None:
+        result, choice = settle_model(motion_model, result, entry, *given)
+    estimate = result.estimate
     body = body_motion(estimate, spec, problem.rig)
     notes = [estimate.reason] if joined.note in estimate.reason else [estimate.reason, joined.note]
     return {
@@ -48,7 +58,8 @@ def solve_problem(
         "direction_known": estimate.direction_known,
         "reference_point": spec.reference_point,
         "d_body": None if isinstance(body, str) else body.d.tolist(),
-        "motion_model": spec.motion_model,
+        "motion_model": spec.motion_model if choice is None else choice.used,
+        **({} if motion_model is None else {"model_choice": None if choice is None else choice.record()}),
         "shutter": spec.shutter,
         "assumes": spec.assumes,
         "inliers": result.inlier_count,

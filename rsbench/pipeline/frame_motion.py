@@ -15,6 +15,7 @@ from rsbench.errors import RsbenchError
 from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Images, eight_bit
+from rsbench.pipeline.model_choice import ModelChoice, settle_model
 from rsbench.pipeline.readout import LEAST_BACKWARDS, ReadoutEstimate, estimate_readout_ratio, runs_backwards
 from rsbench.pipeline.rectification import RefusedFramesError, check_rig, without_offset
 from rsbench.pipeline.robust_motion import RobustEstimate, estimate_motion
@@ -42,7 +43,7 @@ class FoundMotion:
     """The motion of the rig's body, and the solver's answer that it comes from."""
 
     motion: Motion
-    """Of the model that the solver assumes, metres."""
+    """Of the model that the solver assumes, or that the matches prefer to it; metres."""
     robust: RobustEstimate
     """As the solver gave it: about its own reference point."""
     solver: str
@@ -51,6 +52,8 @@ class FoundMotion:
     """The point whose translation ``robust.estimate.d`` is."""
     disparity_offset: float = 0.0
     """What was taken from the disparities before, px."""
+    choice: ModelChoice | None = None
+    """How the motion model was chosen; None when it is the solver's."""
 
 
 def find_matches(images: Images, options: CorrectionOptions, sides: tuple[Side, Side] = SIDES) -> Correspondences:
@@ -98,17 +101,22 @@ def find_motion(
     """The body's motion by the solver of the options; ``rng`` draws RANSAC's samples, by default from the seed.
 
     Raises:
-        RsbenchError: another package's solver raised: one line with its name.
+        RsbenchError: another package's solver raised: one line with its name; or the solver cannot take the
+            motion model of the options.
         NoMotionError: the solver found none, or only the direction of the translation.
     """
     entry = options.solver
     rng = np.random.default_rng(options.seed) if rng is None else rng
     with plugins.blame(SOLVERS, entry):
         robust = estimate_motion(matches, rig, shutter, entry.solver, options.robust, rng, entry.options.robust)
-    motion = motion_of(robust.estimate, entry, rig)
-    return FoundMotion(
-        motion=motion, robust=robust, solver=entry.name, reference_point=entry.solver.spec.reference_point
-    )
+    motion, choice = motion_of(robust.estimate, entry, rig), None
+    if options.motion_model is not None:
+        robust, choice = settle_model(
+            options.motion_model, robust, entry, matches, rig, shutter, options.robust, rng
+        )
+        motion = motion if choice is None else choice.motion
+    point = entry.solver.spec.reference_point
+    return FoundMotion(motion=motion, robust=robust, solver=entry.name, reference_point=point, choice=choice)
 
 
 def motion_of(estimate: MotionEstimate, entry: SolverEntry, rig: StereoRig) -> Motion:

@@ -1,8 +1,8 @@
 """Which motion model the matches of two frames prefer, how sure that is, and what the choice does to d.
 
-All models are equally likely beforehand, and so are the presets of a spline; the rest is the evidence of the matches,
-by Laplace's approximation, at one scale of the errors: that of the model which fits best. (D. MacKay, Bayesian
-interpolation, Neural Computation 1992.)
+All models are equally likely beforehand, and so are the presets of a spline; the rest is the evidence of the
+matches, by Laplace's approximation, at one scale of the errors: that of the model which fits best. (D. MacKay,
+Bayesian interpolation, Neural Computation 1992.)
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from rsbench.solvers.refined import RefinedSolver
 AUTO = "auto"
 MODELS = tuple(dict.fromkeys(candidate.name for candidate in CANDIDATES))
 _SURE = 0.95
-"""Probability from which a model counts as found, and of all others together below which one counts as excluded."""
+"""Probability from which a model is found; one that has less than the rest of it is excluded."""
 _HOPELESS = 50.0
 """Log-evidence behind the best from which a fit is not repeated at the common scale, where it is only worse."""
 _CELLS = 8
@@ -64,6 +64,7 @@ class ModelChoice:
     def record(self) -> dict[str, Any]:
         """As JSON holds it."""
         return {
+            "text": str(self),
             "used": self.used,
             "decided": self.decided,
             "probability": self.probability,
@@ -106,13 +107,16 @@ def choose_model(
         for found in [[fit.log_evidence(spread) for fit in fits if fit.candidate.name == name]]
     }
     total = logsumexp(list(evidence.values()))
-    probability = {name: float(np.exp(evidence[name] - total)) for name in sorted(MODELS, key=lambda n: -evidence[n])}
+    probability = {
+        name: float(np.exp(evidence[name] - total)) for name in sorted(MODELS, key=lambda n: -evidence[n])
+    }
     best, second = list(probability)[:2]
     used = preferred(probability) if asked == AUTO else asked
     rival = second if used == best else best
     chosen, other = (_likeliest(fits, name, spread) for name in (used, rival))
     accelerated = _likeliest(fits, "accelerated", spread)
     d, d_rival = chosen.motion.d, other.motion.d
+    longer = float(np.linalg.norm(d_rival)) / max(float(np.linalg.norm(d)), 1e-12) - 1.0
     return ModelChoice(
         used=used,
         motion=chosen.motion,
@@ -121,7 +125,7 @@ def choose_model(
         decided=used == best and probability[best] >= _SURE,
         rival=rival,
         d_angle_deg=float(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(d, d_rival)), d @ d_rival))),
-        d_length_percent=100.0 * float(np.linalg.norm(d_rival) / max(np.linalg.norm(d), 1e-12) - 1.0),
+        d_length_percent=100.0 * longer,
         acceleration=float(accelerated.phi[6]),
         acceleration_sigma=float(np.sqrt(accelerated.covariance(spread)[6, 6])),
     )
@@ -159,10 +163,9 @@ def check_asked(asked: str, entry: SolverEntry) -> None:
         raise RsbenchError(f"--motion-model {asked}: {asked!r} is unknown{choices(asked, known)}")
     solver = entry.solver
     if not isinstance(solver, RefinedSolver) or solver.shutter != "rolling":
-        raise RsbenchError(
-            f"--motion-model {asked}: solver {entry.name!r} knows only {entry.solver.spec.motion_model} motion and "
-            f"a {entry.solver.spec.shutter} shutter; take rs-stereo"
-        )
+        spec = solver.spec
+        known_to = f"solver {entry.name!r} knows only {spec.motion_model} motion and a {spec.shutter} shutter"
+        raise RsbenchError(f"--motion-model {asked}: {known_to}; take rs-stereo")
 
 
 def settle_model(
@@ -190,7 +193,7 @@ def settle_model(
     start = make_motion(solver.motion_model, robust.estimate.w, robust.estimate.d, solver.motion_parameters)
     choice = choose_model(correspondences, rig, shutter, start, asked)
     if choice.used == solver.motion_model and not choice.motion.parameters:
-        return robust, choice
+        return robust, replace(choice, motion=start)
     estimate = replace(robust.estimate, w=choice.motion.w, d=choice.motion.d, covariance=choice.covariance)
     if choice.used == "spline":  # no kernel: the solver's inliers are those of its own model
         return replace(robust, estimate=estimate), choice

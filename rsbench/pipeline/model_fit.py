@@ -155,7 +155,11 @@ class Errors:
             for shift in np.eye(2)[:, :, None] * (step * np.eye(3)[k]):
                 above, below = (
                     rs_stereo_transfer(
-                        self.rig, self.shutter, reference, self._stereo[0] + s * shift[0], self._stereo[1] + s * shift[1]
+                        self.rig,
+                        self.shutter,
+                        reference,
+                        self._stereo[0] + s * shift[0],
+                        self._stereo[1] + s * shift[1],
                     )
                     for s in (1.0, -1.0)
                 )
@@ -218,9 +222,21 @@ class ModelFit:
 
     @cached_property
     def curvature(self) -> FloatArray:
-        """Of the matches' negative log-likelihood (6 + k, 6 + k), without the prior."""
-        each = np.repeat(self.weights, self.errors.sizes)
+        """Of the matches' negative log-likelihood (6 + k, 6 + k), without the prior.
+
+        That of the weights alone is too large: they fall where an error grows. Both on average over directions.
+        """
+        sizes, w = self.errors.sizes, self.weights
+        share = self.bend / float(np.sum(sizes * w))
+        each = share * np.repeat(w, sizes)
         return np.asarray((self.jacobian.T * each) @ self.jacobian / self.scale_px**2)
+
+    @cached_property
+    def bend(self) -> float:
+        """Sum over all errors of the second derivative of the loss, in units of the scale."""
+        squares, variance = self.errors.squares(self.values), self.scale_px**2
+        lost = 2.0 * squares / (_TAILS * variance + squares)
+        return float(np.sum(self.weights * (self.errors.sizes - lost)))
 
     def covariance(self, dispersion: float) -> FloatArray:
         """Of phi; ``dispersion``: see ``dispersion``."""
@@ -248,14 +264,15 @@ def fit_model(errors: Errors, candidate: Candidate, start: FloatArray, scale_px:
         for _ in range(_STEPS):
             squares = errors.squares(values)
             each = np.repeat(_weights(squares, errors.sizes, scale), errors.sizes)
-            data = (J.T * each) @ J
+            data = np.asarray((J.T * each) @ J)
             if scale_px is None:
                 H = data / scale**2 + np.diag(candidate.precision)
                 used = float(np.trace(np.linalg.solve(H, data))) / scale**2
                 freedom = max(len(values) - used, 0.2 * len(values))
                 scale = max(float(np.sqrt(each @ values**2 / freedom)), _LEAST_SCALE_PX)
             H = data / scale**2 + np.diag(candidate.precision)
-            step = np.linalg.solve(H, -(J.T @ (each * values)) / scale**2 - candidate.precision * phi)
+            downhill = -(J.T @ (each * values)) / scale**2 - candidate.precision * phi
+            step = np.asarray(np.linalg.solve(H, downhill), dtype=np.float64)
             moved = _descend(errors, candidate, phi, squares, step, scale)
             if moved is None:
                 break
@@ -345,7 +362,6 @@ def dispersion(fit: ModelFit, cell_px: float) -> float:
     errors, sizes, variance = fit.errors, fit.errors.sizes, fit.scale_px**2
     squares, w = errors.squares(fit.values), fit.weights
     varied = float(np.sum(w**2 * squares)) / variance
-    curved = float(np.sum(w * (sizes - 2.0 * squares / (_TAILS * variance + squares))))
     each = np.repeat(w, sizes)
     rows = fit.jacobian[:, :6] * (each * fit.values)[:, None] / variance
     scores = np.add.reduceat(rows, np.cumsum(sizes) - sizes, axis=0)
@@ -356,7 +372,7 @@ def dispersion(fit: ModelFit, cell_px: float) -> float:
     np.add.at(together, cells, scores)
     alone = float(np.sum(scores**2))
     clustered = float(np.sum(together**2)) / alone if alone > 0.0 else 1.0
-    return varied / curved * max(clustered, 1.0)
+    return varied / fit.bend * max(clustered, 1.0)
 
 
 def _first_scale(errors: Errors, values: FloatArray) -> float:

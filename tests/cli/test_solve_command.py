@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import run_here
+from commands import assert_refused, run_here
 
 from rsbench.pipeline.problem import EXAMPLE
 
@@ -167,3 +167,15 @@ def test_an_interrupt_keeps_what_was_answered_and_ends_the_solvers_process(tmp_p
         assert process.stdout.read() == ""
         assert "interrupted; nothing is kept" in process.stderr.read()
         assert process.wait(60) == 130
+
+
+def test_the_motion_model_is_chosen_and_said() -> None:
+    """The sample is of the paper's model; its twenty tracks may leave others open, but not one that says more."""
+    text = run_here("solve", EXAMPLE, "--motion-model", "auto")
+    assert text.returncode == 0 and "motion model: " in text.stdout and "d turns by" in text.stdout
+    answer = json.loads(run_here("solve", EXAMPLE, "--motion-model", "twist", "--json").stdout)
+    choice = answer["model_choice"]
+    assert answer["motion_model"] == choice["used"] == "twist" and choice["probability"]["linear"] > 0.2
+    assert "model_choice" not in json.loads(run_here("solve", EXAMPLE, "--json").stdout)
+    assert_refused(run_here("solve", EXAMPLE, "--motion-model", "twsit"), "did you mean 'twist'")
+    assert_refused(run_here("solve", EXAMPLE, "--motion-model", "auto", "--solver", "gs-8pt"), "take rs-stereo")
