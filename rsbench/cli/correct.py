@@ -43,6 +43,7 @@ the other camera, 64 from the other frame, 0 seen by nobody) and [bold]motion.js
 
 _PAGE_FRAMES = 6
 _SOLVER = "rs-stereo-refined"
+_MODEL = "Motion model: auto, which the matches prefer, or a name. Default: the solver's"
 
 
 def correct(
@@ -60,12 +61,7 @@ def correct(
     sky: Annotated[bool, typer.Option(help="Look for sky, which moves by rotation alone.")] = True,
     fill: Annotated[bool, typer.Option(help="Fill what a frame did not see from the other frames.")] = True,
     solver: Annotated[str, named("solvers", "Finds the motion, in metres: a name or a card.")] = _SOLVER,
-    motion_model: Annotated[
-        str | None,
-        typer.Option(
-            metavar="auto|NAME", help="Model that the matches prefer, or by name. Default: the solver's."
-        ),
-    ] = None,
+    motion_model: Annotated[str | None, typer.Option(metavar="auto|NAME", help=_MODEL)] = None,
     matcher: Annotated[str, named("matchers", "Finds depth: a name or a card.")] = "sgm",
     features: Annotated[str, named("features", "Finds the motion's matches: a name or a card.")] = "sift",
     corrector: Annotated[str, named("correctors", "Makes the corrected frames: a name or a card.")] = "fusion",
@@ -79,8 +75,8 @@ def correct(
     if rig is None or out is None:
         raise RsbenchError(f"--{'rig' if rig is None else 'out'}: is required")
     card = read_rig_card(rig)
-    options = _options(features, solver, matcher, corrector, fill, find_sky=sky, inpaint=inpaint, seed=seed)
-    options = _with_model(options, motion_model)
+    others = {"find_sky": sky, "inpaint": inpaint, "seed": seed, "motion_model": motion_model}
+    options = _options(features, solver, matcher, corrector, fill, **others)
     four = frames is not None and len(frames) == 4 and not (left or right)
     if not four and (frames or not (left and right)):
         count = f"{len(frames)} images; " if frames else ""
@@ -99,27 +95,21 @@ def _options(
     features: str, solver: str, matcher: str, corrector: str, fill: bool, **others: Any
 ) -> CorrectionOptions:
     from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.pipeline.model_choice import check_asked
     from rsbench.solvers.engine.registry import load_solver_entry
     from rsbench.vision.feature_matcher import load_features
     from rsbench.vision.stereo_matcher import load_matcher
 
-    return CorrectionOptions(
+    options = CorrectionOptions(
         features=load_features(features),
         solver=load_solver_entry(solver),
         matcher=load_matcher(matcher),
         corrector=_corrector(corrector, fill),
         **others,
     )
-
-
-def _with_model(options: CorrectionOptions, motion_model: str | None) -> CorrectionOptions:
-    from dataclasses import replace
-
-    from rsbench.pipeline.model_choice import check_asked
-
-    if motion_model is not None:
-        check_asked(motion_model, options.solver)
-    return replace(options, motion_model=motion_model)
+    if options.motion_model is not None:
+        check_asked(options.motion_model, options.solver)
+    return options
 
 
 def _corrector(name: str, fill: bool) -> CorrectorEntry:

@@ -37,6 +37,7 @@ Exit codes: 0 all solved, 1 one without a motion, 2 one that is wrong; the other
 More: [bold]rsbench docs problem-format[/bold]"""
 
 
+_MODEL = "Motion model: auto, which the matches prefer, or a name. Default: the solver's"
 _SOLVER = "Name of a solver (rsbench list solvers) or path of a card; repeatable. Default: rs-stereo"
 
 
@@ -58,12 +59,7 @@ def solve(
         str,
         typer.Option("--with", help="More in each JSON answer: covariance, noise, inliers; with commas between."),
     ] = "",
-    motion_model: Annotated[
-        str | None,
-        typer.Option(
-            metavar="auto|NAME", help="Model that the matches prefer, or by name. Default: the solver's."
-        ),
-    ] = None,
+    motion_model: Annotated[str | None, typer.Option(metavar="auto|NAME", help=_MODEL)] = None,
     time_limit: Annotated[
         float | None, typer.Option(help="Seconds that another package's solver may take for a problem.")
     ] = None,
