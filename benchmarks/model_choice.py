@@ -119,7 +119,7 @@ def rendered(data: Path, asked: str, psnr_db: float) -> Iterator[str]:
     for sequence in read_dataset(data):
         rng = np.random.default_rng(0)
         images = {view: noisy(sequence.image("rs", *view), psnr_db, rng) for view in VIEWS}
-        matches = match_frames(images, CorrectionOptions())
+        matches = match_frames(images, sequence.rig, CorrectionOptions())
         errors = []
         for model in (None, asked):
             found = find_motion(matches, sequence.rig, sequence.shutter, CorrectionOptions(motion_model=model))

@@ -159,7 +159,7 @@ def test_rendered_frames_do_not_exclude_the_model_that_made_them(smoke_dataset: 
     """128 x 96 pixels: a few dozen matches with the errors of SIFT. One sequence is linear, one a twist."""
     for sequence in read_dataset(smoke_dataset):
         options = CorrectionOptions(motion_model="auto")
-        given = match_frames({view: sequence.image("rs", *view) for view in VIEWS}, options)
+        given = match_frames({view: sequence.image("rs", *view) for view in VIEWS}, sequence.rig, options)
         found = find_motion(given, sequence.rig, sequence.shutter, options)
         assert found.choice is not None and found.motion.name == found.choice.used
         assert found.choice.probability[sequence.motion.name] > 0.05
