@@ -260,6 +260,7 @@ def correct(
     """
     from rsbench.pipeline.chain import correct_four
     from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.pipeline.isolated_parts import Isolation
     from rsbench.vision.corrector import load_corrector
     from rsbench.vision.feature_matcher import load_features
     from rsbench.vision.stereo_matcher import load_matcher
@@ -277,7 +278,8 @@ def correct(
     if readout_ratio is not None:
         arguments.check_number("readout_ratio", readout_ratio, 0.0, 1.0)
     arguments.check_number("target_row", target_row, 0.0, rig.camera.height - 1.0)
-    return correct_four(views, rig, readout_ratio, options)
+    with Isolation() as isolation:
+        return correct_four(views, rig, readout_ratio, isolation.chain(options))
 
 
 def read_dataset(folder: AnyPath) -> list[Sequence]:

@@ -71,6 +71,7 @@ def correct(
     from rsbench.errors import RsbenchError
     from rsbench.pipeline.footage import read_rig_card
     from rsbench.pipeline.frame_motion import NoMotionError
+    from rsbench.pipeline.isolated_parts import Isolation
 
     if rig is None or out is None:
         raise RsbenchError(f"--{'rig' if rig is None else 'out'}: is required")
@@ -82,10 +83,12 @@ def correct(
         count = f"{len(frames)} images; " if frames else ""
         raise RsbenchError(f"frames: {count}give LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right")
     try:
-        if frames:
-            _correct_four(frames, card, out, target, options)
-        elif left and right:
-            _correct_sequence(left, right, card, out, target, options)
+        with Isolation() as isolation:
+            options = isolation.chain(options)
+            if frames:
+                _correct_four(frames, card, out, target, options)
+            elif left and right:
+                _correct_sequence(left, right, card, out, target, options)
     except NoMotionError as error:
         typer.echo(f"rsbench: not corrected: {error}", err=True)
         raise typer.Exit(1) from None

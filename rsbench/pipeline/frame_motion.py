@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench import plugins
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
@@ -15,12 +14,13 @@ from rsbench.errors import RsbenchError
 from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Images, eight_bit
+from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.model_choice import ModelChoice, settle_model
 from rsbench.pipeline.readout import LEAST_BACKWARDS, ReadoutEstimate, estimate_readout_ratio, runs_backwards
 from rsbench.pipeline.rectification import RefusedFramesError, check_rig, without_offset
 from rsbench.pipeline.robust_motion import RobustEstimate, estimate_motion
 from rsbench.solvers.engine.base import MotionEstimate
-from rsbench.solvers.engine.registry import SOLVERS, SolverEntry
+from rsbench.solvers.engine.registry import SolverEntry
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.vision.feature_matcher import find_correspondences
 
@@ -100,15 +100,19 @@ def find_motion(
 ) -> FoundMotion:
     """The body's motion by the solver of the options; ``rng`` draws RANSAC's samples, by default from the seed.
 
+    Another package's solver answers from a process of its own, within the time limit of its card.
+
     Raises:
-        RsbenchError: another package's solver raised: one line with its name; or the solver cannot take the
-            motion model of the options.
-        NoMotionError: the solver found none, or only the direction of the translation.
+        RsbenchError: the solver cannot take the motion model of the options.
+        NoMotionError: the solver found none, failed, or found only the direction of the translation.
     """
     entry = options.solver
     rng = np.random.default_rng(options.seed) if rng is None else rng
-    with plugins.blame(SOLVERS, entry):
+    if entry.built_in:
         robust = estimate_motion(matches, rig, shutter, entry.solver, options.robust, rng, entry.options.robust)
+    else:
+        with SolverRunner() as runner:
+            robust = runner.robust(entry, matches, rig, shutter, options.robust, rng)
     motion, choice = motion_of(robust.estimate, entry, rig), None
     if options.motion_model is not None:
         robust, choice = settle_model(
@@ -129,7 +133,7 @@ def motion_of(estimate: MotionEstimate, entry: SolverEntry, rig: StereoRig) -> M
     if isinstance(motion, Motion):
         return motion
     if not estimate.success:
-        raise NoMotionError(f"no motion found: {motion}")
+        raise NoMotionError(f"solver {entry.name!r} found no motion: {motion}")
     if entry.solver.spec.metric:
         raise NoMotionError(f"solver {entry.name!r}: {motion}: more matches must be seen by both cameras")
     raise NoMotionError(f"solver {entry.name!r}: {motion}; a correction needs metres, as rs-stereo-refined finds")
@@ -167,7 +171,6 @@ def solve_frames(
 
     Raises:
         RefusedFramesError: time runs backwards in the frames.
-        RsbenchError: another package's solver raised.
         NoMotionError: no motion explains the matches, or they do not determine the readout ratio.
     """
     shutter, readout = solve_shutter(matches, rig, readout_ratio, options, disparity_offset)

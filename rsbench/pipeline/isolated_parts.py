@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig, View
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.isolated_solver import entrys_own
 from rsbench.pipeline.isolation import IsolatedWorker
 from rsbench.plugins import Entry, Kind
@@ -26,14 +27,12 @@ from rsbench.vision.corrector import (
     CORRECTORS,
     CorrectionProblem,
     Corrector,
-    CorrectorEntry,
     CorrectorSpec,
     find_corrected,
     load_corrector,
 )
 from rsbench.vision.feature_matcher import (
     FEATURE_MATCHERS,
-    FeatureEntry,
     FeatureMatcher,
     find_correspondences,
     load_features,
@@ -41,7 +40,6 @@ from rsbench.vision.feature_matcher import (
 from rsbench.vision.fusion import Fused
 from rsbench.vision.stereo_matcher import (
     STEREO_MATCHERS,
-    MatcherEntry,
     StereoMatcher,
     find_disparities,
     load_matcher,
@@ -59,14 +57,14 @@ class Isolation:
     def __init__(self) -> None:
         self._stack = ExitStack()
 
-    def features(self, entry: FeatureEntry) -> FeatureEntry:
-        return self.wrap(FEATURE_MATCHERS, entry, _serve_features, (Correspondences,), _Features)
-
-    def matcher(self, entry: MatcherEntry) -> MatcherEntry:
-        return self.wrap(STEREO_MATCHERS, entry, _serve_matcher, (), _Matcher)
-
-    def corrector(self, entry: CorrectorEntry) -> CorrectorEntry:
-        return self.wrap(CORRECTORS, entry, _serve_corrector, (Fused,), _Corrector)
+    def chain(self, options: CorrectionOptions) -> CorrectionOptions:
+        """The options with all but the solver isolated, which ``find_motion`` runs apart by itself."""
+        return replace(
+            options,
+            features=self.wrap(FEATURE_MATCHERS, options.features, _serve_features, (Correspondences,), _Features),
+            matcher=self.wrap(STEREO_MATCHERS, options.matcher, _serve_matcher, (), _Matcher),
+            corrector=self.wrap(CORRECTORS, options.corrector, _serve_corrector, (Fused,), _Corrector),
+        )
 
     def wrap(
         self,

@@ -288,7 +288,7 @@ def test_features_without_stereo_matches_are_no_sign_of_wrong_frames(castle: Seq
 def test_matches_without_a_motion_say_why(castle: Sequence) -> None:
     rng = np.random.default_rng(0)
     noise = Correspondences(left=rng.uniform(0, 90, (8, 4)), right=rng.uniform(0, 90, (8, 4)))
-    with pytest.raises(NoMotionError, match="no motion found: "):
+    with pytest.raises(NoMotionError, match="found no motion: "):
         solve_frames(noise, castle.rig, 0.8, CorrectionOptions())
 
 

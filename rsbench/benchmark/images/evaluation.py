@@ -76,14 +76,8 @@ class Evaluation:
 
     def _isolated(self, isolation: Isolation) -> Plan:
         """The plan with other packages' components in child processes."""
-        chain = self.plan.chain
-        chain = replace(
-            chain,
-            features=isolation.features(chain.features),
-            matcher=isolation.matcher(chain.matcher),
-            corrector=isolation.corrector(chain.corrector),
-        )
-        return replace(self.plan, chain=chain, metrics=isolated_metrics(isolation, self.plan.metrics))
+        metrics = isolated_metrics(isolation, self.plan.metrics)
+        return replace(self.plan, chain=isolation.chain(self.plan.chain), metrics=metrics)
 
     def _folder(self, sequence: Sequence) -> Path:
         return self.out / "predictions" / sequence.name
