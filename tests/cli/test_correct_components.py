@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -172,12 +173,14 @@ def test_single_files_with_their_cards_beside_them(castle: Sequence, strangers: 
 
 
 def test_an_installed_package(castle: Sequence, strangers: Path, tmp_path: Path) -> None:
-    info = strangers / "strange-1.0.dist-info"
+    # A copy, for this process has the other folder on its path, where later tests would find the package.
+    site = Path(shutil.copytree(strangers, tmp_path / "site"))
+    info = site / "strange-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: strange\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(ENTRY_POINTS)
     names = ("--matcher", "flat", "--features", "known", "--corrector", "negative", "--no-sky")
-    result = correct(castle, tmp_path, *names, path=strangers)
+    result = correct(castle, tmp_path, *names, path=site)
     assert result.returncode == 0, result.stderr
     check_strange_results(castle, tmp_path / "out")
 
