@@ -80,8 +80,11 @@ Shot = tuple[MitsubaScene, PinholeCamera, Pose]
 
 
 @pytest.fixture(scope="module", params=["castle", "room"])
-def shot(request: pytest.FixtureRequest, built_scene: Callable[[str], Scene]) -> Shot:
+def shot(
+    request: pytest.FixtureRequest, built_scene: Callable[[str], Scene], give_back: Callable[[], None]
+) -> Shot:
     """A scene and the rows of its second right frame; of module scope, so that one scene goes before the next."""
+    give_back()
     card = load_dataset_card("paper")
     (sequence,) = card.only([str(request.param)]).sequence
     scene = built_scene(sequence.scene)
