@@ -28,13 +28,27 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # command line, which tests start as others do, does it.
 import_untried()
 
-LARGE_SCENES = ("test_depth_by_rays.py", "test_built_scenes.py", "test_paper_sequences.py")
-"""Files that hold a built-in scene, hundreds of MB: one process runs them all, and builds each scene once."""
+LARGE_SCENES = (
+    "test_depth_by_rays.py",
+    "test_installed_wheel.py",
+    "test_built_scenes.py",
+    "test_paper_sequences.py",
+)
+"""Files that hold a built-in scene, or start what does, 1 to 2 GB: one process runs them, in this order.
+
+So each scene is built once, and those of child processes do not lie beside its own.
+"""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What takes long comes first, so that no process works alone at the end."""
-    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+
+    def place(item: pytest.Item) -> int:
+        if item.path.name in LARGE_SCENES:
+            return LARGE_SCENES.index(item.path.name)
+        return len(LARGE_SCENES) + (item.get_closest_marker("slow") is None)
+
+    items.sort(key=place)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -26,7 +26,6 @@ def traced_depth(scene: MitsubaScene, origins: FloatArray, directions: FloatArra
     return np.array(scene.scene.ray_intersect_preliminary(ray).t, dtype=np.float64)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["castle", "room-twist"])
 def test_every_surface_pixel_is_where_another_frame_sees_it(
     smoke_dataset: Path, built_scene: Callable[[str], Scene], name: str

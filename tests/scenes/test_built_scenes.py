@@ -18,7 +18,6 @@ from rsbench.scenes.model import Material, Scene, SceneMesh
 from rsbench.scenes.palette import RECIPES
 from rsbench.scenes.surfaces import Surface
 
-pytestmark = pytest.mark.slow
 BUILT_IN = ("castle", "old-town", "poles", "room")
 FOCAL, SIZE = 1384.6, 900  # the paper's camera, 36 degrees
 
