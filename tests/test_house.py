@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import csv
 import itertools
 import re
 import subprocess
@@ -20,6 +21,7 @@ import rsbench
 from rsbench.benchmark.simulated.contract import CHECKS, check_solver
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.benchmark.studies.claims import CLAIMS
+from rsbench.benchmark.studies.correction_methods import METHODS
 from rsbench.cards import CardKind, list_cards, load_card, read_toml
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.metrics import rotation_error, translation_error
@@ -307,3 +309,22 @@ def test_readme_figures_are_those_of_the_committed_results() -> None:
     rows = re.findall(rf"^\| (?:{shown}) \|.*$", (ROOT / "README.md").read_text("utf-8"), re.MULTILINE)
     assert {claim.key for claim in CLAIMS} <= {row.split(" | ")[0].removeprefix("| ") for row in rows}
     assert [row for row in rows if row not in published] == []
+
+
+def test_readme_corrections_are_those_of_the_study() -> None:
+    """Covered / all PSNR, and the interval of what ours gains on the covered pixels, of each stratum."""
+    lines = (ROOT / "results" / "correction" / "summary.csv").read_text("utf-8").splitlines()
+    rows = {(row["stratum"], row["method"]): row for row in csv.DictReader(lines)}
+    keys = {method.title: method.key for method in METHODS}
+    section = (ROOT / "README.md").read_text("utf-8").partition("### Correction")[2].partition("\n## ")[0]
+    shown = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")][2:]
+    assert len(shown) > 5
+    for title, *cells in shown:
+        key = keys[title.removesuffix(" (oracle)").strip("*")]
+        for stratum, cell in zip(("mild", "moderate", "aggressive"), cells, strict=True):
+            row = rows[stratum, key]
+            expected = f"{float(row['psnr_covered']):.1f} / {float(row['psnr_all']):.1f}"
+            if key != "ours":
+                low, high = (round(float(row[f"gain_{end}"]), 1) + 0.0 for end in ("low", "high"))  # no -0.0
+                expected += f" [{low:.1f}, {high:.1f}]"
+            assert cell == expected, (title, stratum)
