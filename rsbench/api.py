@@ -1,8 +1,7 @@
 """The functions of ``import rsbench``: arrays in, arrays out, every option with a default.
 
-Thin: each finds the cards that it is given by name and calls the module that does the work. Images are (H, W) or
-(H, W, 3), uint8 or uint16; four images are in the order left 0, right 0, left 1, right 1. Angles are radians and
-lengths metres unless a name says otherwise; frames and times are those of docs/conventions.md.
+Images are (H, W) or (H, W, 3), uint8 or uint16; four images are in the order left 0, right 0, left 1, right 1.
+Angles are radians, lengths metres unless a name says otherwise; frames and times as in docs/conventions.md.
 """
 
 from __future__ import annotations
