@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import subprocess
 import sys
+from collections.abc import Sequence
 
 import pytest
 
@@ -36,6 +38,18 @@ def run_here(*arguments: object, text: str = "", **environment: str) -> subproce
         finally:
             console.be_quiet(False)
     return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
+
+
+def sweep_card(
+    solvers: Sequence[str], *, noise_px: Sequence[float], trials: int, name: str = "mine", more: str = ""
+) -> str:
+    """The text of a card for ``rsbench simulate`` whose trials are small; ``more`` is appended to the setting."""
+    return (
+        f'name = {json.dumps(name)}\naxis = "noise_px"\nvalues = {list(noise_px)}\n'
+        f"solvers = {json.dumps(list(solvers))}\ntrials = {trials}\n[setting]\n"
+        "width = 640\nheight = 480\nfocal = 500.0\nbaseline = 0.2\nreadout_ratio = 0.5\npoints = 30\n"
+        f"depth = [2.0, 5.0]\nrotation_deg = 1.0\ntranslation = 0.1\nnoise_px = 0.0\n{more}"
+    )
 
 
 def assert_refused(result: subprocess.CompletedProcess[str], *words: str) -> None:

@@ -10,29 +10,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import sweep_card
 
 from rsbench.cards import read_toml
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "add-a-motion.md"
-SWEEP = """
-name = "mine"
-axis = "noise_px"
-values = [0.0]
-solvers = ["rs-stereo-ease.toml", "rs-stereo-refined"]
-trials = 2
-[setting]
-width = 640
-height = 480
-focal = 500.0
-baseline = 0.2
-readout_ratio = 0.8
-points = 40
-depth = [2.0, 5.0]
-rotation_deg = 1.0
-translation = 0.1
-noise_px = 0.0
-motion_model = "ease"
-"""
+SWEEP = sweep_card(
+    ["rs-stereo-ease.toml", "rs-stereo-refined"], noise_px=[0.0], trials=2, more='motion_model = "ease"\n'
+)
 
 
 @pytest.fixture(scope="module")

@@ -291,7 +291,7 @@ def test_the_wheel_carries_cards_documents_and_type_marker(tmp_path: Path) -> No
     expected |= {str(path.relative_to(ROOT)) for path in SOURCES} | {"rsbench/py.typed"}
     expected |= {str(path.relative_to(ROOT)) for path in (ROOT / "rsbench").rglob("*.j2")}
     expected |= {f"rsbench/_docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
-    expected |= {f"rsbench/_docs/examples/{path.name}" for path in (ROOT / "examples").iterdir()}
+    expected |= {f"rsbench/_docs/examples/{path.name}" for path in (ROOT / "examples").iterdir() if path.is_file()}
     assert expected <= names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not any("__pycache__" in name or name.startswith("tests/") for name in names)

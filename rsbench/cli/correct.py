@@ -260,7 +260,8 @@ def _correct_sequence(
     failed = _told(record["frames"], "reason")
     skipped = _told(record["frames"], "skipped")
     typer.echo(f"readout ratio {_readout(shutter, readout)}")
-    typer.echo(f"{len(record['frames']) - len(failed)} of {len(record['frames'])} times corrected")
+    corrected = [frame for frame in record["frames"] if "reason" not in frame]
+    typer.echo(f"{len(corrected)} of {len(record['frames'])} times corrected")
     typer.echo(f"report: {(out / 'report.html').resolve()}")
     if skipped:
         typer.echo(f"rsbench: corrected with the motion from the frame before: {skipped}", err=True)

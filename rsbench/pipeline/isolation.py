@@ -73,7 +73,7 @@ class Cancelled(Exception):  # noqa: N818
 
 
 class IsolatedWorker:
-    """A child process that answers calls; use as a context manager, from one thread."""
+    """A child process that answers calls, one at a time, of any thread; use as a context manager."""
 
     def __init__(
         self,
@@ -100,6 +100,7 @@ class IsolatedWorker:
         self._environment = {**os.environ, **(environment or {})}
         self._cancel = cancel or threading.Event()
         self._child: _Child | None = None
+        self._one_call = threading.Lock()
 
     def call(self, *arguments: object, limit_s: float) -> Outcome:
         """The child's answer, or why there is none.
@@ -108,17 +109,18 @@ class IsolatedWorker:
             RuntimeError: rsbench's own code in the child is at fault.
             Cancelled: see ``cancel``.
         """
-        try:
-            if self._child is None:
-                self._child = _Child(self._environment)
-                started = self._exchange(self._start, self._start_limit_s)
-                if not started.success:
-                    self.close()
-                    return replace(started, reason=f"did not start: {started.reason}")
-            return self._exchange(arguments, limit_s)
-        except BaseException:
-            self.close()  # an answer that nobody waits for must not be taken for the next one
-            raise
+        with self._one_call:  # the answers to two would be mixed up
+            try:
+                if self._child is None:
+                    self._child = _Child(self._environment)
+                    started = self._exchange(self._start, self._start_limit_s)
+                    if not started.success:
+                        self.close()
+                        return replace(started, reason=f"did not start: {started.reason}")
+                return self._exchange(arguments, limit_s)
+            except BaseException:
+                self.close()  # an answer that nobody waits for must not be taken for the next one
+                raise
 
     def close(self) -> None:
         """End the child."""

@@ -10,25 +10,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from commands import sweep_card
 
-CARD = """
-name = "mine"
-axis = "noise_px"
-values = [0.5]
-solvers = ["gs-8pt"]
-trials = 2
-[setting]
-width = 640
-height = 480
-focal = 500.0
-baseline = 0.2
-readout_ratio = 0.5
-points = 30
-depth = [2.0, 5.0]
-rotation_deg = 1.0
-translation = 0.1
-noise_px = 0.0
-"""
+CARD = sweep_card(["gs-8pt"], noise_px=[0.5], trials=2)
 BROKEN = {
     "raises": "raise RuntimeError('half installed')",
     "exits": "raise SystemExit(3)",

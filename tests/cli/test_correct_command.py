@@ -14,7 +14,7 @@ import pytest
 from commands import assert_refused, run_here
 
 from rsbench.dataset.corrected_frames import MASK_VALUES, fresh_folder
-from rsbench.dataset.files import read_depth, read_png
+from rsbench.dataset.files import read_depth, read_png, write_png
 from rsbench.dataset.sequence import Sequence, read_dataset
 
 ORDER = ("left_0", "right_0", "left_1", "right_1")
@@ -104,6 +104,29 @@ def test_a_sequence_of_folders(tmp_path: Path, frames: list[Path], rig: Path) ->
         assert (out / "corrected" / f"{name}.png").is_file()
     record = json.loads((out / "motion.json").read_text("utf-8"))
     assert [frame["number"] for frame in record["frames"]] == [0, 1]
+
+
+def test_a_bad_window_is_skipped_and_told(tmp_path: Path, castle: Sequence, rig: Path) -> None:
+    """The third of five frames is blank: its neighbours are corrected, and the end names who was not, and why."""
+    order = (0, 1, None, 0, 1)
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        for number, frame in enumerate(order):
+            image = np.full_like(castle.image("rs", "left", 0), 128)
+            if frame is not None:
+                image = castle.image("rs", side, frame)
+            write_png(tmp_path / side / f"{number}.png", image)
+    out = tmp_path / "out"
+    result = correct("--left", tmp_path / "left", "--right", tmp_path / "right", "--rig", rig, "--out", out)
+    assert result.returncode == 1, result.stderr
+    skipped, failed = result.stderr.strip().splitlines()[-2:]
+    assert "corrected with the motion from the frame before: frame 1 (only 0 matches" in skipped
+    assert "not corrected: frame 2 (only 0 matches" in failed and failed.count("frame ") == 1
+    frames = json.loads((out / "motion.json").read_text())["frames"]
+    assert [("skipped" in frame, "reason" in frame) for frame in frames] == [
+        (number == 1, number == 2) for number in range(len(order))
+    ]
+    assert "4 of 5 times corrected" in result.stdout
 
 
 def test_bad_calls_are_refused_and_leave_nothing(tmp_path: Path, frames: list[Path], rig: Path) -> None:

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from commands import run_here
+from commands import run_here, sweep_card
 from small_scenes import write_box_scene, write_small_card
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -29,24 +29,7 @@ class Slow(Solver):
         time.sleep(float(os.environ["RSBENCH_TEST_PAUSE"]))
         return EIGHT_POINT.estimate(correspondences, rig, shutter)
 """
-CARD = """
-name = "long"
-axis = "noise_px"
-values = [0.0, 0.5, 1.0]
-solvers = ["gs-8pt", "{slow}"]
-trials = 100
-[setting]
-width = 640
-height = 480
-focal = 500.0
-baseline = 0.2
-readout_ratio = 0.5
-points = 30
-depth = [2.0, 5.0]
-rotation_deg = 1.0
-translation = 0.1
-noise_px = 0.0
-"""
+CARD = sweep_card(["gs-8pt", "{slow}"], noise_px=[0.0, 0.5, 1.0], trials=100, name="long")
 STOP_S = 20.0
 """Seconds. On a free machine it takes 0.01 to 1.3; without the cure it took 45, which a busy one is not."""
 

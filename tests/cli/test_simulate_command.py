@@ -6,26 +6,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from commands import assert_refused, run_here
+from commands import assert_refused, run_here, sweep_card
 
-CARD = """
-name = "mine"
-axis = "noise_px"
-values = [0.0, 0.5]
-solvers = ["gs-8pt"]
-trials = 3
-[setting]
-width = 640
-height = 480
-focal = 500.0
-baseline = 0.2
-readout_ratio = 0.5
-points = 30
-depth = [2.0, 5.0]
-rotation_deg = 1.0
-translation = 0.1
-noise_px = 0.0
-"""
+CARD = sweep_card(["gs-8pt"], noise_px=[0.0, 0.5], trials=3)
 
 
 def test_a_users_own_sweep(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -311,6 +312,17 @@ def test_nothing_outlives_its_parent(tmp_path: Path, end: signal.Signals) -> Non
         parent.send_signal(end)
         parent.communicate(timeout=5.0)
     assert not alive(note)
+
+
+def test_threads_get_the_answers_to_their_own_calls() -> None:
+    """Both frames of a pair are matched at once, by one worker."""
+    numbers = [float(number) for number in range(200)]
+    with (
+        IsolatedWorker(functools.partial, math.sqrt) as worker,
+        ThreadPoolExecutor(8) as pool,
+    ):
+        answers = list(pool.map(lambda number: worker.call(number, limit_s=20.0).value, numbers))
+    assert answers == [math.sqrt(number) for number in numbers]
 
 
 def test_our_own_mistakes_stop(simulation: Simulation) -> None:

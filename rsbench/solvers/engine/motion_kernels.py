@@ -84,19 +84,23 @@ class LinearKernel(MotionKernel):
         linear_translation_jacobian(theta, tau0, R, A, tau1, T_w, T_v)
 
 
+@compiled
+def beta(k: float, tau: float) -> tuple[float, float]:
+    """beta(tau) of a constant acceleration k (Zhuang et al., ICCV 2017), 1 at tau = 1, and its derivative."""
+    scale = 2.0 / (2.0 + k)
+    return scale * (tau + 0.5 * k * tau * tau), scale * (1.0 + k * tau)
+
+
 @final
 @kernel_for(AcceleratedMotion)
 @dataclass(frozen=True)
 class AcceleratedKernel(MotionKernel):
-    """Constant acceleration: the paper's motion at the times beta(tau) of Zhuang et al., ICCV 2017; v is d."""
+    """Constant acceleration: the paper's motion at the times beta(tau); v is d."""
 
     acceleration: float
 
     def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
-        k = self.acceleration
-        scale = 2.0 / (2.0 + k)
-        beta0, beta1 = scale * (tau0 + 0.5 * k * tau0 * tau0), scale * (tau1 + 0.5 * k * tau1 * tau1)
-        speed0, speed1 = scale * (1.0 + k * tau0), scale * (1.0 + k * tau1)
+        (beta0, speed0), (beta1, speed1) = beta(self.acceleration, tau0), beta(self.acceleration, tau1)
         T, rate0, rate1, spin0, spin1 = linear_move(theta, beta0, beta1, R, A)
         return T, times(speed0, rate0), times(speed1, rate1), times(speed0, spin0), times(speed1, spin1)
 
@@ -110,9 +114,7 @@ class AcceleratedKernel(MotionKernel):
         T_w: FloatArray,
         T_v: FloatArray,
     ) -> None:
-        k = self.acceleration
-        scale = 2.0 / (2.0 + k)
-        beta0, beta1 = scale * (tau0 + 0.5 * k * tau0 * tau0), scale * (tau1 + 0.5 * k * tau1 * tau1)
+        beta0, beta1 = beta(self.acceleration, tau0)[0], beta(self.acceleration, tau1)[0]
         linear_translation_jacobian(theta, beta0, R, A, beta1, T_w, T_v)
 
 
