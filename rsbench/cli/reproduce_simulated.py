@@ -152,9 +152,9 @@ def image_claims(out: Path) -> None:
     from rsbench.dataset.files import write_bytes
     from rsbench.report.claims_page import image_claims_page
 
-    page = out / "claims" / "images.md"
+    text, page = image_claims_page(judge_image_claims(out)), out / "claims" / "images.md"
     page.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(page, image_claims_page(judge_image_claims(out)).encode())
+    write_bytes(page, text.encode())
     typer.echo(f"claims: {page}")
 
 

@@ -93,7 +93,9 @@ _MARGIN = 3
 def fuse(
     views: Sequence[SourceView], camera: PinholeCamera, target_pose: Pose, options: WarpOptions | None = None
 ) -> Fused:
-    """Warp the first view to ``target_pose`` and fill its holes from the others, GUESSED ones last.
+    """Warp the first view to ``target_pose`` and fill its holes from the others.
+
+    First with what they measured and the frame does not contradict, then with GUESSED ones, at last with the rest.
 
     Raises ValueError as ``rsbench.vision.correction.warp``.
     """
@@ -103,6 +105,7 @@ def fuse(
     origin = np.where(corrected.mask, np.uint8(first.origin), np.uint8(Origin.NOBODY))
     measured = [view for view in others if view.origin is not Origin.GUESSED]
     guessed = [view for view in others if view.origin is Origin.GUESSED]
+    contradicted: list[tuple[Corrected, Mask, Origin]] = []
     for group in (measured, guessed):
         holes = origin == Origin.NOBODY
         for view in group:
@@ -116,9 +119,14 @@ def fuse(
             nearer = candidate.depth < known * (1.0 - _AGREE)
             take = candidate.mask & holes & ((origin == Origin.NOBODY) | nearer)
             if view.origin is not Origin.GUESSED:
-                take &= ~_contradicted(first, candidate, take, camera, target_pose)
+                against = _contradicted(first, candidate, take, camera, target_pose)
+                contradicted.append((candidate, take & against, view.origin))
+                take &= ~against
             image[take], depth[take] = candidate.image[take], candidate.depth[take]
             origin[take] = view.origin
+    for candidate, mask, source in contradicted:  # what nothing else fills, not even the frame's own guess
+        take = mask & (origin == Origin.NOBODY)
+        image[take], depth[take], origin[take] = candidate.image[take], candidate.depth[take], source
     return Fused(image=image, origin=origin, depth=depth)
 
 

@@ -142,6 +142,8 @@ def test_what_one_frame_alone_sees_is_not_replaced_by_what_lies_behind(
     inside = where.mask & (where.image > 0.999)
     assert np.count_nonzero(inside) > 500
     assert np.all(fused.origin[inside] == Origin.GUESSED) and np.all(fused.image[inside] > 0.9)
+    # Where not even a guess is left, the wall is better than nothing, and marked as the others'.
+    assert np.all(_fuse(scene, seen, *darker).origin[inside] >= Origin.OTHER_CAMERA)
     # What the frame does not contradict is still filled: the wall outside its picture.
     assert np.count_nonzero((fused.origin == Origin.OTHER_CAMERA) | (fused.origin == Origin.OTHER_FRAME)) > 50
 
@@ -172,7 +174,9 @@ def test_guesses_come_last_and_nothing_is_kept_unmarked(scene: Any) -> None:
     other = _view(scene, "right", 0, Origin.OTHER_CAMERA)
     fused = _fuse(scene, seen, guess, other)
     with_other, alone = fused.origin == Origin.OTHER_CAMERA, _fuse(scene, seen, other).origin
-    np.testing.assert_array_equal(with_other, alone == Origin.OTHER_CAMERA)
+    # Guesses come after what another camera saw, but before what the frame contradicts.
+    assert np.all(alone[with_other] == Origin.OTHER_CAMERA) and np.any(with_other)
+    assert np.all(fused.origin[(alone == Origin.OTHER_CAMERA) & ~with_other] == Origin.GUESSED)
     assert np.any(fused.origin == Origin.GUESSED)
     nobody = fused.origin == Origin.NOBODY
     np.testing.assert_array_equal(fused.image[nobody], 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ import pandas as pd
 
 from rsbench.benchmark.studies.claim_rules import Check, verdict
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.isolation import one_line
 
 COINCIDES_DB, ACCURATE_PX, FAR_SHARE = 30.0, 0.1, 0.05
 PUBLISHED = ("rs-stereo-linear", "rs-stereo-linear-symmetric")
@@ -43,7 +45,7 @@ def motion_on_images(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
 
 def sgm_is_accurate(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
     """Per sequence and motion, cameras in step: median disparity error and share of pixels 2 m off."""
-    rows = table[(table.delay == 0.0) & ~table.opposite.astype(bool)].to_dict("records")
+    rows = table[(table["delay"] == 0.0) & ~table["opposite"].astype(bool)].to_dict("records")
     checks = [
         Check(
             f"{row['sequence']} ({row['stratum']})",
@@ -58,13 +60,13 @@ def sgm_is_accurate(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
 
 def almost_coincides(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
     """Per sequence: PSNR of the corrected views, from estimated motion and SGM depth."""
-    rows = table[(table.corrector == "fusion") & (table.matcher == "sgm") & (table.solver != "true")]
+    rows = table[(table["corrector"] == "fusion") & (table["matcher"] == "sgm") & (table["solver"] != "true")]
     found = {}
     for solver, own in rows.groupby("solver", sort=False):
         for pixels, what in (("visible", "what the frame saw"), ("all", "all pixels")):
-            psnr = own[own.pixels == pixels].groupby("sequence", sort=False).psnr.mean()
+            psnr = own[own["pixels"] == pixels].groupby("sequence", sort=False)["psnr"].mean()
             checks = [Check(str(name), bool(value >= COINCIDES_DB)) for name, value in psnr.items()]
-            words = "; ".join(f"{name}: {value:.1f} dB" for name, value in psnr.items())
+            words = "; ".join(f"{name}: {value:.2f} dB" for name, value in psnr.items())
             found[f"{solver}, {what}"] = (checks, words)
     return found
 
@@ -124,14 +126,23 @@ def judge_image_claims(results: Path) -> pd.DataFrame:
     """One row per claim and who is judged: verdict and figures.
 
     Raises:
-        RsbenchError: a table is missing.
+        RsbenchError: a table is missing or damaged.
     """
     rows = []
     for claim in IMAGE_CLAIMS:
         path = results / claim.table
+        target = claim.table.partition("/")[0]
         if not path.is_file():
-            target = claim.table.partition("/")[0]
             raise RsbenchError(f"{path}: no such table; run: rsbench reproduce {target}")
-        for who, (checks, words) in claim.check(pd.read_csv(path)).items():
+        try:
+            content = path.read_text("utf-8")
+            if not content.endswith("\n"):
+                raise ValueError("the last line has no end")
+            found = claim.check(pd.read_csv(io.StringIO(content)))
+        except (KeyError, ValueError) as error:  # no such column or row; no table
+            raise RsbenchError(
+                f"{path}: cut short, or another version's ({one_line(error)}); run: rsbench reproduce {target}"
+            ) from error
+        for who, (checks, words) in found.items():
             rows.append({"claim": claim.key, "who": who, "verdict": verdict(checks, "scene"), "figures": words})
     return pd.DataFrame(rows)

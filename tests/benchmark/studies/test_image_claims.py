@@ -11,6 +11,7 @@ from rsbench.benchmark.studies.claim_rules import verdict
 from rsbench.benchmark.studies.image_claims import (
     IMAGE_CLAIMS,
     PUBLISHED,
+    ImageClaim,
     almost_coincides,
     judge_image_claims,
     motion_on_images,
@@ -87,3 +88,16 @@ def test_the_page_is_that_of_the_committed_results() -> None:
 def test_missing_results_are_named(tmp_path: Path) -> None:
     with pytest.raises(RsbenchError, match=r"pose\.csv: no such table; run: rsbench reproduce images"):
         judge_image_claims(tmp_path)
+
+
+@pytest.mark.parametrize("claim", IMAGE_CLAIMS, ids=lambda claim: claim.table)
+@pytest.mark.parametrize("left", [0, 3, 200])
+def test_a_table_that_is_cut_short_is_one_line(tmp_path: Path, claim: ImageClaim, left: int) -> None:
+    for other in IMAGE_CLAIMS:
+        (tmp_path / other.table).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / other.table).write_bytes((ROOT / "results" / other.table).read_bytes())
+    path = tmp_path / claim.table
+    path.write_bytes(path.read_bytes()[:left])
+    with pytest.raises(RsbenchError, match="reproduce") as caught:
+        judge_image_claims(tmp_path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
