@@ -10,6 +10,7 @@ readout ratio 0; --ratio none has it estimated, with the disparity offset, from 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,9 +39,12 @@ def read_matrices(path: Path) -> FloatArray:
         raise RsbenchError(f"{path}: no such file")
     lines = [line.rpartition(":")[2].split() for line in path.read_text("utf-8").splitlines() if line.strip()]
     try:
-        return np.array(lines, dtype=np.float64).reshape(-1, 3, 4)
+        matrices = np.array(lines, dtype=np.float64).reshape(-1, 3, 4)
     except ValueError:
-        raise RsbenchError(f"{path}: every line must hold twelve numbers") from None
+        matrices = np.full((1, 3, 4), np.nan)
+    if not np.all(np.isfinite(matrices)):
+        raise RsbenchError(f"{path}: every line must hold twelve numbers")
+    return matrices
 
 
 def read_rig(folder: Path, image: Path) -> StereoRig:
@@ -50,8 +54,12 @@ def read_rig(folder: Path, image: Path) -> StereoRig:
         raise RsbenchError(f"{folder / 'calib.txt'}: {len(matrices)} matrices; those of both cameras are needed")
     left, right = matrices[:2]
     height, width = read_frame(image).shape[:2]
-    camera = PinholeCamera(width=width, height=height, fx=left[0, 0], fy=left[1, 1], cx=left[0, 2], cy=left[1, 2])
-    return StereoRig(camera=camera, baseline=float(left[0, 3] - right[0, 3]) / camera.fx)
+    fx, fy, cx, cy = left[0, 0], left[1, 1], left[0, 2], left[1, 2]
+    try:
+        camera = PinholeCamera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+        return StereoRig(camera=camera, baseline=float(left[0, 3] - right[0, 3]) / camera.fx)
+    except ValueError as error:
+        raise RsbenchError(f"{folder / 'calib.txt'}: {error}") from error
 
 
 def true_motion(before: FloatArray, after: FloatArray, rig: StereoRig) -> tuple[FloatArray, FloatArray]:
@@ -62,13 +70,30 @@ def true_motion(before: FloatArray, after: FloatArray, rig: StereoRig) -> tuple[
     return R, t - offset + R @ offset
 
 
+def readout_ratio(word: str) -> float | None:
+    """From the command line; None for "none"."""
+    try:
+        ratio = None if word == "none" else float(word)
+    except ValueError:
+        ratio = math.nan
+    if ratio is None or 0.0 <= ratio <= 1.0:
+        return ratio
+    raise argparse.ArgumentTypeError(f"{word!r} must be a number from 0 to 1, or none")
+
+
+def step(word: str) -> int:
+    if not word.isdecimal() or int(word) < 1:
+        raise argparse.ArgumentTypeError(f"{word!r} must be a whole number above 0")
+    return int(word)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--left", default="image_0")
     parser.add_argument("--right", default="image_1")
-    parser.add_argument("--ratio", default="0", help="readout ratio, or none")
-    parser.add_argument("--every", type=int, default=1, help="score every n-th window")
+    parser.add_argument("--ratio", type=readout_ratio, default=0.0, help="readout ratio from 0 to 1, or none")
+    parser.add_argument("--every", type=step, default=1, help="score every n-th window")
     given = parser.parse_args(arguments)
     try:
         sys.stdout.writelines(f"{line}\n" for line in score(given))
@@ -88,13 +113,11 @@ def score(given: argparse.Namespace) -> list[str]:
         raise RsbenchError(
             f"{given.folder}: {len(files[0])} left and {len(files[1])} right images, {len(poses)} poses"
         )
-    ratio, offset, lines = 0.0, 0.0, []
-    if given.ratio == "none":
+    ratio, offset, lines = given.ratio, 0.0, []
+    if ratio is None:
         found = estimate_sequence_readout(sources[0], sources[1], rig, options)
         ratio, offset = found.readout_ratio, found.disparity_offset
         lines.append(f"readout ratio {found}, disparity offset {offset:+.2f} +- {found.offset_sigma:.2f} px")
-    else:
-        ratio = float(given.ratio)
     rows, refused = [], 0
     for k in range(0, len(poses) - 1, given.every):
         images = {

@@ -68,3 +68,24 @@ def test_what_is_missing_is_named(
     (folder / name).unlink()
     assert script.main([str(folder)]) == 2
     assert name in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [("--ratio", "nan"), ("--ratio", "half"), ("--ratio", "1.5"), ("--every", "0")])
+def test_options_that_mean_nothing_are_refused(
+    script: ModuleType, folder: Path, words: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        script.main([str(folder), *words])
+    assert end.value.code == 2 and f"argument {words[0]}: {words[1]!r} must be" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["calib.txt", "poses.txt"])
+@pytest.mark.parametrize("damage", ["nan", "one", ""])
+def test_damaged_numbers_are_one_line(
+    script: ModuleType, folder: Path, name: str, damage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = folder / name
+    path.write_text(path.read_text().replace(" 0 ", f" {damage} ", 1))
+    assert script.main([str(folder)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{name}: every line must hold twelve numbers" in line
