@@ -69,7 +69,8 @@ def _pose_table(out: Path) -> SummaryTable:
     frame = frame.rename(columns=words)
     counts = [name for name in ("runs", "failures") if name in frame]
     brief = frame[["sequence", "solver", "assumes", *headings.values(), "inliers", "matches", *counts]]
-    return SummaryTable(title="Relative pose", note=note, frame=frame, brief=brief)
+    told_first = frame[[*brief, *[name for name in frame if name not in brief]]]
+    return SummaryTable(title="Relative pose", note=note, frame=told_first, brief=brief)
 
 
 def _over_seeds(scores: pd.DataFrame, metrics: list[str]) -> tuple[pd.DataFrame, str]:
