@@ -1,5 +1,37 @@
-"""``python -m rsbench``."""
+"""``python -m rsbench`` and the command ``rsbench``."""
 
-from rsbench.cli.main import run
+import os
+import signal
+import sys
 
-run()
+
+def main() -> None:
+    """Run the command line; a signal while it is loaded ends the process in one line, or without one."""
+    _open_streams()
+    heard = [each for each in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(each) != signal.SIG_IGN]
+    for number in heard:
+        signal.signal(number, signal.SIG_DFL)
+    from rsbench.cli.stopping import end_at_once
+
+    for number in heard:
+        signal.signal(number, end_at_once)
+    from rsbench.cli.main import run
+
+    run()
+
+
+def _open_streams() -> None:
+    """Standard streams that are closed lead nowhere: else the next file opened would get what is printed."""
+    for descriptor, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            if nowhere != descriptor:
+                os.dup2(nowhere, descriptor)
+                os.close(nowhere)
+            setattr(sys, name, os.fdopen(descriptor, mode, closefd=False))
+
+
+if __name__ == "__main__":
+    main()

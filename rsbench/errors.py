@@ -5,3 +5,6 @@ from __future__ import annotations
 
 class RsbenchError(Exception):
     """Bad input: the message names the file, the field, the value and what is allowed."""
+
+    exit_code = 2
+    """Of the command that it ends."""

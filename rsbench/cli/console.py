@@ -64,31 +64,6 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[str], None]]:
         yield advance
 
 
-class _Terminated(KeyboardInterrupt):
-    """SIGTERM, which ends work like Ctrl-C."""
-
-
-@contextmanager
-def stoppable(resume: str = "the same command resumes where it stopped") -> Iterator[None]:
-    """Work that Ctrl-C and SIGTERM end with one line that says how to go on, and exit codes 130 and 143."""
-    import signal
-    import sys
-
-    import typer
-
-    def terminate(number: int, frame: object) -> None:
-        raise _Terminated
-
-    before = signal.signal(signal.SIGTERM, terminate)
-    try:
-        yield
-    except KeyboardInterrupt as error:
-        sys.stderr.write(f"interrupted; {resume}\n")
-        raise typer.Exit(143 if isinstance(error, _Terminated) else 130) from error
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 @contextmanager
 def late_progress(label: str) -> Iterator[Callable[[str], None]]:
     """A count of steps on a terminal's stderr, for work of more than two seconds; stdout stays free."""

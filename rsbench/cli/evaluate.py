@@ -104,11 +104,11 @@ def evaluate_dataset(folder: Path, out: Path, options: EvaluationOptions | None,
     """
     from rsbench.benchmark.images.evaluation import open_evaluation
     from rsbench.benchmark.images.plan import EvaluationOptions
-    from rsbench.cli.console import print_table, progress_bar, stoppable
+    from rsbench.cli.console import print_table, progress_bar
     from rsbench.report.evaluation_page import summary_tables, write_report
 
     evaluation = open_evaluation(folder, out, options or EvaluationOptions(solvers=tuple(every_solver())))
-    with stoppable(), progress_bar(f"evaluating {folder.name}", evaluation.steps) as advance:
+    with progress_bar(f"evaluating {folder.name}", evaluation.steps) as advance:
         stale = evaluation.run(command, advance)
     for table in summary_tables(out):
         print_table(table.title, table.brief)

@@ -35,7 +35,7 @@ def generate(
     ] = False,
 ) -> None:
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
-    from rsbench.cli.console import progress_bar, stoppable
+    from rsbench.cli.console import progress_bar
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import STEPS, generate_dataset
     from rsbench.renderers.backend import start_backend
@@ -47,7 +47,7 @@ def generate(
     if backend.message:
         typer.echo(backend.message, err=True)
     steps = STEPS * len(dataset.sequence)
-    with stoppable(), progress_bar(f"rendering {dataset.name}", steps) as advance:
+    with progress_bar(f"rendering {dataset.name}", steps) as advance:
         rendered = generate_dataset(dataset, out, workers=workers, full_frames=full_frames, progress=advance)
     typer.echo(f"{out}: {len(dataset.sequence)} sequences, {len(rendered)} rendered now")
 

@@ -23,6 +23,7 @@ from rsbench.cli import (
     verify,
 )
 from rsbench.cli import list_cards as cards
+from rsbench.cli.stopping import stoppable
 from rsbench.errors import RsbenchError
 
 app = typer.Typer(
@@ -31,7 +32,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     help="Rolling-shutter stereo: render data with exact ground truth, solve, correct and score.",
-    epilog="Start with: [bold]rsbench demo[/bold]   Exit codes: 0 done, 1 ran but failed, 2 bad input.",
+    epilog="Start with: [bold]rsbench demo[/bold]   Exit codes: 0 done, 1 ran but failed, 2 bad input, "
+    "130 interrupted.",
 )
 
 
@@ -77,13 +79,14 @@ for module in (
 def run() -> None:
     """Entry point: known errors become one line on stderr and exit code 2."""
     try:
-        app(prog_name="rsbench")
+        with stoppable():
+            app(prog_name="rsbench")
     except RsbenchError as error:
-        _fail(str(error))
+        _fail(str(error), error.exit_code)
     except OSError as error:  # a full disk or a folder without permission, wherever it is met
         _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
 
 
-def _fail(message: str) -> None:
+def _fail(message: str, code: int = 2) -> None:
     sys.stderr.write(f"rsbench: error: {' '.join(message.split())}\n")
-    sys.exit(2)
+    sys.exit(code)

@@ -79,20 +79,19 @@ def run_and_summarise(
     from rsbench.benchmark.provenance import provenance
     from rsbench.benchmark.simulated.run_sweep import run_sweep, sweep_steps
     from rsbench.benchmark.simulated.sweep_summary import summarise_sweep
-    from rsbench.cli.console import progress_bar, stoppable
+    from rsbench.cli.console import progress_bar
     from rsbench.dataset.files import write_json
 
-    with stoppable():
-        with progress_bar(f"simulating {card.name}", sweep_steps(card)) as advance:
-            run_sweep(
-                card,
-                out,
-                workers=workers or os.cpu_count() or 1,
-                progress=advance,
-                time_limit_s=time_limit_s,
-                force=force,
-            )
-        table = summarise_sweep(out)
+    with progress_bar(f"simulating {card.name}", sweep_steps(card)) as advance:
+        run_sweep(
+            card,
+            out,
+            workers=workers or os.cpu_count() or 1,
+            progress=advance,
+            time_limit_s=time_limit_s,
+            force=force,
+        )
+    table = summarise_sweep(out)
     write_json(out / "provenance.json", provenance(command, sweep=card.name, seed=card.seed, trials=card.trials))
     return table
 

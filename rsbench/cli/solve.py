@@ -73,14 +73,12 @@ def solve(
         return
     if not problems:
         raise RsbenchError("PROBLEM: none given; give files, folders or -, or have a sample made by --example")
-    from rsbench.cli.console import stoppable
     from rsbench.solvers.engine.registry import load_solver_entries
 
     wanted, options, limit = _extras(extras, json), _options(threshold_px), _limit(time_limit)
     entries = load_solver_entries(solver or ["rs-stereo"])
     _check_model(motion_model, entries)
-    with stoppable("nothing is kept; what was answered stays answered"):
-        code = _tell(_answers(problems, entries, options, seed, wanted, limit, motion_model), json)
+    code = _tell(_answers(problems, entries, options, seed, wanted, limit, motion_model), json)
     if code:
         raise typer.Exit(code)
 
