@@ -14,7 +14,7 @@ import json
 import math
 import os
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from types import UnionType
@@ -23,13 +23,18 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from rsbench.errors import RsbenchError
+from rsbench.reading import CARD_BYTES, read_text
 
 T = TypeVar("T")
 CardKind = Literal[
     "scenes", "renderers", "solvers", "datasets", "sweeps", "matchers", "features", "correctors", "metrics"
 ]
 
-_CONFIG = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+Extra = Literal["forbid", "ignore"]
+_LONGEST = 100
+"""Characters of a value in a message."""
+_DEEPEST = 64
+"""Levels of tables and arrays."""
 _UNKNOWN_KEY = ("unexpected_keyword_argument", "extra_forbidden")
 
 
@@ -72,16 +77,17 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises:
         RsbenchError: the file cannot be read, or is not TOML (with the line and column).
     """
+    text = read_text(path, CARD_BYTES)
     try:
-        return tomllib.loads(path.read_bytes().decode("utf-8"))
-    except OSError as error:
-        raise RsbenchError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return tomllib.loads(text)
+    except ValueError as error:  # not TOML, or a number of thousands of digits
         raise RsbenchError(f"{path}: not valid TOML: {error}") from error
+    except RecursionError as error:
+        raise RsbenchError(f"{path}: not valid TOML: nested too deeply") from error
 
 
-def parse_card(cls: type[T], data: Mapping[str, Any], where: str) -> T:
-    """Turn the tables of a card into the dataclass ``cls``.
+def parse_card(cls: type[T], data: Mapping[str, Any], where: str, *, extra: Extra = "forbid") -> T:
+    """Turn the tables of a card, or what JSON holds, into the dataclass ``cls``.
 
     Types are strict (no text for a number, no truth value for a number; a whole number may stand for a real
     one), numbers are finite, and a key that no field has is refused at every level of nesting. A
@@ -89,17 +95,18 @@ def parse_card(cls: type[T], data: Mapping[str, Any], where: str) -> T:
 
     Args:
         cls: a dataclass whose fields are scalars, ``Literal``s, tuples, dicts and further dataclasses.
-        data: what ``tomllib`` read.
+        data: what ``tomllib`` or ``json`` read.
         where: the file, for messages.
+        extra: "ignore" passes over keys that no field has, as a reader of files of later versions must.
 
     Raises:
         RsbenchError: one line with ``where``, the dotted field, the value and what is allowed.
     """
     card: tuple[T]
-    check_finite(data, where)
+    check_values(data, where)
     try:
         # Strict JSON validation reads arrays as tuples and tables as dataclasses, as TOML means them.
-        card = _adapter(cls).validate_json(json.dumps([data], default=str))  # type: ignore[arg-type]
+        card = _adapter(cls, extra).validate_json(json.dumps([data], default=str))  # type: ignore[arg-type]
     except ValidationError as error:
         raise RsbenchError(f"{where}: {_first_problem(cls, error)}") from None
     except RsbenchError as error:
@@ -108,23 +115,36 @@ def parse_card(cls: type[T], data: Mapping[str, Any], where: str) -> T:
 
 
 @functools.lru_cache(maxsize=64)
-def _adapter(cls: type) -> TypeAdapter[Any]:
+def _adapter(cls: type, extra: Extra) -> TypeAdapter[Any]:
     """Kept, for it takes a hundred times as long to make as to use.
 
     pydantic takes no settings for a standard dataclass itself, but hands those of a container down to it.
     """
-    return TypeAdapter(tuple[cls], config=_CONFIG)  # type: ignore[valid-type]
+    config = ConfigDict(extra=extra, strict=True, allow_inf_nan=False)
+    return TypeAdapter(tuple[cls], config=config)  # type: ignore[valid-type]
 
 
-def check_finite(data: Mapping[str, Any], where: str) -> None:
-    """Refuse numbers that are not finite, however deep they lie.
+def check_values(data: Mapping[str, Any], where: str) -> None:
+    """Refuse numbers that are not finite, however deep they lie, and what lies too deep.
+
+    Fields typed ``Any`` would let them pass.
 
     Raises:
         RsbenchError: one line with ``where`` and the dotted field.
     """
-    stray = next(_not_finite(data), None)
-    if stray is not None:
-        raise RsbenchError(f"{where}: {stray}: numbers must be finite")
+    todo: list[tuple[Any, tuple[object, ...]]] = [(data, ())]
+    while todo:
+        values, keys = todo.pop()
+        if len(keys) > _DEEPEST:
+            raise RsbenchError(
+                f"{where}: {'.'.join(map(str, keys[:3]))}...: nested more than {_DEEPEST} levels deep"
+            )
+        for key, value in values.items() if isinstance(values, Mapping) else enumerate(values):
+            if isinstance(value, Mapping | list | tuple):
+                todo.append((value, (*keys, key)))
+            elif isinstance(value, float) and not math.isfinite(value):
+                field = ".".join(map(str, (*keys, key)))
+                raise RsbenchError(f"{where}: {field} = {value}: numbers must be finite")
 
 
 def choices(value: str, names: Iterable[str]) -> str:
@@ -146,18 +166,6 @@ def _card_folder(kind: CardKind) -> Path:
     return shipped_folder(kind, f"_cards/{kind}")
 
 
-def _not_finite(value: Any, field: str = "") -> Iterator[str]:
-    """Fields that are not finite; fields typed ``Any`` would let them pass."""
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from _not_finite(item, f"{field}.{key}" if field else str(key))
-    elif isinstance(value, list | tuple):
-        for number, item in enumerate(value):
-            yield from _not_finite(item, f"{field}.{number}")
-    elif isinstance(value, float) and not math.isfinite(value):
-        yield f"{field} = {value}"
-
-
 def _first_problem(cls: type, error: ValidationError) -> str:
     """One problem of many; a misspelt key first, for it also causes the 'required' ones."""
     problems = error.errors(include_url=False)
@@ -171,7 +179,14 @@ def _first_problem(cls: type, error: ValidationError) -> str:
     message = problem["msg"].removeprefix("Value error, ")
     if not field:
         return message
-    return f"{field} = {problem['input']!r}: {message[:1].lower()}{message[1:]}"
+    whole = problem["type"] == "value_error" and isinstance(problem["input"], dict)
+    value = "" if whole else f" = {_short(problem['input'])}"
+    return f"{field}{value}: {message[:1].lower()}{message[1:]}"
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 def _keys_at(kind: Any, location: Sequence[int | str]) -> list[str]:

@@ -17,7 +17,7 @@ from rsbench.cards import choices
 from rsbench.core import so3
 from rsbench.core.motion import Motion
 from rsbench.errors import RsbenchError
-from rsbench.imports import blaming
+from rsbench.imports import blaming, import_target
 from rsbench.plugins import Kind, NoOptions, list_names, load_class
 
 MOTIONS: Kind[Motion, NoOptions] = Kind(
@@ -71,10 +71,15 @@ def motion_record(motion: Motion) -> dict[str, Any]:
 def read_motion(record: Mapping[str, Any]) -> Motion:
     """The motion of a ``motion_record``.
 
+    A class that it names must be installed or on Python's path: no code is run from the folder where data happen
+    to lie.
+
     Raises:
         RsbenchError: see ``make_motion``.
         KeyError: ``model``, ``w`` or ``d`` is missing.
     """
+    if ":" in record["model"]:
+        import_target(record["model"], None, f"motion model = {record['model']!r}")
     return make_motion(record["model"], record["w"], record["d"], record.get("parameters", {}))
 
 
@@ -89,7 +94,7 @@ def make_motion(name: str, w: ArrayLike, d: ArrayLike, parameters: Mapping[str, 
     if not _foreign(model):
         try:
             return model(w, d, **dict(parameters or {}))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, ArithmeticError, LookupError) as error:  # parameters of any type and shape
             raise RsbenchError(f"{where}: {error}") from error
     with blaming(where, "cannot be made"):
         motion = model(w, d, **dict(parameters or {}))

@@ -23,7 +23,7 @@ from typing import Any, Generic, TypeVar
 
 from pydantic.errors import PydanticUserError
 
-from rsbench.cards import CardKind, card_path, check_finite, choices, list_cards, parse_card, read_toml
+from rsbench.cards import CardKind, card_path, check_values, choices, list_cards, parse_card, read_toml
 from rsbench.errors import RsbenchError
 from rsbench.identity import component_key, own_source_version, source_version
 from rsbench.imports import blaming, import_target, in_words, try_import
@@ -352,7 +352,7 @@ def make_component(
     Raises:
         RsbenchError: an unknown or wrong parameter, or whatever the class raises: one line.
     """
-    check_finite(parameters, f"{where}: parameters")
+    check_values(parameters, f"{where}: parameters")
     if _has_dataclass_init(cls):
         component = _blamed_parse(cls, parameters, where)
     else:

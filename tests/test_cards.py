@@ -92,7 +92,7 @@ def test_invalid_toml_names_the_line(tmp_path: Path) -> None:
     with pytest.raises(RsbenchError, match="line 2"):
         read_toml(path)
     path.write_bytes(b'name = "\xff"\n')
-    with pytest.raises(RsbenchError, match="not valid TOML"):
+    with pytest.raises(RsbenchError, match="not UTF-8 text"):
         read_toml(path)
 
 

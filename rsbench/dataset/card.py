@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,6 +16,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
 from rsbench.imports import search
 from rsbench.motions import drawn_parameters, fixed_endpoint, make_motion
+from rsbench.reading import check_name, check_size
 
 Vector = tuple[float, float, float]
 Axis = Vector | str
@@ -124,8 +124,7 @@ class SequenceCard:
     """Replaces the dataset's seed."""
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", self.name):
-            raise ValueError(f"name = {self.name!r}: a folder name of letters, digits, '.', '_' and '-'")
+        check_name(self.name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,6 +147,7 @@ class DatasetCard:
     sequence: tuple[SequenceCard, ...] = field(default=())
 
     def __post_init__(self) -> None:
+        check_size("camera", (self.camera.width, self.camera.height))
         self.shutter()
         for sequence in self.sequence:
             self.rig_of(sequence)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import hashlib
 import io
 import json
 import os
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +21,9 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
+from rsbench.reading import check_image_size, check_size, read_bytes, read_text
+from rsbench.reading import load_arrays as load_arrays
+from rsbench.reading import read_json as read_json
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,34 +38,42 @@ def sha256(path: Path) -> str:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write through a temporary file in the same folder, so the name never holds half of it."""
+    """Write through a temporary file in the same folder, so the name never holds half of it.
+
+    Raises:
+        RsbenchError: one line with the file, the bytes that it needs, the reason and a remedy.
+    """
     partial = path.with_name(f".{path.name}.partial")
-    with partial.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(partial, path)
+    try:
+        with partial.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(partial, path)
+    except OSError as error:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        remedy = "make room there and run the same command again" if full else "choose another --out"
+        raise RsbenchError(f"{path}: cannot be written, {len(data)} bytes: {error.strerror}; {remedy}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+
+
+def open_folder(out: Path) -> None:
+    """Make a folder of results, if missing, and see that it can be written: before minutes of work, not after.
+
+    Raises:
+        RsbenchError: it cannot.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=out).close()
+    except OSError as error:
+        raise RsbenchError(f"{out}: cannot be written: {error.strerror}; choose another --out") from error
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     write_bytes(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object.
-
-    Raises:
-        RsbenchError: missing, unreadable, or not a JSON object.
-    """
-    try:
-        content = json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise RsbenchError(f"{path}: cannot be read: {error.strerror}") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise RsbenchError(f"{path}: not valid JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise RsbenchError(f"{path}: must hold a JSON object, holds a {type(content).__name__}")
-    return content
 
 
 def write_png(path: Path, image: NDArray[np.uint8]) -> None:
@@ -71,15 +85,19 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
     write_bytes(path, data.tobytes())
 
 
-def read_png(path: Path) -> NDArray[np.uint8]:
+def read_png(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
     """RGB image (H, W, 3) uint8.
 
+    Args:
+        path: of an image file.
+        size: width and height that it must have; without them, it is of at most ``reading.PIXELS``.
+
     Raises:
-        RsbenchError: missing or not an image.
+        RsbenchError: missing, not an image or of another size.
     """
-    if not path.is_file():
-        raise RsbenchError(f"{path}: no such image")
-    pixels = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    data = read_bytes(path)
+    check_image_size(data, path, size)
+    pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
     if pixels is None:
         raise RsbenchError(f"{path}: cannot be decoded as an image")
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
@@ -90,33 +108,48 @@ def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    partial = path.with_name(f".{path.name}.partial")
+    content = io.BytesIO()  # OpenEXR does not tell of a full disk in one way, write_bytes does
     with OpenEXR.File(header, {"Z": np.ascontiguousarray(depth, dtype=np.float32)}) as file:
-        file.write(str(partial))
-    os.replace(partial, path)
+        file.write(content)
+    write_bytes(path, content.getvalue())
 
 
-def read_depth(path: Path) -> NDArray[np.float32]:
-    """Channel Z (H, W) float32, metres, 0 = no surface.
+def read_depth(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
+    """Channel Z (H, W) float32, metres, 0 = no surface; ``size`` as of ``read_png``.
 
     Raises:
-        RsbenchError: missing, damaged, without a float32 channel Z, or with negative or non-finite depth.
+        RsbenchError: missing, damaged, of another size, with anything but one float32 channel Z in scanlines, or
+            with negative or non-finite depth.
     """
     import OpenEXR
 
-    if not path.is_file():
-        raise RsbenchError(f"{path}: no such depth file")
+    data = read_bytes(path)
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = file.channels()
-            pixels = np.array(channels["Z"].pixels) if "Z" in channels else None
+        with OpenEXR.File(io.BytesIO(data), header_only=True) as file:
+            _check_depth_header([part.header for part in file.parts], path, size)
+        with OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:
+            pixels = np.array(file.channels()["Z"].pixels)
+    except RsbenchError:
+        raise
     except Exception as error:  # OpenEXR raises plain RuntimeError, ValueError and others for damaged files
         raise RsbenchError(f"{path}: damaged or not an EXR file ({str(error).splitlines()[0]})") from error
-    if pixels is None or pixels.dtype != np.float32 or pixels.ndim != 2:
+    if pixels.dtype != np.float32 or pixels.ndim != 2:
         raise RsbenchError(f"{path}: must hold a float32 channel Z")
     if not np.all(np.isfinite(pixels)) or np.any(pixels < 0):
         raise RsbenchError(f"{path}: depth must be finite and not negative (0 = no surface)")
     return pixels
+
+
+def _check_depth_header(headers: list[dict[str, Any]], path: Path, size: tuple[int, int] | None) -> None:
+    """Before pixels are decoded: one part, one channel, and not more of it than there should be."""
+    import OpenEXR
+
+    names = [channel.name for header in headers for channel in header["channels"]]
+    if len(headers) != 1 or headers[0]["type"] != OpenEXR.scanlineimage or names != ["Z"]:
+        raise RsbenchError(f"{path}: must hold one part of scanlines with one channel, Z, of float32")
+    first, last = headers[0]["dataWindow"]
+    width, height = (int(end) - int(start) + 1 for start, end in zip(first, last, strict=True))
+    check_size(path, (width, height), size)
 
 
 def write_poses(path: Path, tau: FloatArray, poses: Pose) -> None:
@@ -132,11 +165,9 @@ def read_poses(path: Path) -> tuple[FloatArray, Pose]:
     Raises:
         RsbenchError: missing or not in the format of ``write_poses``.
     """
+    lines = read_text(path).splitlines()
     try:
-        lines = path.read_text("utf-8").splitlines()
         table = np.array([[float(x) for x in line.split(",")] for line in lines[1:]])
-    except OSError as error:
-        raise RsbenchError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:
         raise RsbenchError(f"{path}: not a table of numbers: {error}") from error
     if not lines or lines[0] != POSE_COLUMNS or table.ndim != 2 or table.shape[1] != 9:
@@ -151,7 +182,11 @@ def save_matches(path: Path, matches: Correspondences) -> None:
 
 
 def load_matches(path: Path) -> Correspondences:
-    return Correspondences(**load_arrays(path))
+    """Raises RsbenchError as ``load_arrays``, and for arrays that are no matches."""
+    try:
+        return Correspondences(**load_arrays(path))
+    except (TypeError, ValueError) as error:
+        raise RsbenchError(f"{path}: {error}") from error
 
 
 def save_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
@@ -159,11 +194,6 @@ def save_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     write_bytes(path, buffer.getvalue())
-
-
-def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    with np.load(path, allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
 
 
 def write_table(path: Path, frame: pd.DataFrame) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.cards import parse_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
@@ -18,8 +20,9 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.files import read_depth, read_json, read_png, read_poses
 from rsbench.errors import RsbenchError
 from rsbench.motions import motion_record, read_motion
+from rsbench.reading import check_name, check_size, inside
 
-FORMAT = 1
+FORMAT = CONVENTIONS = 1
 FRAMES = (0, 1)
 Shutter = Literal["rs", "gs"]
 SHUTTERS: tuple[Shutter, Shutter] = ("rs", "gs")
@@ -38,6 +41,73 @@ RELATIVE_FILES = tuple(
 )
 
 
+Vector = tuple[float, float, float]
+M = TypeVar("M")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionManifest:
+    """A motion as ``motions.motion_record`` writes it."""
+
+    model: str
+    w: Vector
+    d: Vector
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceManifest:
+    """What sequence.json must hold; it holds more."""
+
+    format: int
+    conventions: int
+    name: str
+    camera: PinholeCamera
+    baseline: float
+    readout_ratio: float
+    frame_period_s: float
+    readout_time_s: float
+    row_time_s: float
+    motion: MotionManifest
+    files: dict[str, str] = field(default_factory=dict)
+    """sha256 by the path below the sequence's folder."""
+
+    def __post_init__(self) -> None:
+        check_name(self.name)
+        if self.conventions != CONVENTIONS:
+            raise ValueError(f"conventions = {self.conventions}: this version reads {CONVENTIONS}")
+        check_size("camera", (self.camera.width, self.camera.height))
+        if not self.frame_period_s > 0.0:
+            raise ValueError(f"frame_period_s = {self.frame_period_s}: must be positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileManifest:
+    """One file, as dataset.json lists it."""
+
+    sha256: str
+    size: int
+    """Bytes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetManifest:
+    """What dataset.json must hold; it holds more."""
+
+    format: int
+    sequences: tuple[str, ...]
+    files: dict[str, FileManifest]
+    """By the path below the dataset's folder."""
+    name: str = ""
+    card: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for number, name in enumerate(self.sequences):
+            check_name(name)
+            if name in self.sequences[:number]:
+                raise ValueError(f"sequences: {name!r} stands there twice")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Sequence:
     """A sequence folder of format 1; frames 0 and 1, sides left and right."""
@@ -53,10 +123,7 @@ class Sequence:
 
     def image(self, shutter: Shutter, side: Side, frame: int) -> NDArray[np.uint8]:
         """(H, W, 3) sRGB; ``gs`` is the global-shutter image at the pose of the frame's row 0."""
-        path = self.folder / shutter / f"{side}_{frame}.png"
-        pixels = read_png(path)
-        self._check_size(path, pixels.shape[:2])
-        return pixels
+        return read_png(inside(self.folder, f"{shutter}/{side}_{frame}.png"), self._size)
 
     def images(self, shutter: Shutter = "rs") -> list[NDArray[np.uint8]]:
         """Left 0, right 0, left 1, right 1: the order of ``rsbench.match`` and ``rsbench.correct``."""
@@ -64,25 +131,19 @@ class Sequence:
 
     def depth(self, shutter: Shutter, side: Side, frame: int) -> NDArray[np.float32]:
         """(H, W) z in the camera of the row that saw the pixel, metres, 0 = no surface."""
-        path = self.folder / f"{shutter}_depth" / f"{side}_{frame}.exr"
-        depth = read_depth(path)
-        self._check_size(path, depth.shape)
-        return depth
+        return read_depth(inside(self.folder, f"{shutter}_depth/{side}_{frame}.exr"), self._size)
 
     def poses(self, side: Side, frame: int) -> tuple[FloatArray, Pose]:
         """Row times (H,) and ``cam_from_world`` (H, 3, 3), (H, 3) as stored."""
-        path = self.folder / "poses" / f"{side}_{frame}.csv"
+        path = inside(self.folder, f"poses/{side}_{frame}.csv")
         tau, poses = read_poses(path)
         if len(tau) != self.shutter.height:
             raise RsbenchError(f"{path}: has {len(tau)} rows, the camera has {self.shutter.height}")
         return tau, poses
 
-    def _check_size(self, path: Path, shape: tuple[int, ...]) -> None:
-        camera = self.rig.camera
-        if shape != (camera.height, camera.width):
-            raise RsbenchError(
-                f"{path}: is {shape[1]} x {shape[0]} pixels, the camera {camera.width} x {camera.height}"
-            )
+    @property
+    def _size(self) -> tuple[int, int]:
+        return self.rig.camera.width, self.rig.camera.height
 
 
 def sequence_manifest(
@@ -94,7 +155,7 @@ def sequence_manifest(
     readout_s = shutter.readout_ratio * frame_period_s
     return {
         "format": FORMAT,
-        "conventions": 1,
+        "conventions": CONVENTIONS,
         "name": name,
         "camera": {field: getattr(camera, field) for field in fields},
         "baseline": rig.baseline,
@@ -110,26 +171,26 @@ def read_sequence(folder: Path) -> Sequence:
     """Open a sequence folder.
 
     Raises:
-        RsbenchError: no sequence.json, a format of another version, or a field that is missing or wrong.
+        RsbenchError: no sequence.json, a format of another version, a field that is missing or wrong, or a name
+            that is not the folder's.
     """
-    path = folder / "sequence.json"
-    manifest = read_json(path)
-    if manifest.get("format") != FORMAT:
-        raise RsbenchError(f"{path}: format = {manifest.get('format')!r}; this version reads {FORMAT}")
+    path = inside(folder, "sequence.json")
+    content = read_json(path)
+    manifest = _parsed(SequenceManifest, content, path)
+    if manifest.name != (is_named := os.path.basename(os.path.abspath(folder))):
+        raise RsbenchError(f"{path}: name = {manifest.name!r}: must be the name of its folder, {is_named!r}")
     try:
-        camera = PinholeCamera(**manifest["camera"])
         return Sequence(
             folder=folder,
-            name=str(manifest["name"]),
-            rig=StereoRig(camera=camera, baseline=manifest["baseline"]),
-            shutter=RollingShutter(height=camera.height, readout_ratio=manifest["readout_ratio"]),
-            motion=read_motion(manifest["motion"]),
-            frame_period_s=float(manifest["frame_period_s"]),
-            manifest=manifest,
+            name=manifest.name,
+            rig=StereoRig(camera=manifest.camera, baseline=manifest.baseline),
+            shutter=RollingShutter(height=manifest.camera.height, readout_ratio=manifest.readout_ratio),
+            motion=read_motion(content["motion"]),
+            frame_period_s=manifest.frame_period_s,
+            manifest=content,
         )
-    except (KeyError, TypeError, ValueError, RsbenchError) as error:
-        what = f"{error} is missing or unknown" if isinstance(error, KeyError) else str(error)
-        raise RsbenchError(f"{path}: {what}") from error
+    except (ValueError, RsbenchError) as error:
+        raise RsbenchError(f"{path}: {error}") from error
 
 
 def read_dataset(folder: Path) -> list[Sequence]:
@@ -138,15 +199,24 @@ def read_dataset(folder: Path) -> list[Sequence]:
     Raises:
         RsbenchError: not a finished dataset, or a sequence that cannot be read.
     """
-    path = folder / "dataset.json"
+    return [read_sequence(inside(folder, name)) for name in read_dataset_manifest(folder).sequences]
+
+
+def read_dataset_manifest(folder: Path) -> DatasetManifest:
+    """The dataset.json of a folder.
+
+    Raises:
+        RsbenchError: not a finished dataset, a format of another version, or a field that is missing or wrong.
+    """
+    path = inside(folder, "dataset.json")
     if not path.is_file():
         raise RsbenchError(
             f"{folder}: not a dataset (no dataset.json); make one with: rsbench generate CARD --out DIR"
         )
-    manifest = read_json(path)
-    if manifest.get("format") != FORMAT:
-        raise RsbenchError(f"{path}: format = {manifest.get('format')!r}; this version reads {FORMAT}")
-    names = manifest.get("sequences")
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise RsbenchError(f"{path}: 'sequences' must be a list of names")
-    return [read_sequence(folder / name) for name in names]
+    return _parsed(DatasetManifest, read_json(path), path)
+
+
+def _parsed(cls: type[M], content: dict[str, Any], path: Path) -> M:
+    if content.get("format") != FORMAT:
+        raise RsbenchError(f"{path}: format = {content.get('format')!r}; this version reads {FORMAT}")
+    return parse_card(cls, content, str(path), extra="ignore")

@@ -19,10 +19,12 @@ from rsbench.cards import parse_card, read_toml
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig, View
 from rsbench.errors import RsbenchError
+from rsbench.reading import check_image_size, check_size, read_bytes
 
 _SMALLEST = 32
 """Pixels of the shorter side; below that there is nothing to match."""
 _LARGEST_OFFSET_PX = 10.0
+_MOST_FRAMES = 1e9
 _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm"}
 _READ = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -79,11 +81,11 @@ def read_frame(path: Path) -> NDArray[Any]:
     """Image (H, W) grey or (H, W, 3) RGB, uint8 or uint16; transparency and orientation tags are ignored.
 
     Raises:
-        RsbenchError: missing, not an image, too small, or of another type.
+        RsbenchError: missing, not an image, too small, too large, or of another type.
     """
-    if not path.is_file():
-        raise RsbenchError(f"{path}: no such image file")
-    pixels = cv2.imread(str(path), _READ)
+    data = read_bytes(path)
+    check_image_size(data, path)
+    pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _READ)
     if pixels is None:
         raise RsbenchError(f"{path}: cannot be decoded as an image")
     return _checked(pixels, str(path))
@@ -151,7 +153,8 @@ class FrameSource:
             self.count = len(self._files)
         elif path.is_file():
             video = self._open()
-            self.count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+            count = video.get(cv2.CAP_PROP_FRAME_COUNT)  # as the file says: progress alone believes it
+            self.count = int(count) if 0.0 <= count < _MOST_FRAMES else 0
             video.release()
         else:
             raise RsbenchError(f"{path}: no such folder or video")
@@ -160,6 +163,8 @@ class FrameSource:
         video = cv2.VideoCapture(str(self.path))
         if not video.isOpened():
             raise RsbenchError(f"{self.path}: cannot be read as a video")
+        width, height = (video.get(what) for what in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        check_size(self.path, (int(width), int(height)))
         # Turning frames would turn rows into columns.
         video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         return video

@@ -15,6 +15,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.reading import unpack_arrays
+
 _LENGTH_BYTES = 8
 _LONGEST = 1 << 32
 _KINDS = "biufU"
@@ -42,8 +44,7 @@ def decode(data: bytes, classes: Mapping[str, type]) -> Any:
         ValueError: the bytes are no such value, or a constructor refuses its fields.
     """
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+        arrays = unpack_arrays(io.BytesIO(data), "message", limit=len(data))  # ``encode`` compresses nothing
         return _built(json.loads(str(arrays["tree"])), arrays, classes)
     except ValueError:
         raise

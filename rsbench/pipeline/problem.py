@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rsbench.cards import choices, parse_card, shipped_folder
 from rsbench.core.camera import PinholeCamera
@@ -18,6 +16,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
+from rsbench.reading import FILE_BYTES, check_amount, load_arrays, parse_json
 
 _COLUMNS = {
     "left": "x0, y0, x1, y1",
@@ -114,18 +113,26 @@ def _parsed(file: TextIO, where: str, name: str, lines: bool | None) -> Iterator
     """One problem of a text, or one per line; None: the first line tells, for it is a problem of its own."""
     first = ""
     if lines is None:
-        first = next((line for line in file if line.strip()), "")
+        first = next((line for line in _lines(file, where) if line.strip()), "")
         lines = _is_object(first)
     if not lines:
-        yield _attempt(first + file.read(), where, name)
+        rest = file.read(FILE_BYTES + 1)
+        check_amount(where, "characters", len(rest), FILE_BYTES)
+        yield _attempt(first + rest, where, name)
         return
     number = 1 if first else 0
     if first:
         yield _attempt(first, f"{where}:1", f"{name}:1")
-    for line in file:
+    for line in _lines(file, where):
         number += 1
         if line.strip():
             yield _attempt(line, f"{where}:{number}", f"{name}:{number}")
+
+
+def _lines(file: TextIO, where: str) -> Iterator[str]:
+    while line := file.readline(FILE_BYTES + 1):
+        check_amount(where, "characters of a line", len(line), FILE_BYTES)
+        yield line
 
 
 def _is_object(line: str) -> bool:
@@ -153,16 +160,7 @@ def parse_problem(text: str, where: str, name: str = "") -> Problem:
     Raises:
         RsbenchError: one line with the file, the field, the value and what is allowed.
     """
-    try:
-        data = json.loads(text)  # reads NaN, which parse_card refuses with the field's name
-    except json.JSONDecodeError as error:
-        raise RsbenchError(
-            f"{where}: not valid JSON: {error.msg} at line {error.lineno} column {error.colno}"
-        ) from error
-    except RecursionError as error:
-        raise RsbenchError(f"{where}: not valid JSON: nested too deeply") from error
-    if not isinstance(data, dict):
-        raise RsbenchError(f"{where}: must be a JSON object with camera, baseline, ..., got {type(data).__name__}")
+    data = parse_json(text, where)  # reads NaN, which parse_card refuses with the field's name
     content = parse_card(_Content, data, where)
     _check_sets(data, where)
     for key, columns in _COLUMNS.items():
@@ -200,7 +198,7 @@ def _problem(
 
 def _from_npz(path: Path) -> Problem:
     """A problem in arrays: ``camera`` (6,) as width, height, fx, fy, cx, cy, and the other keys as in JSON."""
-    arrays = _load(path)
+    arrays = load_arrays(path)
     known = ("camera", "baseline", "readout_ratio", "name", *_COLUMNS)
     for key in arrays:
         if key not in known:
@@ -225,16 +223,3 @@ def _from_npz(path: Path) -> Problem:
     baseline, ratio = float(arrays["baseline"].item()), float(arrays["readout_ratio"].item())
     name = str(arrays["name"]) if "name" in arrays else path.stem
     return _problem(camera, baseline, ratio, sets, name, str(path))
-
-
-def _load(path: Path) -> dict[str, NDArray[Any]]:
-    try:
-        with path.open("rb") as file:
-            loaded = np.load(file, allow_pickle=False)
-            if not isinstance(loaded, np.lib.npyio.NpzFile):
-                raise ValueError("one array without a name")
-            return {key: loaded[key] for key in loaded.files}
-    except OSError as error:
-        raise RsbenchError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise RsbenchError(f"{path}: not an npz file of plain arrays: {error}") from error

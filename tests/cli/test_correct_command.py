@@ -138,7 +138,7 @@ def test_bad_calls_are_refused_and_leave_nothing(tmp_path: Path, frames: list[Pa
     cv2.imwrite(str(flat), np.full((96, 128), 128, np.uint8))
     assert_refused(correct(*frames[:3], *common), "3 images")
     assert_refused(correct(*frames[:3], small, *common), "small.png", "128 x 60", "128 x 96")
-    assert_refused(correct(*frames[:3], tmp_path / "none.png", *common), "none.png", "no such")
+    assert_refused(correct(*frames[:3], tmp_path / "none.png", *common), "none.png", "No such file")
     assert_refused(correct(*[flat] * 4, *common), "no texture")
     assert_refused(correct(*frames, *common, "--target", "500"), "--target 500", "95")
     assert_refused(correct(*frames, "--out", out), "--rig")

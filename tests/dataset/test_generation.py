@@ -158,7 +158,7 @@ def test_unwritable_folder_is_named(small: Small, tmp_path: Path) -> None:
         ("readout_ratio = 0.8", "readout_ratio = nan", "readout_ratio"),
         ("rotation_deg = 1.5", "rotation_deg = -1.5", "must not be negative"),
         ('name = "b"', 'name = "a"', "two sequences are named 'a'"),
-        ('name = "a"', 'name = "../a"', "a folder name"),
+        ('name = "a"', 'name = "../a"', "a folder's name"),
         ('renderer = "preview"', 'renderer = "previeww"', "previeww"),
     ],
 )
