@@ -30,10 +30,10 @@ SCENES = ("castle", "old-town", "room")
 
 @pytest.fixture(scope="module")
 def paper(tmp_path_factory: pytest.TempPathFactory, built_scene: Callable[[str], Scene]) -> Path:
-    """The paper's sequences at two thirds of their size, for time; ``rsbench reproduce images`` has the whole."""
+    """The paper's sequences at half their size, for time; ``rsbench reproduce images`` has the whole."""
     folder = tmp_path_factory.mktemp("paper") / "paper"
     card = load_dataset_card("paper")
-    camera = replace(card.camera, width=600, height=600, focal=card.camera.focal * 600 / card.camera.width)
+    camera = replace(card.camera, width=450, height=450, focal=card.camera.focal * 450 / card.camera.width)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(generation, "load_scene", built_scene)
         generation.generate_dataset(replace(card, camera=camera), folder)
@@ -97,7 +97,7 @@ def shot(
 def test_single_pass_equals_stitched_on_the_paper_frame(shot: Shot, integrator: str) -> None:
     scene, camera, poses = shot
     preset = "default" if integrator == "sunsky" else "path"
-    options = replace(load_card(RendererOptions, "renderers", preset), samples=4 if integrator == "path" else 16)
+    options = replace(load_card(RendererOptions, "renderers", preset), samples=2 if integrator == "path" else 16)
     rows = np.linspace(0, 899, 20).astype(int).tolist()
     geometry = scene, camera, poses.R, poses.t
     whole = render(*geometry, replace(options, method="single-pass"))
