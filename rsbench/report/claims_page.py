@@ -19,7 +19,7 @@ nine matches are taken (any | nine of a hundred that stand far apart). `literal`
 these; `best` is the most favourable verdict over all readings, and over mean and median. **A claim is refuted
 only where its best reading fails.** With 9 + 9 matches A X = 0 has an exact solution, which no scaling changes.
 The paper also leaves open in what its noise of "10^-3" is measured: both are here. What settings it does not
-state do to the verdicts: `rsbench reproduce readings`; what was chosen here:
+state do to the verdicts: [../readings](../readings/README.md); what was chosen here:
 [../fig3/settings.csv](../fig3/settings.csv).
 
 Every verdict follows by the rule above its table, from the 95 % intervals in brackets (median: bootstrap of
