@@ -96,7 +96,7 @@ def correct_four(
         find_depth(images, rig, shutter, motion, options, given.pairs, offset) if "depth" in needs else given.pairs
     )
     clock("depth")
-    frames = correct_frames(images, pairs, rig, shutter, motion, options, views)
+    frames = correct_frames(images, pairs, rig, shutter, motion, options, views, offset)
     clock("correction")
     return CorrectedFrames(
         motion=motion,
@@ -161,6 +161,7 @@ def correct_frames(
     motion: Motion | None,
     options: CorrectionOptions,
     views: tuple[View, ...] = VIEWS,
+    disparity_offset: float = 0.0,
 ) -> dict[View, Fused]:
     """Corrected frames of the views asked for, at the time of ``options.target_row`` of each.
 
@@ -179,6 +180,7 @@ def correct_frames(
         motion=motion,
         depth=None if pairs is None else {(s, f): pairs[f].depth[s] for s in SIDES for f in FRAMES},
         guess=None if pairs is None else {(s, f): pairs[f].guess[s] for s in SIDES for f in FRAMES},
+        disparity_offset=disparity_offset,
     )
     corrected = find_corrected(options.corrector, problem, views)
     return {view: _finish(fused, options) for view, fused in corrected.items()}

@@ -198,7 +198,8 @@ def _moment(
     if pairs is not None:
         pairs = find_depth(window.images, rig, shutter, motion, options, pairs)
     views = tuple((side, place) for side in SIDES)
-    fused = correct_frames(window.images, pairs, rig, shutter, motion, options, views)
+    offset = 0.0 if window.found is None else window.found.disparity_offset
+    fused = correct_frames(window.images, pairs, rig, shutter, motion, options, views, offset)
     frames = {side: fused[side, place] for side in SIDES}
     return CorrectedMoment(
         number=number, images=images, frames=frames, found=window.found, reason=here.reason if frame == 0 else ""

@@ -60,14 +60,15 @@ class Corrected:
 
 
 def relative_row_maps(
-    camera: PinholeCamera, source_poses: Pose, target_pose: Pose
+    camera: PinholeCamera, source_poses: Pose, target_pose: Pose, source_camera: PinholeCamera | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """``M`` (H, 3, 3) and ``b`` (H, 3) px m: homogeneous target pixel = M_y (x, y, 1) + b_y / depth.
 
-    ``source_poses`` are ``cam_from_world`` of every row, ``target_pose`` of the target camera.
+    ``source_poses`` are ``cam_from_world`` of every row, ``target_pose`` of the target camera. ``source_camera``
+    is the frame's when it is another one.
     """
     R, t = compose(target_pose, inverse(source_poses))
-    return camera.K @ R @ np.linalg.inv(camera.K), t @ camera.K.T
+    return camera.K @ R @ np.linalg.inv((source_camera or camera).K), t @ camera.K.T
 
 
 def warp_gain(camera: PinholeCamera, source_poses: Pose, target_pose: Pose) -> FloatArray:
@@ -94,17 +95,18 @@ def warp(
     *,
     sky_mask: NDArray[np.bool_] | None = None,
     options: WarpOptions | None = None,
+    source_camera: PinholeCamera | None = None,
 ) -> Corrected:
     """Warp a frame with one pose per row to any pose of the same camera model; z-buffered.
 
     ``image`` (H, W) or (H, W, C) of uint8, uint16 or float32; ``depth`` (H, W) is z in each row's own camera,
     metres: inf is infinitely far, and 0, negative or NaN unknown, unless ``sky_mask`` (H, W) puts the pixel at
-    infinity. Poses are ``cam_from_world``, (H, 3, 3) and (H, 3), and (3, 3) and (3,). Raises ValueError on other
-    shapes or types.
+    infinity. Poses are ``cam_from_world``, (H, 3, 3) and (H, 3), and (3, 3) and (3,). ``source_camera``, of the
+    same size, is the frame's where its principal point is another one. Raises ValueError on other shapes or types.
     """
     options = options or WarpOptions()
     _check(image, depth, camera, source_poses, sky_mask)
-    M, b = relative_row_maps(camera, source_poses, target_pose)
+    M, b = relative_row_maps(camera, source_poses, target_pose, source_camera)
     rho = inverse_depth(depth, sky_mask)
     gain = warp_gain(camera, source_poses, target_pose)
     joined = forward_warp.connect(rho, options.tear_px / np.maximum(gain, np.finfo(np.float64).tiny))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from rsbench import plugins
 from rsbench.core import projection
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
-from rsbench.core.rig import StereoRig, View
+from rsbench.core.rig import Side, StereoRig, View
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
@@ -64,6 +65,15 @@ class CorrectionProblem:
     it."""
     guess: Depths | None
     """(H, W) the same, guessed from the neighbours where ``depth`` is unknown; 0 elsewhere."""
+    disparity_offset: float = 0.0
+    """px by which disparities in the images are too large, half of it in either camera; ``depth`` is without."""
+
+    def camera(self, side: Side, reference: Side) -> PinholeCamera:
+        """Of one side's images, in pixels in which the images of ``reference`` have the rig's principal point."""
+        if side == reference or self.disparity_offset == 0.0:
+            return self.rig.camera
+        shift = self.disparity_offset if side == "left" else -self.disparity_offset
+        return replace(self.rig.camera, cx=self.rig.camera.cx + shift)
 
     def row_poses(self, view: View) -> Pose:
         """``cam_from_world`` (H, 3, 3), (H, 3) of every row of a frame. Raises ValueError without a motion."""

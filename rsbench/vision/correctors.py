@@ -65,7 +65,10 @@ class FusionCorrector(Corrector):
             ]
         if self.guess_depth:
             order.append((view, Origin.GUESSED))
-        return [_source(problem, source, poses[source], origin) for source, origin in order]
+        return [
+            replace(_source(problem, source, poses[source], origin), camera=problem.camera(source[0], side))
+            for source, origin in order
+        ]
 
     def _placed(self, problem: CorrectionProblem, view: View, source: SourceView) -> SourceView:
         """The frame with a depth in the rows where no depth would move a pixel by more than ``tear_px``."""

@@ -54,6 +54,8 @@ class SourceView:
     poses: Pose
     """``cam_from_world`` of every row."""
     origin: Origin
+    camera: PinholeCamera | None = None
+    """Where it is not the target's: a rig whose disparities are off has two principal points."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -198,12 +200,12 @@ def _warp_into(
     view: SourceView, holes: Mask, camera: PinholeCamera, target_pose: Pose, options: WarpOptions | None
 ) -> Corrected | None:
     """The part of a view that falls into the holes; None when nothing does."""
-    M, b = relative_row_maps(camera, view.poses, target_pose)
+    M, b = relative_row_maps(camera, view.poses, target_pose, view.camera)
     wanted = cv2.dilate(holes.astype(np.uint8), np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8))
     depth = np.zeros_like(view.depth)
     if _keep_landing(view.depth, inverse_depth(view.depth), M, b, wanted, depth) == 0:
         return None
-    return warp(view.image, depth, camera, view.poses, target_pose, options=options)
+    return warp(view.image, depth, camera, view.poses, target_pose, options=options, source_camera=view.camera)
 
 
 @compiled(error_model="numpy")

@@ -68,6 +68,36 @@ def test_each_is_right_in_the_scene_that_it_assumes(world: Build, shapes: Any, v
         assert _gain(scene, problem_of(scene, row), corrector, view) > 10.0, corrector
 
 
+def _moved(array: np.ndarray, pixels: int) -> np.ndarray:
+    """What a camera sees whose principal point lies so many pixels to the left; the border is repeated."""
+    return np.concatenate([array[:, pixels:], np.repeat(array[:, -1:], pixels, axis=1)], axis=1)
+
+
+def test_what_the_other_camera_fills_counts_the_disparity_offset(world: Build, shapes: Any) -> None:
+    """The right images 4 px to the left give the same left frames, once the problem says so, and others unless."""
+    plane = shapes[0]
+    card = plane((0.0, 0.0, 1.0), 3.0, lambda X: (np.abs(X[..., 0]) < 0.5) & (np.abs(X[..., 1]) < 0.6))
+    problem = problem_of(world((plane((0.05, 0.1, 1.0), 7.0), card), d=(0.25, -0.1, 0.1), baseline=0.4))
+    assert problem.depth is not None
+    right = [view for view in VIEWS if view[0] == "right"]
+    apart = replace(
+        problem,
+        images={**problem.images, **{view: _moved(problem.images[view], 4) for view in right}},
+        depth={**problem.depth, **{view: _moved(problem.depth[view], 4) for view in right}},
+    )
+    view: View = ("left", 0)
+    expected, told, untold = (
+        FusionCorrector().correct(each, [view])[view]
+        for each in (problem, replace(apart, disparity_offset=4.0), apart)
+    )
+    filled = (expected.origin == Origin.OTHER_CAMERA) & (told.origin == Origin.OTHER_CAMERA)
+    assert filled.sum() > 200
+    # The same arithmetic but for the rounding of an offset: a grey level at most.
+    assert np.max(np.abs(told.image[filled].astype(int) - expected.image[filled])) <= 1
+    both = filled & (untold.origin == Origin.OTHER_CAMERA)
+    assert psnr(untold.image, expected.image, both) < 30.0
+
+
 def test_each_is_wrong_in_the_scene_of_the_next(world: Build, shapes: Any) -> None:
     plane = shapes[0]((0.1, 0.1, 1.0), 5.0)
     near = world((plane, shapes[1]((0.3, 0.2, 2.0), 0.4)))
