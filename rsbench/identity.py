@@ -62,8 +62,8 @@ def source_version(cls: type) -> str:
     root = sys.modules.get(module.partition(".")[0])
     if root is not None and getattr(root, "__file__", None) and hasattr(root, "__path__"):
         folder = Path(str(root.__file__)).parent
-        return _hash_of(folder.parent, sorted(folder.rglob("*.py")))
-    return _hash_of(Path(file).parent, with_neighbours(Path(file)))
+        return hash_of_files(folder.parent, sorted(folder.rglob("*.py")))
+    return hash_of_files(Path(file).parent, with_neighbours(Path(file)))
 
 
 def with_neighbours(file: Path) -> list[Path]:
@@ -101,10 +101,10 @@ def own_source_version() -> str:
     """Hash of rsbench's own sources that decide what solvers, matchers and correctors answer."""
     package = Path(str(resources.files("rsbench")))
     rooms = [path for room in _NUMERIC_ROOMS for path in (package / room).rglob("*.py")]
-    return _hash_of(package, sorted([*rooms, *(package / name for name in _NUMERIC_FILES)]))
+    return hash_of_files(package, sorted([*rooms, *(package / name for name in _NUMERIC_FILES)]))
 
 
-def _hash_of(folder: Path, files: list[Path]) -> str:
+def hash_of_files(folder: Path, files: list[Path]) -> str:
     text = "\n".join(f"{path.relative_to(folder).as_posix()} {file_hash(path)}" for path in files)
     return hashlib.sha256(text.encode()).hexdigest()
 

@@ -33,6 +33,10 @@ def generate(
         bool,
         typer.Option("--full-frames", help="The paper's recipe: render and keep a whole image per row (slow)."),
     ] = False,
+    rehash: Annotated[
+        bool,
+        typer.Option("--rehash", help="Read all that is there again, not only what has another size or time."),
+    ] = False,
 ) -> None:
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
     from rsbench.cli.console import progress_bar
@@ -48,7 +52,9 @@ def generate(
         typer.echo(backend.message, err=True)
     steps = STEPS * len(dataset.sequence)
     with progress_bar(f"rendering {dataset.name}", steps) as advance:
-        rendered = generate_dataset(dataset, out, workers=workers, full_frames=full_frames, progress=advance)
+        rendered = generate_dataset(
+            dataset, out, workers=workers, full_frames=full_frames, rehash=rehash, progress=advance
+        )
     typer.echo(f"{out}: {len(dataset.sequence)} sequences, {len(rendered)} rendered now")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -160,8 +161,8 @@ class DatasetCard:
         names = [sequence.name for sequence in self.sequence]
         if not names:
             raise ValueError("a dataset needs at least one [[sequence]]")
-        for name in names:
-            if names.count(name) > 1:
+        for name, count in Counter(names).items():
+            if count > 1:
                 raise ValueError(f"two sequences are named {name!r}")
 
     def rig_of(self, sequence: SequenceCard) -> StereoRig:

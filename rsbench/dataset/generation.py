@@ -4,32 +4,35 @@ from __future__ import annotations
 
 import hashlib
 import os
-import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import asdict, replace
 from functools import lru_cache
 from importlib.metadata import version
-from itertools import groupby, product
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench import __version__
-from rsbench.cards import load_card
+from rsbench.cards import card_path, load_card
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, Side
 from rsbench.core.se3 import Pose
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_png, write_poses
-from rsbench.dataset.sequence import FORMAT, FRAMES, RELATIVE_FILES, sequence_manifest
+from rsbench.dataset.hashes import FileHashes, HashedFile
+from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
+from rsbench.dataset.sequence import FORMAT, FRAMES, RELATIVE_FILES, is_of_sequence, sequence_manifest
+from rsbench.dataset.workplace import HIDDEN, WORK, named, remove, strangers, workplace
 from rsbench.errors import RsbenchError
-from rsbench.pipeline.isolated_jobs import run_jobs
+from rsbench.pipeline.isolated_jobs import finished_jobs
 from rsbench.pipeline.isolation import EntryFailure
 from rsbench.renderers.options import RendererOptions
-from rsbench.scenes.load import load_scene
+from rsbench.scenes.load import SceneCard, load_scene, read_scene_card
 from rsbench.scenes.model import Scene
 
 if TYPE_CHECKING:
@@ -37,9 +40,22 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str], None]
 """Called with the name of the sequence after each of its ``STEPS``."""
-LoadScene = Callable[[str], Scene]
 STEPS = 1 + 2 * len(SIDES) * len(FRAMES)
-"""Per sequence: building the scene, and four rolling-shutter and four global-shutter renders."""
+"""Per sequence: four rolling-shutter and four global-shutter renders, and putting it into its place."""
+
+
+class _Built(NamedTuple):
+    """A scene and its hash."""
+
+    scene: Scene
+    sha256: str
+
+
+Build = Callable[[str], _Built]
+Plan = dict[str, Any]
+"""All that decides the bytes of a sequence, as it stands in its sequence.json; but for the hash of the scene."""
+Files = dict[str, HashedFile]
+"""The files of a sequence by their paths below its folder, in the order of dataset.json."""
 
 
 def generate_dataset(
@@ -48,6 +64,7 @@ def generate_dataset(
     *,
     workers: int = 1,
     full_frames: bool = False,
+    rehash: bool = False,
     progress: Progress | None = None,
 ) -> list[str]:
     """Render every sequence that ``out`` does not hold yet and write dataset.json; returns what was rendered.
@@ -61,50 +78,62 @@ def generate_dataset(
         workers: processes; each renders whole sequences.
         full_frames: make every rolling-shutter frame as the paper did, from one whole global-shutter image per
             row, and keep these images as gs_stack/<side>_<frame>/<row>.png.
+        rehash: read every file again, also those that have the size and times that they had when last read.
         progress: see ``Progress``.
 
     Raises:
-        RsbenchError: ``out`` cannot be written or holds a dataset of another card; a scene, viewpoint or
-            renderer of the card does not exist.
+        RsbenchError: ``out`` cannot be written, another command works there, or it holds a dataset of another
+            card or files of others in a sequence that is damaged; a scene, viewpoint or renderer of the card
+            does not exist.
+        LostJobsError: see ``finished_jobs``.
     """
     options = load_card(RendererOptions, "renderers", card.renderer)
     if full_frames:
         options = replace(options, method="stitched", full_frames=True)
-    # Of this run alone, and the last one only: a scene takes hundreds of MB, and its card may change between runs.
-    load = lru_cache(maxsize=1)(load_scene)
-    plans = _plans(card, options, load)
-    _open_folder(out)
-    todo = []
-    for sequence in card.sequence:
-        if _is_complete(out / sequence.name, plans[sequence.name]):
-            for _ in range(STEPS if progress else 0):
-                progress(sequence.name)  # type: ignore[misc]
-        else:
-            todo.append(sequence)
-    for name in _render_all(card, sorted(todo, key=_scene_name), options, plans, load, out, workers):
-        if progress:
-            progress(name)
-    _write_manifest(card, out)
+    scenes = lru_cache(maxsize=None)(_scene_card)
+    plans = {each.name: _plan(card, each, options, scenes(each.scene)) for each in card.sequence}
+    with workplace(out) as hidden:
+        # Of this run alone, and the last one only: a scene takes hundreds of MB, and its card may change.
+        build = lru_cache(maxsize=1)(_build)
+        hashes = FileHashes(out, hidden / "hashes.jsonl", rehash)
+        scene_hashes = SceneHashes(hidden / "scenes.json", lambda name: build(name).sha256)
+        made: dict[str, Files] = {}
+        for sequence in card.sequence:
+            files = _complete(out, sequence, plans[sequence.name], scene_hashes, hashes)
+            if files is not None:
+                made[sequence.name] = files
+                _repeat(progress, sequence.name, STEPS)
+        hashes.flush()
+        todo = [sequence for sequence in card.sequence if sequence.name not in made]
+        done: Counter[str] = Counter()
+        for name, steps in _render_all(card, sorted(todo, key=_scene_name), options, plans, build, out, workers):
+            done[name] += steps
+            if done[name] == STEPS:
+                made[name] = _learned(out, name, hashes)
+            _repeat(progress, name, steps)
+        _write_manifest(card, out, made)
     return [sequence.name for sequence in todo]
+
+
+def _repeat(progress: Progress | None, name: str, times: int) -> None:
+    for _ in range(times if progress else 0):
+        progress(name)  # type: ignore[misc]
 
 
 def _scene_name(sequence: SequenceCard) -> str:
     return sequence.scene
 
 
-def _plans(card: DatasetCard, options: RendererOptions, load: LoadScene) -> dict[str, dict[str, Any]]:
-    """The plan of each sequence by its name; each scene is loaded once, the one rendered first last."""
-    plans: dict[str, dict[str, Any]] = {}
-    for name, sequences in groupby(sorted(card.sequence, key=_scene_name, reverse=True), _scene_name):
-        digest = _scene_digest(load(name))
-        plans |= {sequence.name: _plan(card, sequence, options, load(name), digest) for sequence in sequences}
-    return plans
+def _build(name: str) -> _Built:
+    scene = load_scene(name)
+    return _Built(scene, scene_hash(scene))
 
 
-def _plan(
-    card: DatasetCard, sequence: SequenceCard, options: RendererOptions, scene: Scene, digest: str
-) -> dict[str, Any]:
-    """All that decides the bytes of a sequence, as it stands in its sequence.json."""
+def _scene_card(name: str) -> SceneCard:
+    return read_scene_card(card_path("scenes", name))[0]
+
+
+def _plan(card: DatasetCard, sequence: SequenceCard, options: RendererOptions, scene: SceneCard) -> Plan:
     if sequence.viewpoint not in scene.viewpoints:
         names = ", ".join(scene.viewpoints)
         raise RsbenchError(f"scene {sequence.scene}: no viewpoint {sequence.viewpoint!r}; there are: {names}")
@@ -119,7 +148,7 @@ def _plan(
     return manifest | {
         "scene": {
             "name": scene.name,
-            "sha256": digest,
+            "sha256": "",
             "viewpoint": sequence.viewpoint,
             **_listed(asdict(viewpoint)),
         },
@@ -128,88 +157,107 @@ def _plan(
     }
 
 
+def _of_scene(plan: Plan, sha256: str) -> Plan:
+    return plan | {"scene": plan["scene"] | {"sha256": sha256}}
+
+
 def _listed(values: dict[str, Any]) -> dict[str, Any]:
     return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
 
-def _scene_digest(scene: Scene) -> str:
-    """Hash of all that is rendered of a scene: geometry, materials and light."""
-    digest = hashlib.sha256()
-    digest.update(repr(scene.light).encode())
-    for mesh in scene.meshes:
-        digest.update(f"{mesh.name}/{mesh.material.name}/{mesh.material.colour}".encode())
-        for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.normals, mesh.material.texture):
-            digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
-def _open_folder(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".writable"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise RsbenchError(f"{out}: cannot be written: {error.strerror}; choose another --out") from error
-    for leftover in out.glob(".*.partial"):
-        shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
-
-
-def _is_complete(folder: Path, plan: dict[str, Any]) -> bool:
-    """Whether the sequence exists, was made from the same plan, and has the bytes it had then."""
-    if not folder.exists():
-        return False
+def _complete(
+    out: Path, sequence: SequenceCard, plan: Plan, scene_hashes: SceneHashes, hashes: FileHashes
+) -> Files | None:
+    """The files of a sequence that was made from the same plan and has the bytes it had then; else None."""
+    folder = out / sequence.name
+    if not os.path.lexists(folder):
+        return None
+    if not (folder / "sequence.json").is_file():
+        raise RsbenchError(
+            f"{folder}: holds no sequence.json, so rsbench did not make it; move it away or choose another --out"
+        )
     manifest = read_json(folder / "sequence.json")
-    other = [key for key, value in plan.items() if manifest.get(key) != value]
+    expected = _of_scene(plan, scene_hashes.of(sequence.scene))
+    other = [key for key, value in expected.items() if manifest.get(key) != value]
     if other:
         raise RsbenchError(
             f"{folder}: holds a sequence of another card (differs in {', '.join(other)}); choose another --out"
         )
-    files = manifest.get("files", {})
-    names = {*RELATIVE_FILES, *files}
-    intact = all((folder / name).is_file() and sha256(folder / name) == files.get(name) for name in names)
-    if not intact:
-        shutil.rmtree(folder)
-    return intact
+    listed = manifest.get("files")
+    listed = listed if isinstance(listed, dict) else {}
+    files = {name: hashes.of(f"{sequence.name}/{name}") for name in listed if is_of_sequence(name)}
+    damaged = [
+        name
+        for name in {**dict.fromkeys(RELATIVE_FILES), **listed}
+        if (found := files.get(name)) is None or found.sha256 != listed.get(name)
+    ]
+    if damaged:
+        _refuse_strangers(folder, f"{named(damaged)} differs from what was written")
+        return None
+    own = hashes.of(f"{sequence.name}/sequence.json")
+    return {"sequence.json": own, **files} if own else None  # type: ignore[dict-item]
+
+
+def _refuse_strangers(folder: Path, why: str) -> None:
+    """What is to be removed must be rsbench's own, to the last file."""
+    if folder.is_symlink():
+        raise RsbenchError(f"{folder}: {why}, and it is a link: move it away, then run the same command again")
+    if others := strangers(folder, is_of_sequence):
+        raise RsbenchError(
+            f"{folder}: {why}, but {named(others)} is not rsbench's: move it away, then run the same command again"
+        )
+
+
+def _learned(out: Path, name: str, hashes: FileHashes) -> Files:
+    """The files of a sequence that was just rendered."""
+    listed = read_json(out / name / "sequence.json")["files"]
+    listed = {"sequence.json": sha256(out / name / "sequence.json"), **listed}
+    files = {file: hashes.learn(f"{name}/{file}", digest) for file, digest in listed.items()}
+    hashes.flush()
+    return files
 
 
 def _render_all(
     card: DatasetCard,
     todo: list[SequenceCard],
     options: RendererOptions,
-    plans: dict[str, dict[str, Any]],
-    load: LoadScene,
+    plans: dict[str, Plan],
+    build: Build,
     out: Path,
     workers: int,
-) -> Iterator[str]:
+) -> Iterator[tuple[str, int]]:
+    """Names of sequences, with steps that were done; the last of a sequence is given when it is complete."""
     if workers <= 1 or len(todo) <= 1:
         for sequence in todo:
-            for _ in _render_sequence(card, sequence, options, plans[sequence.name], load(sequence.scene), out):
-                yield sequence.name
+            for _ in _render_sequence(card, sequence, options, plans[sequence.name], build(sequence.scene), out):
+                yield sequence.name, 1
         return
     jobs = [(sequence, plans[sequence.name]) for sequence in todo]
     threads = max(1, (os.cpu_count() or 1) // workers)
-    with closing(run_jobs(_serve_renders, jobs, workers, {}, card, options, out, threads)) as outcomes:
-        for (sequence, _), outcome in outcomes:
-            if not outcome.success:
-                raise RsbenchError(f"sequence {sequence.name}: {outcome.reason}")
-            for _ in range(STEPS):
-                yield sequence.name
+    found = finished_jobs(_serve_renders, jobs, workers, {}, card, options, out, threads, name=_job_name)
+    with closing(found):
+        for (sequence, _), _ in found:
+            yield sequence.name, STEPS
+
+
+def _job_name(job: tuple[SequenceCard, Plan]) -> str:
+    return f"sequence {job[0].name}"
 
 
 def _serve_renders(
     card: DatasetCard, options: RendererOptions, out: Path, threads: int
-) -> Callable[[tuple[SequenceCard, dict[str, Any]]], None]:
+) -> Callable[[tuple[SequenceCard, Plan]], None]:
     """What renders sequences, in a child."""
     from rsbench.renderers.backend import set_threads, start_backend
 
     start_backend()
     set_threads(threads)
+    build = lru_cache(maxsize=1)(_build)
 
-    def render(job: tuple[SequenceCard, dict[str, Any]]) -> None:
+    def render(job: tuple[SequenceCard, Plan]) -> None:
         sequence, plan = job
         try:
-            for _ in _render_sequence(card, sequence, options, plan, load_scene(sequence.scene), out):
+            for _ in _render_sequence(card, sequence, options, plan, build(sequence.scene), out):
                 pass
         except RsbenchError as error:
             raise EntryFailure(str(error)) from error
@@ -221,21 +269,21 @@ def _render_sequence(
     card: DatasetCard,
     sequence: SequenceCard,
     options: RendererOptions,
-    plan: dict[str, Any],
-    scene: Scene,
+    plan: Plan,
+    built: _Built,
     out: Path,
 ) -> Iterator[None]:
-    """Render into a temporary folder and rename it when complete; yields after each step."""
+    """Render into a folder of the workplace and move it when complete; yields after each step."""
     from rsbench.renderers.backend import start_backend
     from rsbench.renderers.scene import MitsubaScene
 
     backend = start_backend()
+    scene = built.scene
     mitsuba_scene = MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint]))
-    partial = out / f".{sequence.name}.partial"
-    shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
+    partial = out / HIDDEN / WORK / sequence.name
+    remove(partial)  # of a worker that was killed
     for folder in {Path(name).parent for name in RELATIVE_FILES}:
         (partial / folder).mkdir(parents=True, exist_ok=True)
-    yield
     for side, frame in product(SIDES, FRAMES):
         yield from _render_camera(card, sequence, options, mitsuba_scene, side, frame, partial)
     paths = sorted(path for path in partial.rglob("*") if path.is_file())
@@ -246,8 +294,14 @@ def _render_sequence(
         "drjit": version("drjit"),
         "variant": backend.variant,
     }
-    write_json(partial / "sequence.json", plan | {"made_by": made_by, "files": files})
-    os.replace(partial, out / sequence.name)
+    content = _of_scene(plan, built.sha256) | {"made_by": made_by, "files": files}
+    write_json(partial / "sequence.json", content)
+    place = out / sequence.name
+    if os.path.lexists(place):
+        _refuse_strangers(place, "it is to be replaced")
+        os.rename(place, partial.with_name(f"{sequence.name}.old"))
+    os.rename(partial, place)
+    yield
 
 
 def _render_camera(
@@ -292,13 +346,12 @@ def _image_seed(seed: int, sequence: str, side: Side, frame: int) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "little")
 
 
-def _write_manifest(card: DatasetCard, out: Path) -> None:
-    paths = [
-        f"{sequence.name}/{name}"
+def _write_manifest(card: DatasetCard, out: Path, made: dict[str, Files]) -> None:
+    files = {
+        f"{sequence.name}/{name}": {"sha256": file.sha256, "size": file.size}
         for sequence in card.sequence
-        for name in ("sequence.json", *read_json(out / sequence.name / "sequence.json")["files"])
-    ]
-    files = {path: {"sha256": sha256(out / path), "size": (out / path).stat().st_size} for path in paths}
+        for name, file in made[sequence.name].items()
+    }
     write_json(
         out / "dataset.json",
         {

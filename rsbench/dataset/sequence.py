@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -39,6 +41,12 @@ RELATIVE_FILES = tuple(
     for side in SIDES
     for frame in FRAMES
 )
+_STACK = re.compile(r"gs_stack/(left|right)_[01]/[0-9]{4,}\.png")
+
+
+def is_of_sequence(name: str) -> bool:
+    """Whether a path below a sequence's folder is one that rsbench writes."""
+    return name == "sequence.json" or name in RELATIVE_FILES or _STACK.fullmatch(name) is not None
 
 
 Vector = tuple[float, float, float]
@@ -102,9 +110,9 @@ class DatasetManifest:
     card: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for number, name in enumerate(self.sequences):
+        for name, count in Counter(self.sequences).items():
             check_name(name)
-            if name in self.sequences[:number]:
+            if count > 1:
                 raise ValueError(f"sequences: {name!r} stands there twice")
 
 

@@ -21,7 +21,7 @@ import stat
 import sys
 import threading
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -30,15 +30,18 @@ from rsbench.errors import RsbenchError
 
 HIDDEN = ".rsbench"
 """Name of the hidden folder; it may be deleted when no command runs."""
+WORK = "work"
+"""Name of the folder in it for what is not complete; fresh for each command."""
 _LOCK = "lock"
 _BEAT_S = 15.0
+_TRIES = 100
 _DEAD_S = 90.0
 """NFS shows a time of change up to 60 s late."""
 
 
 @contextmanager
 def workplace(out: Path, hidden: Path | None = None) -> Iterator[Path]:
-    """Be the only command that writes to ``out``; yields the hidden folder, with a fresh folder ``work`` in it.
+    """Be the only command that writes to ``out``; yields the hidden folder, with a fresh folder ``WORK`` in it.
 
     Args:
         out: folder of the results, made if missing when the hidden folder lies in it.
@@ -52,8 +55,8 @@ def workplace(out: Path, hidden: Path | None = None) -> Iterator[Path]:
     done = threading.Event()
     threading.Thread(target=_beat, args=(hidden / _LOCK, done), daemon=True).start()
     try:
-        remove(hidden / "work")
-        (hidden / "work").mkdir()
+        remove(hidden / WORK)
+        (hidden / WORK).mkdir()
         yield hidden
     finally:
         done.set()
@@ -68,15 +71,18 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
 
 
-def strangers(folder: Path, known: Collection[str]) -> list[str]:
-    """Paths below a folder that are no plain files of ``known``, sorted; both relative, with slashes."""
+def strangers(folder: Path, ours: Callable[[str], bool]) -> list[str]:
+    """Paths below a folder that are no plain files of ours, sorted; relative, with slashes.
+
+    A link is a stranger whatever its name is, and so is an empty folder.
+    """
     found: list[str] = []
     for place, folders, files in os.walk(folder):
         here = Path(place).relative_to(folder)
         links = [name for name in folders if (Path(place) / name).is_symlink()]
         for name in [*files, *links]:
             path = (here / name).as_posix()
-            if path not in known or not stat.S_ISREG((folder / path).lstat().st_mode):
+            if not ours(path) or not stat.S_ISREG((folder / path).lstat().st_mode):
                 found.append(path)
         if not folders and not files and place != str(folder):
             found.append(here.as_posix())
@@ -91,7 +97,7 @@ def named(paths: list[str], most: int = 3) -> str:
 
 def _take(out: Path, hidden: Path) -> int:
     """The descriptor of the locked file."""
-    while True:
+    for _ in range(_TRIES):
         try:
             hidden.mkdir(parents=True, exist_ok=True)
             _refuse_foreign(hidden)
@@ -109,6 +115,7 @@ def _take(out: Path, hidden: Path) -> int:
             os.close(descriptor)
             raise
         os.close(descriptor)
+    raise RsbenchError(f"{out}: cannot be written: {hidden} does not stay; choose another --out")
 
 
 def _refuse_foreign(hidden: Path) -> None:
@@ -179,7 +186,7 @@ def _beat(lock: Path, done: threading.Event) -> None:
 def _leave(hidden: Path, descriptor: int) -> None:
     """Free the lock; the hidden folder goes when it holds nothing that a later run can use."""
     with contextlib.suppress(OSError):
-        remove(hidden / "work")
+        remove(hidden / WORK)
         os.ftruncate(descriptor, 0)
         if [path.name for path in hidden.iterdir()] == [_LOCK]:
             (hidden / _LOCK).unlink()

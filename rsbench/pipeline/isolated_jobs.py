@@ -6,12 +6,50 @@ import math
 import queue
 import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
-from typing import TypeVar
+from contextlib import closing
+from typing import Any, TypeVar
 
+from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolation import Cancelled, IsolatedWorker, Outcome, Server
 
 Job = TypeVar("Job")
 _Done = tuple[Job, Outcome | BaseException]
+
+
+class LostJobsError(RsbenchError):
+    """Jobs whose process ended twice; what the others did is kept."""
+
+    exit_code = 1
+
+
+def finished_jobs(
+    factory: Callable[..., Server],
+    jobs: Sequence[Job],
+    workers: int,
+    environment: Mapping[str, str],
+    *arguments: object,
+    name: Callable[[Job], str] = str,
+) -> Generator[tuple[Job, Any], None, None]:
+    """Jobs with their answers, as of ``run_jobs``; ``name`` says in errors which job it was.
+
+    Raises:
+        LostJobsError: when all others are done, with the jobs whose process ended twice.
+        RsbenchError: at once, for a job that failed.
+    """
+    lost = []
+    with closing(run_jobs(factory, jobs, workers, environment, *arguments)) as outcomes:
+        for job, outcome in outcomes:
+            if outcome.ended:
+                lost.append(f"{name(job)} ({outcome.reason}, twice)")
+            elif not outcome.success:
+                raise RsbenchError(f"{name(job)}: {outcome.reason}")
+            else:
+                yield job, outcome.value
+    if lost:
+        raise LostJobsError(
+            f"not done: {', '.join(sorted(lost))}; perhaps for want of memory: the others are kept, and the same "
+            "command tries again"
+        )
 
 
 def run_jobs(

@@ -13,6 +13,8 @@ import pytest
 from commands import run_here, sweep_card
 from small_scenes import write_box_scene, write_small_card
 
+from rsbench.dataset.workplace import HIDDEN, WORK
+
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
 SLOW = """
@@ -119,9 +121,9 @@ def test_rendering_by_several_processes_stops_at_once(tmp_path: Path) -> None:
     # Large enough for a minute.
     card.write_text(card.read_text().replace("width = 96", "width = 3000").replace("height = 64", "height = 3000"))
     run = Run("generate", card, tmp_path / "out")
-    run.wait_for(tmp_path / "out", 2, ".*.partial")
+    run.wait_for(tmp_path / "out" / HIDDEN / WORK, 2, "*")
     stop(run, signal.SIGINT, 130)
-    assert not list((tmp_path / "out").glob("[a-d]"))
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def stop(run: Run, how: signal.Signals, code: int) -> None:

@@ -21,11 +21,13 @@ from rsbench.dataset.files import read_png, sha256
 from rsbench.dataset.generation import STEPS, generate_dataset
 from rsbench.dataset.sequence import read_dataset
 from rsbench.dataset.verification import verify_dataset
+from rsbench.dataset.workplace import HIDDEN
 from rsbench.errors import RsbenchError
 
 
 def bytes_of(folder: Path) -> dict[str, str]:
-    return {str(path.relative_to(folder)): sha256(path) for path in sorted(folder.rglob("*")) if path.is_file()}
+    paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and HIDDEN not in path.parts)
+    return {str(path.relative_to(folder)): sha256(path) for path in paths}
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from rsbench.pipeline.isolated_jobs import run_jobs
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.isolated_jobs import LostJobsError, finished_jobs, run_jobs
+from rsbench.pipeline.isolation import EntryFailure
 
 ASK = "__import__('os').getpid()"
 
@@ -44,6 +46,25 @@ def test_a_job_that_was_killed_once_is_done(tmp_path: Path) -> None:
         functools.partial, [f"test -e {mark} || {{ touch {mark}; kill -9 $PPID; }}"], 1, {}, os.system
     )
     assert outcome.success and outcome.value == 0
+
+
+def test_jobs_that_are_lost_are_named_when_the_others_are_done() -> None:
+    done = []
+    with pytest.raises(LostJobsError, match=r"not done: kill -9 \$PPID \(killed by signal 9 \(SIGKILL\), twice\)"):
+        for job, value in finished_jobs(functools.partial, ["kill -9 $PPID", "true", "exit 3"], 1, {}, os.system):
+            done.append((job, os.waitstatus_to_exitcode(value)))
+    assert done == [("true", 0), ("exit 3", 3)]
+
+
+def refuse(job: str) -> None:
+    raise EntryFailure(f"{job} is wrong")
+
+
+def test_a_job_that_fails_ends_all_at_once() -> None:
+    with pytest.raises(RsbenchError, match=r"^job of 3 letters: abc is wrong$"):
+        list(
+            finished_jobs(functools.partial, ["abc"], 1, {}, refuse, name=lambda job: f"job of {len(job)} letters")
+        )
 
 
 def test_leaving_early_ends_everything_at_once() -> None:

@@ -1,0 +1,90 @@
+"""Hashes of files, kept: what has the size and the times that it had when it was hashed is not read again."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from pathlib import Path
+from typing import NamedTuple
+
+from rsbench.dataset.files import sha256
+
+
+class HashedFile(NamedTuple):
+    """A file as it was when it was hashed."""
+
+    size: int
+    modified_ns: int
+    changed_ns: int
+    """Of its content, name, owner or permissions; no tool can set it."""
+    sha256: str
+
+
+class FileHashes:
+    """SHA-256 of the files below a folder; new ones are appended to a file by ``flush``."""
+
+    def __init__(self, root: Path, store: Path, rehash: bool = False) -> None:
+        """
+        Args:
+            root: the folder.
+            store: where hashes are kept; need not exist.
+            rehash: forget what is kept.
+        """
+        self._root, self._store = root, store
+        if rehash:
+            store.unlink(missing_ok=True)
+        self._known = _read(store)
+        self._new: list[str] = []
+
+    def of(self, name: str) -> HashedFile | None:
+        """A file by its path below the folder, with slashes; None when it is no file."""
+        path = f"{self._root}/{name}"
+        try:
+            found = os.stat(path)
+        except OSError:
+            return None
+        if not stat.S_ISREG(found.st_mode):
+            return None
+        state = found.st_size, found.st_mtime_ns, found.st_ctime_ns
+        known = self._known.get(name)
+        if known is None or known[:3] != state:
+            known = self._keep(name, HashedFile(*state, sha256(Path(path))))
+        return known
+
+    def sha256(self, path: Path) -> str:
+        """Of a file below the folder, by its path."""
+        found = self.of(path.relative_to(self._root).as_posix())
+        return sha256(path) if found is None else found.sha256
+
+    def learn(self, name: str, digest: str) -> HashedFile:
+        """Keep the hash of a file that was just written."""
+        found = os.stat(f"{self._root}/{name}")
+        return self._keep(name, HashedFile(found.st_size, found.st_mtime_ns, found.st_ctime_ns, digest))
+
+    def flush(self) -> None:
+        """Append what is new."""
+        if self._new:
+            with self._store.open("a", encoding="utf-8") as stream:
+                stream.write("\n" + "\n".join(self._new) + "\n")  # the line before may have been cut by a kill
+            self._new.clear()
+
+    def _keep(self, name: str, file: HashedFile) -> HashedFile:
+        self._known[name] = file
+        self._new.append(json.dumps([name, *file]))
+        return file
+
+
+def _read(store: Path) -> dict[str, HashedFile]:
+    known = {}
+    try:
+        with store.open(encoding="utf-8", errors="replace") as stream:
+            for line in stream:
+                try:
+                    name, size, modified, changed, digest = json.loads(line)
+                except (ValueError, TypeError):  # empty, or cut
+                    continue
+                known[name] = HashedFile(size, modified, changed, digest)
+    except OSError:
+        return {}
+    return known

@@ -1,0 +1,84 @@
+"""Hashes of scenes: what decides a render besides camera, motion and options."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from importlib import resources
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsbench.cards import card_path
+from rsbench.dataset.files import read_json, write_json
+from rsbench.errors import RsbenchError
+from rsbench.identity import hash_of_files
+from rsbench.renderers.verdicts import cpu_key
+from rsbench.scenes.load import read_scene_card
+from rsbench.scenes.mesh import MeshBuilder
+from rsbench.scenes.model import Scene
+
+_PACKAGES = ("numpy", "trimesh", "shapely", "mapbox-earcut")
+"""Decide, with the sources of ``rsbench.scenes``, what our builders make of a card."""
+
+
+def scene_hash(scene: Scene) -> str:
+    """Hash of all that is rendered of a scene: geometry, materials and light."""
+    digest = hashlib.sha256()
+    digest.update(repr(scene.light).encode())
+    for mesh in scene.meshes:
+        digest.update(f"{mesh.name}/{mesh.material.name}/{mesh.material.colour}".encode())
+        for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.normals, mesh.material.texture):
+            digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+class SceneHashes:
+    """Hashes of scenes; not built again where the card and our code say all."""
+
+    def __init__(self, store: Path, build: Callable[[str], str]) -> None:
+        """
+        Args:
+            store: JSON file of what was built before; need not exist.
+            build: builds the scene of a name and returns the hash.
+        """
+        self._store, self._build = store, build
+        self._by_name: dict[str, str] = {}
+        try:
+            self._known: dict[str, Any] = read_json(store)
+        except RsbenchError:
+            self._known = {}
+
+    def of(self, name: str) -> str:
+        """By the name or path of a scene card; each is looked at once."""
+        if name not in self._by_name:
+            self._by_name[name] = self._find(name)
+        return self._by_name[name]
+
+    def _find(self, name: str) -> str:
+        key = scene_key(name)
+        if key is None:
+            return self._build(name)
+        if key not in self._known:
+            self._known[key] = self._build(name)
+            write_json(self._store, self._known)
+        return str(self._known[key])
+
+
+def scene_key(name: str) -> str | None:
+    """Equal keys are equal scenes on one machine; None when files or other packages' code decide too."""
+    card, builder = read_scene_card(card_path("scenes", name))
+    if isinstance(builder, MeshBuilder) or type(builder).__module__.partition(".")[0] != "rsbench":
+        return None
+    package = Path(str(resources.files("rsbench")))
+    content = {
+        "card": asdict(card),
+        "source": hash_of_files(package, sorted((package / "scenes").glob("*.py"))),
+        "packages": {each: version(each) for each in _PACKAGES},
+        "processor": cpu_key(),
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
