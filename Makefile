@@ -1,5 +1,6 @@
 # make demo    render, solve, correct and score one sequence; ends with the path of its report
 # make test    format, lint, types, layers and every test
+# make attack  kills, failing files, mutated inputs, hostile surroundings: an hour; its counts go to docs/reliability.md
 # make docs    the documentation site, in build/docs; warnings are errors
 # make lock    renew constraints.txt from pyproject.toml (needs uv)
 # make clean   remove .venv and caches
@@ -13,7 +14,7 @@ CANDIDATES = $(or $(PYTHON),python3 python3.14 python3.13 python3.12 python3.11)
 COMPILE := from rsbench.solvers.engine.warm_up import warm_up; warm_up(["linear", "twist"])
 SUITABLE := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: demo test docs lock clean
+.PHONY: demo test attack docs lock clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -28,6 +29,9 @@ test: $(STAMP)
 	$(BIN)/python -c '$(COMPILE)' & compiled=$$!; \
 	$(BIN)/mypy; types=$$?; wait $$compiled && exit $$types
 	@echo "== tests"; OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --no-loadscope-reorder
+
+attack: $(STAMP)
+	@PYTHONPATH=tests $(BIN)/python -m attack --write docs/reliability.md
 
 docs: $(STAMP)
 	@$(BIN)/sphinx-build -W --keep-going -q -b html docs build/docs

@@ -1,0 +1,154 @@
+"""``python -m attack``: run the attacks, print what they counted, and write it into a document."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from attack.stage import stage
+
+if TYPE_CHECKING:
+    from attack.arena import Arena
+    from attack.cases import Reference, Tally
+
+CASES = ("generate", "evaluate", "simulate", "correct", "reproduce")
+ATTACKS = ("kills", "files", "fuzz", "environment")
+BEGIN, END = "<!-- figures of make attack -->", "<!-- end of the figures -->"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extent:
+    """How much of each attack."""
+
+    kills: int
+    """Of each command."""
+    files: int | None
+    """Operations of each command that fail; None: every one."""
+    sizes: int
+    """Limits of the size of files at which each command writes."""
+    inputs: int
+    surroundings: int | None
+    """Pairs of a surrounding and a command; None: every one."""
+    cases: tuple[str, ...] = CASES
+
+
+LONG = Extent(kills=100, files=None, sizes=10, inputs=10_000, surroundings=None)
+SAMPLE = Extent(kills=2, files=3, sizes=0, inputs=300, surroundings=1, cases=("generate", "correct"))
+
+
+def say(text: str) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
+def main() -> int:
+    chosen = _options()
+    extent = SAMPLE if chosen.sample else LONG
+    if chosen.case:
+        extent = Extent(**{**vars(extent), "cases": tuple(chosen.case)})
+    extent = Extent(
+        **{**vars(extent), **{k: getattr(chosen, k) for k in ("kills", "inputs") if getattr(chosen, k)}}
+    )
+    chosen.keep.mkdir(parents=True, exist_ok=True)
+    rows, faults = [], 0
+    with tempfile.TemporaryDirectory(prefix="attack-") as root, stage(Path(root)) as arena:
+        for name, tally, seconds in _attacks(arena, extent, chosen.attack or ATTACKS, chosen.seed, chosen.keep):
+            counts = ", ".join(f"{count} {what}" for what, count in tally.counts.items())
+            rows.append(f"| {name} | {counts} | {len(tally.faults)} |")
+            say(f"{name}: {counts}; {len(tally.faults)} faults; {seconds:.0f} s")
+            for fault in tally.faults:
+                say(f"  fault: {fault}")
+            faults += len(tally.faults)
+    if chosen.write is not None:
+        _write(chosen.write, rows, chosen.seed)
+    return int(faults > 0)
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m attack", description=__doc__)
+    parser.add_argument("attack", nargs="*", choices=(*ATTACKS, []), help="which; all by default")
+    parser.add_argument("--sample", action="store_true", help="a little of each, in seconds")
+    parser.add_argument("--case", action="append", choices=CASES, help="command to kill and starve; repeatable")
+    parser.add_argument("--kills", type=int, help="of each command")
+    parser.add_argument("--inputs", type=int, help="of all loaders together")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()) / "attack-inputs")
+    parser.add_argument("--write", type=Path, help="document whose table of figures is replaced")
+    return parser.parse_args()
+
+
+def _attacks(
+    arena: Arena, extent: Extent, wanted: Collection[str], seed: int, keep: Path
+) -> Iterator[tuple[str, Tally, float]]:
+    import numpy as np
+
+    from attack import files, fuzz, kills
+    from attack.cases import cases, undisturbed
+    from attack.loaders import loaders
+
+    references: dict[str, Reference] = {}
+    results: dict[str, Path] = {}
+    known = cases(arena)
+    for number, name in enumerate(CASES):
+        if name not in extent.cases:
+            continue
+        references[name] = undisturbed(arena, known[name])
+        results[name] = arena.root.parent / "results" / name
+        shutil.copytree(arena.work / "out", results[name])
+        given = arena, known[name], references[name], np.random.default_rng([seed, number])
+        if "kills" in wanted:
+            yield _timed(f"kills of {name}", partial(kills.attack, *given, extent.kills))
+        if "files" in wanted:
+            yield _timed(f"file operations of {name}", partial(files.attack, *given, extent.files, extent.sizes))
+    if "fuzz" in wanted:
+        every = loaders(arena.inputs, results, arena.root.parent / "fuzz")
+        yield _timed(f"inputs of {len(every)} loaders", partial(fuzz.attack, every, extent.inputs, seed, keep))
+    if "environment" in wanted:
+        yield _timed("surroundings", partial(_surroundings, arena, references, extent))
+
+
+def _surroundings(arena: Arena, references: dict[str, Reference], extent: Extent) -> Tally:
+    from attack import environment
+
+    pairs = environment.every_pair()
+    if extent.surroundings is not None:
+        pairs = [(one, command) for one, command in pairs if one.folder and command == "correct"][
+            : extent.surroundings
+        ]
+    expected = {name: reference.contents for name, reference in references.items()}
+    return environment.attack(arena, expected, pairs)
+
+
+def _timed(name: str, attack: Callable[[], Tally]) -> tuple[str, Tally, float]:
+    start = time.monotonic()
+    return name, attack(), time.monotonic() - start
+
+
+def _write(document: Path, rows: list[str], seed: int) -> None:
+    """Replace the table between the marks."""
+    head, _, rest = document.read_text("utf-8").partition(BEGIN)
+    _, _, tail = rest.partition(END)
+    day = datetime.datetime.now(datetime.UTC).date().isoformat()
+    command = " ".join(["python -m attack", *sys.argv[1:]])
+    lines = [
+        BEGIN,
+        f"`{command}`, {day}, seed {seed}, {os.cpu_count()} cores:",
+        "",
+        "| attack | counts | faults |",
+    ]
+    lines += ["|---|---|---|", *rows, END]
+    document.write_text(head + "\n".join(lines) + tail, "utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,243 @@
+"""Commands in forked children of one warm process, watched from outside: how they ended, and what they left.
+
+A start of rsbench costs seconds, a fork milliseconds. The warm process must have one thread (forks of others may
+hang), so nothing is rendered in it: children start the renderer themselves.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+GRACE_S = 3.0
+"""Seconds in which the children of a process that was stopped or killed must end."""
+LIMIT_S = 120.0
+"""Seconds after which a command hangs: the longest of them takes ten on a free machine."""
+MACHINE = ("seconds.json", "seconds.csv", "provenance.json")
+"""Files that hold times, the date and the machine: the only ones that need not be the same again."""
+_SUBREAPER = 36  # PR_SET_CHILD_SUBREAPER of prctl
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ending:
+    """What became of a command."""
+
+    code: int
+    """Exit code; minus the signal's number for one that a signal ended."""
+    out: str
+    err: str
+    seconds: float
+    orphans: int
+    """Processes that outlived it."""
+    peak_mb: float
+    hung: bool
+
+    @property
+    def errors(self) -> list[str]:
+        """Its lines that tell of errors."""
+        return [line for line in self.err.splitlines() if "rsbench: error:" in line]
+
+    @property
+    def traceback(self) -> bool:
+        return "Traceback" in self.err or "Traceback" in self.out
+
+
+class Arena:
+    """A folder with all that commands may see: home/, tmp/, in/, and work/, where they run and write."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        for name in ("home", "tmp", "work"):
+            (root / name).mkdir(parents=True, exist_ok=True)
+        libc = ctypes.CDLL(None, use_errno=True)
+        if libc.prctl(_SUBREAPER, 1, 0, 0, 0):
+            raise OSError(ctypes.get_errno(), "prctl")
+
+    @property
+    def inputs(self) -> Path:
+        return self.root / "in"
+
+    @property
+    def work(self) -> Path:
+        return self.root / "work"
+
+    def environment(self) -> dict[str, str]:
+        return {"HOME": str(self.root / "home"), "TMPDIR": str(self.root / "tmp"), "COLUMNS": "200"}
+
+    def clear(self) -> None:
+        """Empty what commands write."""
+        for folder in (self.work, self.root / "tmp"):
+            shutil.rmtree(folder)
+            folder.mkdir()
+
+    def outside(self, *allowed: Path) -> dict[str, str]:
+        """Hashes of all files but those below ``allowed``, the home and the temporary folder."""
+        skipped = (*allowed, self.root / "home", self.root / "tmp")
+        return {
+            str(path.relative_to(self.root)): _digest(path)
+            for path in sorted(self.root.rglob("*"))
+            if not any(path.is_relative_to(folder) for folder in skipped)
+        }
+
+    def leftovers(self) -> list[str]:
+        """What lies in the temporary folder."""
+        return sorted(path.name for path in (self.root / "tmp").iterdir())
+
+    def run(
+        self,
+        arguments: Iterable[object],
+        *,
+        before: Callable[[], None] | None = None,
+        stop: tuple[float, signal.Signals] | None = None,
+        environment: Mapping[str, str | None] | None = None,
+        limit_s: float = LIMIT_S,
+    ) -> Ending:
+        """Run ``rsbench`` with these arguments in work/; ``before`` is called in its process first.
+
+        ``stop`` sends a signal after so many seconds.
+        """
+        streams = [self.root / "home" / name for name in (".out", ".err")]
+        start = time.monotonic()
+        sys.stdout.flush()
+        pid = os.fork()
+        if pid == 0:
+            _become(list(map(str, arguments)), self, streams, before, environment or {})
+        code, peak_mb, hung = _wait(pid, start, stop, limit_s)
+        seconds = time.monotonic() - start
+        orphans = _bury()
+        out, err = (path.read_text("utf-8", errors="replace") for path in streams)
+        return Ending(code=code, out=out, err=err, seconds=seconds, orphans=orphans, peak_mb=peak_mb, hung=hung)
+
+
+def _become(
+    arguments: list[str],
+    arena: Arena,
+    streams: list[Path],
+    before: Callable[[], None] | None,
+    environment: Mapping[str, str | None],
+) -> None:
+    """In the child: be the command, and end."""
+    code = 1
+    try:
+        os.setsid()
+        for number, path in enumerate([Path(os.devnull), *streams]):
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600)
+            os.dup2(descriptor, number)
+            os.close(descriptor)
+        os.chdir(arena.work)
+        for name, value in {**arena.environment(), **environment}.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+        code = command(arguments, before)
+        sys.stdout.flush()
+        sys.stderr.flush()
+    except BaseException:  # as the interpreter tells it
+        with contextlib.suppress(BaseException):
+            traceback.print_exc()
+            sys.stderr.flush()
+    finally:
+        os._exit(code)
+
+
+def command(arguments: list[str], before: Callable[[], None] | None) -> int:
+    import tempfile
+
+    from rsbench.__main__ import main
+    from rsbench.cli import console
+
+    tempfile.tempdir = None  # as in a new process
+    console.be_quiet(False)
+    sys.argv = ["rsbench", *arguments]
+    if before is not None:
+        before()
+    try:
+        main()
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    return 0
+
+
+def _wait(
+    pid: int, start: float, stop: tuple[float, signal.Signals] | None, limit_s: float
+) -> tuple[int, float, bool]:
+    """Exit code, peak memory in MB, and whether it hung, even after the signal."""
+    pause, end, hung = 0.002, start + limit_s, False
+    while True:
+        found, status, usage = os.wait4(pid, os.WNOHANG)
+        if found:
+            return os.waitstatus_to_exitcode(status), usage.ru_maxrss / 1024, hung
+        now = time.monotonic()
+        if stop is not None and now - start >= stop[0]:
+            os.kill(pid, stop[1])
+            stop, end = None, min(end, now + 20.0)
+        if now > end:
+            hung = True
+            os.kill(pid, signal.SIGKILL)
+        time.sleep(pause)
+
+
+def _bury() -> int:
+    """Wait for what the command left running, which is ours now; how many of them outlived the grace."""
+    end = time.monotonic() + GRACE_S
+    survivors: set[int] = set()
+    while True:
+        try:
+            found, _ = os.waitpid(-1, os.WNOHANG)
+        except ChildProcessError:
+            return len(survivors)
+        if not found:
+            if time.monotonic() > end:
+                survivors |= (alive := _children())
+                for pid in alive:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(pid, signal.SIGKILL)
+            time.sleep(0.002)
+
+
+def _children() -> set[int]:
+    found = set()
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError, IndexError):
+            if path.read_text().rpartition(")")[2].split()[1] == str(os.getpid()):
+                found.add(int(path.parent.name))
+    return found
+
+
+def _digest(path: Path) -> str:
+    if path.is_symlink():
+        return f"link {os.readlink(path)}"
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "folder"
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Hashes of all files of a result, hidden ones too.
+
+    Left out are ``MACHINE``, seconds/ of sweeps, and what motion.json and its page say of seconds.
+    """
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        name = str(path.relative_to(folder))
+        if path.name in MACHINE or path.parent.name == "seconds" or not path.is_file():
+            continue
+        found[name] = _digest(path)
+        if path.name == "motion.json":
+            record = json.loads(path.read_text("utf-8"))
+            record.pop("seconds", None)
+            found[name] = json.dumps(record)
+        elif path.name == "report.html":
+            page = re.sub(r"&#34;seconds&#34;: {[^}]*}", "", path.read_text("utf-8"))
+            found[name] = hashlib.sha256(page.encode()).hexdigest()
+    return found

@@ -1,0 +1,151 @@
+"""The commands under attack, each with the smallest input that uses all of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from attack.arena import Arena, Ending, contents
+from attack.injection import Trap, read_log, set_trap
+from attack.painting import keep_frames, show_frames
+
+FRAMES = tuple(f"one/rs/{side}_{frame}.png" for frame in (0, 1) for side in ("left", "right"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A command whose results lie in work/out."""
+
+    name: str
+    arguments: tuple[object, ...]
+    children: bool = False
+    """Whether its work is done in child processes; ``here`` then takes it into its own, where operations count."""
+
+
+@dataclass
+class Reference:
+    """What a command does undisturbed."""
+
+    seconds: float
+    contents: dict[str, str]
+    operations: list[str]
+    """File operations, in their order."""
+
+
+@dataclass
+class Tally:
+    """Counts of an attack, and what went wrong, each with what repeats it."""
+
+    counts: dict[str, int] = field(default_factory=dict)
+    faults: list[str] = field(default_factory=list)
+
+    def count(self, name: str, by: int = 1) -> None:
+        self.counts[name] = self.counts.get(name, 0) + by
+
+    def check(self, held: bool, fault: str) -> None:
+        if not held:
+            self.faults.append(" ".join(fault.split())[:400])
+
+
+def cases(arena: Arena) -> dict[str, Case]:
+    inputs = arena.inputs
+    frames = [inputs / "data" / frame for frame in FRAMES]
+    images = ("reproduce", "images", "--out", "out/results", "--data", "out/data", "--seeds", 1)
+    return {
+        case.name: case
+        for case in (
+            Case(name="generate", arguments=("generate", inputs / "tiny.toml", "--out", "out")),
+            Case(name="evaluate", arguments=("evaluate", inputs / "data", "--out", "out", "--solver", "gs-8pt")),
+            Case(
+                name="simulate",
+                arguments=("simulate", inputs / "sweep.toml", "--out", "out", "--workers", 2),
+                children=True,
+            ),
+            Case(name="correct", arguments=("correct", *frames, "--rig", inputs / "rig.toml", "--out", "out")),
+            Case(name="reproduce", arguments=images),
+        )
+    }
+
+
+def undisturbed(arena: Arena, case: Case) -> Reference:
+    """Run a command twice, whole and with its work in one process, and keep what it makes.
+
+    Raises:
+        RuntimeError: it fails, or the two differ.
+    """
+    results = []
+    for prepare in (partial(keep_frames, frames_of(arena)), partial(here, arena, case, Trap())):
+        place(arena)
+        start = time.monotonic()
+        ending = arena.run(("--quiet", *case.arguments), before=prepare)
+        if ending.code or ending.orphans:
+            raise RuntimeError(f"{case.name} undisturbed: exit code {ending.code}, {ending.err[-2000:]}")
+        results.append((time.monotonic() - start, contents(arena.work / "out")))
+    if results[0][1] != results[1][1]:
+        raise RuntimeError(f"{case.name}: two runs differ in {differing(results[0][1], results[1][1])}")
+    return Reference(seconds=results[0][0], contents=results[0][1], operations=read_log(log_of(arena)))
+
+
+def place(arena: Arena) -> None:
+    """A fresh start: nothing but files of somebody else beside the results."""
+    arena.clear()
+    mine = arena.work / "precious"
+    mine.mkdir()
+    (mine / "motion.json").write_text("{}")
+    (mine / "notes.txt").write_text("not to be lost")
+    (arena.work / ".hidden").write_text("nor this")
+
+
+def frames_of(arena: Arena) -> Path:
+    return arena.root / "home" / ".frames"
+
+
+def log_of(arena: Arena) -> Path:
+    return arena.root / "home" / ".operations"
+
+
+def here(arena: Arena, case: Case, trap: Trap) -> None:
+    """In the child of the arena: count operations, with all work in this process and nothing rendered."""
+    if case.children:
+        work_here()
+    if case.name in ("generate", "reproduce"):
+        show_frames(frames_of(arena))
+    set_trap((arena.inputs, arena.work, arena.root / "tmp"), log_of(arena), trap)
+
+
+def work_here() -> None:
+    """Let sweeps run in this process, not in children."""
+    from rsbench.benchmark.simulated import run_sweep
+    from rsbench.pipeline.isolated_solver import SolverRunner
+
+    def run_all(todo: Any, workers: int, limit: float | None) -> Iterator[Any]:
+        with SolverRunner() as runner:
+            for job in todo:
+                run_sweep.run_job(job, runner)
+                yield job.part
+
+    setattr(run_sweep, "_run_all", run_all)  # noqa: B010  an assignment has the wrong type
+
+
+def problem_of(ending: Ending) -> str:
+    """What no ending may be, in words; empty for none."""
+    words = []
+    if ending.traceback:
+        words.append(f"traceback: {ending.err[-300:]}")
+    if ending.hung:
+        words.append("hung")
+    if ending.orphans:
+        words.append(f"{ending.orphans} orphans")
+    if ending.peak_mb > 2048:
+        words.append(f"{ending.peak_mb:.0f} MB")
+    return "; ".join(words)
+
+
+def differing(one: dict[str, str], other: dict[str, str]) -> str:
+    """Names of what differs between two folders."""
+    names = sorted(name for name in one.keys() | other.keys() if one.get(name) != other.get(name))
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

@@ -1,0 +1,169 @@
+"""Mutated inputs through every loader: each is read, or refused in one line that names the file.
+
+Loaders run in forked children of limited memory; one that crashes or hangs is named by the number of its input.
+Input ``number`` of a loader is the same in every run with the same seed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import resource
+import select
+import signal
+import time
+import warnings
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import hypothesis
+import numpy as np
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from attack.cases import Tally
+from attack.loaders import Loader
+from attack.mutations import broken
+
+HANG_S = 20.0
+MEMORY_MB = 2048
+BLOCK = 50
+"""Inputs of one child; those of a block are all changed bytes or all broken trees."""
+
+
+def attack(loaders: list[Loader], count: int, seed: int, keep: Path) -> Tally:
+    """``count`` inputs or a few more; those at fault are left in ``keep``."""
+    tally = Tally()
+    weights = [0.1 if loader.slow else 1.0 for loader in loaders]
+    for loader, weight in zip(loaders, weights, strict=True):
+        share = math.ceil(count * weight / sum(weights))
+        for first in range(0, share, BLOCK):
+            _block(loader, first, min(BLOCK, share - first), seed, keep, tally)
+    return tally
+
+
+def _block(loader: Loader, first: int, size: int, seed: int, keep: Path, tally: Tally) -> None:
+    """Run one block in children; after a crash or a hang the next child goes on behind it."""
+    done = 0
+    while done < size:
+        for word, text in _messages(loader, first, size, done, seed, keep):
+            if word == "at":
+                done = int(text) + 1
+                continue
+            tally.count(word)
+            tally.count("inputs")
+            tally.check(
+                word in ("read", "refused"), f"{loader.name}, input {first + done - 1} of seed {seed}: {text}"
+            )
+
+
+def _messages(
+    loader: Loader, first: int, size: int, done: int, seed: int, keep: Path
+) -> Iterator[tuple[str, str]]:
+    """What a child says of the inputs from ``done`` on, up to its end."""
+    reader, writer = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        os.close(reader)
+        _serve(loader, first, size, done, seed, keep, writer)
+    os.close(writer)
+    pending, closed, told = b"", False, True
+    while not closed:
+        ready, _, _ = select.select([reader], [], [], HANG_S)
+        if not ready:
+            os.kill(pid, signal.SIGKILL)
+            yield "hung", f"longer than {HANG_S:g} s"
+            told = True
+            break
+        part = os.read(reader, 65536)
+        closed = not part
+        *lines, pending = (pending + part).split(b"\n")
+        for line in lines:
+            word, _, text = line.decode("utf-8", errors="replace").partition(" ")
+            told = word != "at"
+            yield word, text
+    os.close(reader)
+    _, status = os.waitpid(pid, 0)
+    if not told:
+        yield "crashed", f"exit code {os.waitstatus_to_exitcode(status)}"
+
+
+def _serve(loader: Loader, first: int, size: int, done: int, seed: int, keep: Path, writer: int) -> None:
+    """In the child: read every input of the block from ``done`` on, and tell of each."""
+    try:
+        os.setsid()
+        null = os.open(os.devnull, os.O_RDWR)
+        for number in (0, 1, 2):
+            os.dup2(null, number)
+        _limit_memory()
+        warnings.simplefilter("ignore")
+        for number, data in _inputs(loader, first, size, seed):
+            if number < done:
+                continue
+            os.write(writer, f"at {number}\n".encode())
+            word, text = _outcome(loader, data)
+            if word not in ("read", "refused"):
+                name = f"{loader.name.replace(' ', '-')}-{seed}-{first + number}{loader.path.suffix}"
+                (keep / name).write_bytes(data)
+            os.write(writer, f"{word} {' '.join(text.split())}\n".encode())
+    finally:
+        os._exit(0)
+
+
+def _limit_memory() -> None:
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * os.sysconf("SC_PAGE_SIZE") + MEMORY_MB * 2**20
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def _inputs(loader: Loader, first: int, size: int, seed: int) -> list[tuple[int, bytes]]:
+    """The inputs of a block, with their numbers in it."""
+    rng = np.random.default_rng([seed, zlib.crc32(loader.name.encode()), first])
+    if loader.trees and (first // BLOCK) % 2 == 1:
+        return list(enumerate(_broken_trees(loader, size, int(rng.integers(2**31)))))
+    out = []
+    for number in range(size):
+        data = loader.seeds[int(rng.integers(len(loader.seeds)))]
+        out.append((number, loader.change(data, loader.seeds, rng)))
+    return out
+
+
+def _broken_trees(loader: Loader, size: int, seed: int) -> list[bytes]:
+    found: list[bytes] = []
+
+    @hypothesis.seed(seed)
+    @settings(
+        max_examples=size,
+        database=None,
+        deadline=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(hypothesis.HealthCheck),
+    )
+    @given(st.sampled_from(loader.trees).flatmap(broken))
+    def collect(tree: object) -> None:
+        with contextlib.suppress(ValueError, TypeError):  # surrogates, and what no TOML can say
+            found.append(loader.write(tree).encode())
+
+    collect()
+    return found
+
+
+def _outcome(loader: Loader, data: bytes) -> tuple[str, str]:
+    """How a loader takes an input: read, refused, or at fault."""
+    from rsbench.errors import RsbenchError
+
+    loader.path.write_bytes(data)
+    start = time.monotonic()
+    try:
+        loader.load(loader.path)
+    except RsbenchError as error:
+        text = str(error)
+        named = any(name in text for name in (loader.path.name, loader.path.parent.name))
+        return ("refused", "") if named else ("nameless", f"does not name the file: {text[:200]}")
+    except BaseException as error:
+        return "raised", f"{type(error).__name__}: {str(error)[:200]}"
+    seconds = time.monotonic() - start
+    return ("read", "") if seconds < HANG_S else ("slow", f"{seconds:.0f} s")

@@ -1,0 +1,283 @@
+"""What reads files that somebody else may have written, each with valid files of its kind."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from attack.mutations import mutated, mutated_npz, mutated_png
+from attack.tiny import ROOT, to_toml
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loader:
+    """A reader of one kind of file, with valid files to change."""
+
+    name: str
+    path: Path
+    """Where a changed file is put: what it needs lies around it."""
+    seeds: tuple[bytes, ...]
+    load: Callable[[Path], object]
+    change: Callable[..., bytes] = mutated
+    trees: tuple[Any, ...] = ()
+    """The seeds as trees, where they are."""
+    write: Callable[[Any], str] = json.dumps
+    """Makes a file of a tree."""
+    slow: bool = False
+    """Whether it works for a tenth of a second or more, and gets a tenth of the inputs of others."""
+
+
+def loaders(inputs: Path, results: dict[str, Path], folder: Path) -> list[Loader]:
+    """All loaders; ``results`` holds a folder that each command made, ``folder`` is theirs to write in.
+
+    Those of results are left out where there are none.
+    """
+    found = [
+        *_cards(inputs, folder),
+        *_datasets(inputs, folder),
+        *_meshes(inputs, folder),
+        *_problems(folder),
+    ]
+    return [*found, *_results(inputs, results, folder)] if "evaluate" in results else found
+
+
+def _cards(inputs: Path, folder: Path) -> Iterator[Loader]:
+    from rsbench.benchmark.metric_plugins import load_metrics
+    from rsbench.benchmark.simulated.sweep_card import load_sweep
+    from rsbench.cards import load_card
+    from rsbench.dataset.card import load_dataset_card
+    from rsbench.pipeline.footage import read_rig_card
+    from rsbench.renderers.options import RendererOptions
+    from rsbench.scenes.load import read_scene_card
+    from rsbench.solvers.engine.registry import load_solver_entry
+    from rsbench.vision.corrector import load_corrector
+    from rsbench.vision.feature_matcher import load_features
+    from rsbench.vision.stereo_matcher import load_matcher
+
+    readers: dict[str, Callable[[Path], object]] = {
+        "scenes": read_scene_card,
+        "renderers": lambda path: load_card(RendererOptions, "renderers", path),
+        "solvers": load_solver_entry,
+        "datasets": lambda path: load_dataset_card(str(path)),
+        "sweeps": lambda path: load_sweep(str(path)),
+        "matchers": load_matcher,
+        "features": load_features,
+        "correctors": load_corrector,
+        "metrics": lambda path: load_metrics([path]),
+    }
+    for kind, load in readers.items():
+        seeds = [path.read_bytes() for path in sorted((ROOT / kind).glob("*.toml"))]
+        if kind in ("scenes", "datasets", "sweeps"):
+            seeds.append(
+                (
+                    inputs / {"scenes": "box.toml", "datasets": "tiny.toml", "sweeps": "sweep.toml"}[kind]
+                ).read_bytes()
+            )
+        yield _toml(f"{kind} card", _place(folder, kind) / "card.toml", seeds, load)
+    yield _toml(
+        "rig card", _place(folder, "rig") / "rig.toml", [(inputs / "rig.toml").read_bytes()], read_rig_card
+    )
+
+
+def _toml(name: str, path: Path, seeds: list[bytes], load: Callable[[Path], object]) -> Loader:
+    trees = tuple(tomllib.loads(seed.decode()) for seed in seeds)
+    return Loader(name=name, path=path, seeds=tuple(seeds), load=load, trees=trees, write=to_toml)
+
+
+def _json(name: str, path: Path, load: Callable[[Path], object], slow: bool = False) -> Loader:
+    """One whose valid file lies at its path."""
+    seed = path.read_bytes()
+    return Loader(name=name, path=path, seeds=(seed,), load=load, trees=(json.loads(seed),), slow=slow)
+
+
+def _place(folder: Path, name: str) -> Path:
+    path = folder / name
+    path.mkdir(parents=True)
+    return path
+
+
+def _datasets(inputs: Path, folder: Path) -> Iterator[Loader]:
+    from rsbench.dataset.files import load_arrays, load_matches, read_depth, read_png, read_poses
+    from rsbench.dataset.sequence import read_dataset, read_sequence
+    from rsbench.pipeline.footage import read_frame
+
+    data = folder / "data"
+    shutil.copytree(inputs / "data", data)
+    yield _json(
+        "dataset.json", data / "dataset.json", lambda path: _inside(read_dataset(path.parent), path.parent)
+    )
+    data = folder / "sequence"
+    shutil.copytree(inputs / "data" / "one", data)
+    yield _json("sequence.json", data / "sequence.json", lambda path: read_sequence(path.parent))
+    files = _place(folder, "files")
+    one = inputs / "data" / "one"
+    poses = tuple((one / "poses" / f"left_{frame}.csv").read_bytes() for frame in (0, 1))
+    yield Loader(name="poses", path=files / "poses.csv", seeds=poses, load=read_poses)
+    pngs = tuple((one / "rs" / f"left_{frame}.png").read_bytes() for frame in (0, 1))
+    yield Loader(name="PNG", path=files / "image.png", seeds=pngs, load=read_png, change=mutated_png)
+    yield Loader(name="frame", path=files / "frame.png", seeds=pngs, load=read_frame, change=mutated_png)
+    depths = tuple((one / f"{kind}_depth" / "left_0.exr").read_bytes() for kind in ("rs", "gs"))
+    yield Loader(name="EXR", path=files / "depth.exr", seeds=depths, load=read_depth)
+    matches = _matches()
+    yield Loader(
+        name="matches", path=files / "matches.npz", seeds=(matches,), load=load_matches, change=mutated_npz
+    )
+    yield Loader(name="arrays", path=files / "arrays.npz", seeds=(matches,), load=load_arrays, change=mutated_npz)
+
+
+def _inside(sequences: list[Any], folder: Path) -> None:
+    """Sequences lie in the dataset, in the folders of their names."""
+    for sequence in sequences:
+        if sequence.folder.resolve() != (folder / sequence.name).resolve() or sequence.folder.parent != folder:
+            raise AssertionError(f"sequence {sequence.name!r} lies in {sequence.folder}")
+
+
+def _matches() -> bytes:
+    import numpy as np
+
+    buffer = io.BytesIO()
+    sets: dict[str, Any] = {name: np.ones((3, 4)) for name in ("left", "right", "stereo_0", "stereo_1")}
+    np.savez_compressed(buffer, **sets, tracks=np.ones((2, 8)))
+    return buffer.getvalue()
+
+
+def _meshes(inputs: Path, folder: Path) -> Iterator[Loader]:
+    import trimesh
+
+    from rsbench.scenes import load
+    from rsbench.scenes.mesh import MeshBuilder
+
+    place, box = _place(folder, "meshes"), trimesh.creation.box((1.0, 2.0, 3.0))
+
+    def build(shading: Any, path: Path) -> None:
+        meshes = MeshBuilder(file=path.name, shading=shading).build(0, path.parent)
+        load._check_meshes(meshes, str(path))
+
+    seeds = {
+        "glb": ((inputs / "box.glb").read_bytes(), box.export(file_type="glb")),
+        "obj": (box.export(file_type="obj").encode(),),
+        "ply": (box.export(file_type="ply"), box.export(file_type="ply", encoding="ascii")),
+    }
+    for kind, shading in (("glb", "flat"), ("obj", "smooth"), ("ply", "flat"), ("ply", "smooth")):
+        path = place / f"{shading}.{kind}"
+        yield Loader(name=f"{kind.upper()} {shading}", path=path, seeds=seeds[kind], load=partial(build, shading))
+
+
+def _problems(folder: Path) -> Iterator[Loader]:
+    import numpy as np
+
+    from rsbench.errors import RsbenchError
+    from rsbench.pipeline.problem import read_problems
+
+    def read(path: Path) -> None:
+        for problem in read_problems(path, io.StringIO()):
+            if isinstance(problem, RsbenchError):
+                raise problem
+
+    place = _place(folder, "problems")
+    (place / "problem.json").write_bytes((ROOT / "examples" / "problem.json").read_bytes())
+    yield _json("problem", place / "problem.json", read)
+    tree = json.loads((place / "problem.json").read_bytes())
+    line = json.dumps(tree)
+    yield Loader(
+        name="problem lines",
+        path=place / "problems.jsonl",
+        seeds=(f"{line}\n{line}\n".encode(),),
+        load=read,
+        trees=(tree,),
+        write=lambda content: f"{json.dumps(content)}\n{line}\n",
+    )
+    camera = tree.pop("camera")
+    arrays: dict[str, Any] = {key: np.array(value) for key, value in tree.items() if not isinstance(value, dict)}
+    buffer = io.BytesIO()
+    np.savez(
+        buffer, camera=np.array([camera[key] for key in ("width", "height", "fx", "fy", "cx", "cy")]), **arrays
+    )
+    yield Loader(
+        name="problem npz",
+        path=place / "problem.npz",
+        seeds=(buffer.getvalue(),),
+        load=read,
+        change=mutated_npz,
+    )
+
+
+def _results(inputs: Path, results: dict[str, Path], folder: Path) -> Iterator[Loader]:
+    from rsbench.benchmark.images.evaluation import read_headings, read_scores
+    from rsbench.benchmark.simulated.sweep_summary import read_card, summarise_sweep
+    from rsbench.dataset.corrected_frames import fresh_folder
+    from rsbench.report.evaluation_page import write_report
+
+    sweep, tables = folder / "sweep", folder / "scores"
+    for source, target in (("simulate", sweep), ("simulate", folder / "trials"), ("evaluate", tables)):
+        shutil.copytree(results[source], target)
+    yield _json("sweep.json", sweep / "sweep.json", lambda path: read_card(path.parent))
+    trials = next((folder / "trials" / "trials").glob("*.npz"))
+    yield Loader(
+        name="trials",
+        path=trials,
+        seeds=(trials.read_bytes(),),
+        load=lambda path: summarise_sweep(path.parents[1]),
+        change=mutated_npz,
+        slow=True,
+    )
+    pose = tables / "scores" / "pose.csv"
+    yield Loader(
+        name="scores", path=pose, seeds=(pose.read_bytes(),), load=lambda p: read_scores(p.parents[1], "pose")
+    )
+    yield _json("columns.json", tables / "scores" / "columns.json", lambda p: read_headings(p.parents[1], "pose"))
+    evaluated = folder / "evaluated"
+    shutil.copytree(results["evaluate"], evaluated)
+    record = evaluated / "provenance.json"
+    yield _json("provenance", record, lambda path: write_report(inputs / "data", path.parent), slow=True)
+    yield from _predictions(inputs, results["evaluate"], folder)
+    corrected = folder / "corrected"
+    shutil.copytree(results["correct"], corrected)
+    marker = corrected / "motion.json"
+
+    def correct_again(path: Path) -> None:
+        with fresh_folder(path.parent) as fresh:
+            (fresh / path.name).write_bytes(marker_content)
+
+    marker_content = marker.read_bytes()
+    yield _json("motion.json", marker, correct_again)
+
+
+def _predictions(inputs: Path, evaluation: Path, folder: Path) -> Iterator[Loader]:
+    """Stored predictions, as they are found when they are scored."""
+    from rsbench.benchmark.images.evaluation import open_evaluation
+    from rsbench.benchmark.images.plan import EvaluationOptions, Places
+    from rsbench.benchmark.images.score import Scorer
+
+    stored = folder / "predictions"
+    shutil.copytree(evaluation, stored)
+    opened = open_evaluation(inputs / "data", stored, EvaluationOptions(solvers=("gs-8pt",)))
+    places = Places(opened.sequences[0], stored / "predictions" / "one", opened.plan.chain)
+
+    def score(path: Path) -> None:
+        Scorer(Places(places.sequence, places.folder, places.chain), opened.plan).score()
+
+    below = places.folder
+    yield _json("motion record", below / "motion" / "gs-8pt.json", score, slow=True)
+    yield _json("seconds", below / "seconds.json", score, slow=True)
+    for name, paths in (
+        ("correction record", (below / "corrected").glob("*.json")),
+        ("depth record", (below / "depth").glob("*.json")),
+    ):
+        yield _json(name, sorted(paths)[0], score, slow=True)
+    disparity = sorted((below / "depth").glob("*.npz"))[0]
+    yield Loader(
+        name="disparity",
+        path=disparity,
+        seeds=(disparity.read_bytes(),),
+        load=score,
+        change=mutated_npz,
+        slow=True,
+    )

@@ -1,0 +1,50 @@
+"""Frames rendered once and kept, so that thousands of runs need no renderer: what they write is the same."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+
+def keep_frames(folder: Path) -> None:
+    """From now on this process keeps what it renders in ``folder``."""
+    from rsbench.renderers import backend, render
+
+    rendered = render.render
+    folder.mkdir(exist_ok=True)
+
+    def keep(scene: Any, camera: Any, rotations: Any, translations: Any, options: Any, **more: Any) -> Any:
+        frame = rendered(scene, camera, rotations, translations, options, **more)
+        np.savez(_path(folder, camera, rotations, translations, options), image=frame.image, depth=frame.depth)
+        (folder / "variant").write_text(backend.start_backend().variant)
+        return frame
+
+    setattr(render, "render", keep)  # noqa: B010  an assignment has the wrong type
+
+
+def show_frames(folder: Path) -> None:
+    """From now on this process renders nothing: it takes what ``keep_frames`` left.
+
+    A frame that was not kept raises ``FileNotFoundError``.
+    """
+    from rsbench.renderers import backend, render, scene
+
+    def show(_: Any, camera: Any, rotations: Any, translations: Any, options: Any, **more: Any) -> Any:
+        with np.load(_path(folder, camera, rotations, translations, options)) as kept:
+            return render.Frame(image=kept["image"], depth=kept["depth"])
+
+    started = backend.Backend(variant=(folder / "variant").read_text())
+    backend.start_backend = lambda *_: started
+    scene.MitsubaScene = lambda *_: SimpleNamespace()  # type: ignore[assignment,misc]
+    setattr(render, "render", show)  # noqa: B010  an assignment has the wrong type
+
+
+def _path(folder: Path, camera: Any, rotations: Any, translations: Any, options: Any) -> Path:
+    digest = hashlib.sha256(f"{camera} {options}".encode())
+    for values in (rotations, translations):
+        digest.update(np.ascontiguousarray(values, dtype=np.float64).tobytes())
+    return folder / f"{digest.hexdigest()}.npz"
