@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 CASES = ("generate", "evaluate", "simulate", "correct", "reproduce")
 ATTACKS = ("kills", "files", "fuzz", "environment")
+SHOWN = 40
+"""Faults of an attack that are printed."""
 BEGIN, END = "<!-- figures of make attack -->", "<!-- end of the figures -->"
 
 
@@ -43,7 +45,7 @@ class Extent:
 
 
 LONG = Extent(kills=100, files=None, sizes=10, inputs=10_000, surroundings=None)
-SAMPLE = Extent(kills=2, files=3, sizes=0, inputs=300, surroundings=1, cases=("generate", "correct"))
+SAMPLE = Extent(kills=2, files=0, sizes=1, inputs=300, surroundings=1, cases=("generate", "correct"))
 
 
 def say(text: str) -> None:
@@ -66,8 +68,10 @@ def main() -> int:
             counts = ", ".join(f"{count} {what}" for what, count in tally.counts.items())
             rows.append(f"| {name} | {counts} | {len(tally.faults)} |")
             say(f"{name}: {counts}; {len(tally.faults)} faults; {seconds:.0f} s")
-            for fault in tally.faults:
+            for fault in tally.faults[:SHOWN]:
                 say(f"  fault: {fault}")
+            if len(tally.faults) > SHOWN:
+                say(f"  and {len(tally.faults) - SHOWN} more")
             faults += len(tally.faults)
     if chosen.write is not None:
         _write(chosen.write, rows, chosen.seed)
