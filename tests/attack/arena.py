@@ -25,7 +25,7 @@ GRACE_S = 3.0
 """Seconds in which the children of a process that was stopped or killed must end."""
 LIMIT_S = 120.0
 """Seconds after which a command hangs: the longest of them takes ten on a free machine."""
-MACHINE = ("seconds.json", "seconds.csv", "provenance.json")
+MACHINE = ("seconds.json", "seconds.csv", "provenance.json", "hashes.jsonl")
 """Files that hold times, the date and the machine: the only ones that need not be the same again."""
 _SUBREAPER = 36  # PR_SET_CHILD_SUBREAPER of prctl
 
