@@ -14,6 +14,7 @@ from rsbench.imports import blaming
 from rsbench.plugins import Kind, NoOptions, load_class, make_component
 from rsbench.scenes.model import Light, Scene, SceneBuilder, SceneMesh, Viewpoint
 
+_FARTHEST = 1e9
 Rgb: TypeAlias = tuple[float, float, float]
 
 
@@ -148,6 +149,8 @@ def _problem_of(mesh: SceneMesh) -> str | None:
         used = name != "uv" or mesh.material.texture is not None
         if used and not np.all(np.isfinite(values)):
             return f"has {name} that are not finite"
+        if used and np.max(np.abs(values), initial=0.0) > _FARTHEST:
+            return f"has {name} beyond {_FARTHEST:g}, which single precision cannot place"
     if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces) or faces.dtype.kind not in "iu":
         return f"has faces of shape {faces.shape}: must be (m, 3) whole numbers, m > 0"
     if faces.min() < 0 or faces.max() >= count:

@@ -1,4 +1,7 @@
-"""A scene from a mesh file of the user: glTF, GLB, OBJ, PLY or whatever else trimesh reads."""
+"""A scene from a mesh file of the user: glTF, GLB, OBJ, OFF, PLY or STL, read by trimesh.
+
+A file may name others, such as textures, in its own folder and below.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,9 @@ import trimesh
 from numpy.typing import NDArray
 
 from rsbench.errors import RsbenchError
+from rsbench.imports import in_words
+from rsbench.reading import FILE_BYTES, PIXELS, check_amount, check_size
+from rsbench.scenes.mesh_limits import check_mesh_file
 from rsbench.scenes.model import FloatArray, Material, SceneBuilder, SceneMesh
 
 # Rows turn file axes into a right-handed frame with z up.
@@ -20,6 +26,9 @@ _Z_UP = {
     "z": np.eye(3),
 }
 _SHEET = 1024  # columns of the sheet that holds colours of faces
+_TRIANGLES = 1 << 22
+_TEXTURES = 4
+"""Of ``PIXELS`` each; smaller ones may be more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +59,19 @@ class MeshBuilder(SceneBuilder):
             RsbenchError: the file or one that it refers to is missing or broken, or holds no triangles.
         """
         path = folder / Path(self.file).expanduser()
+        try:
+            with np.errstate(all="ignore"):  # what is not finite is refused by name
+                return self._meshes(path)
+        except RsbenchError:
+            raise
+        except (
+            Exception
+        ) as error:  # trimesh raises what a broken file makes it stumble over, often when asked late
+            raise RsbenchError(f"mesh file {path}: cannot be read: {in_words(error)}") from error
+
+    def _meshes(self, path: Path) -> tuple[SceneMesh, ...]:
         model = _read(path)
+        _check_size(model, path)
         angle = np.deg2rad(self.heading_deg)
         heading = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
         axes = self.metres_per_unit * heading @ _Z_UP[self.up_axis]
@@ -66,34 +87,48 @@ class MeshBuilder(SceneBuilder):
         return tuple(meshes)
 
 
+def _check_size(model: Any, path: Path) -> None:
+    """Refuse what its scene graph, which may show a mesh many times, unfolds to too much."""
+    nodes = [model.geometry[model.graph[node][1]] for node in model.graph.nodes_geometry]
+    triangles = sum(len(part.faces) for part in nodes if isinstance(part, trimesh.Trimesh))
+    check_amount(f"mesh file {path}", "triangles", triangles, _TRIANGLES)
+
+
 class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc,unused-ignore]
-    """Files beside the model; remembers those that were wanted and missing, which trimesh only logs."""
+    """Files beside the model and below; remembers what was wrong with them, which trimesh only logs."""
 
     def __init__(self, source: str) -> None:
         super().__init__(source)
-        self.missing: list[str] = []
+        self.wrong: list[str] = []
 
     def get(self, name: str) -> bytes:
         try:
             content: bytes = super().get(name)
-        except Exception:
-            self.missing.append(str(name))
+        except Exception as error:
+            too_large = isinstance(error, RsbenchError)
+            self.wrong.append(str(error) if too_large else f"{name}, which is missing or lies outside its folder")
             raise
         return content
+
+    def absolute(self, name: str) -> Path:
+        path: Path = super().absolute(name)  # raises where links or dots lead out of the folder
+        if path.exists():
+            if not path.is_file():
+                raise ValueError(f"{name} is no file")
+            check_amount(name, "bytes", path.stat().st_size, FILE_BYTES)
+        return path
 
 
 def _read(path: Path) -> Any:
     if not path.is_file():
         raise RsbenchError(f"mesh file {path}: no such file (parameters.file is relative to the card)")
+    check_mesh_file(path)
     neighbours = _Neighbours(str(path))
     try:
-        model = trimesh.load_scene(str(path), resolver=neighbours, process=False)
-    except Exception as error:  # the readers raise whatever a broken file makes them stumble over
-        reason = neighbours.missing[0] + " is missing" if neighbours.missing else str(error).splitlines()[:1]
-        raise RsbenchError(f"mesh file {path}: cannot be read: {type(error).__name__}: {reason}") from error
-    if neighbours.missing:
-        raise RsbenchError(f"mesh file {path}: refers to {neighbours.missing[0]}, which is missing")
-    return model
+        return trimesh.load_scene(str(path), resolver=neighbours, process=False)
+    finally:
+        if neighbours.wrong:
+            raise RsbenchError(f"mesh file {path}: refers to {neighbours.wrong[0]}")
 
 
 def _scene_mesh(
@@ -105,34 +140,47 @@ def _scene_mesh(
     materials: dict[int, Material],
     path: Path,
 ) -> SceneMesh:
+    where = f"mesh file {path}: part {name!r}"
     linear = axes @ transform[:3, :3]
     vertices = np.asarray(part.vertices, dtype=np.float64) @ linear.T + axes @ transform[:3, 3]
-    faces = np.asarray(part.faces, dtype=np.int32)
+    faces: NDArray[np.int32] = np.asarray(part.faces)
     if not np.isfinite(vertices).all():
-        raise RsbenchError(f"mesh file {path}: part {name!r} has vertices that are not finite")
-    normals = None
-    if shading == "smooth":
-        normals = np.asarray(part.vertex_normals, dtype=np.float64) @ np.linalg.inv(linear)
-        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        raise RsbenchError(f"{where} has vertices that are not finite")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise RsbenchError(f"{where} has faces that name vertices beyond its {len(vertices)}")
+    faces = faces.astype(np.int32)
+    normals = _normals(part, linear, where) if shading == "smooth" else None
     if part.visual.kind in ("vertex", "face"):
         return _coloured_faces(name, vertices, faces, normals, np.asarray(part.visual.face_colors)[:, :3])
     source = getattr(part.visual, "material", None)
     uv = getattr(part.visual, "uv", None)
     if id(source) not in materials:
-        materials[id(source)] = _material(source, f"{path}: part {name!r}")
+        materials[id(source)] = _material(source, where, list(materials.values()))
     material = materials[id(source)]
     if material.texture is not None and (uv is None or not np.isfinite(uv).all()):
-        raise RsbenchError(f"mesh file {path}: part {name!r} has a texture but no finite texture coordinates")
+        raise RsbenchError(f"{where} has a texture but no finite texture coordinates")
     uv = None if uv is None else np.asarray(uv, dtype=np.float64)
     return SceneMesh(name=name, vertices=vertices, faces=faces, material=material, uv=uv, normals=normals)
 
 
-def _material(source: Any, where: str) -> Material:
+def _normals(part: Any, linear: FloatArray, where: str) -> FloatArray:
+    """Unit normals (n, 3) of the vertices in the scene frame."""
+    try:
+        normals = np.asarray(part.vertex_normals, dtype=np.float64) @ np.linalg.inv(linear)
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    except np.linalg.LinAlgError as error:
+        raise RsbenchError(f"{where} is flattened by its transform, so that it has no normals") from error
+    if not np.isfinite(normals).all():
+        raise RsbenchError(f"{where} has normals that are not finite")
+    return normals
+
+
+def _material(source: Any, where: str, others: list[Material]) -> Material:
     """Diffuse part of a glTF or MTL material; everything else that a material may say is left out."""
     if source is None:
         return Material(name="plain")
     if isinstance(source, trimesh.visual.material.MultiMaterial):
-        raise RsbenchError(f"mesh file {where} has several materials in one part: export it as glTF instead")
+        raise RsbenchError(f"{where} has several materials in one part: export it as glTF instead")
     name = str(getattr(source, "name", None) or "unnamed")
     if isinstance(source, trimesh.visual.material.PBRMaterial):
         image, factor = source.baseColorTexture, source.baseColorFactor
@@ -145,10 +193,22 @@ def _material(source: Any, where: str) -> Material:
     if image is None:
         r, g, b = (float(value) for value in _to_srgb(linear))
         return Material(name=name, colour=(r, g, b))
+    return Material(name=name, texture=_texture(image, linear, where, others))
+
+
+def _texture(image: Any, factor: FloatArray, where: str, others: list[Material]) -> NDArray[np.uint8]:
+    """(h, w, 3) sRGB of an image times a linear factor; its size is checked before it is decoded."""
+    check_size(f"{where}: texture", image.size)
+    taken = sum(other.texture.size // 3 for other in others if other.texture is not None)
+    pixels = taken + image.size[0] * image.size[1]
+    check_amount(where, "pixels of all textures", pixels, _TEXTURES * PIXELS)
     texture = np.array(image.convert("RGB"), dtype=np.uint8)
-    if not np.all(linear == 1.0):
-        texture = np.rint(_to_srgb(_to_linear(texture / 255.0) * linear) * 255).astype(np.uint8)
-    return Material(name=name, texture=texture)
+    if not np.all(factor == 1.0):
+        levels = np.rint(_to_srgb(_to_linear(np.arange(256)[:, None] / 255.0) * factor) * 255)
+        levels = np.clip(levels, 0, 255).astype(np.uint8)
+        for channel in range(3):
+            texture[..., channel] = levels[texture[..., channel], channel]
+    return texture
 
 
 def _coloured_faces(

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -187,3 +190,127 @@ def test_bad_parameters_are_refused(tmp_path: Path, parameters: str, message: st
     with pytest.raises(RsbenchError) as caught:
         load(tmp_path, parameters)
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+# Hostile files
+
+
+def refusal(folder: Path, parameters: str) -> str:
+    with pytest.raises(RsbenchError) as caught:
+        load(folder, parameters)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def glb(header: dict[str, Any], binary: bytes = b"") -> bytes:
+    """A binary glTF of a header and a buffer."""
+    text = json.dumps({"asset": {"version": "2.0"}} | header).encode()
+    chunks = b""
+    for kind, data in ((b"JSON", text + b" " * (-len(text) % 4)), (b"BIN\0", binary + b"\0" * (-len(binary) % 4))):
+        chunks += struct.pack("<I4s", len(data), kind) + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+TRIANGLE: dict[str, Any] = {
+    "buffers": [{"byteLength": 36}],
+    "bufferViews": [{"buffer": 0, "byteLength": 36}],
+    "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+    "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+    "nodes": [{"mesh": 0}],
+    "scenes": [{"nodes": [0]}],
+}
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32).tobytes()
+
+
+def test_a_triangle_of_the_tests_own_making_is_read(tmp_path: Path) -> None:
+    (tmp_path / "x.glb").write_bytes(glb(TRIANGLE, CORNERS))
+    (mesh,) = load(tmp_path, 'file = "x.glb"').meshes
+    assert len(mesh.faces) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"accessors": [{"componentType": 5126, "count": 10**9, "type": "VEC3"}]}, "values of all accessors"),
+        ({"accessors": [{"componentType": 5126, "count": -1, "type": "VEC3"}]}, "count = -1"),
+        ({"accessors": [{"componentType": 5126, "count": 3}]}, "KeyError in its header"),
+        ({"accessors": [TRIANGLE["accessors"][0] | {"bufferView": 9}]}, "cannot be read: IndexError"),
+        ({"nodes": [{}] * 5000}, "nodes: 5000 is more than 4096; if meant, set RSBENCH_LIMITS=2"),
+        ({"meshes": [{"primitives": TRIANGLE["meshes"][0]["primitives"] * 5000}]}, "primitives: 5000"),
+        ({"meshes": [{"primitives": [{"attributes": {"POSITION": 7}}]}]}, "cannot be read"),
+        ({"meshes": 3}, "cannot be read"),
+        ({"materials": [{"extensions": {"KHR_materials_pbrSpecularGlossiness": {}}}]}, "metallic-roughness"),
+        ({"nodes": [{"mesh": 0, "scale": [0, 0, 0]}], "shading": "smooth"}, "flattened by its transform"),
+        ({"nodes": [{"mesh": 0, "scale": [1e308, 1e308, 1e308]}]}, "vertices"),
+    ],
+)
+def test_headers_that_unfold_or_lie_are_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    shading = change.pop("shading", "flat")
+    (tmp_path / "x.glb").write_bytes(glb(TRIANGLE | change, CORNERS))
+    found = refusal(tmp_path, f'file = "x.glb"\nshading = "{shading}"')
+    assert "x.glb" in found and message in found
+
+
+def test_a_mesh_that_many_nodes_show_counts_each_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rsbench.scenes.mesh._TRIANGLES", 4)
+    nodes = {"nodes": [{"mesh": 0}] * 5, "scenes": [{"nodes": list(range(5))}]}
+    (tmp_path / "x.glb").write_bytes(glb(TRIANGLE | nodes, CORNERS))
+    assert "triangles: 5 is more than 4" in refusal(tmp_path, 'file = "x.glb"')
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("x.ply", "element vertex 2000000000\nproperty float x\n", "states 2000000000 elements"),
+        ("x.ply", "element vertex -5\nproperty float x\n", "states -5 elements"),
+        ("x.ply", "element vertex many\nproperty float x\n", "ValueError"),
+        ("x.obj", "v 0 0 0\n" + "".join(f"usemtl m{k}\nf 1 1 1\n" for k in range(5000)), "groups: 5000"),
+        ("x.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 99\n", "x.obj"),
+        ("x.obj", "v 0 0 1e308\nv 1e308 0 0\nv 0 1e308 0\nf 1 2 3\n", "vertices"),
+        ("x.obj", "v 0 0 1e10\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "vertices beyond 1e+09"),
+        ("x.obj", "v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
+        ("x.zip", "PK", "must end in .glb"),
+        ("x.dae", "<a/>", "must end in .glb"),
+    ],
+)
+@pytest.mark.parametrize("shading", ["flat", "smooth"])
+def test_texts_that_unfold_or_lie_are_refused(
+    tmp_path: Path, name: str, text: str, message: str, shading: str
+) -> None:
+    if name.endswith(".ply"):
+        text = f"ply\nformat binary_little_endian 1.0\n{text}end_header\n"
+    (tmp_path / name).write_text(text)
+    assert message in refusal(tmp_path, f'file = "{name}"\nshading = "{shading}"')
+
+
+@pytest.mark.parametrize("shading", ["flat", "smooth"])
+def test_faces_that_name_no_vertex_are_refused(tmp_path: Path, shading: str) -> None:
+    faces = {"bufferView": 1, "componentType": 5125, "count": 3, "type": "SCALAR"}
+    header = TRIANGLE | {
+        "buffers": [{"byteLength": 48}],
+        "bufferViews": [*TRIANGLE["bufferViews"], {"buffer": 0, "byteOffset": 36, "byteLength": 12}],
+        "accessors": [*TRIANGLE["accessors"], faces],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+    }
+    (tmp_path / "x.glb").write_bytes(glb(header, CORNERS + np.array([0, 1, 70_000], np.uint32).tobytes()))
+    assert "beyond its 3" in refusal(tmp_path, f'file = "x.glb"\nshading = "{shading}"')
+
+
+def test_files_outside_the_models_folder_are_not_read(tmp_path: Path) -> None:
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    (tmp_path / "secret.mtl").write_text("newmtl m\nKd 1 0 0\n")
+    (inner / "link.mtl").symlink_to(tmp_path / "secret.mtl")
+    (inner / "endless.mtl").symlink_to("/dev/zero")
+    for name in ("../secret.mtl", str(tmp_path / "secret.mtl"), "link.mtl", "endless.mtl"):
+        (inner / "x.obj").write_text(f"mtllib {name}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
+        assert "missing or lies outside its folder" in refusal(inner, 'file = "x.obj"')
+
+
+def test_a_texture_is_measured_before_it_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    textured_quad().export(tmp_path / "quad.glb")
+    monkeypatch.setattr("rsbench.reading.PIXELS", 3)
+    assert "texture: 2 x 2 pixels: 4 is more than 3" in refusal(tmp_path, 'file = "quad.glb"')
+    monkeypatch.setattr("rsbench.reading.PIXELS", 4)
+    monkeypatch.setattr("rsbench.scenes.mesh.PIXELS", 0.5)
+    assert "pixels of all textures: 4 is more than 2" in refusal(tmp_path, 'file = "quad.glb"')

@@ -1,0 +1,87 @@
+"""What a mesh file would unfold to, by what it states of itself, before trimesh reads it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from rsbench.errors import RsbenchError
+from rsbench.reading import FILE_BYTES, check_amount, parse_json, read_bytes
+
+PARTS = 1 << 12
+"""Nodes, meshes, materials and so on, of each kind."""
+VALUES = 1 << 26
+"""Numbers in the arrays of a file, and in those of all its parts, which may share them."""
+SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+_TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_ARCHIVED = "KHR_materials_pbrSpecularGlossiness"
+
+
+def check_mesh_file(path: Path) -> None:
+    """Refuse a mesh file that says of itself that it unfolds to too much.
+
+    Raises:
+        RsbenchError: that, a format that is not read, or a header that cannot be one.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise RsbenchError(
+            f"mesh file {path}: cannot be read: must end in {', '.join(SUFFIXES)}; export it as GLB"
+        )
+    data, where = read_bytes(path, FILE_BYTES), f"mesh file {path}"
+    try:
+        match path.suffix.lower():
+            case ".glb":
+                _check_gltf(_json_chunk(data), where)
+            case ".gltf":
+                _check_gltf(data, where)
+            case ".ply":
+                _check_ply(data, where)
+            case ".obj":
+                check_amount(where, "groups", len(re.findall(rb"^\s*(?:usemtl|o|g)\s", data, re.MULTILINE)), PARTS)
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise RsbenchError(f"{where}: cannot be read: {type(error).__name__} in its header: {error}") from error
+
+
+def _json_chunk(data: bytes) -> bytes:
+    if data[:4] != b"glTF" or data[16:20] != b"JSON":
+        raise ValueError("not binary glTF")
+    return data[20 : 20 + int.from_bytes(data[12:16], "little")]
+
+
+def _check_gltf(text: bytes, where: str) -> None:
+    header = parse_json(text.decode("utf-8"), where)
+    for name, items in header.items():
+        if isinstance(items, list):
+            check_amount(where, name, len(items), PARTS)
+    sizes = [_size(accessor) for accessor in header.get("accessors", [])]
+    check_amount(where, "values of all accessors", sum(sizes), VALUES)
+    primitives = [primitive for mesh in header.get("meshes", []) for primitive in mesh["primitives"]]
+    check_amount(where, "primitives", len(primitives), PARTS)
+    used = [index for primitive in primitives for index in _accessors(primitive)]
+    check_amount(where, "values of all primitives", sum(sizes[index] for index in used), VALUES)
+    if any(_ARCHIVED in material.get("extensions", {}) for material in header.get("materials", [])):
+        raise RsbenchError(f"{where}: has materials of {_ARCHIVED}: export it with metallic-roughness ones")
+
+
+def _size(accessor: dict[str, Any]) -> int:
+    count, width = accessor["count"], _TYPES[accessor["type"]]
+    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+        raise ValueError(f"count = {count!r}")
+    return count * width
+
+
+def _accessors(primitive: dict[str, Any]) -> Iterable[int]:
+    found = [*primitive["attributes"].values(), *([primitive["indices"]] if "indices" in primitive else [])]
+    if any(isinstance(index, bool) or not isinstance(index, int) or index < 0 for index in found):
+        raise ValueError(f"accessors {found}")
+    return found
+
+
+def _check_ply(data: bytes, where: str) -> None:
+    header = data.partition(b"end_header")[0]
+    counts = [int(count) for count in re.findall(rb"^element\s+\S+\s+(\S+)", header, re.MULTILINE)]
+    # Each vertex and each face takes a byte at least; of text, each line is one.
+    if min(counts, default=0) < 0 or sum(counts) > len(data):
+        raise ValueError(f"states {sum(counts)} elements in {len(data)} bytes")
