@@ -14,6 +14,8 @@ PARTS = 1 << 12
 """Nodes, meshes, materials and so on, of each kind."""
 VALUES = 1 << 26
 """Numbers in the arrays of a file, and in those of all its parts, which may share them."""
+_DEEPEST = 64
+_VISITS = 1 << 28
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 _TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _ARCHIVED = "KHR_materials_pbrSpecularGlossiness"
@@ -39,7 +41,7 @@ def check_mesh_file(path: Path) -> None:
             case ".ply":
                 _check_ply(data, where)
             case ".obj":
-                check_amount(where, "groups", len(re.findall(rb"^\s*(?:usemtl|o|g)\s", data, re.MULTILINE)), PARTS)
+                _check_obj(data, where)
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise RsbenchError(f"{where}: cannot be read: {type(error).__name__} in its header: {error}") from error
 
@@ -61,8 +63,24 @@ def _check_gltf(text: bytes, where: str) -> None:
     check_amount(where, "primitives", len(primitives), PARTS)
     used = [index for primitive in primitives for index in _accessors(primitive)]
     check_amount(where, "values of all primitives", sum(sizes[index] for index in used), VALUES)
+    _check_graph(header, where)
     if any(_ARCHIVED in material.get("extensions", {}) for material in header.get("materials", [])):
         raise RsbenchError(f"{where}: has materials of {_ARCHIVED}: export it with metallic-roughness ones")
+
+
+def _check_graph(header: dict[str, Any], where: str) -> None:
+    """Nodes must be trees, as glTF asks, and not so deep that the way to each node takes long."""
+    children = [node.get("children", []) for node in header.get("nodes", [])]
+    parents = {child: number for number, each in enumerate(children) for child in each}
+    shown = [node for scene in header.get("scenes", []) for node in scene.get("nodes", [])]
+    check_amount(where, "nodes of all scenes", len(shown), PARTS)
+    if len(parents) < sum(map(len, children)):
+        raise RsbenchError(f"{where}: a node has two parents")
+    for node in parents:
+        depth = 0
+        while node in parents and depth <= _DEEPEST:
+            node, depth = parents[node], depth + 1
+        check_amount(where, "levels of nodes", depth, _DEEPEST)
 
 
 def _size(accessor: dict[str, Any]) -> int:
@@ -79,9 +97,19 @@ def _accessors(primitive: dict[str, Any]) -> Iterable[int]:
     return found
 
 
+def _check_obj(data: bytes, where: str) -> None:
+    groups = len(re.findall(rb"^\s*(?:usemtl|o|g)\s", data, re.MULTILINE))
+    check_amount(where, "groups", groups, PARTS)
+    # Its reader goes through all vertices for each group.
+    vertices = len(re.findall(rb"^\s*v\s", data, re.MULTILINE))
+    check_amount(where, "vertices times groups", vertices * groups, _VISITS)
+
+
 def _check_ply(data: bytes, where: str) -> None:
-    header = data.partition(b"end_header")[0]
+    header, _, content = data.partition(b"end_header")
     counts = [int(count) for count in re.findall(rb"^element\s+\S+\s+(\S+)", header, re.MULTILINE)]
     # Each vertex and each face takes a byte at least; of text, each line is one.
-    if min(counts, default=0) < 0 or sum(counts) > len(data):
-        raise ValueError(f"states {sum(counts)} elements in {len(data)} bytes")
+    if min(counts, default=0) < 0 or sum(counts) > len(content):
+        raise ValueError(f"states {sum(counts)} elements in {len(content)} bytes")
+    if b"ascii" in header and content.count(b"\n") > 2 * sum(counts) + PARTS:
+        raise ValueError(f"states {sum(counts)} elements in {content.count(bytes([10]))} lines")
