@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,10 +29,19 @@ def check_number(name: str, value: float, least: float, most: float = math.inf) 
         raise ValueError(f"{name} = {value!r}: must be a number {allowed}")
 
 
-def check_whole(name: str, value: object, least: int) -> None:
-    """Raises ValueError unless ``value`` is a whole number of at least ``least``."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"{name} = {value!r}: must be a whole number of at least {least}")
+def check_whole(name: str, value: object, least: int, most: float = math.inf) -> None:
+    """Raises ValueError unless ``value`` is a whole number from ``least`` to ``most``."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
+        allowed = f"of at least {least}" if math.isinf(most) else f"from {least} to {most}"
+        raise ValueError(f"{name} = {value!r}: must be a whole number {allowed}")
+
+
+def check_ranges(component: object, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Raises ValueError unless the numbers of these names lie from the first to the second; None may be."""
+    for name, (least, most) in ranges.items():
+        value = getattr(component, name)
+        if value is not None and not least <= value <= most:
+            raise ValueError(f"{name} = {value!r}: must lie in [{least:g}, {most:g}]")
 
 
 def check_rows(rig: StereoRig, shutter: RollingShutter) -> None:

@@ -12,10 +12,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import logging
-import os
 import shutil
-import stat
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -25,6 +22,8 @@ from typing import Any, TypeVar, overload
 
 from numba import config, njit
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+
+from rsbench.caches import temporary, user_cache
 
 F = TypeVar("F", bound=Callable[..., object])
 
@@ -161,7 +160,7 @@ def source_version() -> str:
 @functools.cache
 def cache_folder() -> Path | None:
     """Folder of the compiled code of these sources, made if missing; None where nothing can be written."""
-    for base in (_asked_for(), _user_cache(), _temporary()):
+    for base in (_asked_for(), user_cache(), temporary()):
         if base is None:
             continue
         folder = base / "kernels" / source_version()[:16]
@@ -179,32 +178,6 @@ def cache_folder() -> Path | None:
 
 def _asked_for() -> Path | None:
     return Path(config.CACHE_DIR) if config.CACHE_DIR else None
-
-
-def _user_cache() -> Path | None:
-    home = os.path.expanduser("~")
-    if os.environ.get("XDG_CACHE_HOME"):
-        return Path(os.environ["XDG_CACHE_HOME"]) / "rsbench"
-    if sys.platform == "win32" and os.environ.get("LOCALAPPDATA"):
-        return Path(os.environ["LOCALAPPDATA"]) / "rsbench"
-    if not os.path.isabs(home):  # no HOME, and no entry of this user
-        return None
-    return Path(home, "Library/Caches" if sys.platform == "darwin" else ".cache") / "rsbench"
-
-
-def _temporary() -> Path | None:
-    """A folder that only this user can write: whoever writes there decides what is run."""
-    try:
-        if sys.platform == "win32":
-            return Path(tempfile.gettempdir()) / "rsbench"
-        folder = Path(tempfile.gettempdir()) / f"rsbench-{os.getuid()}"
-        folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
-        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022:
-            return folder
-        return Path(tempfile.mkdtemp(prefix="rsbench-"))
-    except OSError:
-        return None
 
 
 def _remove_old(folder: Path) -> None:

@@ -12,10 +12,11 @@ import json
 import subprocess
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 import pytest
 
-from rsbench.cli import console, main
+from rsbench.cli import console, faults, main
 
 
 def run_here(*arguments: object, text: str = "", **environment: str) -> subprocess.CompletedProcess[str]:
@@ -27,6 +28,7 @@ def run_here(*arguments: object, text: str = "", **environment: str) -> subproce
     out, err, code = io.StringIO(), io.StringIO(), 0
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         patch.setattr(sys, "argv", words)
+        patch.setattr(faults, "describe", _raise)
         patch.setattr(sys, "stdin", io.StringIO(text))
         for name, value in environment.items():
             patch.setenv(name, value)
@@ -38,6 +40,10 @@ def run_here(*arguments: object, text: str = "", **environment: str) -> subproce
         finally:
             console.be_quiet(False)
     return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
+
+
+def _raise(error: Exception) -> NoReturn:
+    raise error
 
 
 def sweep_card(

@@ -70,7 +70,7 @@ def test_where_nothing_can_be_written_functions_still_compile(tmp_path: Path) ->
     code = f"""
         import sys; sys.path.insert(0, {str(tmp_path)!r})
         from rsbench import compiled
-        compiled._asked_for = compiled._user_cache = compiled._temporary = lambda: None
+        compiled._asked_for = compiled.user_cache = compiled.temporary = lambda: None
         import adds
         assert adds.quotient(3.0, 2.0) == 1.5
         assert compiled.cache_folder() is None

@@ -41,12 +41,14 @@ def generate(
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.card import load_dataset_card
+    from rsbench.dataset.files import check_out
     from rsbench.dataset.generation import STEPS, generate_dataset
     from rsbench.renderers.backend import start_backend
 
     dataset = load_dataset_card(card)
     if sequence:
         dataset = dataset.only(sequence)
+    check_out(out)
     backend = start_backend()
     if backend.message:
         typer.echo(backend.message, err=True)

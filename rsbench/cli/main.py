@@ -15,6 +15,7 @@ from rsbench.cli import (
     docs,
     doctor,
     evaluate,
+    faults,
     generate,
     reproduce,
     show,
@@ -33,8 +34,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Rolling-shutter stereo: render data with exact ground truth, solve, correct and score.",
     epilog="Start with: [bold]rsbench demo[/bold]   Exit codes: 0 done, 1 ran but failed, 2 bad input, "
-    "130 interrupted.",
+    "70 a fault of rsbench (the line names its log), 130 interrupted. What unfolds to more than a file should is "
+    "refused; RSBENCH_LIMITS=4 in the environment allows four times as much.",
 )
+_LONGEST = 2000
+"""Characters of a message; the file is named at its beginning, the remedy at its end."""
 
 
 def _version(show: bool) -> None:
@@ -77,16 +81,23 @@ for module in (
 
 
 def run() -> None:
-    """Entry point: known errors become one line on stderr and exit code 2."""
+    """Entry point: every error becomes one line on stderr; 2 for a user's, 70 for one that nobody foresaw."""
     try:
         with stoppable():
             app(prog_name="rsbench")
     except RsbenchError as error:
         _fail(str(error), error.exit_code)
-    except OSError as error:  # a full disk or a folder without permission, wherever it is met
-        _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
+    except MemoryError:
+        _fail("there is not enough memory for it; close other programs, or ask for less at once", 1)
+    except Exception as error:
+        if isinstance(error, OSError) and error.filename:  # a folder without permission, wherever it is met
+            _fail(f"{error.filename}: {error.strerror or error}")
+        _fail(faults.describe(error), faults.EXIT_CODE)
 
 
 def _fail(message: str, code: int = 2) -> None:
-    sys.stderr.write(f"rsbench: error: {' '.join(message.split())}\n")
+    words = " ".join(message.split())
+    if len(words) > _LONGEST:
+        words = f"{words[: _LONGEST // 2]} ... {words[-_LONGEST // 2 :]}"
+    sys.stderr.write(f"rsbench: error: {words}\n")
     sys.exit(code)

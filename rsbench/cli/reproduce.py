@@ -57,6 +57,9 @@ def reproduce(
     seeds: Annotated[int, typer.Option(min=1, help="Of images: runs of each solver, with other samples.")] = 20,
 ) -> None:
     """Make the committed results again: render or simulate what is missing, run, score, draw."""
+    from rsbench.dataset.files import check_out
+
+    check_out(out)
     if target is Target.images:
         _images(out, data, seeds)
     elif target is Target.correction:

@@ -59,15 +59,15 @@ def write_bytes(path: Path, data: bytes) -> None:
             partial.unlink(missing_ok=True)
 
 
-def open_folder(out: Path) -> None:
-    """Make a folder of results, if missing, and see that it can be written: before minutes of work, not after.
+def check_out(out: Path) -> None:
+    """See that a folder of results can be made or written: before minutes of work, not after. Leaves nothing.
 
     Raises:
         RsbenchError: it cannot.
     """
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=out).close()
+        place = next(path for path in (out, *out.absolute().parents) if path.exists() or path.is_symlink())
+        tempfile.TemporaryFile(dir=place).close()
     except OSError as error:
         raise RsbenchError(f"{out}: cannot be written: {error.strerror}; choose another --out") from error
 

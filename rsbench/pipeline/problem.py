@@ -16,7 +16,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
-from rsbench.reading import FILE_BYTES, check_amount, load_arrays, parse_json
+from rsbench.reading import FILE_BYTES, check_amount, load_arrays, parse_json, read_text
 
 _COLUMNS = {
     "left": "x0, y0, x1, y1",
@@ -99,8 +99,11 @@ def _read_file(path: Path) -> Iterator[Problem | RsbenchError]:
         if path.suffix == ".npz":
             yield _from_npz(path)
             return
+        if path.suffix not in _LINES:
+            yield _attempt(read_text(path), str(path), path.stem)
+            return
         with path.open(encoding="utf-8") as file:
-            yield from _parsed(file, str(path), path.stem, lines=path.suffix in _LINES)
+            yield from _parsed(file, str(path), path.stem, lines=True)
     except OSError as error:
         yield RsbenchError(f"{path}: cannot be read: {error.strerror}")
     except UnicodeDecodeError:

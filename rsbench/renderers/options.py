@@ -10,6 +10,7 @@ from rsbench.errors import RsbenchError
 
 Method = Literal["single-pass", "stitched"]
 Integrator = Literal["sunsky", "path"]
+_MOST_SAMPLES, _LONGEST_PATH = 1 << 16, 1 << 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,12 +40,12 @@ class RendererOptions:
     def __post_init__(self) -> None:
         _one_of("method", self.method, get_args(Method))
         _one_of("integrator", self.integrator, get_args(Integrator))
-        if self.samples < 1 or math.isqrt(self.samples) ** 2 != self.samples:
+        if not 1 <= self.samples <= _MOST_SAMPLES or math.isqrt(self.samples) ** 2 != self.samples:
             raise RsbenchError(
-                f"renderer samples = {self.samples}: a perfect square is needed (1, 4, 9, 16, 25, ...)"
+                f"renderer samples = {self.samples}: a perfect square is needed (1, 4, 9, ..., {_MOST_SAMPLES})"
             )
-        if self.max_depth < 1:
-            raise RsbenchError(f"renderer max_depth = {self.max_depth}: at least 1 is needed")
+        if not 1 <= self.max_depth <= _LONGEST_PATH:
+            raise RsbenchError(f"renderer max_depth = {self.max_depth}: allowed are 1 to {_LONGEST_PATH}")
         if not (math.isfinite(self.exposure) and self.exposure > 0):
             raise RsbenchError(f"renderer exposure = {self.exposure}: a positive number is needed")
         if not 0 <= self.seed < 2**32:

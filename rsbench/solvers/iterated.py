@@ -16,6 +16,7 @@ from typing import Literal, final
 
 import numpy as np
 
+from rsbench.arguments import check_whole
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
@@ -106,8 +107,7 @@ class IteratedSolver(Solver):
     """Longest translation per frame period that counts as known length."""
 
     def __post_init__(self) -> None:
-        if self.passes < 1:
-            raise ValueError(f"passes must be at least 1, got {self.passes}")
+        check_whole("passes", self.passes, 1, 10_000)
 
     @property
     def spec(self) -> SolverSpec:

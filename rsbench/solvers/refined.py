@@ -9,6 +9,7 @@ from typing import Any, Literal, final
 import cv2
 import numpy as np
 
+from rsbench.arguments import check_whole
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
@@ -76,6 +77,7 @@ class RefinedSolver(Solver):
         load_kernel(self.motion_model, self.motion_parameters)
         if not (self.use_tracks or self.use_pairs):
             raise ValueError("use_tracks and use_pairs cannot both be off")
+        check_whole("iterations", self.iterations, 1, 10_000)
 
     @property
     def inner_keys(self) -> tuple[str, ...]:

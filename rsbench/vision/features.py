@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.arguments import check_ranges
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
@@ -26,6 +27,17 @@ from rsbench.vision.images import grey_u8
 from rsbench.vision.nearest import best_two
 
 Indices = NDArray[np.int64]
+_MOST_FEATURES = 100_000
+_RANGES = {
+    "max_features": (0, _MOST_FEATURES),
+    "contrast_threshold": (0.0, 1.0),
+    "edge_threshold": (1.0, 1e6),
+    "ratio": (1e-6, 1.0),
+    "max_distance": (1e-6, 1e6),
+    "search_radius": (1e-6, 1e6),
+    "row_tolerance": (1e-6, 1e6),
+    "max_disparity": (1e-6, 1e6),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +45,7 @@ class MatchOptions:
     """What counts as a feature and what as a match; distances between descriptors are SIFT's, 0 to about 720."""
 
     max_features: int = 6000
-    """Strongest features kept per image; 0 keeps all."""
+    """Strongest features kept per image; 0 keeps all, 100 000 at most."""
     contrast_threshold: float = 0.04
     edge_threshold: float = 10.0
     ratio: float = 0.8
@@ -50,14 +62,7 @@ class MatchOptions:
     """Drop a temporal match when its loop through the other camera ends elsewhere."""
 
     def __post_init__(self) -> None:
-        if self.max_features < 0:
-            raise ValueError(f"max_features must be at least 0, got {self.max_features}")
-        if not 0.0 < self.ratio <= 1.0:
-            raise ValueError(f"ratio must lie in (0, 1], got {self.ratio}")
-        for name in ("search_radius", "max_disparity", "max_distance", "row_tolerance"):
-            value = getattr(self, name)
-            if value is not None and not value > 0.0:
-                raise ValueError(f"{name} must be positive, got {value}")
+        check_ranges(self, _RANGES)
 
 
 @final
@@ -93,7 +98,7 @@ def detect(image: NDArray[Any], options: MatchOptions | None = None) -> Features
     """SIFT features of an image (H, W) or (H, W, 3), uint8 or uint16; none in an image without texture."""
     options = options or MatchOptions()
     sift = cv2.SIFT.create(
-        nfeatures=options.max_features,
+        nfeatures=options.max_features or _MOST_FEATURES,
         contrastThreshold=options.contrast_threshold,
         edgeThreshold=options.edge_threshold,
         enable_precise_upscale=True,

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.arguments import check_ranges
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.vision.disparity_refinement import refine_disparity
 from rsbench.vision.images import grey_u8
@@ -29,6 +30,21 @@ _MODES = {
     "3way": cv2.StereoSGBM_MODE_SGBM_3WAY,
     "hh4": cv2.StereoSGBM_MODE_HH4,
 }
+_RANGES = {
+    "num_disparities": (1, 1 << 16),
+    "least_disparity": (1e-6, 1e6),
+    "nearest_depth": (1e-6, 1e9),
+    "block_size": (1, 51),
+    "p1": (1, 100_000),
+    "p2": (1, 100_000),
+    "uniqueness_percent": (0, 100),
+    "prefilter_cap": (0, 255),
+    "speckle_window": (0, 1_000_000),
+    "speckle_range": (0, 10_000),
+    "consistency_px": (1e-6, 1e6),
+    "refine_iterations": (0, 100),
+}
+"""Beyond them the matcher overflows, or takes minutes for an image."""
 _FRACTION = 16.0  # StereoSGBM counts sixteenths of a pixel
 _COARSE = 4
 _RANGE_MARGIN = 1.1
@@ -64,25 +80,11 @@ class SgmOptions:
     def __post_init__(self) -> None:
         if self.mode not in _MODES:
             raise ValueError(f"mode must be one of {sorted(_MODES)}, got {self.mode!r}")
-        if self.block_size < 1 or self.block_size % 2 == 0:
-            raise ValueError(f"block_size must be odd and positive, got {self.block_size}")
-        if self.num_disparities is not None and self.num_disparities < 1:
-            raise ValueError(f"num_disparities must be at least 1, got {self.num_disparities}")
-        if self.nearest_depth is not None and not self.nearest_depth > 0.0:
-            raise ValueError(f"nearest_depth must be positive metres, got {self.nearest_depth}")
-        if not self.least_disparity > 0.0:
-            raise ValueError(f"least_disparity must be positive, got {self.least_disparity}")
-        if not self.consistency_px > 0.0:
-            raise ValueError(f"consistency_px must be positive, got {self.consistency_px}")
-        if not 0 <= self.uniqueness_percent <= 100:
-            raise ValueError(f"uniqueness_percent must lie in [0, 100], got {self.uniqueness_percent}")
-        for name in ("prefilter_cap", "speckle_window", "speckle_range"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
-        if not 0 < self.p1 <= self.p2:
-            raise ValueError(f"p1 and p2 must satisfy 0 < p1 <= p2, got {self.p1} and {self.p2}")
-        if self.refine_iterations < 0:
-            raise ValueError(f"refine_iterations must be at least 0, got {self.refine_iterations}")
+        if self.block_size % 2 == 0:
+            raise ValueError(f"block_size = {self.block_size}: must be odd")
+        if not self.p1 <= self.p2:
+            raise ValueError(f"p1 = {self.p1}: must not exceed p2, {self.p2}")
+        check_ranges(self, _RANGES)
 
 
 @final

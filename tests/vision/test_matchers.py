@@ -46,12 +46,17 @@ def test_the_default_cards_state_the_defaults() -> None:
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("block_size = 4", "block_size must be odd"),
-        ("consistency_px = -1.0", "consistency_px must be positive"),
-        ("uniqueness_percent = 500", "uniqueness_percent must lie in"),
-        ("prefilter_cap = -3", "prefilter_cap must be at least 0"),
-        ("speckle_window = -5", "speckle_window must be at least 0"),
-        ("speckle_range = -5", "speckle_range must be at least 0"),
+        ("block_size = 4", "block_size = 4: must be odd"),
+        ("block_size = 1001", "block_size = 1001: must lie in"),
+        ("consistency_px = -1.0", "consistency_px = -1.0: must lie in"),
+        ("uniqueness_percent = 500", "uniqueness_percent = 500: must lie in"),
+        ("prefilter_cap = -3", "prefilter_cap = -3: must lie in"),
+        ("speckle_window = -5", "speckle_window = -5: must lie in"),
+        ("speckle_range = -5", "speckle_range = -5: must lie in"),
+        ("refine_iterations = 1000000000", "refine_iterations = 1000000000: must lie in"),
+        ("num_disparities = 10000000000", "num_disparities = 10000000000: must lie in"),
+        ("p2 = 3000000000", "p2 = 3000000000: must lie in"),
+        ("p1 = 100", "p1 = 100: must not exceed p2, 32"),
         ("consistency_px = nan", "must be finite"),
         ("blok_size = 3", "unknown key"),
     ],
@@ -62,6 +67,16 @@ def test_a_wrong_value_is_named(tmp_path: Path, line: str, message: str) -> None
     with pytest.raises(RsbenchError, match=message) as caught:
         load_matcher(card)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "line", ["max_features = 1000000000", "contrast_threshold = -1.0", "edge_threshold = 0.0"]
+)
+def test_features_without_end_are_refused(tmp_path: Path, line: str) -> None:
+    card = tmp_path / "wrong.toml"
+    card.write_text(f'class = "rsbench.vision.features:SiftMatcher"\n[parameters]\n{line}\n', "utf-8")
+    with pytest.raises(RsbenchError, match=f"{line}: must lie in"):
+        load_features(card)
 
 
 @pytest.mark.parametrize("line", ["time_limit_s = 0.0", "time_limit = 3.0"])

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 
+from rsbench.arguments import check_whole
 from rsbench.benchmark.simulated.simulation import SceneShape, SimulationOptions, random_direction
 from rsbench.cards import card_path, load_card, parse_card
 from rsbench.core.camera import PinholeCamera
@@ -18,6 +18,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
 from rsbench.imports import search
 from rsbench.motions import drawn_parameters, fixed_endpoint, make_motion
+from rsbench.reading import check_name
 
 Axis = Literal[
     "noise_px",
@@ -74,8 +75,7 @@ class Setting:
         for name in ("rotation_axis", "translation_axis"):
             if getattr(self, name) is not None and not any(getattr(self, name)):
                 raise ValueError(f"{name} must not be zero")
-        if self.points < 1:
-            raise ValueError(f"points must be at least 1, got {self.points}")
+        check_whole("points", self.points, 1, 100_000)
         if not 0 <= self.outlier_ratio < 1:
             raise ValueError(f"outlier_ratio must lie in [0, 1), got {self.outlier_ratio}")
         if not 0 < self.depth[0] <= self.depth[1]:
@@ -172,8 +172,7 @@ class SweepCard:
     variant: tuple[Variant, ...] = (Variant(name="all"),)
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", self.name):
-            raise ValueError(f"name = {self.name!r}: a folder name of letters, digits, '.', '_' and '-'")
+        check_name(self.name)
         if not self.values or len(set(self.values)) < len(self.values):
             raise ValueError("values must be different numbers, at least one")
         if not self.solvers or len(set(self.solvers)) < len(self.solvers):
@@ -181,8 +180,7 @@ class SweepCard:
         names = [variant.name for variant in self.variant]
         if not names or len(set(names)) < len(names):
             raise ValueError("each [[variant]] needs a name of its own")
-        if self.trials < 1:
-            raise ValueError(f"trials must be at least 1, got {self.trials}")
+        check_whole("trials", self.trials, 1, 1_000_000)
         self.cells()
 
     def cells(self) -> list[Cell]:
