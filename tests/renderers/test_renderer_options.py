@@ -33,7 +33,7 @@ def test_every_card_that_comes_along_is_valid() -> None:
         ("samples", 16.0, "samples"),
         ("method", "warp", "single-pass"),
         ("integrator", "magic", "sunsky"),
-        ("max_depth", 0, "at least 1"),
+        ("max_depth", 0, "allowed are 1 to"),
         ("exposure", -1.0, "positive"),
         ("seed", -1, "4294967295"),
         ("sample", 4, "samples"),
