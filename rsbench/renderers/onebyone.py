@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.renderers.exposure import instant_of
 from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
@@ -44,8 +45,11 @@ def radiance_rows(
         for column in range(camera.width):
             total = np.zeros(3, dtype=np.float32)
             for number, (dx, dy) in enumerate(grid):
-                origin, direction = sensor.row_ray(column + dx, row + dy, row)
-                pixel = row * camera.width + column
+                pixel, pose = row * camera.width + column, row
+                if sensor.instants > 1:
+                    instant = instant_of(options.seed, pixel, number, options.samples, sensor.instants)
+                    pose += camera.height * int(instant)
+                origin, direction = sensor.row_ray(column + dx, row + dy, pose)
                 total += np.asarray(trace(scene, origin, direction, options, pixel, number), dtype=np.float32)
             result[place, column] = total / np.float32(options.samples)
     return result

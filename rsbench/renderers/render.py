@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.se3 import Pose
 from rsbench.errors import RsbenchError
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
@@ -42,6 +43,7 @@ def render(
     translations: ArrayLike,
     options: RendererOptions | None = None,
     *,
+    exposed: Pose | None = None,
     rows: Sequence[int] | None = None,
     on_gs_frame: OnGlobalFrame | None = None,
 ) -> Frame:
@@ -53,6 +55,8 @@ def render(
         rotations: (height, 3, 3) ``cam_from_world`` of each row.
         translations: (height, 3) metres, ``X_cam = R @ X_world + t``; equal rows make a global shutter.
         options: a renderer card; the default one when absent.
+        exposed: poses (instants, height) of each row while it collects light, see ``exposure``; the image is their
+            mean, the depth that of the row poses. The number of instants is a multiple of ``options.samples``.
         rows: render only these rows of the full frame, with the bits that they have in it.
         on_gs_frame: ``stitched`` with ``full_frames`` calls it with each row and its global-shutter image
             (height, width, 3), so that the stack can be kept as the paper keeps it.
@@ -64,9 +68,13 @@ def render(
     if on_gs_frame is not None and not (options.method == "stitched" and options.full_frames):
         raise RsbenchError("on_gs_frame needs renderer method = 'stitched' and full_frames = true")
     chosen = _checked_rows(rows, camera.height)
+    row_poses = Pose(np.asarray(rotations, dtype=np.float64), np.asarray(translations, dtype=np.float64))
+    image_poses = row_poses if exposed is None else exposed
+    if exposed is not None and len(exposed.R) % options.samples:
+        raise RsbenchError(f"{len(exposed.R)} instants: a multiple of the {options.samples} samples is needed")
     if options.method == "single-pass":
-        return _single_pass(scene, camera, rotations, translations, options, chosen)
-    return _stitched(scene, camera, rotations, translations, options, chosen, on_gs_frame)
+        return _single_pass(scene, camera, row_poses, image_poses, options, chosen)
+    return _stitched(scene, camera, row_poses, image_poses, options, chosen, on_gs_frame)
 
 
 def render_global(
@@ -86,31 +94,28 @@ def render_global(
     if R.shape != (3, 3) or t.shape != (3,):
         raise RsbenchError(f"camera pose has shapes {R.shape} and {t.shape}: (3, 3) and (3,) are needed")
     rows = range(camera.height)
-    R, t = np.broadcast_to(R, (camera.height, 3, 3)), np.broadcast_to(t, (camera.height, 3))
-    return _single_pass(scene, camera, R, t, options, rows)
+    poses = Pose(np.broadcast_to(R, (camera.height, 3, 3)), np.broadcast_to(t, (camera.height, 3)))
+    return _single_pass(scene, camera, poses, poses, options, rows)
 
 
 def _single_pass(
     scene: MitsubaScene,
     camera: PinholeCamera,
-    rotations: ArrayLike,
-    translations: ArrayLike,
+    row_poses: Pose,
+    image_poses: Pose,
     options: RendererOptions,
     rows: Sequence[int],
 ) -> Frame:
     tracer = _tracer()
-    sensor = make_sensor(camera, rotations, translations)
-    return Frame(
-        image=tracer.radiance_rows(scene, sensor, camera, rows, options),
-        depth=tracer.depth_rows(scene, sensor, camera, rows),
-    )
+    image = tracer.radiance_rows(scene, make_sensor(camera, *image_poses), camera, rows, options)
+    return Frame(image=image, depth=tracer.depth_rows(scene, make_sensor(camera, *row_poses), camera, rows))
 
 
 def _stitched(
     scene: MitsubaScene,
     camera: PinholeCamera,
-    rotations: ArrayLike,
-    translations: ArrayLike,
+    row_poses: Pose,
+    image_poses: Pose,
     options: RendererOptions,
     rows: Sequence[int],
     on_gs_frame: OnGlobalFrame | None,
@@ -121,21 +126,20 @@ def _stitched(
     a packet, hence their rounding: they have the bits of the whole image.
     """
     tracer = _tracer()
-    table = pose_table(camera, rotations, translations)
-    sensor = make_sensor(camera, rotations, translations)
+    sensors = [make_sensor(camera, *poses) for poses in (image_poses, row_poses)]
+    tables = [pose_table(camera, *poses) for poses in (image_poses, row_poses)]
     image = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
     depth = np.zeros((len(rows), camera.width), dtype=np.float32)
     for place, row in enumerate(rows):
-        sensor.set_poses(np.tile(table[row], (camera.height, 1)))
-        if options.full_frames:
-            gs_image = tracer.radiance_rows(scene, sensor, camera, range(camera.height), options)
-            gs_depth = tracer.depth_rows(scene, sensor, camera, range(camera.height))
-            image[place], depth[place] = gs_image[row], gs_depth[row]
-            if on_gs_frame is not None:
-                on_gs_frame(row, gs_image)
-        else:
-            image[place] = tracer.radiance_rows(scene, sensor, camera, [row], options)[0]
-            depth[place] = tracer.depth_rows(scene, sensor, camera, [row])[0]
+        for sensor, table in zip(sensors, tables, strict=True):
+            sensor.set_poses(np.repeat(table[..., row : row + 1, :], camera.height, axis=-2))
+        traced = range(camera.height) if options.full_frames else [row]
+        gs_image = tracer.radiance_rows(scene, sensors[0], camera, traced, options)
+        gs_depth = tracer.depth_rows(scene, sensors[1], camera, traced)
+        kept = row if options.full_frames else 0
+        image[place], depth[place] = gs_image[kept], gs_depth[kept]
+        if on_gs_frame is not None:
+            on_gs_frame(row, gs_image)
     return Frame(image=image, depth=depth)
 
 

@@ -19,19 +19,20 @@ PLUGIN = "rs_pinhole"
 
 
 def pose_table(camera: PinholeCamera, rotations: ArrayLike, translations: ArrayLike) -> NDArray[np.float32]:
-    """Row poses as the kernels read them, (height, 12): ``R^T`` row-major, then the camera centre ``-R^T t``.
+    """Row poses as the kernels read them, (..., height, 12): ``R^T`` row-major, then the camera centre ``-R^T t``.
 
     Args:
         camera: its height is the number of poses.
-        rotations: (height, 3, 3) world-to-camera rotations, one per row.
-        translations: (height, 3) metres, with ``X_cam = R @ X_world + t``.
+        rotations: (..., height, 3, 3) world-to-camera rotations, one per row; a leading axis holds the instants of
+            an exposure.
+        translations: (..., height, 3) metres, with ``X_cam = R @ X_world + t``.
 
     Raises:
         RsbenchError: wrong shapes, or values that are not finite.
     """
     R = np.asarray(rotations, dtype=np.float64)
     t = np.asarray(translations, dtype=np.float64)
-    if R.shape != (camera.height, 3, 3) or t.shape != (camera.height, 3):
+    if R.shape[-3:] != (camera.height, 3, 3) or t.shape != R.shape[:-1]:
         raise RsbenchError(
             f"row poses have shapes {R.shape} and {t.shape}: a camera of {camera.height} rows needs "
             f"({camera.height}, 3, 3) and ({camera.height}, 3)"
@@ -39,15 +40,14 @@ def pose_table(camera: PinholeCamera, rotations: ArrayLike, translations: ArrayL
     if not (np.isfinite(R).all() and np.isfinite(t).all()):
         raise RsbenchError("row poses are not finite numbers")
     axes = np.swapaxes(R, -1, -2)
-    centre = -np.einsum("hij,hj->hi", axes, t)
-    return np.concatenate([axes.reshape(-1, 9), centre], axis=-1).astype(np.float32)
+    centre = -np.einsum("...ij,...j->...i", axes, t)
+    return np.concatenate([axes.reshape(*t.shape[:-1], 9), centre], axis=-1).astype(np.float32)
 
 
 def make_sensor(camera: PinholeCamera, rotations: ArrayLike, translations: ArrayLike) -> Any:
     """A Mitsuba sensor ``rs_pinhole`` with a box filter, of ``camera``'s size, at these row poses.
 
-    Args and errors: see ``pose_table``. ``rotations`` (height, 3, 3) and ``translations`` (height, 3) that are
-    equal in all rows make a global shutter.
+    Args and errors: see ``pose_table``. Poses that are equal in all rows make a global shutter.
     """
     import mitsuba as mi
 
@@ -79,19 +79,23 @@ def sensor_class() -> Any:
             super().__init__(properties)
             self.intrinsics = [mi.Float(1.0), mi.Float(1.0), mi.Float(0.0), mi.Float(0.0)]
             self.poses: Any = None
+            self.instants = 1
+            """Of an exposure: so many poses has each row."""
 
         def set_intrinsics(self, camera: PinholeCamera) -> None:
             values = (camera.fx, camera.fy, camera.cx, camera.cy)
             self.intrinsics = [dr.opaque(mi.Float, value) for value in values]
 
         def set_poses(self, table: NDArray[np.float32]) -> None:
-            """Table (height, 12) of ``pose_table``."""
+            """Table (height, 12) or (instants, height, 12) of ``pose_table``."""
+            self.instants = table.shape[0] if table.ndim == 3 else 1
             self.poses = table.ravel().tolist() if scalar else mi.Float(table.ravel())
 
         def row_ray(self, x: Any, y: Any, row: Any, active: Any = True) -> tuple[Any, Any]:
             """World origin and direction of the ray through pixel coordinates (x, y), at the pose of ``row``.
 
-            The direction has camera z = 1, so the distance to a hit in units of it is the depth z.
+            With instants, pose ``row + height * instant``. The direction has camera z = 1, so the distance to a
+            hit in units of it is the depth z.
             """
             fx, fy, cx, cy = self.intrinsics
             u, v = (x - cx) / fx, (y - cy) / fy

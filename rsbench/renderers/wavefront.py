@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.renderers.exposure import instant_of
 from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
@@ -105,6 +106,19 @@ def radiance_rows(
     return result
 
 
+def _pose(sensor: Any, camera: PinholeCamera, lanes: _Lanes, sample: Any, options: RendererOptions) -> Any:
+    """Number of the pose that a sample of each lane is seen from: its row's, at an instant of the exposure."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if sensor.instants == 1:
+        return lanes.row
+    pixel = lanes.row * dr.opaque(mi.UInt32, camera.width) + lanes.column
+    seed = dr.opaque(mi.UInt32, options.seed)
+    instant = instant_of(seed, pixel, sample, options.samples, sensor.instants)
+    return lanes.row + dr.opaque(mi.UInt32, camera.height) * instant
+
+
 def _sunsky_band(
     scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
 ) -> Float32Array:
@@ -119,7 +133,8 @@ def _sunsky_band(
 
     def add_sample(k: Any, total: Any) -> tuple[Any, Any]:
         dx, dy = dr.gather(mi.Float, grid, 2 * k), dr.gather(mi.Float, grid, 2 * k + 1)
-        origin, direction = sensor.row_ray(x + dx, y + dy, lanes.row, lanes.active)
+        pose = _pose(sensor, camera, lanes, k, options)
+        origin, direction = sensor.row_ray(x + dx, y + dy, pose, lanes.active)
         ray = mi.Ray3f(origin, dr.normalize(direction))
         return k + 1, total + sunsky_radiance(scene, ray, lanes.active)
 
@@ -149,7 +164,7 @@ def _path_band(
         sample = lanes.copy + dr.opaque(mi.UInt32, first)
         x = mi.Float(lanes.column) + dr.gather(mi.Float, offsets, 2 * sample)
         y = mi.Float(lanes.row) + dr.gather(mi.Float, offsets, 2 * sample + 1)
-        origin, direction = sensor.row_ray(x, y, lanes.row, lanes.active)
+        origin, direction = sensor.row_ray(x, y, _pose(sensor, camera, lanes, sample, options), lanes.active)
         pixel = lanes.row * dr.opaque(mi.UInt32, camera.width) + lanes.column
         sampler.seed_lanes(dr.opaque(mi.UInt32, options.seed), pixel, sample)
         ray = mi.RayDifferential3f(origin, dr.normalize(direction))
