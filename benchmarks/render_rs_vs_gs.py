@@ -1,4 +1,4 @@
-"""What a rolling-shutter frame costs beside a global-shutter frame of the same size and samples.
+"""What a rolling-shutter frame, sharp or exposed for a tenth of the period, costs beside a global-shutter one.
 
 The paper's recipe renders one global-shutter image per row, so a rolling-shutter frame of 900 rows costs 900 of
 them; the single pass should cost one. Runs alternate, so that a busy machine disturbs both alike.
@@ -22,6 +22,7 @@ from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.renderers.backend import start_backend
+from rsbench.renderers.exposure import instant_count, instant_times
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import Frame, render, render_global
 from rsbench.renderers.scene import MitsubaScene
@@ -81,24 +82,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def rolling() -> Frame:
         return render(scene, camera, R, t, options)
 
+    instants = instant_times(shutter.row_time(np.arange(given.size), 0), 0.1, instant_count(given.samples))
+    poses = rig.cam_from_world(motion, instants, "left")
+
+    def exposed() -> Frame:
+        return render(scene, camera, R, t, options, exposed=poses)
+
     def frozen() -> Frame:
         return render_global(scene, camera, R[0], t[0], options)
 
     compile_seconds = seconds(rolling)
-    seconds(frozen)
-    pairs = [(seconds(rolling), seconds(frozen)) for _ in range(given.runs)]
-    ratio = statistics.median(rs / gs for rs, gs in pairs)
-    rs, gs = (statistics.median(times) for times in zip(*pairs, strict=True))
+    seconds(frozen), seconds(exposed)
+    runs = [(seconds(frozen), seconds(rolling), seconds(exposed)) for _ in range(given.runs)]
+    ratio = statistics.median(rs / gs for gs, rs, _ in runs)
+    blur_ratio = statistics.median(blurred / rs for _, rs, blurred in runs)
+    gs, rs, blurred = (statistics.median(times) for times in zip(*runs, strict=True))
     lines = (
         f"{started.variant}, LLVM {started.llvm_version}, {given.integrator}, "
         f"{given.size} x {given.size}, {given.samples} samples, {given.runs} runs of each",
         f"first frame (compiles)    {compile_seconds:7.3f} s",
         f"rolling shutter, median   {rs:7.3f} s",
         f"global shutter, median    {gs:7.3f} s",
-        f"median ratio              {ratio:7.3f}   (limit {given.limit})",
+        f"exposed, median           {blurred:7.3f} s",
+        f"rolling over global       {ratio:7.3f}   (limit {given.limit})",
+        f"exposed over rolling      {blur_ratio:7.3f}   (limit {given.limit})",
     )
     sys.stdout.write("\n".join(lines) + "\n")
-    return 0 if ratio <= given.limit else 1
+    return 0 if max(ratio, blur_ratio) <= given.limit else 1
 
 
 if __name__ == "__main__":

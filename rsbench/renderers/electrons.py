@@ -1,0 +1,119 @@
+"""What a sensor makes of light: electrons, their noise, and digital numbers.
+
+The linear model of EMVA 1288 (release 4.0, section 2): light and dark current free a Poisson number of electrons,
+read-out adds Gaussian noise, the gain makes digital numbers of them, which are rounded and clipped. In electrons
+the variance of a pixel is ``mean + dark + read_noise^2 + step^2 / 12``, with ``step`` electrons to a number.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+_BLACK_SHARE = 1 / 16
+"""Of the digital range lies below black, so that noise in the dark is not clipped there."""
+_RANGES: dict[str, tuple[float, float]] = {
+    "exposure_s": (0.0, 3600.0),
+    "full_well": (1.0, 1e9),
+    "gain": (1e-3, 1e6),
+    "read_noise": (0.0, 1e6),
+    "dark_current": (0.0, 1e9),
+    "bit_depth": (0, 16),
+    "vignetting": (0.0, 1.0),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """Exposure and noise of an image sensor; the defaults are those of an ideal one: nothing.
+
+    Raises:
+        ValueError: a value is out of its range.
+    """
+
+    exposure_s: float = 0.0
+    """For how long a row collects light, in seconds; the middle of it is the row's time."""
+    full_well: float = 6000.0
+    """Electrons of a pixel that saturates at gain 1."""
+    gain: float = 1.0
+    """ISO over base ISO: white is ``full_well / gain`` electrons."""
+    photon_noise: bool = False
+    read_noise: float = 0.0
+    """Electrons, standard deviation."""
+    dark_current: float = 0.0
+    """Electrons per second; cameras take off its mean, its noise stays."""
+    bit_depth: int = 0
+    """Of the digital numbers; 0: they are not rounded."""
+    vignetting: float = 0.0
+    """Share of the light that the corners lose; it grows with the square of the distance from the centre."""
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            if not (math.isfinite(value) and low <= value <= high):
+                raise ValueError(f"sensor {name} = {value}: allowed is {low:g} to {high:g}")
+
+    @property
+    def white(self) -> float:
+        """Electrons of white."""
+        return self.full_well / self.gain
+
+    @property
+    def levels(self) -> tuple[int, int]:
+        """Digital numbers of black and white."""
+        top = 2**self.bit_depth - 1
+        return round(_BLACK_SHARE * top), top
+
+    def variance(self, light: ArrayLike) -> NDArray[np.float64]:
+        """Of linear values (...), white = 1, where ``light`` falls on the sensor; away from black and white."""
+        black, top = self.levels
+        dark = self.dark_current * self.exposure_s
+        shot = self.white * np.asarray(light, dtype=np.float64) + dark if self.photon_noise else 0.0
+        step = self.white / (top - black) if self.bit_depth else 0.0
+        return np.asarray((shot + self.read_noise**2 + step**2 / 12) / self.white**2, dtype=np.float64)
+
+
+def fall_off(sensor: Sensor, width: int, height: int, rows: ArrayLike) -> NDArray[np.float64]:
+    """Share of the light that the lens lets through to rows (n) of an image: (n, width)."""
+    x, y = np.arange(width) - (width - 1) / 2, np.asarray(rows) - (height - 1) / 2
+    corner = ((width - 1) / 2) ** 2 + ((height - 1) / 2) ** 2
+    return np.asarray(1.0 - sensor.vignetting * (x**2 + y[:, None] ** 2) / max(corner, 1.0), dtype=np.float64)
+
+
+def expose(
+    linear: NDArray[np.float32], sensor: Sensor, seed: int, height: int, rows: ArrayLike
+) -> NDArray[np.float64]:
+    """What the sensor says of rows of an image, linear, white = 1: from a little below 0 to 1.
+
+    Each row has random numbers of its own, so that it has the same bits by itself and in the whole image.
+
+    Args:
+        linear: (n, width, 3) light over white, before the lens' fall-off.
+        sensor: see there.
+        seed: of the image, not negative.
+        height: rows of the whole image.
+        rows: (n) their numbers.
+    """
+    rows = np.asarray(rows)
+    light = np.asarray(linear, dtype=np.float64) * fall_off(sensor, linear.shape[1], height, rows)[..., None]
+    read = np.stack(
+        [_read_out(line, sensor, np.random.default_rng([seed, row])) for line, row in zip(light, rows)]
+    )
+    black, top = sensor.levels
+    if not sensor.bit_depth:
+        return np.minimum(read, 1.0)
+    numbers = np.clip(np.round(read * (top - black)) + black, 0, top)
+    return (numbers - black) / (top - black)
+
+
+def _read_out(light: NDArray[np.float64], sensor: Sensor, random: np.random.Generator) -> NDArray[np.float64]:
+    """One row over white, not rounded; dark current is taken off at its mean."""
+    dark = sensor.dark_current * sensor.exposure_s
+    # Far beyond white all is white, and Poisson numbers of the sun's electrons need not be drawn.
+    electrons = sensor.white * np.minimum(light, 10.0) + dark
+    if sensor.photon_noise:
+        electrons = random.poisson(electrons).astype(np.float64)
+    return (electrons - dark + random.normal(0.0, sensor.read_noise, light.shape)) / sensor.white
