@@ -1,4 +1,4 @@
-"""What a rolling-shutter frame, sharp or exposed for a tenth of the period, costs beside a global-shutter one.
+"""What a rolling-shutter frame, sharp or exposed for a tenth of a period, costs beside a global-shutter one.
 
 The paper's recipe renders one global-shutter image per row, so a rolling-shutter frame of 900 rows costs 900 of
 them; the single pass should cost one. Runs alternate, so that a busy machine disturbs both alike.

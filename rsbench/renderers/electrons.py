@@ -99,9 +99,8 @@ def expose(
     """
     rows = np.asarray(rows)
     light = np.asarray(linear, dtype=np.float64) * fall_off(sensor, linear.shape[1], height, rows)[..., None]
-    read = np.stack(
-        [_read_out(line, sensor, np.random.default_rng([seed, row])) for line, row in zip(light, rows)]
-    )
+    numbered = zip(rows, light, strict=True)
+    read = np.stack([_read_out(line, sensor, np.random.default_rng([seed, row])) for row, line in numbered])
     black, top = sensor.levels
     if not sensor.bit_depth:
         return np.minimum(read, 1.0)
