@@ -59,8 +59,8 @@ assert (stitched.image == sunsky.image).all() and (stitched.depth == sunsky.dept
 parts = 0.3 * ((np.arange(64) + 0.5) / 64 - 0.5)[:, None, None]
 blur = Pose(np.tile(R, (64, 1, 1, 1)), t + parts * np.array([0.2, 0, -0.3]))
 exposed = render(scene, camera, R, t, RendererOptions(samples=4, seed=3), exposed=blur)
-np.savez(sys.argv[1], sunsky=sunsky.image, exposed=exposed.image, depth=sunsky.depth, path=path.image, seconds=seconds,
-         variant=started.variant, message=started.message or "")
+np.savez(sys.argv[1], sunsky=sunsky.image, exposed=exposed.image, depth=sunsky.depth, path=path.image,
+         seconds=seconds, variant=started.variant, message=started.message or "")
 """
 
 
