@@ -165,6 +165,16 @@ def read_poses(path: Path) -> tuple[FloatArray, Pose]:
     Raises:
         RsbenchError: missing or not in the format of ``write_poses``.
     """
+    table = read_pose_table(path)
+    return table[:, 1], Pose(so3.from_quaternion(table[:, 2:6]), table[:, 6:9])
+
+
+def read_pose_table(path: Path) -> FloatArray:
+    """The numbers (H, 9) of a file of poses as they stand there, in the order of ``POSE_COLUMNS``.
+
+    Raises:
+        RsbenchError: see ``read_poses``.
+    """
     lines = read_text(path).splitlines()
     try:
         table = np.array([[float(x) for x in line.split(",")] for line in lines[1:]])
@@ -174,7 +184,7 @@ def read_poses(path: Path) -> tuple[FloatArray, Pose]:
         raise RsbenchError(f"{path}: must have the columns {POSE_COLUMNS}")
     if not np.all(np.isfinite(table)) or not np.array_equal(table[:, 0], np.arange(len(table))):
         raise RsbenchError(f"{path}: rows must be numbered 0, 1, ... with finite numbers")
-    return table[:, 1], Pose(so3.from_quaternion(table[:, 2:6]), table[:, 6:9])
+    return table
 
 
 def save_matches(path: Path, matches: Correspondences) -> None:

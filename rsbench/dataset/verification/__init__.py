@@ -1,0 +1,91 @@
+"""Verification of a dataset: every file is what the manifests say, and every channel agrees with the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rsbench.dataset.card import DatasetCard
+from rsbench.dataset.files import read_json
+from rsbench.dataset.sequence import Sequence, read_sequence
+from rsbench.dataset.verification import structure
+from rsbench.dataset.verification.content import Comparison, images_elsewhere, read_content, twin_faults
+from rsbench.dataset.verification.findings import DepthAgreement, Progress, SequenceReport
+from rsbench.dataset.verification.poses import pose_faults
+from rsbench.dataset.verification.shots import PAIRS
+from rsbench.errors import RsbenchError
+
+__all__ = ["DepthAgreement", "SequenceReport", "verification_steps", "verify_dataset", "verify_sequence"]
+
+_STEPS = 1 + len(PAIRS)
+_MOST_ELSEWHERE = 8
+"""Other sequences among whose images an exchanged one is looked for."""
+
+
+def verify_dataset(folder: Path, stride: int = 1, progress: Progress | None = None, rerender: str = "no") -> list[SequenceReport]:
+    """Check every sequence of a dataset; faults are values, only an unreadable dataset raises.
+
+    Args:
+        folder: holds dataset.json.
+        stride: compare every ``stride``-th pixel in both directions.
+        progress: see ``Progress``; there are ``verification_steps`` in all.
+
+    Returns:
+        One report per sequence; before them one named dataset.json where that has faults of its own.
+
+    Raises:
+        RsbenchError: no dataset.json, or one that names no sequences and files.
+    """
+    manifest = read_json(folder / structure.DATASET)
+    step = progress or (lambda name: None)
+    faults = tuple(structure.dataset_faults(folder, manifest))
+    reports = [SequenceReport(name=structure.DATASET, faults=faults)] if faults else []
+    for name in structure.sequence_names(manifest):
+        reports.append(verify_sequence(folder, name, manifest, stride, step))
+    return reports
+
+
+def verification_steps(manifest: Mapping[str, Any]) -> int:
+    """How often ``verify_dataset`` reports progress on the dataset of this dataset.json."""
+    return _STEPS * len(structure.sequence_names(manifest))
+
+
+def verify_sequence(
+    folder: Path, name: str, manifest: Mapping[str, Any], stride: int = 1, step: Progress = lambda name: None
+) -> SequenceReport:
+    """Check one sequence of the dataset in ``folder``, whose dataset.json holds ``manifest``."""
+    faults = list(structure.file_faults(folder, name, manifest.get("files")))
+    agreements: list[DepthAgreement] = []
+    steps = _STEPS
+    try:
+        card = structure.card_of(manifest)
+        sequence = read_sequence(folder / name)
+        faults += structure.sequence_faults(sequence, name, card)
+        faults += pose_faults(sequence)
+        content = read_content(sequence)
+        faults += [*content.faults, *twin_faults(content)]
+        step(name)
+        steps -= 1
+        comparison = Comparison(content, stride)
+        for agreement in comparison.pairs():
+            agreements += [agreement] if agreement else []
+            step(name)
+            steps -= 1
+        others = _others(folder, name, manifest)
+        faults += comparison.faults(images_elsewhere(others))
+    except RsbenchError as error:
+        faults.append(str(error))
+    for _ in range(steps):
+        step(name)
+    return SequenceReport(name=name, faults=tuple(dict.fromkeys(faults)), agreements=tuple(agreements))
+
+
+def _others(folder: Path, name: str, manifest: Mapping[str, Any]) -> list[Sequence]:
+    found = []
+    for other in structure.sequence_names(manifest):
+        try:
+            found += [read_sequence(folder / other)] if other != name else []
+        except RsbenchError:
+            continue
+    return found[:_MOST_ELSEWHERE]

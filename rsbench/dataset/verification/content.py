@@ -1,0 +1,152 @@
+"""What the files of a sequence hold: poses, depth and images, each alone and against the others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rsbench.dataset.files import read_png
+from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.verification import depth, images
+from rsbench.dataset.verification.depth_causes import likely_cause
+from rsbench.dataset.verification.findings import DepthAgreement, finding, rows_of
+from rsbench.dataset.verification.image_causes import Elsewhere, likeness_faults
+from rsbench.dataset.verification.png import png_fault
+from rsbench.dataset.verification.shots import PAIRS, SHOTS, DepthMap, Shot, land
+from rsbench.errors import RsbenchError
+
+
+@dataclass(eq=False)
+class Content:
+    """The depth maps and images of a sequence that can be read, and the faults of those that cannot."""
+
+    sequence: Sequence
+    maps: dict[Shot, DepthMap] = field(default_factory=dict)
+    pictures: dict[Shot, images.Picture] = field(default_factory=dict)
+    faults: list[str] = field(default_factory=list)
+
+
+def read_content(sequence: Sequence) -> Content:
+    """Read all eight shots, one fault for each file that cannot be."""
+    content = Content(sequence)
+    renderer = sequence.manifest.get("renderer")
+    noisy = isinstance(renderer, dict) and renderer.get("integrator") == "path"
+    for shot in SHOTS:
+        try:
+            content.maps[shot] = DepthMap(shot, sequence.depth(shot.shutter, shot.side, shot.frame))
+        except RsbenchError as error:
+            content.faults.append(str(error))
+        camera = sequence.rig.camera
+        fault = png_fault(sequence.folder / shot.image, shot.image, (camera.width, camera.height))
+        try:
+            if fault is None:
+                image = sequence.image(shot.shutter, shot.side, shot.frame)
+                content.pictures[shot] = images.Picture.of(shot, image, noisy)
+            else:
+                content.faults.append(fault)
+        except RsbenchError as error:
+            content.faults.append(str(error))
+    return content
+
+
+def twin_faults(content: Content) -> Iterator[str]:
+    """Row 0 of a rolling-shutter frame and of its global-shutter twin are the same rays, so the same values."""
+    for shot in SHOTS:
+        twin = shot._replace(shutter="gs")
+        if shot.shutter != "rs":
+            continue
+        if {shot, twin} <= content.pictures.keys():
+            rows = [content.pictures[each].colours[0] for each in (shot, twin)]
+            unlike = np.any(rows[0] != rows[1], axis=-1)
+            if np.any(unlike):
+                what = f"{np.sum(unlike)} pixels differ from the global-shutter twin at the same pose"
+                yield finding(shot.image, f"row 0 differs from {twin.image}: {what}")
+        if {shot, twin} <= content.maps.keys():
+            values = [content.maps[each].depth[0] for each in (shot, twin)]
+            if not np.array_equal(*values):
+                what = f"by up to {np.max(np.abs(values[0] - values[1])):.3g} m at the same pose"
+                yield finding(shot.depth, f"row 0 differs from {twin.depth}: {what}")
+
+
+@dataclass(eq=False)
+class Comparison:
+    """All pairs of a sequence compared, step by step."""
+
+    content: Content
+    stride: int
+    agreements: list[tuple[Shot, Shot, DepthAgreement]] = field(default_factory=list)
+    verdicts: dict[Shot, depth.MapVerdict] = field(default_factory=dict)
+    likenesses: list[images.Likeness] = field(default_factory=list)
+    votes: dict[Shot, images.ImageVotes] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        camera = self.content.sequence.rig.camera
+        self.verdicts = {shot: depth.MapVerdict(each, self.stride) for shot, each in self.content.maps.items()}
+        self.votes = {shot: images.ImageVotes.none((camera.height, camera.width)) for shot in self.content.pictures}
+
+    def pairs(self) -> Iterator[DepthAgreement | None]:
+        """Compare one pair after the other; None where a file of it could not be read."""
+        maps, pictures = self.content.maps, self.content.pictures
+        for source, target in PAIRS:
+            if not {source, target} <= maps.keys():
+                yield None
+                continue
+            landing = land(self.content.sequence, maps[source], maps[target], self.stride)
+            agreement = depth.compare(self.verdicts[source], self.verdicts[target], landing)
+            self.agreements.append((source, target, agreement))
+            if {source, target} <= pictures.keys():
+                self.likenesses.append(
+                    images.compare(
+                        pictures[source], pictures[target], maps[source], landing, self.votes[source], self.stride
+                    )
+                )
+            yield agreement
+
+    def faults(self, elsewhere: Elsewhere) -> Iterator[str]:
+        """What the pairs show, each with its likely cause."""
+        wrong = depth.map_faults(self.verdicts)
+        for shot, fault in wrong.items():
+            cause = likely_cause(self.content.sequence, self.content.maps, shot, fault.rows)
+            yield finding(shot.depth, fault.what, rows_of(fault.rows), cause)
+        blamed = {shot.depth for shot in wrong}
+        yield from depth.pair_faults(self.agreements, blamed)
+        yield from self._image_faults(blamed, elsewhere)
+
+    def _image_faults(self, blamed: set[str], elsewhere: Elsewhere) -> Iterator[str]:
+        """Images compared through depth that is in order; a wrong map would accuse its image too."""
+        content, told = self.content, set()
+        for shot, picture in content.pictures.items():
+            fault = images.colour_fault(picture, content.pictures)
+            if fault:
+                told.add(shot)
+                yield fault
+        sound = [
+            each
+            for each in self.likenesses
+            if not {each.source.depth, each.target.depth} & blamed and not {each.source, each.target} & told
+        ]
+        for shot, fault in likeness_faults(content.sequence, content.maps, content.pictures, sound, elsewhere):
+            told.add(shot)
+            yield fault
+        for shot, votes in self.votes.items():
+            rows = images.tile_rows(votes)
+            if shot not in told and shot.depth not in blamed and np.any(rows):
+                what = "a part of these rows shows other colours than two partners at the same surface"
+                yield finding(shot.image, what, rows_of(rows))
+
+
+def images_elsewhere(others: Iterable[Sequence]) -> Elsewhere:
+    """Images of other sequences, those of the same name first."""
+    known = list(others)
+
+    def candidates(shot: Shot) -> Iterator[tuple[str, images.NDArray[np.uint8]]]:
+        for other in known:
+            for each in sorted(SHOTS, key=lambda one: one != shot):
+                try:
+                    yield f"{other.name}/{each.image}", read_png(other.folder / each.image)
+                except RsbenchError:
+                    continue
+
+    return candidates

@@ -1,0 +1,186 @@
+"""Depth maps against each other: every pixel's surface must lie where its partners see it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.dataset.verification.findings import DepthAgreement, finding
+from rsbench.dataset.verification.shots import DEPTH_TOLERANCE, BoolArray, DepthMap, Landing, Shot
+
+Bits = NDArray[np.uint8]
+
+NEAR_MISS = 1e-3
+"""A surface hidden by less than this is a disagreement, not an occlusion; shallow reliefs hide by little more."""
+_SPARE_PIXELS, _SPARE_SHARE = 5, 1e-3
+"""Pixels of a pair that may disagree: grazing edges, where float32 and the flatness test reach their limits."""
+_TYPICAL = 5e-6
+"""Largest typical relative difference of agreeing depths: bilinear interpolation on what counts as flat errs by a
+quarter of ``FLATNESS`` at most, float32 by 6e-8."""
+_BAD_SHARE, _BAD_IN_ROW = 0.05, 0.5
+"""Shares of the comparable pixels of a map, a row, that thin things may contradict: they are seen by one alone."""
+_MOST_BEHIND = 0.3
+"""Share of a map that may lie behind what two partners see: near things hide much of it when the rig moves far."""
+_FEW = 6
+"""Contradicted pixels in one row, or missing ones in a map, that thin things may leave."""
+_TILE, _BAD_IN_TILE = 8, 12
+"""A tile of 8 x 8 pixels in which 12 are contradicted, and more than agree, is no edge."""
+_CENTRED = 0.3
+"""Pixels from a pixel's centre within which a surface that spans its neighbours must be met by its ray."""
+
+
+@dataclass(eq=False)
+class MapVerdict:
+    """What the partners of one depth map say of its pixels, gathered pair by pair: one bit for each partner."""
+
+    map: DepthMap
+    stride: int
+    confirmed: Bits = field(init=False)
+    """(h, w) the partner sees the same surface there, or the same sky."""
+    contradicted: Bits = field(init=False)
+    """(h, w) the partner sees through it, or sees a surface hardly before it."""
+    hidden: Bits = field(init=False)
+    """(h, w) the partner sees a surface well before it: an occlusion, unless another says so too."""
+    holes: Bits = field(init=False)
+    """(H, W) the partner sees a surface where this map says that there is none."""
+    difference: NDArray[np.float32] = field(init=False)
+    """(h, w) smallest relative difference from a partner; infinite where nothing was compared."""
+
+    def __post_init__(self) -> None:
+        shape = self.map.depth[:: self.stride, :: self.stride].shape
+        self.confirmed, self.contradicted, self.hidden = np.zeros((3, *shape), dtype=np.uint8)
+        self.holes = np.zeros(self.map.depth.shape, dtype=np.uint8)
+        self.difference = np.full(shape, np.inf, dtype=np.float32)
+
+    @property
+    def surface(self) -> BoolArray:
+        return self.map.depth[:: self.stride, :: self.stride] > 0
+
+    def bit(self, partner: Shot) -> np.uint8:
+        """That of a partner."""
+        return np.uint8(1 << list(self.map.shot.partners()).index(partner))
+
+
+@dataclass(frozen=True, eq=False)
+class MapFault:
+    """What is wrong with one map."""
+
+    what: str
+    rows: BoolArray
+    """(H,) where."""
+    share: float
+    """Of what could be compared: the map with the largest is blamed first."""
+
+
+def compare(source: MapVerdict, target: MapVerdict, landing: Landing) -> DepthAgreement:
+    """Add what one pair shows to the verdicts of both, and count how the flat surfaces of both agree."""
+    relative, stride = landing.relative, source.stride
+    flat = source.map.flat[::stride, ::stride] & source.surface
+    with np.errstate(invalid="ignore"):
+        size = np.abs(relative)
+        agrees = size <= DEPTH_TOLERANCE
+        bit = source.bit(target.map.shot)
+        source.confirmed |= np.where(agrees, bit, np.uint8(0))
+        source.contradicted |= np.where((relative < NEAR_MISS) & ~agrees, bit, np.uint8(0))
+        source.hidden |= np.where(relative >= NEAR_MISS, bit, np.uint8(0))
+        near = size[flat & (relative < NEAR_MISS)]
+    source.difference = np.fmin(source.difference, size)
+    _mark_holes(target, landing.pixels[flat], target.bit(source.map.shot))
+    near_and_seen = near[np.isfinite(near)]
+    return DepthAgreement(
+        source=source.map.shot.depth,
+        target=target.map.shot.depth,
+        compared=near.size,
+        agreeing=int(np.sum(near <= DEPTH_TOLERANCE)),
+        typical=float(np.median(near_and_seen)) if near_and_seen.size else float("nan"),
+        p99=float(np.percentile(near_and_seen, 99)) if near_and_seen.size else float("nan"),
+    )
+
+
+def _mark_holes(target: MapVerdict, pixels: NDArray[np.float32], bit: np.uint8) -> None:
+    """Pixels of the target without a surface although the middle of a flat one lies there."""
+    pixels = pixels[np.isfinite(pixels[:, 0])]
+    nearest = np.rint(pixels)
+    centred = nearest[np.max(np.abs(pixels - nearest), axis=1, initial=0.0) <= _CENTRED].astype(np.int64)
+    height, width = target.map.depth.shape
+    x, y = np.clip(centred[:, 0], 0, width - 1), np.clip(centred[:, 1], 0, height - 1)
+    missing = target.map.depth[y, x] == 0
+    target.holes[y[missing], x[missing]] |= bit
+
+
+def map_faults(verdicts: Mapping[Shot, MapVerdict]) -> dict[Shot, MapFault]:
+    """The maps that are wrong: the worst first, and then the others without what it says of them."""
+    found: dict[Shot, MapFault] = {}
+    while True:
+        left = {shot: fault for shot in verdicts.keys() - found.keys() if (fault := _fault(verdicts[shot], found))}
+        if not left:
+            return {shot: found[shot] for shot in verdicts if shot in found}
+        worst = max(sorted(left), key=lambda shot: left[shot].share)
+        found[worst] = left[worst]
+
+
+def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
+    """What the partners that are not blamed themselves say against a map."""
+    trusted = np.uint8(sum(int(verdict.bit(each)) for each in verdict.map.shot.partners() if each not in blamed))
+    height, surface = len(verdict.map.depth), verdict.surface
+    holes = np.bitwise_count(verdict.holes & trusted) >= 2
+    if np.sum(holes) > _FEW:
+        share = float(np.mean(holes[verdict.holes > 0]))
+        return MapFault(f"{np.sum(holes)} pixels have no depth where others see a surface", np.any(holes, axis=1), share)
+    good = (verdict.confirmed & trusted != 0) & surface
+    bad = (verdict.contradicted & trusted != 0) & ~good & surface
+    behind = (np.bitwise_count(verdict.hidden & trusted) >= 2) & ~good & surface
+    if np.sum(behind) > _MOST_BEHIND * np.sum(good | bad | behind):
+        bad |= behind
+    if not np.any(bad | good):
+        if blamed and np.any(verdict.confirmed):
+            return None
+        what = "nothing can be compared with another frame" if np.any(surface) else "there is no surface"
+        return MapFault(what, np.full(height, True), 0.0)
+    rows = _bad_rows(bad, good)
+    if np.any(rows):
+        share = np.sum(bad[rows]) / max(1, np.sum((bad | good)[rows]))
+        what = f"depth differs from what others see on {100 * share:.3g} % of the comparable pixels"
+        return MapFault(what, np.repeat(rows, verdict.stride)[:height], float(np.sum(bad) / np.sum(bad | good)))
+    typical = float(np.median(verdict.difference[good])) if np.any(good) else 0.0
+    if typical > _TYPICAL:
+        what = f"depth differs typically by {typical:.1e} of itself from what others see, {_TYPICAL:.0e} is allowed"
+        return MapFault(what, np.full(height, True), 0.0)
+    return None
+
+
+def _bad_rows(bad: BoolArray, good: BoolArray) -> BoolArray:
+    """(h,) rows of a map that are wrong: by themselves, in a tile, or because all of it is."""
+    count, comparable = np.sum(bad, axis=1), np.sum(bad | good, axis=1)
+    rows = (count >= _FEW) & (count > _BAD_IN_ROW * comparable)
+    tiled = _tile_sums(bad)
+    spoilt = (tiled >= _BAD_IN_TILE) & (tiled > _tile_sums(good))
+    rows |= np.repeat(np.any(spoilt, axis=1), _TILE)[: len(bad)] & (count > 0)
+    if np.sum(count[~rows]) > max(_FEW, _BAD_SHARE * np.sum(comparable[~rows])):
+        rows |= count > _BAD_SHARE * comparable
+    return np.asarray(rows)
+
+
+def _tile_sums(flags: BoolArray) -> NDArray[np.int64]:
+    height, width = flags.shape
+    rows, columns = np.arange(0, height, _TILE), np.arange(0, width, _TILE)
+    return np.asarray(np.add.reduceat(np.add.reduceat(flags.astype(np.int64), rows, axis=0), columns, axis=1))
+
+
+def pair_faults(pairs: Iterable[tuple[Shot, Shot, DepthAgreement]], blamed: set[str]) -> Iterator[str]:
+    """Pairs that disagree though neither map is contradicted by all who see it: the motion or the rig is wrong."""
+    for source, target, agreement in pairs:
+        if {source.depth, target.depth} & blamed:
+            continue
+        wrong = agreement.compared - agreement.agreeing
+        keys = "baseline and camera" if source.side != target.side else "motion and readout_ratio"
+        cause = f"look at {keys} in sequence.json"
+        if wrong > _SPARE_PIXELS + _SPARE_SHARE * agreement.compared:
+            what = f"to {DEPTH_TOLERANCE:g} on only {100 * agreement.share:.2f} % of {agreement.compared} visible pixels"
+            yield finding(source.depth, f"depth agrees with {target.depth} {what}", cause=cause)
+        elif agreement.typical > _TYPICAL:
+            what = f"by {agreement.typical:.1e} of itself from {target.depth}, {_TYPICAL:.0e} is allowed"
+            yield finding(source.depth, f"depth differs typically {what}", cause=cause)

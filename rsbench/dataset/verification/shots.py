@@ -1,0 +1,186 @@
+"""The eight pictures of a sequence, and where the surface that one of them sees lies in another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.projection import back_project, rs_project_near
+from rsbench.core.rig import FRAMES, SIDES, Side
+from rsbench.core.se3 import Pose, inverse, transform
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.sequence import SHUTTERS, Sequence, Shutter
+
+DEPTH_TOLERANCE = 1e-4
+"""Relative difference of two depths of one surface point that still agree."""
+FLATNESS = 2e-5
+"""Largest relative second difference of inverse depth (linear on planes) of a locally flat surface: bilinear
+interpolation errs by an eighth of it along each axis, well under the tolerance; an edge bends far more."""
+FAR = 1e7
+"""Where the sky is looked for, metres: no motion of a rig moves it by a hundredth of a pixel."""
+_CHUNK_PIXELS = 1 << 17
+
+BoolArray = NDArray[np.bool_]
+
+
+class Shot(NamedTuple):
+    """One camera at one time, through a rolling shutter or a global one."""
+
+    shutter: Shutter
+    side: Side
+    frame: int
+    row: int = 0
+    """Of a global shutter: the row whose pose it has."""
+
+    @property
+    def image(self) -> str:
+        """File below the folder of the sequence, as ``depth`` is."""
+        return f"{self.shutter}/{self.side}_{self.frame}.png"
+
+    @property
+    def depth(self) -> str:
+        return f"{self.shutter}_depth/{self.side}_{self.frame}.exr"
+
+    def partners(self) -> Iterator[Shot]:
+        """Those that see most of the same: through the other shutter, the other camera's, that of the other time."""
+        yield self._replace(shutter="gs" if self.shutter == "rs" else "rs")
+        yield self._replace(side="right" if self.side == "left" else "left")
+        yield self._replace(frame=1 - self.frame)
+
+
+SHOTS = tuple(Shot(*each) for each in product(SHUTTERS, SIDES, FRAMES))
+PAIRS = tuple((source, target) for source in SHOTS for target in source.partners())
+"""Each shot against its three partners."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthMap:
+    """A depth map, and where it is one flat surface."""
+
+    shot: Shot
+    depth: NDArray[np.float32]
+    """(H, W) metres, 0 = no surface."""
+
+    @cached_property
+    def inverse(self) -> FloatArray:
+        """(H, W) 1 / m, NaN where there is no surface."""
+        solid = self.depth > 0
+        return np.where(solid, 1.0 / np.where(solid, self.depth, 1.0).astype(np.float64), np.nan)
+
+    @cached_property
+    def bends(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Second differences of inverse depth: across (H, W-2), down (H-2, W), twist (H-1, W-1); infinite at holes."""
+        across, down = np.diff(self.inverse, 2, axis=1), np.diff(self.inverse, 2, axis=0)
+        twist = np.diff(np.diff(self.inverse, axis=0), axis=1)
+        return tuple(np.nan_to_num(np.abs(each), nan=np.inf) for each in (across, down, twist))  # type: ignore[return-value]
+
+    @cached_property
+    def flat(self) -> BoolArray:
+        """(H, W) pixels whose 3 x 3 neighbourhood is one flat surface, too wide to slip between pixels."""
+        across, down, _ = self.bends
+        bend = np.maximum(_window_max(across, 3, 1), _window_max(down, 1, 3))
+        flat = np.zeros(self.depth.shape, dtype=np.bool_)
+        with np.errstate(invalid="ignore"):
+            flat[1:-1, 1:-1] = bend <= FLATNESS * self.inverse[1:-1, 1:-1]
+        return flat
+
+    @cached_property
+    def flat_blocks(self) -> BoolArray:
+        """(H-3, W-3) whether pixels [y, x] to [y + 3, x + 3] are one flat surface."""
+        across, down, twist = self.bends
+        bend = np.maximum.reduce([_window_max(across, 4, 2), _window_max(down, 2, 4), _window_max(twist, 3, 3)])
+        with np.errstate(invalid="ignore"):
+            return np.asarray(bend <= FLATNESS * self.inverse[1:-2, 1:-2])
+
+    @cached_property
+    def empty_blocks(self) -> BoolArray:
+        """(H-3, W-3) whether pixels [y, x] to [y + 3, x + 3] see no surface at all."""
+        return _window_max(self.depth, 4, 4) == 0
+
+
+def _window_max(values: NDArray, rows: int, columns: int) -> NDArray:  # type: ignore[type-arg]
+    """Largest value (H - rows + 1, W - columns + 1) of each window."""
+    height, width = values.shape
+    tall = np.maximum.reduce([values[k : height - rows + 1 + k] for k in range(rows)])
+    return np.maximum.reduce([tall[:, k : width - columns + 1 + k] for k in range(columns)])
+
+
+class Landing(NamedTuple):
+    """Where the pixels of a source are seen in a target; all (h, w) of the source's pixels, strided."""
+
+    pixels: NDArray[np.float32]
+    """(h, w, 2) px in the target; NaN outside of it."""
+    relative: NDArray[np.float32]
+    """How far the source's surface lies behind (+) or before (-) the target's, of its depth. NaN where the target
+    is not one flat surface, -inf where it sees none; sky is at 0 in sky, NaN elsewhere."""
+
+
+def land(sequence: Sequence, source: DepthMap, target: DepthMap, stride: int = 1) -> Landing:
+    """Carry every ``stride``-th pixel of the source, in both directions, into the target."""
+    grid = sequence.rig.camera.pixel_grid()[::stride, ::stride]
+    depth = source.depth[::stride, ::stride].astype(np.float64)
+    pixels = np.full(grid.shape, np.nan, dtype=np.float32)
+    relative = np.full(depth.shape, np.nan, dtype=np.float32)
+    step = max(1, _CHUNK_PIXELS // grid.shape[1])
+    for first in range(0, len(grid), step):
+        rows = slice(first, first + step)
+        sky = depth[rows] == 0
+        X = _points(sequence, source.shot, grid[rows], np.where(sky, FAR, depth[rows]))
+        seen, z = _seen(sequence, target.shot, X, grid[rows][..., 1])
+        pixels[rows] = seen
+        relative[rows] = _relative(target, seen, z, sky)
+    return Landing(pixels, relative)
+
+
+def _points(sequence: Sequence, shot: Shot, pixels: FloatArray, depth: FloatArray) -> FloatArray:
+    """World points (..., 3) that a shot sees at pixels (..., 2) with depth (...)."""
+    if shot.shutter == "gs":
+        x_in_cam = depth[..., None] * sequence.rig.camera.unproject(pixels)
+        return transform(inverse(_pose(sequence, shot)), x_in_cam)
+    return back_project(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame, pixels, depth)
+
+
+def _seen(sequence: Sequence, shot: Shot, X: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels (..., 2) and depth (...) of world points (..., 3) in a shot, NaN outside; ``rows`` are guesses."""
+    if shot.shutter == "rs":
+        projection = rs_project_near(
+            sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame, X, rows
+        )
+        return projection.pixels, projection.depth
+    camera = sequence.rig.camera
+    x_in_cam = transform(_pose(sequence, shot), X)
+    pixels = camera.project(x_in_cam)
+    outside = ~camera.contains(pixels)
+    pixels[outside] = np.nan
+    return pixels, np.where(outside, np.nan, x_in_cam[..., 2])
+
+
+def _pose(sequence: Sequence, shot: Shot) -> Pose:
+    time = sequence.shutter.row_time(shot.row, shot.frame)
+    return sequence.rig.cam_from_world(sequence.motion, time, shot.side)
+
+
+def _relative(target: DepthMap, pixels: FloatArray, z: FloatArray, sky: BoolArray) -> FloatArray:
+    """See ``Landing.relative``; of points (...) with depth ``z`` seen at ``pixels`` (..., 2) of the target."""
+    height, width = target.depth.shape
+    relative = np.full(z.shape, np.nan)
+    corner = np.floor(np.where(np.isfinite(pixels), pixels, -1.0)).astype(np.int64)
+    x0, y0 = corner[..., 0], corner[..., 1]
+    inner = (x0 >= 1) & (x0 < width - 2) & (y0 >= 1) & (y0 < height - 2)
+    block = y0[inner] - 1, x0[inner] - 1
+    flat, empty = np.zeros((2, *z.shape), dtype=np.bool_)
+    flat[inner], empty[inner] = target.flat_blocks[block], target.empty_blocks[block]
+    relative[empty] = np.where(sky[empty], 0.0, -np.inf)
+    flat &= ~sky
+    y0, x0 = y0[flat], x0[flat]
+    fx, fy = pixels[flat, 0] - x0, pixels[flat, 1] - y0
+    top = (1 - fx) * target.inverse[y0, x0] + fx * target.inverse[y0, x0 + 1]
+    bottom = (1 - fx) * target.inverse[y0 + 1, x0] + fx * target.inverse[y0 + 1, x0 + 1]
+    relative[flat] = z[flat] * ((1 - fy) * top + fy * bottom) - 1.0
+    return relative

@@ -1,0 +1,244 @@
+"""What dataset.json, its card, each sequence.json and the folders say of each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from rsbench import __version__
+from rsbench.cards import list_cards, load_card, parse_card
+from rsbench.dataset.card import DatasetCard, SequenceCard
+from rsbench.dataset.files import read_json, sha256
+from rsbench.dataset.sequence import FORMAT, RELATIVE_FILES, Sequence, sequence_manifest
+from rsbench.dataset.verification.findings import finding
+from rsbench.errors import RsbenchError
+from rsbench.reading import NAME, inside
+from rsbench.renderers.options import RendererOptions
+from rsbench.scenes.load import read_scene_card
+
+DATASET = "dataset.json"
+UNITS = {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = no surface"}
+_TEXTS = ("name", "description", "rsbench", "mitsuba")
+_MOST_NAMES = 5
+"""Files that one finding names."""
+_SAME = 1e-12
+"""Relative difference of two numbers that were computed from the same card: a thousand roundings."""
+
+
+def sequence_names(manifest: Mapping[str, Any]) -> list[str]:
+    """Names of dataset.json that may be opened: those of a folder in it, each once."""
+    names = manifest.get("sequences")
+    good = [name for name in names if is_name(name)] if isinstance(names, list) else []
+    return list(dict.fromkeys(good))
+
+
+def is_name(name: object) -> bool:
+    """Whether this is a name that a card may give to a sequence, and so no path."""
+    return isinstance(name, str) and NAME.fullmatch(name) is not None
+
+
+def dataset_faults(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
+    """What is wrong with dataset.json as a whole."""
+    if manifest.get("format") != FORMAT or isinstance(manifest.get("format"), bool):
+        yield finding(DATASET, f"format = {manifest.get('format')!r}: {FORMAT} is needed")
+    for key in _TEXTS:
+        if not isinstance(manifest.get(key), str):
+            yield finding(DATASET, f"{key} = {manifest.get(key)!r}: a text is needed")
+    if manifest.get("units") != UNITS:
+        yield finding(DATASET, f"units = {manifest.get('units')!r}: {UNITS} is needed")
+    yield from _name_faults(manifest.get("sequences"))
+    yield from _listing_faults(folder, manifest)
+    card = card_of(manifest)
+    if isinstance(card, str):
+        yield card
+        return
+    for key, value in (("name", card.name), ("description", card.description)):
+        if manifest.get(key) != value:
+            yield finding(DATASET, f"{key} = {manifest.get(key)!r}, its card says {value!r}")
+    made = [sequence.name for sequence in card.sequence]
+    if manifest.get("sequences") != made:
+        yield finding(DATASET, f"sequences = {manifest.get('sequences')!r}, its card makes {made!r}")
+
+
+def _name_faults(names: object) -> Iterator[str]:
+    if not isinstance(names, list) or not names:
+        yield finding(DATASET, f"sequences = {names!r}: a list of names is needed")
+        return
+    for number, name in enumerate(names):
+        if not is_name(name):
+            yield finding(DATASET, f"sequences: {name!r} is not the name of a folder in it")
+        elif name in names[:number]:
+            yield finding(DATASET, f"sequences: {name!r} stands there twice")
+
+
+def _listing_faults(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
+    """``files`` against the sequences and the disk; each file's content is looked at with its sequence."""
+    files, names = manifest.get("files"), sequence_names(manifest)
+    if not isinstance(files, dict):
+        yield finding(DATASET, f"files = {files!r}: a table of paths is needed")
+        return
+    strange = [path for path in files if path.partition("/")[0] not in names or not _stays_inside(path)]
+    if strange:
+        yield finding(DATASET, f"files lists what belongs to none of its sequences: {_some(strange)}")
+    there = [path for path in folder.rglob("*") if not path.is_dir() and not _hidden(path.relative_to(folder))]
+    extra = sorted({path.relative_to(folder).as_posix() for path in there} - {DATASET, *files})
+    if extra:
+        yield finding(DATASET, f"lies there but is not listed in files: {_some(extra)}")
+
+
+def _stays_inside(path: str) -> bool:
+    return not {"", ".", ".."} & set(path.split("/")) and not PurePosixPath(path).is_absolute() and "\\" not in path
+
+
+def _hidden(path: Path) -> bool:
+    """Names with a dot in front belong to the system, or to a run at work: no reader opens them."""
+    return any(part.startswith(".") for part in path.parts)
+
+
+def _some(names: list[str]) -> str:
+    left = len(names) - _MOST_NAMES
+    return ", ".join(names[:_MOST_NAMES]) + (f" and {left} more" if left > 0 else "")
+
+
+def card_of(manifest: Mapping[str, Any]) -> DatasetCard | str:
+    """The card of dataset.json, or the fault that it is none."""
+    card = manifest.get("card")
+    if not isinstance(card, dict):
+        return finding(DATASET, f"card = {card!r}: the card of the dataset is needed")
+    try:
+        return parse_card(DatasetCard, card, f"{DATASET}: card")
+    except RsbenchError as error:
+        return str(error)
+
+
+def file_faults(folder: Path, name: str, files: object) -> Iterator[str]:
+    """Files of a sequence against both manifests: there, listed in both, and with the bytes that they say."""
+    listed = files if isinstance(files, dict) else {}
+    below = f"{name}/"
+    own, fault = _own_files(folder / name)
+    if fault:
+        yield fault
+    expected = {"sequence.json", *RELATIVE_FILES, *own}
+    expected |= {path.removeprefix(below) for path in listed if path.startswith(below) and _stays_inside(path)}
+    for relative in sorted(expected):
+        entry = listed.get(below + relative)
+        if relative not in own and relative != "sequence.json" and not fault:
+            yield finding(f"{below}sequence.json", f"files does not list {relative}")
+        if entry is None:
+            yield finding(below + relative, "not listed in dataset.json")
+        else:
+            yield from _content_faults(folder, below + relative, entry, own.get(relative))
+
+
+def _own_files(folder: Path) -> tuple[dict[str, object], str]:
+    """``files`` of a sequence.json, and what is wrong with it."""
+    try:
+        files = read_json(folder / "sequence.json").get("files")
+    except RsbenchError as error:
+        return {}, str(error)
+    if not isinstance(files, dict) or not files:
+        return {}, finding(f"{folder.name}/sequence.json", f"files = {files!r}: a table of sha256 is needed")
+    strange = [path for path in files if not _stays_inside(path)]
+    if strange:
+        fault = finding(f"{folder.name}/sequence.json", f"files lists paths that leave it: {_some(strange)}")
+        return {path: digest for path, digest in files.items() if path not in strange}, fault
+    return files, ""
+
+
+def _content_faults(folder: Path, name: str, entry: object, own: object) -> Iterator[str]:
+    try:
+        path = inside(folder, name)
+    except RsbenchError as error:
+        yield str(error)
+        return
+    if not path.is_file():
+        yield finding(name, "missing")
+        return
+    if not isinstance(entry, dict) or not isinstance(entry.get("size"), int) or "sha256" not in entry:
+        yield finding(DATASET, f"files: {name} = {entry!r}: size and sha256 are needed")
+        return
+    size = path.stat().st_size
+    digest = sha256(path) if size == entry["size"] else ""
+    if digest != entry["sha256"]:
+        what = f"content differs from its checksum in {DATASET}"
+        yield finding(name, what if digest else f"{what}: {size} bytes, it says {entry['size']}")
+    elif own is not None and digest != own:
+        yield finding(name, f"content differs from its checksum in {name.partition('/')[0]}/sequence.json")
+
+
+def sequence_faults(sequence: Sequence, name: str, card: DatasetCard | str) -> Iterator[str]:
+    """What sequence.json says against itself, its folder and the card."""
+    file, manifest = "sequence.json", sequence.manifest
+    expected = sequence_manifest(
+        name=name,
+        rig=sequence.rig,
+        shutter=sequence.shutter,
+        motion=sequence.motion,
+        frame_period_s=sequence.frame_period_s,
+    )
+    for key, value in expected.items():
+        if not _equal(manifest.get(key), value):
+            yield finding(file, f"{key} = {manifest.get(key)!r}, the rest of it makes {value!r}")
+    if not 0 < sequence.frame_period_s < math.inf:
+        yield finding(file, f"frame_period_s = {sequence.frame_period_s}: a positive number is needed")
+    made_by = manifest.get("made_by")
+    for key in ("rsbench", "mitsuba", "drjit", "variant"):
+        if not isinstance(made_by, dict) or not isinstance(made_by.get(key), str):
+            yield finding(file, f"made_by: {key} is missing")
+    planned = next((s for s in card.sequence if s.name == name), None) if isinstance(card, DatasetCard) else None
+    if isinstance(card, DatasetCard) and planned is not None:
+        yield from _card_faults(manifest, card, planned)
+
+
+def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: SequenceCard) -> Iterator[str]:
+    """sequence.json against what the card would make, as far as that is known without building the scene."""
+    made = manifest.get("made_by")
+    same_version = isinstance(made, dict) and made.get("rsbench") == __version__
+    planned = sequence_manifest(
+        name=sequence.name,
+        rig=card.rig_of(sequence),
+        shutter=card.shutter(),
+        motion=card.motion_of(sequence),
+        frame_period_s=card.frame_period_s,
+    )
+    planned |= {"seed": card.seed_of(sequence)}
+    scene: dict[str, Any] = {"viewpoint": sequence.viewpoint}
+    # The cards that come with another version may say other things.
+    if same_version and sequence.scene in list_cards("scenes"):
+        built_in, _ = read_scene_card(list_cards("scenes")[sequence.scene])
+        scene |= {"name": built_in.name}
+        if sequence.viewpoint in built_in.viewpoints:
+            scene |= asdict(built_in.viewpoints[sequence.viewpoint])
+    options: dict[str, Any] = {}
+    if same_version and card.renderer in list_cards("renderers"):
+        options = asdict(load_card(RendererOptions, "renderers", card.renderer))
+        # `generate --full-frames` replaces these two.
+        options = {key: value for key, value in options.items() if key not in ("method", "full_frames")}
+    for key, value in planned.items():
+        if not _equal(manifest.get(key), value):
+            yield finding("sequence.json", f"{key} = {manifest.get(key)!r}, the card in {DATASET} makes {value!r}")
+    for table, wanted in (("scene", scene), ("renderer", options)):
+        stored = manifest.get(table)
+        if not isinstance(stored, dict):
+            yield finding("sequence.json", f"{table} = {stored!r}: a table is needed")
+            continue
+        for key, value in wanted.items():
+            if not _equal(stored.get(key), value):
+                what = f"{table}.{key} = {stored.get(key)!r}, the card in {DATASET} makes {value!r}"
+                yield finding("sequence.json", what)
+
+
+def _equal(stored: object, expected: object) -> bool:
+    """Equal as JSON holds it, numbers to rounding; a truth value is no number."""
+    if isinstance(expected, Mapping):
+        same_keys = isinstance(stored, Mapping) and stored.keys() == expected.keys()
+        return same_keys and all(_equal(stored[key], value) for key, value in expected.items())  # type: ignore[index]
+    if isinstance(expected, list | tuple):
+        alike = isinstance(stored, list) and len(stored) == len(expected)
+        return alike and all(map(_equal, stored, expected))  # type: ignore[arg-type]
+    if isinstance(expected, bool) or isinstance(stored, bool) or not isinstance(expected, int | float):
+        return type(stored) is type(expected) and stored == expected
+    return isinstance(stored, int | float) and math.isclose(stored, expected, rel_tol=_SAME, abs_tol=1e-15)

@@ -1,0 +1,556 @@
+"""Faults planted into a copy of a sound dataset, each alone and with all hashes made to fit: verify must name each.
+
+The fast sample of the test command and the long run take the same table, ``FAULTS``. By itself, all of them:
+
+    python tests/attack/planted_faults.py --out FOLDER
+
+The dataset is that of datasets/smoke.toml, with the sequences "castle" and "room-twist".
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.motion import TwistMotion
+from rsbench.core.projection import row_poses
+from rsbench.core.rig import VIEWS
+from rsbench.dataset.files import read_depth, read_json, read_png, sha256, write_depth, write_json, write_png, write_poses
+from rsbench.dataset.sequence import read_sequence, sequence_manifest
+from rsbench.dataset.verification import verify_dataset
+
+VICTIM, OTHER = "castle", "room-twist"
+Plant = Callable[[Path], None]
+"""Changes the files of a dataset in a folder."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault: what plants it, and words that one line of verify's answer must hold."""
+
+    name: str
+    plant: Plant
+    words: tuple[str, ...]
+    rendered: bool = False
+    """Whether only rendering again can show it."""
+    rehash: bool = True
+    """Whether the hashes are made to fit; False where the hashes are the fault."""
+
+
+def rehash(folder: Path) -> None:
+    """What an adversary does last: every hash, size and list fits the files that are there now."""
+    manifest = read_json(folder / "dataset.json")
+    listed: dict[str, Any] = {}
+    for name in dict.fromkeys(path.partition("/")[0] for path in manifest["files"]):
+        own = read_json(folder / name / "sequence.json")
+        paths = [path for path in own["files"] if (folder / name / path).is_file()]
+        own["files"] = {path: sha256(folder / name / path) for path in paths}
+        write_json(folder / name / "sequence.json", own)
+        for path in ("sequence.json", *paths):
+            file = folder / name / path
+            listed[f"{name}/{path}"] = {"sha256": sha256(file), "size": file.stat().st_size}
+    write_json(folder / "dataset.json", manifest | {"files": listed})
+
+
+def planted(fault: Fault, sound: Path, out: Path) -> Path:
+    """A copy of the sound dataset with the fault in it."""
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.copytree(sound, out)
+    fault.plant(out)
+    if fault.rehash:
+        rehash(out)
+    return out
+
+
+def found(fault: Fault, folder: Path, rerender: str = "no") -> tuple[bool, list[str]]:
+    """Whether one line of verify's answer has the fault's words; and all lines."""
+    lines = [line for report in verify_dataset(folder, rerender=rerender) for line in report.faults]  # type: ignore[arg-type]
+    return any(all(word in line for word in fault.words) for line in lines), lines
+
+
+# How files are changed
+
+
+def depth_of(shutter: str, view: str, change: Callable[[NDArray[np.float32]], NDArray[Any]]) -> Plant:
+    def plant(folder: Path) -> None:
+        path = folder / VICTIM / f"{shutter}_depth/{view}.exr"
+        write_depth(path, np.asarray(change(read_depth(path).copy()), dtype=np.float32))
+
+    return plant
+
+
+def image_of(shutter: str, view: str, change: Callable[[NDArray[np.uint8]], NDArray[Any]]) -> Plant:
+    def plant(folder: Path) -> None:
+        path = folder / VICTIM / f"{shutter}/{view}.png"
+        pixels = change(read_png(path).copy())
+        if pixels.dtype == np.uint8 and pixels.ndim == 3 and pixels.shape[2] == 3:
+            write_png(path, pixels)
+        else:
+            assert cv2.imwrite(str(path), pixels)
+
+    return plant
+
+
+def copied(source: str, target: str) -> Plant:
+    return lambda folder: shutil.copyfile(folder / source, folder / VICTIM / target) and None
+
+
+def swapped(*pairs: tuple[str, str]) -> Plant:
+    def plant(folder: Path) -> None:
+        for one, other in pairs:
+            a, b = (folder / VICTIM / each for each in (one, other))
+            kept = a.read_bytes()
+            a.write_bytes(b.read_bytes())
+            b.write_bytes(kept)
+
+    return plant
+
+
+def poses_of(view: str, change: Callable[[list[list[str]]], list[list[str]]]) -> Plant:
+    """``change`` takes and gives the lines of the file, header first, split at commas."""
+
+    def plant(folder: Path) -> None:
+        path = folder / VICTIM / f"poses/{view}.csv"
+        lines = [line.split(",") for line in path.read_text().splitlines()]
+        path.write_text("\n".join(",".join(line) for line in change(lines)) + "\n")
+
+    return plant
+
+
+def rows_scaled(columns: slice, factor: float, rows: slice = slice(1, None)) -> Callable[[list[list[str]]], list[list[str]]]:
+    def change(lines: list[list[str]]) -> list[list[str]]:
+        for line in lines[rows]:
+            line[columns] = [repr(factor * float(value)) for value in line[columns]]
+        return lines
+
+    return change
+
+
+def cell(row: int, column: int, value: str) -> Callable[[list[list[str]]], list[list[str]]]:
+    def change(lines: list[list[str]]) -> list[list[str]]:
+        lines[row][column] = value
+        return lines
+
+    return change
+
+
+def renumbered(lines: list[list[str]]) -> list[list[str]]:
+    return [lines[0], *([str(row), *line[1:]] for row, line in enumerate(lines[1:]))]
+
+
+def manifest_of(file: str, change: Callable[[dict[str, Any]], object]) -> Plant:
+    """``change`` changes the content of a JSON file in place."""
+
+    def plant(folder: Path) -> None:
+        content = json.loads((folder / file).read_text())
+        change(content)
+        (folder / file).write_text(json.dumps(content, indent=2))
+
+    return plant
+
+
+def put(*path: Any) -> Callable[[dict[str, Any]], object]:
+    """Set the last of the keys in ``path[:-1]`` to ``path[-1]``."""
+    *keys, last, value = path
+
+    def change(content: Any) -> None:
+        for key in keys:
+            content = content[key]
+        content[last] = value
+
+    return change
+
+
+def drop(*path: Any) -> Callable[[dict[str, Any]], object]:
+    *keys, last = path
+
+    def change(content: Any) -> None:
+        for key in keys:
+            content = content[key]
+        del content[last]
+
+    return change
+
+
+def other_geometry(manifest: dict[str, Any], card: dict[str, Any]) -> Plant:
+    """sequence.json, poses and card all say another geometry than the one that was rendered."""
+
+    def plant(folder: Path) -> None:
+        path = folder / VICTIM / "sequence.json"
+        stored = read_json(path)
+        write_json(path, {**stored, **manifest, "camera": {**stored["camera"], **manifest.get("camera", {})}})
+        sequence = read_sequence(path.parent)
+        if "motion_of" in card:
+            sequence = card["motion_of"](sequence)
+        again = sequence_manifest(
+            name=sequence.name,
+            rig=sequence.rig,
+            shutter=sequence.shutter,
+            motion=sequence.motion,
+            frame_period_s=sequence.frame_period_s,
+        )
+        write_json(path, {**read_json(path), **again})
+        rows = np.arange(sequence.shutter.height)
+        for side, frame in VIEWS:
+            poses = row_poses(sequence.rig, sequence.shutter, sequence.motion, side, frame)
+            write_poses(path.parent / f"poses/{side}_{frame}.csv", sequence.shutter.row_time(rows, frame), poses)
+        dataset = read_json(folder / "dataset.json")
+        dataset["card"].update(card.get("card", {}))
+        dataset["card"]["sequence"][0].update(card.get("sequence", {}))
+        write_json(folder / "dataset.json", dataset)
+
+    return plant
+
+
+# What the changes are
+
+RNG = 7
+
+
+def noised(size: float, rows: slice = slice(1, None)) -> Callable[[NDArray[np.float32]], NDArray[Any]]:
+    def change(depth: NDArray[np.float32]) -> NDArray[Any]:
+        noise = 1 + size * np.random.default_rng(RNG).standard_normal(depth.shape)
+        depth[rows] = (depth * noise)[rows]
+        return np.maximum(depth, 0)
+
+    return change
+
+
+def holed(depth: NDArray[np.float32]) -> NDArray[Any]:
+    depth[50:60, 40:60] = 0
+    return depth
+
+
+def times(factor: float, *where: slice) -> Callable[[NDArray[np.float32]], NDArray[Any]]:
+    def change(depth: NDArray[np.float32]) -> NDArray[Any]:
+        depth[where] = depth[where] * np.float32(factor)
+        return depth
+
+    return change
+
+
+def shifted(down: int, right: int) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    """All but row 0."""
+
+    def change(pixels: NDArray[Any]) -> NDArray[Any]:
+        moved = np.roll(pixels, (down, right), axis=(0, 1))
+        moved[0] = pixels[0]
+        return moved
+
+    return change
+
+
+def below_row_0(function: Callable[[NDArray[Any]], NDArray[Any]]) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    def change(pixels: NDArray[Any]) -> NDArray[Any]:
+        changed = np.array(function(pixels.copy()))
+        changed[0] = pixels[0]
+        return changed
+
+    return change
+
+
+def random_pixels(image: NDArray[np.uint8], rows: slice = slice(1, None)) -> NDArray[np.uint8]:
+    image[rows] = np.random.default_rng(RNG).integers(0, 256, image.shape, dtype=np.uint8)[rows]
+    return image
+
+
+def rays(depth: NDArray[np.float32]) -> NDArray[Any]:
+    """Distance along the ray; the focal length of the dataset is 150 px."""
+    y, x = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    centre = (np.array(depth.shape) - 1) / 2
+    return depth * np.sqrt(1 + ((x - centre[1]) / 150) ** 2 + ((y - centre[0]) / 150) ** 2)
+
+
+def bgr(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+
+
+def brightened(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.clip(image * 1.25, 0, 255).astype(np.uint8)
+
+
+def _depth_faults() -> Iterator[Fault]:
+    for shutter, view in (("rs", "left_0"), ("rs", "right_1"), ("gs", "left_1"), ("gs", "right_0")):
+        file = f"{shutter}_depth/{view}.exr"
+
+        def fault(
+            name: str, change: Callable[[Any], Any], *words: str, shutter: str = shutter, view: str = view, file: str = file
+        ) -> Fault:
+            return Fault(f"{file} {name}", depth_of(shutter, view, change), (file, *words))
+
+        yield fault("scaled by 1.0002", times(1.0002), "scaled by 1.000")
+        yield fault("scaled by 1.02", times(1.02), "scaled by 1.0")
+        yield fault("scaled by 1.0002 below row 0", times(1.0002, slice(1, None)), "scaled by 1.000")
+        yield fault("zeroed", lambda depth: depth * 0, "zeroed")
+        yield fault("zeroed below row 0", times(0.0, slice(1, None)), "others see a surface")
+        yield fault("holed", holed, "others see a surface", "rows 5")
+        yield fault("noise of 1e-3", noised(1e-3), "noise")
+        yield fault("noise of 1e-2 in rows 40 to 59", noised(1e-2, slice(40, 60)), "rows 4")
+        yield fault("shifted by a row", shifted(1, 0), "shifted by 1 row")
+        yield fault("shifted by a pixel", shifted(0, 1), "shifted by 1 column")
+        yield fault("upside down", below_row_0(np.flipud), "upside down")
+        yield fault("left to right", below_row_0(np.fliplr), "left to right")
+        yield fault("along the ray", below_row_0(rays), "along the ray")
+    rs, gs = "rs_depth/left_0.exr", "gs_depth/left_0.exr"
+    for name, change in (
+        ("NaN", lambda depth: np.where(np.arange(len(depth))[:, None] == 20, np.nan, depth)),
+        ("negative", lambda depth: -depth),
+        ("infinite", lambda depth: np.where(depth == 0, np.inf, depth)),
+    ):
+        yield Fault(f"{gs} {name}", depth_of("gs", "left_0", change), (gs, "finite"))
+    yield Fault("one row of 1.0005", depth_of("rs", "left_0", times(1.0005, slice(30, 31))), (rs, "row 30"))
+    yield Fault("patch of 1.001", depth_of("gs", "left_0", times(1.001, slice(60, 80), slice(40, 64))), (gs, "rows 6"))
+    yield Fault("GS depth is RS depth", copied(f"{VICTIM}/{rs}", gs), (gs, f"the same as {rs}"))
+    yield Fault("RS depth is GS depth", copied(f"{VICTIM}/{gs}", rs), (rs, f"the same as {gs}"))
+    yield Fault("RS and GS depth exchanged", swapped((rs, gs)), ("depth/left_0.exr", "looks like"))
+    yield Fault("depth left and right exchanged", swapped((rs, "rs_depth/right_0.exr")), (rs, "looks like rs_depth/right_0.exr"))
+    yield Fault("depth of frames exchanged", swapped((gs, "gs_depth/left_1.exr")), (gs, "looks like gs_depth/left_1.exr"))
+    yield Fault("depth of another sequence", copied(f"{OTHER}/{rs}", rs), (rs, "differs"))
+    yield Fault("every depth scaled by 1.02", _every_depth(1.02), ("depth/",))
+    yield Fault("every depth scaled by 1.0002", _every_depth(1.0002), ("depth/", "scaled by 1.0002"), rendered=True)
+
+
+def _every_depth(factor: float) -> Plant:
+    def plant(folder: Path) -> None:
+        for shutter in ("rs", "gs"):
+            for side, frame in VIEWS:
+                depth_of(shutter, f"{side}_{frame}", times(factor))(folder)
+
+    return plant
+
+
+def _image_faults() -> Iterator[Fault]:
+    for shutter, view in (("rs", "right_0"), ("gs", "left_1")):
+        file = f"{shutter}/{view}.png"
+        for name, change, words in (
+            ("channels exchanged", bgr, "channels exchanged"),
+            ("channels exchanged below row 0", below_row_0(bgr), "channels exchanged"),
+            ("channels turned", lambda image: np.roll(image, 1, axis=2), "channels exchanged"),
+            ("left to right", below_row_0(np.fliplr), "left to right"),
+            ("upside down", below_row_0(np.flipud), "upside down"),
+            ("turned", below_row_0(lambda image: np.rot90(image, 2)), "turned"),
+            ("shifted by a row", shifted(1, 0), "shifted by one row"),
+            ("shifted by a row upwards", shifted(-1, 0), "shifted by one row"),
+            ("shifted by a pixel", shifted(0, 1), "shifted by one column"),
+            ("noise", random_pixels, "noise"),
+            ("noise in rows 40 to 63", lambda image: random_pixels(image, slice(40, 64)), "rows 4"),
+            ("black", lambda image: image * 0, "black"),
+            ("black below row 0", below_row_0(lambda image: image * 0), "other colours"),
+            ("one colour", lambda image: image * 0 + np.uint8(120), "of one colour"),
+            ("brightened", below_row_0(brightened), "times as bright"),
+            ("16 bits", lambda image: image[..., ::-1].astype(np.uint16) * 257, "RGB of 16 bits"),
+            ("grey", grey, "is grey of 8 bits"),
+            ("grey in three channels", lambda image: np.repeat(grey(image)[..., None], 3, axis=2), "image is grey"),
+            ("RGBA", lambda image: cv2.cvtColor(image, cv2.COLOR_RGB2BGRA), "is RGBA of 8 bits"),
+            ("cut", lambda image: image[:-1].copy(), "pixels, the camera"),
+        ):
+            yield Fault(f"{file} {name}", image_of(shutter, view, change), (file, words))
+    yield Fault("patch of noise", image_of("rs", "left_1", _noisy_patch), ("rs/left_1.png", "colours"))
+    for name, one, other in (
+        ("left and right", "rs/left_0.png", "rs/right_0.png"),
+        ("frames", "rs/left_0.png", "rs/left_1.png"),
+        ("shutters", "rs/right_1.png", "gs/right_1.png"),
+        ("GS left and right", "gs/left_0.png", "gs/right_0.png"),
+        ("GS frames", "gs/right_0.png", "gs/right_1.png"),
+        ("cameras and frames", "rs/left_0.png", "rs/right_1.png"),
+    ):
+        yield Fault(f"images exchanged: {name}", swapped((one, other)), (one, f"looks like {other}"))
+    sides = [(f"{s}/left_{k}.png", f"{s}/right_{k}.png") for s in ("rs", "gs") for k in (0, 1)]
+    yield Fault("all left and right images exchanged", swapped(*sides), (".png", "other colours"))
+    frames = [(f"{s}/{side}_0.png", f"{s}/{side}_1.png") for s in ("rs", "gs") for side in ("left", "right")]
+    yield Fault("all frames exchanged", swapped(*frames), (".png", "other colours"))
+    yield Fault("GS image is RS image", copied(f"{VICTIM}/rs/left_0.png", "gs/left_0.png"), ("gs/left_0.png", "like rs/left_0.png"))
+    for shutter in ("rs", "gs"):
+        file = f"{shutter}/left_1.png"
+        yield Fault(f"{shutter} image of another sequence", copied(f"{OTHER}/{file}", file), (file, f"like {OTHER}/{file}"))
+    blurred = below_row_0(lambda image: cv2.GaussianBlur(image, (0, 0), 0.8))
+    yield Fault("blurred", image_of("rs", "left_0", blurred), ("rs/left_0.png",), rendered=True)
+
+
+def _noisy_patch(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    image[40:76, 40:90] = np.random.default_rng(RNG).integers(0, 256, (36, 50, 3), dtype=np.uint8)
+    return image
+
+
+def _pose_faults() -> Iterator[Fault]:
+    file = "poses/left_0.csv"
+    quaternion, place = slice(2, 6), slice(6, 9)
+    for name, change, words in (
+        ("zero quaternions", rows_scaled(quaternion, 0.0), "quaternion is zero"),
+        ("one zero quaternion", rows_scaled(quaternion, 0.0, slice(8, 9)), "row 7: the quaternion is zero"),
+        ("quaternions of norm 1.01", rows_scaled(quaternion, 1.01), "norm 1.01"),
+        ("one quaternion of norm 2", rows_scaled(quaternion, 2.0, slice(8, 9)), "row 7"),
+        ("negated quaternions", rows_scaled(quaternion, -1.0), "w >= 0"),
+        ("one negated quaternion", rows_scaled(quaternion, -1.0, slice(96, 97)), "row 95"),
+        ("millimetres", rows_scaled(place, 1000.0), "differs from the motion"),
+        ("one place off by 1e-9 m", rows_scaled(place, 1 + 1e-8, slice(50, 51)), "row 49"),
+        ("late times", rows_scaled(slice(1, 2), 1.01), "periods"),
+        ("NaN in a quaternion", cell(9, 3, "nan"), "finite numbers"),
+        ("NaN in a place", cell(9, 8, "nan"), "finite numbers"),
+        ("infinite time", cell(9, 1, "inf"), "finite numbers"),
+        ("empty cell", cell(9, 4, ""), "not a table of numbers"),
+        ("a word", cell(9, 4, "abc"), "not a table of numbers"),
+        ("last row cut", lambda lines: lines[:-1], "has 95 rows"),
+        ("one row too many", lambda lines: [*lines, ["96", *lines[-1][1:]]], "has 97 rows"),
+        ("shifted by a row", lambda lines: renumbered([lines[0], lines[1], *lines[1:-1]]), "shifted by one row"),
+        ("rows upside down", lambda lines: renumbered([lines[0], *lines[:0:-1]]), "differs from the motion"),
+        ("columns exchanged", lambda lines: [[*line[:6], line[7], line[6], line[8]] for line in lines], "columns"),
+    ):
+        yield Fault(f"{file} {name}", poses_of("left_0", change), (f"left_0.csv", words))
+    yield Fault("poses left and right exchanged", swapped((file, "poses/right_0.csv")), (file, "poses of right_0"))
+    yield Fault("poses of frames exchanged", swapped((file, "poses/left_1.csv")), (file, "poses of left_1"))
+
+
+def _manifest_faults() -> Iterator[Fault]:
+    own = f"{VICTIM}/sequence.json"
+    for key, value in (
+        ("frame_period_s", 0.2),
+        ("readout_time_s", 0.1),
+        ("row_time_s", 0.001),
+        ("name", "keep"),
+        ("conventions", 2),
+        ("format", True),
+        ("baseline", 0.31),
+        ("seed", 2),
+        ("camera", {"width": 128, "height": 96, "fx": 151.0, "fy": 150.0, "cx": 63.5, "cy": 47.5}),
+    ):
+        yield Fault(f"{key} of sequence.json", manifest_of(own, put(key, value)), ("sequence.json", key))
+    for key in ("conventions", "row_time_s", "scene", "renderer", "made_by", "seed"):
+        yield Fault(f"{key} of sequence.json missing", manifest_of(own, drop(key)), ("sequence.json", key))
+    for path in (("scene", "name"), ("scene", "viewpoint"), ("renderer", "integrator")):
+        yield Fault(f"{'.'.join(path)} of sequence.json", manifest_of(own, put(*path, "x")), ("sequence.json", ".".join(path)))
+    yield Fault("samples of sequence.json", manifest_of(own, put("renderer", "samples", 16)), ("renderer.samples = 16",))
+    motion = manifest_of(own, lambda content: content["motion"].update(w=[0.0, 0.01, 0.0]))
+    yield Fault("motion of sequence.json", motion, ("poses/left_0.csv", "differs from the motion"))
+
+
+def _consistent_faults() -> Iterator[Fault]:
+    """Another truth in all places that state it: only the depth maps know better."""
+    yield Fault(
+        "another readout ratio everywhere",
+        other_geometry({"readout_ratio": 0.79}, {"card": {"readout_ratio": 0.79}}),
+        ("rs_depth/", "depth"),
+    )
+    yield Fault(
+        "another baseline everywhere",
+        other_geometry({"baseline": 0.301}, {"card": {"baseline": 0.301}}),
+        ("_depth/", "baseline"),
+    )
+    yield Fault(
+        "another focal length everywhere",
+        other_geometry({"camera": {"fx": 151.0, "fy": 151.0}}, {}),
+        ("_depth/", "depth"),
+    )
+
+    def twist(sequence: Any) -> Any:
+        from dataclasses import replace
+
+        return replace(sequence, motion=TwistMotion(sequence.motion.w, sequence.motion.d))
+
+    yield Fault("another motion model everywhere", other_geometry({}, {"motion_of": twist}), ("_depth/", "depth"))
+
+
+def _dataset_faults() -> Iterator[Fault]:
+    def dataset(name: str, change: Callable[[dict[str, Any]], object], *words: str, fit: bool = True) -> Fault:
+        return Fault(f"dataset.json: {name}", manifest_of("dataset.json", change), ("dataset.json", *words), rehash=fit)
+
+    yield dataset("another name", put("name", "other"), "name = 'other'")
+    yield dataset("no name", drop("name"), "name = None")
+    yield dataset("another description", put("description", "other"), "description")
+    yield dataset("another format", put("format", 2), "format = 2")
+    yield dataset("other units", put("units", "length", "mm"), "units")
+    yield dataset("no card", drop("card"), "card")
+    for name, path, words in (
+        ("baseline", ("card", "baseline", 0.4), ("baseline = 0.3", "0.4")),
+        ("focal length", ("card", "camera", "focal", 151.0), ("camera", "151")),
+        ("readout ratio", ("card", "readout_ratio", 0.7), ("readout_ratio = 0.8", "0.7")),
+        ("motion", ("card", "motion", "rotation_deg", 1.6), ("motion", "card")),
+        ("seed", ("card", "seed", 2), ("seed = 1", "2")),
+        ("frame period", ("card", "frame_period_s", 0.2), ("frame_period_s = 0.1", "0.2")),
+        ("viewpoint", ("card", "sequence", 0, "viewpoint", "gate"), ("viewpoint", "gate")),
+        ("scene", ("card", "sequence", 0, "scene", "old-town"), ("scene.name", "old-town")),
+        ("renderer", ("card", "renderer", "default"), ("renderer.samples", "16")),
+    ):
+        yield Fault(f"card of another {name}", manifest_of("dataset.json", put(*path)), words)
+    yield dataset("card with an unknown key", put("card", "basline", 1.0), "basline")
+    yield dataset("card of another name", put("card", "name", "other"), "its card says 'other'")
+    yield dataset("card names another sequence", put("card", "sequence", 0, "name", "keep"), "its card makes", "keep")
+    yield dataset("card of one sequence", lambda content: content["card"]["sequence"].pop(), "its card makes")
+    yield dataset("a sequence twice", lambda content: content["sequences"].append(VICTIM), "twice")
+    yield dataset("no sequences", put("sequences", []), "a list of names")
+    yield dataset("a sequence less", lambda content: content["sequences"].pop(), "none of its sequences")
+    yield dataset("other order", lambda content: content["sequences"].reverse(), "its card makes")
+    yield dataset("a path for a name", put("sequences", 0, f"../sound/{VICTIM}"), "not the name of a folder")
+    yield dataset("a number for a name", put("sequences", 0, 3), "not the name of a folder")
+    yield dataset("no files", put("files", {}), "not listed", fit=False)
+    yield dataset("files as a list", put("files", []), "a table of paths", fit=False)
+    file = f"{VICTIM}/rs/left_0.png"
+    yield dataset("a file less", drop("files", file), "not listed", "rs/left_0.png", fit=False)
+    yield dataset("a path outside", put("files", "../x.png", {"sha256": "", "size": 1}), "../x.png", fit=False)
+    yield dataset("an entry without a size", drop("files", file, "size"), "size and sha256", fit=False)
+    yield dataset("an entry of another type", put("files", file, 3), "size and sha256", fit=False)
+    yield Fault("another size", manifest_of("dataset.json", put("files", file, "size", 1)), ("left_0.png", "it says 1"), rehash=False)
+    yield Fault("another hash", manifest_of("dataset.json", put("files", file, "sha256", "0")), ("left_0.png", "checksum"), rehash=False)
+
+
+def _own_list_faults() -> Iterator[Fault]:
+    """Lists of sequence.json, with dataset.json made to fit."""
+    own = f"{VICTIM}/sequence.json"
+
+    def listed(change: Callable[[dict[str, Any]], object]) -> Plant:
+        def plant(folder: Path) -> None:
+            manifest_of(own, change)(folder)
+            file = folder / own
+            entry = {"sha256": sha256(file), "size": file.stat().st_size}
+            manifest_of("dataset.json", put("files", own, entry))(folder)
+
+        return plant
+
+    for name, change, words in (
+        ("a wrong hash", put("files", "gs/left_0.png", "0" * 64), ("gs/left_0.png", "sequence.json")),
+        ("an empty list", put("files", {}), ("files", "sequence.json")),
+        ("no list", drop("files"), ("files", "sequence.json")),
+        ("a file less", drop("files", "gs_depth/left_0.exr"), ("does not list gs_depth/left_0.exr",)),
+        ("a file that is not there", put("files", "gs/left_2.png", "0" * 64), ("left_2.png",)),
+        ("a path outside", put("files", "../x", "0" * 64), ("../x",)),
+    ):
+        yield Fault(f"sequence.json lists {name}", listed(change), words, rehash=False)
+    extra = lambda place: lambda folder: (folder / place).write_text("more") and None  # noqa: E731
+    yield Fault("a file that nothing lists", extra("notes.txt"), ("notes.txt", "not listed"), rehash=False)
+    yield Fault("an image that nothing lists", extra(f"{VICTIM}/rs/left_2.png"), ("left_2.png", "not listed"), rehash=False)
+    gone = lambda folder: (folder / VICTIM / "gs/left_0.png").unlink()  # noqa: E731
+    yield Fault("a file gone", gone, ("gs/left_0.png", "missing"), rehash=False)
+    yield Fault("a file gone from all lists", gone, ("gs/left_0.png",))
+
+
+FAULTS = (
+    *_depth_faults(),
+    *_image_faults(),
+    *_pose_faults(),
+    *_manifest_faults(),
+    *_consistent_faults(),
+    *_dataset_faults(),
+    *_own_list_faults(),
+)
+
+
+def run(sound: Path, out: Path, faults: tuple[Fault, ...] = FAULTS) -> dict[str, list[str]]:
+    """The faults that verify did not name, each with what it said instead."""
+    missed = {}
+    for fault in faults:
+        named, lines = found(fault, planted(fault, sound, out / "planted"), "all" if fault.rendered else "no")
+        if not named:
+            missed[fault.name] = lines
+    return missed
