@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+import rsbench
+from rsbench.cards import load_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.files import sha256, write_depth, write_json, write_png, write_poses
 from rsbench.dataset.sequence import FRAMES, RELATIVE_FILES, sequence_manifest
+from rsbench.dataset.verification.structure import UNITS
+from rsbench.renderers.options import RendererOptions
 
 PLANES = ((np.array([0.05, 1.0, -0.15]), 1.2), (np.array([0.1, 0.05, 1.0]), 9.0))
 """Normal n and offset c of n . X = c, world frame."""
@@ -33,10 +39,35 @@ def plane_depth(camera: PinholeCamera, poses: Pose) -> NDArray[np.float32]:
     return np.min(depths, axis=0).astype(np.float32)
 
 
+def plane_colours(camera: PinholeCamera, poses: Pose, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """What is painted on the planes: waves in the world, some 12 px long, others in each channel."""
+    x_in_cam = depth[..., None] * camera.unproject(camera.pixel_grid())
+    X = np.einsum("hji,hwj->hwi", poses.R, x_in_cam - poses.t[:, None])
+    waves = np.array([[5.0, 4.0, 3.0], [-4.0, 5.0, 2.0], [3.0, -5.0, 4.0]])
+    return np.round(128 + 50 * np.sin(X @ waves.T)).astype(np.uint8)
+
+
+def _card(rig: StereoRig, shutter: RollingShutter, motion: Motion) -> DatasetCard:
+    return DatasetCard(
+        name="planes",
+        camera=CameraCard(width=rig.camera.width, height=rig.camera.height, focal=rig.camera.fx),
+        baseline=rig.baseline,
+        readout_ratio=shutter.readout_ratio,
+        motion=MotionCard(
+            model=motion.name,
+            rotation_deg=float(np.rad2deg(np.linalg.norm(motion.w))),
+            rotation_axis=tuple(motion.w.tolist()),
+            translation=float(np.linalg.norm(motion.d)),
+            translation_axis=tuple(motion.d.tolist()),
+        ),
+        sequence=(SequenceCard(name="planes", scene="planes.toml"),),
+    )
+
+
 def write_analytic_dataset(
     out: Path, rig: StereoRig, shutter: RollingShutter, motion: Motion, *, true_motion: Motion | None = None
 ) -> None:
-    """Write a dataset of format 1; ``true_motion`` makes the depth while ``motion`` is what the manifest says."""
+    """Write a dataset of format 1; ``true_motion`` makes depth and images, ``motion`` is what the rest says."""
     folder = out / "planes"
     for name in RELATIVE_FILES:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -51,16 +82,29 @@ def write_analytic_dataset(
             np.broadcast_to(rolling.R[0], rolling.R.shape), np.broadcast_to(rolling.t[0], rolling.t.shape)
         )
         for kind, poses in (("rs", rolling), ("gs", first)):
-            write_png(folder / f"{kind}/{side}_{frame}.png", np.zeros((camera.height, camera.width, 3), np.uint8))
-            write_depth(folder / f"{kind}_depth/{side}_{frame}.exr", plane_depth(camera, poses))
+            depth = plane_depth(camera, poses)
+            write_png(folder / f"{kind}/{side}_{frame}.png", plane_colours(camera, poses, depth))
+            write_depth(folder / f"{kind}_depth/{side}_{frame}.exr", depth)
     manifest = sequence_manifest(name="planes", rig=rig, shutter=shutter, motion=motion, frame_period_s=0.1)
-    files = {name: sha256(folder / name) for name in RELATIVE_FILES}
-    write_json(folder / "sequence.json", manifest | {"files": files})
+    manifest |= {
+        "scene": {"name": "planes", "sha256": "", "viewpoint": "default", "eye": [0, 0, 0], "target": [0, 1, 0]},
+        "renderer": asdict(load_card(RendererOptions, "renderers", "default")),
+        "seed": 0,
+        "made_by": dict.fromkeys(("rsbench", "mitsuba", "drjit", "variant"), rsbench.__version__),
+        "files": {name: sha256(folder / name) for name in RELATIVE_FILES},
+    }
+    write_json(folder / "sequence.json", manifest)
     names = ["sequence.json", *RELATIVE_FILES]
     write_json(
         out / "dataset.json",
         {
             "format": 1,
+            "name": "planes",
+            "description": "",
+            "rsbench": rsbench.__version__,
+            "mitsuba": "none",
+            "units": UNITS,
+            "card": asdict(_card(rig, shutter, motion)),
             "sequences": ["planes"],
             "files": {
                 f"planes/{name}": {"sha256": sha256(folder / name), "size": (folder / name).stat().st_size}

@@ -1,4 +1,4 @@
-"""Faults planted into a copy of a sound dataset, each alone and with all hashes made to fit: verify must name each.
+"""Faults planted into a copy of a sound dataset, each alone and with hashes made to fit: verify must name each.
 
 The fast sample of the test command and the long run take the same table, ``FAULTS``. By itself, all of them:
 
@@ -23,7 +23,16 @@ from numpy.typing import NDArray
 from rsbench.core.motion import TwistMotion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.files import read_depth, read_json, read_png, sha256, write_depth, write_json, write_png, write_poses
+from rsbench.dataset.files import (
+    read_depth,
+    read_json,
+    read_png,
+    sha256,
+    write_depth,
+    write_json,
+    write_png,
+    write_poses,
+)
 from rsbench.dataset.sequence import read_sequence, sequence_manifest
 from rsbench.dataset.verification import verify_dataset
 
@@ -72,7 +81,7 @@ def planted(fault: Fault, sound: Path, out: Path) -> Path:
 
 def found(fault: Fault, folder: Path, rerender: str = "no") -> tuple[bool, list[str]]:
     """Whether one line of verify's answer has the fault's words; and all lines."""
-    lines = [line for report in verify_dataset(folder, rerender=rerender) for line in report.faults]  # type: ignore[arg-type]
+    lines = [line for report in verify_dataset(folder, rerender=rerender) for line in report.faults]
     return any(all(word in line for word in fault.words) for line in lines), lines
 
 
@@ -100,7 +109,21 @@ def image_of(shutter: str, view: str, change: Callable[[NDArray[np.uint8]], NDAr
 
 
 def copied(source: str, target: str) -> Plant:
-    return lambda folder: shutil.copyfile(folder / source, folder / VICTIM / target) and None
+    def plant(folder: Path) -> None:
+        shutil.copyfile(folder / source, folder / VICTIM / target)
+
+    return plant
+
+
+def written(place: str) -> Plant:
+    def plant(folder: Path) -> None:
+        (folder / place).write_text("more")
+
+    return plant
+
+
+def removed(place: str) -> Plant:
+    return lambda folder: (folder / place).unlink()
 
 
 def swapped(*pairs: tuple[str, str]) -> Plant:
@@ -125,7 +148,9 @@ def poses_of(view: str, change: Callable[[list[list[str]]], list[list[str]]]) ->
     return plant
 
 
-def rows_scaled(columns: slice, factor: float, rows: slice = slice(1, None)) -> Callable[[list[list[str]]], list[list[str]]]:
+def rows_scaled(
+    columns: slice, factor: float, rows: slice = slice(1, None)
+) -> Callable[[list[list[str]]], list[list[str]]]:
     def change(lines: list[list[str]]) -> list[list[str]]:
         for line in lines[rows]:
             line[columns] = [repr(factor * float(value)) for value in line[columns]]
@@ -286,7 +311,12 @@ def _depth_faults() -> Iterator[Fault]:
         file = f"{shutter}_depth/{view}.exr"
 
         def fault(
-            name: str, change: Callable[[Any], Any], *words: str, shutter: str = shutter, view: str = view, file: str = file
+            name: str,
+            change: Callable[[Any], Any],
+            *words: str,
+            shutter: str = shutter,
+            view: str = view,
+            file: str = file,
         ) -> Fault:
             return Fault(f"{file} {name}", depth_of(shutter, view, change), (file, *words))
 
@@ -311,15 +341,25 @@ def _depth_faults() -> Iterator[Fault]:
     ):
         yield Fault(f"{gs} {name}", depth_of("gs", "left_0", change), (gs, "finite"))
     yield Fault("one row of 1.0005", depth_of("rs", "left_0", times(1.0005, slice(30, 31))), (rs, "row 30"))
-    yield Fault("patch of 1.001", depth_of("gs", "left_0", times(1.001, slice(60, 80), slice(40, 64))), (gs, "rows 6"))
+    yield Fault(
+        "patch of 1.001", depth_of("gs", "left_0", times(1.001, slice(60, 80), slice(40, 64))), (gs, "rows 6")
+    )
     yield Fault("GS depth is RS depth", copied(f"{VICTIM}/{rs}", gs), (gs, f"the same as {rs}"))
     yield Fault("RS depth is GS depth", copied(f"{VICTIM}/{gs}", rs), (rs, f"the same as {gs}"))
     yield Fault("RS and GS depth exchanged", swapped((rs, gs)), ("depth/left_0.exr", "looks like"))
-    yield Fault("depth left and right exchanged", swapped((rs, "rs_depth/right_0.exr")), (rs, "looks like rs_depth/right_0.exr"))
-    yield Fault("depth of frames exchanged", swapped((gs, "gs_depth/left_1.exr")), (gs, "looks like gs_depth/left_1.exr"))
+    yield Fault(
+        "depth left and right exchanged",
+        swapped((rs, "rs_depth/right_0.exr")),
+        (rs, "looks like rs_depth/right_0.exr"),
+    )
+    yield Fault(
+        "depth of frames exchanged", swapped((gs, "gs_depth/left_1.exr")), (gs, "looks like gs_depth/left_1.exr")
+    )
     yield Fault("depth of another sequence", copied(f"{OTHER}/{rs}", rs), (rs, "differs"))
     yield Fault("every depth scaled by 1.02", _every_depth(1.02), ("depth/",))
-    yield Fault("every depth scaled by 1.0002", _every_depth(1.0002), ("depth/", "scaled by 1.0002"), rendered=True)
+    yield Fault(
+        "every depth scaled by 1.0002", _every_depth(1.0002), ("depth/", "scaled by 1.0002"), rendered=True
+    )
 
 
 def _every_depth(factor: float) -> Plant:
@@ -352,7 +392,11 @@ def _image_faults() -> Iterator[Fault]:
             ("brightened", below_row_0(brightened), "times as bright"),
             ("16 bits", lambda image: image[..., ::-1].astype(np.uint16) * 257, "RGB of 16 bits"),
             ("grey", grey, "is grey of 8 bits"),
-            ("grey in three channels", lambda image: np.repeat(grey(image)[..., None], 3, axis=2), "image is grey"),
+            (
+                "grey in three channels",
+                lambda image: np.repeat(grey(image)[..., None], 3, axis=2),
+                "image is grey",
+            ),
             ("RGBA", lambda image: cv2.cvtColor(image, cv2.COLOR_RGB2BGRA), "is RGBA of 8 bits"),
             ("cut", lambda image: image[:-1].copy(), "pixels, the camera"),
         ):
@@ -371,10 +415,16 @@ def _image_faults() -> Iterator[Fault]:
     yield Fault("all left and right images exchanged", swapped(*sides), (".png", "other colours"))
     frames = [(f"{s}/{side}_0.png", f"{s}/{side}_1.png") for s in ("rs", "gs") for side in ("left", "right")]
     yield Fault("all frames exchanged", swapped(*frames), (".png", "other colours"))
-    yield Fault("GS image is RS image", copied(f"{VICTIM}/rs/left_0.png", "gs/left_0.png"), ("gs/left_0.png", "like rs/left_0.png"))
+    yield Fault(
+        "GS image is RS image",
+        copied(f"{VICTIM}/rs/left_0.png", "gs/left_0.png"),
+        ("gs/left_0.png", "like rs/left_0.png"),
+    )
     for shutter in ("rs", "gs"):
         file = f"{shutter}/left_1.png"
-        yield Fault(f"{shutter} image of another sequence", copied(f"{OTHER}/{file}", file), (file, f"like {OTHER}/{file}"))
+        yield Fault(
+            f"{shutter} image of another sequence", copied(f"{OTHER}/{file}", file), (file, f"like {OTHER}/{file}")
+        )
     blurred = below_row_0(lambda image: cv2.GaussianBlur(image, (0, 0), 0.8))
     yield Fault("blurred", image_of("rs", "left_0", blurred), ("rs/left_0.png",), rendered=True)
 
@@ -408,7 +458,7 @@ def _pose_faults() -> Iterator[Fault]:
         ("rows upside down", lambda lines: renumbered([lines[0], *lines[:0:-1]]), "differs from the motion"),
         ("columns exchanged", lambda lines: [[*line[:6], line[7], line[6], line[8]] for line in lines], "columns"),
     ):
-        yield Fault(f"{file} {name}", poses_of("left_0", change), (f"left_0.csv", words))
+        yield Fault(f"{file} {name}", poses_of("left_0", change), ("left_0.csv", words))
     yield Fault("poses left and right exchanged", swapped((file, "poses/right_0.csv")), (file, "poses of right_0"))
     yield Fault("poses of frames exchanged", swapped((file, "poses/left_1.csv")), (file, "poses of left_1"))
 
@@ -430,8 +480,14 @@ def _manifest_faults() -> Iterator[Fault]:
     for key in ("conventions", "row_time_s", "scene", "renderer", "made_by", "seed"):
         yield Fault(f"{key} of sequence.json missing", manifest_of(own, drop(key)), ("sequence.json", key))
     for path in (("scene", "name"), ("scene", "viewpoint"), ("renderer", "integrator")):
-        yield Fault(f"{'.'.join(path)} of sequence.json", manifest_of(own, put(*path, "x")), ("sequence.json", ".".join(path)))
-    yield Fault("samples of sequence.json", manifest_of(own, put("renderer", "samples", 16)), ("renderer.samples = 16",))
+        yield Fault(
+            f"{'.'.join(path)} of sequence.json",
+            manifest_of(own, put(*path, "x")),
+            ("sequence.json", ".".join(path)),
+        )
+    yield Fault(
+        "samples of sequence.json", manifest_of(own, put("renderer", "samples", 16)), ("renderer.samples = 16",)
+    )
     motion = manifest_of(own, lambda content: content["motion"].update(w=[0.0, 0.01, 0.0]))
     yield Fault("motion of sequence.json", motion, ("poses/left_0.csv", "differs from the motion"))
 
@@ -464,7 +520,9 @@ def _consistent_faults() -> Iterator[Fault]:
 
 def _dataset_faults() -> Iterator[Fault]:
     def dataset(name: str, change: Callable[[dict[str, Any]], object], *words: str, fit: bool = True) -> Fault:
-        return Fault(f"dataset.json: {name}", manifest_of("dataset.json", change), ("dataset.json", *words), rehash=fit)
+        return Fault(
+            f"dataset.json: {name}", manifest_of("dataset.json", change), ("dataset.json", *words), rehash=fit
+        )
 
     yield dataset("another name", put("name", "other"), "name = 'other'")
     yield dataset("no name", drop("name"), "name = None")
@@ -486,7 +544,9 @@ def _dataset_faults() -> Iterator[Fault]:
         yield Fault(f"card of another {name}", manifest_of("dataset.json", put(*path)), words)
     yield dataset("card with an unknown key", put("card", "basline", 1.0), "basline")
     yield dataset("card of another name", put("card", "name", "other"), "its card says 'other'")
-    yield dataset("card names another sequence", put("card", "sequence", 0, "name", "keep"), "its card makes", "keep")
+    yield dataset(
+        "card names another sequence", put("card", "sequence", 0, "name", "keep"), "its card makes", "keep"
+    )
     yield dataset("card of one sequence", lambda content: content["card"]["sequence"].pop(), "its card makes")
     yield dataset("a sequence twice", lambda content: content["sequences"].append(VICTIM), "twice")
     yield dataset("no sequences", put("sequences", []), "a list of names")
@@ -501,8 +561,18 @@ def _dataset_faults() -> Iterator[Fault]:
     yield dataset("a path outside", put("files", "../x.png", {"sha256": "", "size": 1}), "../x.png", fit=False)
     yield dataset("an entry without a size", drop("files", file, "size"), "size and sha256", fit=False)
     yield dataset("an entry of another type", put("files", file, 3), "size and sha256", fit=False)
-    yield Fault("another size", manifest_of("dataset.json", put("files", file, "size", 1)), ("left_0.png", "it says 1"), rehash=False)
-    yield Fault("another hash", manifest_of("dataset.json", put("files", file, "sha256", "0")), ("left_0.png", "checksum"), rehash=False)
+    yield Fault(
+        "another size",
+        manifest_of("dataset.json", put("files", file, "size", 1)),
+        ("left_0.png", "it says 1"),
+        rehash=False,
+    )
+    yield Fault(
+        "another hash",
+        manifest_of("dataset.json", put("files", file, "sha256", "0")),
+        ("left_0.png", "checksum"),
+        rehash=False,
+    )
 
 
 def _own_list_faults() -> Iterator[Fault]:
@@ -527,10 +597,11 @@ def _own_list_faults() -> Iterator[Fault]:
         ("a path outside", put("files", "../x", "0" * 64), ("../x",)),
     ):
         yield Fault(f"sequence.json lists {name}", listed(change), words, rehash=False)
-    extra = lambda place: lambda folder: (folder / place).write_text("more") and None  # noqa: E731
-    yield Fault("a file that nothing lists", extra("notes.txt"), ("notes.txt", "not listed"), rehash=False)
-    yield Fault("an image that nothing lists", extra(f"{VICTIM}/rs/left_2.png"), ("left_2.png", "not listed"), rehash=False)
-    gone = lambda folder: (folder / VICTIM / "gs/left_0.png").unlink()  # noqa: E731
+    unlisted = "lies there but is not listed"
+    yield Fault("a file that nothing lists", written("notes.txt"), ("notes.txt", unlisted), rehash=False)
+    extra = written(f"{VICTIM}/rs/left_2.png")
+    yield Fault("an image that nothing lists", extra, ("left_2.png", unlisted), rehash=False)
+    gone = removed(f"{VICTIM}/gs/left_0.png")
     yield Fault("a file gone", gone, ("gs/left_0.png", "missing"), rehash=False)
     yield Fault("a file gone from all lists", gone, ("gs/left_0.png",))
 

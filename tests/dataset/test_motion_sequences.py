@@ -14,7 +14,8 @@ from rsbench.dataset.card import CameraCard, MotionCard, load_dataset_card
 from rsbench.dataset.files import read_json, write_json
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_dataset, read_sequence
-from rsbench.dataset.verification import _pose_faults, verify_dataset
+from rsbench.dataset.verification import verify_dataset
+from rsbench.dataset.verification.poses import pose_faults
 from rsbench.errors import RsbenchError
 
 COMMON = {"rotation_deg": 2.0, "rotation_axis": "random", "translation": 0.15, "translation_axis": "random"}
@@ -52,8 +53,8 @@ def test_sequences_of_every_model_are_rendered_verified_and_read_back(tmp_path: 
     manifest["motion"]["parameters"]["acceleration"] = 0.25
     write_json(path, manifest)
     assert read_sequence(path.parent).motion.parameters == {"acceleration": 0.25}
-    assert all("differs from the motion" in fault for fault in _pose_faults(read_sequence(path.parent)))
-    assert len(list(_pose_faults(read_sequence(path.parent)))) == 4
+    assert all("differs from the motion" in fault for fault in pose_faults(read_sequence(path.parent)))
+    assert len(list(pose_faults(read_sequence(path.parent)))) == 4
 
 
 def test_a_shake_is_drawn_for_each_sequence_and_stays() -> None:

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rsbench.dataset.card import DatasetCard
 from rsbench.dataset.files import read_json
 from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.verification import structure
@@ -23,7 +22,9 @@ _MOST_ELSEWHERE = 8
 """Other sequences among whose images an exchanged one is looked for."""
 
 
-def verify_dataset(folder: Path, stride: int = 1, progress: Progress | None = None, rerender: str = "no") -> list[SequenceReport]:
+def verify_dataset(
+    folder: Path, stride: int = 1, progress: Progress | None = None, rerender: str = "no"
+) -> list[SequenceReport]:
     """Check every sequence of a dataset; faults are values, only an unreadable dataset raises.
 
     Args:
@@ -61,9 +62,10 @@ def verify_sequence(
     try:
         card = structure.card_of(manifest)
         sequence = read_sequence(folder / name)
+        missing = {fault.removesuffix(": missing").removeprefix(f"{name}/") for fault in faults}
         faults += structure.sequence_faults(sequence, name, card)
         faults += pose_faults(sequence)
-        content = read_content(sequence)
+        content = read_content(sequence, missing)
         faults += [*content.faults, *twin_faults(content)]
         step(name)
         steps -= 1

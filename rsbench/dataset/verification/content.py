@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rsbench.dataset.files import read_png
 from rsbench.dataset.sequence import Sequence
@@ -16,6 +17,7 @@ from rsbench.dataset.verification.image_causes import Elsewhere, likeness_faults
 from rsbench.dataset.verification.png import png_fault
 from rsbench.dataset.verification.shots import PAIRS, SHOTS, DepthMap, Shot, land
 from rsbench.errors import RsbenchError
+from rsbench.reading import inside
 
 
 @dataclass(eq=False)
@@ -28,24 +30,25 @@ class Content:
     faults: list[str] = field(default_factory=list)
 
 
-def read_content(sequence: Sequence) -> Content:
-    """Read all eight shots, one fault for each file that cannot be."""
+def read_content(sequence: Sequence, missing: Collection[str] = ()) -> Content:
+    """Read all eight shots but ``missing`` files, one fault for each that cannot be."""
     content = Content(sequence)
     renderer = sequence.manifest.get("renderer")
     noisy = isinstance(renderer, dict) and renderer.get("integrator") == "path"
+    size = sequence.rig.camera.width, sequence.rig.camera.height
     for shot in SHOTS:
         try:
-            content.maps[shot] = DepthMap(shot, sequence.depth(shot.shutter, shot.side, shot.frame))
+            if shot.depth not in missing:
+                content.maps[shot] = DepthMap(shot, sequence.depth(*shot[:3]))
         except RsbenchError as error:
             content.faults.append(str(error))
-        camera = sequence.rig.camera
-        fault = png_fault(sequence.folder / shot.image, shot.image, (camera.width, camera.height))
+        if shot.image in missing:
+            continue
         try:
+            fault = png_fault(inside(sequence.folder, shot.image), shot.image, size)
+            content.faults += [fault] if fault else []
             if fault is None:
-                image = sequence.image(shot.shutter, shot.side, shot.frame)
-                content.pictures[shot] = images.Picture.of(shot, image, noisy)
-            else:
-                content.faults.append(fault)
+                content.pictures[shot] = images.Picture.of(shot, sequence.image(*shot[:3]), noisy)
         except RsbenchError as error:
             content.faults.append(str(error))
     return content
@@ -84,7 +87,9 @@ class Comparison:
     def __post_init__(self) -> None:
         camera = self.content.sequence.rig.camera
         self.verdicts = {shot: depth.MapVerdict(each, self.stride) for shot, each in self.content.maps.items()}
-        self.votes = {shot: images.ImageVotes.none((camera.height, camera.width)) for shot in self.content.pictures}
+        self.votes = {
+            shot: images.ImageVotes.none((camera.height, camera.width)) for shot in self.content.pictures
+        }
 
     def pairs(self) -> Iterator[DepthAgreement | None]:
         """Compare one pair after the other; None where a file of it could not be read."""
@@ -106,15 +111,18 @@ class Comparison:
 
     def faults(self, elsewhere: Elsewhere) -> Iterator[str]:
         """What the pairs show, each with its likely cause."""
+        geometry = depth.geometry_fault(self.agreements)
+        if geometry:
+            yield geometry
+            return
         wrong = depth.map_faults(self.verdicts)
         for shot, fault in wrong.items():
             cause = likely_cause(self.content.sequence, self.content.maps, shot, fault.rows)
             yield finding(shot.depth, fault.what, rows_of(fault.rows), cause)
-        blamed = {shot.depth for shot in wrong}
-        yield from depth.pair_faults(self.agreements, blamed)
-        yield from self._image_faults(blamed, elsewhere)
+        yield from depth.pair_faults(self.agreements, wrong)
+        yield from self._image_faults(wrong.keys(), elsewhere)
 
-    def _image_faults(self, blamed: set[str], elsewhere: Elsewhere) -> Iterator[str]:
+    def _image_faults(self, blamed: Collection[Shot], elsewhere: Elsewhere) -> Iterator[str]:
         """Images compared through depth that is in order; a wrong map would accuse its image too."""
         content, told = self.content, set()
         for shot, picture in content.pictures.items():
@@ -122,17 +130,13 @@ class Comparison:
             if fault:
                 told.add(shot)
                 yield fault
-        sound = [
-            each
-            for each in self.likenesses
-            if not {each.source.depth, each.target.depth} & blamed and not {each.source, each.target} & told
-        ]
+        sound = [each for each in self.likenesses if not {each.source, each.target} & {*blamed, *told}]
         for shot, fault in likeness_faults(content.sequence, content.maps, content.pictures, sound, elsewhere):
             told.add(shot)
             yield fault
         for shot, votes in self.votes.items():
             rows = images.tile_rows(votes)
-            if shot not in told and shot.depth not in blamed and np.any(rows):
+            if shot not in told and shot not in blamed and np.any(rows):
                 what = "a part of these rows shows other colours than two partners at the same surface"
                 yield finding(shot.image, what, rows_of(rows))
 
@@ -141,7 +145,7 @@ def images_elsewhere(others: Iterable[Sequence]) -> Elsewhere:
     """Images of other sequences, those of the same name first."""
     known = list(others)
 
-    def candidates(shot: Shot) -> Iterator[tuple[str, images.NDArray[np.uint8]]]:
+    def candidates(shot: Shot) -> Iterator[tuple[str, NDArray[np.uint8]]]:
         for other in known:
             for each in sorted(SHOTS, key=lambda one: one != shot):
                 try:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,8 +27,10 @@ _MOST_BEHIND = 0.3
 """Share of a map that may lie behind what two partners see: near things hide much of it when the rig moves far."""
 _FEW = 6
 """Contradicted pixels in one row, or missing ones in a map, that thin things may leave."""
-_TILE, _BAD_IN_TILE = 8, 12
-"""A tile of 8 x 8 pixels in which 12 are contradicted, and more than agree, is no edge."""
+_MANY = 4
+"""Pairs, of 8 between the cameras and 16 others, that say that the geometry is wrong and not a map."""
+_TILE, _BAD_IN_TILE = 5, 12
+"""A square of 5 x 5 pixels in which 12 are contradicted, and more than agree, is no edge."""
 _CENTRED = 0.3
 """Pixels from a pixel's centre within which a surface that spans its neighbours must be met by its ray."""
 
@@ -129,7 +132,9 @@ def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
     holes = np.bitwise_count(verdict.holes & trusted) >= 2
     if np.sum(holes) > _FEW:
         share = float(np.mean(holes[verdict.holes > 0]))
-        return MapFault(f"{np.sum(holes)} pixels have no depth where others see a surface", np.any(holes, axis=1), share)
+        return MapFault(
+            f"{np.sum(holes)} pixels have no depth where others see a surface", np.any(holes, axis=1), share
+        )
     good = (verdict.confirmed & trusted != 0) & surface
     bad = (verdict.contradicted & trusted != 0) & ~good & surface
     behind = (np.bitwise_count(verdict.hidden & trusted) >= 2) & ~good & surface
@@ -147,7 +152,9 @@ def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
         return MapFault(what, np.repeat(rows, verdict.stride)[:height], float(np.sum(bad) / np.sum(bad | good)))
     typical = float(np.median(verdict.difference[good])) if np.any(good) else 0.0
     if typical > _TYPICAL:
-        what = f"depth differs typically by {typical:.1e} of itself from what others see, {_TYPICAL:.0e} is allowed"
+        what = (
+            f"depth differs typically by {typical:.1e} of itself from what others see, {_TYPICAL:.0e} is allowed"
+        )
         return MapFault(what, np.full(height, True), 0.0)
     return None
 
@@ -156,31 +163,57 @@ def _bad_rows(bad: BoolArray, good: BoolArray) -> BoolArray:
     """(h,) rows of a map that are wrong: by themselves, in a tile, or because all of it is."""
     count, comparable = np.sum(bad, axis=1), np.sum(bad | good, axis=1)
     rows = (count >= _FEW) & (count > _BAD_IN_ROW * comparable)
-    tiled = _tile_sums(bad)
-    spoilt = (tiled >= _BAD_IN_TILE) & (tiled > _tile_sums(good))
-    rows |= np.repeat(np.any(spoilt, axis=1), _TILE)[: len(bad)] & (count > 0)
+    rows |= np.any(_clusters(bad, good), axis=1)
     if np.sum(count[~rows]) > max(_FEW, _BAD_SHARE * np.sum(comparable[~rows])):
         rows |= count > _BAD_SHARE * comparable
     return np.asarray(rows)
 
 
-def _tile_sums(flags: BoolArray) -> NDArray[np.int64]:
-    height, width = flags.shape
-    rows, columns = np.arange(0, height, _TILE), np.arange(0, width, _TILE)
-    return np.asarray(np.add.reduceat(np.add.reduceat(flags.astype(np.int64), rows, axis=0), columns, axis=1))
+def _clusters(bad: BoolArray, good: BoolArray) -> BoolArray:
+    """(h, w) contradicted pixels that lie together, more than agree there."""
+    wrong, right = (
+        cv2.boxFilter(
+            np.asarray(each, np.float32), -1, (_TILE, _TILE), normalize=False, borderType=cv2.BORDER_CONSTANT
+        )
+        for each in (bad, good)
+    )
+    spoilt = np.asarray((wrong > _BAD_IN_TILE - 0.5) & (wrong > right), np.uint8)
+    return np.asarray((cv2.dilate(spoilt, np.ones((_TILE + 1, _TILE + 1), np.uint8)) > 0) & bad)
 
 
-def pair_faults(pairs: Iterable[tuple[Shot, Shot, DepthAgreement]], blamed: set[str]) -> Iterator[str]:
-    """Pairs that disagree though neither map is contradicted by all who see it: the motion or the rig is wrong."""
+def geometry_fault(pairs: Sequence[tuple[Shot, Shot, DepthAgreement]]) -> str | None:
+    """What the maps say against the geometry that sequence.json states, where none of them is wrong by itself."""
+    wrong = [(source, target) for source, target, each in pairs if not _agree(each)]
+    across = sum(source.side != target.side for source, target in wrong)
+    if not across and len(wrong) >= _MANY:
+        cause = "the two cameras agree with each other: look at motion and readout_ratio in sequence.json"
+    elif across >= 2 * _MANY - 1:
+        cause = "the two cameras never agree: look at baseline and camera in sequence.json, or all depth is scaled"
+    else:
+        return None
+    worst = min((each for _, _, each in pairs), key=lambda each: each.share)
+    what = (
+        f"{len(wrong)} of {len(pairs)} pairs of depth maps disagree, {worst.source} and {worst.target} on "
+        f"{100 * (1 - worst.share):.3g} % of {worst.compared} pixels"
+    )
+    return finding("sequence.json", what, cause=cause)
+
+
+def _agree(agreement: DepthAgreement) -> bool:
+    """A pair with nothing to compare says nothing."""
+    wrong = agreement.compared - agreement.agreeing
+    few = wrong <= _SPARE_PIXELS + _SPARE_SHARE * agreement.compared
+    return few and not agreement.typical > _TYPICAL
+
+
+def pair_faults(pairs: Sequence[tuple[Shot, Shot, DepthAgreement]], blamed: Collection[Shot]) -> Iterator[str]:
+    """Pairs that disagree though neither map is contradicted by all who see it."""
     for source, target, agreement in pairs:
-        if {source.depth, target.depth} & blamed:
+        if _agree(agreement) or {source, target} & set(blamed):
             continue
-        wrong = agreement.compared - agreement.agreeing
+        what = (
+            f"depth agrees with {target.depth} to {DEPTH_TOLERANCE:g} on only {100 * agreement.share:.2f} % of "
+            f"{agreement.compared} visible pixels, and differs typically by {agreement.typical:.1e} of itself"
+        )
         keys = "baseline and camera" if source.side != target.side else "motion and readout_ratio"
-        cause = f"look at {keys} in sequence.json"
-        if wrong > _SPARE_PIXELS + _SPARE_SHARE * agreement.compared:
-            what = f"to {DEPTH_TOLERANCE:g} on only {100 * agreement.share:.2f} % of {agreement.compared} visible pixels"
-            yield finding(source.depth, f"depth agrees with {target.depth} {what}", cause=cause)
-        elif agreement.typical > _TYPICAL:
-            what = f"by {agreement.typical:.1e} of itself from {target.depth}, {_TYPICAL:.0e} is allowed"
-            yield finding(source.depth, f"depth differs typically {what}", cause=cause)
+        yield finding(source.depth, what, cause=f"look at {keys} in sequence.json")

@@ -41,9 +41,7 @@ def likely_cause(sequence: Sequence, maps: Mapping[Shot, DepthMap], shot: Shot, 
     return f"looks like noise of {spread:.1e} of the depth" if DEPTH_TOLERANCE / 3 < spread < 0.3 else ""
 
 
-def _candidates(
-    sequence: Sequence, maps: Mapping[Shot, DepthMap], shot: Shot
-) -> Iterator[tuple[str, DepthMap]]:
+def _candidates(sequence: Sequence, maps: Mapping[Shot, DepthMap], shot: Shot) -> Iterator[tuple[str, DepthMap]]:
     """Depth maps that the stored one may have been, or the shots whose depth it may be."""
     depth = maps[shot].depth
     for other in SHOTS:
@@ -74,7 +72,7 @@ def _relative(sequence: Sequence, source: DepthMap, partner: DepthMap, rows: Boo
 
 
 def _agreeing(sequence: Sequence, source: DepthMap, partners: list[DepthMap], rows: BoolArray) -> float:
-    """Share of the pixels in these rows that agrees with the middle one of the partners; one may be wrong itself."""
+    """Share of these rows that agrees with the middle one of the partners: one may be wrong itself."""
     shares = []
     for partner in partners:
         relative = _relative(sequence, source, partner, rows)

@@ -24,8 +24,8 @@ Elsewhere = Callable[[Shot], Iterable[tuple[str, NDArray[np.uint8]]]]
 """Names and images of other sequences that may have been exchanged with a shot's."""
 _TRIED_PIXELS = 20_000
 _PLAIN, _AS_LIKE = 0.7, 2.0
-"""A candidate must differ by at most this share of what the image as it is does, and this factor of what sound pairs
-differ by."""
+"""A candidate must differ by at most this share of what the image as it is does, and by this factor of what sound
+pairs do."""
 _NOISY = 15.0
 """Codes of noise that no rendering has."""
 
@@ -45,7 +45,9 @@ def likeness_faults(
         unlike = np.any([each.unlike for each in pairs], axis=0)
         others = sorted({(each.target if each.source == shot else each.source).image for each in pairs})
         beyond = 100 * max(float(np.max(each.beyond[each.unlike])) for each in pairs)
-        what = f"shows other colours than {', '.join(others)} at the same surface, on up to {beyond:.3g} % of pixels"
+        what = (
+            f"shows other colours than {', '.join(others)} at the same surface, on up to {beyond:.3g} % of pixels"
+        )
         partners = sorted((each for each in shot.partners() if each in maps), key=lambda each: each in suspects)
         cause = _cause(sequence, maps, pictures, shot, partners[0], likenesses, elsewhere) if partners else ""
         yield shot, finding(shot.image, what, rows_of(unlike[bands]), cause)

@@ -240,5 +240,3 @@ def _chroma(picture: Picture) -> float:
     """Mean distance of the channels from their mean, codes."""
     grey = np.mean(picture.colours, axis=2, keepdims=True)
     return float(np.mean(np.abs(picture.colours - grey)))
-
-

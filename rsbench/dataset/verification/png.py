@@ -12,7 +12,7 @@ _COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGB
 
 
 def png_fault(path: Path, name: str, size: tuple[int, int]) -> str | None:
-    """What keeps a file from being an 8-bit RGB image of ``size`` (width, height), or None; only its header is read."""
+    """What keeps a file from being an 8-bit RGB image of ``size`` (width, height); only its header is read."""
     try:
         with path.open("rb") as stream:
             head = stream.read(26)

@@ -49,7 +49,9 @@ def _table_faults(sequence: Sequence, file: str, side: Side, frame: int, table: 
     # At w = 0, half a turn, both signs are right.
     negated = table[:, 2] < -_ROUNDING
     if np.any(negated):
-        yield finding(file, f"quaternion with w = {table[negated, 2].min():.6g}: w >= 0 is needed", rows_of(negated))
+        yield finding(
+            file, f"quaternion with w = {table[negated, 2].min():.6g}: w >= 0 is needed", rows_of(negated)
+        )
     expected = _table(sequence, side, frame)
     wrong_time, wrong_angle, wrong_place = _differences(table, expected)
     wrong = np.maximum.reduce([wrong_time, wrong_angle, wrong_place]) > _ROUNDING

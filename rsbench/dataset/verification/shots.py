@@ -48,7 +48,7 @@ class Shot(NamedTuple):
         return f"{self.shutter}_depth/{self.side}_{self.frame}.exr"
 
     def partners(self) -> Iterator[Shot]:
-        """Those that see most of the same: through the other shutter, the other camera's, that of the other time."""
+        """Those that see most of the same: of the other shutter, the other camera, the other time."""
         yield self._replace(shutter="gs" if self.shutter == "rs" else "rs")
         yield self._replace(side="right" if self.side == "left" else "left")
         yield self._replace(frame=1 - self.frame)
@@ -75,7 +75,7 @@ class DepthMap:
 
     @cached_property
     def bends(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Second differences of inverse depth: across (H, W-2), down (H-2, W), twist (H-1, W-1); infinite at holes."""
+        """Second differences of inverse depth: across (H, W-2), down (H-2, W), twist (H-1, W-1)."""
         across, down = np.diff(self.inverse, 2, axis=1), np.diff(self.inverse, 2, axis=0)
         twist = np.diff(np.diff(self.inverse, axis=0), axis=1)
         return tuple(np.nan_to_num(np.abs(each), nan=np.inf) for each in (across, down, twist))  # type: ignore[return-value]

@@ -90,7 +90,9 @@ def _listing_faults(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _stays_inside(path: str) -> bool:
-    return not {"", ".", ".."} & set(path.split("/")) and not PurePosixPath(path).is_absolute() and "\\" not in path
+    return (
+        not {"", ".", ".."} & set(path.split("/")) and not PurePosixPath(path).is_absolute() and "\\" not in path
+    )
 
 
 def _hidden(path: Path) -> bool:
@@ -234,11 +236,11 @@ def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: Seque
 def _equal(stored: object, expected: object) -> bool:
     """Equal as JSON holds it, numbers to rounding; a truth value is no number."""
     if isinstance(expected, Mapping):
-        same_keys = isinstance(stored, Mapping) and stored.keys() == expected.keys()
-        return same_keys and all(_equal(stored[key], value) for key, value in expected.items())  # type: ignore[index]
+        if not isinstance(stored, Mapping) or stored.keys() != expected.keys():
+            return False
+        return all(_equal(stored[key], value) for key, value in expected.items())
     if isinstance(expected, list | tuple):
-        alike = isinstance(stored, list) and len(stored) == len(expected)
-        return alike and all(map(_equal, stored, expected))  # type: ignore[arg-type]
+        return isinstance(stored, list) and len(stored) == len(expected) and all(map(_equal, stored, expected))
     if isinstance(expected, bool) or isinstance(stored, bool) or not isinstance(expected, int | float):
         return type(stored) is type(expected) and stored == expected
     return isinstance(stored, int | float) and math.isclose(stored, expected, rel_tol=_SAME, abs_tol=1e-15)
