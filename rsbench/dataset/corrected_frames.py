@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,7 +13,8 @@ from numpy.typing import NDArray
 
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.dataset.files import read_png, write_depth, write_json, write_png
+from rsbench.dataset.files import read_json, read_png, write_depth, write_json, write_png
+from rsbench.dataset.workplace import HIDDEN, WORK, named, remove, strangers, workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import FoundMotion, referee
@@ -30,32 +30,64 @@ MASK_VALUES = {
 }
 """Grey value of each origin in the mask files: the larger, the better founded."""
 MARKER = "motion.json"
+_LIST = f"{HIDDEN}/files.json"
+"""All that was written, below the folder."""
 
 
 @contextmanager
 def fresh_folder(out: Path) -> Iterator[Path]:
-    """A temporary folder beside ``out`` that takes its name when all is written; nothing is left after an error.
+    """A folder that takes the place and name of ``out`` when all is written; nothing is left after an error.
+
+    What ``rsbench correct`` wrote there before is replaced: moved aside, and removed when the new is in its place.
+    A kill in between leaves it aside, and the next run puts it back.
 
     Raises:
-        RsbenchError: ``out`` cannot be written, or holds something that ``rsbench correct`` did not write.
+        RsbenchError: ``out`` cannot be written, holds something that ``rsbench correct`` did not write, is the
+            working folder, or another command works there.
     """
-    if out.exists() and not (out.is_dir() and (not any(out.iterdir()) or (out / MARKER).is_file())):
+    place = out.resolve()
+    if Path.cwd().is_relative_to(place):
+        raise RsbenchError(f"--out {out}: this command runs there; choose a folder of its own, such as corrected")
+    with workplace(out, place.with_name(f".{place.name}{HIDDEN}")) as hidden:
+        old, fresh = hidden / "old", hidden / WORK / "new"
+        if old.exists() and not place.exists():
+            os.rename(old, place)
+        remove(old)
+        _refuse_others(out, place)
+        fresh.mkdir()
+        yield fresh
+        files = sorted(path.relative_to(fresh).as_posix() for path in fresh.rglob("*") if path.is_file())
+        (fresh / _LIST).parent.mkdir()
+        write_json(fresh / _LIST, {"files": files})
+        _refuse_others(out, place)  # that came meanwhile
+        _exchange(fresh, place, old)
+        remove(old)
+
+
+def _refuse_others(out: Path, place: Path) -> None:
+    """What is to be replaced must be ours, to the last file."""
+    if not place.exists() or (place.is_dir() and not any(place.iterdir())):
+        return
+    if not (place / _LIST).is_file():
         raise RsbenchError(f"{out}: exists and was not written by 'rsbench correct'; choose another --out")
-    partial = out.with_name(f".{out.name}.partial")
+    files = read_json(place / _LIST).get("files")
+    known = {_LIST, *files} if isinstance(files, list) else set()
+    if others := strangers(place, known.__contains__):
+        raise RsbenchError(
+            f"{out}: holds {named(others)}, which 'rsbench correct' did not write; move it away or choose another "
+            "--out"
+        )
+
+
+def _exchange(fresh: Path, place: Path, old: Path) -> None:
+    if place.exists():
+        os.rename(place, old)
     try:
-        if partial.exists():
-            shutil.rmtree(partial)
-        partial.mkdir(parents=True)
-    except OSError as error:
-        raise RsbenchError(f"{out}: cannot be written: {error.strerror}; choose another --out") from error
-    try:
-        yield partial
-        if out.exists():
-            shutil.rmtree(out)
-        os.replace(partial, out)
-    finally:
-        if partial.exists():
-            shutil.rmtree(partial)
+        os.rename(fresh, place)
+    except OSError:
+        if old.exists():
+            os.rename(old, place)
+        raise
 
 
 def write_frame(folder: Path, name: str, fused: Fused) -> None:

@@ -74,7 +74,7 @@ def remove(path: Path) -> None:
 def strangers(folder: Path, ours: Callable[[str], bool]) -> list[str]:
     """Paths below a folder that are no plain files of ours, sorted; relative, with slashes.
 
-    A link is a stranger whatever its name is, and so is an empty folder.
+    A link is a stranger whatever its name is; an empty folder is none.
     """
     found: list[str] = []
     for place, folders, files in os.walk(folder):
@@ -84,8 +84,6 @@ def strangers(folder: Path, ours: Callable[[str], bool]) -> list[str]:
             path = (here / name).as_posix()
             if not ours(path) or not stat.S_ISREG((folder / path).lstat().st_mode):
                 found.append(path)
-        if not folders and not files and place != str(folder):
-            found.append(here.as_posix())
     return sorted(found)
 
 
