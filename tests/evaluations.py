@@ -10,10 +10,13 @@ import pandas as pd
 
 from rsbench.benchmark.images.evaluation import open_evaluation
 from rsbench.benchmark.images.plan import EvaluationOptions
+from rsbench.dataset.hashes import HASHES
 
 QUICK = EvaluationOptions(solvers=("gs-8pt",), correction_solver="rs-stereo-refined")
 MACHINE = ("seconds.json", "seconds.csv", "provenance.json")
 """Files that hold times, the date and the machine."""
+KEPT = Path(HASHES)
+"""Hashes of the data with its times."""
 
 
 def evaluate(dataset: Path, out: Path, step: Any = lambda word: None, **changes: Any) -> list[str]:
@@ -22,7 +25,7 @@ def evaluate(dataset: Path, out: Path, step: Any = lambda word: None, **changes:
 
 
 def contents(out: Path) -> dict[str, bytes]:
-    files = (path for path in sorted(out.rglob("*")) if path.is_file() and path.name not in MACHINE)
+    files = (path for path in sorted(out.rglob("*")) if path.is_file() and path.name not in (*MACHINE, KEPT.name))
     return {str(path.relative_to(out)): path.read_bytes() for path in files}
 
 

@@ -70,6 +70,7 @@ def evaluate(
     force: Annotated[bool, typer.Option("--force", help="Predict again what is there already.")] = False,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each solver, with other RANSAC samples.")] = 1,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
+    rehash: Annotated[bool, typer.Option("--rehash", help="Read all data again, not only what changed.")] = False,
 ) -> None:
     """Pose, depth and correction against the truth of a dataset, with a report."""
     from rsbench.benchmark.images.plan import EvaluationOptions
@@ -85,6 +86,7 @@ def evaluate(
         force=force,
         seeds=seeds,
         seed=seed,
+        rehash=rehash,
     )
     evaluate_dataset(folder, out, options, f"rsbench evaluate {folder} --out {out}")
 

@@ -37,6 +37,10 @@ class Target(StrEnum):
     sgm = "sgm"
 
 
+_FOLDERS = {Target.claims: ("fig3", "claims"), Target.image_claims: ("claims",)}
+"""Where a target writes below ``--out``, if not in the folder of its name."""
+
+
 def reproduce(
     target: Annotated[
         Target,
@@ -57,17 +61,23 @@ def reproduce(
     seeds: Annotated[int, typer.Option(min=1, help="Of images: runs of each solver, with other samples.")] = 20,
 ) -> None:
     """Make the committed results again: render or simulate what is missing, run, score, draw."""
+    from contextlib import ExitStack
+
     from rsbench.dataset.files import check_out
+    from rsbench.dataset.workplace import workplace
 
     check_out(out)
-    if target is Target.images:
-        _images(out, data, seeds)
-    elif target is Target.correction:
-        _correction(out, data, workers)
-    elif target in (Target.fig4, Target.sgm):
-        _depth(target, out, data)
-    else:
-        _simulated(target, out, data, workers)
+    with ExitStack() as stack:
+        for name in _FOLDERS.get(target, (target.value,)):
+            stack.enter_context(workplace(out / name))
+        if target is Target.images:
+            _images(out, data, seeds)
+        elif target is Target.correction:
+            _correction(out, data, workers)
+        elif target in (Target.fig4, Target.sgm):
+            _depth(target, out, data)
+        else:
+            _simulated(target, out, data, workers)
 
 
 def _correction(out: Path, data: Path, workers: int | None) -> None:

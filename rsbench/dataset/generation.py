@@ -24,7 +24,7 @@ from rsbench.core.rig import SIDES, Side
 from rsbench.core.se3 import Pose
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_png, write_poses
-from rsbench.dataset.hashes import FileHashes, HashedFile
+from rsbench.dataset.hashes import HASHES, FileHashes, HashedFile
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence import FORMAT, FRAMES, RELATIVE_FILES, is_of_sequence, sequence_manifest
 from rsbench.dataset.workplace import HIDDEN, WORK, named, remove, strangers, workplace
@@ -95,7 +95,7 @@ def generate_dataset(
     with workplace(out) as hidden:
         # Of this run alone, and the last one only: a scene takes hundreds of MB, and its card may change.
         build = lru_cache(maxsize=1)(_build)
-        hashes = FileHashes(out, hidden / "hashes.jsonl", rehash)
+        hashes = FileHashes(out, out / HASHES, rehash)
         scene_hashes = SceneHashes(hidden / "scenes.json", lambda name: build(name).sha256)
         made: dict[str, Files] = {}
         for sequence in card.sequence:

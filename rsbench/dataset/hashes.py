@@ -9,6 +9,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rsbench.dataset.files import sha256
+from rsbench.dataset.workplace import HIDDEN
+
+HASHES = f"{HIDDEN}/hashes.jsonl"
+"""Where a folder of results keeps hashes, below it."""
 
 
 class HashedFile(NamedTuple):

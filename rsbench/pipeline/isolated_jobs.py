@@ -13,6 +13,9 @@ from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolation import Cancelled, IsolatedWorker, Outcome, Server
 
 Job = TypeVar("Job")
+_MOST_LOST = 10
+"""So many that the next ones will be too: each costs the start of two processes."""
+_NAMED = 3
 _Done = tuple[Job, Outcome | BaseException]
 
 
@@ -33,7 +36,7 @@ def finished_jobs(
     """Jobs with their answers, as of ``run_jobs``; ``name`` says in errors which job it was.
 
     Raises:
-        LostJobsError: when all others are done, with the jobs whose process ended twice.
+        LostJobsError: names jobs whose process ended twice, when all others are done or ``_MOST_LOST`` are lost.
         RsbenchError: at once, for a job that failed.
     """
     lost = []
@@ -45,10 +48,13 @@ def finished_jobs(
                 raise RsbenchError(f"{name(job)}: {outcome.reason}")
             else:
                 yield job, outcome.value
+            if len(lost) == _MOST_LOST:
+                break
     if lost:
+        more = f" and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
         raise LostJobsError(
-            f"not done: {', '.join(sorted(lost))}; perhaps for want of memory: the others are kept, and the same "
-            "command tries again"
+            f"not done: {', '.join(lost[:_NAMED])}{more}; perhaps for want of memory: what is done is kept, and "
+            "the same command tries again"
         )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,8 @@ from rsbench.core.rig import View
 from rsbench.dataset.corrected_frames import read_origin
 from rsbench.dataset.files import load_arrays, load_matches, read_json, read_png, write_bytes
 from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.dataset.workplace import named
+from rsbench.errors import RsbenchError
 from rsbench.report import pictures
 from rsbench.report.pictures import Image
 from rsbench.vision.fusion import Origin
@@ -221,13 +222,20 @@ def write_overview(out: Path) -> Path:
 
 
 def publish(evaluation: Path, out: Path) -> Path:
-    """Copy what is small of an evaluation: scores, motions, pictures, an overview and the tables in Markdown."""
-    for name in ("scores", "pictures", "provenance.json", *_motions(evaluation)):
-        source, target = evaluation / name, out / name
-        if target.is_dir():
-            shutil.rmtree(target)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copytree(source, target) if source.is_dir() else shutil.copyfile(source, target)
+    """Copy what is small of an evaluation: scores, motions, pictures, an overview and the tables in Markdown.
+
+    Raises:
+        RsbenchError: ``out`` holds scores, motions or pictures that the evaluation has not; nothing is removed.
+    """
+    names = ["provenance.json", *_motions(evaluation), *_files(evaluation, "scores", "pictures")]
+    there = _files(out, "scores", "pictures", "predictions")
+    if others := sorted(set(there) - set(names)):
+        raise RsbenchError(
+            f"{out}: holds {named(others)}, which this evaluation has not; move it away, then run it again"
+        )
+    for name in names:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(out / name, (evaluation / name).read_bytes())
     write_overview(out)
     lines = []
     for table in summary_tables(evaluation):
@@ -237,9 +245,15 @@ def publish(evaluation: Path, out: Path) -> Path:
     return path
 
 
+def _files(folder: Path, *parts: str) -> list[str]:
+    """Files in some parts of a folder, by their paths below it."""
+    paths = (path for part in parts for path in (folder / part).rglob("*") if path.is_file())
+    return [path.relative_to(folder).as_posix() for path in paths]
+
+
 def _motions(evaluation: Path) -> list[str]:
     paths = sorted(evaluation.glob("predictions/*/motion/*.json"))
-    return [str(path.relative_to(evaluation)) for path in paths]
+    return [path.relative_to(evaluation).as_posix() for path in paths]
 
 
 def markdown_table(frame: pd.DataFrame) -> str:

@@ -99,10 +99,10 @@ def test_stopped_terminated_and_killed_it_goes_on_to_the_same_bytes(tmp_path: Pa
     assert result.returncode == 0, result.stderr
 
     run = Run("simulate", card, out, 0.03)
-    run.wait_for(out / ".chunks", 1)
+    run.wait_for(out / HIDDEN / "chunks", 1)
     assert len(run.processes()) == 1 + 2 + 2  # workers, and the solver's own process of each
     os.kill(run.worker(), signal.SIGKILL)
-    run.wait_for(out / ".chunks", 3)  # more than the other worker had begun
+    run.wait_for(out / HIDDEN / "chunks", 3)  # more than the other worker had begun
     stop(run, signal.SIGINT, 130)
     assert not (out / "summary.csv").exists()
 

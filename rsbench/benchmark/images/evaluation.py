@@ -17,7 +17,9 @@ from rsbench.benchmark.isolated_metric import isolated_metrics
 from rsbench.benchmark.metric_plugins import DepthCase, ImageCase, PoseCase
 from rsbench.benchmark.provenance import dataset_record, provenance
 from rsbench.dataset.files import read_json, write_json, write_table
+from rsbench.dataset.hashes import HASHES, FileHashes
 from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.dataset.workplace import workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.pipeline.isolated_solver import SolverRunner
@@ -51,27 +53,36 @@ class Evaluation:
             Stored predictions that are not current: they are neither scored nor deleted.
 
         Raises:
-            RsbenchError: the dataset is damaged, or a stored prediction is of another entry of the same name.
+            RsbenchError: the dataset is damaged, a stored prediction is of another entry of the same name, or
+                another command works in ``out``.
         """
-        rows: dict[str, list[Row]] = {table: [] for table in TABLES}
-        stale = []
-        with SolverRunner() as runner, Isolation() as isolation:
+        with workplace(self.out), SolverRunner() as runner, Isolation() as isolation:
             plan = self._isolated(isolation)
+            hashes = FileHashes(self.dataset, self.out / HASHES, self.options.rehash)
             for sequence in self.sequences:
                 if sequence.name in plan.sequence_names:
-                    Bench(sequence, self._folder(sequence), plan, runner).predict(step)
-            repeat(self.dataset, self.out, self.options, plan, self.sequences, step)
-            for sequence in self.sequences:
-                scorer = Scorer(Places(sequence, self._folder(sequence), plan.chain), plan)
-                scorer.score()
-                for table in TABLES:
-                    rows[table] += scorer.rows[table]
-                stale += scorer.stale
-                step(f"{sequence.name}: scores")
+                    Bench(sequence, self._folder(sequence), plan, runner, hashes.sha256).predict(step)
+            repeat(self.dataset, self.out, self.options, plan, self.sequences, hashes, step)
+            stale = self._score(plan, hashes, step)
+            hashes.flush()
+            write_json(self.out / "scores" / "columns.json", described_columns(self.plan))
+            write_json(self.out / "provenance.json", self._provenance(command))
+        return stale
+
+    def _score(self, plan: Plan, hashes: FileHashes, step: Step) -> list[str]:
+        """Write all tables; what is not current is returned."""
+        rows: dict[str, list[Row]] = {table: [] for table in TABLES}
+        stale = []
+        for sequence in self.sequences:
+            places = Places(sequence, self._folder(sequence), plan.chain, hashes.sha256)
+            scorer = Scorer(places, plan)
+            scorer.score()
+            for table in TABLES:
+                rows[table] += scorer.rows[table]
+            stale += scorer.stale
+            step(f"{sequence.name}: scores")
         for table, content in rows.items():
             write_table(self.out / "scores" / f"{table}.csv", _frame(table, content, self.plan))
-        write_json(self.out / "scores" / "columns.json", described_columns(self.plan))
-        write_json(self.out / "provenance.json", self._provenance(command))
         return stale
 
     def _isolated(self, isolation: Isolation) -> Plan:

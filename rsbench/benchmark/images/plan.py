@@ -25,6 +25,7 @@ from rsbench.vision.feature_matcher import load_features
 from rsbench.vision.stereo_matcher import MatcherEntry, load_matcher
 
 Component = TypeVar("Component")
+HashOf = Callable[[Path], str]
 STANDARD_METRICS = ("pose", "depth", "psnr", "ssim")
 TRUE = "true"
 """Stands for a solver or a matcher where an oracle is given the truth instead; no entry may have this name."""
@@ -53,6 +54,8 @@ class EvaluationOptions:
     seeds: int = 1
     """How often each solver's robust loop is run, with other samples; the correction uses the first motion."""
     seed: int = 0
+    rehash: bool = False
+    """Read all files of the dataset again, also those that have the size and times that they had."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -182,11 +185,14 @@ class Recipe:
 class Places:
     """Where the predictions on a sequence are, with the identity that each must have to be current.
 
-    Components other than those of ``chain`` may be given; ``chain`` says everything else that decides.
+    Components other than those of ``chain`` may be given; ``chain`` says everything else that decides. ``hash_of``
+    gives the SHA-256 of a file of the sequence.
     """
 
-    def __init__(self, sequence: Sequence, folder: Path, chain: CorrectionOptions) -> None:
-        self.sequence, self.folder, self.chain = sequence, folder, chain
+    def __init__(
+        self, sequence: Sequence, folder: Path, chain: CorrectionOptions, hash_of: HashOf = sha256
+    ) -> None:
+        self.sequence, self.folder, self.chain, self._file_hash = sequence, folder, chain, hash_of
 
     @cached_property
     def data(self) -> str:
@@ -204,7 +210,7 @@ class Places:
             folder / "sequence.json",
             *sorted(path for name in channels for path in (folder / name).iterdir()),
         ]
-        return hashlib.sha256("".join(sha256(path) for path in paths).encode()).hexdigest()
+        return hashlib.sha256("".join(map(self._file_hash, paths)).encode()).hexdigest()
 
     def matches(self) -> Artefact:
         return self._artefact("matches", data=self.data, features=self.chain.features.key)

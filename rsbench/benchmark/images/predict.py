@@ -16,14 +16,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.benchmark.images.plan import NONE, Places, Plan, Recipe, reference_of
+from rsbench.benchmark.images.plan import NONE, HashOf, Places, Plan, Recipe, reference_of
 from rsbench.benchmark.images.store import Artefact, read_record
 from rsbench.benchmark.seeds import generator
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, StereoRig, View
 from rsbench.dataset.corrected_frames import write_origin
-from rsbench.dataset.files import MATCH_SETS, load_arrays, load_matches, save_arrays, save_matches, write_png
+from rsbench.dataset.files import (
+    MATCH_SETS,
+    load_arrays,
+    load_matches,
+    save_arrays,
+    save_matches,
+    sha256,
+    write_png,
+)
 from rsbench.dataset.sequence import Sequence
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.body_motion import body_motion
@@ -50,9 +58,11 @@ def prediction_steps(plan: Plan) -> int:
 class Bench:
     """The predictions on one sequence."""
 
-    def __init__(self, sequence: Sequence, folder: Path, plan: Plan, runner: SolverRunner) -> None:
+    def __init__(
+        self, sequence: Sequence, folder: Path, plan: Plan, runner: SolverRunner, hash_of: HashOf = sha256
+    ) -> None:
         self.sequence, self.plan, self.runner = sequence, plan, runner
-        self.places = Places(sequence, folder, plan.chain)
+        self.places = Places(sequence, folder, plan.chain, hash_of)
 
     @cached_property
     def images(self) -> dict[View, NDArray[np.uint8]]:

@@ -9,9 +9,10 @@ from pathlib import Path
 
 from rsbench.benchmark.images.plan import EvaluationOptions, Plan, make_plan
 from rsbench.benchmark.images.predict import Bench, Step
+from rsbench.dataset.hashes import HASHES, FileHashes
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.errors import RsbenchError
-from rsbench.pipeline.isolated_jobs import run_jobs
+from rsbench.pipeline.isolated_jobs import finished_jobs
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 
@@ -31,15 +32,22 @@ def repeats_of(plan: Plan) -> list[Job]:
 
 
 def repeat(
-    dataset: Path, out: Path, options: EvaluationOptions, plan: Plan, sequences: list[Sequence], step: Step
+    dataset: Path,
+    out: Path,
+    options: EvaluationOptions,
+    plan: Plan,
+    sequences: list[Sequence],
+    hashes: FileHashes,
+    step: Step,
 ) -> None:
     """Make the motions of ``repeats_of`` that are not current, with the matches that are stored.
 
     Raises:
-        RsbenchError: a solver cannot be loaded, or a process ended twice.
+        RsbenchError: a solver cannot be loaded.
+        LostJobsError: see ``finished_jobs``.
     """
     with SolverRunner() as runner:
-        benches = {s.name: Bench(s, out / "predictions" / s.name, plan, runner) for s in sequences}
+        benches = {s.name: Bench(s, out / "predictions" / s.name, plan, runner, hashes.sha256) for s in sequences}
         entries = {entry.name: entry for entry in plan.solvers}
         todo = []
         for sequence, solver, seed in repeats_of(plan):
@@ -50,12 +58,16 @@ def repeat(
                 todo.append((sequence, solver, seed))
     if not todo:
         return
+    hashes.flush()
     workers, one_thread = os.cpu_count() or 1, dict.fromkeys(THREAD_VARIABLES, "1")
-    with closing(run_jobs(_serve, todo, workers, one_thread, dataset, out, options)) as outcomes:
-        for (sequence, solver, seed), outcome in outcomes:
-            if not outcome.success:
-                raise RsbenchError(f"{sequence}, {solver}, seed {seed}: {outcome.reason}")
+    with closing(finished_jobs(_serve, todo, workers, one_thread, dataset, out, options, name=_name)) as found:
+        for (sequence, solver, _), _ in found:
             step(f"{sequence}: {solver}")
+
+
+def _name(job: Job) -> str:
+    sequence, solver, seed = job
+    return f"{sequence}, {solver}, seed {seed}"
 
 
 def _serve(dataset: Path, out: Path, options: EvaluationOptions) -> Callable[[Job], None]:
@@ -67,7 +79,8 @@ def _serve(dataset: Path, out: Path, options: EvaluationOptions) -> Callable[[Jo
     except RsbenchError as error:
         raise EntryFailure(str(error)) from error
     runner = SolverRunner(single_thread=True)  # as long as this process
-    benches = {s.name: Bench(s, out / "predictions" / s.name, plan, runner) for s in sequences}
+    hashes = FileHashes(dataset, out / HASHES)
+    benches = {s.name: Bench(s, out / "predictions" / s.name, plan, runner, hashes.sha256) for s in sequences}
     entries = {entry.name: entry for entry in plan.solvers}
 
     def run(job: Job) -> None:

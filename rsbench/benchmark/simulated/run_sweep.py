@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
+import re
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import asdict
@@ -26,10 +26,11 @@ from rsbench import __version__
 from rsbench.benchmark.simulated.sweep_card import Cell, SweepCard
 from rsbench.benchmark.simulated.trials import Arrays, Entrant, enter, run_bounds, run_trials
 from rsbench.dataset.files import load_arrays, read_json, save_arrays, write_json
+from rsbench.dataset.workplace import remove, workplace
 from rsbench.errors import RsbenchError
 from rsbench.identity import source_version
 from rsbench.motions import motion_model
-from rsbench.pipeline.isolated_jobs import run_jobs
+from rsbench.pipeline.isolated_jobs import finished_jobs
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.solvers.engine.registry import load_solver_entries
@@ -40,6 +41,9 @@ CHUNK = 50
 """Trials of one job."""
 Progress = Callable[[str], None]
 """Called with the name of the variant after each chunk."""
+_KINDS = ("trials", "bounds", "seconds")
+_OURS = re.compile(r"[0-9]{3,}\.npz")
+"""Names of the files of cells."""
 _SIMULATOR = ("bound.py", "simulation.py", "sweep_card.py", "trials.py")
 
 
@@ -52,6 +56,10 @@ class _Part(NamedTuple):
     def path(self, out: Path) -> Path:
         return out / self.kind / f"{self.cell.index:03d}.npz"
 
+    def chunk(self, first: int) -> str:
+        """Name of the file of some of its trials, from number ``first``."""
+        return f"{self.kind}-{self.cell.index:03d}-{first:06d}.npz"
+
 
 class _Job(NamedTuple):
     """A chunk of a part."""
@@ -62,13 +70,10 @@ class _Job(NamedTuple):
     trials: int
     path: Path
 
-    @property
-    def cell(self) -> str:
-        """Its cell in words."""
-        return f"sweep {self.card.name}, {self.part.cell.variant}, {self.card.axis} = {self.part.cell.value:g}"
-
     def __str__(self) -> str:
-        return f"{self.cell}, {self.part.kind} {self.first} to {self.first + self.trials - 1}"
+        cell, last = self.part.cell, self.first + self.trials - 1
+        where = f"sweep {self.card.name}, {cell.variant}, {self.card.axis} = {cell.value:g}"
+        return f"{where}, {self.part.kind} {self.first} to {last}"
 
 
 def sweep_steps(card: SweepCard) -> int:
@@ -117,25 +122,28 @@ def run_sweep(
         RsbenchError: no such solver, or two of one name; ``out`` holds another sweep; a motion leaves too few
             points in view; a worker was killed twice over the same trials.
     """
-    _open_folder(card, entrants(card), out, force)
-    step = progress or (lambda word: None)
-    chunks = out / ".chunks"
-    chunks.mkdir(exist_ok=True)
-    todo = []
-    for part in _parts(card):
-        for first in _firsts(card):
-            path = chunks / f"{part.kind}-{part.cell.index:03d}-{first:06d}.npz"
-            if part.path(out).is_file() or path.is_file():
-                step(part.cell.variant)
-            else:
-                todo.append(_Job(card, part, first, min(CHUNK, card.trials - first), path))
-    if todo:
-        _compile(card)
-    for part in _run_all(todo, workers, time_limit_s):
-        step(part.cell.variant)
-    for part in _parts(card):
-        _collect(card, part, out)
-    shutil.rmtree(chunks)
+    step, plan = progress or (lambda word: None), _plan(card, entrants(card))
+    with workplace(out) as hidden:
+        chunks = hidden / "chunks"
+        if force:
+            remove(chunks)
+        _open_folder(plan, out, force)
+        chunks.mkdir(exist_ok=True)
+        todo = []
+        for part in _parts(card):
+            for first in _firsts(card):
+                path = chunks / part.chunk(first)
+                if part.path(out).is_file() or path.is_file():
+                    step(part.cell.variant)
+                else:
+                    todo.append(_Job(card, part, first, min(CHUNK, card.trials - first), path))
+        if todo:
+            _compile(card)
+        for part in _run_all(todo, workers, time_limit_s):
+            step(part.cell.variant)
+        for part in _parts(card):
+            _collect(card, part, out, chunks)
+        remove(chunks)
 
 
 def read_trials(out: Path, cell: Cell) -> Arrays:
@@ -208,11 +216,11 @@ def simulator_version() -> str:
     return hashlib.sha256(b"\n".join(file.read_bytes() for file in files)).hexdigest()
 
 
-def _open_folder(card: SweepCard, solvers: list[Entrant], out: Path, force: bool) -> None:
-    plan = _plan(card, solvers)
+def _open_folder(plan: dict[str, Any], out: Path, force: bool) -> None:
     if force:
-        for kind in ("trials", "bounds", "seconds", ".chunks"):
-            shutil.rmtree(out / kind, ignore_errors=True)
+        for path in (path for kind in _KINDS for path in (out / kind).glob("*.npz")):
+            if _OURS.fullmatch(path.name):
+                path.unlink()
     elif (out / "sweep.json").is_file():
         other = _differences(read_sweep(out), plan)
         if other:
@@ -220,7 +228,7 @@ def _open_folder(card: SweepCard, solvers: list[Entrant], out: Path, force: bool
             raise RsbenchError(
                 f"{out}: holds another sweep ({what}); choose another --out, or remake with --force"
             )
-    for kind in ("trials", "bounds", "seconds"):
+    for kind in _KINDS:
         (out / kind).mkdir(parents=True, exist_ok=True)
     write_json(out / "sweep.json", plan)
 
@@ -249,15 +257,8 @@ def _compile(card: SweepCard) -> None:
 def _run_all(todo: list[_Job], workers: int, time_limit_s: float | None) -> Iterator[_Part]:
     """Always in children, so that BLAS has one thread and one summation order whatever the parent has loaded."""
     one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
-    with closing(run_jobs(_serve_jobs, todo, workers, one_thread, time_limit_s)) as outcomes:
-        for job, outcome in outcomes:
-            if outcome.ended:
-                raise RsbenchError(
-                    f"{job}: {outcome.reason}, twice; perhaps for want of memory: what is done is kept, and the "
-                    "same command resumes"
-                )
-            if not outcome.success:
-                raise RsbenchError(outcome.reason)
+    with closing(finished_jobs(_serve_jobs, todo, workers, one_thread, time_limit_s)) as found:
+        for job, _ in found:
             yield job.part
 
 
@@ -283,24 +284,21 @@ def run_job(job: _Job, runner: SolverRunner) -> None:
         RsbenchError: a motion leaves too few points in view.
     """
     card, cell = job.card, job.part.cell
-    try:
-        if job.part.kind == "bounds":
-            arrays = run_bounds(cell.setting, card.solvers, card.seed, job.first, job.trials)
-        else:
-            arrays = run_trials(
-                cell.setting, card.solvers, card.seed, job.first, job.trials, robust=card.robust, runner=runner
-            )
-    except RsbenchError as error:
-        raise RsbenchError(f"{job.cell}: {error}") from error
+    if job.part.kind == "bounds":
+        arrays = run_bounds(cell.setting, card.solvers, card.seed, job.first, job.trials)
+    else:
+        arrays = run_trials(
+            cell.setting, card.solvers, card.seed, job.first, job.trials, robust=card.robust, runner=runner
+        )
     save_arrays(job.path, arrays)
 
 
-def _collect(card: SweepCard, part: _Part, out: Path) -> None:
+def _collect(card: SweepCard, part: _Part, out: Path, folder: Path) -> None:
     """Join the chunks of a part into its file."""
-    path, prefix = part.path(out), f"{part.kind}-{part.cell.index:03d}"
+    path = part.path(out)
     if path.is_file():
         return
-    chunks = [load_arrays(out / ".chunks" / f"{prefix}-{first:06d}.npz") for first in _firsts(card)]
+    chunks = [load_arrays(folder / part.chunk(first)) for first in _firsts(card)]
     joined = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
     if part.kind == "trials":
         save_arrays(out / "seconds" / path.name, {"seconds": joined.pop("seconds")})

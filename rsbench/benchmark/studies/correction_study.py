@@ -9,12 +9,10 @@ takes no pixels from the others.
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
+import os
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +25,14 @@ from rsbench.benchmark.standard_metrics import Flip, Psnr, Ssim
 from rsbench.benchmark.studies.correction_methods import METHODS
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, VIEWS, Side, View
-from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
+from rsbench.errors import RsbenchError
 from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Pairs, frame_pairs, known_depth
 from rsbench.pipeline.frame_motion import FoundMotion, NoMotionError, find_matches, find_motion
+from rsbench.pipeline.isolated_jobs import finished_jobs
+from rsbench.pipeline.isolation import EntryFailure
 from rsbench.pipeline.readout import select
 from rsbench.pipeline.simpler_motions import global_shutter_motion, monocular_motion, solved_alone
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
@@ -84,20 +85,36 @@ def study_dataset(
 
     Raises:
         RsbenchError: the dataset cannot be read, or there is no such solver.
+        LostJobsError: see ``finished_jobs``.
     """
     sequences = read_dataset(dataset)
-    tables: Rows = ([], [], [])
-    job = partial(study_sequence, seed=seed, solver=solver)
-    with ExitStack() as stack:
-        found: Iterable[Rows] = map(job, sequences)
-        if workers != 1:
-            context = multiprocessing.get_context("spawn")
-            found = stack.enter_context(ProcessPoolExecutor(workers, context)).map(job, sequences)
-        for sequence, rows in zip(sequences, found, strict=True):
-            for table, more in zip(tables, rows, strict=True):
-                table += more
+    found: dict[str, Rows] = {}
+    if workers == 1:
+        for sequence in sequences:
+            found[sequence.name] = study_sequence(sequence, seed, solver)
             step(sequence.name)
-    return tables
+    else:
+        names, count = [sequence.name for sequence in sequences], workers or os.cpu_count() or 1
+        with closing(finished_jobs(_serve, names, count, {}, dataset, seed, solver)) as outcomes:
+            for name, rows in outcomes:
+                found[name] = rows
+                step(name)
+    images, bands, motions = (
+        [row for sequence in sequences for row in found[sequence.name][table]] for table in range(3)
+    )
+    return images, bands, motions
+
+
+def _serve(dataset: Path, seed: int, solver: str) -> Callable[[str], Rows]:
+    """What studies sequences by their names, in a child."""
+
+    def study(name: str) -> Rows:
+        try:
+            return study_sequence(read_sequence(dataset / name), seed, solver)
+        except RsbenchError as error:
+            raise EntryFailure(str(error)) from error
+
+    return study
 
 
 def study_sequence(sequence: Sequence, seed: int = 0, solver: str = "rs-stereo-refined") -> Rows:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from evaluations import QUICK, cell, contents, evaluate, remade, times
 
 from rsbench.benchmark.images.evaluation import columns_of, open_evaluation, read_scores
 from rsbench.benchmark.images.score import TABLES
+from rsbench.dataset import hashes
+from rsbench.dataset.workplace import workplace
 from rsbench.errors import RsbenchError
 
 
@@ -27,10 +30,18 @@ def test_two_runs_write_the_same_bytes(smoke_dataset: Path, evaluated: Path, tmp
     assert contents(tmp_path) == contents(evaluated)
 
 
-def test_a_repeated_run_makes_nothing_again(smoke_dataset: Path, copy: Path) -> None:
+def test_a_repeated_run_makes_nothing_and_reads_no_data_again(
+    smoke_dataset: Path, copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hashes, "sha256", lambda path: pytest.fail(f"{path} is read again"))
     before = times(copy)
     evaluate(smoke_dataset, copy)
     assert remade(before, copy) == set()
+
+
+def test_two_evaluations_do_not_share_a_folder(smoke_dataset: Path, copy: Path) -> None:
+    with workplace(copy), pytest.raises(RsbenchError, match=f"process {os.getpid()} on .* is at work there"):
+        evaluate(smoke_dataset, copy)
 
 
 def test_one_more_solver_redoes_and_deletes_nothing(smoke_dataset: Path, copy: Path) -> None:

@@ -20,6 +20,7 @@ from rsbench.benchmark.simulated.sweep_summary import failure_reasons, summarise
 from rsbench.benchmark.simulated.trials import Arrays, enter, run_bounds, run_trials
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.motion import LinearMotion
+from rsbench.dataset.workplace import workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.solvers.eight_point import EightPointSolver
@@ -96,8 +97,26 @@ def test_a_folder_of_another_sweep_is_refused(finished: Path, changes: dict[str,
 
 def test_a_motion_that_loses_the_scene_names_its_cell(tmp_path: Path) -> None:
     card = replace(CARD, values=(170.0,), trials=1, solvers=("gs-8pt",))
-    with pytest.raises(RsbenchError, match=r"sweep small, low, rotation_deg = 170: trial 0: .* in view"):
+    with pytest.raises(
+        RsbenchError, match=r"sweep small, low, rotation_deg = 170, trials 0 to 0: trial 0: .* in view"
+    ):
         run_sweep(card, tmp_path / "lost")
+
+
+def test_force_removes_nothing_of_others(finished: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(finished, tmp_path / "copy"))
+    for name in ("trials/notes.txt", "trials/mine.npz", "notes.txt"):
+        (folder / name).write_text("mine")
+    (folder / "trials/099.npz").write_bytes(b"of an earlier sweep with more cells")
+    run_sweep(CARD, folder, workers=1, force=True)
+    assert not (folder / "trials/099.npz").exists()
+    for name in ("trials/notes.txt", "trials/mine.npz", "notes.txt"):
+        assert (folder / name).read_text() == "mine"
+
+
+def test_two_commands_do_not_share_a_folder(finished: Path) -> None:
+    with workplace(finished), pytest.raises(RsbenchError, match="is at work there"):
+        run_sweep(CARD, finished)
 
 
 DEADLY = """
@@ -116,9 +135,9 @@ def test_a_worker_killed_twice_is_one_line_that_names_its_trials(
     monkeypatch.setattr(module, "_serve_jobs", importlib.import_module("deadly").serve)
     with pytest.raises(
         RsbenchError,
-        match=r"small, low, rotation_deg = 1, trials 0 to 6: ended its process with exit code 9, twice.*resumes",
+        match=r"small, low, rotation_deg = 1, trials 0 to 6 .ended its process with exit code 9, twice.*again",
     ):
-        run_sweep(CARD, tmp_path / "killed")
+        run_sweep(replace(CARD, values=(1.0,), variant=CARD.variant[:1]), tmp_path / "killed")
     sys.modules.pop("deadly")
 
 
