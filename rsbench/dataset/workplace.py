@@ -95,15 +95,16 @@ def named(paths: list[str], most: int = 3) -> str:
 
 def _take(out: Path, hidden: Path) -> int:
     """The descriptor of the locked file."""
-    for _ in range(_TRIES):
+    for tries in range(_TRIES, 0, -1):
         try:
             hidden.mkdir(parents=True, exist_ok=True)
             _refuse_foreign(hidden)
             flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
             descriptor = os.open(hidden / _LOCK, flags, 0o644)
-        except FileNotFoundError:  # its last owner removed it meanwhile
-            continue
         except OSError as error:
+            gone = isinstance(error, FileNotFoundError | FileExistsError) and not hidden.is_file()
+            if gone and tries > 1:  # its last owner removed it meanwhile
+                continue
             raise RsbenchError(f"{out}: cannot be written: {error.strerror}; choose another --out") from error
         try:
             _claim(out, descriptor)
@@ -113,11 +114,12 @@ def _take(out: Path, hidden: Path) -> int:
             os.close(descriptor)
             raise
         os.close(descriptor)
-    raise RsbenchError(f"{out}: cannot be written: {hidden} does not stay; choose another --out")
+    raise RsbenchError(f"{out}: other commands come and go there; choose another --out")
 
 
 def _refuse_foreign(hidden: Path) -> None:
-    if hidden.is_symlink() or (any(hidden.iterdir()) and not (hidden / _LOCK).is_file()):
+    names = {path.name for path in hidden.iterdir()}
+    if hidden.is_symlink() or (names and _LOCK not in names):
         raise RsbenchError(f"{hidden}: is not a folder that rsbench made; move it away or choose another --out")
 
 

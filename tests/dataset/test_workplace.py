@@ -109,7 +109,7 @@ def test_no_two_are_in_at_once(tmp_path: Path) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert most == [1] and entered[0] > 10
+    assert most == [1] and entered[0] > 0
 
 
 @pytest.mark.parametrize("kind", ["folder", "link", "file"])
