@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
+    import numpy as np
     import pandas as pd
+    from numpy.typing import NDArray
 
     from rsbench.benchmark.simulated.sweep_card import SweepCard
 
@@ -19,15 +21,22 @@ _OTHER_SWEEPS = ("solvers", "limit", "degenerate", "planar", "outliers", "wrong-
 def fig3(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.benchmark.provenance import provenance
     from rsbench.benchmark.simulated.sweep_card import load_sweep
-    from rsbench.dataset.files import write_bytes, write_json, write_table
+    from rsbench.benchmark.simulated.trial_errors import errors_of_rows
+    from rsbench.dataset.files import save_arrays, write_bytes, write_json, write_table
     from rsbench.report.fig3 import SWEEPS, draw_fig3, fig3_page, setting_table
 
     folder = out / "fig3"
     folder.mkdir(parents=True, exist_ok=True)
     command = "rsbench reproduce fig3"
+    errors: dict[str, NDArray[np.float32]] = {}
     cards = {name: load_sweep(name) for name in SWEEPS}
     for name, card in cards.items():
-        write_table(folder / f"{name}.csv", _confirmed(card, data / "simulated" / name, workers, command))
+        home = data / "simulated" / name
+        table = _confirmed(card, home, workers, command)
+        write_table(folder / f"{name}.csv", table)
+        found = errors_of_rows(table, [home, _again(home)] if table.seed.nunique() > 1 else [home])
+        errors |= {f"{name}_{measure}": values for measure, values in found.items()}
+    save_arrays(folder / "trials.npz", errors)
     settings = setting_table(list(cards.values()))
     write_table(folder / "settings.csv", settings)
     write_bytes(folder / "README.md", fig3_page(settings).encode())
@@ -178,10 +187,15 @@ def _confirmed(card: SweepCard, folder: Path, workers: int | None, command: str)
         values=tuple(v for v in card.values if v in set(doubtful.value)),
         variant=tuple(v for v in card.variant if v.name in set(doubtful.variant)),
     )
-    fresh = run_and_summarise(again, folder.with_name(f"{folder.name}-again"), workers, command)
+    fresh = run_and_summarise(again, _again(folder), workers, command)
     keys = ["variant", "value", "solver"]
     replaced = pd.merge(doubtful[keys].assign(place=doubtful.index), fresh, on=keys).set_index("place")
     return pd.concat([table.drop(doubtful.index), replaced]).sort_index()[list(table.columns)]
+
+
+def _again(folder: Path) -> Path:
+    """Where the trials of other draws lie."""
+    return folder.with_name(f"{folder.name}-again")
 
 
 def _joined(*tables: pd.DataFrame) -> pd.DataFrame:

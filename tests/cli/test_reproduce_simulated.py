@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -57,6 +58,13 @@ def test_claims_and_figure_come_from_the_stored_tables(tmp_path: Path, monkeypat
         for c in ("mean", "median")
         for kind in ("pdf", "png")
     }
+    with np.load(out / "fig3" / "trials.npz") as stored_errors:
+        for name in SWEEPS:
+            table = pd.read_csv(out / "fig3" / f"{name}.csv")
+            # Single precision, and six digits in the table.
+            np.testing.assert_allclose(
+                np.mean(stored_errors[f"{name}_e_R_deg"], axis=1), table.e_R_mean, rtol=1e-5
+            )
     verdicts = pd.read_csv(out / "claims" / "claims.csv")
     assert set(verdicts.matches) == {"100 + 100", "9 + 9", "9 + 9 and more"}
     assert verdicts.verdict.str.match("holds|fails|undecided").all()

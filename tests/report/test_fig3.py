@@ -76,3 +76,16 @@ def test_the_table_of_settings_says_what_the_paper_leaves_open() -> None:
     assert table.loc["noise", "depth (m)"] == "2 to 10, uniform"
     assert set(table["points per camera"]) == {"100"} and set(table.trials) == {"300"}
     assert set(READINGS) == {cell.variant for cell in load_sweep("rotation").cells()}
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+def test_the_committed_tables_are_those_of_the_committed_trials(name: str) -> None:
+    """Median and mean of every row by NumPy; tables have six digits, trials single precision."""
+    folder = Path(__file__).parents[2] / "results" / "fig3"
+    table = pd.read_csv(folder / f"{name}.csv")
+    with np.load(folder / "trials.npz") as stored:
+        errors = {measure: stored[f"{name}_{measure}_deg"].astype(float) for measure in ("e_R", "e_T")}
+    for measure, values in errors.items():
+        assert values.shape == (len(table), 300) and set(table.trials) == {300}
+        np.testing.assert_allclose(np.median(values, axis=1), table[f"{measure}_median"], rtol=1e-5)
+        np.testing.assert_allclose(np.mean(values, axis=1), table[f"{measure}_mean"], rtol=1e-5)
