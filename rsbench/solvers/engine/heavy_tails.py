@@ -136,10 +136,16 @@ def _freedom(packed: Packed) -> FloatArray:
 
 
 def _scale(squares: FloatArray, p: FloatArray, nu: float, scale: float) -> float:
-    """Of the largest likelihood, by the EM algorithm; the motion has taken six degrees of freedom."""
+    """Of the largest likelihood; the motion has taken six degrees of freedom.
+
+    By the parameter-expanded EM algorithm, in half the steps of the plain one: the mean that weights have in the
+    end is known, and a step divides by the one they have (C. Liu, D. Rubin, Y. Wu, Biometrika 1998).
+    """
+    freedom = max(float(np.sum(p)) - _PARAMETERS, 1.0)
+    count = len(p) + (float(np.sum(p)) - freedom) / nu
     for _ in range(_SCALE_STEPS):
         weights = (nu + p) / (nu + squares / scale**2)
-        last, scale = scale, float(np.sqrt(np.sum(weights * squares) / max(np.sum(p) - _PARAMETERS, 1.0)))
+        last, scale = scale, float(np.sqrt(weights @ squares / freedom * count / np.sum(weights)))
         scale = max(scale, _LEAST_SCALE_PX)
         if abs(scale - last) <= _SCALE_FLAT * scale:
             break
