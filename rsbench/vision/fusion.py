@@ -24,6 +24,7 @@ from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.correction import Corrected, WarpOptions, inverse_depth, relative_row_maps, warp
 from rsbench.vision.resample import resample
+from rsbench.vision.stereo_depth import known_beside
 
 Mask = NDArray[np.bool_]
 
@@ -97,7 +98,8 @@ def fuse(
 ) -> Fused:
     """Warp the first view to ``target_pose`` and fill its holes from the others.
 
-    First with what they measured and the frame does not contradict, then with GUESSED ones, at last with the rest.
+    First with what they measured and the frame does not contradict, then with GUESSED ones, then with the rest; at
+    last, with a GUESSED view only, tears in one surface are closed.
 
     Raises ValueError as ``rsbench.vision.correction.warp``.
     """
@@ -129,7 +131,49 @@ def fuse(
     for candidate, mask, source in contradicted:  # what nothing else fills, not even the frame's own guess
         take = mask & (origin == Origin.NOBODY)
         image[take], depth[take], origin[take] = candidate.image[take], candidate.depth[take], source
+    if guessed:
+        _close_tears(image, depth, origin, (first, *measured), camera, target_pose, options)
     return Fused(image=image, origin=origin, depth=depth)
+
+
+def _close_tears(
+    image: NDArray[Any],
+    depth: NDArray[np.float32],
+    origin: NDArray[np.uint8],
+    views: Sequence[SourceView],
+    camera: PinholeCamera,
+    target_pose: Pose,
+    options: WarpOptions | None,
+) -> None:
+    """Fill in place the holes that lie in one surface, GUESSED, by what the views show there, the first one first.
+
+    A view past an edge opens between two surfaces. A hole between two places of one, in its row or its column, is
+    a tear: of pixels whose depth is unknown or off. It has the depth of its sides, and a view shows it unless that
+    view knows something nearer there.
+    """
+    rho, interpolation = _of_both_sides(inverse_depth(depth)), (options or WarpOptions()).interpolation
+    for view in views:
+        holes = (origin == Origin.NOBODY) & np.isfinite(rho)
+        if not np.any(holes):
+            break
+        places, expected, known = _look_up(view, rho, holes, camera, target_pose)
+        take = np.isfinite(places[..., 0]) & ~(known * (1.0 - _AGREE) > expected)
+        image[take] = resample(view.image, places, interpolation)[take]
+        origin[take] = Origin.GUESSED
+        with np.errstate(divide="ignore"):  # at infinity
+            depth[take] = 1.0 / rho[take]
+
+
+def _of_both_sides(rho: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Inverse depth (H, W) of the surface on both sides of a pixel, the farther one's; NaN where they differ.
+
+    The sides are the nearest known pixels of its row, or of its column where those of the row lie apart.
+    """
+    found = np.full_like(rho, np.nan)
+    for sides in (known_beside(rho), tuple(side.T for side in known_beside(rho.T))):
+        one = np.abs(sides[0] - sides[1]) <= _AGREE * np.maximum(*sides)
+        found = np.where(np.isnan(found) & one, np.minimum(*sides), found)
+    return found
 
 
 def _contradicted(
@@ -142,17 +186,29 @@ def _contradicted(
     a nearer surface it was hidden, and nothing contradicts. The first view's own pixels decide, ``wanted`` (H, W)
     says where to look.
     """
-    M, b = relative_row_maps(camera, target_pose, frame.poses)
-    places = np.full((*wanted.shape, 2), np.nan, dtype=np.float32)
-    rho = np.zeros(wanted.shape, dtype=np.float32)
-    _find_in_rows(inverse_depth(found.depth), wanted, M, b, places, rho)
+    places, expected, known = _look_up(frame, inverse_depth(found.depth), wanted, camera, target_pose)
     seen = np.isfinite(places[..., 0])
-    # Half a pixel past the last centre still belongs to the frame, and rounds beyond it in float32.
-    nearest = np.rint(np.where(seen[..., None], places, 0.0)).astype(np.intp)
-    x, y = np.moveaxis(np.clip(nearest, 0, (camera.width - 1, camera.height - 1)), -1, 0)
-    there = inverse_depth(frame.depth)[y, x]
     shown = resample(frame.image, places, "linear")
-    return seen & np.where(np.isnan(there), _differ(shown, found.image, seen), there < rho * (1.0 - _AGREE))
+    return seen & np.where(np.isnan(known), _differ(shown, found.image, seen), known < expected * (1.0 - _AGREE))
+
+
+def _look_up(
+    view: SourceView, rho: NDArray[np.float32], wanted: Mask, camera: PinholeCamera, target_pose: Pose
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Where a view would see the ``wanted`` (H, W) points of inverse depth ``rho`` (H, W) of the target.
+
+    Returns:
+        The places (H, W, 2), px, NaN outside the view; the inverse depth (H, W) of the points there; what the view
+        knows there, NaN where it knows none.
+    """
+    M, b = relative_row_maps(view.camera or camera, target_pose, view.poses, camera)
+    places = np.full((*wanted.shape, 2), np.nan, dtype=np.float32)
+    expected = np.zeros(wanted.shape, dtype=np.float32)
+    _find_in_rows(rho, wanted, M, b, places, expected)
+    # Half a pixel past the last centre still belongs to the frame, and rounds beyond it in float32.
+    nearest = np.rint(np.where(np.isfinite(places), places, 0.0)).astype(np.intp)
+    x, y = np.moveaxis(np.clip(nearest, 0, (camera.width - 1, camera.height - 1)), -1, 0)
+    return places, expected, inverse_depth(view.depth)[y, x]
 
 
 def _differ(a: NDArray[Any], b: NDArray[Any], where: Mask) -> Mask:

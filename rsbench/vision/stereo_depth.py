@@ -229,22 +229,25 @@ def _mirrored(image: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(image[:, ::-1])
 
 
-def fill_holes(disparity: F32, max_width: int | None = None) -> F32:
+def fill_holes(disparity: F32) -> F32:
     """Disparity (H, W) with its holes filled along the rows by the farther of the two neighbours.
 
     What one camera does not see lies behind what hides it, so the smaller disparity is the better guess; it stays
-    a guess. ``max_width`` limits the width of the holes filled, px; rows without any value stay unknown.
+    a guess. Rows without any value stay unknown.
     """
-    height, width = disparity.shape
-    known = np.isfinite(disparity)
+    return np.fmin(*known_beside(disparity))
+
+
+def known_beside(values: F32) -> tuple[F32, F32]:
+    """Of each pixel (H, W) the nearest finite value at it or to its left, and to its right; NaN where none is."""
+    height, width = values.shape
+    known = np.isfinite(values)
     columns = np.broadcast_to(np.arange(width), (height, width))
     before = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
     after = np.minimum.accumulate(np.where(known, columns, width)[:, ::-1], axis=1)[:, ::-1]
-    left = np.where(before >= 0, np.take_along_axis(disparity, np.maximum(before, 0), axis=1), np.inf)
-    right = np.where(after < width, np.take_along_axis(disparity, np.minimum(after, width - 1), axis=1), np.inf)
-    guess = np.minimum(left, right)
-    fits = np.isfinite(guess) & ((max_width is None) | (after - before - 1 <= (max_width or 0)))
-    return np.where(known, disparity, np.where(fits, guess, np.nan)).astype(np.float32)
+    left = np.where(before >= 0, np.take_along_axis(values, np.maximum(before, 0), axis=1), np.nan)
+    right = np.where(after < width, np.take_along_axis(values, np.minimum(after, width - 1), axis=1), np.nan)
+    return left, right
 
 
 def seen_by_other(depth: NDArray[Any], other_depth: NDArray[Any], rig: StereoRig, side: Side) -> NDArray[np.bool_]:

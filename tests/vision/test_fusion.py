@@ -119,6 +119,24 @@ def test_nearer_surfaces_hide_farther_ones_among_the_fillers(scene: Any) -> None
         np.testing.assert_allclose(fused.image[middle], 0.48, atol=1e-6)
 
 
+def test_tears_in_one_surface_are_closed_and_views_past_an_edge_stay_open(scene: Any, truth: Build) -> None:
+    """One pixel in twenty has twice its depth, lands behind its neighbours and leaves a hole in the surface."""
+    left, expected = _view(scene, "left", 0, Origin.HERE), truth(scene, "left", 0, 0.0)
+    off = np.random.default_rng(0).random(left.depth.shape) < 0.05
+    seen = replace(left, depth=np.where(off, 2.0 * left.depth, left.depth))
+    nothing = replace(left, depth=np.zeros_like(left.depth), origin=Origin.GUESSED)
+    alone, closed = _fuse(scene, seen), _fuse(scene, seen, nothing)
+    torn = (alone.origin == Origin.NOBODY) & expected.visible
+    assert torn.sum() > 200
+    assert np.mean(closed.origin[torn] == Origin.GUESSED) > 0.9  # the others lie between the card and the wall
+    shut = torn & (closed.origin == Origin.GUESSED)
+    # The depth of the farther side, within the 3 % by which the sides of one surface may differ.
+    np.testing.assert_allclose(closed.depth[shut], expected.depth[shut], rtol=0.03)
+    assert psnr(closed.image, expected.image.astype(np.float32), shut) > 30.0
+    unseen = (alone.origin == Origin.NOBODY) & ~expected.visible
+    assert unseen.sum() > 200 and np.mean(closed.origin[unseen] == Origin.NOBODY) > 0.9
+
+
 @pytest.mark.parametrize("half_width", [0.03, 0.25])
 def test_what_one_frame_alone_sees_is_not_replaced_by_what_lies_behind(
     world: Build, shapes: Any, half_width: float

@@ -188,8 +188,6 @@ def test_holes_are_filled_from_behind() -> None:
     )
     expected = [[4, 4, 2, 2, 2, 2], [nan] * 6, [1, 2, 3, 4, 5, 6], [7, 7, 7, 7, 7, 9]]
     np.testing.assert_array_equal(fill_holes(rows), expected)
-    narrow = [[4, 4, nan, nan, 2, 2], [nan] * 6, [1, 2, 3, 4, 5, 6], [nan, nan, nan, 7, 7, 9]]
-    np.testing.assert_array_equal(fill_holes(rows, max_width=1), narrow)
 
 
 def test_metrics_of_known_errors() -> None:
