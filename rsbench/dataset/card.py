@@ -18,6 +18,7 @@ from rsbench.errors import RsbenchError
 from rsbench.imports import search
 from rsbench.motions import drawn_parameters, fixed_endpoint, make_motion
 from rsbench.reading import check_name, check_size
+from rsbench.renderers.electrons import Sensor
 
 Vector = tuple[float, float, float]
 Axis = Vector | str
@@ -142,6 +143,8 @@ class DatasetCard:
     motion: MotionCard
     renderer: str = "default"
     """Name of a renderer card, or a path to one."""
+    sensor: Sensor | None = None
+    """Exposure and noise of the rolling-shutter frames; absent, an ideal sensor's."""
     seed: int = 0
     seeds: tuple[int, ...] = ()
     """When given, every sequence is made once per seed under the name NAME-SEED; random axes change with it."""
@@ -154,6 +157,10 @@ class DatasetCard:
             self.rig_of(sequence)
         if not self.frame_period_s > 0:
             raise ValueError(f"frame_period_s must be positive, got {self.frame_period_s}")
+        if self.sensor is not None and self.sensor.exposure_s > self.frame_period_s:
+            raise ValueError(
+                f"sensor exposure_s = {self.sensor.exposure_s}: longer than frame_period_s = {self.frame_period_s}"
+            )
         if any(sequence.seed is not None for sequence in self.sequence) and self.seeds:
             raise ValueError("seeds and the seed of a sequence exclude each other")
         if len(set(self.seeds)) < len(self.seeds):

@@ -26,7 +26,7 @@ from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_png, write_poses
 from rsbench.dataset.hashes import HASHES, FileHashes, HashedFile
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
-from rsbench.dataset.sequence import FORMAT, FRAMES, RELATIVE_FILES, is_of_sequence, sequence_manifest
+from rsbench.dataset.sequence import FORMAT, FRAMES, files_of, is_of_sequence, sequence_manifest
 from rsbench.dataset.workplace import HIDDEN, WORK, named, remove, strangers, workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_jobs import finished_jobs
@@ -145,7 +145,9 @@ def _plan(card: DatasetCard, sequence: SequenceCard, options: RendererOptions, s
         motion=card.motion_of(sequence),
         frame_period_s=card.frame_period_s,
     )
+    sensor = {} if card.sensor is None else {"sensor": asdict(card.sensor)}
     return manifest | {
+        **sensor,
         "scene": {
             "name": scene.name,
             "sha256": "",
@@ -188,7 +190,7 @@ def _complete(
     files = {name: hashes.of(f"{sequence.name}/{name}") for name in listed if is_of_sequence(name)}
     damaged = [
         name
-        for name in {**dict.fromkeys(RELATIVE_FILES), **listed}
+        for name in {**dict.fromkeys(files_of(plan)), **listed}
         if (found := files.get(name)) is None or found.sha256 != listed.get(name)
     ]
     if damaged:
@@ -282,7 +284,7 @@ def _render_sequence(
     mitsuba_scene = MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint]))
     partial = out / HIDDEN / WORK / sequence.name
     remove(partial)  # of a worker that was killed
-    for folder in {Path(name).parent for name in RELATIVE_FILES}:
+    for folder in {Path(name).parent for name in files_of(plan)}:
         (partial / folder).mkdir(parents=True, exist_ok=True)
     for side, frame in product(SIDES, FRAMES):
         yield from _render_camera(card, sequence, options, mitsuba_scene, side, frame, partial)
@@ -313,9 +315,13 @@ def _render_camera(
     frame: int,
     folder: Path,
 ) -> Iterator[None]:
-    """One camera at one time: the rolling-shutter frame, then the global-shutter frame at its row 0's pose."""
+    """One camera at one time: the rolling-shutter frame, then the global-shutter frame at its row 0's pose.
+
+    What a sensor does is done to the rolling-shutter frame alone; its clean twin is kept.
+    """
     from rsbench.renderers.image import to_srgb8
     from rsbench.renderers.render import render
+    from rsbench.renderers.sensed import sensed_rows
 
     rig, shutter = card.rig_of(sequence), card.shutter()
     options = replace(options, seed=_image_seed(card.seed_of(sequence), sequence.name, side, frame))
@@ -328,8 +334,13 @@ def _render_camera(
         # A global-shutter frame needs no stitching: all its rows have one pose.
         chosen = options if kind == "rs" else replace(options, method="single-pass")
         rendered = render(scene, rig.camera, pose.R, pose.t, chosen, on_gs_frame=keep if kind == "rs" else None)
-        write_png(folder / kind / f"{side}_{frame}.png", to_srgb8(rendered.image, options.exposure))
+        place = "rs_clean" if kind == "rs" and card.sensor else kind
+        write_png(folder / place / f"{side}_{frame}.png", to_srgb8(rendered.image, options.exposure))
         write_depth(folder / f"{kind}_depth" / f"{side}_{frame}.exr", rendered.depth)
+        if kind == "rs" and card.sensor:
+            period, motion = card.frame_period_s, card.motion_of(sequence)
+            seen = sensed_rows(scene, rig, shutter, motion, card.sensor, period, side, frame, options)
+            write_png(folder / "rs" / f"{side}_{frame}.png", to_srgb8(seen, 1.0))
         yield
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -23,6 +24,7 @@ from rsbench.dataset.files import read_depth, read_json, read_png, read_poses
 from rsbench.errors import RsbenchError
 from rsbench.motions import motion_record, read_motion
 from rsbench.reading import check_name, check_size, inside
+from rsbench.renderers.electrons import Sensor
 
 FORMAT = CONVENTIONS = 1
 FRAMES = (0, 1)
@@ -41,12 +43,19 @@ RELATIVE_FILES = tuple(
     for side in SIDES
     for frame in FRAMES
 )
+CLEAN_FILES = tuple(f"rs_clean/{side}_{frame}.png" for side in SIDES for frame in FRAMES)
+"""Only where a sensor is not ideal: the rolling-shutter frames that an ideal one would have seen."""
 _STACK = re.compile(r"gs_stack/(left|right)_[01]/[0-9]{4,}\.png")
 
 
 def is_of_sequence(name: str) -> bool:
     """Whether a path below a sequence's folder is one that rsbench writes."""
-    return name == "sequence.json" or name in RELATIVE_FILES or _STACK.fullmatch(name) is not None
+    return name in ("sequence.json", *RELATIVE_FILES, *CLEAN_FILES) or _STACK.fullmatch(name) is not None
+
+
+def files_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
+    """Paths that a sequence must have, by its sequence.json: all but the stacks of whole frames."""
+    return RELATIVE_FILES + CLEAN_FILES if manifest.get("sensor") else RELATIVE_FILES
 
 
 Vector = tuple[float, float, float]
@@ -77,6 +86,7 @@ class SequenceManifest:
     readout_time_s: float
     row_time_s: float
     motion: MotionManifest
+    sensor: Sensor | None = None
     files: dict[str, str] = field(default_factory=dict)
     """sha256 by the path below the sequence's folder."""
 
@@ -126,12 +136,19 @@ class Sequence:
     shutter: RollingShutter
     motion: Motion
     frame_period_s: float
+    sensor: Sensor | None = None
+    """Of the rolling-shutter frames; None: an ideal one's."""
     manifest: dict[str, Any]
     """Content of sequence.json."""
 
     def image(self, shutter: Shutter, side: Side, frame: int) -> NDArray[np.uint8]:
         """(H, W, 3) sRGB; ``gs`` is the global-shutter image at the pose of the frame's row 0."""
         return read_png(inside(self.folder, f"{shutter}/{side}_{frame}.png"), self._size)
+
+    def clean_image(self, side: Side, frame: int) -> NDArray[np.uint8]:
+        """(H, W, 3) sRGB: the rolling-shutter frame of an ideal sensor, sharp and without noise."""
+        kind = "rs" if self.sensor is None else "rs_clean"
+        return read_png(inside(self.folder, f"{kind}/{side}_{frame}.png"), self._size)
 
     def images(self, shutter: Shutter = "rs") -> list[NDArray[np.uint8]]:
         """Left 0, right 0, left 1, right 1: the order of ``rsbench.match`` and ``rsbench.correct``."""
@@ -195,6 +212,7 @@ def read_sequence(folder: Path) -> Sequence:
             shutter=RollingShutter(height=manifest.camera.height, readout_ratio=manifest.readout_ratio),
             motion=read_motion(content["motion"]),
             frame_period_s=manifest.frame_period_s,
+            sensor=manifest.sensor,
             manifest=content,
         )
     except (ValueError, RsbenchError) as error:

@@ -12,3 +12,9 @@ def to_srgb8(image: ArrayLike, exposure: float) -> NDArray[np.uint8]:
     curve = 1.055 * np.power(np.maximum(linear, 0.0031308), 1 / 2.4) - 0.055
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, curve)
     return np.round(encoded * 255.0).astype(np.uint8)
+
+
+def linear_of_codes(codes: ArrayLike) -> NDArray[np.float64]:
+    """Linear values of 8-bit sRGB codes (...), also between them: the inverse of ``to_srgb8`` at exposure 1."""
+    encoded = np.clip(np.asarray(codes, dtype=np.float64) / 255.0, 0.0, 1.0)
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

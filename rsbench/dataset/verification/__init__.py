@@ -12,6 +12,7 @@ from rsbench.dataset.verification import structure
 from rsbench.dataset.verification.content import Comparison, images_elsewhere, read_content, twin_faults
 from rsbench.dataset.verification.findings import DepthAgreement, Progress, SequenceReport
 from rsbench.dataset.verification.poses import pose_faults
+from rsbench.dataset.verification.sensors import sensor_faults
 from rsbench.dataset.verification.shots import PAIRS
 from rsbench.errors import RsbenchError
 
@@ -67,6 +68,7 @@ def verify_sequence(
         faults += pose_faults(sequence)
         content = read_content(sequence, missing)
         faults += [*content.faults, *twin_faults(content)]
+        faults += sensor_faults(sequence, content.maps, content.pictures, missing)
         step(name)
         steps -= 1
         comparison = Comparison(content, stride)

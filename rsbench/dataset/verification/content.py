@@ -42,16 +42,25 @@ def read_content(sequence: Sequence, missing: Collection[str] = ()) -> Content:
                 content.maps[shot] = DepthMap(shot, sequence.depth(*shot[:3]))
         except RsbenchError as error:
             content.faults.append(str(error))
-        if shot.image in missing:
+        file = clean_file(sequence, shot)
+        if file in missing:
             continue
         try:
-            fault = png_fault(inside(sequence.folder, shot.image), shot.image, size)
+            fault = png_fault(inside(sequence.folder, file), file, size)
             content.faults += [fault] if fault else []
             if fault is None:
-                content.pictures[shot] = images.Picture.of(shot, sequence.image(*shot[:3]), noisy)
+                content.pictures[shot] = images.Picture.of(
+                    shot, read_png(inside(sequence.folder, file), size), noisy
+                )
         except RsbenchError as error:
             content.faults.append(str(error))
     return content
+
+
+def clean_file(sequence: Sequence, shot: Shot) -> str:
+    """The image of a shot that shows light alone: where a sensor blurs and errs, its clean twin."""
+    blurred = sequence.sensor is not None and shot.shutter == "rs"
+    return f"rs_clean/{shot.side}_{shot.frame}.png" if blurred else shot.image
 
 
 def twin_faults(content: Content) -> Iterator[str]:
@@ -65,7 +74,7 @@ def twin_faults(content: Content) -> Iterator[str]:
             unlike = np.any(rows[0] != rows[1], axis=-1)
             if np.any(unlike):
                 what = f"{np.sum(unlike)} pixels differ from the global-shutter twin at the same pose"
-                yield finding(shot.image, f"row 0 differs from {twin.image}: {what}")
+                yield finding(clean_file(content.sequence, shot), f"row 0 differs from {twin.image}: {what}")
         if {shot, twin} <= content.maps.keys():
             values = [content.maps[each].depth[0] for each in (shot, twin)]
             if not np.array_equal(*values):

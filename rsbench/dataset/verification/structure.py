@@ -206,7 +206,7 @@ def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: Seque
         motion=card.motion_of(sequence),
         frame_period_s=card.frame_period_s,
     )
-    planned |= {"seed": card.seed_of(sequence)}
+    planned |= {"seed": card.seed_of(sequence), "sensor": None if card.sensor is None else asdict(card.sensor)}
     scene: dict[str, Any] = {"viewpoint": sequence.viewpoint}
     # The cards that come with another version may say other things.
     if same_version and sequence.scene in list_cards("scenes"):

@@ -1,0 +1,104 @@
+"""Frames of a sensor that is not ideal, against their clean twins: no more blur and noise than the sensor makes."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.projection import back_project, project_at
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.verification.findings import finding, rows_of
+from rsbench.dataset.verification.images import Picture
+from rsbench.dataset.verification.png import png_fault
+from rsbench.dataset.verification.shots import FAR, DepthMap, Shot
+from rsbench.errors import RsbenchError
+from rsbench.reading import inside
+from rsbench.renderers.electrons import Sensor, fall_off
+from rsbench.renderers.image import linear_of_codes
+
+_BEYOND_SIGMA, _BEYOND_SHARE, _ROW_SHARE = 5.0, 5e-3, 0.1
+"""Of Gaussian noise 6e-7 are beyond, of Poisson numbers in the dark more; and a blur sees what lies between the
+samples of a texture finer than a pixel, or behind a thin near edge, which the twin does not show."""
+_LEAST_VALUES, _VARIANCE_RANGE = 1000, (0.85, 1.2)
+"""The variance of 1000 values is known to 4.5 %; five times that, and what a smooth surface changes in a blur."""
+_UNCLIPPED = (0.03, 0.75)
+
+
+def sensor_faults(
+    sequence: Sequence, maps: Mapping[Shot, DepthMap], pictures: Mapping[Shot, Picture], missing: Collection[str]
+) -> Iterator[str]:
+    """What the rolling-shutter frames of a sequence show that their sensor cannot have made of the clean twins."""
+    sensor = sequence.sensor
+    size = sequence.rig.camera.width, sequence.rig.camera.height
+    for shot in pictures:
+        if sensor is None or shot.shutter != "rs" or shot.image in missing or shot not in maps:
+            continue
+        try:
+            fault = png_fault(inside(sequence.folder, shot.image), shot.image, size)
+            if fault is None:
+                seen = sequence.image(*shot[:3])
+                fault = _fault(sensor, shot, seen, pictures[shot].colours, _window(sequence, sensor, maps[shot]))
+        except RsbenchError as error:
+            fault = str(error)
+        if fault:
+            yield fault
+
+
+def _window(sequence: Sequence, sensor: Sensor, depth_map: DepthMap) -> tuple[int, int]:
+    """How far (x, y) a surface may be, in whole pixels, from where the row's time sees it, while it is exposed."""
+    if not sensor.exposure_s:
+        return 0, 0
+    shot = depth_map.shot
+    grid = sequence.rig.camera.pixel_grid()[::4, ::4]
+    depth = depth_map.depth[::4, ::4].astype(np.float64)
+    depth = np.where(depth > 0, depth, FAR)
+    geometry = sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame
+    X = back_project(*geometry, grid, depth)
+    half = 0.5 * sensor.exposure_s / sequence.frame_period_s
+    tau = sequence.shutter.row_time(grid[..., 1], shot.frame)
+    moved = [
+        np.abs(project_at(sequence.rig, sequence.motion, shot.side, tau + sign * half, X)[..., :2] - grid)
+        for sign in (-1.0, 1.0)
+    ]
+    # One more: a pixel is an area, and thin near things lie between the points looked at.
+    x, y = np.ceil(np.nanmax(np.stack(moved), axis=(0, 1, 2))).astype(int) + 1
+    return int(x), int(y)
+
+
+def _fault(
+    sensor: Sensor, shot: Shot, image: NDArray[np.uint8], clean: NDArray[np.float32], window: tuple[int, int]
+) -> str | None:
+    height, width = clean.shape[:2]
+    twin = f"rs_clean/{shot.side}_{shot.frame}.png"
+    around = np.ones((2 * window[1] + 1, 2 * window[0] + 1), np.uint8)
+    share = fall_off(sensor, width, height, np.arange(height))[..., None]
+    low, high = (linear_of_codes(way(clean, around)) * share for way in (cv2.erode, cv2.dilate))
+    seen = linear_of_codes(image)
+    sigma = np.sqrt(sensor.variance(high) + _rounding(image) + _rounding(clean))
+    slack = _BEYOND_SIGMA * sigma
+    beyond = (seen < np.minimum(low, 1.0) - slack) | (seen > np.minimum(high, 1.0) + slack)
+    rows = np.mean(beyond, axis=(1, 2)) > _ROW_SHARE
+    if np.mean(beyond) > _BEYOND_SHARE or np.any(rows):
+        what = (
+            f"{100 * np.mean(beyond):.2f} % of the values are beyond {_BEYOND_SIGMA:g} sigma of what {twin} allows"
+        )
+        return finding(shot.image, what, rows_of(rows))
+    smooth = (high - low < sigma) & (low > _UNCLIPPED[0]) & (high < _UNCLIPPED[1])
+    if np.sum(smooth) < _LEAST_VALUES:
+        return None
+    ratio = float(np.var(((seen - 0.5 * (low + high)) / sigma)[smooth]))
+    if not _VARIANCE_RANGE[0] < ratio < _VARIANCE_RANGE[1]:
+        return finding(
+            shot.image, f"its noise has {ratio:.2f} times the variance of the sensor's, seen beside {twin}"
+        )
+    return None
+
+
+def _rounding(codes: NDArray[np.uint8] | NDArray[np.float32]) -> FloatArray:
+    """Variance of the linear values (...) by rounding to codes."""
+    exact = codes.astype(np.float64)
+    return np.asarray((linear_of_codes(exact + 0.5) - linear_of_codes(exact - 0.5)) ** 2 / 12.0, dtype=np.float64)

@@ -1,0 +1,56 @@
+"""A rolling-shutter frame as a sensor delivers it: exposed for a while, with the sensor's noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.motion import Motion
+from rsbench.core.rig import Side, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.renderers.electrons import Sensor, expose
+from rsbench.renderers.exposure import instant_count, instant_times
+from rsbench.renderers.options import RendererOptions
+from rsbench.renderers.render import render
+from rsbench.renderers.scene import MitsubaScene
+
+
+def sensed_rows(
+    scene: MitsubaScene,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    sensor: Sensor,
+    frame_period_s: float,
+    side: Side,
+    frame: int,
+    options: RendererOptions,
+    rows: Sequence[int] | None = None,
+) -> NDArray[np.float64]:
+    """Linear values (rows, width, 3) of rows of a frame, all by default; white = 1, black a little noisy.
+
+    Args:
+        scene: in the world frame of the motion.
+        rig: camera and baseline.
+        shutter: the middle of a row's exposure is its time.
+        motion: of the rig's body.
+        sensor: see there.
+        frame_period_s: seconds of a frame period, in which the motion counts.
+        side: of the rig.
+        frame: 0 or 1.
+        options: how to render; their seed is that of the image, of the noise too.
+        rows: these only, with the bits that they have in the whole frame.
+    """
+    tau = shutter.row_time(np.arange(shutter.height), frame)
+    exposed = None
+    if sensor.exposure_s:
+        instants = instant_times(tau, sensor.exposure_s / frame_period_s, instant_count(options.samples))
+        exposed = rig.cam_from_world(motion, instants, side)
+    chosen = range(shutter.height) if rows is None else rows
+    R, t = rig.cam_from_world(motion, tau, side)
+    options = replace(options, full_frames=False)
+    light = render(scene, rig.camera, R, t, options, exposed=exposed, rows=chosen).image
+    return expose(light * np.float32(options.exposure), sensor, options.seed, shutter.height, chosen)

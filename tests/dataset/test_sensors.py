@@ -1,0 +1,162 @@
+"""Sequences of a sensor that is not ideal: exposure and noise in the frames, a clean twin beside them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rsbench.cards import parse_card
+from rsbench.dataset import generation
+from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
+from rsbench.dataset.files import write_png
+from rsbench.dataset.generation import generate_dataset
+from rsbench.dataset.sequence import read_sequence
+from rsbench.dataset.verification import verify_dataset
+from rsbench.dataset.verification.content import read_content
+from rsbench.dataset.verification.sensors import sensor_faults
+from rsbench.dataset.verification.shots import Shot
+from rsbench.errors import RsbenchError
+from rsbench.renderers.electrons import Sensor
+from rsbench.scenes.model import Scene
+
+NOISY = Sensor(full_well=6000, gain=4, photon_noise=True, read_noise=2.5, bit_depth=10)
+
+
+def _card(sensor: Sensor | None, **fields: object) -> DatasetCard:
+    smoke = load_dataset_card("smoke")
+    camera = CameraCard(width=96, height=72, focal=112.0)
+    return replace(smoke, camera=camera, sequence=smoke.sequence[1:], sensor=sensor, **fields)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, built_scene: Callable[[str], Scene]) -> dict[str, Path]:
+    """Folders of one sequence with an ideal sensor, with noise, and with noise and an exposure."""
+    sensors = {"ideal": None, "noisy": NOISY, "exposed": replace(NOISY, exposure_s=0.02)}
+    folders = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(generation, "load_scene", built_scene)
+        for name, sensor in sensors.items():
+            folders[name] = tmp_path_factory.mktemp("sensors") / name
+            generate_dataset(_card(sensor), folders[name])
+            assert generate_dataset(_card(sensor), folders[name]) == [], "a second run has nothing to do"
+    return {name: folder / "room-twist" for name, folder in folders.items()}
+
+
+def test_the_clean_twin_is_the_frame_of_an_ideal_sensor(made: dict[str, Path]) -> None:
+    for name in ("noisy", "exposed"):
+        for file in ("left_0.png", "right_1.png"):
+            assert (made[name] / "rs_clean" / file).read_bytes() == (made["ideal"] / "rs" / file).read_bytes()
+        for file in ("rs_depth/left_1.exr", "gs/left_1.png", "gs_depth/right_0.exr", "poses/left_1.csv"):
+            assert (made[name] / file).read_bytes() == (made["ideal"] / file).read_bytes()
+    assert not (made["ideal"] / "rs_clean").exists()
+
+
+def _linear(image: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1, backwards."""
+    x = image / 255.0
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
+def test_noise_on_rendered_frames_is_the_model_s(made: dict[str, Path]) -> None:
+    sequence = read_sequence(made["noisy"])
+    assert sequence.sensor == NOISY
+    seen, clean = (
+        np.stack([_linear(image(side, frame)) for side in ("left", "right") for frame in (0, 1)])
+        for image in (lambda side, frame: sequence.image("rs", side, frame), sequence.clean_image)
+    )
+    middle = (clean > 0.05) & (clean < 0.8)
+    # Both images are rounded to 8 bits of sRGB: one twelfth of a step each, whose size is the curve's slope.
+    step = (_linear(np.minimum(255.0 * _srgb(clean) + 0.5, 255.0)) - _linear(255.0 * _srgb(clean) - 0.5)) ** 2
+    variance = NOISY.variance(clean) + 2 * step / 12
+    z = ((seen - clean) / np.sqrt(variance))[middle]
+    assert middle.sum() > 30_000
+    assert abs(z.mean()) < 0.03 and z.var() == pytest.approx(1.0, abs=0.05)
+
+
+def _srgb(linear: np.ndarray) -> np.ndarray:
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def test_an_exposure_blurs_what_moves(made: dict[str, Path]) -> None:
+    """Neighbours along x differ less than in the noisy frame, which has the same noise but sharp edges."""
+    sharp, blurred = (read_sequence(made[name]).image("rs", "left", 1) for name in ("noisy", "exposed"))
+    clean = read_sequence(made["exposed"]).clean_image("left", 1)
+    edges = np.abs(np.diff(clean.astype(float), axis=1)) > 25
+    steps = [np.abs(np.diff(image.astype(float), axis=1))[edges].mean() for image in (sharp, blurred)]
+    assert steps[1] < 0.9 * steps[0]
+
+
+def test_such_sequences_are_verified(made: dict[str, Path]) -> None:
+    for name in ("noisy", "exposed"):
+        (report,) = verify_dataset(made[name].parent)
+        assert report.faults == ()
+
+
+FAULTS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    "the clean twin": lambda seen, clean: clean,
+    "of more noise": lambda seen, clean: np.clip(
+        seen + np.random.default_rng(1).normal(0, 9, seen.shape), 0, 255
+    ).astype(np.uint8),
+    "black": lambda seen, clean: np.zeros_like(seen),
+    "channels exchanged": lambda seen, clean: seen[..., ::-1],
+    "upside down": lambda seen, clean: seen[::-1],
+    "mirrored": lambda seen, clean: seen[:, ::-1],
+    "brighter": lambda seen, clean: np.minimum(seen.astype(int) + 12, 255).astype(np.uint8),
+    "one row replaced": lambda seen, clean: np.concatenate([seen[:40], 255 - seen[40:41], seen[41:]]),
+}
+
+
+# A blur of a fine texture hides how much noise there is; rows that are rendered again tell.
+HIDDEN = {("exposed", "the clean twin"), ("exposed", "of more noise")}
+
+
+@pytest.mark.parametrize(
+    ("name", "fault"), [pair for pair in product(("noisy", "exposed"), FAULTS) if pair not in HIDDEN]
+)
+def test_frames_that_the_sensor_cannot_have_made_are_named(
+    made: dict[str, Path], name: str, fault: str, tmp_path: Path
+) -> None:
+    """The checks of hashes aside: an adversary mends those."""
+    sequence = read_sequence(made[name])
+    content = read_content(sequence)
+    copy = tmp_path / sequence.name
+    shutil.copytree(made[name], copy)
+    shot = Shot("rs", "left", 1)
+    bad = FAULTS[fault](sequence.image("rs", "left", 1), sequence.clean_image("left", 1))
+    write_png(copy / shot.image, np.ascontiguousarray(bad))
+    found = list(sensor_faults(read_sequence(copy), content.maps, content.pictures, ()))
+    assert len(found) == 1 and found[0].startswith("rs/left_1.png: ")
+
+
+def test_a_card_says_what_its_sensor_cannot_be() -> None:
+    fields = {"exposure_s": 0.2}
+    with pytest.raises(RsbenchError, match=r"exposure_s = 0.2: longer than frame_period_s = 0.1"):
+        parse_card(
+            DatasetCard,
+            {
+                "name": "x",
+                "camera": {"width": 8, "height": 8, "focal": 9.0},
+                "baseline": 0.1,
+                "readout_ratio": 0.5,
+                "sensor": fields,
+                "motion": {
+                    "rotation_deg": 1.0,
+                    "rotation_axis": [1, 0, 0],
+                    "translation": 0.1,
+                    "translation_axis": [1, 0, 0],
+                },
+                "sequence": [{"name": "a", "scene": "room"}],
+            },
+            "mine.toml",
+        )
+
+
+def test_the_telephone_is_a_card() -> None:
+    card = load_dataset_card("phone")
+    assert card.sensor is not None and card.sensor.white == 1500.0
