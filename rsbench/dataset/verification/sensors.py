@@ -1,4 +1,4 @@
-"""Frames of a sensor that is not ideal, against their clean twins: no more blur and noise than the sensor makes."""
+"""Frames of a sensor that is not ideal, against clean twins: no more blur and noise than the sensor makes."""
 
 from __future__ import annotations
 
