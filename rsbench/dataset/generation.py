@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -363,17 +364,24 @@ def _write_manifest(card: DatasetCard, out: Path, made: dict[str, Files]) -> Non
         for sequence in card.sequence
         for name, file in made[sequence.name].items()
     }
-    write_json(
-        out / "dataset.json",
-        {
-            "format": FORMAT,
-            "name": card.name,
-            "description": card.description,
-            "rsbench": __version__,
-            "mitsuba": version("mitsuba"),
-            "units": {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = no surface"},
-            "card": asdict(card),
-            "sequences": [sequence.name for sequence in card.sequence],
-            "files": files,
-        },
-    )
+    content = {
+        "format": FORMAT,
+        "name": card.name,
+        "description": card.description,
+        "rsbench": __version__,
+        "mitsuba": version("mitsuba"),
+        "units": {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = no surface"},
+        "card": asdict(card),
+        "sequences": [sequence.name for sequence in card.sequence],
+        "files": files,
+    }
+    if not _stands(out / "dataset.json", content):
+        write_json(out / "dataset.json", content)
+
+
+def _stands(path: Path, content: dict[str, Any]) -> bool:
+    """Whether a file holds this already; to read millions of lines is much faster than to write them."""
+    try:
+        return read_json(path) == json.loads(json.dumps(content))
+    except RsbenchError:
+        return False
