@@ -27,7 +27,7 @@ _IMPORTED = 173
 """Exit code of a process in which a module was tried, that no module is likely to choose."""
 _COMMAND = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from rsbench.imports import import_and_end; import_and_end(sys.argv[2], float(sys.argv[3]))"
+    "from rsbench.imports import import_and_end; import_and_end(sys.argv[2], float(sys.argv[3]), int(sys.argv[4]))"
 )
 _expendable = False
 _beside_cards: dict[str, tuple[Path, str]] = {}
@@ -84,24 +84,26 @@ def try_import(module: str, version: str = "") -> None:
 
 @functools.cache
 def _fate(module: str, version: str) -> str:
-    limit_s = _import_limit()
-    process = subprocess.Popen(
-        [sys.executable, "-c", _COMMAND, json.dumps([str(entry) for entry in sys.path]), module, str(limit_s)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,  # its own process group
-    )
-    try:
-        code = process.wait(limit_s)
-    except subprocess.TimeoutExpired:
-        return f"took longer than {limit_s:g} s ({IMPORT_LIMIT} allows more)"
-    finally:
-        if _POSIX:
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(process.pid, signal.SIGKILL)
-        process.kill()
-        process.wait()
+    limit_s, path = _import_limit(), json.dumps([str(entry) for entry in sys.path])
+    with lifeline() as line:
+        process = subprocess.Popen(
+            [sys.executable, "-c", _COMMAND, path, module, str(limit_s), str(line)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # its own process group
+            pass_fds=(line,) if _POSIX else (),
+        )
+        try:
+            code = process.wait(limit_s)
+        except subprocess.TimeoutExpired:
+            return f"took longer than {limit_s:g} s ({IMPORT_LIMIT} allows more)"
+        finally:
+            if _POSIX:
+                with contextlib.suppress(ProcessLookupError, PermissionError):
+                    os.killpg(process.pid, signal.SIGKILL)
+            process.kill()
+            process.wait()
     return "" if code == _IMPORTED else ending(code)
 
 
@@ -113,13 +115,46 @@ def _import_limit() -> float:
     raise RsbenchError(f"{IMPORT_LIMIT} = {text!r}: must be a positive number of seconds")
 
 
-def import_and_end(module: str, limit_s: float) -> NoReturn:
+def import_and_end(module: str, limit_s: float, line: int) -> NoReturn:
     """In a process of its own: import a module, and say by the exit code that this came to an end."""
     if _POSIX:
-        signal.alarm(math.ceil(limit_s) + 1)  # should the parent be gone by then
+        signal.alarm(math.ceil(limit_s) + 1)  # should the parent be gone by then, where ``end_with`` does nothing
+        end_with(line)
     with contextlib.suppress(BaseException):
         importlib.import_module(module)
     os._exit(_IMPORTED)
+
+
+@contextlib.contextmanager
+def lifeline() -> Iterator[int]:
+    """A descriptor for a child to inherit and to give to ``end_with``; -1 where there are none."""
+    if not _POSIX:
+        yield -1
+        return
+    reader, writer = os.pipe()
+    try:
+        yield reader
+    finally:
+        os.close(reader)
+        os.close(writer)
+
+
+def end_with(line: int) -> None:
+    """In a child that leads its group: let Linux kill the group when the parent is gone.
+
+    Even while code that holds Python's lock loops, and whatever the parent's end was: the other end of the pipe is
+    closed then.
+    """
+    if sys.platform == "linux":
+        import fcntl
+        import select
+
+        with contextlib.suppress(OSError):
+            fcntl.fcntl(line, fcntl.F_SETOWN, -os.getpgrp())
+            fcntl.fcntl(line, fcntl.F_SETSIG, signal.SIGKILL)
+            fcntl.fcntl(line, fcntl.F_SETFL, fcntl.fcntl(line, fcntl.F_GETFL) | os.O_ASYNC)
+            if select.select([line], [], [], 0.0)[0]:  # it was gone before
+                os.killpg(os.getpgrp(), signal.SIGKILL)
 
 
 def import_untried() -> None:

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, NoReturn
 
-_PATIENCE_S = 1.5
+_PATIENCE_S = 1.0
 _SPEECH_S = 0.3
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _RESUMES = "the same command resumes where it stopped"

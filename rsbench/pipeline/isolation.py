@@ -26,7 +26,7 @@ from multiprocessing.reduction import ForkingPickler
 from types import TracebackType
 from typing import Any, BinaryIO, NoReturn
 
-from rsbench.imports import ending, import_untried
+from rsbench.imports import end_with, ending, import_untried
 from rsbench.pipeline.plain_data import decode, encode, receive, send
 
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
@@ -293,7 +293,7 @@ def use_one_thread() -> None:
 def serve_parent(lifeline: int) -> NoReturn:
     """Answer the parent until it is gone."""
     if lifeline >= 0:
-        _end_with(lifeline)
+        end_with(lifeline)  # elsewhere than on Linux ``_listen`` does it, as soon as Python runs
     import_untried()
     requests, answers = _take_streams()
     waiting: queue.SimpleQueue[bytes] = queue.SimpleQueue()
@@ -333,20 +333,6 @@ def _listen(requests: BinaryIO, waiting: queue.SimpleQueue[bytes]) -> None:
     while (data := receive(requests)) is not None:
         waiting.put(data)
     _end_group()
-
-
-def _end_with(lifeline: int) -> None:
-    """Let Linux kill this group when the parent is gone, even while code that holds Python's lock loops.
-
-    Elsewhere ``_listen`` does it as soon as Python runs.
-    """
-    if sys.platform == "linux":
-        import fcntl
-
-        with contextlib.suppress(OSError):
-            fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpgrp())
-            fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
-            fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
 
 
 def _end_group() -> NoReturn:
