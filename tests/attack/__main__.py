@@ -59,7 +59,7 @@ def main() -> int:
     if chosen.case:
         extent = Extent(**{**vars(extent), "cases": tuple(chosen.case)})
     extent = Extent(
-        **{**vars(extent), **{k: getattr(chosen, k) for k in ("kills", "inputs") if getattr(chosen, k)}}
+        **{**vars(extent), **{k: getattr(chosen, k) for k in ("kills", "files", "inputs") if getattr(chosen, k)}}
     )
     chosen.keep.mkdir(parents=True, exist_ok=True)
     rows, faults = [], 0
@@ -84,6 +84,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--sample", action="store_true", help="a little of each, in seconds")
     parser.add_argument("--case", action="append", choices=CASES, help="command to kill and starve; repeatable")
     parser.add_argument("--kills", type=int, help="of each command")
+    parser.add_argument("--files", type=int, help="operations of each command that fail; default: every one")
     parser.add_argument("--inputs", type=int, help="of all loaders together")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()) / "attack-inputs")

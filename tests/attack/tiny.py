@@ -28,17 +28,20 @@ KINDS = (
 )
 CAMERA = {"width": 96, "height": 64, "focal": 80.0}
 RIG = "baseline = 0.3\nreadout_ratio = 0.8\n[camera]\nfx = 80.0\nfy = 80.0\ncx = 47.5\ncy = 31.5\n"
-_SWEEP = {"trials": 2, "width": 640, "height": 480, "focal": 500.0, "points": 30}
+SOLVERS = ("gs-8pt", "rs-stereo-linear", "rs-stereo-refined", "rs-stereo")
 
 
 def make_checkout(folder: Path) -> Path:
-    """A checkout whose scenes are one textured box, its frames 96 x 64, its sweeps two trials at two values."""
+    """A checkout of few solvers, one textured box for a scene, frames of 96 x 64, sweeps of two trials."""
     folder.mkdir(parents=True)
     shutil.copyfile(ROOT / "pyproject.toml", folder / "pyproject.toml")
     for name in ("rsbench", "docs", "examples"):
         (folder / name).symlink_to(ROOT / name)
     for kind in KINDS:
         shutil.copytree(ROOT / kind, folder / kind)
+    for path in (folder / "solvers").glob("*.toml"):
+        if path.stem not in SOLVERS:
+            path.unlink()
     for path in (folder / "scenes").glob("*.toml"):
         write_box_scene(folder / "scenes", path.stem)
     for path in (folder / "datasets").glob("*.toml"):
