@@ -107,15 +107,15 @@ def write_origin(path: Path, origin: NDArray[np.uint8]) -> None:
     write_png(path, values[origin])
 
 
-def read_origin(path: Path) -> NDArray[np.uint8]:
-    """Origin (H, W) of every pixel, from an image of ``write_origin``.
+def read_origin(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+    """Origin (H, W) of every pixel, from an image of ``write_origin``; ``size`` as of ``read_png``.
 
     Raises:
         RsbenchError: missing or not an image.
     """
     origins = np.zeros(256, dtype=np.uint8)
     origins[list(MASK_VALUES.values())] = list(MASK_VALUES)
-    return origins[read_png(path)[..., 0]]
+    return origins[read_png(path, size)[..., 0]]
 
 
 def motion_record(found: FoundMotion) -> dict[str, Any]:

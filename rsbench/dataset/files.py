@@ -9,6 +9,7 @@ import io
 import json
 import os
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -204,6 +205,30 @@ def save_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     write_bytes(path, buffer.getvalue())
+
+
+def read_table(
+    path: Path, columns: Iterable[str] = (), numbers: Iterable[str] = (), **options: Any
+) -> pd.DataFrame:
+    """A CSV file; ``options`` are those of ``pandas.read_csv``.
+
+    Raises:
+        RsbenchError: it cannot be read, is no table, lacks one of the ``columns`` or ``numbers``, or holds
+            something else among the numbers.
+    """
+    import pandas as pd
+
+    try:
+        table = pd.read_csv(io.StringIO(read_text(path)), **options)
+    except ValueError as error:  # of pandas, all that a damaged table is
+        raise RsbenchError(f"{path}: not a table: {' '.join(str(error).split())}") from error
+    for name in (*columns, *numbers):
+        if name not in table:
+            raise RsbenchError(f"{path}: lacks the column {name!r}")
+    for name in numbers if len(table) else ():
+        if not pd.api.types.is_numeric_dtype(table[name]):
+            raise RsbenchError(f"{path}: the column {name!r} must hold numbers")
+    return table
 
 
 def write_table(path: Path, frame: pd.DataFrame) -> None:

@@ -24,7 +24,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from rsbench.errors import RsbenchError
 
@@ -77,7 +77,7 @@ def strangers(folder: Path, ours: Callable[[str], bool]) -> list[str]:
     A link is a stranger whatever its name is; an empty folder is none.
     """
     found: list[str] = []
-    for place, folders, files in os.walk(folder):
+    for place, folders, files in os.walk(folder, onerror=raise_it):
         here = Path(place).relative_to(folder)
         links = [name for name in folders if (Path(place) / name).is_symlink()]
         for name in [*files, *links]:
@@ -85,6 +85,11 @@ def strangers(folder: Path, ours: Callable[[str], bool]) -> list[str]:
             if not ours(path) or not stat.S_ISREG((folder / path).lstat().st_mode):
                 found.append(path)
     return sorted(found)
+
+
+def raise_it(error: OSError) -> NoReturn:
+    """For ``os.walk``, which else passes over folders that cannot be read as if they were empty."""
+    raise error
 
 
 def named(paths: list[str], most: int = 3) -> str:

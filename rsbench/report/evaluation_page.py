@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from numpy.typing import NDArray
 
 from rsbench.benchmark.images.evaluation import read_headings, read_scores
-from rsbench.benchmark.images.predict import depth_of
+from rsbench.benchmark.images.predict import depth_of, load_disparities
 from rsbench.core.rig import View
 from rsbench.dataset.corrected_frames import read_origin
 from rsbench.dataset.files import load_arrays, load_matches, read_json, read_png, write_bytes
@@ -171,7 +171,11 @@ def _failure_table(out: Path) -> SummaryTable:
 def write_report(dataset: Path, out: Path) -> Path:
     """Write pictures/ and report.html below ``out``; returns the page, which needs no other file."""
     record = read_json(out / "provenance.json")
-    chosen = correction_of(record)
+    try:
+        chosen, title = correction_of(record), f"rsbench: {record['inputs']['dataset']}"
+        date = str(record["date"])
+    except (KeyError, TypeError) as error:
+        raise RsbenchError(f"{out / 'provenance.json'}: is not that of an evaluation; evaluate again") from error
     sections = []
     for sequence in read_dataset(dataset):
         drawn = draw_sequence(sequence, out / "predictions" / sequence.name, chosen)
@@ -189,8 +193,8 @@ def write_report(dataset: Path, out: Path) -> Path:
         {"title": table.title, "note": table.note, "html": _html(table.frame)} for table in summary_tables(out)
     ]
     page = environment.get_template("evaluation.html.j2").render(
-        title=f"rsbench: {record['inputs']['dataset']}",
-        subtitle=f"Rolling-shutter stereo evaluation, {record['date']}; pictures: {' + '.join(chosen.values())}",
+        title=title,
+        subtitle=f"Rolling-shutter stereo evaluation, {date}; pictures: {' + '.join(chosen.values())}",
         tables=tables,
         sections=sections,
         provenance=json.dumps(record, indent=2),
@@ -246,9 +250,9 @@ def publish(evaluation: Path, out: Path) -> Path:
 
 
 def _files(folder: Path, *parts: str) -> list[str]:
-    """Files in some parts of a folder, by their paths below it."""
+    """Files in some parts of a folder, by their paths below it; without those that a killed run was writing."""
     paths = (path for part in parts for path in (folder / part).rglob("*") if path.is_file())
-    return [path.relative_to(folder).as_posix() for path in paths]
+    return [path.relative_to(folder).as_posix() for path in paths if not path.name.endswith(".partial")]
 
 
 def _motions(evaluation: Path) -> list[str]:
@@ -301,8 +305,9 @@ def _draw_corrected(folder: Path, chosen: dict[str, str], truth: Image) -> Drawn
     stem = folder / "corrected" / ("+".join(chosen.values()) + f"-{_SHOWN[0]}_{_SHOWN[1]}")
     if not stem.with_name(f"{stem.name}.png").is_file():
         return {}
-    corrected = read_png(stem.with_name(f"{stem.name}.png"))
-    mask = read_origin(stem.with_name(f"{stem.name}-origin.png")) != Origin.NOBODY
+    size = truth.shape[1], truth.shape[0]
+    corrected = read_png(stem.with_name(f"{stem.name}.png"), size)
+    mask = read_origin(stem.with_name(f"{stem.name}-origin.png"), size) != Origin.NOBODY
     return {
         "corrected": (
             pictures.masked(corrected, mask),
@@ -321,7 +326,9 @@ def _draw_motion(sequence: Sequence, folder: Path, chosen: dict[str, str]) -> Dr
     matches = load_matches(folder / "matches.npz").left
     stored = folder / "motion" / f"{chosen['solver']}-inliers.npz"
     inliers = load_arrays(stored).get("left") if stored.is_file() else None
-    keep = np.ones(len(matches), dtype=np.bool_) if inliers is None or len(inliers) != len(matches) else inliers
+    keep = np.ones(len(matches), dtype=np.bool_)
+    if inliers is not None and inliers.shape == keep.shape and inliers.dtype == keep.dtype:
+        keep = inliers
     image = pictures.draw_matches(sequence.image("rs", "left", 0), matches, keep)
     return {"matches": (image, "Left matches over time; orange: rejected")}
 
@@ -337,7 +344,8 @@ def _draw_depth(sequence: Sequence, folder: Path, matcher: str) -> Drawn:
     drawn: Drawn = {"depth-truth": (inverse(truth), "True depth of the rolling-shutter frame")}
     stored = folder / "depth" / f"{matcher}.npz"
     if stored.is_file():
-        depth = depth_of(load_arrays(stored)[f"{_SHOWN[0]}_{_SHOWN[1]}"], sequence.rig)
+        found = load_disparities(stored, sequence.rig)
+        depth = depth_of(found[f"{_SHOWN[0]}_{_SHOWN[1]}"], sequence.rig)
         error = np.where(surface & (depth > 0), np.abs(depth - truth), np.nan)
         drawn["depth"] = (inverse(depth), f"Depth by {matcher} (dark: invalid)")
         drawn["depth-error"] = (

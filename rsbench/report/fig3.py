@@ -12,6 +12,7 @@ import pandas as pd
 from rsbench.benchmark.simulated.sweep_card import Setting, SweepCard
 from rsbench.benchmark.studies.claim_rules import Centre
 from rsbench.benchmark.studies.claims import OURS, READINGS
+from rsbench.dataset.files import read_table
 from rsbench.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -53,14 +54,14 @@ def read_summaries(folder: Path, sweeps: tuple[str, ...], ending: str = "") -> d
     """Stored summaries ``<sweep><ending>.csv`` by the name of the sweep.
 
     Raises:
-        RsbenchError: one is missing.
+        RsbenchError: one is missing or damaged.
     """
     tables = {}
     for name in sweeps:
         path = folder / f"{name}{ending}.csv"
         if not path.is_file():
             raise RsbenchError(f"{path}: no such summary; run: rsbench reproduce fig3")
-        tables[name] = pd.read_csv(path)
+        tables[name] = read_table(path)
     return tables
 
 

@@ -225,12 +225,12 @@ def _digest(path: Path) -> str:
 def contents(folder: Path) -> dict[str, str]:
     """Hashes of all files of a result, hidden ones too.
 
-    Left out are ``MACHINE``, seconds/ of sweeps, and what motion.json and its page say of seconds.
+    Left out are ``MACHINE``, the lock, seconds/ of sweeps, and what motion.json and its page say of seconds.
     """
     found = {}
     for path in sorted(folder.rglob("*")):
         name = str(path.relative_to(folder))
-        if path.name in MACHINE or path.parent.name == "seconds" or not path.is_file():
+        if path.name in MACHINE or name == ".rsbench/lock" or path.parent.name == "seconds" or not path.is_file():
             continue
         found[name] = _digest(path)
         if path.name == "motion.json":

@@ -154,3 +154,17 @@ def test_strangers_are_all_that_is_not_a_plain_file_of_ours(tmp_path: Path) -> N
     (tmp_path / "away").symlink_to(tmp_path / "deep")
     (tmp_path / "empty").mkdir()
     assert strangers(tmp_path, ours.__contains__) == ["away", "deep/note", "linked"]
+
+
+def test_a_folder_that_cannot_be_listed_is_not_taken_for_an_empty_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``os.walk`` passes over it in silence, and what lies in it would be taken for rsbench's own."""
+
+    def broken(path: object) -> None:
+        raise OSError(5, "Input/output error", str(path))
+
+    (tmp_path / "mine.txt").write_text("mine")
+    monkeypatch.setattr(os, "scandir", broken)
+    with pytest.raises(OSError, match="Input/output"):
+        strangers(tmp_path, lambda path: False)

@@ -16,7 +16,7 @@ from rsbench.benchmark.images.score import AFTER, KEYS, TABLES, Row, Scorer
 from rsbench.benchmark.isolated_metric import isolated_metrics
 from rsbench.benchmark.metric_plugins import DepthCase, ImageCase, PoseCase
 from rsbench.benchmark.provenance import dataset_record, provenance
-from rsbench.dataset.files import read_json, write_json, write_table
+from rsbench.dataset.files import read_json, read_table, write_json, write_table
 from rsbench.dataset.hashes import HASHES, FileHashes
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.dataset.workplace import workplace
@@ -154,17 +154,28 @@ def _frame(table: str, rows: Iterable[Row], plan: Plan) -> pd.DataFrame:
 
 
 def read_headings(out: Path, table: str) -> dict[str, str]:
-    """Headings of the metrics' columns of a score file, by their names; errors as ``read_json``."""
-    return {column["name"]: column["heading"] for column in read_json(out / "scores" / "columns.json")[table]}
+    """Headings of the metrics' columns of a score file, by their names.
+
+    Raises:
+        RsbenchError: columns.json is not there, or damaged.
+    """
+    path = out / "scores" / "columns.json"
+    columns = read_json(path).get(table)
+    try:
+        return {str(column["name"]): str(column["heading"]) for column in columns}  # type: ignore[union-attr]
+    except (KeyError, TypeError) as error:
+        raise RsbenchError(f"{path}: {table!r} must be a list of columns with name and heading") from error
 
 
 def read_scores(out: Path, table: str) -> pd.DataFrame:
     """One of ``TABLES`` of an evaluation, as ``columns_of`` names its columns.
 
     Raises:
-        RsbenchError: the evaluation is not there.
+        RsbenchError: the evaluation is not there, or its files are damaged.
     """
     path = out / "scores" / f"{table}.csv"
     if not path.is_file():
         raise RsbenchError(f"{path}: no such scores; make them with: rsbench evaluate DIR --out {out}")
-    return pd.read_csv(path, keep_default_na=False, na_values=[""])
+    numbers = read_headings(out, table) if table in _CASES else {}
+    columns = (*KEYS[table], *AFTER.get(table, ()))
+    return read_table(path, columns, numbers, keep_default_na=False, na_values=[""])

@@ -221,7 +221,7 @@ class Bench:
         record = artefact.record()
         if record is None or not record["success"]:
             return str(record["reason"]) if record else "not made"
-        stored = load_arrays(artefact.file(".npz"))
+        stored = load_disparities(artefact.file(".npz"), self.sequence.rig)
         first, second = (
             depth_of_pair(
                 self.images["left", frame],
@@ -275,6 +275,23 @@ def read_motion(places: Places, solver: SolverEntry) -> Motion | str:
         return str(record["reason"])
     estimate = MotionEstimate(w=record["w"], d=record["d"], success=True, metric=record["metric"])
     return body_motion(estimate, solver.solver.spec, places.sequence.rig)
+
+
+def load_disparities(path: Path, rig: StereoRig) -> dict[str, NDArray[np.float32]]:
+    """Disparity of every view (H, W), by names such as ``left_0``.
+
+    Raises:
+        RsbenchError: the file is damaged, or is of another camera.
+    """
+    stored, shape = load_arrays(path), (rig.camera.height, rig.camera.width)
+    for side, frame in VIEWS:
+        found = stored.get(f"{side}_{frame}")
+        if found is None or found.dtype != np.float32 or found.shape != shape:
+            raise RsbenchError(
+                f"{path}: must hold {side}_{frame} as float32 {shape}; delete {path.stem}.json beside it, "
+                "and the same command makes it again"
+            )
+    return stored
 
 
 def true_pairs(sequence: Sequence, images: Images) -> Pairs:

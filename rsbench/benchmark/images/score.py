@@ -17,13 +17,13 @@ from rsbench.benchmark.images.plan import (
     stored_depths,
     stored_motions,
 )
-from rsbench.benchmark.images.predict import depth_of, true_pairs
+from rsbench.benchmark.images.predict import depth_of, load_disparities, true_pairs
 from rsbench.benchmark.images.store import read_seconds
 from rsbench.benchmark.metric_plugins import Case, DepthCase, ImageCase, MetricEntry, PoseCase
 from rsbench.benchmark.scoring import answered, score
 from rsbench.core.rig import VIEWS, Side, View
 from rsbench.dataset.corrected_frames import read_origin
-from rsbench.dataset.files import load_arrays, read_png
+from rsbench.dataset.files import read_png
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
@@ -138,7 +138,7 @@ class Scorer:
                 continue
             stored = None
             if record["success"]:
-                stored = load_arrays(self.places.depth(matcher).file(".npz"))
+                stored = load_disparities(self.places.depth(matcher).file(".npz"), self.sequence.rig)
             else:
                 self._fail("matcher", record["matcher"], record["reason"])
             for view in VIEWS:
@@ -174,12 +174,13 @@ class Scorer:
             if not record["success"]:
                 self._fail("correction", "+".join(names.values()), record["reason"])
             artefact = self.places.corrected(recipe)
+            size = self.sequence.rig.camera.width, self.sequence.rig.camera.height
             for view in VIEWS:
-                end = f"-{view[0]}_{view[1]}"
-                image = read_png(artefact.file(f"{end}.png")) if record["success"] else None
-                drawn = (
-                    read_origin(artefact.file(f"{end}-origin.png")) != Origin.NOBODY if record["success"] else None
-                )
+                image = drawn = None
+                if record["success"]:
+                    end = f"-{view[0]}_{view[1]}"
+                    image = read_png(artefact.file(f"{end}.png"), size)
+                    drawn = read_origin(artefact.file(f"{end}-origin.png"), size) != Origin.NOBODY
                 self._add("correction", self._image_rows(names, view, image, drawn))
 
     def _image_rows(

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rsbench.benchmark.images.records import is_whole
 from rsbench.dataset.files import read_json, write_json
 from rsbench.errors import RsbenchError
 
@@ -48,7 +49,8 @@ class Artefact:
     def record(self) -> dict[str, Any] | None:
         """What was stored, when it is current; None otherwise."""
         record = read_record(self.file(".json"))
-        return record if record is not None and record.get("identity") == self.identity else None
+        current = record is not None and record.get("identity") == self.identity and is_whole(self.name, record)
+        return record if current else None
 
     def forget(self) -> None:
         """Make it stale: the next run makes it again."""
@@ -75,13 +77,14 @@ def read_record(path: Path) -> dict[str, Any] | None:
 
 
 def records_below(folder: Path, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Names and records of all artefacts of a kind, such as ``motion``, in the order of their names."""
+    """Names and whole records of all artefacts of a kind, such as ``motion``, in the order of their names."""
     for path in sorted((folder / kind).glob("*.json")):
         record = read_record(path)
-        if record is not None:
+        if record is not None and is_whole(kind, record):
             yield path.stem, record
 
 
 def read_seconds(folder: Path) -> dict[str, float]:
-    """Seconds by the name of the artefact."""
-    return read_record(folder / SECONDS) or {}
+    """Seconds by the name of the artefact; what is no number is left out."""
+    found = read_record(folder / SECONDS) or {}
+    return {name: float(value) for name, value in found.items() if isinstance(value, int | float)}

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict
 from importlib import resources
@@ -146,25 +146,77 @@ def run_sweep(
         remove(chunks)
 
 
-def read_trials(out: Path, cell: Cell) -> Arrays:
-    """Stored truth and predictions of a cell."""
-    return load_arrays(_Part("trials", cell).path(out))
+def read_trials(out: Path, card: SweepCard, cell: Cell) -> Arrays:
+    """Stored truth and predictions of a cell.
+
+    Raises:
+        RsbenchError: the file is damaged.
+    """
+    path = _Part("trials", cell).path(out)
+    arrays = _checked(load_arrays(path), path, card, _TRIALS)
+    codes, reasons = arrays["reason_code"], arrays.get("reasons", np.zeros(0))
+    if reasons.ndim != 1 or np.any((codes < 0) | (codes >= len(reasons))):
+        raise RsbenchError(f"{path}: 'reasons' is damaged; {_REMAKE}")
+    return arrays
 
 
 def read_bounds(out: Path, card: SweepCard, cell: Cell) -> Arrays:
-    """Stored bounds of a cell, for a noise of 1 px."""
-    return load_arrays(_Part("bounds", geometry_of(card, cell)).path(out))
+    """Stored bounds of a cell, for a noise of 1 px.
+
+    Raises:
+        RsbenchError: the file is damaged.
+    """
+    path = _Part("bounds", geometry_of(card, cell)).path(out)
+    return _checked(load_arrays(path), path, card, _BOUNDS)
+
+
+_SAID = ("name", "information", "shutter", "motion_model", "reference_point")
+"""What sweep.json must say of every solver."""
+_REMAKE = "delete the file, and the same command makes it again"
+_TRIALS = {
+    "w": ("f", (3,)),
+    "d": ("f", (3,)),
+    "w_est": ("f", (0, 3)),
+    "d_est": ("f", (0, 3)),
+    "success": ("b", (0,)),
+    "metric": ("b", (0,)),
+    "direction_known": ("b", (0,)),
+    "reason_code": ("i", (0,)),
+}
+_BOUNDS = {"rotation": ("f", (0, 3)), "direction": ("f", (0, 2)), "scale": ("f", (0,))}
+"""Kind of the arrays of a part, and their shape after the trials; 0 stands for the number of solvers."""
+
+
+def _checked(
+    arrays: Arrays, path: Path, card: SweepCard, layout: Mapping[str, tuple[str, tuple[int, ...]]]
+) -> Arrays:
+    for name, (kind, tail) in layout.items():
+        shape = (card.trials, *(size or len(card.solvers) for size in tail))
+        array = arrays.get(name, np.zeros(0))
+        if array.dtype.kind != kind or array.shape != shape:
+            raise RsbenchError(f"{path}: {name!r} is damaged; {_REMAKE}")
+    return arrays
 
 
 def read_sweep(folder: Path) -> dict[str, Any]:
     """sweep.json of a finished run.
 
     Raises:
-        RsbenchError: no such file, or of another format.
+        RsbenchError: no such file, of another format, or damaged.
     """
-    content = read_json(folder / "sweep.json")
+    path = folder / "sweep.json"
+    content = read_json(path)
     if content.get("format") != FORMAT:
-        raise RsbenchError(f"{folder / 'sweep.json'}: format = {content.get('format')!r}: must be {FORMAT}")
+        raise RsbenchError(f"{path}: format = {content.get('format')!r}: must be {FORMAT}")
+    solvers = content.get("solvers")
+    solvers = solvers if isinstance(solvers, list) else [solvers]
+    said = [[one.get(key) for key in _SAID] if isinstance(one, dict) else [None] for one in solvers]
+    if not (
+        isinstance(content.get("card"), dict) and all(isinstance(word, str) for words in said for word in words)
+    ):
+        raise RsbenchError(
+            f"{path}: card or solvers are damaged; choose another --out, or remake all with --force"
+        )
     return content
 
 

@@ -19,6 +19,7 @@ from rsbench.benchmark.statistics import average_interval, share_interval, typic
 from rsbench.cards import parse_card
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.files import write_table
+from rsbench.errors import RsbenchError
 
 SUCCESS_DEG = (1.0, 5.0)
 """A trial counts as solved when e_R and e_T are below these."""
@@ -41,12 +42,14 @@ def summarise_sweep(folder: Path) -> pd.DataFrame:
     """Write summary.csv, one row per solver and cell, from the stored trials; returns it.
 
     Raises:
-        RsbenchError: the folder holds no sweep.
+        RsbenchError: the folder holds no sweep, or a damaged one.
     """
     card, solvers = read_card(folder), read_sweep(folder)["solvers"]
+    if len(solvers) != len(card.solvers):
+        raise RsbenchError(f"{folder / 'sweep.json'}: solvers: {len(solvers)}, the card has {len(card.solvers)}")
     rows = []
     for cell in card.cells():
-        trials, bounds = read_trials(folder, cell), read_bounds(folder, card, cell)
+        trials, bounds = read_trials(folder, card, cell), read_bounds(folder, card, cell)
         for number, solver in enumerate(solvers):
             scores = score_trials(trials, number, solver["reference_point"], cell)
             limit = {key: _scaled(values[:, number], cell.setting.noise_px) for key, values in bounds.items()}

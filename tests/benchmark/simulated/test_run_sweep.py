@@ -20,6 +20,7 @@ from rsbench.benchmark.simulated.sweep_summary import failure_reasons, summarise
 from rsbench.benchmark.simulated.trials import Arrays, enter, run_bounds, run_trials
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.motion import LinearMotion
+from rsbench.dataset.files import load_arrays, read_json, save_arrays, write_json
 from rsbench.dataset.workplace import workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_solver import SolverRunner
@@ -244,7 +245,7 @@ def test_solvers_get_what_they_need_and_no_more() -> None:
 def test_noise_and_told_readout_share_exact_matches(finished: Path) -> None:
     cells = CARD.cells()
     assert [geometry_of(CARD, cell).index for cell in cells] == [0, 1, 0, 1]
-    low, high = read_trials(finished, cells[0]), read_trials(finished, cells[2])
+    low, high = read_trials(finished, CARD, cells[0]), read_trials(finished, CARD, cells[2])
     np.testing.assert_array_equal(low["w"], high["w"])
     np.testing.assert_array_equal(
         read_bounds(finished, CARD, cells[0])["rotation"], read_bounds(finished, CARD, cells[2])["rotation"]
@@ -324,3 +325,23 @@ def test_bounds_tell_what_pairs_and_tracks_can_observe(
         assert np.all(np.linalg.norm(bounds["rotation"], axis=-1) < 0.02)
         assert np.all((np.linalg.norm(bounds["direction"], axis=-1) < 0.1) == direction)
         assert np.median(bounds["scale"] < 0.5) == know_scale
+
+
+def test_a_damaged_part_is_refused_by_name(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(finished, folder)
+    path = folder / "trials" / "000.npz"
+    whole = load_arrays(path)
+    for name, array in {"w": whole["w"][:, :2], "success": whole["success"].astype(float), "d_est": None}.items():
+        kept = {key: value for key, value in whole.items() if key != name}
+        save_arrays(path, kept if array is None else {**kept, name: array})
+        with pytest.raises(RsbenchError, match=rf"000\.npz: '{name}' is damaged; delete the file"):
+            summarise_sweep(folder)
+    save_arrays(path, whole | {"reasons": whole["reasons"][:0]})
+    with pytest.raises(RsbenchError, match="'reasons' is damaged"):
+        summarise_sweep(folder)
+    content = read_json(folder / "sweep.json")
+    for damage in ({"card": 3}, {"solvers": None}, {"solvers": [{}]}, {"solvers": content["solvers"][:1]}):
+        write_json(folder / "sweep.json", content | damage)
+        with pytest.raises(RsbenchError, match=r"sweep\.json: .*solvers"):
+            summarise_sweep(folder)
