@@ -341,7 +341,8 @@ def test_a_damaged_part_is_refused_by_name(finished: Path, tmp_path: Path) -> No
     with pytest.raises(RsbenchError, match="'reasons' is damaged"):
         summarise_sweep(folder)
     content = read_json(folder / "sweep.json")
-    for damage in ({"card": 3}, {"solvers": None}, {"solvers": [{}]}, {"solvers": content["solvers"][:1]}):
+    damages: list[dict[str, Any]] = [{"card": 3}, {"solvers": None}, {"solvers": [{}]}, {"solvers": [1]}]
+    for damage in (*damages, {"solvers": content["solvers"][:1]}):
         write_json(folder / "sweep.json", content | damage)
         with pytest.raises(RsbenchError, match=r"sweep\.json: .*solvers"):
             summarise_sweep(folder)
