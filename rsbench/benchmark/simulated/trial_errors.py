@@ -27,7 +27,7 @@ def errors_of_rows(table: pd.DataFrame, folders: Sequence[Path]) -> dict[str, ND
     for folder in folders:
         card, solvers = read_card(folder), read_sweep(folder)["solvers"]
         for cell in card.cells():
-            trials = read_trials(folder, cell)
+            trials = read_trials(folder, card, cell)
             for number, solver in enumerate(solvers):
                 scores = score_trials(trials, number, solver["reference_point"], cell)
                 key = (card.seed, cell.variant, cell.value, solver["name"])
