@@ -1,5 +1,6 @@
 """``python -m rsbench`` and the command ``rsbench``."""
 
+import contextlib
 import os
 import signal
 import sys
@@ -17,7 +18,14 @@ def main() -> None:
         signal.signal(number, end_at_once)
     from rsbench.cli.main import run
 
-    run()
+    try:
+        run()
+    except SystemExit as end:
+        if end.code not in [128 + number for number in heard]:
+            raise
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+        os._exit(int(end.code))  # all is closed but Python, which takes a second for its modules
 
 
 def _open_streams() -> None:

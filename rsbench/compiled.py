@@ -9,10 +9,11 @@ that processes which compile at the same time write the same, and none spoils wh
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import logging
-import shutil
+import re
 import tempfile
 import time
 from collections.abc import Callable
@@ -30,6 +31,8 @@ F = TypeVar("F", bound=Callable[..., object])
 _LOGGER = logging.getLogger("rsbench")
 _WORTH_SAYING_S = 1.0
 _KEPT_DAYS = 30
+_VERSION = re.compile(r"[0-9a-f]{16}")
+"""Names of the folders of versions."""
 _MARKS = (b"@compiled", b"MotionKernel")
 """What files with compiled code hold; all of them decide the version."""
 
@@ -181,11 +184,12 @@ def _asked_for() -> Path | None:
 
 
 def _remove_old(folder: Path) -> None:
-    """Code of other versions that nobody has added to for a month."""
+    """Code of other versions that nobody has added to for a month; nothing else, wherever the cache was put."""
     oldest = time.time() - _KEPT_DAYS * 86400
     for other in folder.parent.iterdir():
-        try:
-            if other != folder and other.stat().st_mtime < oldest:
-                shutil.rmtree(other, ignore_errors=True)
-        except OSError:  # another process removed it first
-            continue
+        with contextlib.suppress(OSError):  # another process removed it first
+            if other == folder or not _VERSION.fullmatch(other.name) or other.lstat().st_mtime > oldest:
+                continue
+            for file in [] if other.is_symlink() else [*other.glob("*.nbi"), *other.glob("*.nbc")]:
+                file.unlink()
+            other.rmdir()

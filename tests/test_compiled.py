@@ -178,3 +178,16 @@ def test_long_compiling_is_announced_in_one_line_and_once(tmp_path: Path) -> Non
     first, second = (child(code, NUMBA_CACHE_DIR=str(tmp_path / "cache")) for _ in range(2))
     assert first.stderr == "rsbench: compiling, once per installation: up to a minute\n"
     assert (second.stdout, second.stderr) == ("1.5 1", "")
+
+
+def test_only_compiled_code_of_old_versions_is_removed(tmp_path: Path) -> None:
+    """The cache may be put where other things lie (NUMBA_CACHE_DIR)."""
+    kept = {"0123456789abcdef/now.nbc", "sources/mine.c", "fedcba9876543210/notes.txt"}
+    for name in (*kept, "fedcba9876543210/old.nbi", "aaaaaaaaaaaaaaaa/old.nbc"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("")
+    for folder in tmp_path.iterdir():
+        os.utime(folder, (0, 0))
+    compiled._remove_old(tmp_path / "0123456789abcdef")
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()} == kept
+    assert not (tmp_path / "aaaaaaaaaaaaaaaa").exists()

@@ -16,7 +16,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, NoReturn
+from typing import NoReturn
 
 _PATIENCE_S = 1.0
 _SPEECH_S = 0.3
@@ -52,9 +52,6 @@ def stoppable() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     # Ignored from the start, as of a background process of a shell without job control, it stays so.
     ours = [number for number, handler in before.items() if handler != signal.SIG_IGN]
-    hook, (reader, writer) = sys.unraisablehook, os.pipe()
-    os.set_blocking(writer, False)
-    done = threading.Event()
     received: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
@@ -63,23 +60,39 @@ def stoppable() -> Iterator[None]:
             signal.signal(each, signal.SIG_IGN)  # a second one must not disturb the closing
         raise Stopped
 
+    with _watched():
+        try:
+            for number in ours:
+                signal.signal(number, stop)
+            yield
+        except BaseException:
+            # What a signal interrupts may turn it into an error of its own, as the import of a module does.
+            if not received:
+                raise
+            _say()
+            sys.exit(128 + received[0])
+        finally:
+            for number in ours:
+                signal.signal(number, before[number])
+
+
+@contextmanager
+def _watched() -> Iterator[None]:
+    """With a thread that ends the process when the main thread does not heed a signal."""
+    if os.name != "posix":
+        yield
+        return
+    hook, (reader, writer) = sys.unraisablehook, os.pipe()
+    os.set_blocking(writer, False)
+    done = threading.Event()
     threading.Thread(target=_watch, args=(reader, done), daemon=True).start()
     wakeup = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    sys.unraisablehook = _quiet_hook(hook)
+    # ``Stopped`` raised where Python can pass nothing on, as in a destructor, is left to the thread.
+    sys.unraisablehook = lambda problem: None if problem.exc_type is Stopped else hook(problem)
     try:
-        for number in ours:
-            signal.signal(number, stop)
         yield
-    except BaseException:
-        # What a signal interrupts may turn it into an error of its own, as the import of a module does.
-        if not received:
-            raise
-        _say()
-        sys.exit(128 + received[0])
     finally:
         done.set()
-        for number in ours:
-            signal.signal(number, before[number])
         sys.unraisablehook = hook
         signal.set_wakeup_fd(wakeup)
         os.close(writer)
@@ -94,11 +107,6 @@ def _watch(reader: int, done: threading.Event) -> None:
                 speaker.start()
                 speaker.join(_SPEECH_S)  # whoever should read it may have stopped reading
                 os._exit(128 + byte[0])
-
-
-def _quiet_hook(hook: Any) -> Any:
-    """``Stopped`` raised where Python can pass nothing on, as in a destructor, is left to ``_watch``."""
-    return lambda problem: None if problem.exc_type is Stopped else hook(problem)
 
 
 def _say() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import stat
@@ -84,11 +85,9 @@ def _read(store: Path) -> dict[str, HashedFile]:
     try:
         with store.open(encoding="utf-8", errors="replace") as stream:
             for line in stream:
-                try:
+                with contextlib.suppress(ValueError, TypeError):  # an empty line, or one that was cut
                     name, size, modified, changed, digest = json.loads(line)
-                except (ValueError, TypeError):  # empty, or cut
-                    continue
-                known[name] = HashedFile(size, modified, changed, digest)
+                    known[name] = HashedFile(size, modified, changed, digest)
     except OSError:
         return {}
     return known
