@@ -1,10 +1,11 @@
 """Score the motion that rsbench finds on a folder in the layout of KITTI odometry.
 
-python examples/score_kitti.py FOLDER [--left image_0 --right image_1] [--ratio 0] [--every 1]
+python examples/score_kitti.py FOLDER [--left image_0 --right image_1] [--ratio 0] [--focal 1] [--every 1]
 
 FOLDER holds calib.txt (projection matrices, the first two of the left and the right camera), poses.txt (3 x 4
 matrices world_from_left, one line a frame) and two folders of rectified images. Global-shutter footage has the
-readout ratio 0; --ratio none has it estimated, with the disparity offset, from all windows.
+readout ratio 0; --ratio none has it estimated, with the disparity offset, from all windows. A wrong --ratio or
+--focal (a factor) shows what becomes of a wrong card.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ def read_matrices(path: Path) -> FloatArray:
     return matrices
 
 
-def read_rig(folder: Path, image: Path) -> StereoRig:
-    """Rig of a folder whose images are like this one."""
+def read_rig(folder: Path, image: Path, focal: float = 1.0) -> StereoRig:
+    """Rig of a folder whose images are like this one, its focal length wrong by the factor ``focal``."""
     matrices = read_matrices(folder / "calib.txt")
     if len(matrices) < 2:
         raise RsbenchError(f"{folder / 'calib.txt'}: {len(matrices)} matrices; those of both cameras are needed")
@@ -56,8 +57,8 @@ def read_rig(folder: Path, image: Path) -> StereoRig:
     height, width = read_frame(image).shape[:2]
     fx, fy, cx, cy = left[0, 0], left[1, 1], left[0, 2], left[1, 2]
     try:
-        camera = PinholeCamera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
-        return StereoRig(camera=camera, baseline=float(left[0, 3] - right[0, 3]) / camera.fx)
+        camera = PinholeCamera(width=width, height=height, fx=focal * fx, fy=focal * fy, cx=cx, cy=cy)
+        return StereoRig(camera=camera, baseline=float(left[0, 3] - right[0, 3]) / fx)
     except ValueError as error:
         raise RsbenchError(f"{folder / 'calib.txt'}: {error}") from error
 
@@ -81,6 +82,17 @@ def readout_ratio(word: str) -> float | None:
     raise argparse.ArgumentTypeError(f"{word!r} must be a number from 0 to 1, or none")
 
 
+def factor(word: str) -> float:
+    """Of the focal length, from the command line."""
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
+    if not 0.5 <= value <= 2.0:
+        raise argparse.ArgumentTypeError(f"{word!r} must be a number from 0.5 to 2")
+    return value
+
+
 def step(word: str) -> int:
     if not word.isdecimal() or int(word) < 1:
         raise argparse.ArgumentTypeError(f"{word!r} must be a whole number above 0")
@@ -93,6 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--left", default="image_0")
     parser.add_argument("--right", default="image_1")
     parser.add_argument("--ratio", type=readout_ratio, default=0.0, help="readout ratio from 0 to 1, or none")
+    parser.add_argument("--focal", type=factor, default=1.0, help="tried focal length over the card's, 0.5 to 2")
     parser.add_argument("--every", type=step, default=1, help="score every n-th window")
     given = parser.parse_args(arguments)
     try:
@@ -107,7 +120,7 @@ def score(given: argparse.Namespace) -> list[str]:
     """Lines of the table, one a window, and the summary."""
     sources = [FrameSource(given.folder / name) for name in (given.left, given.right)]
     files = [sorted(path for path in source.path.iterdir() if path.is_file()) for source in sources]
-    rig, options = read_rig(given.folder, files[0][0]), CorrectionOptions()
+    rig, options = read_rig(given.folder, files[0][0], given.focal), CorrectionOptions()
     poses = read_matrices(given.folder / "poses.txt")
     if not len(files[0]) == len(files[1]) == len(poses):
         raise RsbenchError(

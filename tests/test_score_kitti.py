@@ -61,6 +61,11 @@ def test_exchanged_cameras_are_refused_in_every_window(
     assert "exchanged" in out and "2 of 2 windows refused" in out
 
 
+def test_a_wrong_focal_length_leaves_the_baseline(script: ModuleType, folder: Path) -> None:
+    rig = script.read_rig(folder, folder / "image_0" / "000000.png", 1.1)
+    np.testing.assert_allclose([rig.camera.fx, rig.camera.fy, rig.baseline], [1.1 * F, 1.1 * F, BASELINE])
+
+
 @pytest.mark.parametrize("name", ["calib.txt", "poses.txt"])
 def test_what_is_missing_is_named(
     script: ModuleType, folder: Path, name: str, capsys: pytest.CaptureFixture[str]
@@ -70,7 +75,9 @@ def test_what_is_missing_is_named(
     assert name in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [("--ratio", "nan"), ("--ratio", "half"), ("--ratio", "1.5"), ("--every", "0")])
+@pytest.mark.parametrize(
+    "words", [("--ratio", "nan"), ("--ratio", "half"), ("--ratio", "1.5"), ("--every", "0"), ("--focal", "3")]
+)
 def test_options_that_mean_nothing_are_refused(
     script: ModuleType, folder: Path, words: tuple[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:

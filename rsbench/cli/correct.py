@@ -214,6 +214,8 @@ def _readout(shutter: RollingShutter, readout: ReadoutEstimate | None) -> str:
         text += ", corrected as 0"
     if readout.offset_sigma > 0.0:
         text += f"; disparity offset {readout.disparity_offset:+.2f} +- {readout.offset_sigma:.2f} px (estimated)"
+        if readout.windows == 1:
+            text += "; a rig like this errs by twice the deviations of one window"
     return text
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,12 @@ import numpy as np
 import pytest
 from commands import assert_refused, run_here
 
+from rsbench.cli.correct import _readout
+from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.corrected_frames import MASK_VALUES, fresh_folder
 from rsbench.dataset.files import read_depth, read_png, write_png
 from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.pipeline.readout import ReadoutEstimate
 
 ORDER = ("left_0", "right_0", "left_1", "right_1")
 
@@ -171,3 +175,12 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
         (folder / "half").write_text("x")
         raise RuntimeError
     assert not any(tmp_path.iterdir())
+
+
+def test_one_window_of_a_rig_that_is_off_says_how_far_it_errs() -> None:
+    """A fitted disparity offset is what tells a real rig from a rendered one."""
+    shutter, covariance = RollingShutter(height=480, readout_ratio=0.1), np.diag([0.02**2, 0.1**2])
+    off = ReadoutEstimate(signed_ratio=0.1, disparity_offset=-0.5, covariance=covariance, matches=100)
+    right = replace(off, disparity_offset=0.0, covariance=np.diag([0.02**2, 0.0]))
+    assert "twice" in _readout(shutter, off)
+    assert not any("twice" in _readout(shutter, each) for each in (replace(off, windows=25), right))
