@@ -80,12 +80,12 @@ def _refuse_others(out: Path, place: Path) -> None:
 
 
 def _exchange(fresh: Path, place: Path, old: Path) -> None:
-    if place.exists():
-        os.rename(place, old)
     try:
+        if place.exists():
+            os.rename(place, old)
         os.rename(fresh, place)
-    except OSError:
-        if old.exists():
+    except BaseException:  # a signal too
+        if old.exists() and not place.exists():
             os.rename(old, place)
         raise
 

@@ -74,6 +74,14 @@ def test_a_folder_with_a_motion_file_of_others_is_not_ours(tmp_path: Path) -> No
     assert texts(tmp_path / "out") == {"motion.json": "{}"}
 
 
+def test_two_commands_do_not_share_a_folder(out: Path) -> None:
+    with fresh_folder(out) as folder:
+        (folder / "motion.json").write_text("first of two")
+        with pytest.raises(RsbenchError, match=f"process {os.getpid()} on .* is at work there"):
+            write(out, "second of two")
+    assert texts(out) == {"motion.json": "first of two"}
+
+
 @pytest.mark.parametrize("name", [".", "..", "../sub"])
 def test_the_working_folder_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     (tmp_path / "sub").mkdir()

@@ -269,10 +269,15 @@ def simulator_version() -> str:
 
 
 def _open_folder(plan: dict[str, Any], out: Path, force: bool) -> None:
+    there = [path for kind in _KINDS for path in (out / kind).glob("*.npz") if _OURS.fullmatch(path.name)]
+    links = [out / kind for kind in _KINDS if (out / kind).is_symlink()]
+    if links or (there and not (out / "sweep.json").is_file()):
+        raise RsbenchError(
+            f"{[*links, *there][0]}: 'rsbench simulate' did not make it; move it away or choose another --out"
+        )
     if force:
-        for path in (path for kind in _KINDS for path in (out / kind).glob("*.npz")):
-            if _OURS.fullmatch(path.name):
-                path.unlink()
+        for path in there:
+            path.unlink()
     elif (out / "sweep.json").is_file():
         other = _differences(read_sweep(out), plan)
         if other:

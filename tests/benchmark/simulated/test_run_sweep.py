@@ -115,6 +115,20 @@ def test_force_removes_nothing_of_others(finished: Path, tmp_path: Path) -> None
         assert (folder / name).read_text() == "mine"
 
 
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("link", [False, True])
+def test_trials_of_others_are_neither_removed_nor_taken_for_ours(tmp_path: Path, force: bool, link: bool) -> None:
+    place = tmp_path / ("theirs" if link else "out/trials")
+    place.mkdir(parents=True)
+    (place / "000.npz").write_bytes(b"mine")
+    if link:
+        (tmp_path / "out").mkdir()
+        (tmp_path / "out/trials").symlink_to(place)
+    with pytest.raises(RsbenchError, match="'rsbench simulate' did not make it; move it away"):
+        run_sweep(CARD, tmp_path / "out", force=force)
+    assert (place / "000.npz").read_bytes() == b"mine"
+
+
 def test_two_commands_do_not_share_a_folder(finished: Path) -> None:
     with workplace(finished), pytest.raises(RsbenchError, match="is at work there"):
         run_sweep(CARD, finished)
