@@ -115,7 +115,8 @@ def evaluate_dataset(folder: Path, out: Path, options: EvaluationOptions | None,
     for table in summary_tables(out):
         print_table(table.title, table.brief)
     if stale:
-        typer.echo(f"not scored, made from other data, components or options: {', '.join(stale)}", err=True)
+        why = "made from other data, components or options, or by a card that was not named"
+        typer.echo(f"not scored, {why}: {', '.join(stale)}", err=True)
     page = write_report(folder, out)
     typer.echo(f"report: {page.resolve()}")
     return page

@@ -140,6 +140,8 @@ def _changes(assignments: list[str]) -> dict[str, object]:
             changes[key.strip()] = tomllib.loads(f"value = {value}")["value"]
         except tomllib.TOMLDecodeError:
             changes[key.strip()] = value.strip()
+        except (ValueError, RecursionError) as error:  # a number of thousands of digits, or brackets
+            raise RsbenchError(f"--set {key}: not a value of TOML: {error}") from error
     return changes
 
 

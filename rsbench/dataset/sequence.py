@@ -120,6 +120,8 @@ class DatasetManifest:
     card: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if not self.sequences:
+            raise ValueError("sequences = []: must name one at least")
         for name, count in Counter(self.sequences).items():
             check_name(name)
             if count > 1:

@@ -174,7 +174,7 @@ def write_report(dataset: Path, out: Path) -> Path:
     try:
         chosen, title = correction_of(record), f"rsbench: {record['inputs']['dataset']}"
         date = str(record["date"])
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise RsbenchError(f"{out / 'provenance.json'}: is not that of an evaluation; evaluate again") from error
     sections = []
     for sequence in read_dataset(dataset):
@@ -278,8 +278,10 @@ Drawn = dict[str, tuple[Image, str]]
 
 def correction_of(record: dict[str, Any]) -> dict[str, str]:
     """Names of the corrector, solver and matcher that an evaluation's pictures show, from its provenance."""
-    inputs = record["inputs"]
-    return {name: str(inputs["correction"][name]) for name in ("corrector", "solver", "matcher")}
+    chosen = {name: str(record["inputs"]["correction"][name]) for name in ("corrector", "solver", "matcher")}
+    if any(Path(name).name != name for name in chosen.values()):
+        raise ValueError("a path in place of a name: it becomes part of the names of files")
+    return chosen
 
 
 def draw_sequence(sequence: Sequence, folder: Path, chosen: dict[str, str]) -> Drawn:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rsbench.errors import RsbenchError
 from rsbench.imports import in_words
-from rsbench.reading import FILE_BYTES, PIXELS, check_amount, check_size
+from rsbench.reading import FILE_BYTES, check_amount, check_size
 from rsbench.scenes.mesh_limits import check_mesh_file
 from rsbench.scenes.model import FloatArray, Material, SceneBuilder, SceneMesh
 
@@ -27,8 +27,8 @@ _Z_UP = {
 }
 _SHEET = 1024  # columns of the sheet that holds colours of faces
 _TRIANGLES = 1 << 22
-_TEXTURES = 4
-"""Of ``PIXELS`` each; smaller ones may be more."""
+_TEXTURE, _TEXTURES = 1 << 24, 1 << 26
+"""Pixels of one, 4096 x 4096, and of all."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,10 +198,10 @@ def _material(source: Any, where: str, others: list[Material]) -> Material:
 
 def _texture(image: Any, factor: FloatArray, where: str, others: list[Material]) -> NDArray[np.uint8]:
     """(h, w, 3) sRGB of an image times a linear factor; its size is checked before it is decoded."""
-    check_size(f"{where}: texture", image.size)
+    check_size(f"{where}: texture", image.size, most=_TEXTURE)
     taken = sum(other.texture.size // 3 for other in others if other.texture is not None)
     pixels = taken + image.size[0] * image.size[1]
-    check_amount(where, "pixels of all textures", pixels, _TEXTURES * PIXELS)
+    check_amount(where, "pixels of all textures", pixels, _TEXTURES)
     texture = np.array(image.convert("RGB"), dtype=np.uint8)
     if not np.all(factor == 1.0):
         levels = np.rint(_to_srgb(_to_linear(np.arange(256)[:, None] / 255.0) * factor) * 255)

@@ -41,6 +41,7 @@ def test_a_users_own_sweep(tmp_path: Path) -> None:
         (["noise", "--set", "pints=9"], ["unknown key 'pints'", "did you mean 'points'?"]),
         (["noise", "--set", "points"], ["--set points", "FIELD=VALUE"]),
         (["noise", "--set", "shape=ball"], ["shape = 'ball'"]),
+        (["noise", "--set", "x=" + "[" * 3000], ["--set x", "not a value of TOML"]),
         (["noise", "--solver", "nobody"], ["solver 'nobody' does not exist"]),
     ],
 )

@@ -67,6 +67,7 @@ def refusal(read: Callable[[], Any]) -> str:
         (["planes\n"], "must be a folder's name"),
         (["x" * 200], "must be a folder's name"),
         (["planes", "planes"], "'planes' stands there twice"),
+        ([], "sequences = []: must name one at least"),
         ([7], "sequences.0 = 7: input should be a valid string"),
         ("planes", "sequences = 'planes': input should be a valid array"),
         (None, "sequences = None"),

@@ -19,10 +19,10 @@ from rsbench.dataset.sequence import Sequence
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.plugins import Entry, Kind
-from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
-from rsbench.vision.corrector import load_corrector
+from rsbench.solvers.engine.registry import SOLVERS, SolverEntry, load_solver_entry
+from rsbench.vision.corrector import CORRECTORS, load_corrector
 from rsbench.vision.feature_matcher import load_features
-from rsbench.vision.stereo_matcher import MatcherEntry, load_matcher
+from rsbench.vision.stereo_matcher import STEREO_MATCHERS, MatcherEntry, load_matcher
 
 Component = TypeVar("Component")
 HashOf = Callable[[Path], str]
@@ -259,7 +259,7 @@ class Stored(NamedTuple):
 def stored_motions(places: Places, plan: Plan) -> Iterator[Stored]:
     """Of every solver and seed, planned or not."""
     chosen = {solver.name: solver for solver in plan.solvers}
-    again = cache(partial(_again, load_solver_entry))
+    again = cache(partial(_again, partial(_named, load_solver_entry)))
     numbers = sorted(int(path.name) for path in (places.folder / _SEEDS).glob("[1-9]*"))
     for seed, kind in [(0, "motion"), *((k, f"{_SEEDS}/{k}") for k in numbers)]:
         for name, record in records_below(places.folder, kind):
@@ -271,7 +271,7 @@ def stored_depths(places: Places) -> Iterator[Stored]:
     """Of every stereo matcher."""
     for name, record in records_below(places.folder, "depth"):
         chosen = places.chain.matcher
-        entry = chosen if chosen.name == name else _again(load_matcher, record.get("entry"))
+        entry = chosen if chosen.name == name else _again(partial(_named, load_matcher), record.get("entry"))
         yield Stored(record, entry if _current(entry, places.depth, record) else None)
 
 
@@ -284,13 +284,22 @@ def stored_corrections(places: Places) -> Iterator[Stored]:
 
 def _recipe(chain: CorrectionOptions, record: Mapping[str, Any]) -> Recipe:
     entries = record["entries"]
-    loaded = replace(
-        chain,
-        corrector=load_corrector(entries["corrector"]),
-        solver=load_solver_entry(entries["solver"]),
-        matcher=load_matcher(entries["matcher"]),
-    )
+    corrector, solver, matcher = chain.corrector, chain.solver, chain.matcher
+    if entries["corrector"] != reference_of(CORRECTORS, corrector):
+        corrector = _named(load_corrector, entries["corrector"])
+    if entries["solver"] != reference_of(SOLVERS, solver):
+        solver = _named(load_solver_entry, entries["solver"])
+    if entries["matcher"] != reference_of(STEREO_MATCHERS, matcher):
+        matcher = _named(load_matcher, entries["matcher"])
+    loaded = replace(chain, corrector=corrector, solver=solver, matcher=matcher)
     return Recipe(chain=loaded, true_motion=record["solver"] == TRUE, true_depth=record["matcher"] == TRUE)
+
+
+def _named(load: Callable[[str], Component], source: str) -> Component:
+    """An entry that a record names. Cards run code, and a record may be anybody's: no path in one is followed."""
+    if not isinstance(source, str) or source.endswith(".toml") or "/" in source or os.sep in source:
+        raise RsbenchError(f"{source!r}: a card that this command does not name")
+    return load(source)
 
 
 def _again(load: Callable[[Any], Component], source: Any) -> Component | None:

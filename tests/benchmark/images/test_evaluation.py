@@ -118,6 +118,27 @@ def test_a_changed_card_inside_a_scaled_solver_is_seen(smoke_dataset: Path, copy
     assert remade(before, copy) == {"castle/motion/outer", "room-twist/motion/outer"}
 
 
+def test_a_record_makes_nobody_load_the_card_that_it_names(
+    smoke_dataset: Path, copy: Path, tmp_path: Path
+) -> None:
+    planted = card(tmp_path / "planted.toml", "planted_solver:Planted")
+    (tmp_path / "planted_solver.py").write_text(f"open({str(tmp_path / 'was-run')!r}, 'w')\n")
+    folder = copy / "predictions" / "castle"
+    for kind in ("motion", "depth", "corrected"):
+        path = sorted((folder / kind).glob("*.json"))[0]
+        record = json.loads(path.read_text()) | {"identity": "", "solver": "planted"}
+        if kind == "depth":
+            record = {key: value for key, value in record.items() if key != "solver"} | {"matcher": "planted"}
+        if kind == "corrected":
+            record["entries"] = dict.fromkeys(record["entries"], str(planted))
+        else:
+            record["entry"] = str(planted)
+        (folder / kind / "planted.json").write_text(json.dumps(record))
+    stale = evaluate(smoke_dataset, copy)
+    assert {"castle/motion/planted", "castle/depth/planted"} < set(stale) and len(stale) == 3
+    assert not (tmp_path / "was-run").exists()
+
+
 def test_only_and_force_make_again_what_they_name(smoke_dataset: Path, copy: Path) -> None:
     before, was = times(copy), contents(copy)
     evaluate(smoke_dataset, copy, only=("gs-8pt",), force=True)
