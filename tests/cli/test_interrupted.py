@@ -116,9 +116,10 @@ def test_stopped_terminated_and_killed_it_goes_on_to_the_same_bytes(tmp_path: Pa
     assert contents(out) == contents(undisturbed)
 
 
-def test_rendering_by_several_processes_stops_at_once(tmp_path: Path) -> None:
+def test_rendering_by_several_processes_stops_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     card = write_small_card(tmp_path, [write_box_scene(tmp_path, name) for name in "abcd"])
-    # Large enough for a minute.
+    # Large enough for a minute, and larger than frames may be without being asked for.
+    monkeypatch.setenv("RSBENCH_LIMITS", "8")
     card.write_text(card.read_text().replace("width = 96", "width = 3000").replace("height = 64", "height = 3000"))
     run = Run("generate", card, tmp_path / "out")
     run.wait_for(tmp_path / "out" / HIDDEN / WORK, 2, "*")
