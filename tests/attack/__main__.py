@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 CASES = ("generate", "evaluate", "simulate", "correct", "reproduce")
 ATTACKS = ("kills", "files", "fuzz", "environment")
+HEADING = "| attack | counts | faults | made by |"
 SHOWN = 40
 """Faults of an attack that are printed."""
 BEGIN, END = "<!-- figures of make attack -->", "<!-- end of the figures -->"
@@ -62,11 +63,11 @@ def main() -> int:
         **{**vars(extent), **{k: getattr(chosen, k) for k in ("kills", "files", "inputs") if getattr(chosen, k)}}
     )
     chosen.keep.mkdir(parents=True, exist_ok=True)
-    rows, faults = [], 0
+    rows, faults = dict[str, str](), 0
     with tempfile.TemporaryDirectory(prefix="attack-") as root, stage(Path(root)) as arena:
         for name, tally, seconds in _attacks(arena, extent, chosen.attack or ATTACKS, chosen.seed, chosen.keep):
             counts = ", ".join(f"{count} {what}" for what, count in tally.counts.items())
-            rows.append(f"| {name} | {counts} | {len(tally.faults)} |")
+            rows[name] = f"{counts} | {len(tally.faults)}"
             say(f"{name}: {counts}; {len(tally.faults)} faults; {seconds:.0f} s")
             for fault in tally.faults[:SHOWN]:
                 say(f"  fault: {fault}")
@@ -88,7 +89,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--inputs", type=int, help="of all loaders together")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()) / "attack-inputs")
-    parser.add_argument("--write", type=Path, help="document whose table of figures is replaced")
+    parser.add_argument("--write", type=Path, help="document whose rows of figures are replaced")
     return parser.parse_args()
 
 
@@ -139,19 +140,18 @@ def _timed(name: str, attack: Callable[[], Tally]) -> tuple[str, Tally, float]:
     return name, attack(), time.monotonic() - start
 
 
-def _write(document: Path, rows: list[str], seed: int) -> None:
-    """Replace the table between the marks."""
+def _write(document: Path, rows: dict[str, str], seed: int) -> None:
+    """Replace rows of the table between the marks; those of other runs stay."""
     head, _, rest = document.read_text("utf-8").partition(BEGIN)
-    _, _, tail = rest.partition(END)
+    table, _, tail = rest.partition(END)
+    old = (line for line in table.splitlines() if line.startswith("| ") and line != HEADING)
+    kept = {line.split(" | ")[0].removeprefix("| "): line for line in old}
     day = datetime.datetime.now(datetime.UTC).date().isoformat()
-    command = " ".join(["python -m attack", *sys.argv[1:]])
-    lines = [
-        BEGIN,
-        f"`{command}`, {day}, seed {seed}, {os.cpu_count()} cores:",
-        "",
-        "| attack | counts | faults |",
-    ]
-    lines += ["|---|---|---|", *rows, END]
+    words = [word for word in sys.argv[1:] if word not in ("--write", str(document))]
+    command = " ".join(["python -m attack", *words, "" if "--seed" in words else f"--seed {seed}"]).strip()
+    made = f"{day}, {os.cpu_count()} cores: `{command}`"
+    kept |= {name: f"| {name} | {row} | {made} |" for name, row in rows.items()}
+    lines = [BEGIN, HEADING, "|---|---|---|---|", *(kept[name] for name in sorted(kept)), END]
     document.write_text(head + "\n".join(lines) + tail, "utf-8")
 
 
