@@ -1,6 +1,6 @@
 # make demo    render, solve, correct and score one sequence; ends with the path of its report
 # make test    format, lint, types, layers and every test
-# make attack  kills, failing files, mutated inputs, hostile surroundings: an hour; its counts go to docs/reliability.md
+# make attack  kills, failing files, mutated inputs, hostile surroundings, faults for verify: hours; see docs/reliability.md
 # make docs    the documentation site, in build/docs; warnings are errors
 # make lock    renew constraints.txt from pyproject.toml (needs uv)
 # make clean   remove .venv and caches

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import datetime
 import os
+import re
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -22,10 +24,14 @@ if TYPE_CHECKING:
     from attack.cases import Reference, Tally
 
 CASES = ("generate", "evaluate", "simulate", "correct", "reproduce")
-ATTACKS = ("kills", "files", "fuzz", "environment")
+HERE = ("kills", "files", "fuzz", "environment")
+ATTACKS = (*HERE, "verify")
+"""The last one is ``attack.verifying``, a program of its own."""
 HEADING = "| attack | counts | faults | made by |"
 SHOWN = 40
 """Faults of an attack that are printed."""
+READ = ("evaluate", "simulate", "correct")
+"""Commands whose results loaders read."""
 BEGIN, END = "<!-- figures of make attack -->", "<!-- end of the figures -->"
 
 
@@ -60,12 +66,16 @@ def main() -> int:
     if chosen.case:
         extent = Extent(**{**vars(extent), "cases": tuple(chosen.case)})
     extent = Extent(
-        **{**vars(extent), **{k: getattr(chosen, k) for k in ("kills", "files", "inputs") if getattr(chosen, k)}}
+        **{
+            **vars(extent),
+            **{k: getattr(chosen, k) for k in ("kills", "files", "inputs", "surroundings") if getattr(chosen, k)},
+        }
     )
     chosen.keep.mkdir(parents=True, exist_ok=True)
     rows, faults = dict[str, str](), 0
-    with tempfile.TemporaryDirectory(prefix="attack-") as root, stage(Path(root)) as arena:
-        for name, tally, seconds in _attacks(arena, extent, chosen.attack or ATTACKS, chosen.seed, chosen.keep):
+    with tempfile.TemporaryDirectory(prefix="attack-") as root, stage(Path(root), extent.cases) as arena:
+        wanted = chosen.attack or (HERE if chosen.sample else ATTACKS)
+        for name, tally, seconds in _attacks(arena, extent, wanted, chosen.seed, chosen.keep):
             counts = ", ".join(f"{count} {what}" for what, count in tally.counts.items())
             rows[name] = f"{counts} | {len(tally.faults)}"
             say(f"{name}: {counts}; {len(tally.faults)} faults; {seconds:.0f} s")
@@ -87,6 +97,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--kills", type=int, help="of each command")
     parser.add_argument("--files", type=int, help="operations of each command that fail; default: every one")
     parser.add_argument("--inputs", type=int, help="of all loaders together")
+    parser.add_argument("--surroundings", type=int, help="pairs of one and a command, drawn; default: every one")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()) / "attack-inputs")
     parser.add_argument("--write", type=Path, help="document whose rows of figures are replaced")
@@ -106,7 +117,8 @@ def _attacks(
     results: dict[str, Path] = {}
     known = cases(arena)
     for number, name in enumerate(CASES):
-        if name not in extent.cases:
+        asked = {"kills", "files", "environment"} & set(wanted) or ("fuzz" in wanted and name in READ)
+        if name not in extent.cases or not asked:
             continue
         references[name] = undisturbed(arena, known[name])
         results[name] = arena.root.parent / "results" / name
@@ -120,17 +132,39 @@ def _attacks(
         every = loaders(arena.inputs, results, arena.root.parent / "fuzz")
         yield _timed(f"inputs of {len(every)} loaders", partial(fuzz.attack, every, extent.inputs, seed, keep))
     if "environment" in wanted:
-        yield _timed("surroundings", partial(_surroundings, arena, references, extent))
+        yield _timed("surroundings", partial(_surroundings, arena, references, extent, seed))
+    if "verify" in wanted:
+        yield _timed("verify", _verify)
 
 
-def _surroundings(arena: Arena, references: dict[str, Reference], extent: Extent) -> Tally:
+def _verify() -> Tally:
+    """Planted faults and sound sequences, counted by what ``attack.verifying`` prints."""
+    from attack.cases import Tally
+
+    tests = str(Path(__file__).parents[1])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(tests).parent), tests])}
+    command = [sys.executable, "-m", "attack.verifying"]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True)
+    tally = Tally()
+    for name, count in re.findall(r"^(planted faults|sound sequences): (\d+)", result.stdout, re.MULTILINE):
+        tally.count(name, int(count))
+    for line in result.stdout.splitlines():
+        tally.check(not line.startswith("  "), line)
+    tally.check(len(tally.counts) == 2, f"attack.verifying: exit code {result.returncode}: {result.stderr[-300:]}")
+    return tally
+
+
+def _surroundings(arena: Arena, references: dict[str, Reference], extent: Extent, seed: int) -> Tally:
+    import numpy as np
+
     from attack import environment
 
-    pairs = environment.every_pair()
+    pairs = [pair for pair in environment.every_pair() if pair[1] in (*extent.cases, "solve", "verify")]
     if extent.surroundings is not None:
-        pairs = [(one, command) for one, command in pairs if one.folder and command == "correct"][
-            : extent.surroundings
-        ]
+        # One of strange names first, which has ended the process by a signal.
+        order = np.random.default_rng([seed, len(pairs)]).permutation(len(pairs)).tolist()
+        order.sort(key=lambda k: not (pairs[k][0].folder and pairs[k][1] == "correct"))
+        pairs = [pairs[k] for k in order[: extent.surroundings]]
     expected = {name: reference.contents for name, reference in references.items()}
     return environment.attack(arena, expected, pairs)
 

@@ -38,11 +38,12 @@ def attack(arena: Arena, case: Case, reference: Reference, rng: np.random.Genera
     tally, kills = Tally(), 0
     while kills < count:
         place(arena)
-        before, deaths = arena.outside(arena.work / "out"), []
+        before, deaths, whole = arena.outside(arena.work / "out"), [], False
         for _ in range(min(CHAIN, count - kills)):
             death = draw(arena, case, reference, rng)
             ending = arena.run(("--quiet", *case.arguments), before=death.before, stop=death.stop)
             deaths.append(death.name)
+            whole = whole or death.stop is not None
             where = f"{case.name}, after {'; '.join(deaths)}"
             if ending.code == 0:
                 tally.count("came too late")
@@ -53,7 +54,9 @@ def attack(arena: Arena, case: Case, reference: Reference, rng: np.random.Genera
             now = arena.outside(arena.work / "out")
             lost = {name for name in before if now.get(name) != before[name]}
             tally.check(not lost, f"{where}: changed outside --out: {sorted(lost)[:5]}")
-        _check_resumed(arena, case, reference, tally, before, f"{case.name}, after {'; '.join(deaths)}")
+        alone = None if whole else partial(here, arena, case, Trap())  # what it would render is known
+        ending = arena.run(("--quiet", *case.arguments), before=alone)
+        _check_resumed(arena, ending, reference, tally, before, f"{case.name}, after {'; '.join(deaths)}")
     tally.count("kills", kills)
     return tally
 
@@ -71,7 +74,12 @@ def draw(arena: Arena, case: Case, reference: Reference, rng: np.random.Generato
         text = f"operation {place}, {trap.how}"
         return Death(name=text, before=partial(here, arena, case, trap))
     size = int(rng.integers(1, 10000))
-    return Death(name=f"within a file at byte {size}", before=partial(limit_files, size, True))
+    return Death(name=f"within a file at byte {size}", before=partial(_limit, arena, case, size))
+
+
+def _limit(arena: Arena, case: Case, size: int) -> None:
+    here(arena, case, Trap())
+    limit_files(size, True)
 
 
 def _check_death(tally: Tally, death: Death, ending: Ending, where: str) -> None:
@@ -87,9 +95,8 @@ def _check_death(tally: Tally, death: Death, ending: Ending, where: str) -> None
 
 
 def _check_resumed(
-    arena: Arena, case: Case, reference: Reference, tally: Tally, before: dict[str, str], where: str
+    arena: Arena, ending: Ending, reference: Reference, tally: Tally, before: dict[str, str], where: str
 ) -> None:
-    ending = arena.run(("--quiet", *case.arguments))
     tally.count("resumed")
     problem = problem_of(ending)
     tally.check(

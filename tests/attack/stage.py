@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,8 +17,11 @@ _ONE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM
 
 
 @contextmanager
-def stage(root: Path) -> Iterator[Arena]:
-    """An arena below ``root`` with a rendered dataset, in a process that has not imported rsbench yet."""
+def stage(root: Path, cases: Collection[str]) -> Iterator[Arena]:
+    """An arena below ``root`` with a rendered dataset, in a process that has not imported rsbench yet.
+
+    ``cases`` names the commands that will be run.
+    """
     if "rsbench" in sys.modules:
         raise RuntimeError("rsbench is imported already, and not from the tiny checkout")
     os.environ |= dict.fromkeys(_ONE, "1")  # a process with threads cannot be forked safely
@@ -36,11 +39,11 @@ def stage(root: Path) -> Iterator[Arena]:
     ending = arena.run(("--quiet", "generate", arena.inputs / "tiny.toml", "--out", arena.inputs / "data"))
     if ending.code:
         raise RuntimeError(f"no data: {ending.err[-2000:]}")
-    _warm_up(arena)
+    _warm_up(arena, [name for name in ("evaluate", "correct") if name in cases])
     yield arena
 
 
-def _warm_up(arena: Arena) -> None:
+def _warm_up(arena: Arena, names: list[str]) -> None:
     """Run what children will run, so that they need not import and load it."""
     import cv2
 
@@ -49,7 +52,7 @@ def _warm_up(arena: Arena) -> None:
 
     cv2.setNumThreads(1)
     folder, log = os.getcwd(), arena.root / "home" / ".warm-up"
-    for name in ("evaluate", "correct"):
+    for name in names:
         arena.clear()
         os.chdir(arena.work)
         with _silence(log):
