@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.files import read_json, read_png, write_depth, write_json, write_png
-from rsbench.dataset.workplace import HIDDEN, WORK, named, remove, strangers, workplace
+from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, remove, strangers, workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import FoundMotion, referee
@@ -56,7 +56,7 @@ def fresh_folder(out: Path) -> Iterator[Path]:
         _refuse_others(out, place)
         fresh.mkdir()
         yield fresh
-        files = sorted(path.relative_to(fresh).as_posix() for path in fresh.rglob("*") if path.is_file())
+        files = files_below(fresh)
         (fresh / _LIST).parent.mkdir()
         write_json(fresh / _LIST, {"files": files})
         _refuse_others(out, place)  # that came meanwhile

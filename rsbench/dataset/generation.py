@@ -28,7 +28,7 @@ from rsbench.dataset.files import read_json, sha256, write_depth, write_json, wr
 from rsbench.dataset.hashes import HASHES, FileHashes, HashedFile
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence import FORMAT, FRAMES, files_of, is_of_sequence, sequence_manifest
-from rsbench.dataset.workplace import HIDDEN, WORK, named, raise_it, remove, strangers, workplace
+from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, remove, strangers, workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_jobs import finished_jobs
 from rsbench.pipeline.isolation import EntryFailure
@@ -289,9 +289,7 @@ def _render_sequence(
         (partial / folder).mkdir(parents=True, exist_ok=True)
     for side, frame in product(SIDES, FRAMES):
         yield from _render_camera(card, sequence, options, mitsuba_scene, side, frame, partial)
-    walked = os.walk(partial, onerror=raise_it)
-    paths = sorted(Path(place) / name for place, _, names in walked for name in names)
-    files = {path.relative_to(partial).as_posix(): sha256(path) for path in paths}
+    files = {name: sha256(partial / name) for name in files_below(partial)}
     made_by = {
         "rsbench": __version__,
         "mitsuba": version("mitsuba"),

@@ -77,7 +77,7 @@ def strangers(folder: Path, ours: Callable[[str], bool]) -> list[str]:
     A link is a stranger whatever its name is; an empty folder is none.
     """
     found: list[str] = []
-    for place, folders, files in os.walk(folder, onerror=raise_it):
+    for place, folders, files in os.walk(folder, onerror=_raise):
         here = Path(place).relative_to(folder)
         links = [name for name in folders if (Path(place) / name).is_symlink()]
         for name in [*files, *links]:
@@ -87,8 +87,18 @@ def strangers(folder: Path, ours: Callable[[str], bool]) -> list[str]:
     return sorted(found)
 
 
-def raise_it(error: OSError) -> NoReturn:
-    """For ``os.walk``, which else passes over folders that cannot be read as if they were empty."""
+def files_below(folder: Path) -> list[str]:
+    """Paths of all files below a folder, relative to it, with slashes, sorted.
+
+    Raises:
+        OSError: a folder cannot be listed; ``Path.rglob`` passes over it in silence.
+    """
+    walked = os.walk(folder, onerror=_raise)
+    paths = [Path(place, name).relative_to(folder).as_posix() for place, _, names in walked for name in names]
+    return sorted(paths)
+
+
+def _raise(error: OSError) -> NoReturn:
     raise error
 
 

@@ -61,7 +61,7 @@ def say(text: str) -> None:
 
 
 def main() -> int:
-    chosen = _options()
+    chosen, given = _options(), sys.argv[1:]  # the commands have arguments of their own there
     extent = SAMPLE if chosen.sample else LONG
     if chosen.case:
         extent = Extent(**{**vars(extent), "cases": tuple(chosen.case)})
@@ -85,7 +85,7 @@ def main() -> int:
                 say(f"  and {len(tally.faults) - SHOWN} more")
             faults += len(tally.faults)
     if chosen.write is not None:
-        _write(chosen.write, rows, chosen.seed)
+        _write(chosen.write, rows, given, chosen.seed)
     return int(faults > 0)
 
 
@@ -174,15 +174,16 @@ def _timed(name: str, attack: Callable[[], Tally]) -> tuple[str, Tally, float]:
     return name, attack(), time.monotonic() - start
 
 
-def _write(document: Path, rows: dict[str, str], seed: int) -> None:
+def _write(document: Path, rows: dict[str, str], given: list[str], seed: int) -> None:
     """Replace rows of the table between the marks; those of other runs stay."""
     head, _, rest = document.read_text("utf-8").partition(BEGIN)
     table, _, tail = rest.partition(END)
     old = (line for line in table.splitlines() if line.startswith("| ") and line != HEADING)
     kept = {line.split(" | ")[0].removeprefix("| "): line for line in old}
     day = datetime.datetime.now(datetime.UTC).date().isoformat()
-    words = [word for word in sys.argv[1:] if word not in ("--write", str(document))]
-    command = " ".join(["python -m attack", *words, "" if "--seed" in words else f"--seed {seed}"]).strip()
+    words = [word for word in given if word not in ("--write", str(document))]
+    seeded = [] if "--seed" in words else ["--seed", str(seed)]
+    command = " ".join(["python -m attack", *words, *seeded])
     made = f"{day}, {os.cpu_count()} cores: `{command}`"
     kept |= {name: f"| {name} | {row} | {made} |" for name, row in rows.items()}
     lines = [BEGIN, HEADING, "|---|---|---|---|", *(kept[name] for name in sorted(kept)), END]

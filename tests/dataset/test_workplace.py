@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from rsbench.dataset.workplace import HIDDEN, WORK, remove, strangers, workplace
+from rsbench.dataset.workplace import HIDDEN, WORK, files_below, remove, strangers, workplace
 from rsbench.errors import RsbenchError
 
 HOLDS = """
@@ -168,3 +168,5 @@ def test_a_folder_that_cannot_be_listed_is_not_taken_for_an_empty_one(
     monkeypatch.setattr(os, "scandir", broken)
     with pytest.raises(OSError, match="Input/output"):
         strangers(tmp_path, lambda path: False)
+    with pytest.raises(OSError, match="Input/output"):
+        files_below(tmp_path)
