@@ -315,23 +315,34 @@ def generate(card: str, out: AnyPath, *, sequences: Series[str] | None = None, w
     return read_dataset(out)
 
 
-def verify(folder: AnyPath, *, stride: int = 1) -> list[SequenceReport]:
-    """Check a dataset: files against checksums, poses against the motion, all depth maps against each other.
+def verify(
+    folder: AnyPath,
+    *,
+    stride: int = 1,
+    rerender: Literal["no", "auto", "all"] = "auto",
+    scenes: Series[AnyPath] = (),
+) -> list[SequenceReport]:
+    """Check a dataset: files, lists and card against each other, poses against the motion, depth maps and images
+    against what all others show, and rows of both against what is rendered again.
 
     Args:
         folder: of the dataset.
         stride: compare every n-th pixel in both directions.
+        rerender: rows to render again where the scene can be built here: none, some (seconds) or all.
+        scenes: cards of scenes that are not rsbench's own; what a dataset says of its scene is never opened.
 
     Returns:
-        One report per sequence; a sequence is in order when its ``faults`` are empty.
+        One report per sequence, and before them one named "dataset.json" where that has faults of its own; all is
+        in order when no report has ``faults``. ``notes`` say what was rendered again, or why not.
 
     Raises:
-        RsbenchError: not a dataset.
+        RsbenchError: not a dataset, or no scene card of that name.
     """
     from rsbench.dataset.verification import verify_dataset
 
     arguments.check_whole("stride", stride, 1)
-    return verify_dataset(Path(folder), stride)
+    arguments.check_one_of("rerender", rerender, ("no", "auto", "all"))
+    return verify_dataset(Path(folder), stride, rerender=rerender, scenes=[Path(path) for path in scenes])
 
 
 def evaluate(

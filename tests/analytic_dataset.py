@@ -19,8 +19,7 @@ from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.files import sha256, write_depth, write_json, write_png, write_poses
-from rsbench.dataset.sequence import FRAMES, RELATIVE_FILES, sequence_manifest
-from rsbench.dataset.verification.structure import UNITS
+from rsbench.dataset.sequence import FRAMES, RELATIVE_FILES, UNITS, sequence_manifest
 from rsbench.renderers.options import RendererOptions
 
 PLANES = ((np.array([0.05, 1.0, -0.15]), 1.2), (np.array([0.1, 0.05, 1.0]), 9.0))

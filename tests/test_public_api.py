@@ -205,7 +205,7 @@ def test_a_dataset_is_read_matched_and_measured(smoke_dataset: Path) -> None:
     both = (depth > 0) & (truth > 0)
     # At 128 x 96 a tenth of a pixel of disparity is some percent of depth.
     assert both.mean() > 0.3 and np.median(np.abs(depth[both] / truth[both] - 1)) < 0.05
-    assert not any(report.faults for report in rsbench.verify(smoke_dataset, stride=4))
+    assert not any(report.faults for report in rsbench.verify(smoke_dataset, stride=4, rerender="no"))
 
 
 def test_frames_without_a_motion_raise_what_a_notebook_can_catch() -> None:
@@ -249,6 +249,7 @@ FEW_ROWS = rsbench.RollingShutter(height=9, readout_ratio=0.8)
         (lambda: rsbench.correct([FLAT] * 4, RIG, 1.5), "readout_ratio = 1.5: must be a number from 0 to 1"),
         (lambda: rsbench.correct([FLAT] * 4, RIG, target_row=900), "target_row = 900: must be .* to 899"),
         (lambda: rsbench.generate("smoke", "unused", workers=0), "workers = 0: must be a whole"),
+        (lambda: rsbench.verify("unused", rerender="some"), "rerender = 'some': must be one of"),  # type: ignore[arg-type]
         (lambda: rsbench.verify("unused", stride=0), "stride = 0: must be a whole number of at least 1"),
     ],
 )  # fmt: skip

@@ -1,32 +1,56 @@
-"""``rsbench verify``: integrity and geometric consistency of a dataset."""
+"""``rsbench verify``: whether a dataset is what it says."""
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from rsbench.cli.kinds import complete
+
 EPILOG = """[bold]Examples[/bold]
 
   rsbench verify data/paper
 
-  rsbench verify data/paper --stride 4      [dim](every 4th pixel in both directions)[/dim]"""
+  rsbench verify data/paper --stride 4 --rerender no     [dim](in a hurry)[/dim]
+
+  rsbench verify data/mine --scene my/scene.toml --rerender all"""
+
+
+class Rerender(StrEnum):
+    """Rows that are rendered again."""
+
+    NO = "no"
+    AUTO = "auto"
+    ALL = "all"
 
 
 def verify(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with a dataset.json.")],
     stride: Annotated[int, typer.Option(min=1, help="Compare every n-th pixel in both directions.")] = 1,
+    rerender: Annotated[
+        Rerender, typer.Option(help="Rows to render again where the scene can be built here: auto takes seconds.")
+    ] = Rerender.AUTO,
+    scene: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Card of a scene that is not rsbench's own; repeatable.", autocompletion=complete("scenes")
+        ),
+    ] = None,
 ) -> None:
-    """Check files against checksums, poses against the motion, and all depth maps against each other."""
+    """Check files and lists, poses, all depth maps and images against each other, and rows rendered again."""
     import pandas as pd
 
-    from rsbench.cli.console import print_table, progress_bar
+    from rsbench.cli.console import print_table, progress_bar, say
     from rsbench.dataset.files import read_json
     from rsbench.dataset.verification import verification_steps, verify_dataset
+    from rsbench.dataset.verification.structure import DATASET
 
     with progress_bar("verifying", verification_steps(read_json(folder / "dataset.json"))) as advance:
-        reports = verify_dataset(folder, stride, advance)
+        cards = [Path(each) for each in scene or []]
+        reports = verify_dataset(folder, stride, advance, rerender=rerender.value, scenes=cards)
     rows = [
         {
             "sequence": report.name,
@@ -41,10 +65,13 @@ def verify(
     ]
     if rows:
         print_table("Depth agreement between frames (relative tolerance 1e-4)", pd.DataFrame(rows))
+    for report in reports:
+        for note in report.notes:
+            say(f"{report.name}: {note}")
     faults = [f"{report.name}: {fault}" for report in reports for fault in report.faults]
     for fault in faults:
         typer.echo(f"fault: {fault}", err=True)
-    typer.echo(f"{folder}: {len(reports)} sequences, {len(faults)} faults")
+    typer.echo(f"{folder}: {sum(report.name != DATASET for report in reports)} sequences, {len(faults)} faults")
     if faults:
         raise typer.Exit(1)
 

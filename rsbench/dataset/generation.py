@@ -27,7 +27,7 @@ from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_png, write_poses
 from rsbench.dataset.hashes import HASHES, FileHashes, HashedFile
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
-from rsbench.dataset.sequence import FORMAT, FRAMES, files_of, is_of_sequence, sequence_manifest
+from rsbench.dataset.sequence import FORMAT, FRAMES, UNITS, files_of, is_of_sequence, sequence_manifest
 from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, remove, strangers, workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_jobs import finished_jobs
@@ -324,7 +324,7 @@ def _render_camera(
     from rsbench.renderers.sensed import sensed_rows
 
     rig, shutter = card.rig_of(sequence), card.shutter()
-    options = replace(options, seed=_image_seed(card.seed_of(sequence), sequence.name, side, frame))
+    options = replace(options, seed=image_seed(card.seed_of(sequence), sequence.name, side, frame))
     poses = row_poses(rig, shutter, card.motion_of(sequence), side, frame)
     tau = shutter.row_time(np.arange(shutter.height), frame)
     write_poses(folder / "poses" / f"{side}_{frame}.csv", tau, poses)
@@ -351,7 +351,7 @@ def _stack_writer(folder: Path, options: RendererOptions) -> Callable[[int, NDAr
     return lambda row, image: write_png(folder / f"{row:04d}.png", to_srgb8(image, options.exposure))
 
 
-def _image_seed(seed: int, sequence: str, side: Side, frame: int) -> int:
+def image_seed(seed: int, sequence: str, side: Side, frame: int) -> int:
     """Independent noise per image; rolling- and global-shutter twins share it, so that row 0 is the same."""
     text = f"{seed}/{sequence}/{side}/{frame}"
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "little")
@@ -369,7 +369,7 @@ def _write_manifest(card: DatasetCard, out: Path, made: dict[str, Files]) -> Non
         "description": card.description,
         "rsbench": __version__,
         "mitsuba": version("mitsuba"),
-        "units": {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = no surface"},
+        "units": UNITS,
         "card": asdict(card),
         "sequences": [sequence.name for sequence in card.sequence],
         "files": files,

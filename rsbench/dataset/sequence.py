@@ -27,6 +27,8 @@ from rsbench.reading import check_name, check_size, inside
 from rsbench.renderers.electrons import Sensor
 
 FORMAT = CONVENTIONS = 1
+UNITS = {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = no surface"}
+"""What dataset.json tells people who find the folder."""
 FRAMES = (0, 1)
 Shutter = Literal["rs", "gs"]
 SHUTTERS: tuple[Shutter, Shutter] = ("rs", "gs")

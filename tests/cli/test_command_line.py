@@ -162,13 +162,13 @@ def test_damaged_depth_is_refused_by_evaluate_and_found_by_verify(smoke_dataset:
     assert_refused(
         run_here("evaluate", copy, "--out", tmp_path / "e", "--solver", "gs-8pt"), "left_0.exr", "damaged"
     )
-    result = run_here("verify", copy)
+    result = run_here("verify", copy, "--rerender", "no")
     assert result.returncode == 1
     assert "left_0.exr" in result.stderr
 
 
 def test_verify_passes_on_sound_data(smoke_dataset: Path) -> None:
-    result = run_here("verify", smoke_dataset)
+    result = run_here("verify", smoke_dataset, "--rerender", "no")
     assert result.returncode == 0, result.stderr
     assert "0 faults" in result.stdout
 

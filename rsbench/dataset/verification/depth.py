@@ -87,7 +87,9 @@ def compare(source: MapVerdict, target: MapVerdict, landing: Landing) -> DepthAg
         agrees = size <= DEPTH_TOLERANCE
         bit = source.bit(target.map.shot)
         source.confirmed |= np.where(agrees, bit, np.uint8(0))
-        source.contradicted |= np.where((relative < NEAR_MISS) & ~agrees, bit, np.uint8(0))
+        # What is not flat may slip between the pixels of a partner that sees nothing there.
+        through = (relative < NEAR_MISS) & ~agrees & (flat | np.isfinite(relative))
+        source.contradicted |= np.where(through, bit, np.uint8(0))
         source.hidden |= np.where(relative >= NEAR_MISS, bit, np.uint8(0))
         near = size[flat & (relative < NEAR_MISS)]
     source.difference = np.fmin(source.difference, size)
@@ -131,7 +133,7 @@ def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
     height, surface = len(verdict.map.depth), verdict.surface
     holes = np.bitwise_count(verdict.holes & trusted) >= 2
     if np.sum(holes) > _FEW:
-        share = float(np.mean(holes[verdict.holes > 0]))
+        share = 1.0 + float(np.mean(holes[verdict.holes > 0]))  # before all others: holes accuse who sees through
         return MapFault(
             f"{np.sum(holes)} pixels have no depth where others see a surface", np.any(holes, axis=1), share
         )

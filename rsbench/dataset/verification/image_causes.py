@@ -16,18 +16,19 @@ from rsbench.dataset.verification.images import (
     band_of_row,
     culprits,
     difference,
+    noise_of,
     show,
 )
-from rsbench.dataset.verification.shots import DepthMap, Shot, land
+from rsbench.dataset.verification.shots import BoolArray, DepthMap, Shot, land
 
 Elsewhere = Callable[[Shot], Iterable[tuple[str, NDArray[np.uint8]]]]
 """Names and images of other sequences that may have been exchanged with a shot's."""
 _TRIED_PIXELS = 20_000
-_PLAIN, _AS_LIKE = 0.7, 2.0
+_PLAIN, _AS_LIKE = 0.7, 1.4
 """A candidate must differ by at most this share of what the image as it is does, and by this factor of what sound
 pairs do."""
-_NOISY = 15.0
-"""Codes of noise that no rendering has."""
+_NOISY, _NOISIER = 15.0, 3.0
+"""Codes of noise that few renderings have, and how many times as noisy as the others."""
 
 
 def likeness_faults(
@@ -49,7 +50,9 @@ def likeness_faults(
             f"shows other colours than {', '.join(others)} at the same surface, on up to {beyond:.3g} % of pixels"
         )
         partners = sorted((each for each in shot.partners() if each in maps), key=lambda each: each in suspects)
-        cause = _cause(sequence, maps, pictures, shot, partners[0], likenesses, elsewhere) if partners else ""
+        cause = "looks like noise" if _is_noise(pictures, shot, unlike[bands]) else ""
+        if partners and not cause:
+            cause = _cause(sequence, maps, pictures, shot, partners[0], likenesses, elsewhere)
         yield shot, finding(shot.image, what, rows_of(unlike[bands]), cause)
 
 
@@ -84,7 +87,12 @@ def _cause(
     best = int(np.argmin(costs))
     if best and costs[best] < min(_PLAIN * costs[0], _AS_LIKE * _usual(likenesses)):
         return f"looks {candidates[best][0]}"
-    return "looks like noise" if pictures[shot].noise > _NOISY else ""
+    return ""
+
+
+def _is_noise(pictures: Mapping[Shot, Picture], shot: Shot, rows: BoolArray) -> bool:
+    usual = float(np.median([picture.noise for other, picture in pictures.items() if other != shot] or [0.0]))
+    return noise_of(pictures[shot].colours[rows]) > max(_NOISY, _NOISIER * usual)
 
 
 def _usual(likenesses: list[Likeness]) -> float:

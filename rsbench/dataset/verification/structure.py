@@ -12,7 +12,7 @@ from rsbench import __version__
 from rsbench.cards import list_cards, load_card, parse_card
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.files import read_json, sha256
-from rsbench.dataset.sequence import FORMAT, RELATIVE_FILES, Sequence, sequence_manifest
+from rsbench.dataset.sequence import FORMAT, RELATIVE_FILES, UNITS, Sequence, sequence_manifest
 from rsbench.dataset.verification.findings import finding
 from rsbench.errors import RsbenchError
 from rsbench.reading import NAME, inside
@@ -20,7 +20,6 @@ from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import read_scene_card
 
 DATASET = "dataset.json"
-UNITS = {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = no surface"}
 _TEXTS = ("name", "description", "rsbench", "mitsuba")
 _MOST_NAMES = 5
 """Files that one finding names."""

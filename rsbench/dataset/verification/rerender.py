@@ -1,0 +1,216 @@
+"""Rows rendered again, where the scene can be built here: the only check that knows what is true."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench import __version__
+from rsbench.cards import list_cards, parse_card
+from rsbench.core.projection import row_poses
+from rsbench.dataset.generation import image_seed
+from rsbench.dataset.scene_hashes import scene_hash
+from rsbench.dataset.verification.content import Content
+from rsbench.dataset.verification.findings import finding, rows_of
+from rsbench.dataset.verification.images import CHANGES, Picture
+from rsbench.dataset.verification.shots import SHOTS, DepthMap, Shot
+from rsbench.errors import RsbenchError
+from rsbench.renderers.options import RendererOptions
+from rsbench.scenes.load import load_scene, read_scene_card
+
+if TYPE_CHECKING:
+    from rsbench.renderers.render import Frame
+    from rsbench.renderers.scene import MitsubaScene
+
+Rerender = Literal["no", "auto", "all"]
+"""No row, some rows of every image where that takes seconds, or all rows."""
+_ROWS = 16
+"""Of an image, with ``auto``."""
+_MOST_RAYS = 2e8
+"""Of a sequence, with ``auto``: fewer rows where the samples are many."""
+_SAME_DEPTH = 2e-6
+"""Relative: rays in float32 on another processor; on the same one they have the same bits."""
+_OTHER_CODES, _FAR_CODES = 0.05, 0.005
+"""Shares of pixels that may differ at all, and by more than ``_NEAR``: rounding on another processor moves a
+sample across an edge now and then."""
+_NEAR = 2.0
+_OTHER_DEPTH = 0.005
+
+
+@dataclass(eq=False)
+class Again:
+    """Renders rows of sequences again; keeps the scene of the last one."""
+
+    mode: Rerender
+    scene_cards: Sequence[Path] = ()
+    """Of scenes that are not rsbench's own. What a dataset says of its scene is a name, and never opened."""
+    _built: tuple[tuple[object, ...], str, MitsubaScene] | None = field(default=None, init=False)
+
+    def check(self, content: Content, told: set[str]) -> tuple[list[str], str]:
+        """Faults of files that are not ``told`` yet, and what was done or why not."""
+        start = time.perf_counter()
+        manifest = content.sequence.manifest
+        try:
+            options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
+            scene, digest = self._scene(_table(manifest, "scene"))
+        except RsbenchError as error:
+            return [], f"no row rendered again: {error}"
+        rows = self._rows(content, options)
+        if not rows:
+            return [], "no row rendered again: its renderer takes too many samples; --rerender all does it"
+        checks = list(_checks(content, scene, options, rows))
+        wrong = [check for check in checks if check.fault]
+        done = (
+            f"{len(rows)} rows of each image and depth map rendered again in {time.perf_counter() - start:.1f} s"
+        )
+        if _table(manifest, "scene").get("sha256") != digest:
+            done += "; the scene built here has another sha256 than sequence.json says"
+            if wrong and _table(manifest, "made_by").get("rsbench") != __version__:
+                return [], f"{done}, and other images: another version of rsbench built it"
+        if wrong and len(wrong) == len(checks):
+            cause = "look at scene, motion, camera and renderer in sequence.json"
+            what = f"not one file is what its scene looks like when rendered again, {wrong[0].fault}"
+            return [finding("sequence.json", what, cause=cause)], done
+        same = all(check.same_bits for check in checks)
+        done += ": the same bits" if same else "" if wrong else ": the same but for rounding"
+        return [check.fault for check in wrong if check.file not in told], done
+
+    def _scene(self, record: Mapping[str, Any]) -> tuple[MitsubaScene, str]:
+        """The scene of a sequence in the renderer, and its hash."""
+        from rsbench.renderers.scene import MitsubaScene
+
+        name, viewpoint = record.get("name"), record.get("viewpoint")
+        cards = {read_scene_card(path)[0].name: path for path in self.scene_cards}
+        path = cards.get(str(name), list_cards("scenes").get(str(name)))
+        if path is None:
+            raise RsbenchError(f"the scene {name!r} is not one of rsbench's; name its card with --scene")
+        card, _ = read_scene_card(path)
+        if viewpoint not in card.viewpoints:
+            raise RsbenchError(f"the scene {name!r} has no viewpoint {viewpoint!r}")
+        for key, value in asdict(card.viewpoints[viewpoint]).items():
+            if list(value) != record.get(key):
+                raise RsbenchError(f"{key} of the viewpoint {viewpoint!r} is {list(value)}, not {record.get(key)}")
+        wanted = (path, path.stat().st_mtime_ns, viewpoint)
+        if self._built is None or self._built[0] != wanted:
+            self._built = None  # a scene takes hundreds of MB: not two at a time
+            scene = load_scene(path)
+            self._built = wanted, scene_hash(scene), MitsubaScene(scene.seen_from(scene.viewpoints[viewpoint]))
+        return self._built[2], self._built[1]
+
+    def _rows(self, content: Content, options: RendererOptions) -> list[int]:
+        """One row of each of equal bands, drawn by the hash of the images: nobody knows them before they are."""
+        camera = content.sequence.rig.camera
+        if self.mode == "all":
+            return list(range(camera.height))
+        depth = options.max_depth if options.integrator == "path" else 1
+        affordable = int(_MOST_RAYS / (len(SHOTS) * camera.width * options.samples * depth))
+        count = min(_ROWS, camera.height, affordable)
+        digest = hashlib.sha256(repr(content.sequence.manifest.get("files")).encode()).digest()
+        rng = np.random.default_rng(int.from_bytes(digest[:8], "little"))
+        edges = np.linspace(0, camera.height, count + 1).astype(int)
+        return [int(rng.integers(low, high)) for low, high in pairwise(edges)]
+
+
+@dataclass(frozen=True)
+class _Check:
+    """One file against its rows rendered again; ``fault`` is "" when they are alike."""
+
+    file: str
+    fault: str
+    same_bits: bool
+
+
+def _table(manifest: Mapping[str, Any], key: str) -> dict[str, Any]:
+    table = manifest.get(key)
+    if not isinstance(table, dict):
+        raise RsbenchError(f"sequence.json has no table {key!r}")
+    return table
+
+
+def _checks(content: Content, scene: MitsubaScene, options: RendererOptions, rows: list[int]) -> Iterator[_Check]:
+    from rsbench.renderers.image import to_srgb8
+
+    elsewhere = not _made_here(content)
+    for shot in SHOTS:
+        if shot not in content.maps and shot not in content.pictures:
+            continue
+        frame = _render(content, scene, options, shot, rows)
+        if shot in content.maps:
+            yield _depth_check(content.maps[shot], frame.depth, rows)
+        if shot in content.pictures:
+            noisy = options.integrator == "path" and elsewhere
+            rendered = to_srgb8(frame.image, options.exposure)
+            yield _image_check(content.pictures[shot], rendered, rows, noisy)
+
+
+def _made_here(content: Content) -> bool:
+    """Whether the same versions and variant rendered it, so that even random numbers are the same."""
+    from rsbench.renderers.backend import start_backend
+
+    here = {"mitsuba": version("mitsuba"), "drjit": version("drjit"), "variant": start_backend().variant}
+    made_by = _table(content.sequence.manifest, "made_by")
+    return all(made_by.get(key) == value for key, value in here.items())
+
+
+def _render(content: Content, scene: MitsubaScene, options: RendererOptions, shot: Shot, rows: list[int]) -> Frame:
+    """Rows of a shot, with the bits that they have in the whole image."""
+    from rsbench.renderers.render import render
+
+    sequence = content.sequence
+    seed = image_seed(int(sequence.manifest.get("seed", 0)), sequence.name, shot.side, shot.frame)
+    chosen = replace(options, seed=seed, method="single-pass", full_frames=False)
+    R, t = row_poses(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame)
+    if shot.shutter == "gs":
+        R, t = np.broadcast_to(R[0], R.shape), np.broadcast_to(t[0], t.shape)
+    return render(scene, sequence.rig.camera, R, t, chosen, rows=rows)
+
+
+def _depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]) -> _Check:
+    depth, file = stored.depth[rows], stored.shot.depth
+    wrong = np.abs(depth - rendered) > _SAME_DEPTH * np.maximum(depth, rendered)
+    share = float(np.mean(wrong))
+    if share <= _OTHER_DEPTH:
+        return _Check(file, "", np.array_equal(depth, rendered))
+    both = wrong & (depth > 0) & (rendered > 0)
+    ratio = depth[both] / rendered[both] if np.any(both) else np.ones(1)
+    middle = float(np.median(ratio))
+    scaled = np.median(np.abs(ratio / middle - 1)) < 1e-6 and abs(middle - 1) > _SAME_DEPTH
+    cause = f"looks scaled by {middle:.7g}" if scaled else ""
+    what = f"depth differs from what is rendered again on {100 * share:.3g} % of {wrong.size} pixels"
+    if np.any(both):
+        what += f", typically by {np.median(np.abs(ratio - 1)):.1e} of itself"
+    return _Check(file, finding(file, what, _rows(wrong, rows, len(stored.depth)), cause), False)
+
+
+def _image_check(stored: Picture, rendered: NDArray[np.uint8], rows: list[int], noisy: bool) -> _Check:
+    file, truth = stored.shot.image, rendered.astype(np.float32)
+    difference = np.max(np.abs(stored.colours[rows] - truth), axis=-1)
+    far = difference > _NEAR + (4 * stored.noise if noisy else 0.0)
+    other = far if noisy else difference > 0
+    if np.mean(far) <= _FAR_CODES and np.mean(other) <= _OTHER_CODES:
+        return _Check(file, "", not np.any(difference))
+    what = (
+        f"the image differs from what is rendered again on {100 * np.mean(other):.3g} % of {far.size} pixels, "
+        f"by up to {np.max(difference):g} codes"
+    )
+    y, x = (each.ravel() for each in np.meshgrid(rows, np.arange(truth.shape[1]), indexing="ij"))
+    costs = [np.mean(np.abs(change.undone(stored.colours, y, x) - truth.reshape(-1, 3))) for change in CHANGES]
+    best = int(np.argmin(costs))
+    cause = f"looks {CHANGES[best].words}" if best and costs[best] < 0.5 * costs[0] else ""
+    return _Check(file, finding(file, what, _rows(other, rows, len(stored.colours)), cause), False)
+
+
+def _rows(wrong: NDArray[np.bool_], rows: list[int], height: int) -> str:
+    """Words for the rendered rows in which many pixels are wrong."""
+    flags = np.zeros(height, dtype=np.bool_)
+    flags[np.asarray(rows)[np.mean(wrong, axis=1) > _OTHER_DEPTH]] = True
+    return "all rows that were rendered" if np.sum(flags) == len(rows) else rows_of(flags)

@@ -1,0 +1,88 @@
+"""Sound sequences of random cards, in which verify must find nothing.
+
+Cameras, rigs, shutters, motions of every model, renderers, scenes and viewpoints are drawn; motions go to 20
+degrees and a metre per frame, through walls if they must; one scene has hardly any texture. Small, so that there
+can be many. There are no glossy surfaces: rsbench's scenes have none.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+from small_scenes import write_box_scene
+
+from rsbench.cards import list_cards
+from rsbench.dataset import generation
+from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
+from rsbench.dataset.verification import verify_dataset
+from rsbench.scenes.load import load_scene, read_scene_card
+
+MODELS = ("linear", "twist", "accelerated", "spline")
+PER_DATASET = 5
+"""Sequences of one camera, shutter and renderer."""
+RENDERERS = {
+    "one": 'integrator = "sunsky"\nsamples = 1\n',
+    "four": 'integrator = "sunsky"\nsamples = 4\n',
+    "sixteen": 'integrator = "sunsky"\nsamples = 16\nexposure = 1.6\n',
+    "traced": 'integrator = "path"\nsamples = 4\nmax_depth = 3\n',
+}
+
+
+def random_cards(count: int, folder: Path, seed: int) -> Iterator[DatasetCard]:
+    """Cards of ``count`` sequences in all; those of one scene follow each other, as it is built once."""
+    rng = np.random.default_rng(seed)
+    for name, text in RENDERERS.items():
+        (folder / f"{name}.toml").write_text(f'description = "{name}"\n{text}')
+    plain = str(write_box_scene(folder, "plain", (2, 2)))
+    scenes = [*(name for name in list_cards("scenes") if name != "mesh"), plain]
+    datasets = -(-count // PER_DATASET)
+    for number in range(datasets):
+        scene = scenes[number * len(scenes) // datasets]
+        yield _card(rng, number, scene, folder, min(PER_DATASET, count - number * PER_DATASET))
+
+
+def _card(rng: np.random.Generator, number: int, scene: str, folder: Path, sequences: int) -> DatasetCard:
+    path = Path(scene) if scene.endswith(".toml") else list_cards("scenes")[scene]
+    views = list(read_scene_card(path)[0].viewpoints)
+    width, height = (int(size) for size in rng.integers(48, 97, 2))
+    return DatasetCard(
+        name=f"random-{number}",
+        camera=CameraCard(width=width, height=height, focal=float(width * rng.uniform(0.6, 2.0))),
+        baseline=float(rng.uniform(0.05, 0.6)),
+        readout_ratio=float(rng.choice([0.0, 1.0, rng.uniform(0, 1)])),
+        frame_period_s=float(rng.uniform(0.01, 0.2)),
+        motion=_motion(rng),
+        renderer=str(folder / f"{rng.choice(list(RENDERERS))}.toml"),
+        seed=int(rng.integers(1000)),
+        sequence=tuple(
+            SequenceCard(name=f"s{k}", scene=scene, viewpoint=str(rng.choice(views)), motion=_motion(rng))
+            for k in range(sequences)
+        ),
+    ).expanded()
+
+
+def _motion(rng: np.random.Generator) -> MotionCard:
+    return MotionCard(
+        model=str(rng.choice(MODELS)),
+        rotation_deg=float(rng.choice([0.0, rng.uniform(0, 2), rng.uniform(2, 20)])),
+        rotation_axis="random",
+        translation=float(rng.choice([0.0, rng.uniform(0, 0.2), rng.uniform(0.2, 1)])),
+        translation_axis="random",
+    )
+
+
+def false_alarms(count: int, folder: Path, seed: int = 0) -> Iterator[tuple[str, int, list[str]]]:
+    """Of each dataset its name, how many sequences it has, and what verify found in them."""
+    with patch.object(generation, "load_scene", lru_cache(maxsize=1)(load_scene)):
+        for card in random_cards(count, folder, seed):
+            out = folder / card.name
+            generation.generate_dataset(card, out)
+            found = [f"{report.name}: {fault}" for report in verify_dataset(out) for fault in report.faults]
+            yield f"{card.name} ({Path(card.renderer).stem})", len(card.sequence), found
+            if not found:
+                shutil.rmtree(out)
