@@ -21,10 +21,11 @@ from rsbench.dataset import generation
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.verification import verify_dataset
 from rsbench.scenes.load import load_scene, read_scene_card
+from rsbench.scenes.model import Scene
 
 MODELS = ("linear", "twist", "accelerated", "spline")
-PER_DATASET = 5
-"""Sequences of one camera, shutter and renderer."""
+PER_DATASET = 10
+"""Sequences of one viewpoint, camera, shutter and renderer."""
 RENDERERS = {
     "one": 'integrator = "sunsky"\nsamples = 1\n',
     "four": 'integrator = "sunsky"\nsamples = 4\n',
@@ -39,7 +40,7 @@ def random_cards(count: int, folder: Path, seed: int) -> Iterator[DatasetCard]:
     for name, text in RENDERERS.items():
         (folder / f"{name}.toml").write_text(f'description = "{name}"\n{text}')
     plain = str(write_box_scene(folder, "plain", (2, 2)))
-    scenes = [*(name for name in list_cards("scenes") if name != "mesh"), plain]
+    scenes = [plain, *(name for name in list_cards("scenes") if name != "mesh")]
     datasets = -(-count // PER_DATASET)
     for number in range(datasets):
         scene = scenes[number * len(scenes) // datasets]
@@ -48,7 +49,7 @@ def random_cards(count: int, folder: Path, seed: int) -> Iterator[DatasetCard]:
 
 def _card(rng: np.random.Generator, number: int, scene: str, folder: Path, sequences: int) -> DatasetCard:
     path = Path(scene) if scene.endswith(".toml") else list_cards("scenes")[scene]
-    views = list(read_scene_card(path)[0].viewpoints)
+    viewpoint = str(rng.choice(list(read_scene_card(path)[0].viewpoints)))
     width, height = (int(size) for size in rng.integers(48, 97, 2))
     return DatasetCard(
         name=f"random-{number}",
@@ -60,7 +61,7 @@ def _card(rng: np.random.Generator, number: int, scene: str, folder: Path, seque
         renderer=str(folder / f"{rng.choice(list(RENDERERS))}.toml"),
         seed=int(rng.integers(1000)),
         sequence=tuple(
-            SequenceCard(name=f"s{k}", scene=scene, viewpoint=str(rng.choice(views)), motion=_motion(rng))
+            SequenceCard(name=f"s{k}", scene=scene, viewpoint=viewpoint, motion=_motion(rng))
             for k in range(sequences)
         ),
     ).expanded()
@@ -78,7 +79,23 @@ def _motion(rng: np.random.Generator) -> MotionCard:
 
 def false_alarms(count: int, folder: Path, seed: int = 0) -> Iterator[tuple[str, int, list[str]]]:
     """Of each dataset its name, how many sequences it has, and what verify found in them."""
-    with patch.object(generation, "load_scene", lru_cache(maxsize=1)(load_scene)):
+    from rsbench.renderers import scene
+
+    kept: dict[object, scene.MitsubaScene] = {}
+
+    def once(seen: Scene) -> scene.MitsubaScene:
+        """The renderer's scene, which takes seconds; the light in the frame of the view tells views apart."""
+        key = seen.name, seen.light
+        if key not in kept:
+            kept.clear()
+            kept[key] = made(seen)
+        return kept[key]
+
+    made = scene.MitsubaScene
+    with (
+        patch.object(generation, "load_scene", lru_cache(maxsize=1)(load_scene)),
+        patch.object(scene, "MitsubaScene", once),
+    ):
         for card in random_cards(count, folder, seed):
             out = folder / card.name
             generation.generate_dataset(card, out)

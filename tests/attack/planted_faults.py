@@ -35,7 +35,7 @@ from rsbench.dataset.files import (
 from rsbench.dataset.sequence import read_sequence, sequence_manifest
 from rsbench.dataset.verification import verify_sequence
 from rsbench.dataset.verification.rerender import Again
-from rsbench.dataset.verification.structure import dataset_faults
+from rsbench.dataset.verification.structure import Listing, dataset_faults
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene
 
@@ -86,10 +86,14 @@ def planted(fault: Fault, sound: Path, out: Path) -> Path:
 
 def found(fault: Fault, folder: Path) -> tuple[bool, list[str]]:
     """Whether one line of verify's answer has the fault's words; and all lines, but for the other sequence."""
-    manifest = read_json(folder / "dataset.json")
+    listing = Listing.of(folder, read_json(folder / "dataset.json"))
     again = Again("auto") if fault.rendered else None
-    lines = [*dataset_faults(folder, manifest), *verify_sequence(folder, VICTIM, manifest, again=again).faults]
+    lines = [*dataset_faults(listing), *_of_victim(listing, again)]
     return any(all(word in line for word in fault.words) for line in lines), lines
+
+
+def _of_victim(listing: Listing, again: Again | None) -> tuple[str, ...]:
+    return verify_sequence(listing, VICTIM, again=again).faults if VICTIM in listing.names else ()
 
 
 # How files are changed

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import contextlib
+from collections.abc import Collection, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -57,36 +59,34 @@ def verify_dataset(
     """
     manifest = read_json(folder / structure.DATASET)
     step = progress or (lambda name: None)
-    faults = tuple(structure.dataset_faults(folder, manifest))
+    listing = structure.Listing.of(folder, manifest)
+    faults = tuple(structure.dataset_faults(listing))
     reports = [SequenceReport(name=structure.DATASET, faults=faults)] if faults else []
     again = None if rerender == "no" else Again(rerender, [card_path("scenes", path) for path in scenes])
-    for name in structure.sequence_names(manifest):
-        reports.append(verify_sequence(folder, name, manifest, stride, step, again))
-    return reports
+    return reports + [verify_sequence(listing, name, stride, step, again) for name in listing.names]
 
 
 def verification_steps(manifest: Mapping[str, Any]) -> int:
     """How often ``verify_dataset`` reports progress on the dataset of this dataset.json."""
-    return _STEPS * len(structure.sequence_names(manifest))
+    return _STEPS * len(structure.Listing.of(Path(), manifest).names)
 
 
 def verify_sequence(
-    folder: Path,
+    listing: structure.Listing,
     name: str,
-    manifest: Mapping[str, Any],
     stride: int = 1,
     step: Progress = lambda name: None,
     again: Again | None = None,
 ) -> SequenceReport:
-    """Check one sequence of the dataset in ``folder``, whose dataset.json holds ``manifest``."""
-    faults = list(structure.file_faults(folder, name, manifest.get("files")))
+    """Check one sequence of a dataset; the rest as of ``verify_dataset``."""
+    faults = list(structure.file_faults(listing, name))
     agreements: list[DepthAgreement] = []
     notes: list[str] = []
     steps = _STEPS
     try:
         missing = {fault.removesuffix(": missing").removeprefix(f"{name}/") for fault in faults}
-        sequence = read_sequence(folder / name)
-        faults += structure.sequence_faults(sequence, name, structure.card_of(manifest))
+        sequence = read_sequence(listing.folder / name)
+        faults += structure.sequence_faults(sequence, name, listing)
         faults += pose_faults(sequence)
         content = read_content(sequence, missing)
         faults += [*content.faults, *twin_faults(content)]
@@ -96,7 +96,7 @@ def verify_sequence(
             agreements += [agreement] if agreement else []
             step(name)
             steps -= 1
-        faults += comparison.faults(images_elsewhere(_others(folder, name, manifest)))
+        faults += comparison.faults(images_elsewhere(partial(_others, listing, name)))
         if again is not None:
             found, note = again.check(content, {fault.partition(": ")[0] for fault in faults})
             faults += found
@@ -110,11 +110,10 @@ def verify_sequence(
     )
 
 
-def _others(folder: Path, name: str, manifest: Mapping[str, Any]) -> list[Sequence]:
-    found = []
-    for other in structure.sequence_names(manifest):
-        try:
-            found += [read_sequence(folder / other)] if other != name else []
-        except RsbenchError:
-            continue
-    return found[:_MOST_ELSEWHERE]
+def _others(listing: structure.Listing, name: str) -> Iterator[Sequence]:
+    """Some sequences, the nearest in the list first."""
+    place = listing.names.index(name)
+    near = sorted(range(len(listing.names)), key=lambda other: abs(other - place))[1 : _MOST_ELSEWHERE + 1]
+    for other in near:
+        with contextlib.suppress(RsbenchError):
+            yield read_sequence(listing.folder / listing.names[other])

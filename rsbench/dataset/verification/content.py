@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -150,12 +150,11 @@ class Comparison:
                 yield finding(shot.image, what, rows_of(rows))
 
 
-def images_elsewhere(others: Iterable[Sequence]) -> Elsewhere:
+def images_elsewhere(others: Callable[[], Iterable[Sequence]]) -> Elsewhere:
     """Images of other sequences, those of the same name first."""
-    known = list(others)
 
     def candidates(shot: Shot) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-        for other in known:
+        for other in others():
             for each in sorted(SHOTS, key=lambda one: one != shot):
                 try:
                     yield f"{other.name}/{each.image}", read_png(other.folder / each.image)

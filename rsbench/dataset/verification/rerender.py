@@ -19,7 +19,7 @@ from rsbench.cards import list_cards, parse_card
 from rsbench.core.projection import row_poses
 from rsbench.dataset.generation import image_seed
 from rsbench.dataset.scene_hashes import scene_hash
-from rsbench.dataset.verification.content import Content
+from rsbench.dataset.verification.content import Content, clean_file
 from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.dataset.verification.images import CHANGES, Picture
 from rsbench.dataset.verification.shots import SHOTS, DepthMap, Shot
@@ -149,7 +149,8 @@ def _checks(content: Content, scene: MitsubaScene, options: RendererOptions, row
         if shot in content.pictures:
             noisy = options.integrator == "path" and elsewhere
             rendered = to_srgb8(frame.image, options.exposure)
-            yield _image_check(content.pictures[shot], rendered, rows, noisy)
+            file = clean_file(content.sequence, shot)
+            yield _image_check(file, content.pictures[shot], rendered, rows, noisy)
 
 
 def _made_here(content: Content) -> bool:
@@ -191,8 +192,8 @@ def _depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int
     return _Check(file, finding(file, what, _rows(wrong, rows, len(stored.depth)), cause), False)
 
 
-def _image_check(stored: Picture, rendered: NDArray[np.uint8], rows: list[int], noisy: bool) -> _Check:
-    file, truth = stored.shot.image, rendered.astype(np.float32)
+def _image_check(file: str, stored: Picture, rendered: NDArray[np.uint8], rows: list[int], noisy: bool) -> _Check:
+    truth = rendered.astype(np.float32)
     difference = np.max(np.abs(stored.colours[rows] - truth), axis=-1)
     far = difference > _NEAR + (4 * stored.noise if noisy else 0.0)
     other = far if noisy else difference > 0

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
+from reprlib import repr as shortened
 from typing import Any
 
 from rsbench import __version__
 from rsbench.cards import list_cards, load_card, parse_card
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.files import read_json, sha256
-from rsbench.dataset.sequence import FORMAT, RELATIVE_FILES, UNITS, Sequence, sequence_manifest
+from rsbench.dataset.sequence import FORMAT, RELATIVE_FILES, UNITS, Sequence, files_of, sequence_manifest
 from rsbench.dataset.verification.findings import finding
 from rsbench.errors import RsbenchError
 from rsbench.reading import NAME, inside
@@ -27,11 +29,33 @@ _SAME = 1e-12
 """Relative difference of two numbers that were computed from the same card: a thousand roundings."""
 
 
-def sequence_names(manifest: Mapping[str, Any]) -> list[str]:
-    """Names of dataset.json that may be opened: those of a folder in it, each once."""
-    names = manifest.get("sequences")
-    good = [name for name in names if is_name(name)] if isinstance(names, list) else []
-    return list(dict.fromkeys(good))
+@dataclass(frozen=True, eq=False)
+class Listing:
+    """A dataset as its dataset.json tells it, sorted once for all of its sequences."""
+
+    folder: Path
+    manifest: Mapping[str, Any]
+    card: DatasetCard | str
+    """The card, or the fault that it is none."""
+    names: tuple[str, ...]
+    """Of sequences that may be opened: folders in it, each once."""
+    files: Mapping[str, Mapping[str, object]]
+    """What ``files`` says of each sequence, by its name and the path below its folder."""
+    planned: Mapping[str, SequenceCard]
+    """Sequences of the card by name."""
+
+    @classmethod
+    def of(cls, folder: Path, manifest: Mapping[str, Any]) -> Listing:
+        card = _card_of(manifest)
+        names, files = manifest.get("sequences"), manifest.get("files")
+        good = [name for name in names if is_name(name)] if isinstance(names, list) else []
+        below: dict[str, dict[str, object]] = {name: {} for name in good}
+        for path, entry in files.items() if isinstance(files, dict) else ():
+            name, _, relative = path.partition("/")
+            if name in below and _stays_inside(path):
+                below[name][relative] = entry
+        made = {} if isinstance(card, str) else {sequence.name: sequence for sequence in card.sequence}
+        return cls(folder, manifest, card, tuple(below), below, made)
 
 
 def is_name(name: object) -> bool:
@@ -39,8 +63,9 @@ def is_name(name: object) -> bool:
     return isinstance(name, str) and NAME.fullmatch(name) is not None
 
 
-def dataset_faults(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
+def dataset_faults(listing: Listing) -> Iterator[str]:
     """What is wrong with dataset.json as a whole."""
+    manifest, card = listing.manifest, listing.card
     if manifest.get("format") != FORMAT or isinstance(manifest.get("format"), bool):
         yield finding(DATASET, f"format = {manifest.get('format')!r}: {FORMAT} is needed")
     for key in _TEXTS:
@@ -49,8 +74,7 @@ def dataset_faults(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
     if manifest.get("units") != UNITS:
         yield finding(DATASET, f"units = {manifest.get('units')!r}: {UNITS} is needed")
     yield from _name_faults(manifest.get("sequences"))
-    yield from _listing_faults(folder, manifest)
-    card = card_of(manifest)
+    yield from _listing_faults(listing)
     if isinstance(card, str):
         yield card
         return
@@ -59,27 +83,30 @@ def dataset_faults(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
             yield finding(DATASET, f"{key} = {manifest.get(key)!r}, its card says {value!r}")
     made = [sequence.name for sequence in card.sequence]
     if manifest.get("sequences") != made:
-        yield finding(DATASET, f"sequences = {manifest.get('sequences')!r}, its card makes {made!r}")
+        yield finding(
+            DATASET, f"sequences = {shortened(manifest.get('sequences'))}, its card makes {shortened(made)}"
+        )
 
 
 def _name_faults(names: object) -> Iterator[str]:
     if not isinstance(names, list) or not names:
         yield finding(DATASET, f"sequences = {names!r}: a list of names is needed")
         return
-    for number, name in enumerate(names):
+    for name in names:
         if not is_name(name):
             yield finding(DATASET, f"sequences: {name!r} is not the name of a folder in it")
-        elif name in names[:number]:
+    for name, count in Counter(map(str, names)).items():
+        if count > 1:
             yield finding(DATASET, f"sequences: {name!r} stands there twice")
 
 
-def _listing_faults(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
+def _listing_faults(listing: Listing) -> Iterator[str]:
     """``files`` against the sequences and the disk; each file's content is looked at with its sequence."""
-    files, names = manifest.get("files"), sequence_names(manifest)
+    folder, files = listing.folder, listing.manifest.get("files")
     if not isinstance(files, dict):
         yield finding(DATASET, f"files = {files!r}: a table of paths is needed")
         return
-    strange = [path for path in files if path.partition("/")[0] not in names or not _stays_inside(path)]
+    strange = [path for path in files if path.partition("/")[0] not in listing.files or not _stays_inside(path)]
     if strange:
         yield finding(DATASET, f"files lists what belongs to none of its sequences: {_some(strange)}")
     there = [path for path in folder.rglob("*") if not path.is_dir() and not _hidden(path.relative_to(folder))]
@@ -104,7 +131,7 @@ def _some(names: list[str]) -> str:
     return ", ".join(names[:_MOST_NAMES]) + (f" and {left} more" if left > 0 else "")
 
 
-def card_of(manifest: Mapping[str, Any]) -> DatasetCard | str:
+def _card_of(manifest: Mapping[str, Any]) -> DatasetCard | str:
     """The card of dataset.json, or the fault that it is none."""
     card = manifest.get("card")
     if not isinstance(card, dict):
@@ -115,17 +142,14 @@ def card_of(manifest: Mapping[str, Any]) -> DatasetCard | str:
         return str(error)
 
 
-def file_faults(folder: Path, name: str, files: object) -> Iterator[str]:
+def file_faults(listing: Listing, name: str) -> Iterator[str]:
     """Files of a sequence against both manifests: there, listed in both, and with the bytes that they say."""
-    listed = files if isinstance(files, dict) else {}
-    below = f"{name}/"
-    own, fault = _own_files(folder / name)
+    folder, listed, below = listing.folder, listing.files[name], f"{name}/"
+    own, needed, fault = _own_files(folder / name)
     if fault:
         yield fault
-    expected = {"sequence.json", *RELATIVE_FILES, *own}
-    expected |= {path.removeprefix(below) for path in listed if path.startswith(below) and _stays_inside(path)}
-    for relative in sorted(expected):
-        entry = listed.get(below + relative)
+    for relative in sorted({"sequence.json", *needed, *own, *listed}):
+        entry = listed.get(relative)
         if relative not in own and relative != "sequence.json" and not fault:
             yield finding(f"{below}sequence.json", f"files does not list {relative}")
         if entry is None:
@@ -134,19 +158,24 @@ def file_faults(folder: Path, name: str, files: object) -> Iterator[str]:
             yield from _content_faults(folder, below + relative, entry, own.get(relative))
 
 
-def _own_files(folder: Path) -> tuple[dict[str, object], str]:
-    """``files`` of a sequence.json, and what is wrong with it."""
+def _own_files(folder: Path) -> tuple[dict[str, object], tuple[str, ...], str]:
+    """``files`` of a sequence.json, those that it must have, and what is wrong with them."""
     try:
-        files = read_json(folder / "sequence.json").get("files")
+        manifest = read_json(inside(folder, "sequence.json"))
     except RsbenchError as error:
-        return {}, str(error)
+        return {}, RELATIVE_FILES, str(error)
+    files, needed = manifest.get("files"), files_of(manifest)
     if not isinstance(files, dict) or not files:
-        return {}, finding(f"{folder.name}/sequence.json", f"files = {files!r}: a table of sha256 is needed")
+        return (
+            {},
+            needed,
+            finding(f"{folder.name}/sequence.json", f"files = {files!r}: a table of sha256 is needed"),
+        )
     strange = [path for path in files if not _stays_inside(path)]
     if strange:
         fault = finding(f"{folder.name}/sequence.json", f"files lists paths that leave it: {_some(strange)}")
-        return {path: digest for path, digest in files.items() if path not in strange}, fault
-    return files, ""
+        return {path: digest for path, digest in files.items() if path not in strange}, needed, fault
+    return files, needed, ""
 
 
 def _content_faults(folder: Path, name: str, entry: object, own: object) -> Iterator[str]:
@@ -170,7 +199,7 @@ def _content_faults(folder: Path, name: str, entry: object, own: object) -> Iter
         yield finding(name, f"content differs from its checksum in {name.partition('/')[0]}/sequence.json")
 
 
-def sequence_faults(sequence: Sequence, name: str, card: DatasetCard | str) -> Iterator[str]:
+def sequence_faults(sequence: Sequence, name: str, listing: Listing) -> Iterator[str]:
     """What sequence.json says against itself, its folder and the card."""
     file, manifest = "sequence.json", sequence.manifest
     expected = sequence_manifest(
@@ -189,9 +218,8 @@ def sequence_faults(sequence: Sequence, name: str, card: DatasetCard | str) -> I
     for key in ("rsbench", "mitsuba", "drjit", "variant"):
         if not isinstance(made_by, dict) or not isinstance(made_by.get(key), str):
             yield finding(file, f"made_by: {key} is missing")
-    planned = next((s for s in card.sequence if s.name == name), None) if isinstance(card, DatasetCard) else None
-    if isinstance(card, DatasetCard) and planned is not None:
-        yield from _card_faults(manifest, card, planned)
+    if isinstance(listing.card, DatasetCard) and name in listing.planned:
+        yield from _card_faults(manifest, listing.card, listing.planned[name])
 
 
 def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: SequenceCard) -> Iterator[str]:
