@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from rsbench.benchmark.simulated.simulation import Simulation
     from rsbench.dataset.sequence import Sequence
-    from rsbench.dataset.verification import SequenceReport
+    from rsbench.dataset.verification import Rerender, SequenceReport
     from rsbench.pipeline.chain import CorrectedFrames
     from rsbench.pipeline.robust_motion import RobustEstimate
     from rsbench.solvers.engine.base import MotionEstimate, Solver
@@ -316,32 +316,21 @@ def generate(card: str, out: AnyPath, *, sequences: Series[str] | None = None, w
 
 
 def verify(
-    folder: AnyPath,
-    *,
-    stride: int = 1,
-    rerender: Literal["no", "auto", "all"] = "auto",
-    scenes: Series[AnyPath] = (),
+    folder: AnyPath, *, stride: int = 1, rerender: Rerender = "auto", scenes: Series[AnyPath] = ()
 ) -> list[SequenceReport]:
-    """Check a dataset: files, lists and card against each other, poses against the motion, depth maps and images
-    against what all others show, and rows of both against what is rendered again.
+    """Check a dataset: files and lists, poses, all depth maps and images against each other, rows rendered again.
+
+    Returns one report per sequence, in order when its ``faults`` are empty; before them one of dataset.json if it
+    has any. Raises RsbenchError for what is no dataset.
 
     Args:
         folder: of the dataset.
         stride: compare every n-th pixel in both directions.
-        rerender: rows to render again where the scene can be built here: none, some (seconds) or all.
-        scenes: cards of scenes that are not rsbench's own; what a dataset says of its scene is never opened.
-
-    Returns:
-        One report per sequence, and before them one named "dataset.json" where that has faults of its own; all is
-        in order when no report has ``faults``. ``notes`` say what was rendered again, or why not.
-
-    Raises:
-        RsbenchError: not a dataset, or no scene card of that name.
+        rerender: rows to render again where the scene can be built here: "no", "auto" (seconds) or "all".
+        scenes: cards of scenes that are not rsbench's own.
     """
     from rsbench.dataset.verification import verify_dataset
 
-    arguments.check_whole("stride", stride, 1)
-    arguments.check_one_of("rerender", rerender, ("no", "auto", "all"))
     return verify_dataset(Path(folder), stride, rerender=rerender, scenes=[Path(path) for path in scenes])
 
 

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rsbench import arguments
 from rsbench.cards import card_path
 from rsbench.dataset.files import read_json
 from rsbench.dataset.sequence import Sequence, read_sequence
@@ -55,8 +56,11 @@ def verify_dataset(
         One report per sequence; before them one named dataset.json where that has faults of its own.
 
     Raises:
+        ValueError: ``stride`` or ``rerender`` is none of the allowed.
         RsbenchError: no dataset.json, or one that is not a JSON object; no card of a scene where one was named.
     """
+    arguments.check_whole("stride", stride, 1)
+    arguments.check_one_of("rerender", rerender, ("no", "auto", "all"))
     manifest = read_json(folder / structure.DATASET)
     step = progress or (lambda name: None)
     listing = structure.Listing.of(folder, manifest)

@@ -16,7 +16,7 @@ Bits = NDArray[np.uint8]
 
 NEAR_MISS = 1e-3
 """A surface hidden by less than this is a disagreement, not an occlusion; shallow reliefs hide by little more."""
-_SPARE_PIXELS, _SPARE_SHARE = 5, 1e-3
+_SPARE_PIXELS, _SPARE_SHARE = 5, 0.1
 """Pixels of a pair that may disagree: grazing edges, where float32 and the flatness test reach their limits."""
 _TYPICAL = 5e-6
 """Largest typical relative difference of agreeing depths: bilinear interpolation on what counts as flat errs by a
@@ -31,6 +31,7 @@ _MANY = 4
 """Pairs, of 8 between the cameras and 16 others, that say that the geometry is wrong and not a map."""
 _TILE, _BAD_IN_TILE = 5, 12
 """A square of 5 x 5 pixels in which 12 are contradicted, and more than agree, is no edge."""
+_LEAST_WIDTH = 0.5
 _CENTRED = 0.3
 """Pixels from a pixel's centre within which a surface that spans its neighbours must be met by its ray."""
 
@@ -81,14 +82,15 @@ class MapFault:
 def compare(source: MapVerdict, target: MapVerdict, landing: Landing) -> DepthAgreement:
     """Add what one pair shows to the verdicts of both, and count how the flat surfaces of both agree."""
     relative, stride = landing.relative, source.stride
-    flat = source.map.flat[::stride, ::stride] & source.surface
+    wide = _wide(landing.pixels, stride)
+    flat = source.map.flat[::stride, ::stride] & source.surface & wide
     with np.errstate(invalid="ignore"):
         size = np.abs(relative)
         agrees = size <= DEPTH_TOLERANCE
         bit = source.bit(target.map.shot)
         source.confirmed |= np.where(agrees, bit, np.uint8(0))
         # What is not flat may slip between the pixels of a partner that sees nothing there.
-        through = (relative < NEAR_MISS) & ~agrees & (flat | np.isfinite(relative))
+        through = (relative < NEAR_MISS) & ~agrees & (flat | (np.isfinite(relative) & wide))
         source.contradicted |= np.where(through, bit, np.uint8(0))
         source.hidden |= np.where(relative >= NEAR_MISS, bit, np.uint8(0))
         near = size[flat & (relative < NEAR_MISS)]
@@ -103,6 +105,18 @@ def compare(source: MapVerdict, target: MapVerdict, landing: Landing) -> DepthAg
         typical=float(np.median(near_and_seen)) if near_and_seen.size else float("nan"),
         p99=float(np.percentile(near_and_seen, 99)) if near_and_seen.size else float("nan"),
     )
+
+
+def _wide(pixels: NDArray[np.float32], stride: int) -> BoolArray:
+    """(h, w) whether what one source pixel spans is at least half a pixel wide in the target, in every direction.
+
+    A surface seen at a grazing angle there may slip between two pixels, however flat and large the source sees it.
+    """
+    across, down = np.gradient(pixels / stride, axis=1), np.gradient(pixels / stride, axis=0)
+    area = np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])
+    longest = np.sqrt(np.sum(across**2 + down**2, axis=-1))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(area >= _LEAST_WIDTH * longest)
 
 
 def _mark_holes(target: MapVerdict, pixels: NDArray[np.float32], bit: np.uint8) -> None:
@@ -132,6 +146,9 @@ def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
     trusted = np.uint8(sum(int(verdict.bit(each)) for each in verdict.map.shot.partners() if each not in blamed))
     height, surface = len(verdict.map.depth), verdict.surface
     holes = np.bitwise_count(verdict.holes & trusted) >= 2
+    seen = verdict.map.depth > 0
+    # Gaps narrower than a pixel, between battlements or leaves, lie one by one among pixels that see a surface.
+    holes &= _clusters(holes, seen) | (np.sum(holes) > _BAD_SHARE * np.sum(seen))
     if np.sum(holes) > _FEW:
         share = 1.0 + float(np.mean(holes[verdict.holes > 0]))  # before all others: holes accuse who sees through
         return MapFault(
