@@ -65,9 +65,8 @@ def verify(
     ]
     if rows:
         print_table("Depth agreement between frames (relative tolerance 1e-4)", pd.DataFrame(rows))
-    for report in reports:
-        for note in report.notes:
-            say(f"{report.name}: {note}")
+    for note in [f"{report.name}: {note}" for report in reports for note in report.notes]:
+        say(note)
     faults = [f"{report.name}: {fault}" for report in reports for fault in report.faults]
     for fault in faults:
         typer.echo(f"fault: {fault}", err=True)

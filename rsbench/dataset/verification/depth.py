@@ -16,8 +16,9 @@ Bits = NDArray[np.uint8]
 
 NEAR_MISS = 1e-3
 """A surface hidden by less than this is a disagreement, not an occlusion; shallow reliefs hide by little more."""
-_SPARE_PIXELS, _SPARE_SHARE = 5, 0.1
-"""Pixels of a pair that may disagree: grazing edges, where float32 and the flatness test reach their limits."""
+_SPARE_PIXELS, _SPARE_SHARE = 5, 0.3
+"""Pixels of a pair that may disagree: what is thinner than a pixel lies before what is flat. A wrong geometry
+shows in the median too."""
 _TYPICAL = 5e-6
 """Largest typical relative difference of agreeing depths: bilinear interpolation on what counts as flat errs by a
 quarter of ``FLATNESS`` at most, float32 by 6e-8."""
@@ -32,6 +33,7 @@ _MANY = 4
 _TILE, _BAD_IN_TILE = 5, 12
 """A square of 5 x 5 pixels in which 12 are contradicted, and more than agree, is no edge."""
 _LEAST_WIDTH = 0.5
+_HOLE, _HITS_IN_HOLE = 7, 8
 _CENTRED = 0.3
 """Pixels from a pixel's centre within which a surface that spans its neighbours must be met by its ray."""
 
@@ -46,6 +48,8 @@ class MapVerdict:
     """(h, w) the partner sees the same surface there, or the same sky."""
     contradicted: Bits = field(init=False)
     """(h, w) the partner sees through it, or sees a surface hardly before it."""
+    near: BoolArray = field(init=False)
+    """(h, w) some partner contradicts it by less than ``NEAR_MISS``."""
     hidden: Bits = field(init=False)
     """(h, w) the partner sees a surface well before it: an occlusion, unless another says so too."""
     holes: Bits = field(init=False)
@@ -57,6 +61,7 @@ class MapVerdict:
         shape = self.map.depth[:: self.stride, :: self.stride].shape
         self.confirmed, self.contradicted, self.hidden = np.zeros((3, *shape), dtype=np.uint8)
         self.holes = np.zeros(self.map.depth.shape, dtype=np.uint8)
+        self.near = np.zeros(shape, dtype=np.bool_)
         self.difference = np.full(shape, np.inf, dtype=np.float32)
 
     @property
@@ -92,6 +97,7 @@ def compare(source: MapVerdict, target: MapVerdict, landing: Landing) -> DepthAg
         # What is not flat may slip between the pixels of a partner that sees nothing there.
         through = (relative < NEAR_MISS) & ~agrees & (flat | (np.isfinite(relative) & wide))
         source.contradicted |= np.where(through, bit, np.uint8(0))
+        source.near |= through & (size < NEAR_MISS)
         source.hidden |= np.where(relative >= NEAR_MISS, bit, np.uint8(0))
         near = size[flat & (relative < NEAR_MISS)]
     source.difference = np.fmin(source.difference, size)
@@ -148,7 +154,7 @@ def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
     holes = np.bitwise_count(verdict.holes & trusted) >= 2
     seen = verdict.map.depth > 0
     # Gaps narrower than a pixel, between battlements or leaves, lie one by one among pixels that see a surface.
-    holes &= _clusters(holes, seen) | (np.sum(holes) > _BAD_SHARE * np.sum(seen))
+    holes &= _emptied(holes, seen) | (np.sum(holes) > _BAD_SHARE * np.sum(seen))
     if np.sum(holes) > _FEW:
         share = 1.0 + float(np.mean(holes[verdict.holes > 0]))  # before all others: holes accuse who sees through
         return MapFault(
@@ -164,7 +170,7 @@ def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
             return None
         what = "nothing can be compared with another frame" if np.any(surface) else "there is no surface"
         return MapFault(what, np.full(height, True), 0.0)
-    rows = _bad_rows(bad, good)
+    rows = _bad_rows(bad, good, verdict.near)
     if np.any(rows):
         share = np.sum(bad[rows]) / max(1, np.sum((bad | good)[rows]))
         what = f"depth differs from what others see on {100 * share:.3g} % of the comparable pixels"
@@ -178,14 +184,33 @@ def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
     return None
 
 
-def _bad_rows(bad: BoolArray, good: BoolArray) -> BoolArray:
-    """(h,) rows of a map that are wrong: by themselves, in a tile, or because all of it is."""
+def _bad_rows(bad: BoolArray, good: BoolArray, near: BoolArray) -> BoolArray:
+    """(h,) rows of a map that are wrong: by themselves, in a cluster, or because all of it is.
+
+    A row or two may be a thing thinner than the rows of others, unless it is ``near`` what they see.
+    """
     count, comparable = np.sum(bad, axis=1), np.sum(bad | good, axis=1)
     rows = (count >= _FEW) & (count > _BAD_IN_ROW * comparable)
+    rows = _runs(rows) | (rows & (np.sum(bad & near, axis=1) > _BAD_IN_ROW * comparable))
     rows |= np.any(_clusters(bad, good), axis=1)
     if np.sum(count[~rows]) > max(_FEW, _BAD_SHARE * np.sum(comparable[~rows])):
         rows |= count > _BAD_SHARE * comparable
     return np.asarray(rows)
+
+
+def _runs(rows: BoolArray) -> BoolArray:
+    """(h,) those of at least three rows in a row."""
+    flags = np.asarray(rows, np.uint8)[:, None]
+    return np.asarray(cv2.morphologyEx(flags, cv2.MORPH_OPEN, np.ones((3, 1), np.uint8))[:, 0] > 0)
+
+
+def _emptied(holes: BoolArray, seen: BoolArray) -> BoolArray:
+    """(H, W) missing pixels in squares of 7 x 7 that see nothing at all, 8 of which others see covered."""
+    size = (_HOLE, _HOLE)
+    hit = cv2.boxFilter(np.asarray(holes, np.float32), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    empty = cv2.dilate(np.asarray(seen, np.uint8), np.ones(size, np.uint8)) == 0
+    spoilt = np.asarray(empty & (hit > _HITS_IN_HOLE - 0.5), np.uint8)
+    return np.asarray((cv2.dilate(spoilt, np.ones(size, np.uint8)) > 0) & holes)
 
 
 def _clusters(bad: BoolArray, good: BoolArray) -> BoolArray:

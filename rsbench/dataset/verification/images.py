@@ -26,11 +26,13 @@ _BANDS, _LEAST_BAND = 12, 8
 """Bands of rows that are judged by themselves, and their least height."""
 _LEAST_PIXELS = 60
 """Pixels of a band below which it is not judged."""
-_UNLIKE = 0.3
-"""Share of a band's pixels that lie beyond: clean data has at most 0.1."""
+_UNLIKE = 0.5
+"""Share of a band's pixels that lie beyond: sound data of one sample per pixel has up to 0.36."""
 _BETTER, _GAIN = 0.8, 0.5
 """A change of the image that brings the mean difference below 0.8 of what it was, and 0.5 codes down, is what was
 done to it: clean data has 1.4 at the least."""
+_LEAST_EVIDENCE = 3
+"""Bands of pairs, each direction for itself, below which an image is not blamed: one of few pixels errs by chance."""
 _TILE, _BAD_IN_TILE = 16, 0.6
 _SAMPLES = 60_000
 
@@ -209,7 +211,9 @@ def culprits(likenesses: list[Likeness]) -> Iterator[tuple[Shot, list[Likeness]]
     while left:
         counts = Counter(shot for each in left for shot in (each.source, each.target))
         worst = max(counts, key=lambda shot: counts[shot])
-        yield worst, [each for each in left if worst in (each.source, each.target)]
+        pairs = [each for each in left if worst in (each.source, each.target)]
+        if sum(int(np.sum(each.unlike)) for each in pairs) >= _LEAST_EVIDENCE:
+            yield worst, pairs
         left = [each for each in left if worst not in (each.source, each.target)]
 
 
