@@ -32,7 +32,7 @@ _BETTER, _GAIN = 0.8, 0.5
 """A change of the image that brings the mean difference below 0.8 of what it was, and 0.5 codes down, is what was
 done to it: clean data has 1.4 at the least."""
 _LEAST_EVIDENCE = 3
-"""Bands of pairs, each direction for itself, below which an image is not blamed: one of few pixels errs by chance."""
+"""Bands of pairs, each direction by itself, below which an image is not blamed: a small one errs by chance."""
 _TILE, _BAD_IN_TILE = 16, 0.6
 _SAMPLES = 60_000
 
