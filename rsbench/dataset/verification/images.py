@@ -26,8 +26,9 @@ _BANDS, _LEAST_BAND = 12, 8
 """Bands of rows that are judged by themselves, and their least height."""
 _LEAST_PIXELS = 60
 """Pixels of a band below which it is not judged."""
-_UNLIKE = 0.5
-"""Share of a band's pixels that lie beyond: sound data of one sample per pixel has up to 0.36."""
+_UNLIKE, _UNLIKE_WHOLE = 0.5, 0.22
+"""Share of a band's pixels that lie beyond: sound data of one sample per pixel has up to 0.36;
+and of all pixels of a pair, where it has 0.17."""
 _BETTER, _GAIN = 0.8, 0.5
 """A change of the image that brings the mean difference below 0.8 of what it was, and 0.5 codes down, is what was
 done to it: clean data has 1.4 at the least."""
@@ -128,7 +129,10 @@ class Likeness:
     @property
     def unlike(self) -> BoolArray:
         """(B,) bands in which the two images do not show the same."""
-        return self.judged & ((self.beyond > _UNLIKE) | (self.better > 0))
+        pixels = float(np.sum(self.pixels))
+        whole = pixels > 0 and float(np.sum(self.beyond * self.pixels)) > _UNLIKE_WHOLE * pixels
+        allowed = _UNLIKE_WHOLE if whole else _UNLIKE
+        return self.judged & ((self.beyond > allowed) | (self.better > 0))
 
 
 @dataclass(eq=False)
