@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 from typing import Annotated
 
@@ -80,6 +81,15 @@ for module in (
     module.register(app)
 
 
+_NAMELESS = {
+    errno.ENOSPC: "standard output",
+    errno.EIO: "standard output",
+    errno.EDQUOT: "standard output",
+    errno.ENOENT: "the working folder, which must exist",
+}
+"""What an operation of the system failed on that names no file."""
+
+
 def run() -> None:
     """Entry point: every error becomes one line on stderr; 2 for a user's, 70 for one that nobody foresaw."""
     try:
@@ -90,8 +100,9 @@ def run() -> None:
     except MemoryError:
         _fail("there is not enough memory for it; close other programs, or ask for less at once", 1)
     except Exception as error:
-        if isinstance(error, OSError) and error.filename:  # a folder without permission, wherever it is met
-            _fail(f"{error.filename}: {error.strerror or error}")
+        # A folder without permission, wherever it is met; or what has no name, as a full disk behind stdout.
+        if isinstance(error, OSError) and (place := error.filename or _NAMELESS.get(error.errno or 0)):
+            _fail(f"{place}: {error.strerror or error}")
         _fail(faults.describe(error), faults.EXIT_CODE)
 
 

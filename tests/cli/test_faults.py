@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,19 @@ def test_an_unknown_error_is_one_line_with_a_log(
     assert [path.name for path in cache.parent.iterdir()] == ["cache"]
 
 
+@pytest.mark.parametrize(
+    ("number", "place"),
+    [(errno.ENOSPC, "standard output: "), (errno.ENOENT, "the working folder, which must exist: ")],
+)
+def test_what_has_no_name_is_named(
+    number: int, place: str, cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A full disk behind standard output, or a working folder that was removed: a user's, and no log."""
+    code, line = run(monkeypatch, capsys, OSError(number, os.strerror(number)))
+    assert (code, line) == (2, f"rsbench: error: {place}{os.strerror(number)}")
+    assert not cache.exists()
+
+
 def test_logs_do_not_pile_up(cache: Path) -> None:
     for _ in range(25):
         faults.describe(ValueError())
@@ -68,7 +82,7 @@ def test_without_a_place_for_a_log_the_line_stays(
     [
         (MemoryError(), 1, "not enough memory"),
         (PermissionError(errno.EACCES, "Permission denied", "/x"), 2, "rsbench: error: /x: Permission denied"),
-        (OSError(errno.ENOSPC, "No space left on device"), 70, "the system refused: OSError: [Errno 28] No space"),
+        (OSError(errno.EBADF, "Bad file descriptor"), 70, "the system refused: OSError: [Errno 9] Bad file"),
     ],
 )
 def test_errors_of_the_system(
