@@ -97,7 +97,7 @@ def shot(
 def test_single_pass_equals_stitched_on_the_paper_frame(shot: Shot, integrator: str) -> None:
     scene, camera, poses = shot
     preset = "default" if integrator == "sunsky" else "path"
-    options = replace(load_card(RendererOptions, "renderers", preset), samples=2 if integrator == "path" else 16)
+    options = replace(load_card(RendererOptions, "renderers", preset), samples=1 if integrator == "path" else 16)
     rows = np.linspace(0, 899, 20).astype(int).tolist()
     geometry = scene, camera, poses.R, poses.t
     whole = render(*geometry, replace(options, method="single-pass"))
