@@ -346,6 +346,7 @@ def evaluate(
     metrics: Series[str] = (),
     only: Series[str] = (),
     force: bool = False,
+    rehash: bool = False,
     seeds: int = 1,
     seed: int = 0,
 ) -> dict[str, pd.DataFrame]:
@@ -356,12 +357,10 @@ def evaluate(
         out: folder of predictions and scores; current predictions that it holds are kept, and scored too.
         solvers: names of ``list_solvers`` or paths of cards.
         correct_with: solver whose motion the correction uses.
-        matcher, features, corrector: names or cards.
-        metrics: names or cards of further metrics.
+        matcher, features, corrector, metrics: names or cards; the metrics are further ones.
         only: names of solvers and sequences: predict nothing else. All is scored.
-        force: predict again what is there already.
-        seeds: runs of each solver, with other RANSAC samples: one row each in ``pose``.
-        seed: of every random choice.
+        force: predict again what is there already; rehash: read data again that seem unchanged.
+        seeds: runs of each solver, with other RANSAC samples: one row each in ``pose``; seed: of every choice.
 
     Returns:
         The tables ``pose``, ``depth``, ``correction``, ``failures`` and ``seconds``: see docs/score-files.md.
@@ -382,6 +381,7 @@ def evaluate(
         metrics=arguments.names(metrics),
         only=arguments.names(only),
         force=force,
+        rehash=rehash,
         seeds=seeds,
         seed=seed,
     )
