@@ -104,8 +104,8 @@ def make_motion(name: str, w: ArrayLike, d: ArrayLike, parameters: Mapping[str, 
 
 
 def check_parameters(name: str, parameters: Mapping[str, Any]) -> None:
-    """Raises RsbenchError when a model has no parameter of one of these names."""
-    if not parameters:
+    """Raises RsbenchError when there is no such model, or it has no parameter of one of these names."""
+    if not parameters and name in MOTIONS.built_in:
         return
     known = list(inspect.signature(motion_model(name)).parameters)[2:]
     for key in parameters:
