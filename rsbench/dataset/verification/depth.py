@@ -16,13 +16,15 @@ Bits = NDArray[np.uint8]
 
 NEAR_MISS = 1e-3
 """A surface hidden by less than this is a disagreement, not an occlusion; shallow reliefs hide by little more."""
-_SPARE_PIXELS, _SPARE_SHARE = 5, 0.3
+_SPARE_PIXELS, _SPARE_SHARE = 30, 0.3
 """Pixels of a pair that may disagree: what is thinner than a pixel lies before what is flat. A wrong geometry
 shows in the median too."""
+_STRICT_SHARE = 0.01
+"""The same, where nearly all pairs of a kind must exceed it."""
 _TYPICAL = 5e-6
 """Largest typical relative difference of agreeing depths: bilinear interpolation on what counts as flat errs by a
 quarter of ``FLATNESS`` at most, float32 by 6e-8."""
-_BAD_SHARE, _BAD_IN_ROW = 0.05, 0.5
+_BAD_SHARE, _BAD_IN_ROW, _EMPTY_SHARE = 0.2, 0.5, 0.05
 """Shares of the comparable pixels of a map, a row, that thin things may contradict: they are seen by one alone."""
 _MOST_BEHIND = 0.3
 """Share of a map that may lie behind what two partners see: near things hide much of it when the rig moves far."""
@@ -154,7 +156,7 @@ def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
     holes = np.bitwise_count(verdict.holes & trusted) >= 2
     seen = verdict.map.depth > 0
     # Gaps narrower than a pixel, between battlements or leaves, lie one by one among pixels that see a surface.
-    holes &= _emptied(holes, seen) | (np.sum(holes) > _BAD_SHARE * np.sum(seen))
+    holes &= _emptied(holes, seen) | (np.sum(holes) > _EMPTY_SHARE * np.sum(seen))
     if np.sum(holes) > _FEW:
         share = 1.0 + float(np.mean(holes[verdict.holes > 0]))  # before all others: holes accuse who sees through
         return MapFault(
@@ -192,8 +194,8 @@ def _bad_rows(bad: BoolArray, good: BoolArray, near: BoolArray) -> BoolArray:
     count, comparable = np.sum(bad, axis=1), np.sum(bad | good, axis=1)
     rows = (count >= _FEW) & (count > _BAD_IN_ROW * comparable)
     rows = _runs(rows) | (rows & (np.sum(bad & near, axis=1) > _BAD_IN_ROW * comparable))
-    rows |= np.any(_clusters(bad, good), axis=1)
-    if np.sum(count[~rows]) > max(_FEW, _BAD_SHARE * np.sum(comparable[~rows])):
+    rows |= np.any(_clusters(bad & near, good), axis=1)
+    if np.sum(count[~rows]) > max(4 * _FEW, _BAD_SHARE * np.sum(comparable[~rows])):
         rows |= count > _BAD_SHARE * comparable
     return np.asarray(rows)
 
@@ -227,9 +229,9 @@ def _clusters(bad: BoolArray, good: BoolArray) -> BoolArray:
 
 def geometry_fault(pairs: Sequence[tuple[Shot, Shot, DepthAgreement]]) -> str | None:
     """What the maps say against the geometry that sequence.json states, where none of them is wrong by itself."""
-    wrong = [(source, target) for source, target, each in pairs if not _agree(each)]
+    wrong = [(source, target) for source, target, each in pairs if not _agree(each, _STRICT_SHARE)]
     across = sum(source.side != target.side for source, target in wrong)
-    if not across and len(wrong) >= _MANY:
+    if not across and len(wrong) >= 2 * _MANY:
         cause = "the two cameras agree with each other: look at motion and readout_ratio in sequence.json"
     elif across >= 2 * _MANY - 1:
         cause = "the two cameras never agree: look at baseline and camera in sequence.json, or all depth is scaled"
@@ -243,10 +245,10 @@ def geometry_fault(pairs: Sequence[tuple[Shot, Shot, DepthAgreement]]) -> str | 
     return finding("sequence.json", what, cause=cause)
 
 
-def _agree(agreement: DepthAgreement) -> bool:
+def _agree(agreement: DepthAgreement, spare: float = _SPARE_SHARE) -> bool:
     """A pair with nothing to compare says nothing."""
     wrong = agreement.compared - agreement.agreeing
-    few = wrong <= _SPARE_PIXELS + _SPARE_SHARE * agreement.compared
+    few = wrong <= _SPARE_PIXELS + spare * agreement.compared
     return few and not agreement.typical > _TYPICAL
 
 

@@ -34,6 +34,8 @@ _BETTER, _GAIN = 0.8, 0.5
 done to it: clean data has 1.4 at the least."""
 _LEAST_EVIDENCE = 3
 """Bands of pairs, each direction by itself, below which an image is not blamed: a small one errs by chance."""
+_CHANCE = 6.0
+"""Standard deviations of a band's mean by which noise may favour one of the changes."""
 _TILE, _BAD_IN_TILE = 16, 0.6
 _SAMPLES = 60_000
 
@@ -81,6 +83,8 @@ class Picture:
     """(H, W, 3) 8-bit codes."""
     noise: float
     """Standard deviation of what looks like noise in it, codes."""
+    doubt: float
+    """That, where the renderer draws random numbers; else 0."""
     low: Colours
     """(H, W, 3) smallest of the 3 x 3 pixels around, less what noise may add; ``high`` likewise."""
     high: Colours
@@ -90,7 +94,14 @@ class Picture:
         colours = image.astype(np.float32)
         noise, around = noise_of(colours), np.ones((3, 3), np.uint8)
         beyond = np.float32(_BEYOND + (_NOISE_FACTOR * noise if noisy else 0.0))
-        return cls(shot, colours, noise, cv2.erode(colours, around) - beyond, cv2.dilate(colours, around) + beyond)
+        return cls(
+            shot,
+            colours,
+            noise,
+            noise if noisy else 0.0,
+            cv2.erode(colours, around) - beyond,
+            cv2.dilate(colours, around) + beyond,
+        )
 
 
 def noise_of(colours: Colours) -> float:
@@ -113,6 +124,8 @@ class Likeness:
     """(B,) share of them that the other frame's neighbourhood does not span."""
     costs: NDArray[np.float64]
     """(C, B) mean absolute difference of each of ``CHANGES``, codes."""
+    doubt: float
+    """Standard deviation of the noise of both, codes; 0 where they have none."""
 
     @property
     def judged(self) -> BoolArray:
@@ -123,7 +136,8 @@ class Likeness:
         """(B,) number of the change that explains a band better than none; 0 for none."""
         best = np.argmin(self.costs, axis=0)
         least = np.min(self.costs, axis=0)
-        decisive = (least < _BETTER * self.costs[0]) & (least < self.costs[0] - _GAIN)
+        chance = _CHANCE * self.doubt / np.sqrt(np.maximum(self.pixels, 1.0))
+        decisive = (least < _BETTER * self.costs[0]) & (least < self.costs[0] - _GAIN - chance)
         return np.where(decisive, best, 0)
 
     @property
@@ -189,7 +203,8 @@ def compare(
     share = np.bincount(bands[y], weights=beyond, minlength=count) / np.maximum(pixels, 1)
     every = slice(None, None, max(1, len(y) // _SAMPLES))
     costs = _costs(source.colours, y[every], x[every], shown[every], bands[y[every]], count)
-    return Likeness(source.shot, target.shot, pixels.astype(np.float64), share, costs)
+    doubt = float(np.hypot(source.doubt, target.doubt))
+    return Likeness(source.shot, target.shot, pixels.astype(np.float64), share, costs, doubt)
 
 
 def _costs(
