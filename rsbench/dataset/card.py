@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.sequence import sequence_manifest
 from rsbench.errors import RsbenchError
 from rsbench.imports import search
 from rsbench.motions import drawn_parameters, fixed_endpoint, make_motion
@@ -185,6 +186,18 @@ class DatasetCard:
 
     def seed_of(self, sequence: SequenceCard) -> int:
         return self.seed if sequence.seed is None else sequence.seed
+
+    def manifest_of(self, sequence: SequenceCard) -> dict[str, Any]:
+        """What the sequence.json of a sequence says whatever scene, renderer and seed are."""
+        manifest = sequence_manifest(
+            name=sequence.name,
+            rig=self.rig_of(sequence),
+            shutter=self.shutter(),
+            motion=self.motion_of(sequence),
+            frame_period_s=self.frame_period_s,
+        )
+        sensor = {} if self.sensor is None else {"sensor": asdict(self.sensor)}
+        return {**manifest, **sensor}
 
     def only(self, names: list[str]) -> DatasetCard:
         """The same card with some of its sequences.

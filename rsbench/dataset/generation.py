@@ -27,7 +27,7 @@ from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_png, write_poses
 from rsbench.dataset.hashes import HASHES, FileHashes, HashedFile
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
-from rsbench.dataset.sequence import FORMAT, FRAMES, UNITS, files_of, is_of_sequence, sequence_manifest
+from rsbench.dataset.sequence import FORMAT, FRAMES, UNITS, files_of, is_of_sequence
 from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, remove, strangers, workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_jobs import finished_jobs
@@ -139,16 +139,7 @@ def _plan(card: DatasetCard, sequence: SequenceCard, options: RendererOptions, s
         names = ", ".join(scene.viewpoints)
         raise RsbenchError(f"scene {sequence.scene}: no viewpoint {sequence.viewpoint!r}; there are: {names}")
     viewpoint = scene.viewpoints[sequence.viewpoint]
-    manifest = sequence_manifest(
-        name=sequence.name,
-        rig=card.rig_of(sequence),
-        shutter=card.shutter(),
-        motion=card.motion_of(sequence),
-        frame_period_s=card.frame_period_s,
-    )
-    sensor = {} if card.sensor is None else {"sensor": asdict(card.sensor)}
-    return manifest | {
-        **sensor,
+    return card.manifest_of(sequence) | {
         "scene": {
             "name": scene.name,
             "sha256": "",

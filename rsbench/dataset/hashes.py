@@ -85,7 +85,7 @@ def _read(store: Path) -> dict[str, HashedFile]:
     try:
         with store.open(encoding="utf-8", errors="replace") as stream:
             for line in stream:
-                with contextlib.suppress(ValueError, TypeError):  # an empty line, or one that was cut
+                with contextlib.suppress(ValueError, TypeError, RecursionError):  # empty, cut, or not ours
                     name, size, modified, changed, digest = json.loads(line)
                     known[name] = HashedFile(size, modified, changed, digest)
     except OSError:

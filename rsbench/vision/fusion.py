@@ -37,7 +37,7 @@ class Origin(IntEnum):
     HERE = 1
     """The frame itself, at a measured depth, at infinity, or where its depth hardly moves it."""
     GUESSED = 2
-    """The frame itself, at a depth guessed from its neighbours."""
+    """At a depth guessed from its neighbours: the frame itself, or, in a tear that it does not show, another."""
     OTHER_CAMERA = 3
     """The other camera's frame of the same time."""
     OTHER_FRAME = 4

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from attack.clean_sequences import false_alarms
-from attack.planted_faults import FAULTS, Fault, found, planted
+from attack.planted_faults import FAULTS
+from attack.planting import Fault, found, planted
 
 SAMPLE = [fault for fault in FAULTS if not (fault.rendered or fault.slow)][4::9]
 

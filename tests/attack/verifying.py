@@ -9,7 +9,8 @@ import time
 from pathlib import Path
 
 from attack.clean_sequences import false_alarms
-from attack.planted_faults import FAULTS, found, planted
+from attack.planted_faults import FAULTS
+from attack.planting import found, planted
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
 

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from attack.planted_faults import rehash
+from attack.planting import rehash
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.dataset.card import load_dataset_card
