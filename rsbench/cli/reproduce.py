@@ -20,7 +20,7 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench reproduce sweeps --out results                   [dim](results/sweeps: limits, degeneracies)[/dim]
 
-  rsbench reproduce fig4 --out results --data data         [dim](renders 21 sequences first: minutes)[/dim]"""
+  rsbench reproduce fig4 --out results --data data         [dim](renders 63 sequences first: 20 minutes)[/dim]"""
 
 
 class Target(StrEnum):

@@ -64,7 +64,9 @@ def correction(out: Path, data: Path, workers: int | None = None) -> None:
     for card in STRATA:
         _generate(card, data)
         with progress_bar(f"correcting {card}", len(read_dataset(data / card))) as advance:
-            for table, rows in zip(tables, study_dataset(data / card, advance, workers=workers), strict=True):
+            kept = data / "correction" / card
+            study = study_dataset(data / card, advance, workers=workers, kept=kept)
+            for table, rows in zip(tables, study, strict=True):
                 frame = pd.DataFrame(rows)
                 frame.insert(0, "stratum", card)
                 table.append(frame)

@@ -10,7 +10,7 @@ takes no pixels from the others.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +23,7 @@ from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.standard_metrics import Flip, Psnr, Ssim
 from rsbench.benchmark.studies.correction_methods import METHODS
+from rsbench.benchmark.studies.kept_rows import KeptRows, Row, Rows
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, VIEWS, Side, View
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
@@ -46,7 +47,6 @@ from rsbench.vision.simpler_depths import monocular_depth, plane_depth
 
 Mask = NDArray[np.bool_]
 Depth = NDArray[np.float32]
-Row = dict[str, Any]
 ROW_BANDS = 9
 """Bands of rows in which the flow error is reported; their distance from row 0 is the distance in time."""
 WORST = {column.name: column.worst for metric in (Psnr, Ssim, Flip) for column in metric.columns}
@@ -55,8 +55,6 @@ WORST = {column.name: column.worst for metric in (Psnr, Ssim, Flip) for column i
 
 _SLOW = {method.key for method in METHODS if method.slow_scores}
 _SCALED, _MONOCULAR = "gs-stereo-tracks-scaled", "gs-poselib-scaled"
-Rows = tuple[list[Row], list[Row], list[Row]]
-"""Scores of every method on every view, errors by row band, motion errors."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,11 +75,13 @@ def study_dataset(
     seed: int = 0,
     solver: str = "rs-stereo-refined",
     workers: int | None = 1,
+    kept: Path | None = None,
 ) -> Rows:
     """Scores of every method on every view, errors by row band, and the motion errors, of all sequences.
 
     ``solver`` names the solver of "our" motion, whose model the corrections take. ``step`` is called with the name
-    of each sequence done; ``workers`` processes share them, one per core for None.
+    of each sequence done; ``workers`` processes share them, one per core for None. A folder ``kept`` holds what is
+    done of a run that is cut off.
 
     Raises:
         RsbenchError: the dataset cannot be read, or there is no such solver.
@@ -89,20 +89,34 @@ def study_dataset(
     """
     sequences = read_dataset(dataset)
     found: dict[str, Rows] = {}
-    if workers == 1:
-        for sequence in sequences:
-            found[sequence.name] = study_sequence(sequence, seed, solver)
-            step(sequence.name)
-    else:
-        names, count = [sequence.name for sequence in sequences], workers or os.cpu_count() or 1
-        with closing(finished_jobs(_serve, names, count, {}, dataset, seed, solver)) as outcomes:
-            for name, rows in outcomes:
-                found[name] = rows
-                step(name)
+    store = None if kept is None else KeptRows(folder=kept, dataset=dataset, seed=seed, solver=solver)
+    if store is not None:
+        found = {one.name: rows for one in sequences if (rows := store.read(one.name)) is not None}
+    for name in found:
+        step(name)
+    missing = [sequence for sequence in sequences if sequence.name not in found]
+    with closing(_studied(missing, dataset, seed, solver, workers)) as outcomes:
+        for name, rows in outcomes:
+            found[name] = rows
+            if store is not None:
+                store.write(name, rows)
+            step(name)
     images, bands, motions = (
         [row for sequence in sequences for row in found[sequence.name][table]] for table in range(3)
     )
     return images, bands, motions
+
+
+def _studied(
+    sequences: list[Sequence], dataset: Path, seed: int, solver: str, workers: int | None
+) -> Generator[tuple[str, Rows], None, None]:
+    """Names of sequences with their rows, as they become ready."""
+    if workers == 1:
+        for sequence in sequences:
+            yield sequence.name, study_sequence(sequence, seed, solver)
+    else:
+        names, count = [sequence.name for sequence in sequences], workers or os.cpu_count() or 1
+        yield from finished_jobs(_serve, names, count, {}, dataset, seed, solver)
 
 
 def _serve(dataset: Path, seed: int, solver: str) -> Callable[[str], Rows]:

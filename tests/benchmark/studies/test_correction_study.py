@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from rsbench.benchmark.studies import correction_study
 from rsbench.benchmark.studies.correction_methods import METHODS
 from rsbench.benchmark.studies.correction_study import ROW_BANDS, flow_error, study_dataset
 from rsbench.benchmark.studies.correction_summary import (
@@ -20,6 +21,8 @@ from rsbench.benchmark.studies.correction_summary import (
     summarise_bands,
     verdict,
 )
+from rsbench.benchmark.studies.kept_rows import Rows
+from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.robust_motion import RobustEstimate
 from rsbench.report.correction_page import study_page, write_study
 from rsbench.solvers.engine.base import MotionEstimate
@@ -190,3 +193,28 @@ def test_flow_errors_are_lengths() -> None:
     flow[1, 2] = np.nan
     error = flow_error(flow, truth)
     assert error[0, 0] == 5.0 and np.isnan(error[1, 2]) and error[0, 1] == 0.0
+
+
+def test_a_study_that_was_cut_off_goes_on_where_it_stopped(
+    smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    studied: list[str] = []
+
+    def study_sequence(sequence: Sequence, seed: int, solver: str) -> Rows:
+        studied.append(sequence.name)
+        row = {"sequence": sequence.name, "psnr_all": 1 / 3, "flip_all": float("nan"), "success": True}
+        return [row], [row | {"band": 1}], [row]
+
+    def stop(name: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(correction_study, "study_sequence", study_sequence)
+    whole = study_dataset(smoke_dataset, lambda name: None)
+    with pytest.raises(KeyboardInterrupt):
+        study_dataset(smoke_dataset, stop, kept=tmp_path)
+    resumed = study_dataset(smoke_dataset, lambda name: None, kept=tmp_path)
+    for table, expected in zip(resumed, whole, strict=True):
+        pd.testing.assert_frame_equal(pd.DataFrame(table), pd.DataFrame(expected), check_exact=True)
+    assert studied == ["castle", "room-twist", "castle", "room-twist"]
+    study_dataset(smoke_dataset, lambda name: None, seed=1, kept=tmp_path)
+    assert studied[4:] == ["castle", "room-twist"]
