@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import platform
 import stat
 import sys
 import tempfile
@@ -34,3 +36,13 @@ def temporary() -> Path | None:
         return Path(tempfile.mkdtemp(prefix="rsbench-"))
     except OSError:
         return None
+
+
+def cpu_key() -> str:
+    """Names the CPU model: a home folder is often shared by machines that differ."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        known = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
+    except OSError:
+        known = [platform.processor()]
+    return hashlib.sha256("\n".join([platform.machine(), *known]).encode()).hexdigest()[:16]

@@ -6,8 +6,6 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import asdict
-from importlib import resources
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +14,9 @@ import numpy as np
 from rsbench.cards import card_path
 from rsbench.dataset.files import read_json, write_json
 from rsbench.errors import RsbenchError
-from rsbench.identity import hash_of_files
-from rsbench.renderers.verdicts import cpu_key
+from rsbench.scenes.kept import built_key
 from rsbench.scenes.load import read_scene_card
-from rsbench.scenes.mesh import MeshBuilder
 from rsbench.scenes.model import Scene
-
-_PACKAGES = ("numpy", "trimesh", "shapely", "mapbox-earcut")
-"""Decide, with the sources of ``rsbench.scenes``, what our builders make of a card."""
 
 
 def scene_hash(scene: Scene) -> str:
@@ -72,13 +65,7 @@ class SceneHashes:
 def scene_key(name: str) -> str | None:
     """Equal keys are equal scenes on one machine; None when files or other packages' code decide too."""
     card, builder = read_scene_card(card_path("scenes", name))
-    if isinstance(builder, MeshBuilder) or type(builder).__module__.partition(".")[0] != "rsbench":
+    key = built_key(builder, card.seed)
+    if key is None:
         return None
-    package = Path(str(resources.files("rsbench")))
-    content = {
-        "card": asdict(card),
-        "source": hash_of_files(package, sorted((package / "scenes").glob("*.py"))),
-        "packages": {each: version(each) for each in _PACKAGES},
-        "processor": cpu_key(),
-    }
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([key, asdict(card)], sort_keys=True).encode()).hexdigest()

@@ -20,6 +20,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rsbench.caches import cpu_key
 from rsbench.renderers import verdicts
 
 MINIMUM_VERSION = 17
@@ -168,7 +169,7 @@ def probe(candidate: Candidate, timeout: float = 60.0) -> Verdict:
     except OSError as error:
         return Verdict(ok=False, reason=f"cannot be opened ({error.strerror})")
     drjit = importlib.metadata.version("drjit")
-    key = f"llvm|{path}|{status.st_mtime_ns}|{status.st_size}|{drjit}|{verdicts.cpu_key()}"
+    key = f"llvm|{path}|{status.st_mtime_ns}|{status.st_size}|{drjit}|{cpu_key()}"
     known = verdicts.recall(key)
     if known is not None:
         return Verdict(ok=True, version=known)

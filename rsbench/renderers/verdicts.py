@@ -6,10 +6,8 @@ Nothing here may fail: without a home folder or with a read-only one there is si
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
-import platform
 import tempfile
 from pathlib import Path
 
@@ -24,16 +22,6 @@ def cache_file() -> Path | None:
     except RuntimeError:
         return None
     return base / "rsbench" / "probes.json" if base.is_absolute() else None
-
-
-def cpu_key() -> str:
-    """Names the CPU model: a home folder is often shared by machines that differ."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-        known = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
-    except OSError:
-        known = [platform.processor()]
-    return hashlib.sha256("\n".join([platform.machine(), *known]).encode()).hexdigest()[:16]
 
 
 def recall(key: str) -> str | None:

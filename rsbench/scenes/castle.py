@@ -22,6 +22,8 @@ from rsbench.scenes.parts import Piece, assemble, grid, lump, placed
 class CastleBuilder(SceneBuilder):
     """The courtyard of a castle; lengths in metres."""
 
+    closed = True
+
     wall_height: float = 6.5
     keep_height: float = 15.0
     trees: int = 26

@@ -12,6 +12,7 @@ from rsbench.cards import card_path, parse_card, read_toml
 from rsbench.errors import RsbenchError
 from rsbench.imports import blaming
 from rsbench.plugins import Kind, NoOptions, load_class, make_component
+from rsbench.scenes.kept import built_key, keep, kept_meshes
 from rsbench.scenes.model import Light, Scene, SceneBuilder, SceneMesh, Viewpoint
 
 _FARTHEST = 1e9
@@ -104,12 +105,23 @@ def load_scene(name_or_path: str | Path) -> Scene:
     path = card_path("scenes", name_or_path)
     card, builder = read_scene_card(path)
     if type(builder).__module__.partition(".")[0] == "rsbench":
-        meshes = tuple(builder.build(card.seed, path.parent))
+        meshes = _built(builder, card.seed, path.parent)
     else:
         with blaming(f"{path}: builder = {card.builder!r}", "failed"):
             meshes = tuple(builder.build(card.seed, path.parent))
     _check_meshes(meshes, f"{path}: builder = {card.builder!r}")
     return Scene(name=card.name, meshes=meshes, light=card.light.light(), viewpoints=card.viewpoints)
+
+
+def _built(builder: SceneBuilder, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
+    """Meshes of a builder of ours, from the cache where they can be kept."""
+    key = built_key(builder, seed)
+    meshes = None if key is None else kept_meshes(key)
+    if meshes is None:
+        meshes = tuple(builder.build(seed, folder))
+        if key is not None:
+            keep(key, meshes)
+    return meshes
 
 
 def read_scene_card(path: Path) -> tuple[SceneCard, SceneBuilder]:

@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +87,9 @@ class Viewpoint:
 
 class SceneBuilder(ABC):
     """Makes the meshes of a scene. A frozen dataclass: its fields are the parameters that a scene card may set."""
+
+    closed: ClassVar[bool] = False
+    """Whether parameters and seed alone decide the meshes, so that they can be kept; only ours are asked."""
 
     @abstractmethod
     def build(self, seed: int, folder: Path) -> Sequence[SceneMesh]:

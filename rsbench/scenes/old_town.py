@@ -25,6 +25,8 @@ _GROUNDS = ("stone", "ashlar_1", "ashlar_3", "brick")
 class OldTownBuilder(SceneBuilder):
     """A street and a market square; lengths in metres."""
 
+    closed = True
+
     street_width: float = 9.0
     storeys: tuple[int, int] = (2, 3)
     """Least and greatest number of storeys of the houses."""

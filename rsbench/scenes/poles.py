@@ -26,6 +26,8 @@ _HEIGHT = 3.2
 class PolesBuilder(SceneBuilder):
     """A yard seen past posts, rails and a street lamp."""
 
+    closed = True
+
     posts: int = 9
     """Thin ones in the middle of the picture."""
     thinnest: float = 0.008

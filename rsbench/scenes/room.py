@@ -24,6 +24,8 @@ _HALF_X, _HALF_Y = 2.7, 2.9
 class RoomBuilder(SceneBuilder):
     """A living room, furnished."""
 
+    closed = True
+
     ceiling_height: float = 2.7
     """Metres."""
     chairs: int = 3
