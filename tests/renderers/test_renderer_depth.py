@@ -135,6 +135,20 @@ def test_depth_of_a_fine_ball_is_that_of_the_sphere() -> None:
     assert (depth[discriminant < 0] == 0).all()
 
 
+@pytest.mark.parametrize("tiny", [-2e-19, -0.0, 1e-19, -1e-17])
+def test_a_ray_that_runs_along_an_axis_but_for_rounding_harms_no_neighbour(tiny: float) -> None:
+    """Embree's packets lose what hits rays beside one whose direction has a component between -1e-18 and 0."""
+    camera = PinholeCamera.centred(61, 45, 50.0)
+    wall = trimesh.creation.box((80.0, 80.0, 2.0)).subdivide().subdivide()
+    wall.apply_translation((0.0, 0.0, 6.0))
+    faces = np.asarray(wall.faces, dtype=np.int32)
+    mesh = SceneMesh(name="wall", vertices=wall.vertices, faces=faces, material=Material(name="grey"))
+    R = np.eye(3)
+    R[2, :2] = tiny
+    frame = render_global(scene_of(mesh), camera, R, np.array([0.2, 0.3, -0.4]), QUICK)
+    np.testing.assert_allclose(frame.depth, 4.6, rtol=FLOAT32)
+
+
 def test_a_surface_may_be_arbitrarily_near(quad: Any) -> None:
     wall = quad([[-1, -1, 0.001], [1, -1, 0.001], [1, 1, 0.001], [-1, 1, 0.001]])
     depth = render_global(scene_of(wall), CAMERA, np.eye(3), np.zeros(3), QUICK).depth
