@@ -5,6 +5,8 @@ A file may name others, such as textures, in its own folder and below.
 
 from __future__ import annotations
 
+import io
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 from rsbench.errors import RsbenchError
 from rsbench.imports import in_words
 from rsbench.reading import FILE_BYTES, check_amount, check_size
+from rsbench.scenes.gltf import TextureTransform
 from rsbench.scenes.mesh_limits import check_mesh_file
 from rsbench.scenes.model import FloatArray, Material, SceneBuilder, SceneMesh
 
@@ -43,6 +46,8 @@ class MeshBuilder(SceneBuilder):
     heading_deg: float = 0.0
     """Turns the model anticlockwise about the vertical."""
     shading: Literal["flat", "smooth"] = "flat"
+    transparent: Literal["refuse", "opaque"] = "refuse"
+    """What becomes of surfaces that the file cuts out or blends by an alpha: only opaque ones can be rendered."""
 
     def __post_init__(self) -> None:
         if not self.metres_per_unit > 0:
@@ -70,21 +75,32 @@ class MeshBuilder(SceneBuilder):
             raise RsbenchError(f"mesh file {path}: cannot be read: {in_words(error)}") from error
 
     def _meshes(self, path: Path) -> tuple[SceneMesh, ...]:
-        model = _read(path)
+        model, transforms = _read(path)
         _check_size(model, path)
         angle = np.deg2rad(self.heading_deg)
         heading = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
         axes = self.metres_per_unit * heading @ _Z_UP[self.up_axis]
-        materials: dict[int, Material] = {}
+        look = _Look(shading=self.shading, transparent=self.transparent, transforms=transforms, materials={})
         meshes = []
         for node in sorted(model.graph.nodes_geometry):
             transform, name = model.graph[node]
             part = model.geometry[name]
             if isinstance(part, trimesh.Trimesh) and len(part.faces):
-                meshes.append(_scene_mesh(str(node), part, axes, transform, self.shading, materials, path))
+                meshes.append(_scene_mesh(str(node), part, axes, transform, look, path))
         if not meshes:
             raise RsbenchError(f"{path}: holds no triangles")
         return tuple(meshes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Look:
+    """What the parts of a file share, besides their geometry."""
+
+    shading: str
+    transparent: str
+    transforms: dict[str, TextureTransform]
+    materials: dict[int, Material]
+    """Made so far, by the identity of what trimesh read."""
 
 
 def _check_size(model: Any, path: Path) -> None:
@@ -95,19 +111,24 @@ def _check_size(model: Any, path: Path) -> None:
 
 
 class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc,unused-ignore]
-    """Files beside the model and below; remembers what was wrong with them, which trimesh only logs."""
+    """Files beside the model and below, as UTF-8; remembers what was wrong with them, which trimesh only logs."""
 
     def __init__(self, source: str) -> None:
         super().__init__(source)
         self.wrong: list[str] = []
+        self.libraries: list[bytes] = []
+        """Contents of the MTL files that were read."""
 
     def get(self, name: str) -> bytes:
         try:
-            content: bytes = super().get(name)
+            content: bytes = super().get(name.replace("\\", "/"))  # exporters on Windows write paths of theirs
         except Exception as error:
             too_large = isinstance(error, RsbenchError)
             self.wrong.append(str(error) if too_large else f"{name}, which is missing or lies outside its folder")
             raise
+        if name.lower().endswith(".mtl"):
+            content = _as_utf8(content)
+            self.libraries.append(content)
         return content
 
     def absolute(self, name: str) -> Path:
@@ -119,16 +140,43 @@ class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc,unus
         return path
 
 
-def _read(path: Path) -> Any:
+def _as_utf8(text: bytes) -> bytes:
+    """Text of unknown encoding: UTF-8 when it can be, else the old one of Western exporters."""
+    try:
+        text.decode("utf-8")
+    except UnicodeDecodeError:
+        return text.decode("latin-1").encode("utf-8")
+    return text
+
+
+def _read(path: Path) -> tuple[Any, dict[str, TextureTransform]]:
+    """What trimesh makes of a file, and the transforms of its textures."""
     if not path.is_file():
         raise RsbenchError(f"mesh file {path}: no such file (parameters.file is relative to the card)")
-    check_mesh_file(path)
+    transforms = check_mesh_file(path)
     neighbours = _Neighbours(str(path))
+    options = {"resolver": neighbours, "process": False}
     try:
-        return trimesh.load_scene(str(path), resolver=neighbours, process=False)
+        if path.suffix.lower() != ".obj":
+            return trimesh.load_scene(str(path), **options), transforms
+        content = path.read_bytes()
+        text = _as_utf8(content)
+        given = {"file_obj": str(path)} if text == content else {"file_obj": io.BytesIO(text), "file_type": "obj"}
+        model = trimesh.load_scene(**given, **options)
+        _check_names(text, neighbours.libraries, path)
+        return model, transforms
     finally:
         if neighbours.wrong:
             raise RsbenchError(f"mesh file {path}: refers to {neighbours.wrong[0]}")
+
+
+def _check_names(text: bytes, libraries: list[bytes], path: Path) -> None:
+    """Refuse materials that no library has, where trimesh takes grey instead; an OBJ without any is grey."""
+    used = re.findall(rb"^\s*usemtl[ \t]+(.+?)\s*$", text, re.MULTILINE)
+    known = re.findall(rb"^\s*newmtl[ \t]+(.+?)\s*$", b"\n".join(libraries), re.MULTILINE)
+    missing = sorted(set(used) - set(known)) if libraries else []
+    if missing:
+        raise RsbenchError(f"mesh file {path}: usemtl {missing[0].decode()}: its .mtl has no such material")
 
 
 def _scene_mesh(
@@ -136,8 +184,7 @@ def _scene_mesh(
     part: Any,
     axes: FloatArray,
     transform: FloatArray,
-    shading: str,
-    materials: dict[int, Material],
+    look: _Look,
     path: Path,
 ) -> SceneMesh:
     where = f"mesh file {path}: part {name!r}"
@@ -149,17 +196,20 @@ def _scene_mesh(
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise RsbenchError(f"{where} has faces that name vertices beyond its {len(vertices)}")
     faces = faces.astype(np.int32)
-    normals = _normals(part, linear, where) if shading == "smooth" else None
+    normals = _normals(part, linear, where) if look.shading == "smooth" else None
     if part.visual.kind in ("vertex", "face"):
         return _coloured_faces(name, vertices, faces, normals, np.asarray(part.visual.face_colors)[:, :3])
     source = getattr(part.visual, "material", None)
     uv = getattr(part.visual, "uv", None)
-    if id(source) not in materials:
-        materials[id(source)] = _material(source, where, list(materials.values()))
-    material = materials[id(source)]
+    if id(source) not in look.materials:
+        _check_alpha(source, where, look.transparent)
+        look.materials[id(source)] = _material(source, where, list(look.materials.values()))
+    material = look.materials[id(source)]
     if material.texture is not None and (uv is None or not np.isfinite(uv).all()):
         raise RsbenchError(f"{where} has a texture but no finite texture coordinates")
     uv = None if uv is None else np.asarray(uv, dtype=np.float64)
+    if uv is not None and (transform_of := look.transforms.get(material.name)) is not None:
+        uv = transform_of(uv)
     return SceneMesh(name=name, vertices=vertices, faces=faces, material=material, uv=uv, normals=normals)
 
 
@@ -173,6 +223,31 @@ def _normals(part: Any, linear: FloatArray, where: str) -> FloatArray:
     if not np.isfinite(normals).all():
         raise RsbenchError(f"{where} has normals that are not finite")
     return normals
+
+
+def _check_alpha(source: Any, where: str, transparent: str) -> None:
+    """Refuse a material that is anywhere less than opaque, unless that is to be passed over.
+
+    Raises:
+        RsbenchError: see above.
+    """
+    if transparent == "opaque" or source is None:
+        return
+    image, least = None, 1.0
+    if isinstance(source, trimesh.visual.material.PBRMaterial):
+        if source.alphaMode in ("MASK", "BLEND"):
+            image = source.baseColorTexture
+            least = 1.0 if source.baseColorFactor is None else float(source.baseColorFactor[3]) / 255
+    else:
+        stated = getattr(source, "kwargs", {})
+        least = 0.0 if "map_d" in stated else float(stated.get("d", [1.0])[-1])
+    if image is not None and image.mode in ("RGBA", "LA", "PA"):
+        least = min(least, image.getchannel("A").getextrema()[0] / 255)
+    if least < 1.0:
+        raise RsbenchError(
+            f"{where} is transparent, and only opaque surfaces are rendered: model its outline as geometry, or "
+            'write transparent = "opaque" to fill it'
+        )
 
 
 def _material(source: Any, where: str, others: list[Material]) -> Material:

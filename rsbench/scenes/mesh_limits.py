@@ -9,6 +9,7 @@ from typing import Any
 
 from rsbench.errors import RsbenchError
 from rsbench.reading import FILE_BYTES, check_amount, parse_json, read_bytes
+from rsbench.scenes.gltf import TextureTransform, check_extensions, texture_transforms
 
 PARTS = 1 << 12
 """Nodes, meshes, materials and so on, of each kind."""
@@ -18,11 +19,10 @@ _DEEPEST = 64
 _VISITS = 1 << 28
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 _TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_ARCHIVED = "KHR_materials_pbrSpecularGlossiness"
 
 
-def check_mesh_file(path: Path) -> None:
-    """Refuse a mesh file that says of itself that it unfolds to too much.
+def check_mesh_file(path: Path) -> dict[str, TextureTransform]:
+    """Refuse a mesh file that says of itself that it unfolds to too much; returns its transforms of textures.
 
     Raises:
         RsbenchError: that, a format that is not read, or a header that cannot be one.
@@ -35,15 +35,16 @@ def check_mesh_file(path: Path) -> None:
     try:
         match path.suffix.lower():
             case ".glb":
-                _check_gltf(_json_chunk(data), where)
+                return _check_gltf(_json_chunk(data), where)
             case ".gltf":
-                _check_gltf(data, where)
+                return _check_gltf(data, where)
             case ".ply":
                 _check_ply(data, where)
             case ".obj":
                 _check_obj(data, where)
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise RsbenchError(f"{where}: cannot be read: {type(error).__name__} in its header: {error}") from error
+    return {}
 
 
 def _json_chunk(data: bytes) -> bytes:
@@ -52,7 +53,7 @@ def _json_chunk(data: bytes) -> bytes:
     return data[20 : 20 + int.from_bytes(data[12:16], "little")]
 
 
-def _check_gltf(text: bytes, where: str) -> None:
+def _check_gltf(text: bytes, where: str) -> dict[str, TextureTransform]:
     header = parse_json(text.decode("utf-8"), where)
     for name, items in header.items():
         if isinstance(items, list):
@@ -64,8 +65,10 @@ def _check_gltf(text: bytes, where: str) -> None:
     used = [index for primitive in primitives for index in _accessors(primitive)]
     check_amount(where, "values of all primitives", sum(sizes[index] for index in used), VALUES)
     _check_graph(header, where)
-    if any(_ARCHIVED in material.get("extensions", {}) for material in header.get("materials", [])):
-        raise RsbenchError(f"{where}: has materials of {_ARCHIVED}: export it with metallic-roughness ones")
+    check_extensions(header, where)
+    if any(not {"bufferView", "sparse"} & set(header["accessors"][index]) for index in used):
+        raise RsbenchError(f"{where}: has meshes without data: export it without compression")
+    return texture_transforms(header, where)
 
 
 def _check_graph(header: dict[str, Any], where: str) -> None:
