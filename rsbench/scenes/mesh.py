@@ -21,6 +21,7 @@ from rsbench.reading import FILE_BYTES, check_amount, check_size
 from rsbench.scenes.gltf import TextureTransform
 from rsbench.scenes.mesh_limits import check_mesh_file
 from rsbench.scenes.model import FloatArray, Material, SceneBuilder, SceneMesh
+from rsbench.scenes.staging import standing, surroundings
 
 # Rows turn file axes into a right-handed frame with z up.
 _Z_UP = {
@@ -49,15 +50,28 @@ class MeshBuilder(SceneBuilder):
     transparent: Literal["refuse", "opaque"] = "refuse"
     """What becomes of surfaces that the file cuts out or blends by an alpha: only opaque ones can be rendered."""
 
+    size: float | None = None
+    """Longest side of the model's box, metres, whatever its units are."""
+    place: Literal["file", "origin"] = "file"
+    """``origin`` sets the model over the scene's origin, its lowest point at z = 0."""
+    ground: bool = False
+    """Cobbles below the model."""
+    backdrop: bool = False
+    """Brick walls around it, four of its sizes away."""
+
     def __post_init__(self) -> None:
-        if not self.metres_per_unit > 0:
-            raise ValueError(f"metres_per_unit = {self.metres_per_unit}: must be positive")
+        for name in ("metres_per_unit", "size"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} = {value}: must be positive")
+        if self.size is not None and self.place == "file":
+            raise ValueError('size: needs place = "origin", for the file\'s own place has no size')
 
     def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
         """Meshes of a file in the scene frame, one for each part of its scene graph, textures and uv kept.
 
         Args:
-            seed: decides nothing here.
+            seed: of the textures of ground and walls.
             folder: where a relative path starts.
 
         Raises:
@@ -66,7 +80,10 @@ class MeshBuilder(SceneBuilder):
         path = folder / Path(self.file).expanduser()
         try:
             with np.errstate(all="ignore"):  # what is not finite is refused by name
-                return self._meshes(path)
+                meshes = self._meshes(path)
+                if self.place == "origin":
+                    meshes = standing(meshes, self.size)
+                return meshes + surroundings(meshes, self.ground, self.backdrop, seed)
         except RsbenchError:
             raise
         except (

@@ -430,3 +430,25 @@ def test_an_obj_whose_material_is_missing_or_transparent_is_refused(tmp_path: Pa
     # Without usemtl there is no material to miss.
     (mesh,) = load(tmp_path, _obj(tmp_path, "", "newmtl m\nKd 1 0 0\n")).meshes
     assert len(mesh.faces) == 1
+
+
+def test_a_model_of_any_size_and_place_is_framed(tmp_path: Path) -> None:
+    """A box far from its file's origin, in millimetres: over the scene's origin, two metres at its longest."""
+    crate = trimesh.creation.box((400.0, 1000.0, 250.0))
+    crate.apply_translation((5000.0, -300.0, 7000.0))
+    crate.export(tmp_path / "crate.glb")
+    parameters = 'file = "crate.glb"\nplace = "origin"\nsize = 2.0\nground = true\nbackdrop = true'
+    model, *around = load(tmp_path, parameters).meshes
+    np.testing.assert_allclose(model.vertices.min(axis=0), (-0.4, -0.25, 0.0), atol=1e-6)
+    np.testing.assert_allclose(model.vertices.max(axis=0), (0.4, 0.25, 2.0), atol=1e-6)
+    walls, floor = around
+    assert floor.vertices[:, 2].max() < 0.0 == model.vertices[:, 2].min()
+    # Walls all around, four sizes away, taller than the model; the ground reaches beyond them.
+    assert np.abs(walls.vertices[:, :2]).max(axis=1).min() == pytest.approx(8.0, abs=1e-5)
+    assert walls.vertices[:, 2].max() > 3.9
+    np.testing.assert_allclose(np.ptp(floor.vertices[:, :2], axis=0), 32.0, atol=1e-5)
+
+
+def test_a_size_without_a_place_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RsbenchError, match='size: needs place = "origin"'):
+        load(tmp_path, 'file = "crate.glb"\nsize = 2.0')
