@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -62,3 +63,18 @@ def test_a_document_that_does_not_exist_is_named_with_the_nearest() -> None:
         rsbench.RsbenchError, match=r"document 'convention' does not exist \(did you mean 'conventions'"
     ):
         docs("convention")
+
+
+def test_a_mesh_becomes_a_dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The script as printed, on smaller frames; what it makes is what verify finds."""
+    script = runpy.run_path(str(ROOT / "examples" / "own_mesh.py"))
+    small = script["DATASET"].replace("480", "96").replace("360", "72").replace("default", "preview")
+    monkeypatch.setitem(script["main"].__globals__, "DATASET", small)
+    monkeypatch.setattr("sys.argv", ["own_mesh.py", "--out", str(tmp_path), "--picture", str(tmp_path / "p.jpg")])
+    script["main"]()
+    assert (tmp_path / "p.jpg").stat().st_size > 1000
+    assert not any(report.faults for report in rsbench.verify(tmp_path / "data"))
+    (sequence,) = rsbench.read_dataset(tmp_path / "data")
+    depth = sequence.depth("rs", "left", 0)
+    assert depth[36:].min() > 0.0  # the ground, at least
+    assert 3.5 < depth[20:40, 36:60].min() < 5.1  # the model, in the middle, 5 m away
