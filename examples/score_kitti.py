@@ -5,7 +5,7 @@ python examples/score_kitti.py FOLDER [--left image_0 --right image_1] [--ratio 
 FOLDER holds calib.txt (projection matrices, the first two of the left and the right camera), poses.txt (3 x 4
 matrices world_from_left, one line a frame) and two folders of rectified images. Global-shutter footage has the
 readout ratio 0; --ratio none has it estimated, with the disparity offset, from all windows. A wrong --ratio or
---focal (a factor) shows what becomes of a wrong card.
+--focal (a factor) shows what becomes of a wrong card. When every window was solved, the last line tells the drift.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, read_frame
 from rsbench.pipeline.frame_motion import match_frames, solve_frames
 from rsbench.pipeline.sliding import estimate_sequence_readout
+
+Step = tuple[FloatArray, FloatArray]
+"""Rotation (3, 3) and translation (3,), metres, of the body from one frame to the next."""
 
 
 def read_matrices(path: Path) -> FloatArray:
@@ -69,6 +72,22 @@ def true_motion(before: FloatArray, after: FloatArray, rig: StereoRig) -> tuple[
     t = after[:, :3].T @ (before[:, 3] - after[:, 3])
     offset = rig.offset("left")
     return R, t - offset + R @ offset
+
+
+def end_of(steps: Sequence[Step]) -> FloatArray:
+    """Where the body is after some motions, (3,), in its first frame."""
+    R, t = np.eye(3), np.zeros(3)
+    for turn, d in steps:
+        R, t = turn @ R, turn @ t + d
+    return -R.T @ t
+
+
+def drift(steps: Sequence[tuple[Step, Step]]) -> str:
+    """Line about estimated and true motions of windows that follow each other."""
+    found, true = zip(*steps, strict=True)
+    path = sum(float(np.linalg.norm(d)) for _, d in true)
+    off = float(np.linalg.norm(end_of(found) - end_of(true)))
+    return f"drift {off:.2f} m over {path:.0f} m, {off / path:.1%}"
 
 
 def readout_ratio(word: str) -> float | None:
@@ -131,7 +150,7 @@ def score(given: argparse.Namespace) -> list[str]:
         found = estimate_sequence_readout(sources[0], sources[1], rig, options)
         ratio, offset = found.readout_ratio, found.disparity_offset
         lines.append(f"readout ratio {found}, disparity offset {offset:+.2f} +- {found.offset_sigma:.2f} px")
-    rows, refused = [], 0
+    rows, steps, refused = [], [], 0
     for k in range(0, len(poses) - 1, given.every):
         images = {
             (side, n): read_frame(files[i][k + n]) for n in (0, 1) for i, side in enumerate(("left", "right"))
@@ -144,6 +163,7 @@ def score(given: argparse.Namespace) -> list[str]:
             continue
         R, d = true_motion(poses[k], poses[k + 1], rig)
         w_est, d_est = motion.motion.w, motion.motion.d
+        steps.append(((so3.exp(w_est), d_est), (R, d)))
         rows.append(
             (
                 np.rad2deg(rotation_error(w_est, so3.log(R))),
@@ -154,6 +174,8 @@ def score(given: argparse.Namespace) -> list[str]:
         lines.append("{:4d}  e_R {:.3f} deg  e_T {:.2f} deg  length {:+.1%}".format(k, *rows[-1]))
     if rows:
         lines.append("median  e_R {:.3f} deg  e_T {:.2f} deg  length {:+.1%}".format(*np.median(rows, axis=0)))
+    if len(rows) == len(poses) - 1:
+        lines.append(drift(steps))
     return [*lines, f"{refused} of {len(rows) + refused} windows refused"]
 
 

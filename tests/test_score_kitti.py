@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
+from rsbench.core import so3
+
 ROOT = Path(__file__).parents[1]
 F, BASELINE, DEPTH, STEP = 200.0, 0.5, 10.0, 6
 
@@ -48,9 +50,20 @@ def test_a_known_motion_scores_well(script: ModuleType, folder: Path, capsys: py
     """Whole pixels of motion: SIFT's keypoints repeat to 0.05 px, which is 0.01 deg and 1 % of 6 px."""
     assert script.main([str(folder)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    rotation, direction, length = map(float, re.findall(r"[-+]?\d+\.\d+", lines[-2]))
+    rotation, direction, length = map(float, re.findall(r"[-+]?\d+\.\d+", lines[-3]))
     assert rotation < 0.05 and direction < 1.0 and abs(length) < 1.0
+    off, path, share = map(float, re.findall(r"\d+\.?\d*", lines[-2]))
+    assert off < 0.02 and path == 1.0 and share < 2.0  # 0.6 m, rounded
     assert lines[-1] == "0 of 2 windows refused"
+
+
+def test_the_drift_is_the_distance_at_the_end(script: ModuleType) -> None:
+    """A quarter turn on the spot, then a metre ahead: to the right of the first frame, or to the left."""
+    turn = so3.exp(np.array([0.0, np.pi / 2, 0.0]))
+    ahead = (np.eye(3), np.array([0.0, 0.0, -1.0]))  # the world comes nearer
+    right, left = ([(each, np.zeros(3)), ahead] for each in (turn.T, turn))
+    np.testing.assert_allclose(script.end_of(right), (1.0, 0.0, 0.0), atol=1e-12)
+    assert script.drift(list(zip(left, right, strict=True))) == "drift 2.00 m over 1 m, 200.0%"
 
 
 def test_exchanged_cameras_are_refused_in_every_window(
