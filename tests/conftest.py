@@ -86,10 +86,10 @@ def _give_back_after_large_scenes(request: pytest.FixtureRequest, give_back: Cal
 
 @pytest.fixture(scope="session")
 def built_scene() -> Callable[[str], Scene]:
-    """``load_scene``, which takes seconds for a built-in scene, with the last three kept."""
+    """``load_scene`` with the last one kept: hundreds of MB."""
     from rsbench.scenes.load import load_scene
 
-    return lru_cache(maxsize=3)(load_scene)
+    return lru_cache(maxsize=1)(load_scene)
 
 
 @pytest.fixture(scope="session")

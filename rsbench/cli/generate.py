@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rsbench.cli.kinds import complete
+
+if TYPE_CHECKING:
+    from rsbench.dataset.card import DatasetCard
 
 EPILOG = """[bold]Examples[/bold]
 
   rsbench generate paper --out data/paper
 
   rsbench generate smoke --out data/smoke --sequence castle
+
+  rsbench generate moderate --out data/moderate --estimate [dim](only say what it will take)[/dim]
+
+  rsbench generate moderate --out data/moderate --shard 2/4 [dim](on the second of four machines; then bring all
+  folders into one and run it without --shard: it checks them and writes dataset.json)[/dim]
 
   rsbench generate smoke --out data/stack --full-frames    [dim](keeps every row's whole image)[/dim]"""
 
@@ -27,7 +35,13 @@ def generate(
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder of the dataset; an interrupted run resumes there.")],
-    sequence: Annotated[list[str] | None, typer.Option(help="Only this sequence of the card; repeatable.")] = None,
+    sequence: Annotated[
+        list[str] | None,
+        typer.Option("--sequence", "--only", help="Only this sequence of the card; repeatable."),
+    ] = None,
+    shard: Annotated[
+        str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts of the sequences: one machine's.")
+    ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes; each renders whole sequences.")] = 1,
     full_frames: Annotated[
         bool,
@@ -36,6 +50,12 @@ def generate(
     rehash: Annotated[
         bool,
         typer.Option("--rehash", help="Read all that is there again, not only what has another size or time."),
+    ] = False,
+    estimate: Annotated[
+        bool,
+        typer.Option(
+            "--estimate", help="Only say how many files, bytes and minutes; tries one camera of each scene."
+        ),
     ] = False,
 ) -> None:
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
@@ -48,16 +68,51 @@ def generate(
     dataset = load_dataset_card(card)
     if sequence:
         dataset = dataset.only(sequence)
-    check_out(out)
+    if shard:
+        dataset = dataset.shard(*_part(shard))
+    if not estimate:
+        check_out(out)
     backend = start_backend()
     if backend.message:
         typer.echo(backend.message, err=True)
+    if estimate:
+        typer.echo(_estimated(dataset, full_frames))
+        return
     steps = STEPS * len(dataset.sequence)
     with progress_bar(f"rendering {dataset.name}", steps) as advance:
         rendered = generate_dataset(
             dataset, out, workers=workers, full_frames=full_frames, rehash=rehash, progress=advance
         )
     typer.echo(f"{out}: {len(dataset.sequence)} sequences, {len(rendered)} rendered now")
+
+
+def _part(word: str) -> tuple[int, int]:
+    """Of ``2/5``: 2 and 5."""
+    from rsbench.errors import RsbenchError
+
+    part, slash, parts = word.partition("/")
+    if not (slash and part.isdecimal() and parts.isdecimal()):
+        raise RsbenchError(f"--shard {word}: must be I/N, such as 1/4")
+    return int(part), int(parts)
+
+
+def _estimated(dataset: DatasetCard, full_frames: bool) -> str:
+    """What it will take, in one line."""
+    from rsbench.cli.console import progress_bar
+    from rsbench.dataset.estimate import estimate_dataset
+    from rsbench.errors import RsbenchError
+
+    if full_frames:
+        raise RsbenchError("--estimate: not with --full-frames, of which one frame takes as long as hundreds")
+    scenes = len({sequence.scene for sequence in dataset.sequence})
+    with progress_bar("trying each scene", scenes) as advance:
+        found = estimate_dataset(dataset, advance)
+    size = f"{found.bytes / 1e9:.1f} GB" if found.bytes >= 1e9 else f"{found.bytes / 1e6:.0f} MB"
+    minutes = f"{found.seconds / 60:.0f} min" if found.seconds >= 120 else f"{found.seconds:.0f} s"
+    return (
+        f"{dataset.name}: {found.sequences} sequences, {found.files} files, about {size}, about {minutes} in one "
+        "process on this machine"
+    )
 
 
 def register(app: typer.Typer) -> None:

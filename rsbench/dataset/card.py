@@ -211,6 +211,20 @@ class DatasetCard:
                 raise RsbenchError(f"dataset {self.name}: no sequence {name!r}; there are: {', '.join(known)}")
         return replace(self, sequence=tuple(known[name] for name in names))
 
+    def shard(self, part: int, parts: int) -> DatasetCard:
+        """The same card with every ``parts``-th sequence, from the ``part``-th, counted from 1.
+
+        Raises:
+            RsbenchError: no such part, or none of the sequences is in it.
+        """
+        if not 1 <= part <= parts:
+            raise RsbenchError(f"shard {part}/{parts}: the first number goes from 1 to the second")
+        if part > len(self.sequence):
+            raise RsbenchError(
+                f"shard {part}/{parts}: is empty, for {self.name} has {len(self.sequence)} sequences"
+            )
+        return replace(self, sequence=self.sequence[part - 1 :: parts])
+
     def expanded(self) -> DatasetCard:
         """One sequence per seed, and every random axis drawn: a card that says all that it will make."""
         if not self.seeds:

@@ -95,7 +95,7 @@ def generate_dataset(
     plans = {each.name: _plan(card, each, options, scenes(each.scene)) for each in card.sequence}
     with workplace(out) as hidden:
         # Of this run alone, and the last one only: a scene takes hundreds of MB, and its card may change.
-        build = lru_cache(maxsize=1)(_build)
+        build = lru_cache(maxsize=1)(build_scene)
         hashes = FileHashes(out, out / HASHES, rehash)
         scene_hashes = SceneHashes(hidden / "scenes.json", lambda name: build(name).sha256)
         made: dict[str, Files] = {}
@@ -107,7 +107,7 @@ def generate_dataset(
         hashes.flush()
         todo = [sequence for sequence in card.sequence if sequence.name not in made]
         done: Counter[str] = Counter()
-        for name, steps in _render_all(card, sorted(todo, key=_scene_name), options, plans, build, out, workers):
+        for name, steps in _render_all(card, sorted(todo, key=scene_name), options, plans, build, out, workers):
             done[name] += steps
             if done[name] == STEPS:
                 made[name] = _learned(out, name, hashes)
@@ -121,11 +121,11 @@ def _repeat(progress: Progress | None, name: str, times: int) -> None:
         progress(name)  # type: ignore[misc]
 
 
-def _scene_name(sequence: SequenceCard) -> str:
+def scene_name(sequence: SequenceCard) -> str:
     return sequence.scene
 
 
-def _build(name: str) -> _Built:
+def build_scene(name: str) -> _Built:
     scene = load_scene(name)
     return _Built(scene, scene_hash(scene))
 
@@ -246,7 +246,7 @@ def _serve_renders(
 
     start_backend()
     set_threads(threads)
-    build = lru_cache(maxsize=1)(_build)
+    build = lru_cache(maxsize=1)(build_scene)
 
     def render(job: tuple[SequenceCard, Plan]) -> None:
         sequence, plan = job
@@ -279,7 +279,7 @@ def _render_sequence(
     for folder in {Path(name).parent for name in files_of(plan)}:
         (partial / folder).mkdir(parents=True, exist_ok=True)
     for side, frame in product(SIDES, FRAMES):
-        yield from _render_camera(card, sequence, options, mitsuba_scene, side, frame, partial)
+        yield from render_camera(card, sequence, options, mitsuba_scene, side, frame, partial)
     files = {name: sha256(partial / name) for name in files_below(partial)}
     made_by = {
         "rsbench": __version__,
@@ -297,7 +297,7 @@ def _render_sequence(
     yield
 
 
-def _render_camera(
+def render_camera(
     card: DatasetCard,
     sequence: SequenceCard,
     options: RendererOptions,

@@ -17,6 +17,7 @@ import pytest
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, load_dataset_card
+from rsbench.dataset.estimate import estimate_dataset
 from rsbench.dataset.files import read_png, sha256
 from rsbench.dataset.generation import STEPS, generate_dataset
 from rsbench.dataset.sequence import read_dataset
@@ -192,6 +193,35 @@ def test_only_names_the_sequences_that_exist() -> None:
     assert isinstance(card, DatasetCard)
     with pytest.raises(RsbenchError, match="no sequence 'x'; there are: castle, room-twist"):
         card.only(["x"])
+
+
+def test_shards_are_all_of_a_card_and_share_nothing() -> None:
+    card = load_dataset_card("poles")
+    for parts in (1, 3, len(card.sequence)):
+        names = [sequence.name for part in range(parts) for sequence in card.shard(part + 1, parts).sequence]
+        assert sorted(names) == sorted(sequence.name for sequence in card.sequence)
+    for part, parts in ((0, 2), (3, 2), (len(card.sequence) + 1, 100)):
+        with pytest.raises(RsbenchError, match=f"shard {part}/{parts}: "):
+            card.shard(part, parts)
+
+
+def test_shards_brought_together_are_the_dataset(small: Small, tmp_path: Path) -> None:
+    card = load_dataset_card(str(small.card))
+    for part in (1, 2):
+        (made,) = generate_dataset(card.shard(part, 2), tmp_path / str(part))
+        shutil.copytree(tmp_path / str(part) / made, tmp_path / "both" / made)
+    assert generate_dataset(card, tmp_path / "both") == []
+    assert bytes_of(tmp_path / "both") == bytes_of(small.dataset)
+
+
+def test_the_estimate_counts_files_and_bytes(small: Small) -> None:
+    words: list[str] = []
+    found = estimate_dataset(load_dataset_card(str(small.card)), words.append)
+    made = [path for path in small.dataset.rglob("*") if path.is_file() and HIDDEN not in path.parts]
+    assert len(words) == 2 and (found.sequences, found.files) == (2, len(made))
+    # One camera at one time stands for four.
+    assert found.bytes == pytest.approx(sum(path.stat().st_size for path in made), rel=0.1)
+    assert 0.0 < found.seconds < 60.0
 
 
 def test_dataset_manifest_lists_every_file(smoke_dataset: Path) -> None:
