@@ -26,37 +26,40 @@ EPILOG = """[bold]Examples[/bold]
   rsbench generate smoke --out data/stack --full-frames    [dim](keeps every row's whole image)[/dim]"""
 
 
+_Card = Annotated[
+    str,
+    typer.Argument(
+        help="Name of a dataset card (see: rsbench list datasets) or path to one.",
+        autocompletion=complete("datasets"),
+    ),
+]
+_Only = Annotated[
+    list[str] | None, typer.Option("--sequence", "--only", help="Only this sequence of the card; repeatable.")
+]
+_Shard = Annotated[
+    str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts of the sequences: one machine's.")
+]
+_FullFrames = Annotated[
+    bool, typer.Option("--full-frames", help="The paper's recipe: render and keep a whole image per row (slow).")
+]
+_Rehash = Annotated[
+    bool, typer.Option("--rehash", help="Read all that is there again, not only what has another size or time.")
+]
+_Estimate = Annotated[
+    bool,
+    typer.Option("--estimate", help="Only say how many files, bytes and minutes; tries one camera of each scene."),
+]
+
+
 def generate(
-    card: Annotated[
-        str,
-        typer.Argument(
-            help="Name of a dataset card (see: rsbench list datasets) or path to one.",
-            autocompletion=complete("datasets"),
-        ),
-    ],
+    card: _Card,
     out: Annotated[Path, typer.Option(help="Folder of the dataset; an interrupted run resumes there.")],
-    sequence: Annotated[
-        list[str] | None,
-        typer.Option("--sequence", "--only", help="Only this sequence of the card; repeatable."),
-    ] = None,
-    shard: Annotated[
-        str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts of the sequences: one machine's.")
-    ] = None,
+    sequence: _Only = None,
+    shard: _Shard = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes; each renders whole sequences.")] = 1,
-    full_frames: Annotated[
-        bool,
-        typer.Option("--full-frames", help="The paper's recipe: render and keep a whole image per row (slow)."),
-    ] = False,
-    rehash: Annotated[
-        bool,
-        typer.Option("--rehash", help="Read all that is there again, not only what has another size or time."),
-    ] = False,
-    estimate: Annotated[
-        bool,
-        typer.Option(
-            "--estimate", help="Only say how many files, bytes and minutes; tries one camera of each scene."
-        ),
-    ] = False,
+    full_frames: _FullFrames = False,
+    rehash: _Rehash = False,
+    estimate: _Estimate = False,
 ) -> None:
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
     from rsbench.cli.console import progress_bar
