@@ -14,12 +14,15 @@ from rsbench.core.joining import join_stereo
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.robust_problem import MatchCount, RobustProblem
-from rsbench.robust.ransac import RansacOptions, ransac
+from rsbench.robust.ransac import RansacOptions, msac_score, ransac
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
 
 _SECOND_TRY = 3.0
 """Factor on the threshold when nothing was found."""
 _ADAPTATIONS = 2
+_WORSE = 1.5
+"""Factor on the cost of what the search found, at its threshold, beyond which the end is no improvement (that cost
+counts as one datum at least). On rendered frames closer inliers cost up to 1.3 times as much, and err less."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,17 +208,23 @@ def _conclude(
         if options.adapt_threshold:
             threshold = _adapted(problem, final, threshold, options)
         return final, np.abs(problem.residuals(final)) <= threshold, threshold
+    found = model, inliers, threshold
     if options.adapt_threshold:
         for _ in range(_ADAPTATIONS):
             model = problem.refine(model, inliers) or model
             threshold = _adapted(problem, model, threshold, options)
             inliers = np.abs(problem.residuals(model)) <= threshold
     final = problem.conclude(model, inliers)
-    explained = np.abs(problem.residuals(final)) <= threshold
-    if np.count_nonzero(explained) < 0.5 * np.count_nonzero(inliers):
+    if _cost(problem, final, found[2]) > _WORSE * max(_cost(problem, found[0], found[2]), 1.0):
         # A solver that more matches make worse: what the search found stands.
-        return model, inliers, threshold
-    return final, explained, threshold
+        return found
+    return final, np.abs(problem.residuals(final)) <= threshold, threshold
+
+
+def _cost(problem: RobustProblem, model: MotionEstimate, threshold: float) -> float:
+    """What the search minimises."""
+    errors = np.abs(problem.residuals(model))
+    return msac_score(np.where(np.isnan(errors), np.inf, errors), threshold)
 
 
 def _adapted(problem: RobustProblem, model: MotionEstimate, threshold: float, options: RobustOptions) -> float:

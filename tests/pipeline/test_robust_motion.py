@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import final
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.pipeline.robust_problem import _moment, _quantile
-from rsbench.solvers.engine.base import MatchSet
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.registry import list_solvers, load_solver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
@@ -124,6 +126,39 @@ def test_every_solver_runs_in_the_loop(name: str) -> None:
     assert np.degrees(translation_error(estimate.d, d)) < 4.0
     assert set(result.inliers) == {"left", "right", "tracks"}
     assert result.iterations >= 1 and result.seconds > 0.0
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class SpoiledByMany(Solver):
+    """The eight-point algorithm, 10 degrees off when it is given more than 40 matches."""
+
+    @property
+    def spec(self) -> SolverSpec:
+        return load_solver("gs-8pt").spec
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        found = load_solver("gs-8pt").estimate(correspondences, rig, shutter)
+        if not found.success or len(correspondences.left) <= 40:
+            return found
+        return replace(found, w=found.w + np.radians(10.0))
+
+
+@pytest.mark.parametrize("adapt", [False, True])
+def test_a_solver_that_more_matches_make_worse_keeps_what_the_search_found(adapt: bool) -> None:
+    """Refits that RANSAC has refused must not come back at its end: the paper's linear solver is like that."""
+    motion = random_motion(np.random.default_rng(1), np.radians(2.0), 0.3)
+    slow = RollingShutter(height=900, readout_ratio=1e-6)  # hardly rolls: the eight-point algorithm fits
+    given = simulate(
+        RIG, slow, motion, SimulationOptions(pairs=200, noise_px=0.1, outlier_ratio=0.2), np.random.default_rng(0)
+    ).correspondences
+    options = RobustOptions(adapt_threshold=adapt)
+    found = estimate_motion(given, RIG, slow, SpoiledByMany(), options, np.random.default_rng(0))
+    assert found.estimate.success
+    assert found.inlier_count > 0.7 * len(given.left)  # 160 of 200 are right
+    assert np.degrees(rotation_error(found.estimate.w, motion.w)) < 1.0
 
 
 @pytest.mark.parametrize("sets", ["pairs", "tracks"])
