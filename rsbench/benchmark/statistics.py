@@ -165,6 +165,30 @@ def rounded(value: float, digits: int) -> str:
     return f"{round(value, digits):.{max(digits, 0)}f}"
 
 
+def median_and_quartiles(values: ArrayLike) -> str:
+    """``median [lower, upper]`` with as many digits as their distance allows, at most three; one if they agree.
+
+    NaN is left out; of an even number of values the median is the lower middle one.
+    """
+    numbers = np.asarray(values, dtype=np.float64)
+    found = numbers[~np.isnan(numbers)]
+    if not found.size:
+        return "–"
+    low, middle, high = np.quantile(found, [0.25, 0.5, 0.75], method="inverted_cdf")
+    if not np.isfinite(middle):
+        return "inf"
+    size = _exponent(middle)
+    width = size if np.isinf(high) else _exponent(high - low) if high > low else size - 2
+    places = max(0, 1 - width if width >= size - 1 else 2 - size)
+    texts = [f"{value:.{places}f}" for value in (middle, low, high)]
+    return texts[0] if len(set(texts)) == 1 else f"{texts[0]} [{texts[1]}, {texts[2]}]"
+
+
+def _exponent(value: float) -> int:
+    """The place of the first digit that counts: 0 for ones, -1 for tenths."""
+    return math.floor(math.log10(abs(value))) if value else 0
+
+
 def median(values: FloatArray) -> FloatArray:
     """Over the last axis."""
     return np.asarray(np.median(values, axis=-1))

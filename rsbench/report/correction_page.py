@@ -108,7 +108,7 @@ def _table(summary: pd.DataFrame) -> str:
         if row["failures"]:
             cells[0] += f" ({row['failures']:.0f} failed)"
         if row["method"] == "ours":
-            cells = [f"**{cell}**" if cell else "" for cell in cells]
+            cells[0] = f"**{cells[0]}**"  # the name alone: bold figures would read as the best ones
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -169,7 +169,7 @@ def _draw_rows(rows: pd.DataFrame, path: Path) -> Path:
                     axes.plot(middle, values, label=_TITLES[key], **style)
             axes.set(yscale="log", title=stratum, xlabel="row / height")
             axes.grid(True, which="major", linewidth=0.3)
-        panels[0].set_ylabel("flow error (px)")
+        panels[0].set_ylabel("mean flow error (px)")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
         figure.savefig(path, metadata={"Date": None})
     return path

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.evaluation import read_headings, read_scores
 from rsbench.benchmark.images.predict import depth_of, load_disparities
+from rsbench.benchmark.statistics import median_and_quartiles
 from rsbench.core.rig import View
 from rsbench.dataset.corrected_frames import read_origin
 from rsbench.dataset.files import load_arrays, load_matches, read_json, read_png, write_bytes
@@ -64,8 +64,8 @@ def _pose_table(out: Path) -> SummaryTable:
         f"{about}e_R and e_T against the true motion of the rig over one frame period (a monocular solver against "
         "the translation of its own camera); e_s = |log(estimated length / true length)| where a solver claims "
         "metres. A failure scores 180 degrees. 'Data' is the motion model that the data follow, 'assumes' that of "
-        "the solver. Inliers are among the matches that the solver works on, each counted once. All solvers had "
-        "the same matches, sampler and budget."
+        "the solver. Inliers are among the matches that the solver works on, each counted once. All solvers ran "
+        "in the same robust loop on the same matches, of which each takes the sets that it can use."
     )
     frame = frame.rename(columns=words)
     counts = [name for name in ("runs", "failures") if name in frame]
@@ -89,29 +89,9 @@ def _over_seeds(scores: pd.DataFrame, metrics: list[str]) -> tuple[pd.DataFrame,
     frame[counts] = frame[counts].round().astype(int)
     note = (
         "Median [lower quartile, upper quartile] over the runs of each solver with other RANSAC samples; one "
-        "number where the three agree in its digits. "
+        "number where the three agree in its digits; of an even number of runs the lower middle one. "
     )
     return frame.reset_index(), note
-
-
-def median_and_quartiles(values: pd.Series) -> str:
-    """``median [lower, upper]`` with as many digits as their distance allows, at most three; one if they agree."""
-    found = np.asarray(values.dropna(), dtype=np.float64)
-    if not found.size:
-        return "–"
-    low, middle, high = np.quantile(found, [0.25, 0.5, 0.75], method="inverted_cdf")
-    if not np.isfinite(middle):
-        return "inf"
-    size = _exponent(middle)
-    width = size if np.isinf(high) else _exponent(high - low) if high > low else size - 2
-    places = max(0, 1 - width if width >= size - 1 else 2 - size)
-    texts = [f"{value:.{places}f}" for value in (middle, low, high)]
-    return texts[0] if len(set(texts)) == 1 else f"{texts[0]} [{texts[1]}, {texts[2]}]"
-
-
-def _exponent(value: float) -> int:
-    """The place of the first digit that counts: 0 for ones, -1 for tenths."""
-    return math.floor(math.log10(abs(value))) if value else 0
 
 
 def _mean(scores: pd.DataFrame, keys: list[str], numbers: list[str]) -> pd.DataFrame:

@@ -250,7 +250,9 @@ seed in the table's column `seed`; the eight-point algorithm, which is biased, s
 | mean | ![mean, 10^-3 px](fig3-px-mean.png) | ![mean, 0.81 px](fig3-normalised-mean.png) |
 
 The panels stand where the paper has them; its first column shows both errors in one panel, which has two halves
-here. The eight-point algorithm sees the left camera alone and is scored against that camera's own translation.
+here. Where the two readings of the paper's solver agree, as in most e_T, the second covers the first. The baseline
+is the distance between the cameras; the paper may mean half of it. The eight-point algorithm sees the left camera
+alone and is scored against that camera's own translation.
 The tables `<sweep>.csv` hold all figures, also of scale, failures and error over bound.
 [trials.npz](trials.npz) holds what they summarise, the errors of every trial in single precision:
 `<sweep>_e_R_deg` and `<sweep>_e_T_deg` (rows, trials), whose row k is that of the table; NumPy reads it.

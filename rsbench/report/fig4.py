@@ -138,10 +138,11 @@ def caption(name: str, n: dict[str, Any]) -> tuple[str, ...]:
         f"{name}: {n['rotation_deg']:.2g} deg and {n['translation']:.2g} m per frame, readout ratio "
         f"{n['readout_ratio']:g}; seed {n['seed']}, RANSAC seed {n['ransac_seed']}. Error of the motion: "
         f"{_small(n['e_R_deg'])} deg (rotation), {_small(n['e_T_deg'])} deg (direction).",
-        f"PSNR of what the frame saw: {n['psnr_rolling']:.1f} dB before, {n['psnr_corrected']:.1f} dB after, "
-        f"{n['psnr_oracle']:.1f} dB with true depth and motion.",
+        f"PSNR of the frame's own pixels: {n['psnr_rolling']:.1f} dB before, {n['psnr_corrected']:.1f} dB after, "
+        f"{n['psnr_oracle']:.1f} dB with true depth and motion; of all pixels, inpainted where nobody saw: "
+        f"{n['psnr_rolling_all']:.1f} and {n['psnr_corrected_all']:.1f} dB.",
         f"SGM depth: median error {100 * n['depth_median_m']:.1f} cm, {_percent(n['depth_over_2m'])} above 2 m, "
-        f"{_percent(n['depth_coverage'])} known{_sky(n['depth_on_sky'])}.",
+        f"{_percent(n['depth_coverage'])} known, the rest grey{_sky(n['depth_on_sky'])}.",
         f"Corrected frame: {_percent(n['share_here'])} its own pixels, {_percent(n['share_guessed'])} at a "
         f"guessed depth, {_percent(filled)} from the other frames, {_percent(n['share_nobody'])} seen by nobody "
         "(dark).",

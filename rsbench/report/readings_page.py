@@ -15,11 +15,18 @@ is left out of its grid. In the literal reading of the solver, and with w from t
 in all readings at one setting: [../claims](../claims/README.md). All settings: [settings.csv](settings.csv).
 Made by `rsbench reproduce readings`.
 """
+_UNITS = {
+    "depth": " (m)",
+    "rotation_deg": " (deg)",
+    "translation": " (m)",
+    "baseline": " (m)",
+    "points": " per camera",
+}
 
 
 def readings_page(settings: pd.DataFrame) -> str:
     """Markdown from the table of ``claims.holding_settings``."""
-    grid = [f"- {name}: {low} or {high}" for name, (low, high) in SETTINGS.items()]
+    grid = [f"- {name}{_UNITS.get(name, '')}: {low} or {high}" for name, (low, high) in SETTINGS.items()]
     names = list(dict.fromkeys(settings.reading))
     head = " | ".join(f"{name}: holds | fails" for name in names)
     lines = [_SETTINGS, *grid, "", f"| claim | settings | {head} |", f"|---|---|{'---|---|' * len(names)}"]

@@ -34,6 +34,7 @@ def sgm_page(table: pd.DataFrame) -> str:
         floor_low=none["error_px"].min(),
         floor_high=none["error_px"].max(),
         lost_rows=worst["vertical_px"],
+        lost_where=f"{worst['stratum']}, {worst['sequence']}",
         lost_share=100 * (1 - worst["coverage"] / before["coverage"]),
         opposite_low=100 * opposite["coverage"].min(),
         opposite_high=100 * opposite["coverage"].max(),

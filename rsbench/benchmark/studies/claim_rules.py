@@ -30,14 +30,16 @@ SCALE_MARGIN = 0.1
 
 
 class Figure(NamedTuple):
-    """A statistic with its 95 % interval; NaN where the matches do not determine it."""
+    """A statistic with its 95 % interval, of no width where it is exact; NaN where the matches do not tell it."""
 
     value: float
     low: float
     high: float
 
     def __str__(self) -> str:
-        return "not observable" if math.isnan(self.value) else in_words(*self)
+        if math.isnan(self.value):
+            return "not observable"
+        return f"{self.value:.3g}" if self.low == self.high else in_words(*self)
 
 
 class Check(NamedTuple):

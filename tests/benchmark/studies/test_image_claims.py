@@ -44,7 +44,15 @@ def test_motion_must_be_better_in_both_errors_in_the_median_of_runs() -> None:
 
 def test_depth_counts_only_with_cameras_in_step() -> None:
     rows = [
-        {"sequence": "a", "stratum": "mild", "delay": d, "opposite": o, "error_px": e, "over_2m": f}
+        {
+            "sequence": "a",
+            "stratum": "mild",
+            "delay": d,
+            "opposite": o,
+            "error_px": e,
+            "over_2m": f,
+            "coverage": 0.9,
+        }
         for d, o, e, f in ((0.0, False, 0.05, 0.01), (0.1, False, 3.0, 0.5), (0.0, True, 3.0, 0.5))
     ]
     ((checks, _),) = sgm_is_accurate(pd.DataFrame(rows)).values()
