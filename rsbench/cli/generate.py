@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,6 +24,8 @@ EPILOG = """[bold]Examples[/bold]
   rsbench generate moderate --out data/moderate --shard 2/4 [dim](on the second of four machines; then bring all
   folders into one and run it without --shard: it checks them and writes dataset.json)[/dim]
 
+  rsbench generate paper --out data/flow --channels disparity,flow
+
   rsbench generate smoke --out data/stack --full-frames    [dim](keeps every row's whole image)[/dim]"""
 
 
@@ -42,6 +45,10 @@ _Shard = Annotated[
 _FullFrames = Annotated[
     bool, typer.Option("--full-frames", help="The paper's recipe: render and keep a whole image per row (slow).")
 ]
+_Channels = Annotated[
+    str | None,
+    typer.Option(help="Channels of truth in place of the card's, with commas between; or all; or none."),
+]
 _Rehash = Annotated[
     bool, typer.Option("--rehash", help="Read all that is there again, not only what has another size or time.")
 ]
@@ -58,12 +65,14 @@ def generate(
     shard: _Shard = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes; each renders whole sequences.")] = 1,
     full_frames: _FullFrames = False,
+    channels: _Channels = None,
     rehash: _Rehash = False,
     estimate: _Estimate = False,
 ) -> None:
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.card import load_dataset_card
+    from rsbench.dataset.channels import named_channels
     from rsbench.dataset.files import check_out
     from rsbench.dataset.generation import STEPS, generate_dataset
     from rsbench.renderers.backend import start_backend
@@ -73,6 +82,8 @@ def generate(
         dataset = dataset.only(sequence)
     if shard:
         dataset = dataset.shard(*_part(shard))
+    if channels:
+        dataset = replace(dataset, channels=named_channels(channels))
     if not estimate:
         check_out(out)
     backend = start_backend()

@@ -14,6 +14,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.channels import Channel
 from rsbench.dataset.sequence import sequence_manifest
 from rsbench.errors import RsbenchError
 from rsbench.imports import search
@@ -146,6 +147,8 @@ class DatasetCard:
     """Name of a renderer card, or a path to one."""
     sensor: Sensor | None = None
     """Exposure and noise of the rolling-shutter frames; absent, an ideal sensor's."""
+    channels: tuple[Channel, ...] = ()
+    """Of ground truth, beside images, depth and poses."""
     seed: int = 0
     seeds: tuple[int, ...] = ()
     """When given, every sequence is made once per seed under the name NAME-SEED; random axes change with it."""
@@ -162,6 +165,8 @@ class DatasetCard:
             raise ValueError(
                 f"sensor exposure_s = {self.sensor.exposure_s}: longer than frame_period_s = {self.frame_period_s}"
             )
+        if len(set(self.channels)) < len(self.channels):
+            raise ValueError(f"channels = {list(self.channels)}: must differ from each other")
         if any(sequence.seed is not None for sequence in self.sequence) and self.seeds:
             raise ValueError("seeds and the seed of a sequence exclude each other")
         if len(set(self.seeds)) < len(self.seeds):
@@ -197,7 +202,8 @@ class DatasetCard:
             frame_period_s=self.frame_period_s,
         )
         sensor = {} if self.sensor is None else {"sensor": asdict(self.sensor)}
-        return {**manifest, **sensor}
+        channels = {"channels": list(self.channels)} if self.channels else {}
+        return {**manifest, **sensor, **channels}
 
     def only(self, names: list[str]) -> DatasetCard:
         """The same card with some of its sequences.

@@ -9,7 +9,7 @@ import io
 import json
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,13 +105,33 @@ def read_png(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
+def read_grey_png(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+    """Image (H, W) uint8 of one channel of 8 bits; ``size`` as of ``read_png``.
+
+    Raises:
+        RsbenchError: missing, no such image or of another size.
+    """
+    data = read_bytes(path)
+    check_image_size(data, path, size)
+    pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype != np.uint8 or pixels.ndim != 2:
+        raise RsbenchError(f"{path}: must be a grey image of 8 bits")
+    return np.asarray(pixels, dtype=np.uint8)
+
+
 def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
     """float32 channel Z (H, W), metres, 0 = no surface; lossless ZIP."""
+    write_exr(path, {"Z": depth})
+
+
+def write_exr(path: Path, channels: Mapping[str, NDArray[np.float32]]) -> None:
+    """float32 channels (H, W) by name; lossless ZIP."""
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    pixels = {name: np.ascontiguousarray(each, dtype=np.float32) for name, each in channels.items()}
     content = io.BytesIO()  # OpenEXR does not tell of a full disk in one way, write_bytes does
-    with OpenEXR.File(header, {"Z": np.ascontiguousarray(depth, dtype=np.float32)}) as file:
+    with OpenEXR.File(header, pixels) as file:
         file.write(content)
     write_bytes(path, content.getvalue())
 
@@ -120,35 +140,48 @@ def read_depth(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.fl
     """Channel Z (H, W) float32, metres, 0 = no surface; ``size`` as of ``read_png``.
 
     Raises:
-        RsbenchError: missing, damaged, of another size, with anything but one float32 channel Z in scanlines, or
-            with negative or non-finite depth.
+        RsbenchError: see ``read_exr``; or negative or non-finite depth.
+    """
+    depth = read_exr(path, ("Z",), size)[..., 0]
+    if not np.all(np.isfinite(depth)) or np.any(depth < 0):
+        raise RsbenchError(f"{path}: depth must be finite and not negative (0 = no surface)")
+    return depth
+
+
+def read_exr(path: Path, names: tuple[str, ...], size: tuple[int, int] | None = None) -> NDArray[np.float32]:
+    """Channels (H, W, channels) float32 in the order of ``names``; ``size`` as of ``read_png``.
+
+    Raises:
+        RsbenchError: missing, damaged, of another size, or with anything but these float32 channels in scanlines.
     """
     import OpenEXR
 
     data = read_bytes(path)
     try:
         with OpenEXR.File(io.BytesIO(data), header_only=True) as file:
-            _check_depth_header([part.header for part in file.parts], path, size)
+            _check_exr_header([part.header for part in file.parts], path, names, size)
         with OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:
-            pixels = np.array(file.channels()["Z"].pixels)
+            pixels = [np.array(file.channels()[name].pixels) for name in names]
     except RsbenchError:
         raise
     except Exception as error:  # OpenEXR raises plain RuntimeError, ValueError and others for damaged files
         raise RsbenchError(f"{path}: damaged or not an EXR file ({str(error).splitlines()[0]})") from error
-    if pixels.dtype != np.float32 or pixels.ndim != 2:
-        raise RsbenchError(f"{path}: must hold a float32 channel Z")
-    if not np.all(np.isfinite(pixels)) or np.any(pixels < 0):
-        raise RsbenchError(f"{path}: depth must be finite and not negative (0 = no surface)")
-    return pixels
+    for name, each in zip(names, pixels, strict=True):
+        if each.dtype != np.float32 or each.ndim != 2:
+            raise RsbenchError(f"{path}: must hold a float32 channel {name}")
+    return np.stack(pixels, axis=-1)
 
 
-def _check_depth_header(headers: list[dict[str, Any]], path: Path, size: tuple[int, int] | None) -> None:
-    """Before pixels are decoded: one part, one channel, and not more of it than there should be."""
+def _check_exr_header(
+    headers: list[dict[str, Any]], path: Path, names: tuple[str, ...], size: tuple[int, int] | None
+) -> None:
+    """Before pixels are decoded: one part, these channels, and not more of them than there should be."""
     import OpenEXR
 
-    names = [channel.name for header in headers for channel in header["channels"]]
-    if len(headers) != 1 or headers[0]["type"] != OpenEXR.scanlineimage or names != ["Z"]:
-        raise RsbenchError(f"{path}: must hold one part of scanlines with one channel, Z, of float32")
+    found = sorted(channel.name for header in headers for channel in header["channels"])
+    if len(headers) != 1 or headers[0]["type"] != OpenEXR.scanlineimage or found != sorted(names):
+        of = "one channel, Z," if names == ("Z",) else f"the channels {', '.join(names)}"
+        raise RsbenchError(f"{path}: must hold one part of scanlines with {of} of float32")
     first, last = headers[0]["dataWindow"]
     width, height = (int(end) - int(start) + 1 for start, end in zip(first, last, strict=True))
     check_size(path, (width, height), size)

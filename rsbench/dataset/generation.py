@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import asdict, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
@@ -24,10 +24,12 @@ from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, Side
 from rsbench.core.se3 import Pose
 from rsbench.dataset.card import DatasetCard, SequenceCard
+from rsbench.dataset.channel_writer import write_channels
 from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_png, write_poses
 from rsbench.dataset.hashes import HASHES, FileHashes, HashedFile
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence import FORMAT, FRAMES, UNITS, files_of, is_of_sequence
+from rsbench.dataset.shots import GivenGeometry, Shot
 from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, remove, strangers, workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_jobs import finished_jobs
@@ -171,7 +173,7 @@ def _complete(
             f"{folder}: holds no sequence.json, so rsbench did not make it; move it away or choose another --out"
         )
     manifest = read_json(folder / "sequence.json")
-    expected = _of_scene(plan, scene_hashes.of(sequence.scene))
+    expected = {"sensor": None, "channels": None} | _of_scene(plan, scene_hashes.of(sequence.scene))
     other = [key for key, value in expected.items() if manifest.get(key) != value]
     if other:
         raise RsbenchError(
@@ -312,6 +314,7 @@ def render_camera(
     """
     from rsbench.renderers.image import to_srgb8
     from rsbench.renderers.render import render
+    from rsbench.renderers.segments import blocked
     from rsbench.renderers.sensed import sensed_rows
 
     rig, shutter = card.rig_of(sequence), card.shutter()
@@ -332,6 +335,9 @@ def render_camera(
             period, motion = card.frame_period_s, card.motion_of(sequence)
             seen = sensed_rows(scene, rig, shutter, motion, card.sensor, period, side, frame, options)
             write_png(folder / "rs" / f"{side}_{frame}.png", to_srgb8(seen, 1.0))
+        if kind == "rs":
+            geometry, shot = GivenGeometry(rig, shutter, card.motion_of(sequence)), Shot("rs", side, frame)
+            write_channels(folder, card.channels, geometry, shot, rendered.depth, partial(blocked, scene))
         yield
 
 

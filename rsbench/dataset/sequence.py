@@ -20,7 +20,16 @@ from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.files import read_depth, read_json, read_png, read_poses
+from rsbench.dataset.channels import (
+    CHANNELS,
+    COMPONENTS,
+    PairChannel,
+    PixelClass,
+    channel_files,
+    mask_file,
+    value_file,
+)
+from rsbench.dataset.files import read_depth, read_exr, read_grey_png, read_json, read_png, read_poses
 from rsbench.errors import RsbenchError
 from rsbench.motions import motion_record, read_motion
 from rsbench.reading import check_name, check_size, inside
@@ -52,12 +61,20 @@ _STACK = re.compile(r"gs_stack/(left|right)_[01]/[0-9]{4,}\.png")
 
 def is_of_sequence(name: str) -> bool:
     """Whether a path below a sequence's folder is one that rsbench writes."""
-    return name in ("sequence.json", *RELATIVE_FILES, *CLEAN_FILES) or _STACK.fullmatch(name) is not None
+    known = ("sequence.json", *RELATIVE_FILES, *CLEAN_FILES, *channel_files(CHANNELS))
+    return name in known or _STACK.fullmatch(name) is not None
 
 
 def files_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
     """Paths that a sequence must have, by its sequence.json: all but the stacks of whole frames."""
-    return RELATIVE_FILES + CLEAN_FILES if manifest.get("sensor") else RELATIVE_FILES
+    clean = CLEAN_FILES if manifest.get("sensor") else ()
+    return RELATIVE_FILES + clean + channel_files(channels_of(manifest))
+
+
+def channels_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
+    """Names of the channels that a sequence.json lists, unknown ones too; what is no list of names has none."""
+    names = manifest.get("channels")
+    return tuple(name for name in names if isinstance(name, str)) if isinstance(names, list) else ()
 
 
 Vector = tuple[float, float, float]
@@ -89,6 +106,7 @@ class SequenceManifest:
     row_time_s: float
     motion: MotionManifest
     sensor: Sensor | None = None
+    channels: tuple[str, ...] = ()
     files: dict[str, str] = field(default_factory=dict)
     """sha256 by the path below the sequence's folder."""
 
@@ -142,6 +160,8 @@ class Sequence:
     frame_period_s: float
     sensor: Sensor | None = None
     """Of the rolling-shutter frames; None: an ideal one's."""
+    channels: tuple[str, ...] = ()
+    """Names of those that it has beside images, depth and poses; later versions know more."""
     manifest: dict[str, Any]
     """Content of sequence.json."""
 
@@ -169,6 +189,35 @@ class Sequence:
         if len(tau) != self.shutter.height:
             raise RsbenchError(f"{path}: has {len(tau)} rows, the camera has {self.shutter.height}")
         return tau, poses
+
+    def offsets(self, channel: PairChannel, side: Side, frame: int) -> NDArray[np.float32]:
+        """(H, W, components) px of the pixels of a rolling-shutter frame: see ``channels.PairChannel``.
+
+        Raises:
+            RsbenchError: the sequence does not have this channel, or the file cannot be read.
+        """
+        self._check_channel(channel)
+        return read_exr(inside(self.folder, value_file(channel, side, frame)), COMPONENTS[channel], self._size)
+
+    def classes(self, channel: PairChannel, side: Side, frame: int) -> NDArray[np.uint8]:
+        """(H, W) of ``channels.PixelClass``: what became of each pixel in the picture that the channel looks at.
+
+        Raises:
+            RsbenchError: as ``offsets``.
+        """
+        self._check_channel(channel)
+        path = inside(self.folder, mask_file(channel, side, frame))
+        classes = read_grey_png(path, self._size)
+        if np.any(classes > max(PixelClass)):
+            raise RsbenchError(f"{path}: holds {np.max(classes)}: the classes are 0 to {max(PixelClass)}")
+        return classes
+
+    def _check_channel(self, channel: str) -> None:
+        if channel not in self.channels:
+            has = ", ".join(self.channels) or "none"
+            raise RsbenchError(
+                f"{self.folder}: has no channel {channel!r} ({has}); make it with: generate --channels {channel}"
+            )
 
     @property
     def _size(self) -> tuple[int, int]:
@@ -217,6 +266,7 @@ def read_sequence(folder: Path) -> Sequence:
             motion=read_motion(content["motion"]),
             frame_period_s=manifest.frame_period_s,
             sensor=manifest.sensor,
+            channels=manifest.channels,
             manifest=content,
         )
     except (ValueError, RsbenchError) as error:

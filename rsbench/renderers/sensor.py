@@ -16,7 +16,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.errors import RsbenchError
 
 PLUGIN = "rs_pinhole"
-_LEAST_COMPONENT = 1e-15
+LEAST_COMPONENT = 1e-15
 """Smaller components of a ray's direction, which are rounding, are made 0. Embree takes one between -1e-18 and 0
 for negative and its inverse for positive: rays of its packet then miss surfaces that they meet."""
 
@@ -104,7 +104,7 @@ def sensor_class() -> Any:
             u, v = (x - cx) / fx, (y - cy) / fy
             p = [self._entry(row, k, active) for k in range(12)]
             direction = [dr.fma(p[3 * i], u, dr.fma(p[3 * i + 1], v, p[3 * i + 2])) for i in range(3)]
-            level = [dr.select(dr.abs(value) < _LEAST_COMPONENT, 0.0, value) for value in direction]
+            level = [dr.select(dr.abs(value) < LEAST_COMPONENT, 0.0, value) for value in direction]
             return mi.Point3f(p[9], p[10], p[11]), mi.Vector3f(*level)
 
         def _entry(self, row: Any, k: int, active: Any) -> Any:

@@ -13,6 +13,7 @@ from rsbench.cards import card_path
 from rsbench.dataset.files import read_json
 from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.verification import structure
+from rsbench.dataset.verification.channels import channel_faults
 from rsbench.dataset.verification.content import Comparison, images_elsewhere, read_content, twin_faults
 from rsbench.dataset.verification.findings import DepthAgreement, Progress, SequenceReport
 from rsbench.dataset.verification.poses import pose_faults
@@ -101,8 +102,9 @@ def verify_sequence(
             step(name)
             steps -= 1
         faults += comparison.faults(images_elsewhere(partial(_others, listing, name)))
+        faults += channel_faults(sequence, content.maps, {*missing, *map(_file_of, faults)}, stride)
         if again is not None:
-            found, note = again.check(content, {fault.partition(": ")[0] for fault in faults})
+            found, note = again.check(content, {*missing, *map(_file_of, faults)})
             faults += found
             notes.append(note)
     except RsbenchError as error:
@@ -112,6 +114,10 @@ def verify_sequence(
     return SequenceReport(
         name=name, faults=tuple(dict.fromkeys(faults)), agreements=tuple(agreements), notes=tuple(notes)
     )
+
+
+def _file_of(fault: str) -> str:
+    return fault.partition(": ")[0]
 
 
 def _others(listing: structure.Listing, name: str) -> Iterator[Sequence]:

@@ -6,6 +6,7 @@ import hashlib
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +20,7 @@ from rsbench.cards import list_cards, parse_card
 from rsbench.core.projection import row_poses
 from rsbench.dataset.generation import image_seed
 from rsbench.dataset.scene_hashes import scene_hash
+from rsbench.dataset.verification.channels import channels_again
 from rsbench.dataset.verification.content import Content, clean_file
 from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.dataset.verification.images import CHANGES, Picture
@@ -67,7 +69,7 @@ class Again:
         rows = self._rows(content, options)
         if not rows:
             return [], "no row rendered again: its renderer takes too many samples; --rerender all does it"
-        checks = list(_checks(content, scene, options, rows))
+        checks = list(_checks(content, scene, options, rows, told))
         wrong = [check for check in checks if check.fault]
         done = (
             f"{len(rows)} rows of each image and depth map rendered again in {time.perf_counter() - start:.1f} s"
@@ -136,8 +138,11 @@ def _table(manifest: Mapping[str, Any], key: str) -> dict[str, Any]:
     return table
 
 
-def _checks(content: Content, scene: MitsubaScene, options: RendererOptions, rows: list[int]) -> Iterator[_Check]:
+def _checks(
+    content: Content, scene: MitsubaScene, options: RendererOptions, rows: list[int], told: set[str]
+) -> Iterator[_Check]:
     from rsbench.renderers.image import to_srgb8
+    from rsbench.renderers.segments import blocked
 
     elsewhere = not _made_here(content)
     for shot in SHOTS:
@@ -151,6 +156,8 @@ def _checks(content: Content, scene: MitsubaScene, options: RendererOptions, row
             rendered = to_srgb8(frame.image, options.exposure)
             file = clean_file(content.sequence, shot)
             yield _image_check(file, content.pictures[shot], rendered, rows, noisy)
+        again = channels_again(content.sequence, shot, rows, frame.depth, partial(blocked, scene), told)
+        yield from (_Check(*check) for check in again)
 
 
 def _made_here(content: Content) -> bool:

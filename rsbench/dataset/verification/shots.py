@@ -1,62 +1,28 @@
-"""The eight pictures of a sequence, and where the surface that one of them sees lies in another."""
+"""Where the surface that one picture of a sequence sees lies in another, and how well both agree."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.projection import back_project, rs_project_near
-from rsbench.core.rig import FRAMES, SIDES, Side
-from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.sequence import SHUTTERS, Sequence, Shutter
+from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.shots import FAR, PAIRS, SHOTS, Shot, points_of, seen_by
+
+__all__ = ["DEPTH_TOLERANCE", "FAR", "PAIRS", "SHOTS", "BoolArray", "DepthMap", "Landing", "Shot", "land"]
 
 DEPTH_TOLERANCE = 1e-4
 """Relative difference of two depths of one surface point that still agree."""
 FLATNESS = 2e-5
 """Largest relative second difference of inverse depth (linear on planes) of a locally flat surface: bilinear
 interpolation errs by an eighth of it along each axis, well under the tolerance; an edge bends far more."""
-FAR = 1e7
-"""Where the sky is looked for, metres: no motion of a rig moves it by a hundredth of a pixel."""
 _CHUNK_PIXELS = 1 << 17
 
 BoolArray = NDArray[np.bool_]
-
-
-class Shot(NamedTuple):
-    """One camera at one time, through a rolling shutter or a global one."""
-
-    shutter: Shutter
-    side: Side
-    frame: int
-    row: int = 0
-    """Of a global shutter: the row whose pose it has."""
-
-    @property
-    def image(self) -> str:
-        """File below the folder of the sequence, as ``depth`` is."""
-        return f"{self.shutter}/{self.side}_{self.frame}.png"
-
-    @property
-    def depth(self) -> str:
-        return f"{self.shutter}_depth/{self.side}_{self.frame}.exr"
-
-    def partners(self) -> Iterator[Shot]:
-        """Those that see most of the same: of the other shutter, the other camera, the other time."""
-        yield self._replace(shutter="gs" if self.shutter == "rs" else "rs")
-        yield self._replace(side="right" if self.side == "left" else "left")
-        yield self._replace(frame=1 - self.frame)
-
-
-SHOTS = tuple(Shot(*each) for each in product(SHUTTERS, SIDES, FRAMES))
-PAIRS = tuple((source, target) for source in SHOTS for target in source.partners())
-"""Each shot against its three partners."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,39 +97,11 @@ def land(sequence: Sequence, source: DepthMap, target: DepthMap, stride: int = 1
     for first in range(0, len(grid), step):
         rows = slice(first, first + step)
         sky = depth[rows] == 0
-        X = _points(sequence, source.shot, grid[rows], np.where(sky, FAR, depth[rows]))
-        seen, z = _seen(sequence, target.shot, X, grid[rows][..., 1])
+        X = points_of(sequence, source.shot, grid[rows], np.where(sky, FAR, depth[rows]))
+        seen, z, _ = seen_by(sequence, target.shot, X, grid[rows][..., 1])
         pixels[rows] = seen
         relative[rows] = _relative(target, seen, z, sky)
     return Landing(pixels, relative)
-
-
-def _points(sequence: Sequence, shot: Shot, pixels: FloatArray, depth: FloatArray) -> FloatArray:
-    """World points (..., 3) that a shot sees at pixels (..., 2) with depth (...)."""
-    if shot.shutter == "gs":
-        x_in_cam = depth[..., None] * sequence.rig.camera.unproject(pixels)
-        return transform(inverse(_pose(sequence, shot)), x_in_cam)
-    return back_project(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame, pixels, depth)
-
-
-def _seen(sequence: Sequence, shot: Shot, X: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (..., 2) and depth (...) of world points (..., 3) in a shot, NaN outside; ``rows`` are guesses."""
-    if shot.shutter == "rs":
-        projection = rs_project_near(
-            sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame, X, rows
-        )
-        return projection.pixels, projection.depth
-    camera = sequence.rig.camera
-    x_in_cam = transform(_pose(sequence, shot), X)
-    pixels = camera.project(x_in_cam)
-    outside = ~camera.contains(pixels)
-    pixels[outside] = np.nan
-    return pixels, np.where(outside, np.nan, x_in_cam[..., 2])
-
-
-def _pose(sequence: Sequence, shot: Shot) -> Pose:
-    time = sequence.shutter.row_time(shot.row, shot.frame)
-    return sequence.rig.cam_from_world(sequence.motion, time, shot.side)
 
 
 def _relative(target: DepthMap, pixels: FloatArray, z: FloatArray, sky: BoolArray) -> FloatArray:

@@ -226,7 +226,7 @@ def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: Seque
     """sequence.json against what the card would make, as far as that is known without building the scene."""
     made = manifest.get("made_by")
     same_version = isinstance(made, dict) and made.get("rsbench") == __version__
-    planned = {"sensor": None, "seed": card.seed_of(sequence)} | card.manifest_of(sequence)
+    planned = {"sensor": None, "channels": None, "seed": card.seed_of(sequence)} | card.manifest_of(sequence)
     scene: dict[str, Any] = {"viewpoint": sequence.viewpoint}
     # The cards that come with another version may say other things.
     if same_version and sequence.scene in list_cards("scenes"):

@@ -1,0 +1,50 @@
+"""Computing the channels of a sequence and writing their files."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.channel_truth import Blocked, pair_truth, target_of
+from rsbench.dataset.channels import COMPONENTS, PAIR_CHANNELS, STEP_PX, PairChannel, mask_file, value_file
+from rsbench.dataset.files import write_exr, write_png
+from rsbench.dataset.shots import Geometry, Shot
+
+
+def write_channels(
+    folder: Path,
+    names: Collection[str],
+    geometry: Geometry,
+    shot: Shot,
+    depth: NDArray[np.float32],
+    blocked: Blocked,
+) -> None:
+    """The files of the channels of these names that tell of one rolling-shutter frame.
+
+    Args:
+        folder: of the sequence.
+        names: of channels.
+        geometry: of the sequence.
+        shot: the frame.
+        depth: (H, W) of the frame, metres, 0 = no surface.
+        blocked: see there.
+    """
+    for channel in PAIR_CHANNELS:
+        if channel not in names:
+            continue
+        truth = pair_truth(geometry, shot, target_of(channel, shot), depth, blocked)
+        values = pair_values(channel, shot, truth.offset)
+        pixels = {name: values[..., k] for k, name in enumerate(COMPONENTS[channel])}
+        write_exr(folder / value_file(channel, shot.side, shot.frame), pixels)
+        write_png(folder / mask_file(channel, shot.side, shot.frame), truth.classes)
+
+
+def pair_values(channel: PairChannel, source: Shot, offset: FloatArray) -> NDArray[np.float32]:
+    """What a channel stores (..., components) of offsets (..., 2), px: a disparity is x_left - x_right."""
+    if channel == "disparity":
+        offset = offset[..., :1] * (1.0 if source.side == "right" else -1.0)
+    return (np.round(offset / STEP_PX) * STEP_PX + 0.0).astype(np.float32)  # no -0

@@ -1,0 +1,78 @@
+"""Channels of ground truth that a card may ask for beside images, depth and poses: names, files and values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import IntEnum
+from typing import Literal, get_args
+
+from rsbench.core.rig import VIEWS
+from rsbench.errors import RsbenchError
+
+PairChannel = Literal["disparity", "flow", "gs_flow"]
+"""Where each pixel of a rolling-shutter frame lies in another picture: of the other camera at the same time
+(disparity), of the same camera at the other time (flow), and of its global-shutter twin (gs_flow)."""
+Channel = PairChannel
+CHANNELS: tuple[Channel, ...] = get_args(Channel)
+PAIR_CHANNELS: tuple[PairChannel, ...] = get_args(PairChannel)
+COMPONENTS: dict[PairChannel, tuple[str, ...]] = {"disparity": ("d",), "flow": ("x", "y"), "gs_flow": ("x", "y")}
+"""Names of the float32 channels of the EXR files."""
+
+STEP_PX = 2.0**-10
+"""Values are rounded to multiples of it, which makes the files four times smaller."""
+
+
+class PixelClass(IntEnum):
+    """What became of a pixel's surface in the other picture: the values of a mask."""
+
+    UNSOLVED = 0
+    """The row that sees it could not be found; no value."""
+    VISIBLE = 1
+    OCCLUDED = 2
+    """In view, but something nearer hides it."""
+    OUT_OF_VIEW = 3
+    """Beside the picture or behind the camera, sky too."""
+    SKY = 4
+    """No surface here, and none there: the value is that of the direction."""
+    SKY_OCCLUDED = 5
+    """No surface here, but one there."""
+
+
+def value_file(channel: PairChannel, side: str, frame: int) -> str:
+    """Below the folder of a sequence, by the picture whose pixels it tells of."""
+    return f"{channel}/{side}_{frame}.exr"
+
+
+def mask_file(channel: PairChannel, side: str, frame: int) -> str:
+    return f"{channel}_mask/{side}_{frame}.png"
+
+
+def channel_files(names: Iterable[str]) -> tuple[str, ...]:
+    """Paths below a sequence's folder of the channels of these names; those of later versions are nobody's."""
+    given = set(names)
+    return tuple(
+        file(channel, *view)
+        for channel in PAIR_CHANNELS
+        if channel in given
+        for file in (value_file, mask_file)
+        for view in VIEWS
+    )
+
+
+def named_channels(text: str) -> tuple[Channel, ...]:
+    """Channels of a text like "flow,disparity"; "all" and "none" are what they say.
+
+    Raises:
+        RsbenchError: a name that no channel has, or one twice.
+    """
+    if text in ("all", "none"):
+        return CHANNELS if text == "all" else ()
+    found = []
+    for name in text.split(","):
+        matching = [channel for channel in CHANNELS if channel == name.strip()]
+        if not matching or matching[0] in found:
+            raise RsbenchError(
+                f"--channels {text}: {name!r}: allowed are {', '.join(CHANNELS)}, each once, or all"
+            )
+        found += matching
+    return tuple(found)

@@ -1,0 +1,122 @@
+"""The eight pictures of a sequence, what they see where, and from where."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rsbench.core.motion import Motion
+from rsbench.core.projection import back_project, rs_project_near
+from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
+from rsbench.core.se3 import Pose, inverse, transform
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.sequence import SHUTTERS, Shutter
+
+FAR = 1e7
+"""Where the sky is looked for, metres: no motion of a rig moves it by a hundredth of a pixel."""
+
+
+class Geometry(Protocol):
+    """What sees, how it reads and how it moves: a ``Sequence`` is one."""
+
+    @property
+    def rig(self) -> StereoRig: ...
+    @property
+    def shutter(self) -> RollingShutter: ...
+    @property
+    def motion(self) -> Motion: ...
+
+
+class GivenGeometry(NamedTuple):
+    """A ``Geometry`` before there is a sequence."""
+
+    rig: StereoRig
+    shutter: RollingShutter
+    motion: Motion
+
+
+class Shot(NamedTuple):
+    """One camera at one time, through a rolling shutter or a global one."""
+
+    shutter: Shutter
+    side: Side
+    frame: int
+    row: int = 0
+    """Of a global shutter: the row whose pose it has."""
+
+    @property
+    def image(self) -> str:
+        """File below the folder of the sequence, as ``depth`` is."""
+        return f"{self.shutter}/{self.side}_{self.frame}.png"
+
+    @property
+    def depth(self) -> str:
+        return f"{self.shutter}_depth/{self.side}_{self.frame}.exr"
+
+    @property
+    def other_shutter(self) -> Shot:
+        return self._replace(shutter="gs" if self.shutter == "rs" else "rs")
+
+    @property
+    def other_side(self) -> Shot:
+        return self._replace(side="right" if self.side == "left" else "left")
+
+    @property
+    def other_frame(self) -> Shot:
+        return self._replace(frame=1 - self.frame)
+
+    def partners(self) -> Iterator[Shot]:
+        """Those that see most of the same: of the other shutter, the other camera, the other time."""
+        yield from (self.other_shutter, self.other_side, self.other_frame)
+
+
+SHOTS = tuple(Shot(*each) for each in product(SHUTTERS, SIDES, FRAMES))
+PAIRS = tuple((source, target) for source in SHOTS for target in source.partners())
+"""Each shot against its three partners."""
+
+
+class Seen(NamedTuple):
+    """Where and when a shot sees points (...); NaN where it does not."""
+
+    pixels: FloatArray
+    """(..., 2) px."""
+    depth: FloatArray
+    """(...) z in the camera of that time, metres."""
+    tau: FloatArray
+    """(...) frame periods."""
+
+
+def points_of(geometry: Geometry, shot: Shot, pixels: FloatArray, depth: FloatArray) -> FloatArray:
+    """World points (..., 3) that a shot sees at pixels (..., 2) with depth (...)."""
+    rig, shutter, motion = geometry.rig, geometry.shutter, geometry.motion
+    if shot.shutter == "gs":
+        x_in_cam = depth[..., None] * rig.camera.unproject(pixels)
+        return transform(inverse(_pose(geometry, shot)), x_in_cam)
+    return back_project(rig, shutter, motion, shot.side, shot.frame, pixels, depth)
+
+
+def seen_by(geometry: Geometry, shot: Shot, X: FloatArray, rows: ArrayLike) -> Seen:
+    """Where a shot sees world points (..., 3); ``rows`` (...) are guesses."""
+    rig, shutter, motion = geometry.rig, geometry.shutter, geometry.motion
+    if shot.shutter == "rs":
+        found = rs_project_near(rig, shutter, motion, shot.side, shot.frame, X, rows)
+        return Seen(found.pixels, found.depth, found.tau)
+    x_in_cam = transform(_pose(geometry, shot), X)
+    pixels = rig.camera.project(x_in_cam)
+    outside = ~rig.camera.contains(pixels)
+    pixels[outside] = np.nan
+    tau = np.broadcast_to(_time(geometry, shot), outside.shape)
+    return Seen(pixels, np.where(outside, np.nan, x_in_cam[..., 2]), np.where(outside, np.nan, tau))
+
+
+def _time(geometry: Geometry, shot: Shot) -> FloatArray:
+    return geometry.shutter.row_time(shot.row, shot.frame)
+
+
+def _pose(geometry: Geometry, shot: Shot) -> Pose:
+    return geometry.rig.cam_from_world(geometry.motion, _time(geometry, shot), shot.side)
