@@ -328,6 +328,11 @@ def render_camera(
         # A global-shutter frame needs no stitching: all its rows have one pose.
         chosen = options if kind == "rs" else replace(options, method="single-pass")
         rendered = render(scene, rig.camera, pose.R, pose.t, chosen, on_gs_frame=keep if kind == "rs" else None)
+        if not np.any(rendered.depth):
+            raise RsbenchError(
+                f"sequence {sequence.name}: {side}_{frame} shows no surface at all: change the viewpoint "
+                f"{sequence.viewpoint!r} of scene {sequence.scene}, or the motion"
+            )
         place = "rs_clean" if kind == "rs" and card.sensor else kind
         write_png(folder / place / f"{side}_{frame}.png", to_srgb8(rendered.image, options.exposure))
         write_depth(folder / f"{kind}_depth" / f"{side}_{frame}.exr", rendered.depth)

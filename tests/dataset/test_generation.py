@@ -224,6 +224,18 @@ def test_the_estimate_counts_files_and_bytes(small: Small) -> None:
     assert 0.0 < found.seconds < 60.0
 
 
+def test_a_frame_without_any_surface_is_an_error(tmp_path: Path) -> None:
+    """A card's viewpoint that looks away from its mesh, or from inside out of it."""
+    scene = write_box_scene(tmp_path, "away")
+    scene.write_text(
+        scene.read_text().replace("[0.0, -3.0, 0.2]", "[0.0, -30.0, 0.2]").replace("3.0, 0.0]", "-60.0, 0.0]")
+    )
+    card = load_dataset_card(str(write_small_card(tmp_path, [scene])))
+    with pytest.raises(RsbenchError, match="sequence away: left_0 shows no surface at all"):
+        generate_dataset(card, tmp_path / "out")
+    assert not (tmp_path / "out" / "away").exists()
+
+
 def test_dataset_manifest_lists_every_file(smoke_dataset: Path) -> None:
     manifest = json.loads((smoke_dataset / "dataset.json").read_text())
     assert set(manifest["files"]) == set(bytes_of(smoke_dataset)) - {"dataset.json"}
