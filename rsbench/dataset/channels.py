@@ -7,14 +7,15 @@ from enum import IntEnum
 from typing import Literal, get_args
 
 from rsbench.core.rig import VIEWS
+from rsbench.dataset.timing import TIMING_FILES
 from rsbench.errors import RsbenchError
 
 PairChannel = Literal["disparity", "flow", "gs_flow"]
 """Where each pixel of a rolling-shutter frame lies in another picture: of the other camera at the same time
 (disparity), of the same camera at the other time (flow), and of its global-shutter twin (gs_flow)."""
-Channel = PairChannel
-CHANNELS: tuple[Channel, ...] = get_args(Channel)
+Channel = Literal["disparity", "flow", "gs_flow", "timing"]
 PAIR_CHANNELS: tuple[PairChannel, ...] = get_args(PairChannel)
+CHANNELS: tuple[Channel, ...] = get_args(Channel)
 COMPONENTS: dict[PairChannel, tuple[str, ...]] = {"disparity": ("d",), "flow": ("x", "y"), "gs_flow": ("x", "y")}
 """Names of the float32 channels of the EXR files."""
 
@@ -50,13 +51,14 @@ def mask_file(channel: PairChannel, side: str, frame: int) -> str:
 def channel_files(names: Iterable[str]) -> tuple[str, ...]:
     """Paths below a sequence's folder of the channels of these names; those of later versions are nobody's."""
     given = set(names)
-    return tuple(
+    pairs = (
         file(channel, *view)
         for channel in PAIR_CHANNELS
         if channel in given
         for file in (value_file, mask_file)
         for view in VIEWS
     )
+    return (*pairs, *(TIMING_FILES if "timing" in given else ()))
 
 
 def named_channels(text: str) -> tuple[Channel, ...]:

@@ -30,6 +30,7 @@ from rsbench.dataset.hashes import HASHES, FileHashes, HashedFile
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence import FORMAT, FRAMES, UNITS, files_of, is_of_sequence
 from rsbench.dataset.shots import GivenGeometry, Shot
+from rsbench.dataset.timing import write_timing
 from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, remove, strangers, workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_jobs import finished_jobs
@@ -282,6 +283,8 @@ def _render_sequence(
         (partial / folder).mkdir(parents=True, exist_ok=True)
     for side, frame in product(SIDES, FRAMES):
         yield from render_camera(card, sequence, options, mitsuba_scene, side, frame, partial)
+    if "timing" in card.channels:
+        write_timing(partial, card.shutter(), card.frame_period_s, card.sensor)
     files = {name: sha256(partial / name) for name in files_below(partial)}
     made_by = {
         "rsbench": __version__,

@@ -30,6 +30,7 @@ from rsbench.dataset.channels import (
     value_file,
 )
 from rsbench.dataset.files import read_depth, read_exr, read_grey_png, read_json, read_png, read_poses
+from rsbench.dataset.timing import MANIFEST, read_timing_table, table_file
 from rsbench.errors import RsbenchError
 from rsbench.motions import motion_record, read_motion
 from rsbench.reading import check_name, check_size, inside
@@ -211,6 +212,16 @@ class Sequence:
         if np.any(classes > max(PixelClass)):
             raise RsbenchError(f"{path}: holds {np.max(classes)}: the classes are 0 to {max(PixelClass)}")
         return classes
+
+    def timing(self) -> dict[str, Any]:
+        """Content of timing.json; RsbenchError as of ``offsets``."""
+        self._check_channel("timing")
+        return read_json(inside(self.folder, MANIFEST))
+
+    def row_times_ns(self, side: Side, frame: int) -> NDArray[np.int64]:
+        """(H, 4) of each row: number, time, start and end of its exposure; RsbenchError likewise."""
+        self._check_channel("timing")
+        return read_timing_table(inside(self.folder, table_file(side, frame)), self.shutter.height)
 
     def _check_channel(self, channel: str) -> None:
         if channel not in self.channels:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from attack.planting import rehash
+from attack.planting import drop, manifest_of, put, rehash
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -23,6 +23,7 @@ from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.dataset.verification import Rerender, verify_dataset
 from rsbench.errors import RsbenchError
+from rsbench.renderers.electrons import Sensor
 from rsbench.scenes.load import load_scene
 
 Array = NDArray[np.float64]
@@ -70,6 +71,7 @@ def yard_card(folder: Path, **fields: object) -> DatasetCard:
             translation_axis=(-0.7, 0.3, -0.6),
         ),
         renderer="preview",
+        sensor=Sensor(exposure_s=0.004, full_well=6000, photon_noise=True, read_noise=2.5),
         sequence=(SequenceCard(name="yard", scene=str(folder / "yard.toml")),),
         **fields,  # type: ignore[arg-type]
     )
@@ -214,6 +216,17 @@ def test_every_pixel_lies_where_rays_say(sequence: Sequence, triangles: Array, c
     assert np.all(seen[PixelClass.VISIBLE :] >= 20) and seen[PixelClass.UNSOLVED] == 0, seen
 
 
+def test_rows_are_timed_in_nanoseconds(sequence: Sequence) -> None:
+    """48 rows in 0.9 of 0.1 s: 1.875 ms each, exposed for 4 ms about their times."""
+    camera = sequence.timing()["right"]
+    assert camera["line_delay_ns"] == pytest.approx(1_875_000) and camera["readout_ns"] == pytest.approx(90e6)
+    assert camera["exposure_ns"] == pytest.approx(4e6) and camera["reference_ns"] == pytest.approx([0, 1e8])
+    for side, frame in VIEWS:
+        table = sequence.row_times_ns(side, frame)
+        assert np.array_equal(table[:, 1], 100_000_000 * frame + 1_875_000 * np.arange(48))
+        assert np.all(table[:, 2] + 2_000_000 == table[:, 1]) and np.all(table[:, 1] + 2_000_000 == table[:, 3])
+
+
 def test_a_sequence_without_channels_has_none(yard: Path, tmp_path: Path) -> None:
     card = yard_card(yard.parent)
     generate_dataset(card, tmp_path / "data")
@@ -301,6 +314,16 @@ def copied(one: str, other: str) -> Callable[[Path], None]:
     return plant
 
 
+def table_of(view: str, row: int, column: int, value: str) -> Callable[[Path], None]:
+    def plant(folder: Path) -> None:
+        path = folder / f"timing/{view}.csv"
+        lines = [line.split(",") for line in path.read_text().splitlines()]
+        lines[row + 1][column] = value
+        path.write_text("\n".join(",".join(line) for line in lines) + "\n")
+
+    return plant
+
+
 def of_class(old: PixelClass, new: PixelClass) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]]:
     return lambda classes: np.where(classes == old, np.uint8(new), classes)
 
@@ -352,6 +375,18 @@ FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
         mask_of("flow_mask/left_1.png", of_class(PixelClass.OUT_OF_VIEW, PixelClass.UNSOLVED)),
         ("flow_mask/left_1.png", "not solved"),
     ),
+    "timing of another readout": (
+        manifest_of("timing.json", put("left", "readout_ns", 8e7)),
+        ("timing.json", "left.readout_ns = 80000000.0"),
+    ),
+    "timing without a camera": (manifest_of("timing.json", drop("right")), ("timing.json", "right = None")),
+    "one row timed late": (table_of("left_1", 20, 1, "137500002"), ("timing/left_1.csv", "row 20")),
+    "exposure too short": (table_of("right_0", 7, 3, "15124000"), ("timing/right_0.csv", "exposure_end_ns")),
+    "timing of frames exchanged": (
+        exchanged("timing/left_0.csv", "timing/left_1.csv"),
+        ("timing/left_0.csv", "those of frame 1"),
+    ),
+    "a word for a time": (table_of("left_0", 3, 1, "soon"), ("timing/left_0.csv", "not a table")),
     "correction flow zeroed": (
         values_of("gs_flow/left_0.exr", lambda values: values * 0),
         ("gs_flow/left_0.exr", "zeroed"),

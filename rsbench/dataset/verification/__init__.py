@@ -20,6 +20,7 @@ from rsbench.dataset.verification.poses import pose_faults
 from rsbench.dataset.verification.rerender import Again, Rerender
 from rsbench.dataset.verification.sensors import sensor_faults
 from rsbench.dataset.verification.shots import PAIRS
+from rsbench.dataset.verification.timing import timing_faults
 from rsbench.errors import RsbenchError
 
 __all__ = [
@@ -102,6 +103,7 @@ def verify_sequence(
             step(name)
             steps -= 1
         faults += comparison.faults(images_elsewhere(partial(_others, listing, name)))
+        faults += timing_faults(sequence, {*missing, *map(_file_of, faults)})
         faults += channel_faults(sequence, content.maps, {*missing, *map(_file_of, faults)}, stride)
         if again is not None:
             found, note = again.check(content, {*missing, *map(_file_of, faults)})

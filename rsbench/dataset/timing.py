@@ -1,0 +1,78 @@
+"""The channel ``timing``: when each row of each frame is exposed and read, in nanoseconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.rig import FRAMES, SIDES, VIEWS
+from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.files import write_bytes, write_json
+from rsbench.errors import RsbenchError
+from rsbench.reading import read_text
+from rsbench.renderers.electrons import Sensor
+
+MANIFEST = "timing.json"
+COLUMNS = "row,time_ns,exposure_start_ns,exposure_end_ns"
+_NS = 1e9
+
+
+def table_file(side: str, frame: int) -> str:
+    """Below the folder of a sequence."""
+    return f"timing/{side}_{frame}.csv"
+
+
+TIMING_FILES = (MANIFEST, *(table_file(*view) for view in VIEWS))
+
+
+def timing_manifest(shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None) -> dict[str, Any]:
+    """Content of timing.json: of each camera what makes its tables; times count from that of row 0 of frame 0."""
+    readout_ns = _NS * shutter.readout_ratio * frame_period_s
+    camera = {
+        "readout_ns": readout_ns,
+        "line_delay_ns": readout_ns / shutter.height,
+        "exposure_ns": _NS * (sensor.exposure_s if sensor else 0.0),
+        "scan": "top",
+        "reference_row": 0,
+        "reference_ns": [_NS * frame_period_s * frame for frame in FRAMES],
+    }
+    common = {"frame_period_ns": _NS * frame_period_s, "time_of_a_row": "middle of its exposure"}
+    return common | dict.fromkeys(SIDES, camera)
+
+
+def timing_table(
+    shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, frame: int
+) -> NDArray[np.int64]:
+    """(H, 4) in the order of ``COLUMNS``, rounded to whole nanoseconds."""
+    rows = np.arange(shutter.height)
+    middle = _NS * frame_period_s * shutter.row_time(rows, frame)
+    half = 0.5 * _NS * (sensor.exposure_s if sensor else 0.0)
+    return np.round(np.stack([rows, middle, middle - half, middle + half], axis=1)).astype(np.int64)
+
+
+def write_timing(folder: Path, shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None) -> None:
+    """All ``TIMING_FILES`` below the folder of a sequence."""
+    write_json(folder / MANIFEST, timing_manifest(shutter, frame_period_s, sensor))
+    for side, frame in VIEWS:
+        table = timing_table(shutter, frame_period_s, sensor, frame)
+        lines = [",".join(map(str, line)) for line in table.tolist()]
+        write_bytes(folder / table_file(side, frame), ("\n".join([COLUMNS, *lines]) + "\n").encode())
+
+
+def read_timing_table(path: Path, height: int) -> NDArray[np.int64]:
+    """(height, 4) in the order of ``COLUMNS``.
+
+    Raises:
+        RsbenchError: missing, or not such a table.
+    """
+    header, *lines = read_text(path).splitlines() or [""]
+    try:
+        table = np.array([[int(cell) for cell in line.split(",")] for line in lines], dtype=np.int64)
+    except (ValueError, OverflowError) as error:
+        raise RsbenchError(f"{path}: not a table of whole numbers: {error}") from error
+    if header != COLUMNS or table.shape != (height, 4) or np.any(table[:, 0] != np.arange(height)):
+        raise RsbenchError(f"{path}: must have the columns {COLUMNS} and rows 0 to {height - 1}")
+    return table
