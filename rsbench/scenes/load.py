@@ -84,6 +84,7 @@ BUILDERS: Kind[SceneBuilder, NoOptions] = Kind(
     options=NoOptions,
     built_in={
         "castle": "rsbench.scenes.castle:CastleBuilder",
+        "corridor": "rsbench.scenes.corridor:CorridorBuilder",
         "mesh": "rsbench.scenes.mesh:MeshBuilder",
         "old-town": "rsbench.scenes.old_town:OldTownBuilder",
         "poles": "rsbench.scenes.poles:PolesBuilder",

@@ -127,6 +127,17 @@ RECIPES: dict[str, Recipe] = {
     "fabric_1": _recipe(s.leaves, 0.9, greens=((0.62, 0.24, 0.18), (0.80, 0.62, 0.40)), size=0.04, depth=0.7),
     "fabric_2": _recipe(s.cloth, 0.9, stripes=((0.82, 0.74, 0.58), (0.72, 0.62, 0.45)), width=0.025),
     "fabric_3": _recipe(s.leaves, 1.6, greens=((0.56, 0.34, 0.27), (0.78, 0.64, 0.44)), size=0.06, depth=0.7),
+    # Weak on purpose: a few grey levels on coats of paint.
+    "paint_white": _recipe(s.speckled, 3.0, 512, colours=((0.80, 0.79, 0.74),), contrast=0.03, grit=0.012),
+    "paint_sage": _recipe(s.speckled, 3.0, 512, colours=((0.46, 0.56, 0.50),), contrast=0.04, grit=0.015),
+    "paint_blue": _recipe(s.speckled, 3.0, 512, colours=((0.26, 0.37, 0.50),), contrast=0.04, grit=0.015),
+    "paint_grey": _recipe(s.speckled, 3.0, 512, colours=((0.60, 0.58, 0.54),), contrast=0.04, grit=0.015),
+    "paint_red": _recipe(s.speckled, 3.0, 512, colours=((0.70, 0.15, 0.12),), contrast=0.04, grit=0.015),
+    "enamel": _recipe(s.speckled, 3.0, 512, colours=((0.92, 0.92, 0.90),), contrast=0.015, grit=0.01),
+    "steel": _recipe(s.speckled, 3.0, 512, colours=((0.50, 0.51, 0.53),), contrast=0.06, grit=0.03),
+    "terrazzo": _recipe(
+        s.speckled, 3.0, 1024, colours=((0.58, 0.57, 0.54), (0.52, 0.51, 0.48)), contrast=0.05, grit=0.08
+    ),
     "books": _recipe(f.spines, None, 2048),
     "pictures": _recipe(f.pictures, None, 2048),
     "rug": _recipe(f.rug, None),
