@@ -85,6 +85,7 @@ BUILDERS: Kind[SceneBuilder, NoOptions] = Kind(
     built_in={
         "castle": "rsbench.scenes.castle:CastleBuilder",
         "corridor": "rsbench.scenes.corridor:CorridorBuilder",
+        "forest": "rsbench.scenes.forest:ForestBuilder",
         "mesh": "rsbench.scenes.mesh:MeshBuilder",
         "old-town": "rsbench.scenes.old_town:OldTownBuilder",
         "poles": "rsbench.scenes.poles:PolesBuilder",

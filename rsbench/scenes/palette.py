@@ -63,6 +63,7 @@ _SAGE = ((0.42, 0.50, 0.44), (0.74, 0.72, 0.58), (0.84, 0.78, 0.64), (0.60, 0.62
 _DELFT = ((0.80, 0.81, 0.79), (0.30, 0.40, 0.60), (0.82, 0.82, 0.80))
 _GRASS = ((0.24, 0.31, 0.12), (0.38, 0.41, 0.19), (0.46, 0.41, 0.25))
 _EARTH = ((0.40, 0.33, 0.24), (0.50, 0.43, 0.32), (0.34, 0.33, 0.18), (0.56, 0.51, 0.43))
+_NEEDLES = ((0.33, 0.24, 0.15), (0.44, 0.33, 0.21), (0.26, 0.24, 0.12), (0.48, 0.40, 0.28))
 
 RECIPES: dict[str, Recipe] = {
     "ashlar_0": _recipe(s.ashlar, stones=_GREYS),
@@ -74,6 +75,8 @@ RECIPES: dict[str, Recipe] = {
     "cobbles": _recipe(s.cobbles, 14.0, 2048, stones=_SETTS),
     "earth": _recipe(s.speckled, 16.0, 2048, colours=_EARTH, contrast=0.26, grit=0.2),
     "grass": _recipe(s.speckled, 16.0, 2048, colours=_GRASS, contrast=0.3, grit=0.22),
+    "needles": _recipe(s.speckled, 16.0, 2048, colours=_NEEDLES, contrast=0.3, grit=0.3),
+    "litter": _recipe(s.speckled, 1.0, 512, colours=((0.52, 0.34, 0.17), (0.66, 0.48, 0.24)), contrast=0.3),
     "tiles_0": _recipe(s.roof_tiles, tiles=_RED_TILES),
     "tiles_1": _recipe(s.roof_tiles, tiles=(*_RED_TILES[2:], (0.54, 0.42, 0.33))),
     "tiles_2": _recipe(s.roof_tiles, tiles=_SLATES, course=(0.16, 0.2), width=(0.14, 0.3)),

@@ -20,6 +20,7 @@ from rsbench.scenes.surfaces import Surface
 DEPTHS = {
     "castle": (4.0, (8, 27), 70.0),
     "corridor": (2.5, (4, 10), 24.0),
+    "forest": (2.0, (6, 20), 60.0),
     "old-town": (4.0, (8, 25), 70.0),
     "poles": (2.0, (4, 13), 30.0),
     "room": (1.2, (2.5, 5.5), 6.5),
