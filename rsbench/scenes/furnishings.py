@@ -15,6 +15,8 @@ SPINES = (32, 4)
 """Columns and rows of the sheet of book spines."""
 PICTURES = (4, 2)
 """Columns and rows of the sheet of pictures; the last two are printed pages."""
+CARTONS = (2, 2)
+"""Columns and rows of the sheet of cartons; the last cell is a label alone."""
 
 _LEATHERS: tuple[Colour, ...] = (
     (0.42, 0.15, 0.12), (0.16, 0.27, 0.20), (0.18, 0.22, 0.38), (0.52, 0.38, 0.22), (0.30, 0.20, 0.14),
@@ -108,6 +110,49 @@ def _page(rng: np.random.Generator, size: tuple[int, int]) -> Field:
     ink = ink[: len(lines)] * lines * columns
     ink[: size[0] // 12] = 0
     return blend(image, (0.12, 0.11, 0.10), 0.85 * ink)
+
+
+def cartons(paint: Painter) -> Bytes:
+    """A sheet of what is printed on cartons: tape, a mark, signs, a label with a bar code; and the label alone."""
+    n = paint.pixels // 2
+    browns: tuple[Colour, ...] = ((0.62, 0.47, 0.31), (0.70, 0.56, 0.40), (0.55, 0.43, 0.30))
+    inks: tuple[Colour, ...] = ((0.16, 0.20, 0.36), (0.50, 0.14, 0.12), (0.13, 0.12, 0.11))
+    cells = [_carton(paint.rng, n, brown, ink) for brown, ink in zip(browns, inks, strict=True)]
+    cells.append(_label(paint.rng, n, n))
+    image = np.concatenate([np.concatenate(cells[:2], axis=2), np.concatenate(cells[2:], axis=2)][::-1], axis=1)
+    return to_bytes(image * (1 + 0.05 * paint.fine() + 0.05 * paint.broad()))
+
+
+def _carton(rng: np.random.Generator, n: int, brown: Colour, ink: Colour) -> Field:
+    """One print (3, n, n): tape across, blocks of letters, three signs, a label."""
+    image = plain(brown, np.ones((n, n), np.float32))
+    image[:, :, int(0.46 * n) : int(0.54 * n)] *= np.float32(1.15)  # tape
+    colour = np.asarray(ink, np.float32)[:, None, None]
+    mark = np.kron(rng.random((5, 9)) < 0.55, np.ones((n // 40, n // 40))).astype(bool)
+    at = (int(0.12 * n), int(0.08 * n))
+    image[:, at[0] : at[0] + mark.shape[0], at[1] : at[1] + mark.shape[1]][:, mark] = colour[:, 0]
+    for k in range(3):
+        sign = np.kron(rng.random((6, 3)) < 0.5, np.ones((n // 50, n // 50)))
+        sign = np.concatenate([sign, sign[:, ::-1]], axis=1).astype(bool)
+        x, y = int((0.08 + 0.16 * k) * n), int(0.8 * n)
+        image[:, y : y + sign.shape[0], x : x + sign.shape[1]][:, sign] = colour[:, 0]
+    high, wide = int(0.24 * n), int(0.34 * n)
+    y, x = int(rng.uniform(0.1, 0.45) * n), int(rng.uniform(0.58, 0.62) * n)
+    image[:, y : y + high, x : x + wide] = _label(rng, high, wide)
+    return image
+
+
+def _label(rng: np.random.Generator, high: int, wide: int) -> Field:
+    """White paper with a bar code below lines of print."""
+    image = plain((0.88, 0.87, 0.84), np.ones((high, wide), np.float32))
+    dot = max(2, wide // 80)
+    bars = np.repeat(rng.random(wide // dot + 1) < 0.5, dot)[: int(0.84 * wide)]
+    image[:, int(0.58 * high) : int(0.9 * high), int(0.08 * wide) : int(0.08 * wide) + len(bars)][:, :, bars] = 0.1
+    for line in range(4):
+        y, long = int((0.1 + 0.11 * line) * high), int(rng.uniform(0.4, 0.84) * wide)
+        print_ = np.repeat(rng.random(long // dot + 1) < 0.65, dot)[:long]
+        image[:, y : y + int(0.06 * high), int(0.08 * wide) : int(0.08 * wide) + long][:, :, print_] = 0.15
+    return image
 
 
 def rug(paint: Painter) -> Bytes:

@@ -90,6 +90,7 @@ BUILDERS: Kind[SceneBuilder, NoOptions] = Kind(
         "old-town": "rsbench.scenes.old_town:OldTownBuilder",
         "poles": "rsbench.scenes.poles:PolesBuilder",
         "room": "rsbench.scenes.room:RoomBuilder",
+        "shelves": "rsbench.scenes.shelves:ShelvesBuilder",
     },
 )
 """What ``builder`` in a scene card may name; others' are of the entry points ``rsbench.scenes``."""

@@ -77,6 +77,9 @@ RECIPES: dict[str, Recipe] = {
     "grass": _recipe(s.speckled, 16.0, 2048, colours=_GRASS, contrast=0.3, grit=0.22),
     "needles": _recipe(s.speckled, 16.0, 2048, colours=_NEEDLES, contrast=0.3, grit=0.3),
     "litter": _recipe(s.speckled, 1.0, 512, colours=((0.52, 0.34, 0.17), (0.66, 0.48, 0.24)), contrast=0.3),
+    "concrete": _recipe(
+        s.speckled, 8.0, 1024, colours=((0.50, 0.49, 0.47), (0.42, 0.41, 0.40)), contrast=0.1, grit=0.06
+    ),
     "tiles_0": _recipe(s.roof_tiles, tiles=_RED_TILES),
     "tiles_1": _recipe(s.roof_tiles, tiles=(*_RED_TILES[2:], (0.54, 0.42, 0.33))),
     "tiles_2": _recipe(s.roof_tiles, tiles=_SLATES, course=(0.16, 0.2), width=(0.14, 0.3)),
@@ -136,12 +139,14 @@ RECIPES: dict[str, Recipe] = {
     "paint_blue": _recipe(s.speckled, 3.0, 512, colours=((0.26, 0.37, 0.50),), contrast=0.04, grit=0.015),
     "paint_grey": _recipe(s.speckled, 3.0, 512, colours=((0.60, 0.58, 0.54),), contrast=0.04, grit=0.015),
     "paint_red": _recipe(s.speckled, 3.0, 512, colours=((0.70, 0.15, 0.12),), contrast=0.04, grit=0.015),
+    "paint_orange": _recipe(s.speckled, 3.0, 512, colours=((0.80, 0.42, 0.12),), contrast=0.04, grit=0.015),
     "enamel": _recipe(s.speckled, 3.0, 512, colours=((0.92, 0.92, 0.90),), contrast=0.015, grit=0.01),
     "steel": _recipe(s.speckled, 3.0, 512, colours=((0.50, 0.51, 0.53),), contrast=0.06, grit=0.03),
     "terrazzo": _recipe(
         s.speckled, 3.0, 1024, colours=((0.58, 0.57, 0.54), (0.52, 0.51, 0.48)), contrast=0.05, grit=0.08
     ),
     "books": _recipe(f.spines, None, 2048),
+    "cartons": _recipe(f.cartons, None),
     "pictures": _recipe(f.pictures, None, 2048),
     "rug": _recipe(f.rug, None),
     "globe": _recipe(f.world_map, 0.5, 512),
