@@ -166,19 +166,17 @@ def rs_project_near(
     frame: int,
     points: ArrayLike,
     start_rows: ArrayLike,
-    tolerance_px: float = ROW_TOLERANCE_PX,
 ) -> RSProjection:
     """Like ``rs_project`` from a row guess (...) per point: Newton only, for dense maps.
 
-    Finds one crossing and does not look for others, so the status is never TWICE. ``tolerance_px`` is the accepted
-    residual of the row equation.
+    Finds one crossing and does not look for others, so the status is never TWICE.
     """
     X = np.asarray(points, dtype=np.float64)
     y = np.broadcast_to(np.asarray(start_rows, dtype=np.float64), X.shape[:-1]).copy()
     equation = _RowEquation(rig, shutter, motion, side, frame)
     for _ in range(_MAX_NEWTON_STEPS):
         value, slope, x_in_cam = equation(X, y)
-        converged = np.abs(value) <= tolerance_px
+        converged = np.abs(value) <= ROW_TOLERANCE_PX
         # Points behind the camera have no residual and need no further steps.
         if np.all(converged | np.isnan(value)):
             break

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.projection import ProjectionStatus, row_poses, rs_project, rs_project_near
+from rsbench.core.projection import ProjectionStatus, project_at, row_poses, rs_project, rs_project_near
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import PairChannel, PixelClass
 from rsbench.dataset.shots import FAR, Geometry, Shot, seen_by
+from rsbench.renderers.segments import Surfaces
 
 Blocked = Callable[[FloatArray, FloatArray], NDArray[np.bool_]]
 """Whether something stands before points (n, 3) seen from eyes (n, 3), world frame, metres."""
@@ -25,6 +26,13 @@ _BAND_ROWS = 8
 """Done at once: small enough for a core's cache."""
 _TOLERANCE_PX = 1e-5
 """Residual of the row equation that needs no further step; stored values are rounded to 1e-3 px."""
+
+
+class Rays(Protocol):
+    """Rays through the scene of a sequence: ``renderers.segments.SceneRays`` is one."""
+
+    def blocked(self, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool_]: ...
+    def surfaces(self, eyes: FloatArray, points: FloatArray) -> Surfaces: ...
 
 
 class PairTruth(NamedTuple):
@@ -88,6 +96,22 @@ def pair_truth(
     return PairTruth(landed.pixels.reshape(*shape, 2) - grid, classes)
 
 
+def surface_truth(
+    geometry: Geometry, source: Shot, depth: NDArray[np.float32], rays: Rays, rows: Sequence[int] | None = None
+) -> Surfaces:
+    """Normals (H, W, 3) and instances (H, W) of the pixels of a rolling-shutter frame; arguments as above."""
+    chosen = np.arange(geometry.shutter.height) if rows is None else np.asarray(rows)
+    poses = row_poses(geometry.rig, geometry.shutter, geometry.motion, source.side, source.frame)
+    x_in_cam = depth[..., None] * geometry.rig.camera.unproject(geometry.rig.camera.pixel_grid()[chosen])
+    points = (x_in_cam - poses.t[chosen, None]) @ poses.R[chosen]
+    eyes = np.broadcast_to(inverse(poses).t[chosen, None], points.shape)
+    solid = depth > 0
+    normals, instances = np.zeros((*depth.shape, 3), dtype=np.float32), np.zeros(depth.shape, dtype=np.uint16)
+    if np.any(solid):
+        normals[solid], instances[solid] = rays.surfaces(eyes[solid], points[solid])
+    return Surfaces(normals, instances)
+
+
 def _classes(X: FloatArray, landed: _Landed, sky: NDArray[np.bool_], blocked: Blocked) -> NDArray[np.uint8]:
     """(n,) of ``PixelClass``."""
     inside = np.isfinite(landed.pixels[:, 0])
@@ -137,15 +161,18 @@ def _landed(pixels: FloatArray, eyes: FloatArray, unsolved: NDArray[np.bool_]) -
 
 
 def _rolling(table: _RowTable, target: Shot, X: FloatArray, rows: FloatArray) -> _Landed:
-    """By ``rs_project_near`` from a guess that is nearly right; what it cannot solve, ``rs_project`` tries."""
-    geometry = table.geometry.rig, table.geometry.shutter, table.geometry.motion, target.side, target.frame
+    """One exact projection at a guess that is nearly always right; the rest is left to the solvers of ``core``."""
+    rig, shutter, motion = table.geometry.rig, table.geometry.shutter, table.geometry.motion
     X = X.reshape(-1, 3)
-    found = rs_project_near(*geometry, X, table.guess(X, rows.ravel()), _TOLERANCE_PX)
-    pixels, unsolved = found.pixels, found.status == ProjectionStatus.NOT_CONVERGED
-    if np.any(unsolved):
-        again = rs_project(*geometry, X[unsolved])
-        pixels[unsolved] = again.pixels
-        unsolved[unsolved] = again.status == ProjectionStatus.NOT_CONVERGED
+    guess = table.guess(X, rows.ravel())
+    pixels = project_at(rig, motion, target.side, shutter.row_time(guess, target.frame), X)[:, :2]
+    pixels[~rig.camera.contains(pixels)] = np.nan
+    unsolved = ~(np.abs(pixels[:, 1] - guess) <= _TOLERANCE_PX)
+    for solve in (partial(rs_project_near, start_rows=guess[unsolved]), rs_project):
+        if np.any(unsolved):
+            found = solve(rig, shutter, motion, target.side, target.frame, X[unsolved])
+            pixels[unsolved] = found.pixels
+            unsolved[unsolved] = found.status == ProjectionStatus.NOT_CONVERGED
     return _Landed(pixels, table.eyes(pixels[:, 1]), unsolved)
 
 

@@ -9,9 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.channel_truth import Blocked, pair_truth, target_of
-from rsbench.dataset.channels import COMPONENTS, PAIR_CHANNELS, STEP_PX, PairChannel, mask_file, value_file
-from rsbench.dataset.files import write_exr, write_png
+from rsbench.dataset.channel_truth import Rays, pair_truth, surface_truth, target_of
+from rsbench.dataset.channels import (
+    COMPONENTS,
+    NORMAL_COMPONENTS,
+    PAIR_CHANNELS,
+    STEP_PX,
+    PairChannel,
+    mask_file,
+    surface_file,
+    value_file,
+)
+from rsbench.dataset.files import write_exr, write_png, write_png16
 from rsbench.dataset.shots import Geometry, Shot
 
 
@@ -21,7 +30,7 @@ def write_channels(
     geometry: Geometry,
     shot: Shot,
     depth: NDArray[np.float32],
-    blocked: Blocked,
+    rays: Rays,
 ) -> None:
     """The files of the channels of these names that tell of one rolling-shutter frame.
 
@@ -31,16 +40,23 @@ def write_channels(
         geometry: of the sequence.
         shot: the frame.
         depth: (H, W) of the frame, metres, 0 = no surface.
-        blocked: see there.
+        rays: through its scene.
     """
     for channel in PAIR_CHANNELS:
         if channel not in names:
             continue
-        truth = pair_truth(geometry, shot, target_of(channel, shot), depth, blocked)
+        truth = pair_truth(geometry, shot, target_of(channel, shot), depth, rays.blocked)
         values = pair_values(channel, shot, truth.offset)
         pixels = {name: values[..., k] for k, name in enumerate(COMPONENTS[channel])}
         write_exr(folder / value_file(channel, shot.side, shot.frame), pixels)
         write_png(folder / mask_file(channel, shot.side, shot.frame), truth.classes)
+    if {"normals", "instances"} & set(names):
+        surfaces = surface_truth(geometry, shot, depth, rays)
+        if "normals" in names:
+            normals = {name: surfaces.normals[..., k] for k, name in enumerate(NORMAL_COMPONENTS)}
+            write_exr(folder / surface_file("normals", shot.side, shot.frame), normals)
+        if "instances" in names:
+            write_png16(folder / surface_file("instances", shot.side, shot.frame), surfaces.instances)
 
 
 def pair_values(channel: PairChannel, source: Shot, offset: FloatArray) -> NDArray[np.float32]:

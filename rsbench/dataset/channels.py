@@ -13,12 +13,14 @@ from rsbench.errors import RsbenchError
 PairChannel = Literal["disparity", "flow", "gs_flow"]
 """Where each pixel of a rolling-shutter frame lies in another picture: of the other camera at the same time
 (disparity), of the same camera at the other time (flow), and of its global-shutter twin (gs_flow)."""
-Channel = Literal["disparity", "flow", "gs_flow", "timing"]
+Channel = Literal["disparity", "flow", "gs_flow", "timing", "normals", "instances"]
+INSTANCE_TABLE = "instances.json"
 PAIR_CHANNELS: tuple[PairChannel, ...] = get_args(PairChannel)
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
 COMPONENTS: dict[PairChannel, tuple[str, ...]] = {"disparity": ("d",), "flow": ("x", "y"), "gs_flow": ("x", "y")}
 """Names of the float32 channels of the EXR files."""
 
+NORMAL_COMPONENTS = ("x", "y", "z")
 STEP_PX = 2.0**-10
 """Values are rounded to multiples of it, which makes the files four times smaller."""
 
@@ -48,6 +50,10 @@ def mask_file(channel: PairChannel, side: str, frame: int) -> str:
     return f"{channel}_mask/{side}_{frame}.png"
 
 
+def surface_file(channel: Literal["normals", "instances"], side: str, frame: int) -> str:
+    return f"{channel}/{side}_{frame}.{'exr' if channel == 'normals' else 'png'}"
+
+
 def channel_files(names: Iterable[str]) -> tuple[str, ...]:
     """Paths below a sequence's folder of the channels of these names; those of later versions are nobody's."""
     given = set(names)
@@ -58,7 +64,10 @@ def channel_files(names: Iterable[str]) -> tuple[str, ...]:
         for file in (value_file, mask_file)
         for view in VIEWS
     )
-    return (*pairs, *(TIMING_FILES if "timing" in given else ()))
+    timing = TIMING_FILES if "timing" in given else ()
+    normals = (surface_file("normals", *view) for view in VIEWS if "normals" in given)
+    instances = (INSTANCE_TABLE, *(surface_file("instances", *view) for view in VIEWS))
+    return (*pairs, *timing, *normals, *(instances if "instances" in given else ()))
 
 
 def named_channels(text: str) -> tuple[Channel, ...]:

@@ -11,7 +11,7 @@ import os
 import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import cv2
 import numpy as np
@@ -105,8 +105,13 @@ def read_png(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def read_grey_png(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-    """Image (H, W) uint8 of one channel of 8 bits; ``size`` as of ``read_png``.
+def write_png16(path: Path, image: NDArray[np.uint16]) -> None:
+    """16-bit image (H, W)."""
+    write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
+
+
+def read_grey_png(path: Path, size: tuple[int, int] | None = None, bits: Literal[8, 16] = 8) -> NDArray[Any]:
+    """Image (H, W) uint8 or uint16 of one channel; ``size`` as of ``read_png``.
 
     Raises:
         RsbenchError: missing, no such image or of another size.
@@ -114,9 +119,9 @@ def read_grey_png(path: Path, size: tuple[int, int] | None = None) -> NDArray[np
     data = read_bytes(path)
     check_image_size(data, path, size)
     pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.dtype != np.uint8 or pixels.ndim != 2:
-        raise RsbenchError(f"{path}: must be a grey image of 8 bits")
-    return np.asarray(pixels, dtype=np.uint8)
+    if pixels is None or pixels.dtype != np.dtype(f"uint{bits}") or pixels.ndim != 2:
+        raise RsbenchError(f"{path}: must be a grey image of {bits} bits")
+    return np.asarray(pixels)
 
 
 def write_depth(path: Path, depth: NDArray[np.float32]) -> None:

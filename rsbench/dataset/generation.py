@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import asdict, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
@@ -25,6 +25,7 @@ from rsbench.core.rig import SIDES, Side
 from rsbench.core.se3 import Pose
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channel_writer import write_channels
+from rsbench.dataset.channels import INSTANCE_TABLE
 from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_png, write_poses
 from rsbench.dataset.hashes import HASHES, FileHashes, HashedFile
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
@@ -285,6 +286,8 @@ def _render_sequence(
         yield from render_camera(card, sequence, options, mitsuba_scene, side, frame, partial)
     if "timing" in card.channels:
         write_timing(partial, card.shutter(), card.frame_period_s, card.sensor)
+    if "instances" in card.channels:
+        write_json(partial / INSTANCE_TABLE, {"instances": mitsuba_scene.instances})
     files = {name: sha256(partial / name) for name in files_below(partial)}
     made_by = {
         "rsbench": __version__,
@@ -317,7 +320,7 @@ def render_camera(
     """
     from rsbench.renderers.image import to_srgb8
     from rsbench.renderers.render import render
-    from rsbench.renderers.segments import blocked
+    from rsbench.renderers.segments import SceneRays
     from rsbench.renderers.sensed import sensed_rows
 
     rig, shutter = card.rig_of(sequence), card.shutter()
@@ -345,7 +348,7 @@ def render_camera(
             write_png(folder / "rs" / f"{side}_{frame}.png", to_srgb8(seen, 1.0))
         if kind == "rs":
             geometry, shot = GivenGeometry(rig, shutter, card.motion_of(sequence)), Shot("rs", side, frame)
-            write_channels(folder, card.channels, geometry, shot, rendered.depth, partial(blocked, scene))
+            write_channels(folder, card.channels, geometry, shot, rendered.depth, SceneRays(scene))
         yield
 
 

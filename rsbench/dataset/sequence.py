@@ -23,10 +23,13 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import (
     CHANNELS,
     COMPONENTS,
+    INSTANCE_TABLE,
+    NORMAL_COMPONENTS,
     PairChannel,
     PixelClass,
     channel_files,
     mask_file,
+    surface_file,
     value_file,
 )
 from rsbench.dataset.files import read_depth, read_exr, read_grey_png, read_json, read_png, read_poses
@@ -212,6 +215,31 @@ class Sequence:
         if np.any(classes > max(PixelClass)):
             raise RsbenchError(f"{path}: holds {np.max(classes)}: the classes are 0 to {max(PixelClass)}")
         return classes
+
+    def normals(self, side: Side, frame: int) -> NDArray[np.float32]:
+        """(H, W, 3) unit normals of what the pixels see, towards the camera, world frame; 0 where that is nothing.
+
+        RsbenchError as of ``offsets``.
+        """
+        self._check_channel("normals")
+        path = inside(self.folder, surface_file("normals", side, frame))
+        return read_exr(path, NORMAL_COMPONENTS, self._size)
+
+    def instances(self, side: Side, frame: int) -> NDArray[np.uint16]:
+        """(H, W) numbers of the meshes that the pixels see; 0 = none. RsbenchError as of ``offsets``."""
+        self._check_channel("instances")
+        return read_grey_png(inside(self.folder, surface_file("instances", side, frame)), self._size, 16)
+
+    def instance_table(self) -> list[dict[str, str]]:
+        """``name`` and ``material`` of instance 1, 2, ...; RsbenchError as of ``offsets``, or another content."""
+        self._check_channel("instances")
+        path = inside(self.folder, INSTANCE_TABLE)
+        table = read_json(path).get("instances")
+        rows: list[Any] = table if isinstance(table, list) else [None]
+        for row in rows:
+            if not isinstance(row, dict) or not all(isinstance(row.get(key), str) for key in ("name", "material")):
+                raise RsbenchError(f"{path}: instances: must be a list of tables with name and material")
+        return rows
 
     def timing(self) -> dict[str, Any]:
         """Content of timing.json; RsbenchError as of ``offsets``."""

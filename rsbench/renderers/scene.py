@@ -40,7 +40,10 @@ class MitsubaScene:
         if any((*scene.light.sky_zenith, *scene.light.sky_horizon)):
             content["sky"] = _sky(scene.light)
         materials: dict[int, Any] = {}
-        for number, mesh in enumerate(mesh for mesh in scene.meshes if mesh.faces.size):
+        drawn = [mesh for mesh in scene.meshes if mesh.faces.size]
+        self.instances = [{"name": mesh.name, "material": mesh.material.name} for mesh in drawn]
+        """Of the meshes with faces; the shapes of the renderer are called mesh00000 and so on."""
+        for number, mesh in enumerate(drawn):
             key = id(mesh.material)
             if key not in materials:
                 materials[key] = _loaded(mesh.material)

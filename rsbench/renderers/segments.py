@@ -1,8 +1,9 @@
-"""Whether anything stands between an eye and a point: the rays that decide what hides what."""
+"""Rays between eyes and points of our own choice: what stands between them, and what surface is met."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,20 +17,72 @@ REACH = 1.0 - 1e-4
 rounded to float32, so a ray that grazes a surface meets it a little early."""
 
 
-def blocked(scene: MitsubaScene, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
-    """Whether a surface stands before points (n, 3), seen from ``eyes`` (n, 3); world frame, metres."""
+class Surfaces(NamedTuple):
+    """What rays (n,) meet first."""
+
+    normals: NDArray[np.float32]
+    """(n, 3) of the triangles, towards the eye, world frame; 0 where nothing is met."""
+    instances: NDArray[np.uint16]
+    """(n,) numbers of meshes from 1, in the order of ``MitsubaScene.instances``; 0 where nothing is met."""
+
+
+@dataclass(frozen=True)
+class SceneRays:
+    """Rays through a scene; eyes and points (n, 3) are in its frame, metres."""
+
+    scene: MitsubaScene
+
+    def blocked(self, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
+        """Whether (n,) a surface stands before the points."""
+        found = []
+        for ray in _rays(eyes, points):
+            ray.maxt = REACH
+            found.append(np.atleast_1d(np.array(self.scene.scene.ray_test(ray), dtype=np.bool_)))
+        return np.concatenate(found)
+
+    def surfaces(self, eyes: FloatArray, points: FloatArray) -> Surfaces:
+        """What is met on the way to the points and beyond."""
+        normals, instances = [], []
+        for ray, way in zip(_rays(eyes, points), [points - eyes] if _wide() else points - eyes, strict=True):
+            hit = self.scene.scene.ray_intersect(ray)
+            normal = np.nan_to_num(np.array(hit.n, dtype=np.float32)).reshape(3, -1).T
+            away = np.sum(normal * way.reshape(-1, 3), axis=1, keepdims=True) > 0
+            normals.append(np.where(away, -normal, normal) + np.float32(0.0))  # no -0
+            instances.append(self._numbers(hit))
+        return Surfaces(np.concatenate(normals), np.concatenate(instances))
+
+    def _numbers(self, hit: Any) -> NDArray[np.uint16]:
+        import drjit as dr
+        import mitsuba as mi
+
+        if not _wide():
+            return np.array([_number(hit.shape) if hit.is_valid() else 0], dtype=np.uint16)
+        known = self.scene.scene.shapes()
+        pointers: Any = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)) for shape in known]
+        keys = [int(pointer[0]) for pointer in pointers]
+        table = np.zeros(max(keys) + 1, dtype=np.uint16)
+        table[keys] = [_number(shape) for shape in known]
+        return table[np.array(dr.reinterpret_array(mi.UInt32, hit.shape))]
+
+
+def _number(shape: Any) -> int:
+    return 1 + int(str(shape.id()).removeprefix("mesh"))
+
+
+def _wide() -> bool:
+    """Whether the backend traces arrays of rays."""
     import drjit as dr
+    import mitsuba as mi
+
+    return bool(dr.is_jit_v(mi.Float))
+
+
+def _rays(eyes: FloatArray, points: FloatArray) -> list[Any]:
+    """Rays whose parameter is 1 at the points: one array of all of them, or each alone."""
     import mitsuba as mi
 
     origins, ways = eyes.astype(np.float32), (points - eyes).astype(np.float32)
     ways[np.abs(ways) < LEAST_COMPONENT] = 0.0
-    if dr.is_jit_v(mi.Float):
-        ray: Any = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(ways.T))
-        ray.maxt = REACH
-        return np.array(scene.scene.ray_test(ray, coherent=True), dtype=np.bool_)
-    found = np.zeros(len(eyes), dtype=np.bool_)
-    for number, (origin, way) in enumerate(zip(origins.tolist(), ways.tolist(), strict=True)):
-        ray = mi.Ray3f(origin, way)
-        ray.maxt = REACH
-        found[number] = scene.scene.ray_test(ray)
-    return found
+    if _wide():
+        return [mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(ways.T))]
+    return [mi.Ray3f(o, d) for o, d in zip(origins.tolist(), ways.tolist(), strict=True)]

@@ -20,6 +20,7 @@ from rsbench.dataset.verification.poses import pose_faults
 from rsbench.dataset.verification.rerender import Again, Rerender
 from rsbench.dataset.verification.sensors import sensor_faults
 from rsbench.dataset.verification.shots import PAIRS
+from rsbench.dataset.verification.surfaces import surface_faults
 from rsbench.dataset.verification.timing import timing_faults
 from rsbench.errors import RsbenchError
 
@@ -105,6 +106,7 @@ def verify_sequence(
         faults += comparison.faults(images_elsewhere(partial(_others, listing, name)))
         faults += timing_faults(sequence, {*missing, *map(_file_of, faults)})
         faults += channel_faults(sequence, content.maps, {*missing, *map(_file_of, faults)}, stride)
+        faults += surface_faults(sequence, content.maps, {*missing, *map(_file_of, faults)})
         if again is not None:
             found, note = again.check(content, {*missing, *map(_file_of, faults)})
             faults += found

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.channel_truth import Blocked, pair_truth, target_of
+from rsbench.dataset.channel_truth import Rays, pair_truth, target_of
 from rsbench.dataset.channel_writer import pair_values
 from rsbench.dataset.channels import PAIR_CHANNELS, STEP_PX, PairChannel, PixelClass, mask_file, value_file
 from rsbench.dataset.sequence import Sequence
@@ -79,7 +79,7 @@ def channel_faults(
 
 
 def channels_again(
-    sequence: Sequence, shot: Shot, rows: list[int], depth: Float32Array, blocked: Blocked, told: Collection[str]
+    sequence: Sequence, shot: Shot, rows: list[int], depth: Float32Array, rays: Rays, told: Collection[str]
 ) -> Iterator[tuple[str, str, bool]]:
     """Rows of the channels of a frame made again: of each file its name, its fault or "", and whether all is same.
 
@@ -88,7 +88,7 @@ def channels_again(
         shot: the frame; of a global shutter there are none.
         rows: of the frame.
         depth: (rows, W) rendered again.
-        blocked: see ``channel_truth``.
+        rays: through the scene.
         told: files that are not looked at.
     """
     for channel in PAIR_CHANNELS:
@@ -100,7 +100,7 @@ def channels_again(
             classes = sequence.classes(channel, shot.side, shot.frame)[rows]
         except RsbenchError:  # told already
             continue
-        truth = pair_truth(sequence, shot, target_of(channel, shot), depth, blocked, rows)
+        truth = pair_truth(sequence, shot, target_of(channel, shot), depth, rays.blocked, rows)
         made = pair_values(channel, shot, truth.offset)
         far = np.any(~((np.abs(values - made) <= _SAME_PX) | (np.isnan(values) & np.isnan(made))), axis=-1)
         unlike = classes != truth.classes

@@ -6,7 +6,6 @@ import hashlib
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
@@ -25,6 +24,7 @@ from rsbench.dataset.verification.content import Content, clean_file
 from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.dataset.verification.images import CHANGES, Picture
 from rsbench.dataset.verification.shots import SHOTS, DepthMap, Shot
+from rsbench.dataset.verification.surfaces import surfaces_again
 from rsbench.errors import RsbenchError
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene, read_scene_card
@@ -142,7 +142,7 @@ def _checks(
     content: Content, scene: MitsubaScene, options: RendererOptions, rows: list[int], told: set[str]
 ) -> Iterator[_Check]:
     from rsbench.renderers.image import to_srgb8
-    from rsbench.renderers.segments import blocked
+    from rsbench.renderers.segments import SceneRays
 
     elsewhere = not _made_here(content)
     for shot in SHOTS:
@@ -156,8 +156,9 @@ def _checks(
             rendered = to_srgb8(frame.image, options.exposure)
             file = clean_file(content.sequence, shot)
             yield _image_check(file, content.pictures[shot], rendered, rows, noisy)
-        again = channels_again(content.sequence, shot, rows, frame.depth, partial(blocked, scene), told)
-        yield from (_Check(*check) for check in again)
+        for made in (channels_again, surfaces_again):
+            again = made(content.sequence, shot, rows, frame.depth, SceneRays(scene), told)
+            yield from (_Check(*check) for check in again)
 
 
 def _made_here(content: Content) -> bool:

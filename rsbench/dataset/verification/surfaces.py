@@ -1,0 +1,138 @@
+"""The channels ``normals`` and ``instances`` against the depth maps: what bends, and what is one thing."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.projection import back_project
+from rsbench.core.rig import VIEWS
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.channel_truth import Rays, surface_truth
+from rsbench.dataset.channels import INSTANCE_TABLE, surface_file
+from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.shots import Shot
+from rsbench.dataset.verification.findings import finding, rows_of
+from rsbench.dataset.verification.shots import BoolArray, DepthMap, land
+from rsbench.errors import RsbenchError
+
+_UNIT = 1e-5
+"""Of a length: the rounding of float32."""
+_LEVEL, _FEW_BENT = 0.05, 0.02
+"""Cosine between a normal and its surface, which bends by less where it counts as flat; and the share of flat
+pixels that may be beyond, at creases of less than that."""
+_SURFACE, _FEW_OTHERS = 5e-5, 0.02
+"""As in ``channels``; things that touch, such as tiles, change within a pixel."""
+_FEW_AGAIN, _LEAST = 5e-3, 8
+
+
+def surface_faults(sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str]) -> Iterator[str]:
+    """What normals and instances show that the surfaces of the depth maps are not, but for files ``told``."""
+    instances: dict[Shot, NDArray[np.uint16]] = {}
+    for side, frame in VIEWS:
+        shot = Shot("rs", side, frame)
+        if shot not in maps or shot.depth in told:
+            continue
+        try:
+            file = surface_file("normals", side, frame)
+            if "normals" in sequence.channels and file not in told:
+                yield from _normal_faults(sequence, maps[shot], file, sequence.normals(side, frame))
+            file = surface_file("instances", side, frame)
+            if "instances" in sequence.channels and not {file, INSTANCE_TABLE} & set(told):
+                instances[shot] = sequence.instances(side, frame)
+                yield from _number_faults(maps[shot], file, instances[shot], len(sequence.instance_table()))
+        except RsbenchError as error:
+            yield str(error)
+    for shot in instances:
+        for partner in (shot.other_side, shot.other_frame):
+            if partner in instances:
+                yield from _likeness_faults(sequence, maps, instances, shot, partner)
+
+
+def _normal_faults(
+    sequence: Sequence, depth_map: DepthMap, file: str, normals: NDArray[np.float32]
+) -> Iterator[str]:
+    solid = depth_map.depth > 0
+    length = np.linalg.norm(normals, axis=-1)
+    wrong = ~(np.abs(length - solid) <= _UNIT)
+    if np.sum(wrong) > _LEAST:
+        yield finding(file, f"{np.sum(wrong)} normals are not of length 1, or 0 without a surface", _rows(wrong))
+        return
+    geometry = sequence.rig, sequence.shutter, sequence.motion, depth_map.shot.side, depth_map.shot.frame
+    grid, z = sequence.rig.camera.pixel_grid(), np.where(solid, depth_map.depth, 1.0).astype(np.float64)
+    X = back_project(*geometry, grid, z)
+    away = solid & (np.sum((X - back_project(*geometry, grid, z * 0)) * normals, axis=-1) > 0)
+    if np.sum(away) > _LEAST:
+        yield finding(file, f"{np.sum(away)} normals point away from the camera", _rows(away))
+    bent = np.zeros(solid.shape, dtype=np.bool_)
+    for step in (X[1:-1, 2:] - X[1:-1, :-2], X[2:, 1:-1] - X[:-2, 1:-1]):
+        cosine = np.sum(step * normals[1:-1, 1:-1], axis=-1) / np.linalg.norm(step, axis=-1)
+        bent[1:-1, 1:-1] |= np.abs(cosine) > _LEVEL
+    flat = depth_map.flat
+    if np.sum(bent & flat) > max(_FEW_BENT * np.sum(flat), _LEAST):
+        share = f"{100 * np.sum(bent & flat) / np.sum(flat):.2g} % of the flat pixels"
+        what = f"{share} have a normal that is not upright on the surface of {depth_map.shot.depth}"
+        yield finding(file, what, _rows(bent & flat))
+
+
+def _number_faults(depth_map: DepthMap, file: str, numbers: NDArray[np.uint16], count: int) -> Iterator[str]:
+    wrong = (numbers > 0) != (depth_map.depth > 0)
+    if np.sum(wrong) > _LEAST:
+        yield finding(
+            file, f"{np.sum(wrong)} pixels have an instance and no depth, or depth and none", _rows(wrong)
+        )
+    if np.any(numbers > count):
+        yield finding(
+            file, f"holds instance {np.max(numbers)}, {INSTANCE_TABLE} has {count}", _rows(numbers > count)
+        )
+
+
+def _likeness_faults(
+    sequence: Sequence,
+    maps: Mapping[Shot, DepthMap],
+    instances: Mapping[Shot, NDArray[np.uint16]],
+    shot: Shot,
+    partner: Shot,
+) -> Iterator[str]:
+    landing = land(sequence, maps[shot], maps[partner])
+    with np.errstate(invalid="ignore"):
+        same = np.abs(landing.relative) < _SURFACE
+    x, y = np.round(landing.pixels[same]).astype(int).T
+    other = np.zeros(same.shape, dtype=np.bool_)
+    other[same] = instances[partner][y, x] != instances[shot][same]
+    if np.sum(other) > max(_FEW_OTHERS * np.sum(same), _LEAST):
+        file, there = (surface_file("instances", each.side, each.frame) for each in (shot, partner))
+        share = f"{100 * np.sum(other) / np.sum(same):.2g} % of {np.sum(same)} pixels"
+        yield finding(file, f"{share} see another instance than {there}", _rows(other))
+
+
+def surfaces_again(
+    sequence: Sequence, shot: Shot, rows: list[int], depth: NDArray[np.float32], rays: Rays, told: Collection[str]
+) -> Iterator[tuple[str, str, bool]]:
+    """As ``channels.channels_again``, of normals and instances."""
+    names = [name for name in ("normals", "instances") if shot.shutter == "rs" and name in sequence.channels]
+    truth = surface_truth(sequence, shot, depth, rays, rows) if names else None
+    for name in names:
+        file = surface_file("normals" if name == "normals" else "instances", shot.side, shot.frame)
+        if truth is None or file in told:
+            continue
+        try:
+            stored: NDArray[Any] = getattr(sequence, name)(shot.side, shot.frame)[rows]
+        except RsbenchError:  # told already
+            continue
+        made: FloatArray = getattr(truth, name)
+        off = np.abs(stored.astype(np.float64) - made).reshape(*depth.shape, -1).max(axis=-1)
+        wrong: BoolArray = ~(off <= _UNIT)
+        in_rows = np.isin(np.arange(sequence.shutter.height), np.asarray(rows)[np.any(wrong, axis=1)])
+        bad = np.sum(wrong) > max(_FEW_AGAIN * wrong.size, _LEAST)
+        what = f"{100 * np.mean(wrong):.2g} % of {wrong.size} pixels differ from what is made again"
+        yield file, finding(file, what, rows_of(in_rows)) if bad else "", bool(np.all(off == 0))
+
+
+def _rows(wrong: BoolArray) -> str:
+    """Words for the rows in which many of the wrong pixels lie."""
+    share = np.mean(wrong, axis=1)
+    return rows_of(share > 0.5 * np.max(share))
