@@ -91,6 +91,7 @@ BUILDERS: Kind[SceneBuilder, NoOptions] = Kind(
         "poles": "rsbench.scenes.poles:PolesBuilder",
         "room": "rsbench.scenes.room:RoomBuilder",
         "shelves": "rsbench.scenes.shelves:ShelvesBuilder",
+        "terrain": "rsbench.scenes.terrain:TerrainBuilder",
     },
 )
 """What ``builder`` in a scene card may name; others' are of the entry points ``rsbench.scenes``."""

@@ -111,6 +111,15 @@ RECIPES: dict[str, Recipe] = {
     "fruit_0": _recipe(s.speckled, 1.0, 512, colours=((0.70, 0.16, 0.12), (0.80, 0.45, 0.2)), contrast=0.2),
     "fruit_1": _recipe(s.speckled, 1.0, 512, colours=((0.86, 0.56, 0.14), (0.75, 0.42, 0.12)), contrast=0.2),
     "fruit_2": _recipe(s.speckled, 1.0, 512, colours=((0.42, 0.56, 0.18), (0.62, 0.66, 0.28)), contrast=0.2),
+    # From the air a texel is as large as a hand.
+    "meadow": _recipe(s.speckled, 60.0, colours=_GRASS, contrast=0.3, grit=0.25),
+    "field_wheat": _recipe(
+        s.cloth, 60.0, stripes=((0.72, 0.60, 0.34), (0.64, 0.53, 0.29), (0.69, 0.58, 0.36)), width=1.1
+    ),
+    "field_rows": _recipe(s.cloth, 60.0, stripes=((0.36, 0.43, 0.18), (0.45, 0.38, 0.26)), width=0.9),
+    "field_soil": _recipe(s.cloth, 60.0, stripes=((0.43, 0.34, 0.25), (0.36, 0.28, 0.20)), width=0.8),
+    "asphalt": _recipe(s.speckled, 16.0, 512, colours=((0.31, 0.31, 0.32), (0.40, 0.39, 0.38)), contrast=0.15),
+    "gravel": _recipe(s.speckled, 16.0, 512, colours=_EARTH[:2], contrast=0.25),
     # Indoors everything is nearer: finer textures of the same kinds.
     "floorboards": _recipe(s.planks, 3.4, woods=((0.58, 0.43, 0.28), (0.50, 0.37, 0.24), (0.63, 0.49, 0.34))),
     "oak": _recipe(s.planks, 1.6, woods=((0.64, 0.49, 0.33), (0.56, 0.42, 0.28)), width=(0.1, 0.16)),
