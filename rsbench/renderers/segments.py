@@ -42,9 +42,11 @@ class SceneRays:
 
     def surfaces(self, eyes: FloatArray, points: FloatArray) -> Surfaces:
         """What is met on the way to the points and beyond."""
+        import mitsuba as mi
+
         normals, instances = [], []
         for ray, way in zip(_rays(eyes, points), [points - eyes] if _wide() else points - eyes, strict=True):
-            hit = self.scene.scene.ray_intersect(ray)
+            hit = self.scene.scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True)
             normal = np.nan_to_num(np.array(hit.n, dtype=np.float32)).reshape(3, -1).T
             away = np.sum(normal * way.reshape(-1, 3), axis=1, keepdims=True) > 0
             normals.append(np.where(away, -normal, normal) + np.float32(0.0))  # no -0
@@ -57,11 +59,9 @@ class SceneRays:
 
         if not _wide():
             return np.array([_number(hit.shape) if hit.is_valid() else 0], dtype=np.uint16)
-        known = self.scene.scene.shapes()
-        pointers: Any = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)) for shape in known]
-        keys = [int(pointer[0]) for pointer in pointers]
-        table = np.zeros(max(keys) + 1, dtype=np.uint16)
-        table[keys] = [_number(shape) for shape in known]
+        keys = np.array(dr.reinterpret_array(mi.UInt32, self.scene.scene.shapes_dr()))
+        table = np.zeros(np.max(keys) + 1, dtype=np.uint16)
+        table[keys] = [_number(shape) for shape in self.scene.scene.shapes()]
         return table[np.array(dr.reinterpret_array(mi.UInt32, hit.shape))]
 
 
