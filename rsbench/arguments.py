@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from rsbench.core.rig import FRAMES, SIDES, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.errors import RsbenchError
 
 _IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16))
 
@@ -44,8 +45,20 @@ def check_ranges(component: object, ranges: Mapping[str, tuple[float, float]]) -
             raise ValueError(f"{name} = {value!r}: must lie in [{least:g}, {most:g}]")
 
 
+def check_ideal(rig: StereoRig, what: str) -> None:
+    """Raises RsbenchError where cameras have a lens, which ``what`` does not take."""
+    if rig.camera.lens is not None:
+        raise RsbenchError(
+            f"camera.lens = {rig.camera.lens.model!r}: {what} takes images without distortion; undistort first"
+        )
+
+
 def check_rows(rig: StereoRig, shutter: RollingShutter) -> None:
-    """Raises ValueError unless the shutter reads as many rows as the cameras have."""
+    """Raises ValueError unless the shutter reads as many rows and columns as the cameras have."""
+    if shutter.width not in (None, rig.camera.width):
+        raise ValueError(
+            f"shutter.width = {shutter.width}: must be that of the camera, {rig.camera.width} columns"
+        )
     if shutter.height != rig.camera.height:
         raise ValueError(
             f"shutter.height = {shutter.height}: must be that of the camera, {rig.camera.height} rows"

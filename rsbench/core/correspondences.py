@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import Side
 from rsbench.core.so3 import FloatArray
 
@@ -26,7 +27,7 @@ def _none(columns: int) -> FloatArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Correspondences:
-    """Matches in pixels, one row each; sets that do not exist are empty.
+    """Matches in pixels of the images, distorted as they are, one row each; sets that do not exist are empty.
 
     The sets may hold the same points: ``tracks`` are seen in all four images, and their halves may be
     repeated in the pairwise sets, where ``JOIN_TOLERANCE_PX`` tells them. The order of matches means nothing.
@@ -59,6 +60,24 @@ def _matches(value: ArrayLike, name: str, columns: int) -> FloatArray:
         raise ValueError(f"{name}[{bad[0]}] must be finite pixels, got {rows[bad[0]].tolist()}")
     rows.setflags(write=False)
     return rows
+
+
+def without_lens(correspondences: Correspondences, camera: PinholeCamera) -> Correspondences:
+    """The matches as the camera without its lens has them, in ideal pixels.
+
+    Raises:
+        ValueError: a match at which the lens shows no ray; names it.
+    """
+    if camera.lens is None:
+        return correspondences
+    sets = {}
+    for name, columns in _COLUMNS.items():
+        rows: FloatArray = getattr(correspondences, name)
+        sets[name] = camera.ideal_pixels(rows.reshape(-1, columns // 2, 2)).reshape(rows.shape)
+        lost = np.flatnonzero(np.any(np.isnan(sets[name]), axis=1))
+        if len(lost):
+            raise ValueError(f"{name}[{lost[0]}] = {rows[lost[0]].tolist()}: the lens shows no ray at this pixel")
+    return Correspondences(**sets)
 
 
 def track_pairs(tracks: FloatArray, side: Side) -> FloatArray:

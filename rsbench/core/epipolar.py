@@ -65,10 +65,11 @@ def rs_constraint(
 ) -> tuple[FloatArray, FloatArray]:
     """``x1^T E x0`` (n,) of matches (n, 4) x0, y0, x1, y1 and its total derivative (n, 4) by these pixels.
 
-    The derivative counts that a shifted row is also read at another time.
+    Pixels are those of the image, distorted by its lens. The derivative counts that a shifted row is also read at
+    another time.
     """
     x0, x1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
-    tau0, tau1 = shutter.row_time(matches[:, 1], 0), shutter.row_time(matches[:, 3], 1)
+    tau0, tau1 = shutter.pixel_time(matches[:, :2], 0, side), shutter.pixel_time(matches[:, 2:], 1, side)
     R0, t0 = rig.cam_from_world(motion, tau0, side)
     R1, t1 = rig.cam_from_world(motion, tau1, side)
     R = R1 @ np.swapaxes(R0, -1, -2)
@@ -76,14 +77,23 @@ def rs_constraint(
     T, p = t1 - Rt0, _apply(R, x0)
     (w0, v0), (w1, v1) = motion.velocity(tau0), motion.velocity(tau1)
     value = np.einsum("...i,...i->...", x1, np.cross(T, p))
-    gradient = epipolar_gradient(hat(T) @ R, x0, x1, rig.camera)
+    gradient = _by_pixels(epipolar_gradient(hat(T) @ R, x0, x1, rig.camera), rig.camera, matches)
     # T = t1 - R t0 with dR/dtau1 = [w1]x R and dR/dtau0 = -R [w0]x.
     T_rate1, p_rate1 = v1 - np.cross(w1, Rt0), np.cross(w1, p)
     T_rate0, p_rate0 = _apply(R, np.cross(w0, t0) - v0), -_apply(R, np.cross(w0, x0))
-    for column, T_rate, p_rate in ((1, T_rate0, p_rate0), (3, T_rate1, p_rate1)):
+    for columns, T_rate, p_rate in ((slice(0, 2), T_rate0, p_rate0), (slice(2, 4), T_rate1, p_rate1)):
         rate = np.cross(T_rate, p) + np.cross(T, p_rate)
-        gradient[:, column] += shutter.h * np.sum(x1 * rate, axis=-1)
+        gradient[:, columns] += np.sum(x1 * rate, axis=-1)[:, None] * shutter.rate(side)
     return value, gradient
+
+
+def _by_pixels(gradient: FloatArray, camera: PinholeCamera, matches: FloatArray) -> FloatArray:
+    """Derivatives (n, ..., 4) by the pixels of matches (n, 4) from those by the pixels of an ideal camera."""
+    if camera.lens is None:
+        return gradient
+    L = [camera.ideal_by_pixel(matches[:, columns]) for columns in (slice(0, 2), slice(2, 4))]
+    halves = zip(np.split(gradient, 2, axis=-1), L, strict=True)
+    return np.concatenate([np.einsum("n...i,nij->n...j", half, each) for half, each in halves], axis=-1)
 
 
 def rs_sampson_error(
@@ -111,7 +121,7 @@ def rs_sampson_jacobian(
     the gradient's row-time terms is left out. Exact where the error is zero and for a global shutter.
     """
     x0, x1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
-    tau0, tau1 = shutter.row_time(matches[:, 1], 0), shutter.row_time(matches[:, 3], 1)
+    tau0, tau1 = shutter.pixel_time(matches[:, :2], 0, side), shutter.pixel_time(matches[:, 2:], 1, side)
     a = tau1 - tau0
     R = so3.exp(a[:, None] * motion.w)
     offset = rig.offset(side)
@@ -124,7 +134,7 @@ def rs_sampson_jacobian(
     T_by_d = np.swapaxes(tau1[:, None, None] * np.eye(3) - tau0[:, None, None] * R, -1, -2)
     E_by_d = hat(T_by_d) @ R[:, None]
     dE = np.concatenate([E_by_w, E_by_d], axis=1)
-    dgradient = epipolar_gradient(dE, x0[:, None], x1[:, None], rig.camera)
+    dgradient = _by_pixels(epipolar_gradient(dE, x0[:, None], x1[:, None], rig.camera), rig.camera, matches)
     value, gradient = rs_constraint(rig, shutter, motion, side, matches)
     value = value[:, None]
     dvalue = np.einsum("ni,nkij,nj->nk", x1, dE, x0)

@@ -2,7 +2,8 @@
 
 A point is seen at row y when its projection at row y's pose falls on row y:
 ``f(y) = project(cam_from_world(row_time(y)) X).y - y = 0``. It may have no solution (never seen) or several
-(seen twice, when the image of the point keeps pace with the readout).
+(seen twice, when the image of the point keeps pace with the readout). Rows are those of the image as the lens
+distorts it. Where a camera reads columns, all that is said of rows and y holds for columns and x.
 """
 
 from __future__ import annotations
@@ -68,17 +69,16 @@ class _RowEquation(NamedTuple):
 
     def __call__(self, X: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """f (...) in px, f' (...) and the point (..., 3) in the camera of rows (...); NaN behind the camera."""
-        tau = self.shutter.row_time(y, self.frame)
+        axis = self.shutter.axis(self.side)
+        tau = self.shutter.line_time(y, self.frame, self.side)
         R, t = self.rig.cam_from_world(self.motion, tau, self.side)
         rotated = (R @ X[..., None])[..., 0]
         x = rotated + t
         w_rate, t_rate = self.motion.velocity(tau)
         x_rate = np.cross(w_rate, rotated) + t_rate
-        z = np.where(x[..., 2] > 0.0, x[..., 2], np.nan)
-        fy = self.rig.camera.fy
-        value = fy * x[..., 1] / z + self.rig.camera.cy - y
-        slope = self.shutter.h * fy * (x_rate[..., 1] - x[..., 1] / z * x_rate[..., 2]) / z - 1.0
-        return value, slope, x
+        value = self.rig.camera.project(x)[..., axis] - y
+        velocity = self.rig.camera.velocity(x, x_rate)[..., axis]
+        return value, self.shutter.rate(self.side)[axis] * velocity - 1.0, x
 
 
 class _Brackets(NamedTuple):
@@ -92,7 +92,7 @@ class _Brackets(NamedTuple):
 
 def _brackets(equation: _RowEquation, X: FloatArray) -> _Brackets:
     """Every crossing of points (n, 3), the pairs that hide between two samples of one sign included."""
-    grid = np.linspace(-0.5, equation.shutter.height - 0.5, _COARSE_ROWS)
+    grid = np.linspace(-0.5, equation.shutter.lines(equation.side) - 0.5, _COARSE_ROWS)
     samples = [equation(X, np.full(1, y)) for y in grid]
     found = []
     for (low, high), (at_low, at_high) in zip(pairwise(grid), pairwise(samples), strict=True):
@@ -133,7 +133,7 @@ def rs_project(
     equation = _RowEquation(rig, shutter, motion, side, frame)
     index, low, high = _brackets(equation, X)
     y, converged = _solve_rows(equation, X[index], low, high)
-    times = shutter.row_time(y, frame)
+    times = shutter.line_time(y, frame, side)
     seen = project_at(rig, motion, side, times, X[index])
     inside = converged & rig.camera.contains(seen[:, :2])
     rows_that_see = np.bincount(index[inside], minlength=len(X))
@@ -167,9 +167,9 @@ def rs_project_near(
     points: ArrayLike,
     start_rows: ArrayLike,
 ) -> RSProjection:
-    """Like ``rs_project`` from a row guess (...) per point: Newton only, for dense maps.
+    """Like ``rs_project`` from a row guess (...) per point, or a column where those are read: for dense maps.
 
-    Finds one crossing and does not look for others, so the status is never TWICE.
+    Newton only; finds one crossing and does not look for others, so the status is never TWICE.
     """
     X = np.asarray(points, dtype=np.float64)
     y = np.broadcast_to(np.asarray(start_rows, dtype=np.float64), X.shape[:-1]).copy()
@@ -188,7 +188,7 @@ def rs_project_near(
     return RSProjection(
         pixels=np.where(inside[..., None], pixels, np.nan),
         depth=np.where(inside, x_in_cam[..., 2], np.nan),
-        tau=np.where(inside, shutter.row_time(y, frame), np.nan),
+        tau=np.where(inside, shutter.line_time(y, frame, side), np.nan),
         status=np.where(lost, ProjectionStatus.NOT_CONVERGED, status).astype(np.uint8),
     )
 
@@ -224,11 +224,13 @@ def back_project(
     """World points (..., 3) of pixels (..., 2) with depth z (...) in their own row's camera (paper, eq. 11a)."""
     p = np.asarray(pixels, dtype=np.float64)
     x_in_cam = np.asarray(depth, dtype=np.float64)[..., None] * rig.camera.unproject(p)
-    R, t = rig.cam_from_world(motion, shutter.row_time(p[..., 1], frame), side)
+    R, t = rig.cam_from_world(motion, shutter.pixel_time(p, frame, side), side)
     return (np.swapaxes(R, -1, -2) @ (x_in_cam - t)[..., None])[..., 0]
 
 
 def row_poses(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int) -> Pose:
-    """``cam_from_world`` of every integer row, (height, 3, 3) and (height, 3), for the renderer and the files."""
-    rows = np.arange(shutter.height, dtype=np.float64)
-    return rig.cam_from_world(motion, shutter.row_time(rows, frame), side)
+    """``cam_from_world`` of every line, (lines, 3, 3) and (lines, 3), for the renderer and the files.
+
+    Lines are rows, or columns where the camera reads those, in the order of the image.
+    """
+    return rig.cam_from_world(motion, shutter.line_times(frame, side), side)

@@ -44,6 +44,11 @@ class StereoRig:
         place = {"left": self.baseline / 2, "middle": 0.0, "right": -self.baseline / 2}
         return np.array([place[side] - place[self.origin], 0.0, 0.0])
 
+    @property
+    def ideal(self) -> StereoRig:
+        """The same rig with cameras without a lens."""
+        return self if self.camera.lens is None else replace(self, camera=self.camera.ideal)
+
     def about(self, origin: Literal["middle", "left", "right"]) -> StereoRig:
         """The same rig whose body is another point of it."""
         return replace(self, origin=origin)
@@ -54,7 +59,7 @@ class StereoRig:
         return Pose(R, t + self.offset(side))
 
     def depth(self, disparity: ArrayLike) -> FloatArray:
-        """Depth z (metres) of ``disparity = x_left - x_right`` (px); NaN where it is not positive.
+        """Depth z (metres) of ``disparity = x_left - x_right`` (ideal px); NaN where it is not positive.
 
         Exact for a rolling shutter too: both cameras read the same row at the same time, so the pair of a row
         is an ordinary rectified pair.
@@ -63,6 +68,6 @@ class StereoRig:
         return self.camera.fx * self.baseline / np.where(disparity > 0.0, disparity, np.nan)
 
     def disparity(self, depth: ArrayLike) -> FloatArray:
-        """Disparity (px) of depth z (metres); NaN where the depth is not positive."""
+        """Disparity (ideal px) of depth z (metres); NaN where the depth is not positive."""
         depth = np.asarray(depth, dtype=np.float64)
         return self.camera.fx * self.baseline / np.where(depth > 0.0, depth, np.nan)

@@ -1,40 +1,178 @@
-"""The rolling shutter: the one function that turns an image row into a time."""
+"""The rolling shutter: the one place that turns a pixel into a time."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rsbench.core.so3 import FloatArray
 
+Scan = Literal["top", "bottom", "left", "right"]
+"""The side of the image at which reading begins: rows from the top or the bottom, or columns."""
+_LONGEST_DELAY = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scanning:
+    """How cameras read their lines, as cards and files say it; each key may be left out."""
+
+    scan: Scan = "top"
+    """The side at which reading begins; of both cameras, but for what the next says."""
+    right_scan: Scan | None = None
+    """Of the right camera; None: as the left one."""
+    right_delay: float = 0.0
+    """Frame periods by which the right camera is late, from -1 to 1."""
+
+    @property
+    def plain(self) -> bool:
+        """Whether both cameras read rows from the top at the same times."""
+        return self.scan == "top" and self.right_scan in (None, "top") and self.right_delay == 0.0
+
+    def shutter_of(self, width: int, height: int, readout_ratio: float) -> RollingShutter:
+        """The shutter of images of this size; ValueError for values that cannot be."""
+        columns = {self.scan, self.right_scan} & {"left", "right"}
+        return RollingShutter(
+            height=height,
+            readout_ratio=readout_ratio,
+            scan=self.scan,
+            right_scan=self.right_scan,
+            right_delay=self.right_delay,
+            width=width if columns else None,
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class RollingShutter:
-    """Rows are read from the top, evenly, within ``readout_ratio`` of a frame period."""
+    """Lines are read evenly within ``readout_ratio`` of a frame period: rows from the top, unless said otherwise.
+
+    A line is a row of the image, or a column where a camera reads from the left or the right. Times belong to
+    pixels of the image as the sensor has it, whatever its lens does.
+    """
 
     height: int
     """Number of rows."""
     readout_ratio: float
     """phi = T_a / (T_a + T_b) in [0, 1]; 0 is a global shutter (paper, section 2.2)."""
+    scan: Scan = "top"
+    right_scan: Scan | None = None
+    """Of the right camera; None: as the left one."""
+    right_delay: float = 0.0
+    """Frame periods by which the right camera is late, from -1 to 1."""
+    width: int | None = None
+    """Number of columns; needed where columns are read."""
 
     def __post_init__(self) -> None:
         if self.height < 1:
             raise ValueError(f"shutter height must be at least 1 row, got {self.height}")
         if not (math.isfinite(self.readout_ratio) and 0.0 <= self.readout_ratio <= 1.0):
             raise ValueError(f"readout_ratio must lie in [0, 1], got {self.readout_ratio}")
+        for name in ("scan", "right_scan"):
+            value = getattr(self, name)
+            if value not in get_args(Scan) and not (name == "right_scan" and value is None):
+                raise ValueError(f"{name} = {value!r}: must be one of {', '.join(get_args(Scan))}")
+        if not (math.isfinite(self.right_delay) and abs(self.right_delay) <= _LONGEST_DELAY):
+            raise ValueError(f"right_delay must lie in [-1, 1] frame periods, got {self.right_delay}")
+        if self.width is not None and self.width < 1:
+            raise ValueError(f"shutter width must be at least 1 column, got {self.width}")
+        if self.width is None and not {self.scan, self.scan_of("right")} <= {"top", "bottom"}:
+            raise ValueError("shutter width must be given where columns are read")
+
+    @property
+    def plain(self) -> bool:
+        """Whether both cameras read rows from the top at the same times, as ``row_time`` says."""
+        return self.scanning.plain
+
+    @property
+    def rows_together(self) -> bool:
+        """Whether both cameras read each row at one time, from the top or from the bottom."""
+        return self.scan == self.scan_of("right") and self.scan in ("top", "bottom") and self.right_delay == 0.0
 
     @property
     def h(self) -> float:
         """Time per row in frame periods (the paper's h = phi / N)."""
         return self.readout_ratio / self.height
 
-    def row_time(self, y: ArrayLike, frame: ArrayLike) -> FloatArray:
-        """Time tau in frame periods at which row ``y`` of frame ``frame`` is read.
+    def at_once(self) -> RollingShutter:
+        """The shutter of one who believes that there is none: everything at the start of the frame."""
+        return RollingShutter(height=self.height, readout_ratio=0.0)
 
-        ``y`` is continuous: keypoints use it as it is, rendered rows at the integer row. Row 0 of frame k has
-        tau = k exactly, so the global-shutter truth of a frame is the image at row 0's pose.
+    def with_ratio(self, readout_ratio: float) -> RollingShutter:
+        """The same shutter with another readout ratio."""
+        return replace(self, readout_ratio=readout_ratio)
+
+    @property
+    def scanning(self) -> Scanning:
+        """What ``Scanning.shutter_of`` made it of."""
+        return Scanning(scan=self.scan, right_scan=self.right_scan, right_delay=self.right_delay)
+
+    def scan_of(self, side: str) -> Scan:
+        """Where the camera of a side begins."""
+        return self.right_scan if side == "right" and self.right_scan is not None else self.scan
+
+    def axis(self, side: str) -> int:
+        """The coordinate that numbers lines: 1, y, for rows; 0, x, for columns."""
+        return 1 if self.scan_of(side) in ("top", "bottom") else 0
+
+    def lines(self, side: str) -> int:
+        """Number of lines."""
+        return self.height if self.axis(side) == 1 else int(self.width or 0)
+
+    def rate(self, side: str) -> FloatArray:
+        """Derivative (2,) of the time by the pixel, frame periods per px."""
+        sign = 1.0 if self.scan_of(side) in ("top", "left") else -1.0
+        out = np.zeros(2)
+        out[self.axis(side)] = sign * self.readout_ratio / self.lines(side)
+        return out
+
+    def first_line(self, side: str) -> int:
+        """Number of the line that is read first."""
+        return 0 if self.scan_of(side) in ("top", "left") else self.lines(side) - 1
+
+    def start(self, frame: ArrayLike, side: str) -> FloatArray:
+        """Time (...) at which a camera reads the first line of frame ``frame`` (...)."""
+        late = self.right_delay if side == "right" else 0.0
+        return np.asarray(frame, dtype=np.float64) + late
+
+    def time_after(self, lines: ArrayLike, frame: ArrayLike, side: str) -> FloatArray:
+        """Time (...) at which a camera has read so many lines (...) of a frame."""
+        return self.start(frame, side) + self.readout_ratio / self.lines(side) * np.asarray(
+            lines, dtype=np.float64
+        )
+
+    def line_time(self, line: ArrayLike, frame: ArrayLike, side: str) -> FloatArray:
+        """Time tau in frame periods at which a camera reads line ``line``, counted from the top or the left.
+
+        ``line`` is continuous: keypoints use it as it is, rendered lines at the whole number.
         """
+        read = np.asarray(line, dtype=np.float64)
+        if self.scan_of(side) in ("bottom", "right"):
+            read = self.lines(side) - 1 - read
+        return self.time_after(read, frame, side)
+
+    def line_times(self, frame: int, side: str) -> FloatArray:
+        """Times (lines,) of all lines in the order of the image."""
+        return self.line_time(np.arange(self.lines(side)), frame, side)
+
+    def pixel_time(self, pixels: ArrayLike, frame: ArrayLike, side: str) -> FloatArray:
+        """Time (...) at which a camera reads pixels (..., 2)."""
+        return self.line_time(np.asarray(pixels, dtype=np.float64)[..., self.axis(side)], frame, side)
+
+    def row_time(self, y: ArrayLike, frame: ArrayLike) -> FloatArray:
+        """Time tau in frame periods at which both cameras read row ``y`` of frame ``frame``, from the top.
+
+        ``y`` is continuous. Row 0 of frame k has tau = k exactly, so the global-shutter truth of a frame is the
+        image at row 0's pose.
+
+        Raises:
+            ValueError: a shutter that is not ``plain``; ``pixel_time`` knows those.
+        """
+        if not self.plain:
+            raise ValueError(
+                f"scan = {self.scan!r}, right_scan = {self.right_scan!r}, right_delay = "
+                f"{self.right_delay}: only rows from the top, read by both cameras at once, have one time"
+            )
         return np.asarray(frame, dtype=np.float64) + self.h * np.asarray(y, dtype=np.float64)

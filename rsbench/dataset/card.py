@@ -11,10 +11,11 @@ import numpy as np
 
 from rsbench.cards import card_path, load_card
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.lens import Lens
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
-from rsbench.dataset.channels import Channel
+from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.dataset.channels import Channel, check_channels
 from rsbench.dataset.sequence import sequence_manifest
 from rsbench.errors import RsbenchError
 from rsbench.imports import search
@@ -28,12 +29,14 @@ Axis = Vector | str
 
 @dataclass(frozen=True, kw_only=True)
 class CameraCard:
-    """A pinhole camera with a centred principal point."""
+    """A camera with a centred principal point."""
 
     width: int
     height: int
     focal: float
     """Pixels."""
+    lens: Lens | None = None
+    """None: an ideal one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,7 +135,7 @@ class SequenceCard:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DatasetCard:
+class DatasetCard(Scanning):
     """A dataset: one camera, rig and shutter, and its sequences."""
 
     name: str
@@ -167,6 +170,7 @@ class DatasetCard:
             )
         if len(set(self.channels)) < len(self.channels):
             raise ValueError(f"channels = {list(self.channels)}: must differ from each other")
+        check_channels(self.channels, self.camera.lens is not None, self.plain)
         if any(sequence.seed is not None for sequence in self.sequence) and self.seeds:
             raise ValueError("seeds and the seed of a sequence exclude each other")
         if len(set(self.seeds)) < len(self.seeds):
@@ -180,11 +184,12 @@ class DatasetCard:
 
     def rig_of(self, sequence: SequenceCard) -> StereoRig:
         camera = PinholeCamera.centred(self.camera.width, self.camera.height, self.camera.focal)
+        camera = replace(camera, lens=self.camera.lens)
         baseline = self.baseline if sequence.baseline is None else sequence.baseline
         return StereoRig(camera=camera, baseline=baseline)
 
     def shutter(self) -> RollingShutter:
-        return RollingShutter(height=self.camera.height, readout_ratio=self.readout_ratio)
+        return self.shutter_of(self.camera.width, self.camera.height, self.readout_ratio)
 
     def motion_of(self, sequence: SequenceCard) -> Motion:
         return (sequence.motion or self.motion).motion()

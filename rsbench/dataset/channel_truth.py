@@ -133,7 +133,7 @@ Finder = Callable[[FloatArray, FloatArray], _Landed]
 def _finder(geometry: Geometry, source: Shot, target: Shot) -> Finder:
     if target.shutter == "gs":
         return partial(_global, geometry, target)
-    if target.frame == source.frame:
+    if target.frame == source.frame and geometry.rig.camera.lens is None:
         return partial(_beside, geometry, target)
     return partial(_rolling, _RowTable(geometry, target), target)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from enum import IntEnum
 from typing import Literal, get_args
 
@@ -39,6 +39,21 @@ class PixelClass(IntEnum):
     """No surface here, and none there: the value is that of the direction."""
     SKY_OCCLUDED = 5
     """No surface here, but one there."""
+
+
+def check_channels(names: Collection[str], lens: bool, plain: bool) -> None:
+    """Whether cameras can have these channels: with a lens or not, reading rows from the top together or not.
+
+    Raises:
+        ValueError: one line with the channel.
+    """
+    for name in CHANNELS:
+        if name in names and name != "timing" and not plain:
+            raise ValueError(
+                f"channels: {name!r} is made of cameras that read rows from the top at once, and no other"
+            )
+        if name in names and name == "disparity" and lens:
+            raise ValueError(f"channels: {name!r} is made of cameras without a lens, whose pairs share their rows")
 
 
 def value_file(channel: PairChannel, side: str, frame: int) -> str:

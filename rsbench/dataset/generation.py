@@ -314,7 +314,7 @@ def render_camera(
     frame: int,
     folder: Path,
 ) -> Iterator[None]:
-    """One camera at one time: the rolling-shutter frame, then the global-shutter frame at its row 0's pose.
+    """One camera at one time: the rolling-shutter frame, then the global-shutter frame at its first row's pose.
 
     What a sensor does is done to the rolling-shutter frame alone; its clean twin is kept.
     """
@@ -326,14 +326,15 @@ def render_camera(
     rig, shutter = card.rig_of(sequence), card.shutter()
     options = replace(options, seed=image_seed(card.seed_of(sequence), sequence.name, side, frame))
     poses = row_poses(rig, shutter, card.motion_of(sequence), side, frame)
-    tau = shutter.row_time(np.arange(shutter.height), frame)
-    write_poses(folder / "poses" / f"{side}_{frame}.csv", tau, poses)
-    first = Pose(np.broadcast_to(poses.R[0], poses.R.shape), np.broadcast_to(poses.t[0], poses.t.shape))
+    write_poses(folder / "poses" / f"{side}_{frame}.csv", shutter.line_times(frame, side), poses)
+    line, columns = shutter.first_line(side), shutter.axis(side) == 0
+    first = Pose(np.broadcast_to(poses.R[line], poses.R.shape), np.broadcast_to(poses.t[line], poses.t.shape))
     keep = _stack_writer(folder / "gs_stack" / f"{side}_{frame}", options) if options.full_frames else None
     for kind, pose in (("rs", poses), ("gs", first)):
         # A global-shutter frame needs no stitching: all its rows have one pose.
         chosen = options if kind == "rs" else replace(options, method="single-pass")
-        rendered = render(scene, rig.camera, pose.R, pose.t, chosen, on_gs_frame=keep if kind == "rs" else None)
+        on_gs_frame = keep if kind == "rs" else None
+        rendered = render(scene, rig.camera, *pose, chosen, columns=columns, on_gs_frame=on_gs_frame)
         if not np.any(rendered.depth):
             raise RsbenchError(
                 f"sequence {sequence.name}: {side}_{frame} shows no surface at all: change the viewpoint "

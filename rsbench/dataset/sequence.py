@@ -6,7 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -18,7 +18,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import (
     CHANNELS,
@@ -28,6 +28,7 @@ from rsbench.dataset.channels import (
     PairChannel,
     PixelClass,
     channel_files,
+    check_channels,
     mask_file,
     surface_file,
     value_file,
@@ -39,7 +40,10 @@ from rsbench.motions import motion_record, read_motion
 from rsbench.reading import check_name, check_size, inside
 from rsbench.renderers.electrons import Sensor
 
-FORMAT = CONVENTIONS = 1
+FORMAT = 1
+CONVENTIONS, WITH_LENS = 1, 2
+"""Of pixels and times. Those of a lens, another scan or a late right camera are others, which earlier versions of
+rsbench, that would take them for ideal, refuse to read."""
 UNITS = {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = no surface"}
 """What dataset.json tells people who find the folder."""
 FRAMES = (0, 1)
@@ -85,6 +89,11 @@ Vector = tuple[float, float, float]
 M = TypeVar("M")
 
 
+def conventions_of(camera: PinholeCamera, plain: bool) -> int:
+    """The conventions of such cameras; ``plain``: both read rows from the top at once."""
+    return CONVENTIONS if plain and camera.lens is None else WITH_LENS
+
+
 @dataclass(frozen=True, kw_only=True)
 class MotionManifest:
     """A motion as ``motions.motion_record`` writes it."""
@@ -96,7 +105,7 @@ class MotionManifest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SequenceManifest:
+class SequenceManifest(Scanning):
     """What sequence.json must hold; it holds more."""
 
     format: int
@@ -116,9 +125,13 @@ class SequenceManifest:
 
     def __post_init__(self) -> None:
         check_name(self.name)
-        if self.conventions != CONVENTIONS:
-            raise ValueError(f"conventions = {self.conventions}: this version reads {CONVENTIONS}")
+        if self.conventions != (needed := conventions_of(self.camera, self.plain)):
+            raise ValueError(
+                f"conventions = {self.conventions}: {needed} is needed; this version reads {CONVENTIONS}, and "
+                f"{WITH_LENS} with a lens, another scan or a late camera"
+            )
         check_size("camera", (self.camera.width, self.camera.height))
+        check_channels(self.channels, self.camera.lens is not None, self.plain)
         if not self.frame_period_s > 0.0:
             raise ValueError(f"frame_period_s = {self.frame_period_s}: must be positive")
 
@@ -169,6 +182,17 @@ class Sequence:
     manifest: dict[str, Any]
     """Content of sequence.json."""
 
+    @property
+    def uncorrectable(self) -> str:
+        """Why stereo matchers and correctors do not take such cameras; empty when they do."""
+        if self.rig.camera.lens is not None:
+            return f"camera.lens = {self.rig.camera.lens.model!r}: depth and correction take no lens yet"
+        if not self.shutter.plain:
+            return (
+                "depth and correction take rows from the top, read by both cameras at once, and no other scan yet"
+            )
+        return ""
+
     def image(self, shutter: Shutter, side: Side, frame: int) -> NDArray[np.uint8]:
         """(H, W, 3) sRGB; ``gs`` is the global-shutter image at the pose of the frame's row 0."""
         return read_png(inside(self.folder, f"{shutter}/{side}_{frame}.png"), self._size)
@@ -187,11 +211,11 @@ class Sequence:
         return read_depth(inside(self.folder, f"{shutter}_depth/{side}_{frame}.exr"), self._size)
 
     def poses(self, side: Side, frame: int) -> tuple[FloatArray, Pose]:
-        """Row times (H,) and ``cam_from_world`` (H, 3, 3), (H, 3) as stored."""
+        """Row times (H,) and ``cam_from_world`` (H, 3, 3), (H, 3) as stored; of columns, where those are read."""
         path = inside(self.folder, f"poses/{side}_{frame}.csv")
         tau, poses = read_poses(path)
-        if len(tau) != self.shutter.height:
-            raise RsbenchError(f"{path}: has {len(tau)} rows, the camera has {self.shutter.height}")
+        if len(tau) != (lines := self.shutter.lines(side)):
+            raise RsbenchError(f"{path}: has {len(tau)} rows, the camera has {lines}")
         return tau, poses
 
     def offsets(self, channel: PairChannel, side: Side, frame: int) -> NDArray[np.float32]:
@@ -249,7 +273,7 @@ class Sequence:
     def row_times_ns(self, side: Side, frame: int) -> NDArray[np.int64]:
         """(H, 4) of each row: number, time, start and end of its exposure; RsbenchError likewise."""
         self._check_channel("timing")
-        return read_timing_table(inside(self.folder, table_file(side, frame)), self.shutter.height)
+        return read_timing_table(inside(self.folder, table_file(side, frame)), self.shutter.lines(side))
 
     def _check_channel(self, channel: str) -> None:
         if channel not in self.channels:
@@ -270,18 +294,19 @@ def sequence_manifest(
     camera = rig.camera
     fields = ("width", "height", "fx", "fy", "cx", "cy")
     readout_s = shutter.readout_ratio * frame_period_s
+    lens = {} if camera.lens is None else {"lens": asdict(camera.lens)}
     return {
         "format": FORMAT,
-        "conventions": CONVENTIONS,
+        "conventions": conventions_of(camera, shutter.plain),
         "name": name,
-        "camera": {field: getattr(camera, field) for field in fields},
+        "camera": {field: getattr(camera, field) for field in fields} | lens,
         "baseline": rig.baseline,
         "readout_ratio": shutter.readout_ratio,
         "frame_period_s": frame_period_s,
         "readout_time_s": readout_s,
-        "row_time_s": readout_s / shutter.height,
+        "row_time_s": readout_s / shutter.lines("left"),
         "motion": motion_record(motion),
-    }
+    } | ({} if shutter.plain else asdict(shutter.scanning))
 
 
 def read_sequence(folder: Path) -> Sequence:
@@ -301,7 +326,7 @@ def read_sequence(folder: Path) -> Sequence:
             folder=folder,
             name=manifest.name,
             rig=StereoRig(camera=manifest.camera, baseline=manifest.baseline),
-            shutter=RollingShutter(height=manifest.camera.height, readout_ratio=manifest.readout_ratio),
+            shutter=manifest.shutter_of(manifest.camera.width, manifest.camera.height, manifest.readout_ratio),
             motion=read_motion(content["motion"]),
             frame_period_s=manifest.frame_period_s,
             sensor=manifest.sensor,

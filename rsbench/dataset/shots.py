@@ -47,7 +47,7 @@ class Shot(NamedTuple):
     side: Side
     frame: int
     row: int = 0
-    """Of a global shutter: the row whose pose it has."""
+    """Of a global shutter: the row whose pose it has, counted as they are read."""
 
     @property
     def image(self) -> str:
@@ -101,7 +101,7 @@ def points_of(geometry: Geometry, shot: Shot, pixels: FloatArray, depth: FloatAr
 
 
 def seen_by(geometry: Geometry, shot: Shot, X: FloatArray, rows: ArrayLike) -> Seen:
-    """Where a shot sees world points (..., 3); ``rows`` (...) are guesses."""
+    """Where a shot sees world points (..., 3); ``rows`` (...) are guesses, of columns where it reads those."""
     rig, shutter, motion = geometry.rig, geometry.shutter, geometry.motion
     if shot.shutter == "rs":
         found = rs_project_near(rig, shutter, motion, shot.side, shot.frame, X, rows)
@@ -115,7 +115,7 @@ def seen_by(geometry: Geometry, shot: Shot, X: FloatArray, rows: ArrayLike) -> S
 
 
 def _time(geometry: Geometry, shot: Shot) -> FloatArray:
-    return geometry.shutter.row_time(shot.row, shot.frame)
+    return geometry.shutter.time_after(shot.row, shot.frame, shot.side)
 
 
 def _pose(geometry: Geometry, shot: Shot) -> Pose:

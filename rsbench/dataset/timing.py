@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.rig import FRAMES, SIDES, VIEWS
+from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.files import write_bytes, write_json
 from rsbench.errors import RsbenchError
@@ -31,24 +31,27 @@ TIMING_FILES = (MANIFEST, *(table_file(*view) for view in VIEWS))
 def timing_manifest(shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None) -> dict[str, Any]:
     """Content of timing.json: of each camera what makes its tables; times count from that of row 0 of frame 0."""
     readout_ns = _NS * shutter.readout_ratio * frame_period_s
-    camera = {
-        "readout_ns": readout_ns,
-        "line_delay_ns": readout_ns / shutter.height,
-        "exposure_ns": _NS * (sensor.exposure_s if sensor else 0.0),
-        "scan": "top",
-        "reference_row": 0,
-        "reference_ns": [_NS * frame_period_s * frame for frame in FRAMES],
+    cameras = {
+        side: {
+            "readout_ns": readout_ns,
+            "line_delay_ns": readout_ns / shutter.lines(side),
+            "exposure_ns": _NS * (sensor.exposure_s if sensor else 0.0),
+            "scan": shutter.scan_of(side),
+            "reference_row": shutter.first_line(side),
+            "reference_ns": [_NS * frame_period_s * float(shutter.start(frame, side)) for frame in FRAMES],
+        }
+        for side in SIDES
     }
     common = {"frame_period_ns": _NS * frame_period_s, "time_of_a_row": "middle of its exposure"}
-    return common | dict.fromkeys(SIDES, camera)
+    return common | cameras
 
 
 def timing_table(
-    shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, frame: int
+    shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, side: Side, frame: int
 ) -> NDArray[np.int64]:
-    """(H, 4) in the order of ``COLUMNS``, rounded to whole nanoseconds."""
-    rows = np.arange(shutter.height)
-    middle = _NS * frame_period_s * shutter.row_time(rows, frame)
+    """(H, 4) in the order of ``COLUMNS``, whole nanoseconds; of columns where the camera reads those."""
+    rows = np.arange(shutter.lines(side))
+    middle = _NS * frame_period_s * shutter.line_times(frame, side)
     half = 0.5 * _NS * (sensor.exposure_s if sensor else 0.0)
     return np.round(np.stack([rows, middle, middle - half, middle + half], axis=1)).astype(np.int64)
 
@@ -57,7 +60,7 @@ def write_timing(folder: Path, shutter: RollingShutter, frame_period_s: float, s
     """All ``TIMING_FILES`` below the folder of a sequence."""
     write_json(folder / MANIFEST, timing_manifest(shutter, frame_period_s, sensor))
     for side, frame in VIEWS:
-        table = timing_table(shutter, frame_period_s, sensor, frame)
+        table = timing_table(shutter, frame_period_s, sensor, side, frame)
         lines = [",".join(map(str, line)) for line in table.tolist()]
         write_bytes(folder / table_file(side, frame), ("\n".join([COLUMNS, *lines]) + "\n").encode())
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rsbench.arguments import check_ideal
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, StereoRig, View
@@ -85,6 +86,7 @@ def correct_four(
         NoMotionError: the matches determine no motion or readout ratio.
         ValueError: a motion is given and no readout ratio.
     """
+    check_ideal(rig, "correction")
     given = given or Given()
     if given.motion is not None and readout_ratio is None:
         raise ValueError("readout_ratio must be known where the motion is given: the matches would give another")

@@ -23,6 +23,7 @@ from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.registry import SolverEntry
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.vision.feature_matcher import find_correspondences
+from rsbench.vision.undistortion import undistorted, with_lens
 
 _FEWEST_MATCHES = 12
 _MAX_READOUT_SIGMA = 0.25
@@ -66,6 +67,26 @@ def find_matches(images: Images, options: CorrectionOptions, sides: tuple[Side, 
     levels = eight_bit([images[view] for view in order])
     names = [(side, frame) for frame in (0, 1) for side in SIDES]
     return find_correspondences(options.features, dict(zip(names, levels, strict=True)))
+
+
+def find_matches_of_rig(
+    images: Images, rig: StereoRig, shutter: RollingShutter, options: CorrectionOptions
+) -> Correspondences:
+    """``find_matches`` of cameras as they are, in pixels of their images.
+
+    Matchers see images without distortion. Where the cameras do not read rows together, a left-right match is of
+    two times, and its ends of two rows: only matches over time are kept.
+
+    Raises:
+        RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
+    """
+    camera = rig.camera
+    if camera.lens is not None:
+        images = {view: undistorted(image, camera) for view, image in images.items()}
+    matches = with_lens(find_matches(images, options), camera)
+    if shutter.rows_together:
+        return matches
+    return Correspondences(left=matches.left, right=matches.right)
 
 
 def match_frames(

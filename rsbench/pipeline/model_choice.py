@@ -25,6 +25,7 @@ from rsbench.errors import RsbenchError
 from rsbench.motions import make_motion
 from rsbench.pipeline.model_fit import ACCELERATION_SIGMA, CANDIDATES, Errors, ModelFit, dispersion, fit_model
 from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions, estimate_motion
+from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.registry import SolverEntry
 from rsbench.solvers.refined import RefinedSolver
 
@@ -180,12 +181,17 @@ def settle_model(
 ) -> tuple[RobustEstimate, ModelChoice | None]:
     """A refined solver's answer under the model that the matches prefer (``auto``) or that is asked for.
 
-    A failure stays one, with None. The covariance counts what is not known of the model's own parameters.
+    A failure stays one, with None, and cameras with a lens or another scan are one. The covariance counts what is
+    not known of the model's own parameters.
 
     Raises:
         RsbenchError: see ``check_asked``.
     """
     check_asked(asked, entry)
+    if rig.camera.lens is not None or not shutter.plain:
+        why = f"motion_model = {asked!r} takes cameras without a lens that read rows from the top at once"
+        nothing = {name: np.zeros_like(mask) for name, mask in robust.inliers.items()}
+        return replace(robust, estimate=MotionEstimate.failed(why), inliers=nothing), None
     solver = entry.solver
     assert isinstance(solver, RefinedSolver)
     if not robust.estimate.success:

@@ -14,7 +14,7 @@ from rsbench.cards import choices, parse_card, shipped_folder
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.errors import RsbenchError
 from rsbench.reading import FILE_BYTES, check_amount, load_arrays, parse_json, read_text
 
@@ -45,7 +45,7 @@ class Problem:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Content:
+class _Content(Scanning):
     camera: PinholeCamera
     baseline: float
     readout_ratio: float
@@ -170,7 +170,13 @@ def parse_problem(text: str, where: str, name: str = "") -> Problem:
         _check_widths(getattr(content, key), key, columns, where)
     sets = {key: getattr(content, key) for key in _COLUMNS}
     return _problem(
-        content.camera, content.baseline, content.readout_ratio, sets, content.name or name or where, where
+        content.camera,
+        content.baseline,
+        content.readout_ratio,
+        content,
+        sets,
+        content.name or name or where,
+        where,
     )
 
 
@@ -188,11 +194,17 @@ def _check_widths(rows: _Rows, name: str, columns: str, where: str) -> None:
 
 
 def _problem(
-    camera: PinholeCamera, baseline: float, ratio: float, sets: Mapping[str, Any], name: str, where: str
+    camera: PinholeCamera,
+    baseline: float,
+    ratio: float,
+    scanning: Scanning,
+    sets: Mapping[str, Any],
+    name: str,
+    where: str,
 ) -> Problem:
     try:
         rig = StereoRig(camera=camera, baseline=baseline)
-        shutter = RollingShutter(height=camera.height, readout_ratio=ratio)
+        shutter = scanning.shutter_of(camera.width, camera.height, ratio)
         matches = Correspondences(**{key: np.array(rows, dtype=np.float64) for key, rows in sets.items()})
     except ValueError as error:
         raise RsbenchError(f"{where}: {error}") from error
@@ -225,4 +237,4 @@ def _from_npz(path: Path) -> Problem:
     sets = {key: arrays[key] for key in _COLUMNS if key in arrays}
     baseline, ratio = float(arrays["baseline"].item()), float(arrays["readout_ratio"].item())
     name = str(arrays["name"]) if "name" in arrays else path.stem
-    return _problem(camera, baseline, ratio, sets, name, str(path))
+    return _problem(camera, baseline, ratio, Scanning(), sets, name, str(path))

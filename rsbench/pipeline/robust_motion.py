@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from rsbench.core.correspondences import BoolArray, Correspondences
+from rsbench.core.correspondences import BoolArray, Correspondences, without_lens
 from rsbench.core.joining import join_stereo
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -100,6 +100,9 @@ def estimate_motion(
     scaled so that one threshold rejects as many good tracks as good pairs. Too few matches or no consensus is a
     failed estimate with the reason.
 
+    A global-shutter solver is given the matches as cameras without a lens would have them. One that does not take
+    such cameras is a failure with the reason.
+
     Left-right matches count as parts of tracks; where no tracks are given, those are joined (``join_stereo``).
 
     Args:
@@ -112,6 +115,15 @@ def estimate_motion(
         given, note = joined.correspondences, joined.note
     run = _own if loop == "own" else _search
     start = time.perf_counter()
+    try:
+        ideal = without_lens(given, rig.camera)
+        refusal = solver.spec.refusal(rig, shutter)
+    except ValueError as error:
+        refusal = str(error)
+    if refusal:
+        return _refused(correspondences, refusal, solver, options)
+    if solver.spec.shutter == "global":
+        given, rig, shutter = ideal, rig.ideal, shutter if shutter.plain else shutter.at_once()
     found = run(given, rig, shutter, solver, options, rng)
     seconds = time.perf_counter() - start
     problem, estimate = found.problem, found.estimate
@@ -125,6 +137,21 @@ def estimate_motion(
         iterations=found.iterations,
         seconds=seconds,
         threshold_px=found.threshold_px,
+        reference_point=solver.spec.reference_point,
+    )
+
+
+def _refused(
+    correspondences: Correspondences, reason: str, solver: Solver, options: RobustOptions
+) -> RobustEstimate:
+    """The failure of a solver that is not asked."""
+    names: tuple[MatchSet, ...] = ("left", "right", "tracks")
+    return RobustEstimate(
+        estimate=MotionEstimate.failed(reason),
+        inliers={name: np.zeros(len(getattr(correspondences, name)), dtype=np.bool_) for name in names},
+        iterations=0,
+        seconds=0.0,
+        threshold_px=options.threshold_px,
         reference_point=solver.spec.reference_point,
     )
 

@@ -93,7 +93,7 @@ class RobustProblem:
         data, rig, shutter = self.data, self.rig, self.shutter
         model, own = self.spec.motion_model, self.spec.motion_parameters
         if self.spec.shutter == "global":
-            shutter = RollingShutter(height=shutter.height, readout_ratio=0.0)
+            shutter = shutter.at_once()
         if self.spec.reference_point == "body":
             return pack(data, rig, shutter, model, motion_parameters=own)
         # The errors of tracks are about the body: the left camera's motion is judged by what that camera sees.

@@ -28,7 +28,7 @@ def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Se
     result = np.zeros((len(rows), camera.width), dtype=np.float32)
     for place, row in enumerate(rows):
         for column in range(camera.width):
-            ray = mi.Ray3f(*sensor.row_ray(float(column), float(row), row))
+            ray = mi.Ray3f(*sensor.row_ray(float(column), float(row), column if sensor.columns else row))
             hit = scene.scene.ray_intersect_preliminary(ray)
             result[place, column] = hit.t if hit.is_valid() else 0.0
     return result
@@ -45,10 +45,10 @@ def radiance_rows(
         for column in range(camera.width):
             total = np.zeros(3, dtype=np.float32)
             for number, (dx, dy) in enumerate(grid):
-                pixel, pose = row * camera.width + column, row
+                pixel, pose = row * camera.width + column, column if sensor.columns else row
                 if sensor.instants > 1:
                     instant = instant_of(options.seed, pixel, number, options.samples, sensor.instants)
-                    pose += camera.height * int(instant)
+                    pose += sensor.lines * int(instant)
                 origin, direction = sensor.row_ray(column + dx, row + dy, pose)
                 total += np.asarray(trace(scene, origin, direction, options, pixel, number), dtype=np.float32)
             result[place, column] = total / np.float32(options.samples)

@@ -45,6 +45,7 @@ def render(
     *,
     exposed: Pose | None = None,
     rows: Sequence[int] | None = None,
+    columns: bool = False,
     on_gs_frame: OnGlobalFrame | None = None,
 ) -> Frame:
     """Render a frame whose every row has its own pose, by ``options.method``.
@@ -58,6 +59,7 @@ def render(
         exposed: poses (instants, height) of each row while it collects light, see ``exposure``; the image is their
             mean, the depth that of the row poses. The number of instants is a multiple of ``options.samples``.
         rows: render only these rows of the full frame, with the bits that they have in it.
+        columns: every column has its own pose instead: ``rotations`` and ``translations`` have as many.
         on_gs_frame: ``stitched`` with ``full_frames`` calls it with each row and its global-shutter image
             (height, width, 3), so that the stack can be kept as the paper keeps it.
 
@@ -73,8 +75,8 @@ def render(
     if exposed is not None and len(exposed.R) % options.samples:
         raise RsbenchError(f"{len(exposed.R)} instants: a multiple of the {options.samples} samples is needed")
     if options.method == "single-pass":
-        return _single_pass(scene, camera, row_poses, image_poses, options, chosen)
-    return _stitched(scene, camera, row_poses, image_poses, options, chosen, on_gs_frame)
+        return _single_pass(scene, camera, row_poses, image_poses, options, chosen, columns)
+    return _stitched(scene, camera, row_poses, image_poses, options, chosen, columns, on_gs_frame)
 
 
 def render_global(
@@ -105,10 +107,12 @@ def _single_pass(
     image_poses: Pose,
     options: RendererOptions,
     rows: Sequence[int],
+    columns: bool = False,
 ) -> Frame:
     tracer = _tracer()
-    image = tracer.radiance_rows(scene, make_sensor(camera, *image_poses), camera, rows, options)
-    return Frame(image=image, depth=tracer.depth_rows(scene, make_sensor(camera, *row_poses), camera, rows))
+    image = tracer.radiance_rows(scene, make_sensor(camera, *image_poses, columns), camera, rows, options)
+    depth = tracer.depth_rows(scene, make_sensor(camera, *row_poses, columns), camera, rows)
+    return Frame(image=image, depth=depth)
 
 
 def _stitched(
@@ -118,28 +122,32 @@ def _stitched(
     image_poses: Pose,
     options: RendererOptions,
     rows: Sequence[int],
+    columns: bool,
     on_gs_frame: OnGlobalFrame | None,
 ) -> Frame:
     """One global-shutter camera per row. Without ``full_frames`` only the kept row of each is traced.
 
     The pixels of that row keep their index in the full frame, hence their random numbers, and their neighbours in
-    a packet, hence their rounding: they have the bits of the whole image.
+    a packet, hence their rounding: they have the bits of the whole image. Of columns, all rows are traced.
     """
     tracer = _tracer()
-    sensors = [make_sensor(camera, *poses) for poses in (image_poses, row_poses)]
-    tables = [pose_table(camera, *poses) for poses in (image_poses, row_poses)]
+    sensors = [make_sensor(camera, *poses, columns) for poses in (image_poses, row_poses)]
+    tables = [pose_table(camera, *poses, columns) for poses in (image_poses, row_poses)]
     image = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
     depth = np.zeros((len(rows), camera.width), dtype=np.float32)
-    for place, row in enumerate(rows):
+    for place, line in enumerate(range(camera.width) if columns else rows):
         for sensor, table in zip(sensors, tables, strict=True):
-            sensor.set_poses(np.repeat(table[..., row : row + 1, :], camera.height, axis=-2))
-        traced = range(camera.height) if options.full_frames else [row]
+            sensor.set_poses(np.repeat(table[..., line : line + 1, :], table.shape[-2], axis=-2), columns)
+        traced = rows if columns else range(camera.height) if options.full_frames else [line]
         gs_image = tracer.radiance_rows(scene, sensors[0], camera, traced, options)
         gs_depth = tracer.depth_rows(scene, sensors[1], camera, traced)
-        kept = row if options.full_frames else 0
-        image[place], depth[place] = gs_image[kept], gs_depth[kept]
+        if columns:
+            image[:, line], depth[:, line] = gs_image[:, line], gs_depth[:, line]
+        else:
+            kept = line if options.full_frames else 0
+            image[place], depth[place] = gs_image[kept], gs_depth[kept]
         if on_gs_frame is not None:
-            on_gs_frame(row, gs_image)
+            on_gs_frame(line, gs_image)
     return Frame(image=image, depth=depth)
 
 

@@ -44,13 +44,13 @@ def sensed_rows(
         options: how to render; their seed is that of the image, of the noise too.
         rows: these only, with the bits that they have in the whole frame.
     """
-    tau = shutter.row_time(np.arange(shutter.height), frame)
+    tau = shutter.line_times(frame, side)
     exposed = None
     if sensor.exposure_s:
         instants = instant_times(tau, sensor.exposure_s / frame_period_s, instant_count(options.samples))
         exposed = rig.cam_from_world(motion, instants, side)
     chosen = range(shutter.height) if rows is None else rows
     R, t = rig.cam_from_world(motion, tau, side)
-    options = replace(options, full_frames=False)
-    light = render(scene, rig.camera, R, t, options, exposed=exposed, rows=chosen).image
+    options, columns = replace(options, full_frames=False), shutter.axis(side) == 0
+    light = render(scene, rig.camera, R, t, options, exposed=exposed, rows=chosen, columns=columns).image
     return expose(light * np.float32(options.exposure), sensor, options.seed, shutter.height, chosen)

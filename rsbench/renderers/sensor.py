@@ -1,4 +1,4 @@
-"""The rolling-shutter pinhole camera: every ray leaves from the pose of its image row.
+"""The rolling-shutter camera: every ray leaves from the pose of its image row, or column.
 
 ``rs_pinhole`` is an ordinary Mitsuba sensor, so any Mitsuba integrator can render through it; rsbench's own
 renderers call its ``row_ray`` directly. Poses and intrinsics are data of the compiled kernel, never constants.
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.errors import RsbenchError
+from rsbench.renderers.lens_rays import LensRays
 
 PLUGIN = "rs_pinhole"
 LEAST_COMPONENT = 1e-15
@@ -21,7 +22,9 @@ LEAST_COMPONENT = 1e-15
 for negative and its inverse for positive: rays of its packet then miss surfaces that they meet."""
 
 
-def pose_table(camera: PinholeCamera, rotations: ArrayLike, translations: ArrayLike) -> NDArray[np.float32]:
+def pose_table(
+    camera: PinholeCamera, rotations: ArrayLike, translations: ArrayLike, columns: bool = False
+) -> NDArray[np.float32]:
     """Row poses as the kernels read them, (..., height, 12): ``R^T`` row-major, then the camera centre ``-R^T t``.
 
     Args:
@@ -29,16 +32,18 @@ def pose_table(camera: PinholeCamera, rotations: ArrayLike, translations: ArrayL
         rotations: (..., height, 3, 3) world-to-camera rotations, one per row; a leading axis holds the instants of
             an exposure.
         translations: (..., height, 3) metres, with ``X_cam = R @ X_world + t``.
+        columns: whether columns are read: one pose for each of them instead.
 
     Raises:
         RsbenchError: wrong shapes, or values that are not finite.
     """
     R = np.asarray(rotations, dtype=np.float64)
     t = np.asarray(translations, dtype=np.float64)
-    if R.shape[-3:] != (camera.height, 3, 3) or t.shape != R.shape[:-1]:
+    lines, name = (camera.width, "columns") if columns else (camera.height, "rows")
+    if R.shape[-3:] != (lines, 3, 3) or t.shape != R.shape[:-1]:
         raise RsbenchError(
-            f"row poses have shapes {R.shape} and {t.shape}: a camera of {camera.height} rows needs "
-            f"({camera.height}, 3, 3) and ({camera.height}, 3)"
+            f"row poses have shapes {R.shape} and {t.shape}: a camera of {lines} {name} needs "
+            f"({lines}, 3, 3) and ({lines}, 3)"
         )
     if not (np.isfinite(R).all() and np.isfinite(t).all()):
         raise RsbenchError("row poses are not finite numbers")
@@ -47,7 +52,9 @@ def pose_table(camera: PinholeCamera, rotations: ArrayLike, translations: ArrayL
     return np.concatenate([axes.reshape(*t.shape[:-1], 9), centre], axis=-1).astype(np.float32)
 
 
-def make_sensor(camera: PinholeCamera, rotations: ArrayLike, translations: ArrayLike) -> Any:
+def make_sensor(
+    camera: PinholeCamera, rotations: ArrayLike, translations: ArrayLike, columns: bool = False
+) -> Any:
     """A Mitsuba sensor ``rs_pinhole`` with a box filter, of ``camera``'s size, at these row poses.
 
     Args and errors: see ``pose_table``. Poses that are equal in all rows make a global shutter.
@@ -65,8 +72,19 @@ def make_sensor(camera: PinholeCamera, rotations: ArrayLike, translations: Array
     }
     sensor = mi.load_dict({"type": PLUGIN, "film": film, "sampler": {"type": "independent"}})
     sensor.set_intrinsics(camera)
-    sensor.set_poses(pose_table(camera, rotations, translations))
+    sensor.set_poses(pose_table(camera, rotations, translations, columns), columns)
     return sensor
+
+
+def _coordinates(sensor: Any, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
+    """Coordinates x / z, y / z of the ray through pixel coordinates (x, y)."""
+    if sensor.lens is not None:
+        return sensor.lens.coordinates(x, y, active)
+    if sensor.camera.lens is not None:  # one by one
+        u, v, _ = sensor.camera.unproject([float(x), float(y)]).tolist()
+        return u, v
+    fx, fy, cx, cy = sensor.intrinsics
+    return (x - cx) / fx, (y - cy) / fy
 
 
 @cache
@@ -81,27 +99,35 @@ def sensor_class() -> Any:
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
             self.intrinsics = [mi.Float(1.0), mi.Float(1.0), mi.Float(0.0), mi.Float(0.0)]
+            self.lens: Any = None
             self.poses: Any = None
+            self.columns = False
+            """Whether poses are those of columns."""
+            self.lines = 0
+            """Poses of an instant."""
             self.instants = 1
             """Of an exposure: so many poses has each row."""
 
         def set_intrinsics(self, camera: PinholeCamera) -> None:
             values = (camera.fx, camera.fy, camera.cx, camera.cy)
             self.intrinsics = [dr.opaque(mi.Float, value) for value in values]
+            self.camera = camera
+            if camera.lens is not None and not scalar:
+                self.lens = LensRays(camera, camera.lens)
 
-        def set_poses(self, table: NDArray[np.float32]) -> None:
-            """Table (height, 12) or (instants, height, 12) of ``pose_table``."""
+        def set_poses(self, table: NDArray[np.float32], columns: bool = False) -> None:
+            """Table (lines, 12) or (instants, lines, 12) of ``pose_table``."""
+            self.columns, self.lines = columns, table.shape[-2]
             self.instants = table.shape[0] if table.ndim == 3 else 1
             self.poses = table.ravel().tolist() if scalar else mi.Float(table.ravel())
 
         def row_ray(self, x: Any, y: Any, row: Any, active: Any = True) -> tuple[Any, Any]:
             """World origin and direction of the ray through pixel coordinates (x, y), at the pose of ``row``.
 
-            With instants, pose ``row + height * instant``. The direction has camera z = 1, so the distance to a
-            hit in units of it is the depth z.
+            With instants, pose ``row + lines * instant``; with columns, rows are columns. The direction has camera
+            z = 1, so the distance to a hit in units of it is the depth z.
             """
-            fx, fy, cx, cy = self.intrinsics
-            u, v = (x - cx) / fx, (y - cy) / fy
+            u, v = _coordinates(self, x, y, active)
             p = [self._entry(row, k, active) for k in range(12)]
             direction = [dr.fma(p[3 * i], u, dr.fma(p[3 * i + 1], v, p[3 * i + 2])) for i in range(3)]
             level = [dr.select(dr.abs(value) < LEAST_COMPONENT, 0.0, value) for value in direction]
@@ -118,7 +144,8 @@ def sensor_class() -> Any:
             size, crop, offset = film.size(), film.crop_size(), film.crop_offset()
             x = position.x * crop[0] + offset[0]
             y = position.y * crop[1] + offset[1]
-            row = mi.UInt32(dr.clip(dr.floor(y), 0, size[1] - 1))
+            along, last = (x, size[0] - 1) if self.columns else (y, size[1] - 1)
+            row = mi.UInt32(dr.clip(dr.floor(along), 0, last))
             origin, direction = self.row_ray(x - 0.5, y - 0.5, row, active)
             wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), wavelength, active)
             return mi.Ray3f(origin, dr.normalize(direction), time, wavelengths), weight

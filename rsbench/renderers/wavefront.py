@@ -57,6 +57,10 @@ class _Lanes:
         row = dr.gather(mi.UInt32, table, place % count)
         return cls(row, column, place // count, column < dr.opaque(mi.UInt32, width), shape)
 
+    def line(self, sensor: Any) -> Any:
+        """Number of the row, or of the column where those are read."""
+        return self.column if sensor.columns else self.row
+
     def image(self, channels: Sequence[Any], width: int) -> Float32Array:
         """Host array (copies, rows, width, channels) of Dr.Jit arrays with one entry per lane."""
         import drjit as dr
@@ -85,7 +89,9 @@ def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Se
     done = 0
     for band in _bands(rows, camera.width):
         lanes = _Lanes.of(band, camera.width)
-        ray = mi.Ray3f(*sensor.row_ray(mi.Float(lanes.column), mi.Float(lanes.row), lanes.row, lanes.active))
+        ray = mi.Ray3f(
+            *sensor.row_ray(mi.Float(lanes.column), mi.Float(lanes.row), lanes.line(sensor), lanes.active)
+        )
         hit = scene.scene.ray_intersect_preliminary(ray, coherent=True, active=lanes.active)
         depth = dr.select(hit.is_valid(), hit.t, 0)
         result[done : done + len(band)] = lanes.image([depth], camera.width)[0, :, :, 0]
@@ -112,11 +118,11 @@ def _pose(sensor: Any, camera: PinholeCamera, lanes: _Lanes, sample: Any, option
     import mitsuba as mi
 
     if sensor.instants == 1:
-        return lanes.row
+        return lanes.line(sensor)
     pixel = lanes.row * dr.opaque(mi.UInt32, camera.width) + lanes.column
     seed = dr.opaque(mi.UInt32, options.seed)
     instant = instant_of(seed, pixel, sample, options.samples, sensor.instants)
-    return lanes.row + dr.opaque(mi.UInt32, camera.height) * instant
+    return lanes.line(sensor) + dr.opaque(mi.UInt32, sensor.lines) * instant
 
 
 def _sunsky_band(

@@ -118,6 +118,7 @@ class IteratedSolver(Solver):
             metric=True,
             motion_model="linear",
             shutter="rolling",
+            cameras="any" if self.scale == "pairs" else "ideal",
             reference_point="body",
             reference="rsbench; after Wang, Fan, Dai, eq. 7-10, with the antisymmetric part of E folded into d",
             assumes="small rotation, constant velocity, a scene that is not planar, translation",

@@ -45,7 +45,7 @@ def system_rows(
     entries but the last.
     """
     x, y = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
-    k1, k3 = shutter.row_time(matches[:, 1], 0), shutter.row_time(matches[:, 3], 1)
+    k1, k3 = shutter.pixel_time(matches[:, :2], 0, side), shutter.pixel_time(matches[:, 2:], 1, side)
     a = (k3 - k1)[:, None]
     sb = rig.offset(side)[0]
     c = np.cross(x, y)
@@ -114,6 +114,7 @@ class LinearSolver(Solver):
             metric=True,
             motion_model="linear",
             shutter="rolling",
+            cameras="any",
             reference_point="body",
             reference="Wang, Fan, Dai: Relative Pose Estimation for Stereo Rolling Shutter Cameras, eq. 7-10",
             assumes="small rotation, constant velocity, readout ratio above 0, generic motion, very low noise",

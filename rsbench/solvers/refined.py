@@ -95,6 +95,7 @@ class RefinedSolver(Solver):
             motion_model=self.motion_model,
             motion_parameters=self.motion_parameters,
             shutter=self.shutter,
+            cameras="any",
             reference_point="body",
             reference="rsbench; maximum likelihood of Wang, Fan, Dai, eq. 1-6 without linearisation",
             assumes="constant velocity of the chosen motion model, Gaussian noise, no outliers",
@@ -103,7 +104,7 @@ class RefinedSolver(Solver):
     def packed(self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter) -> Packed:
         """The measurements that this solver uses, with the shutter that it believes in."""
         if self.shutter == "global":
-            shutter = RollingShutter(height=shutter.height, readout_ratio=0.0)
+            shutter = shutter.at_once()
         if not self.use_pairs:
             correspondences = Correspondences(tracks=correspondences.tracks)
         linked = self.use_tracks and len(correspondences.tracks) >= 3

@@ -13,8 +13,8 @@ from typing import final
 
 import numpy as np
 
-from rsbench.core.correspondences import Correspondences
-from rsbench.core.rig import StereoRig
+from rsbench.core.correspondences import Correspondences, track_pairs, without_lens
+from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
@@ -25,20 +25,22 @@ _LEAST_DURATION = 0.05
 """Frame periods; a shorter one means a jump of nearly the whole image upwards, which no flow survives."""
 
 
-def scale_flow(correspondences: Correspondences, shutter: RollingShutter) -> Correspondences:
-    """Matches whose frame-1 ends are moved to where they would be after exactly one frame period."""
-    tracks = correspondences.tracks
-    left = _scaled(tracks[:, [0, 1, 4, 5]], shutter)
-    right = _scaled(tracks[:, [2, 3, 6, 7]], shutter)
+def scale_flow(correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter) -> Correspondences:
+    """Matches, without a lens, whose frame-1 ends are moved to where they are after exactly one frame period."""
+    ideal = without_lens(correspondences, rig.camera)
+    halves = [
+        _scaled(track_pairs(correspondences.tracks, side), track_pairs(ideal.tracks, side), side, shutter)
+        for side in SIDES
+    ]
     return Correspondences(
-        left=_scaled(correspondences.left, shutter),
-        right=_scaled(correspondences.right, shutter),
-        tracks=np.concatenate([tracks[:, :4], left[:, 2:], right[:, 2:]], axis=1),
+        left=_scaled(correspondences.left, ideal.left, "left", shutter),
+        right=_scaled(correspondences.right, ideal.right, "right", shutter),
+        tracks=np.concatenate([ideal.tracks[:, :4], halves[0][:, 2:], halves[1][:, 2:]], axis=1),
     )
 
 
-def _scaled(matches: FloatArray, shutter: RollingShutter) -> FloatArray:
-    duration = shutter.row_time(matches[:, 3], 1) - shutter.row_time(matches[:, 1], 0)
+def _scaled(pixels: FloatArray, matches: FloatArray, side: Side, shutter: RollingShutter) -> FloatArray:
+    duration = shutter.pixel_time(pixels[:, 2:], 1, side) - shutter.pixel_time(pixels[:, :2], 0, side)
     duration = np.maximum(duration, _LEAST_DURATION)[:, None]
     return np.concatenate([matches[:, :2], matches[:, :2] + (matches[:, 2:] - matches[:, :2]) / duration], axis=1)
 
@@ -84,6 +86,7 @@ class FlowScaledSolver(Solver):
             inner,
             motion_model="twist",
             shutter="rolling",
+            cameras="any" if inner.needs == {"left"} else "lens",
             reference=f"Zhuang, Cheong, Lee, ICCV 2017, eq. 8-9; {inner.reference}",
             assumes=f"constant twist, small motion; {inner.assumes}",
         )
@@ -91,18 +94,18 @@ class FlowScaledSolver(Solver):
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        return self.inner.estimate(scale_flow(correspondences, shutter), rig, shutter)
+        return self.inner.estimate(scale_flow(correspondences, rig, shutter), rig.ideal, shutter)
 
     def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
         return self.inner.sample_sizes(correspondences)
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
-        return self.inner.propose(scale_flow(sample, shutter), rig, shutter)
+        return self.inner.propose(scale_flow(sample, rig, shutter), rig.ideal, shutter)
 
     def propose_all(
         self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
     ) -> Iterable[list[MotionEstimate]]:
-        return self.inner.propose_all([scale_flow(sample, shutter) for sample in samples], rig, shutter)
+        return self.inner.propose_all([scale_flow(sample, rig, shutter) for sample in samples], rig.ideal, shutter)
 
     def improve(
         self,
@@ -112,4 +115,4 @@ class FlowScaledSolver(Solver):
         shutter: RollingShutter,
         quick: bool = False,
     ) -> MotionEstimate:
-        return self.inner.improve(motion, scale_flow(correspondences, shutter), rig, shutter, quick)
+        return self.inner.improve(motion, scale_flow(correspondences, rig, shutter), rig.ideal, shutter, quick)

@@ -45,8 +45,8 @@ def flow_depth(
     epipolar curve.
     """
     targets = pixels + flow
-    here = rig.cam_from_world(motion, shutter.row_time(pixels[..., 1], frame), side)
-    there = rig.cam_from_world(motion, shutter.row_time(targets[..., 1], 1 - frame), side)
+    here = rig.cam_from_world(motion, shutter.pixel_time(pixels, frame, side), side)
+    there = rig.cam_from_world(motion, shutter.pixel_time(targets, 1 - frame, side), side)
     R, T = compose(there, inverse(here))
     x, y = rig.camera.unproject(pixels), rig.camera.unproject(targets)
     z = ray_depths(compose(there, inverse(here)), x, y)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench import plugins
+from rsbench.arguments import check_ideal
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.errors import RsbenchError
 from rsbench.plugins import Entry, Kind, RunOptions
@@ -59,6 +60,7 @@ def find_disparities(
         RsbenchError: another package's matcher raised, or answered something else: one line with its name.
     """
     where = f"{STEREO_MATCHERS.singular} {entry.name!r}"
+    check_ideal(rig, where)
     with plugins.blame(STEREO_MATCHERS, entry):
         answer = entry.component.disparities(left, right, rig)
     if not isinstance(answer, tuple) or len(answer) != len(SIDES):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.lens import Lens
 from rsbench.core.motion import LinearMotion, Motion, TwistMotion
 from rsbench.core.projection import (
     ROW_TOLERANCE_PX,
@@ -20,7 +23,7 @@ from rsbench.core.projection import (
 )
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import transform
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
 
 few = settings(max_examples=25, deadline=None, derandomize=True)
@@ -248,3 +251,41 @@ def test_row_poses_are_the_poses_of_integer_rows() -> None:
     body = motion.body_from_world(1.07)
     np.testing.assert_allclose(R[7], body.R, rtol=0, atol=1e-15)
     np.testing.assert_allclose(t[7], body.t - [0.1, 0, 0], rtol=0, atol=1e-15)
+
+
+LENSES = [
+    Lens(model="brown-conrady", k1=-0.2, k2=0.05, p1=0.002, p2=-0.001),
+    Lens(model="kannala-brandt", k1=-0.05, k2=0.02),
+]
+SCANS: list[Scan] = ["top", "bottom", "left", "right"]
+
+
+@few
+@given(st.sampled_from(LENSES), st.sampled_from(SCANS), st.floats(-0.3, 0.3), vectors, vectors, seeds)
+def test_a_point_is_seen_through_a_lens_when_its_distorted_line_is_read(
+    lens: Lens, scan: Scan, delay: float, w: FloatArray, d: FloatArray, seed: int
+) -> None:
+    rig = StereoRig(camera=replace(RIG.camera, lens=lens), baseline=0.2)
+    shutter = RollingShutter(height=80, width=100, readout_ratio=0.8, right_scan=scan, right_delay=delay)
+    motion, side = LinearMotion(0.05 * w, 0.2 * d), SIDES[1]
+    seen = rs_project(rig, shutter, motion, side, 1, _points(seed))
+    assert not np.any(seen.status == ProjectionStatus.NOT_CONVERGED)
+    ok = np.isfinite(seen.depth)
+    x, y = seen.pixels[ok].T
+    share = {"top": y / 80, "bottom": (79 - y) / 80, "left": x / 100, "right": (99 - x) / 100}[scan]
+    tau = 1 + delay + 0.8 * share
+    R, t = rig.cam_from_world(motion, tau, side)
+    X = (R @ _points(seed)[ok][:, :, None])[..., 0] + t
+    expected = lens.distort(X[:, :2] / X[:, 2:]).xy * 100.0 + [49.5, 39.5]
+    np.testing.assert_allclose(seen.pixels[ok], expected, rtol=0, atol=1e-8)
+    again = back_project(rig, shutter, motion, side, 1, seen.pixels[ok], seen.depth[ok])
+    np.testing.assert_allclose(again, _points(seed)[ok], rtol=0, atol=1e-9)
+    start = seen.pixels[ok][:, shutter.axis(side)] + 1.0
+    near = rs_project_near(rig, shutter, motion, side, 1, _points(seed)[ok], start)
+    once = seen.status[ok] == ProjectionStatus.SEEN
+    np.testing.assert_allclose(near.pixels[once], seen.pixels[ok][once], rtol=0, atol=1e-8)
+    R, t = row_poses(rig, shutter, motion, side, 1)
+    assert len(R) == shutter.lines(side)
+    first = {"top": 0, "left": 0, "bottom": 79, "right": 99}[scan]
+    expected_pose = rig.cam_from_world(motion, 1 + delay, side)
+    np.testing.assert_allclose(t[first], expected_pose.t, rtol=0, atol=1e-15)

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.lens import Lens
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -325,3 +327,36 @@ def test_seconds_hold_no_compilation() -> None:
     first, *later = json.loads(result.stdout)
     # Loading compiled code takes ten times as long as this problem, compiling it a thousand times.
     assert first < 5.0 * max(later) + 0.05
+
+
+def test_a_problem_may_have_a_lens_another_scan_and_a_late_camera() -> None:
+    lens = Lens(model="kannala-brandt", k1=-0.02, k2=0.004)
+    rig = replace(RIG, camera=replace(RIG.camera, lens=lens))
+    shutter = replace(SHUTTER, scan="bottom", right_scan="left", right_delay=0.1, width=900)
+    seen = simulate(rig, shutter, MOTION, SimulationOptions(tracks=30), np.random.default_rng(0)).correspondences
+    data = content(left=[], right=[], tracks=seen.tracks.tolist())
+    data["camera"]["lens"] = {"model": "kannala-brandt", "k1": -0.02, "k2": 0.004}
+    data |= {"scan": "bottom", "right_scan": "left", "right_delay": 0.1}
+    problem = parse_problem(json.dumps(data), "p.json")
+    assert (problem.rig, problem.shutter) == (rig, shutter)
+    with SolverRunner() as runner:
+        answer = solve_problem(problem, load_solver_entry("rs-stereo"), RobustOptions(), runner)
+        asked = solve_problem(
+            problem, load_solver_entry("rs-stereo"), RobustOptions(), runner, motion_model="auto"
+        )
+    # Exact matches: what is left is where the descent stops.
+    np.testing.assert_allclose(answer["w"], MOTION.w, atol=1e-7)
+    assert not asked["success"] and "takes cameras without a lens" in asked["reason"]
+
+
+def test_a_lens_that_folds_is_one_line_with_the_field() -> None:
+    data = content()
+    data["camera"]["lens"] = {"model": "brown-conrady", "k1": -2.0}
+    with pytest.raises(
+        RsbenchError, match=r"^p.json: camera: camera lens: the brown-conrady polynomial folds"
+    ) as error:
+        parse_problem(json.dumps(data), "p.json")
+    assert "\n" not in str(error.value)
+    data["camera"]["lens"] = {"model": "brown-conrady", "k5": 0.1}
+    with pytest.raises(RsbenchError, match=r"unknown key 'camera.lens.k5'"):
+        parse_problem(json.dumps(data), "p.json")

@@ -116,7 +116,7 @@ def test_scaled_matches_took_one_frame_period() -> None:
         duration = 1.0 + SHUTTER.h * velocity[:, 1] * duration
     left = np.hstack([start, start + velocity * duration[:, None]])
     tracks = np.hstack([start, start - [40, 0], left[:, 2:], left[:, 2:] - [40, 0]])
-    scaled = scale_flow(Correspondences(left=left, right=left, tracks=tracks), SHUTTER)
+    scaled = scale_flow(Correspondences(left=left, right=left, tracks=tracks), RIG, SHUTTER)
     expected = np.hstack([start, start + velocity])
     np.testing.assert_allclose(scaled.left, expected, atol=1e-9)
     np.testing.assert_allclose(scaled.right, expected, atol=1e-9)
@@ -126,7 +126,7 @@ def test_scaled_matches_took_one_frame_period() -> None:
 
 def test_without_readout_scaling_changes_nothing() -> None:
     c = trial(0, "linear", 0.5, tracks=True).correspondences
-    np.testing.assert_allclose(scale_flow(c, GLOBAL).tracks, c.tracks, atol=1e-9)
+    np.testing.assert_allclose(scale_flow(c, RIG, GLOBAL).tracks, c.tracks, atol=1e-9)
 
 
 def test_scaled_solver_declares_what_its_inner_one_does(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ from rsbench.errors import RsbenchError
 from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.frame_depth import Images, Pairs, depth_of_pair, known_depth
-from rsbench.pipeline.frame_motion import find_matches
+from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.robust_motion import RobustEstimate
 from rsbench.solvers.engine.base import MotionEstimate
@@ -78,7 +78,7 @@ class Bench:
             if entry.name in self.plan.solver_names:
                 self.move(entry)
                 step(f"{self.sequence.name}: {entry.name}")
-        if self.plan.corrects:
+        if self.plan.corrects and not self.sequence.uncorrectable:
             self._find_depth()
             step(f"{self.sequence.name}: depth")
             for recipe in Recipe(chain=self.plan.chain).variants():
@@ -98,7 +98,7 @@ class Bench:
         artefact.start()
         images, start = self.images, time.perf_counter()
         try:
-            matches = find_matches(images, self.plan.chain)
+            matches = find_matches_of_rig(images, self.sequence.rig, self.sequence.shutter, self.plan.chain)
         except RsbenchError as error:
             artefact.finish({"features": entry.name, "success": False, "reason": str(error), "matches": {}})
             return

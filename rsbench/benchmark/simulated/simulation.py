@@ -176,10 +176,10 @@ def _seen_once(
     pixels = np.full((len(points), 2), np.nan)
     slow = _slower_than_readout(rig, shutter, motion, side, frame, points)
     X, y0 = points[slow], guess[slow]
-    seen = project_at(rig, motion, side, shutter.row_time(y0, frame), X)
+    seen = project_at(rig, motion, side, shutter.line_time(y0, frame, side), X)
     f0, y = seen[:, 1] - y0, seen[:, 1]
     for _ in range(_SECANT_STEPS if np.any(np.abs(f0) > ROW_TOLERANCE_PX) else 0):
-        seen = project_at(rig, motion, side, shutter.row_time(y, frame), X)
+        seen = project_at(rig, motion, side, shutter.line_time(y, frame, side), X)
         f = seen[:, 1] - y
         if np.all(np.abs(f) <= ROW_TOLERANCE_PX):
             break
@@ -202,6 +202,8 @@ def _slower_than_readout(
     speed over the frame, none is.
     """
     camera = rig.camera
+    if camera.lens is not None or not shutter.plain:
+        return np.zeros(len(points), dtype=np.bool_)
     rows = (-0.5, 0.5 * shutter.height, shutter.height - 0.5)
     first, middle, last = (float(shutter.row_time(row, frame)) for row in rows)
     fastest = motion.fastest(first, last)

@@ -64,22 +64,28 @@ def clean_file(sequence: Sequence, shot: Shot) -> str:
 
 
 def twin_faults(content: Content) -> Iterator[str]:
-    """Row 0 of a rolling-shutter frame and of its global-shutter twin are the same rays, so the same values."""
+    """The first row of a rolling-shutter frame and of its global-shutter twin are the same rays and values.
+
+    Where columns are read, it is the first column.
+    """
+    shutter = content.sequence.shutter
     for shot in SHOTS:
+        axis, number = 1 - shutter.axis(shot.side), shutter.first_line(shot.side)
+        line = f"{'row' if axis == 0 else 'column'} {number}"
         twin = shot._replace(shutter="gs")
         if shot.shutter != "rs":
             continue
         if {shot, twin} <= content.pictures.keys():
-            rows = [content.pictures[each].colours[0] for each in (shot, twin)]
+            rows = [np.take(content.pictures[each].colours, [number], axis) for each in (shot, twin)]
             unlike = np.any(rows[0] != rows[1], axis=-1)
             if np.any(unlike):
                 what = f"{np.sum(unlike)} pixels differ from the global-shutter twin at the same pose"
-                yield finding(clean_file(content.sequence, shot), f"row 0 differs from {twin.image}: {what}")
+                yield finding(clean_file(content.sequence, shot), f"{line} differs from {twin.image}: {what}")
         if {shot, twin} <= content.maps.keys():
-            values = [content.maps[each].depth[0] for each in (shot, twin)]
-            if not np.array_equal(*values):
-                what = f"by up to {np.max(np.abs(values[0] - values[1])):.3g} m at the same pose"
-                yield finding(shot.depth, f"row 0 differs from {twin.depth}: {what}")
+            own, other = (np.take(content.maps[each].depth, [number], axis) for each in (shot, twin))
+            if not np.array_equal(own, other):
+                what = f"by up to {np.max(np.abs(own - other)):.3g} m at the same pose"
+                yield finding(shot.depth, f"{line} differs from {twin.depth}: {what}")
 
 
 @dataclass(eq=False)

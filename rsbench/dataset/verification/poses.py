@@ -30,8 +30,8 @@ def pose_faults(sequence: Sequence) -> Iterator[str]:
         except RsbenchError as error:
             yield str(error)
             continue
-        if len(table) != sequence.shutter.height:
-            yield finding(file, f"has {len(table)} rows, the camera has {sequence.shutter.height}")
+        if len(table) != (lines := sequence.shutter.lines(side)):
+            yield finding(file, f"has {len(table)} rows, the camera has {lines}")
         else:
             yield from _table_faults(sequence, file, side, frame, table)
 
@@ -65,9 +65,8 @@ def _table_faults(sequence: Sequence, file: str, side: Side, frame: int, table: 
 
 def _table(sequence: Sequence, side: Side, frame: int) -> FloatArray:
     """Row time, rotation matrix and translation (H, 13) that the motion gives."""
-    rows = np.arange(sequence.shutter.height)
     pose = row_poses(sequence.rig, sequence.shutter, sequence.motion, side, frame)
-    tau = sequence.shutter.row_time(rows, frame)
+    tau = sequence.shutter.line_times(frame, side)
     return np.concatenate([tau[:, None], pose.R.reshape(-1, 9), pose.t], axis=1)
 
 
@@ -88,7 +87,7 @@ def _likely(sequence: Sequence, side: Side, frame: int, table: FloatArray) -> st
     candidates += [
         (f"the poses of {other}_{number}", _table(sequence, other, number))
         for other, number in product(SIDES, FRAMES)
-        if (other, number) != (side, frame)
+        if (other, number) != (side, frame) and sequence.shutter.lines(other) == len(table)
     ]
     candidates.append(("world_from_cam instead of cam_from_world", back))
     return next((f"looks like {words}" for words, each in candidates if _mostly(table, each)), "")

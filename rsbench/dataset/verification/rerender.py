@@ -179,8 +179,10 @@ def _render(content: Content, scene: MitsubaScene, options: RendererOptions, sho
     chosen = replace(options, seed=seed, method="single-pass", full_frames=False)
     R, t = row_poses(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame)
     if shot.shutter == "gs":
-        R, t = np.broadcast_to(R[0], R.shape), np.broadcast_to(t[0], t.shape)
-    return render(scene, sequence.rig.camera, R, t, chosen, rows=rows)
+        line = sequence.shutter.first_line(shot.side)
+        R, t = np.broadcast_to(R[line], R.shape), np.broadcast_to(t[line], t.shape)
+    columns = sequence.shutter.axis(shot.side) == 0
+    return render(scene, sequence.rig.camera, R, t, chosen, rows=rows, columns=columns)
 
 
 def _depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]) -> _Check:

@@ -59,7 +59,7 @@ def _window(sequence: Sequence, sensor: Sensor, depth_map: DepthMap) -> tuple[in
     geometry = sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame
     X = back_project(*geometry, grid, depth)
     half = 0.5 * sensor.exposure_s / sequence.frame_period_s
-    tau = sequence.shutter.row_time(grid[..., 1], shot.frame)
+    tau = sequence.shutter.pixel_time(grid, shot.frame, shot.side)
     moved = [
         np.abs(project_at(sequence.rig, sequence.motion, shot.side, tau + sign * half, X)[..., :2] - grid)
         for sign in (-1.0, 1.0)

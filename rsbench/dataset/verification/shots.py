@@ -98,7 +98,8 @@ def land(sequence: Sequence, source: DepthMap, target: DepthMap, stride: int = 1
         rows = slice(first, first + step)
         sky = depth[rows] == 0
         X = points_of(sequence, source.shot, grid[rows], np.where(sky, FAR, depth[rows]))
-        seen, z, _ = seen_by(sequence, target.shot, X, grid[rows][..., 1])
+        guess = grid[rows][..., sequence.shutter.axis(target.shot.side)]
+        seen, z, _ = seen_by(sequence, target.shot, X, guess)
         pixels[rows] = seen
         relative[rows] = _relative(target, seen, z, sky)
     return Landing(pixels, relative)

@@ -51,11 +51,11 @@ def _manifest_faults(sequence: Sequence) -> Iterator[str]:
 def _table_faults(sequence: Sequence, side: Side, frame: int, told: Collection[str]) -> Iterator[str]:
     file, poses = table_file(side, frame), f"poses/{side}_{frame}.csv"
     stored = sequence.row_times_ns(side, frame)
-    expected = timing_table(sequence.shutter, sequence.frame_period_s, sequence.sensor, frame)
+    expected = timing_table(sequence.shutter, sequence.frame_period_s, sequence.sensor, side, frame)
     for name, own, made in zip(COLUMNS.split(","), stored.T, expected.T, strict=True):
         off = own - made
         if np.any(np.abs(off) > _NEAR_NS):
-            other = timing_table(sequence.shutter, sequence.frame_period_s, sequence.sensor, 1 - frame)
+            other = timing_table(sequence.shutter, sequence.frame_period_s, sequence.sensor, side, 1 - frame)
             cause = f"looks like those of frame {1 - frame}" if np.array_equal(stored, other) else ""
             what = f"{name} differs from what sequence.json makes, by up to {np.max(np.abs(off))} ns"
             yield finding(file, what, rows_of(np.abs(off) > _NEAR_NS), cause)

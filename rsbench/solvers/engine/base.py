@@ -88,6 +88,10 @@ class SolverSpec:
     """Where it was published: paper and equation."""
     assumes: str
     """What must hold for it to work, in words."""
+    cameras: Literal["ideal", "lens", "any"] = "ideal"
+    """What it takes beside cameras without a lens that read rows from the top at the same times: a lens; or other
+    scans and a late right camera too. It then has rays from ``camera.unproject`` and times from
+    ``shutter.pixel_time`` alone. Of a global shutter it does not matter: matches come without the lens."""
     motion_parameters: Mapping[str, Any] = field(default_factory=dict)
     """The motion model's own parameters that it assumes; absent ones have the model's defaults."""
 
@@ -111,7 +115,11 @@ class SolverSpec:
         for key, count in self.minimum.items():
             if isinstance(count, bool) or not isinstance(count, int) or count < 1:
                 raise ValueError(f"minimum[{key!r}] = {count!r}: must be a whole number above 0")
-        for name, allowed in (("shutter", ("rolling", "global")), ("reference_point", ("body", "left"))):
+        for name, allowed in (
+            ("shutter", ("rolling", "global")),
+            ("reference_point", ("body", "left")),
+            ("cameras", ("ideal", "lens", "any")),
+        ):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} = {getattr(self, name)!r}: must be one of {', '.join(allowed)}")
         if not isinstance(self.metric, bool):
@@ -123,6 +131,16 @@ class SolverSpec:
             check_parameters(self.motion_model, self.motion_parameters)
         except RsbenchError as error:
             raise ValueError(str(error)) from error
+
+    def refusal(self, rig: StereoRig, shutter: RollingShutter) -> str:
+        """Why it does not take such cameras; empty when it does."""
+        if self.shutter == "global" or self.cameras == "any":
+            return ""
+        if rig.camera.lens is not None and self.cameras == "ideal":
+            return f"it does not take a lens, and the cameras have one ({rig.camera.lens.model})"
+        if not shutter.plain:
+            return "it takes rows from the top that both cameras read at once, and no other scan or delay"
+        return ""
 
     def shortage(self, counts: Mapping[MatchSet, int]) -> MotionEstimate | None:
         """The failure that too few matches are; None when there are enough."""

@@ -26,8 +26,11 @@ from rsbench.solvers.engine.vectors import (
     times,
 )
 
+Matrix = tuple[float, float, float, float]
 BEHIND = 1e12
 """Squared error, px^2, of a track that the motion puts behind the camera; no descent step ever accepts it."""
+NEAREST = 1e-6
+"""Least ratio of a track's depths in frame 1 and frame 0."""
 
 
 @compiled
@@ -46,8 +49,9 @@ def pair_terms(
 
     Args:
         theta: (6,) w and v.
-        pairs: (n, 7) ray 0 (x, y), ray 1 (x, y), tau0, tau1, x of the camera's offset from the body in metres.
-        focal: (2,) fx, fy in pixels; h: frame periods per row.
+        pairs: (n, 7) ray 0 (x, y), ray 1 (x, y), tau0, tau1, x of the camera's offset from the body in metres; or
+            (n, 17) with what ``_at_pixels`` names, where the lens or the scan make it differ.
+        focal: (2,) fx, fy in pixels; h: frame periods per row, of pairs (n, 7).
         residuals: (n,) filled, in pixels.
         H, gradient: (6, 6), (6,), added to when ``want``.
     """
@@ -59,21 +63,39 @@ def pair_terms(
         Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
         T = plus((T[0] + offset, T[1], T[2]), -1.0, Ro)
         rate0, rate1 = plus(rate0, -1.0, cross(spin0, Ro)), plus(rate1, -1.0, cross(spin1, Ro))
-        value, q = _pair_gradient(x, y, R, T, rate0, rate1, spin0, spin1, focal, h)
+        L0, L1, slope = _at_pixels(pairs, m, h)
+        value, q = _pair_gradient(x, y, R, T, rate0, rate1, spin0, spin1, focal, L0, L1, slope)
         qq = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
         residuals[m] = value / math.sqrt(qq) if qq > 0.0 else _displacement(apply(R, x), y, focal)
         if not want or qq <= 0.0:
             continue
         step = value / qq
-        x = (x[0] - step * q[0] / focal[0], x[1] - step * q[1] / focal[1], 1.0)
-        y = (y[0] - step * q[2] / focal[0], y[1] - step * q[3] / focal[1], 1.0)
-        _pair_jacobian(
-            theta, kernel, x, y, tau0 - h * step * q[1], tau1 - h * step * q[3], offset, R, A, T_w, T_v, J
-        )
+        x, y = _shifted(x, L0, step * q[0], step * q[1], focal), _shifted(y, L1, step * q[2], step * q[3], focal)
+        tau0 -= slope[1] * step * q[1] + slope[0] * step * q[0]
+        tau1 -= slope[1] * step * q[3] + slope[0] * step * q[2]
+        _pair_jacobian(theta, kernel, x, y, tau0, tau1, offset, R, A, T_w, T_v, J)
         for i in range(6):
             gradient[i] += J[i] / math.sqrt(qq) * residuals[m]
             for j in range(6):
                 H[i, j] += J[i] * J[j] / qq
+
+
+@compiled
+def _at_pixels(pairs: FloatArray, m: int, h: float) -> tuple[Matrix, Matrix, tuple[float, float]]:
+    """Derivatives of both ideal pixels by the pixels (2 x 2, rows first), and of tau by the pixel."""
+    if pairs.shape[1] == 7:
+        return (1.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.0), (0.0, h)
+    return (
+        (pairs[m, 7], pairs[m, 8], pairs[m, 9], pairs[m, 10]),
+        (pairs[m, 11], pairs[m, 12], pairs[m, 13], pairs[m, 14]),
+        (pairs[m, 15], pairs[m, 16]),
+    )
+
+
+@compiled
+def _shifted(ray: Vector, L: Matrix, dx: float, dy: float, focal: FloatArray) -> Vector:
+    """The ray of a pixel that is (dx, dy) less."""
+    return (ray[0] - (L[0] * dx + L[1] * dy) / focal[0], ray[1] - (L[2] * dx + L[3] * dy) / focal[1], 1.0)
 
 
 @compiled
@@ -95,8 +117,10 @@ def _pair_gradient(
     spin0: Vector,
     spin1: Vector,
     focal: FloatArray,
-    h: float,
-) -> tuple[float, tuple[float, float, float, float]]:
+    L0: Matrix,
+    L1: Matrix,
+    slope: tuple[float, float],
+) -> tuple[float, Matrix]:
     """Value of y^T [T]x R x, and its derivative by the four pixel coordinates; NumPy: ``epipolar.rs_constraint``.
 
     The paper's (7) before its linearisation: E = [T]x R of (6). The rates are T's by the two times, the spins R's.
@@ -106,9 +130,11 @@ def _pair_gradient(
     line, back = cross(T, p), apply_transposed(R, cross(y, T))
     turn0 = dot(spin0, y) * dot(T, p) - dot(spin0, T) * dot(y, p)
     turn1 = dot(spin1, y) * dot(T, p) - dot(spin1, T) * dot(y, p)
-    by_y0 = back[1] / focal[1] + h * (dot(rate0, n) + turn0)
-    by_y1 = line[1] / focal[1] + h * (dot(rate1, n) + turn1)
-    return dot(T, n), (back[0] / focal[0], by_y0, line[0] / focal[0], by_y1)
+    time0, time1 = dot(rate0, n) + turn0, dot(rate1, n) + turn1
+    bx, by, lx, ly = back[0] / focal[0], back[1] / focal[1], line[0] / focal[0], line[1] / focal[1]
+    by_x0, by_y0 = L0[0] * bx + L0[2] * by + slope[0] * time0, L0[1] * bx + L0[3] * by + slope[1] * time0
+    by_x1, by_y1 = L1[0] * lx + L1[2] * ly + slope[0] * time1, L1[1] * lx + L1[3] * ly + slope[1] * time1
+    return dot(T, n), (by_x0, by_y0, by_x1, by_y1)
 
 
 @compiled
@@ -142,7 +168,7 @@ def _pair_jacobian(
 
 @compiled
 def count_in_front(theta: FloatArray, kernel: MotionKernel, pairs: FloatArray) -> int:
-    """How many pairs (n, 7) have both closest points in front of their cameras; parallel rays do not."""
+    """How many pairs (n, 7 or 17) have both closest points in front of their cameras; parallel rays do not."""
     R, A = np.zeros((3, 3)), np.zeros((3, 3))
     count = 0
     for m in range(len(pairs)):

@@ -39,12 +39,11 @@ def _descend(
     out: FloatArray,
 ) -> None:
     size = samples.shape[1]
-    chosen, squares = np.zeros((size, 8)), np.zeros(size)
+    squares = np.zeros(size)
     H, gradient, theta, step = np.zeros((6, 6)), np.zeros(6), np.zeros(6), np.zeros(6)
     trial_H, trial_gradient = np.zeros((6, 6)), np.zeros(6)
     for s in range(len(samples)):
-        for k in range(size):
-            chosen[k] = tracks[samples[s, k]]
+        chosen = tracks[samples[s]]
         theta[:], H[:], gradient[:], damping = 0.0, 0.0, 0.0, _DAMPING
         track_terms(theta, kernel, chosen, focal, h, baseline, squares, H, gradient, True)
         cost = squares.sum()

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 import rsbench.solvers.engine.motion_kernels  # noqa: F401  (gives the models their kernels)
 from rsbench.core.correspondences import BoolArray, Correspondences, temporal_pairs, unlinked_pairs
-from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.kernel_type import MotionKernel, load_kernel
@@ -23,11 +24,12 @@ class Packed:
     """Measurements of one problem."""
 
     pairs: FloatArray
-    """(n, 7), see ``kernels.pair_terms``."""
+    """(n, 7) or (n, 17), see ``kernels.pair_terms``."""
     tracks: FloatArray
-    """(m, 8), see ``track_kernels.track_terms``."""
+    """(m, 8), see ``track_kernels.track_terms``, or (m, 4, 9), see ``timed_tracks.timed_track_terms``."""
     row_checks: FloatArray
-    """(m,) squared row differences within the stereo pairs of the tracks: px^2, chi-squared with 2 degrees."""
+    """(m,) squared row differences within the stereo pairs of the tracks: px^2, chi-squared with 2 degrees; 0 of
+    tracks (m, 4, 9), whose errors hold them."""
     focal: FloatArray
     h: float
     baseline: float
@@ -37,7 +39,7 @@ class Packed:
     @property
     def constraints(self) -> int:
         """Number of scalar equations that depend on the motion."""
-        return len(self.pairs) + 3 * len(self.tracks)
+        return len(self.pairs) + (3 if self.tracks.ndim == 2 else 5) * len(self.tracks)
 
     def pair_counts(self) -> dict[Side, int]:
         """Pairs of either camera."""
@@ -170,7 +172,8 @@ def pack(
     """
     kernel = load_kernel(motion_model, motion_parameters)
     tracks = correspondences.tracks if use_tracks else correspondences.tracks[:0]
-    pairs = [np.zeros((0, 7))]
+    timed = not _rectified(rig, shutter)
+    pairs = [np.zeros((0, 17 if timed else 7))]
     for side in SIDES:
         if use_tracks:
             matches = getattr(correspondences, side)[unlinked_pairs(correspondences, side)]
@@ -179,36 +182,77 @@ def pack(
         if len(matches):
             pairs.append(pack_pairs(matches, side, rig, shutter))
     camera = rig.camera
+    checks = 0.5 * ((tracks[:, 1] - tracks[:, 3]) ** 2 + (tracks[:, 5] - tracks[:, 7]) ** 2)
     return Packed(
         pairs=np.concatenate(pairs),
-        tracks=pack_tracks(tracks, rig, shutter),
-        row_checks=0.5 * ((tracks[:, 1] - tracks[:, 3]) ** 2 + (tracks[:, 5] - tracks[:, 7]) ** 2),
+        tracks=_pack_timed_tracks(tracks, rig, shutter) if timed else pack_tracks(tracks, rig, shutter),
+        row_checks=np.zeros(len(tracks)) if timed else checks,
         focal=np.array([camera.fx, camera.fy]),
-        h=shutter.h,
+        h=float(shutter.rate("left")[1]),
         baseline=rig.baseline,
         kernel=kernel,
     )
 
 
+def _rectified(rig: StereoRig, shutter: RollingShutter) -> bool:
+    """Whether a left-right match is one row of both images, read at one time."""
+    return rig.camera.lens is None and shutter.rows_together
+
+
 def pack_pairs(matches: FloatArray, side: Side, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
-    """(n, 7) for ``kernels.pair_terms`` from matches (n, 4) of one camera."""
-    out = np.zeros((len(matches), 7))
-    out[:, :2] = rig.camera.unproject(matches[:, :2])[:, :2]
-    out[:, 2:4] = rig.camera.unproject(matches[:, 2:])[:, :2]
-    out[:, 4], out[:, 5] = shutter.row_time(matches[:, 1], 0), shutter.row_time(matches[:, 3], 1)
+    """(n, 7) or (n, 17) for ``kernels.pair_terms`` from matches (n, 4) of one camera."""
+    camera, ends = rig.camera, (matches[:, :2], matches[:, 2:])
+    out = np.zeros((len(matches), 7 if _rectified(rig, shutter) else 17))
+    out[:, :2], out[:, 2:4] = (camera.unproject(end)[:, :2] for end in ends)
+    _check_rays(out[:, :4], rig)
+    out[:, 4], out[:, 5] = (shutter.pixel_time(end, frame, side) for frame, end in enumerate(ends))
     out[:, 6] = rig.offset(side)[0]
+    if out.shape[1] == 17:
+        out[:, 7:11], out[:, 11:15] = (camera.ideal_by_pixel(end).reshape(-1, 4) for end in ends)
+        out[:, 15:] = shutter.rate(side)
     return out
 
 
-def pack_tracks(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
-    """(n, 8) for ``track_kernels.track_terms`` from tracks (n, 8)."""
+def _pack_timed_tracks(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
+    """(n, 4, 9) for ``timed_tracks.timed_track_terms`` from tracks (n, 8)."""
+    _check_origin(tracks, rig)
+    out = np.zeros((len(tracks), 4, 9))
+    for k, (frame, side) in enumerate(product(FRAMES, SIDES)):
+        end = tracks[:, 2 * k : 2 * k + 2]
+        out[:, k, :2], out[:, k, 2] = rig.camera.unproject(end)[:, :2], shutter.pixel_time(end, frame, side)
+        _check_rays(out[:, k, :2], rig)
+        out[:, k, 3:7], out[:, k, 7:] = rig.camera.ideal_by_pixel(end).reshape(-1, 4), shutter.rate(side)
+    return out
+
+
+def _check_rays(rays: FloatArray, rig: StereoRig) -> None:
+    if rig.camera.lens is not None and np.any(np.isnan(rays)):
+        raise ValueError(
+            f"{np.count_nonzero(np.isnan(rays[:, 0]))} matches: the lens shows no ray at their pixels"
+        )
+
+
+def _check_origin(tracks: FloatArray, rig: StereoRig) -> None:
     if len(tracks) and rig.origin != "middle":
         raise ValueError(f"tracks are measured about the middle of the baseline, not the {rig.origin} camera")
+
+
+def pack_tracks(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
+    """(n, 8) for ``track_kernels.track_terms`` from tracks (n, 8) of a rig whose rows are read together.
+
+    Raises:
+        ValueError: another rig, or one that is not described by its middle.
+    """
+    _check_origin(tracks, rig)
+    if not _rectified(rig, shutter):
+        raise ValueError("a lens, columns or a late right camera: the two ends of a stereo match have two times")
     camera = rig.camera
     middle = 0.5 * (tracks[:, [0, 1, 4, 5]] + tracks[:, [2, 3, 6, 7]])
     out = np.zeros((len(tracks), 8))
     out[:, :2] = camera.unproject(middle[:, :2])[:, :2]
     out[:, 2], out[:, 5] = tracks[:, 0] - tracks[:, 2], tracks[:, 4] - tracks[:, 6]
     out[:, 3], out[:, 4] = middle[:, 2] - camera.cx, middle[:, 3] - camera.cy
-    out[:, 6], out[:, 7] = shutter.row_time(middle[:, 1], 0), shutter.row_time(middle[:, 3], 1)
+    out[:, 6], out[:, 7] = (
+        shutter.pixel_time(middle[:, 2 * frame : 2 * frame + 2], frame, "left") for frame in FRAMES
+    )
     return out

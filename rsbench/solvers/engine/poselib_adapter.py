@@ -60,6 +60,9 @@ def poselib_module() -> Any:
 
 
 def poselib_camera(camera: PinholeCamera) -> dict[str, Any]:
+    """As PoseLib names it; ValueError for a lens: it is given matches without one."""
+    if camera.lens is not None:
+        raise ValueError("PoseLib is given matches without a lens")
     return {
         "model": "PINHOLE",
         "width": camera.width,

@@ -20,7 +20,8 @@ import numpy as np
 from rsbench.compiled import compiled
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.kernel_type import MotionKernel
-from rsbench.solvers.engine.kernels import BEHIND
+from rsbench.solvers.engine.kernels import BEHIND, NEAREST
+from rsbench.solvers.engine.timed_tracks import timed_track_terms
 from rsbench.solvers.engine.vectors import (
     Vector,
     apply,
@@ -32,8 +33,6 @@ from rsbench.solvers.engine.vectors import (
 )
 
 _VARIANCE = (0.5, 0.5, 2.0)
-NEAREST = 1e-6
-"""Least ratio of a track's depths in frame 1 and frame 0."""
 
 
 @compiled
@@ -75,6 +74,8 @@ def track_terms(
 ) -> None:
     """Squared whitened errors of tracks, and the normal equations of half their sum.
 
+    Tracks (n, 4, 9), whose four ends have times of their own, are those of ``timed_tracks``.
+
     Args:
         theta: (6,) w and v.
         tracks: (n, 8) ray 0 (x, y) and disparity 0; x, y relative to the principal point and disparity of
@@ -83,6 +84,9 @@ def track_terms(
         squares: (n,) filled, px^2: chi-squared with 3 degrees of freedom at a noise of 1 px.
         H, gradient: (6, 6), (6,), added to when ``want``.
     """
+    if tracks.ndim == 3:  # known when compiled: only what is called is
+        timed_track_terms(theta, kernel, tracks, focal, baseline, squares, H, gradient, want)
+        return
     R, A, by_p, S, W = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     D0, D1, T_w, T_v = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     C, WC = np.zeros((3, 6)), np.zeros((3, 6))

@@ -1,0 +1,162 @@
+"""Distortion of real lenses, on the plane z = 1: from ideal coordinates to those on the sensor, and back.
+
+Ideal coordinates are x / z, y / z of a point in the camera frame; distorted ones times the focal length, plus the
+principal point, are pixels. Both models are OpenCV's, coefficient for coefficient.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rsbench.core.so3 import FloatArray
+
+LensModel = Literal["brown-conrady", "kannala-brandt"]
+WIDEST = 1.5
+"""Angle from the optical axis, rad, beyond which a fisheye shows nothing here: rays have z = 1."""
+_CONVERGED = 1e-14
+"""Newton steps end when they are as short as this, relative to 1 + the radius: rounding."""
+_MOST_STEPS = 40
+_UNUSED = {"brown-conrady": ("k4",), "kannala-brandt": ("p1", "p2")}
+
+
+class Distorted(NamedTuple):
+    """Distorted coordinates with their derivative."""
+
+    xy: FloatArray
+    """(..., 2); NaN where the lens does not see the point."""
+    jacobian: FloatArray
+    """(..., 2, 2) by the ideal coordinates."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """Coefficients of a lens; those that are 0 may be left out.
+
+    ``brown-conrady``: D. Brown, Close-range camera calibration, 1971; OpenCV's k1, k2, p1, p2, k3.
+    ``kannala-brandt``: J. Kannala, S. Brandt, PAMI 2006, eq. 6; OpenCV's fisheye k1 to k4.
+
+    Raises:
+        ValueError: a coefficient that is not finite or that the model does not have.
+    """
+
+    model: LensModel
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.model not in get_args(LensModel):
+            raise ValueError(f"lens model = {self.model!r}: must be one of {', '.join(get_args(LensModel))}")
+        for field in fields(self)[1:]:
+            if not math.isfinite(getattr(self, field.name)):
+                raise ValueError(f"lens {field.name} must be finite, got {getattr(self, field.name)}")
+        for name in _UNUSED[self.model]:
+            if getattr(self, name) != 0.0:
+                raise ValueError(f"lens {name} = {getattr(self, name)}: {self.model} has no such coefficient")
+
+    @cached_property
+    def reach(self) -> float:
+        """Ideal radius up to which the distorted radius grows; beyond it the polynomial folds back."""
+        if self.model == "brown-conrady":
+            return math.sqrt(_first_root([1.0, 3.0 * self.k1, 5.0 * self.k2, 7.0 * self.k3]))
+        slope = [1.0, 3.0 * self.k1, 5.0 * self.k2, 7.0 * self.k3, 9.0 * self.k4]
+        return math.tan(min(math.sqrt(_first_root(slope)), WIDEST))
+
+    def distort(self, xy: ArrayLike) -> Distorted:
+        """Distorted coordinates of ideal ones (..., 2); NaN beyond ``reach``."""
+        ideal = np.asarray(xy, dtype=np.float64)
+        radius = np.hypot(ideal[..., 0], ideal[..., 1])
+        known = np.where((radius < self.reach)[..., None], ideal, np.nan)
+        return self._brown(known) if self.model == "brown-conrady" else self._kannala(known)
+
+    def undistort(self, xy: ArrayLike) -> FloatArray:
+        """Ideal coordinates (..., 2) of distorted ones (..., 2), by Newton's method; NaN where it finds none.
+
+        What comes back is within ``reach``, does not fold, and distorts to ``xy`` but for rounding.
+        """
+        wanted = np.asarray(xy, dtype=np.float64)
+        flat = wanted.reshape(-1, 2)
+        ideal = self._start(flat)
+        done = np.zeros(len(flat), dtype=np.bool_)
+        for _ in range(_MOST_STEPS):
+            left = np.flatnonzero(~done & np.isfinite(ideal[:, 0]))
+            if len(left) == 0:
+                break
+            found, J = self.distort(ideal[left])
+            step = _solve(J, flat[left] - found)
+            ideal[left] += step
+            done[left] = np.max(np.abs(step), axis=-1) <= _CONVERGED * (1.0 + np.abs(ideal[left]).max(axis=-1))
+        J = self.distort(ideal).jacobian
+        with np.errstate(invalid="ignore"):
+            good = done & (J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0] > 0.0) & (J[:, 0, 0] > 0.0)
+        return np.where(good[:, None], ideal, np.nan).reshape(wanted.shape)
+
+    def _start(self, distorted: FloatArray) -> FloatArray:
+        """Where Newton's method starts: at the same radius, within half of the reach."""
+        radius = np.hypot(distorted[:, 0], distorted[:, 1])
+        most = 0.5 * self.reach
+        return distorted * np.where(radius > most, most / np.where(radius > 0.0, radius, 1.0), 1.0)[:, None]
+
+    def _brown(self, ideal: FloatArray) -> Distorted:
+        x, y = ideal[..., 0], ideal[..., 1]
+        s = x * x + y * y
+        gain = 1.0 + s * (self.k1 + s * (self.k2 + s * self.k3))
+        bend = 2.0 * (self.k1 + s * (2.0 * self.k2 + s * 3.0 * self.k3))
+        p1, p2 = self.p1, self.p2
+        xd = x * gain + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x)
+        yd = y * gain + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y
+        across = bend * x * y + 2.0 * (p1 * x + p2 * y)
+        by_x = gain + bend * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+        by_y = gain + bend * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+        return Distorted(np.stack([xd, yd], axis=-1), _matrix(by_x, across, by_y))
+
+    def _kannala(self, ideal: FloatArray) -> Distorted:
+        x, y = ideal[..., 0], ideal[..., 1]
+        s = x * x + y * y
+        r = np.sqrt(s)
+        angle = np.arctan(r)
+        a = angle * angle
+        k1, k2, k3, k4 = self.k1, self.k2, self.k3, self.k4
+        bent = angle * (1.0 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
+        slope = 1.0 + a * (3.0 * k1 + a * (5.0 * k2 + a * (7.0 * k3 + a * 9.0 * k4)))
+        central = s < 1e-12  # atan r = r - r^3 / 3: what is left out is below rounding
+        gain = np.where(central, 1.0 + s * (k1 - 1.0 / 3.0), bent / np.where(central, 1.0, r))
+        bend = np.where(central, 2.0 * (k1 - 1.0 / 3.0), (slope / (1.0 + s) - gain) / np.where(central, 1.0, s))
+        J = _matrix(gain + bend * x * x, bend * x * y, gain + bend * y * y)
+        return Distorted(ideal * gain[..., None], J)
+
+
+def _matrix(by_x: FloatArray, across: FloatArray, by_y: FloatArray) -> FloatArray:
+    """Symmetric (..., 2, 2)."""
+    return np.stack([np.stack([by_x, across], axis=-1), np.stack([across, by_y], axis=-1)], axis=-2)
+
+
+def inverse_2x2(J: FloatArray) -> FloatArray:
+    """Inverses of matrices (..., 2, 2); not finite where there is none."""
+    a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(_stack_2x2(d, -b, -c, a) / (a * d - b * c)[..., None, None])
+
+
+def _stack_2x2(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
+    return np.stack([np.stack([a, b], axis=-1), np.stack([c, d], axis=-1)], axis=-2)
+
+
+def _solve(J: FloatArray, right: FloatArray) -> FloatArray:
+    return np.asarray((inverse_2x2(J) @ right[..., None])[..., 0])
+
+
+def _first_root(coefficients: list[float]) -> float:
+    """Smallest positive root of a polynomial, lowest power first; infinite when it has none."""
+    roots = np.polynomial.polynomial.polyroots(coefficients)
+    real = roots.real[(np.abs(roots.imag) <= 1e-6 * np.abs(roots)) & (roots.real > 0.0)]
+    return float(np.min(real, initial=np.inf))

@@ -1,0 +1,193 @@
+"""Sequences through lenses, of other scans and of a late right camera: rendered, verified, solved, scored."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rsbench.benchmark.images.evaluation import open_evaluation, read_scores
+from rsbench.benchmark.images.plan import EvaluationOptions
+from rsbench.cards import parse_card
+from rsbench.core.epipolar import rs_sampson_error
+from rsbench.core.lens import Lens
+from rsbench.core.projection import back_project, rs_project_near
+from rsbench.core.rig import SIDES, VIEWS
+from rsbench.dataset import generation
+from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
+from rsbench.dataset.channels import Channel
+from rsbench.dataset.generation import generate_dataset
+from rsbench.dataset.sequence import FRAMES, read_sequence
+from rsbench.dataset.verification import verify_dataset
+from rsbench.dataset.verification.poses import pose_faults
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.scenes.model import Scene
+
+BARREL = Lens(model="brown-conrady", k1=-0.22, k2=0.05, p1=0.001)
+FISHEYE = Lens(model="kannala-brandt", k1=-0.03, k2=0.01)
+CARDS = {
+    "barrel": (BARREL, {"channels": ("flow", "gs_flow")}),
+    "late": (None, {"scan": "bottom", "right_delay": 0.1, "channels": ("timing",)}),
+    "columns": (FISHEYE, {"scan": "left", "right_scan": "right"}),
+}
+
+
+def _card(name: str) -> DatasetCard:
+    smoke = load_dataset_card("smoke")
+    lens, scanning = CARDS[name]
+    camera = CameraCard(width=128, height=96, focal=110.0, lens=lens)
+    return replace(smoke, camera=camera, sequence=smoke.sequence[1:], **scanning)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, built_scene: Callable[[str], Scene]) -> dict[str, Path]:
+    """Datasets of one sequence each."""
+    folders = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(generation, "load_scene", built_scene)
+        for name in CARDS:
+            folders[name] = tmp_path_factory.mktemp("lenses") / name
+            generate_dataset(_card(name), folders[name])
+            assert generate_dataset(_card(name), folders[name]) == [], "a second run has nothing to do"
+    return folders
+
+
+@pytest.mark.parametrize("name", CARDS)
+def test_verify_finds_them_sound(made: dict[str, Path], name: str) -> None:
+    (report,) = verify_dataset(made[name], rerender="no")
+    assert report.faults == ()
+    sequence = read_sequence(made[name] / "room-twist")
+    card = _card(name)
+    assert sequence.rig == card.rig_of(card.sequence[0]) and sequence.shutter == card.shutter()
+
+
+@pytest.mark.parametrize("name", CARDS)
+def test_depth_carries_every_surface_to_where_the_other_camera_sees_it(made: dict[str, Path], name: str) -> None:
+    sequence = read_sequence(made[name] / "room-twist")
+    grid = sequence.rig.camera.pixel_grid()[8:-8:4, 8:-8:4]
+    geometry = sequence.rig, sequence.shutter, sequence.motion
+    for frame in FRAMES:
+        depth = sequence.depth("rs", "left", frame)[8:-8:4, 8:-8:4].astype(np.float64)
+        X = back_project(*geometry, "left", frame, grid, depth)
+        seen = rs_project_near(*geometry, "right", frame, X, grid[..., sequence.shutter.axis("right")])
+        other = sequence.depth("rs", "right", frame)
+        inside = np.isfinite(seen.depth)
+        x, y = np.round(seen.pixels[inside]).astype(int).T
+        near = other[np.clip(y, 0, 95), np.clip(x, 0, 127)]
+        # Walls are smooth and few pixels are hidden; half a pixel of a slanted wall is 3 % of its depth.
+        assert np.mean(np.abs(near / seen.depth[inside] - 1.0) < 0.05) > 0.85
+
+
+@pytest.mark.parametrize(
+    ("name", "table", "key", "value"),
+    [
+        ("barrel", "camera", "lens", None),
+        ("late", "", "right_delay", 0.09),
+        ("columns", "", "right_scan", "left"),
+    ],
+)
+def test_another_lens_or_scan_than_the_images_have_is_found(
+    made: dict[str, Path], tmp_path: Path, name: str, table: str, key: str, value: object
+) -> None:
+    shutil.copytree(made[name], tmp_path / name)
+    path = tmp_path / name / "room-twist" / "sequence.json"
+    content = json.loads(path.read_text(encoding="utf-8"))
+    (content[table] if table else content)[key] = value
+    path.write_text(json.dumps(content), encoding="utf-8")
+    faults = [fault for report in verify_dataset(tmp_path / name, 2, rerender="no") for fault in report.faults]
+    # Beside the hashes, the card and the poses say it.
+    assert any(key in fault for fault in faults) or any("looks" in fault or "differ" in fault for fault in faults)
+    if not table:
+        assert list(pose_faults(read_sequence(path.parent)))
+
+
+def test_versions_that_know_no_lens_refuse_the_sequence(made: dict[str, Path]) -> None:
+    for name in CARDS:
+        manifest = read_sequence(made[name] / "room-twist").manifest
+        assert manifest["conventions"] == 2, "version 1 is read by those who would take the lens for none"
+
+
+def test_the_chain_finds_the_motion_and_says_what_it_does_not_do(made: dict[str, Path], tmp_path: Path) -> None:
+    options = EvaluationOptions(solvers=("rs-stereo-refined-twist",), correction_solver="rs-stereo-refined-twist")
+    open_evaluation(made["barrel"], tmp_path, options).run("test", lambda word: None)
+    (pose,) = read_scores(tmp_path, "pose").to_dict("records")
+    # A motion of 2 degrees; a tenth of a pixel of these images of 128 x 96 is 0.05 degrees.
+    assert pose["success"] and pose["e_R_deg"] < 0.2, pose
+    (failure,) = read_scores(tmp_path, "failures").to_dict("records")
+    assert failure["kind"] == "correction" and failure["reason"] == (
+        "camera.lens = 'brown-conrady': depth and correction take no lens yet"
+    )
+
+
+@pytest.mark.parametrize("name", CARDS)
+def test_matches_in_the_images_fit_the_true_motion_at_their_own_times(made: dict[str, Path], name: str) -> None:
+    sequence = read_sequence(made[name] / "room-twist")
+    images = {view: sequence.image("rs", *view) for view in VIEWS}
+    rig, shutter, motion = sequence.rig, sequence.shutter, sequence.motion
+    matches = find_matches_of_rig(images, rig, shutter, CorrectionOptions())
+    assert len(matches.left) > 40 and (len(matches.tracks) > 10) == (name == "barrel")
+
+    errors = [rs_sampson_error(rig, shutter, motion, side, getattr(matches, side)) for side in SIDES]
+    # SIFT errs by some tenths of a pixel here. The image moves by few pixels, so this shows that matches are where
+    # they should be; that times are, exact matches show (test_timed_tracks.py).
+    assert np.median(np.abs(np.concatenate(errors))) < 0.25
+
+
+def test_a_card_with_a_lens_that_folds_is_refused_by_name() -> None:
+    data = {
+        "name": "x",
+        "baseline": 0.3,
+        "readout_ratio": 0.8,
+        "camera": {"width": 128, "height": 96, "focal": 60, "lens": {"model": "brown-conrady", "k1": -0.9}},
+        "motion": {"rotation_deg": 0, "rotation_axis": [1, 0, 0], "translation": 0, "translation_axis": [1, 0, 0]},
+        "sequence": [{"name": "a", "scene": "room"}],
+    }
+    with pytest.raises(RsbenchError, match=r"camera lens: the brown-conrady polynomial folds inside the image"):
+        parse_card(DatasetCard, data, "card.toml")
+    data["camera"] = {"width": 128, "height": 96, "focal": 60}
+    with pytest.raises(RsbenchError, match=r"scan = 'up'|'scan'|scan"):
+        parse_card(DatasetCard, data | {"scan": "up"}, "card.toml")
+
+
+def test_flow_through_a_lens_is_that_of_the_points(made: dict[str, Path]) -> None:
+    sequence = read_sequence(made["barrel"] / "room-twist")
+    grid, depth = sequence.rig.camera.pixel_grid(), sequence.depth("rs", "right", 0).astype(np.float64)
+    geometry = sequence.rig, sequence.shutter, sequence.motion
+    X = back_project(*geometry, "right", 0, grid, depth)
+    seen = rs_project_near(*geometry, "right", 1, X, grid[..., 1]).pixels - grid
+    flow = sequence.offsets("flow", "right", 0)
+    both = np.isfinite(seen[..., 0]) & np.isfinite(flow[..., 0]) & (depth > 0)
+    assert np.mean(both) > 0.5
+    # Stored to a thousandth of a pixel, from a depth in single precision.
+    np.testing.assert_allclose(flow[both], seen[both], rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "channel", "message"),
+    [
+        ("barrel", "disparity", "'disparity' is made of cameras without a lens"),
+        ("late", "flow", "'flow' is made of cameras that read rows from the top at once"),
+    ],
+)
+def test_channels_that_cameras_cannot_have_are_refused_by_name(name: str, channel: Channel, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(_card(name), channels=(channel,))
+
+
+def test_all_four_cameras_have_times_of_their_own(made: dict[str, Path]) -> None:
+    sequence = read_sequence(made["columns"] / "room-twist")
+    for side, frame in product(SIDES, FRAMES):
+        tau, _ = sequence.poses(side, frame)
+        expected = frame + 0.8 * np.arange(128) / 128
+        np.testing.assert_allclose(tau, expected if side == "left" else expected[::-1], atol=1e-15)
+    # From the bottom, and the right camera a tenth of a period late: 100 ms a frame, 96 rows in 80 ms.
+    late = read_sequence(made["late"] / "room-twist").row_times_ns("right", 1)
+    assert (late[95, 1], late[0, 1]) == (110_000_000, 110_000_000 + round(95 * 80e6 / 96))
