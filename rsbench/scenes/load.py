@@ -91,6 +91,7 @@ BUILDERS: Kind[SceneBuilder, NoOptions] = Kind(
         "poles": "rsbench.scenes.poles:PolesBuilder",
         "room": "rsbench.scenes.room:RoomBuilder",
         "shelves": "rsbench.scenes.shelves:ShelvesBuilder",
+        "street": "rsbench.scenes.street:StreetBuilder",
         "terrain": "rsbench.scenes.terrain:TerrainBuilder",
     },
 )

@@ -118,7 +118,7 @@ RECIPES: dict[str, Recipe] = {
     ),
     "field_rows": _recipe(s.cloth, 60.0, stripes=((0.36, 0.43, 0.18), (0.45, 0.38, 0.26)), width=0.9),
     "field_soil": _recipe(s.cloth, 60.0, stripes=((0.43, 0.34, 0.25), (0.36, 0.28, 0.20)), width=0.8),
-    "asphalt": _recipe(s.speckled, 16.0, 512, colours=((0.31, 0.31, 0.32), (0.40, 0.39, 0.38)), contrast=0.15),
+    "asphalt": _recipe(s.speckled, 12.0, colours=((0.31, 0.31, 0.32), (0.40, 0.39, 0.38)), contrast=0.15),
     "gravel": _recipe(s.speckled, 16.0, 512, colours=_EARTH[:2], contrast=0.25),
     # Indoors everything is nearer: finer textures of the same kinds.
     "floorboards": _recipe(s.planks, 3.4, woods=((0.58, 0.43, 0.28), (0.50, 0.37, 0.24), (0.63, 0.49, 0.34))),

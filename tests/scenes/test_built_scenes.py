@@ -25,6 +25,7 @@ DEPTHS = {
     "poles": (2.0, (4, 13), 30.0),
     "room": (1.2, (2.5, 5.5), 6.5),
     "shelves": (3.0, (6, 15), 28.0),
+    "street": (4.0, (8, 30), 90.0),
     "terrain": (50.0, (70, 110), 170.0),
 }
 """The built-in scenes. Of the default view, metres: the nearest, the range of the median, the farthest."""
