@@ -28,7 +28,7 @@ from rsbench.scenes.model import Material, SceneBuilder, SceneMesh
 
 _PACKAGES = ("numpy", "trimesh", "shapely", "mapbox-earcut")
 """Decide, with the sources of ``rsbench.scenes``, what our builders make of a card."""
-_MOST = 8
+_MOST = 12
 """Scenes that are kept: 0.2 GB each."""
 _ABANDONED_S = 3600.0
 _ARRAYS = ("vertices", "faces", "uv", "normals")

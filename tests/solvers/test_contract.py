@@ -185,7 +185,8 @@ def test_a_wrong_declaration_is_caught(tmp_path: Path) -> None:
 )
 def test_a_solver_that_hangs_or_ends_its_process_fails_alone(tmp_path: Path, body: str, part: str) -> None:
     start = time.monotonic()
-    findings = check_solver(bad_entry(tmp_path, "process", body), time_limit_s=2.0)
+    limit = 2.0 if "while" in body else 30.0  # a process that ends does so at once, but not on a busy machine
+    findings = check_solver(bad_entry(tmp_path, "process", body), time_limit_s=limit)
     assert findings[0].verdict == "failed" and part in findings[0].why
     assert {finding.verdict for finding in findings[1:]} == {"skipped"}
     assert time.monotonic() - start < 60.0  # mostly the start of the child
