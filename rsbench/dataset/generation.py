@@ -273,11 +273,14 @@ def _render_sequence(
 ) -> Iterator[None]:
     """Render into a folder of the workplace and move it when complete; yields after each step."""
     from rsbench.renderers.backend import start_backend
+    from rsbench.renderers.passage import obstacle
     from rsbench.renderers.scene import MitsubaScene
 
     backend = start_backend()
     scene = built.scene
     mitsuba_scene = MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint]))
+    if words := obstacle(mitsuba_scene, card.rig_of(sequence), card.shutter(), card.motion_of(sequence)):
+        raise RsbenchError(f"sequence {sequence.name}: {words}; choose another motion, viewpoint or baseline")
     partial = out / HIDDEN / WORK / sequence.name
     remove(partial)  # of a worker that was killed
     for folder in {Path(name).parent for name in files_of(plan)}:
@@ -356,7 +359,7 @@ def render_camera(
 def _stack_writer(folder: Path, options: RendererOptions) -> Callable[[int, NDArray[np.float32]], None]:
     from rsbench.renderers.image import to_srgb8
 
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     return lambda row, image: write_png(folder / f"{row:04d}.png", to_srgb8(image, options.exposure))
 
 

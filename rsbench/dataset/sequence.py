@@ -64,6 +64,8 @@ RELATIVE_FILES = tuple(
 )
 CLEAN_FILES = tuple(f"rs_clean/{side}_{frame}.png" for side in SIDES for frame in FRAMES)
 """Only where a sensor is not ideal: the rolling-shutter frames that an ideal one would have seen."""
+_MOST_WHOLE_FRAMES = 1 << 14
+"""Of one camera and time: a number in a manifest must not ask for a list of millions."""
 _STACK = re.compile(r"gs_stack/(left|right)_[01]/[0-9]{4,}\.png")
 
 
@@ -74,9 +76,26 @@ def is_of_sequence(name: str) -> bool:
 
 
 def files_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
-    """Paths that a sequence must have, by its sequence.json: all but the stacks of whole frames."""
+    """Paths that a sequence must have, by its sequence.json."""
     clean = CLEAN_FILES if manifest.get("sensor") else ()
-    return RELATIVE_FILES + clean + channel_files(channels_of(manifest))
+    stacks = tuple(
+        stack_file(side, frame, row) for side in SIDES for frame in FRAMES for row in range(whole_frames(manifest))
+    )
+    return RELATIVE_FILES + clean + stacks + channel_files(channels_of(manifest))
+
+
+def stack_file(side: Side, frame: int, row: int) -> str:
+    """The whole global-shutter image at a row's pose, where a dataset keeps those."""
+    return f"gs_stack/{side}_{frame}/{row:04d}.png"
+
+
+def whole_frames(manifest: Mapping[str, Any]) -> int:
+    """How many whole frames each camera has at each time, by a sequence.json: one for each row, or none."""
+    renderer, camera = manifest.get("renderer"), manifest.get("camera")
+    if not (isinstance(renderer, dict) and renderer.get("full_frames") is True and isinstance(camera, dict)):
+        return 0
+    height = camera.get("height")
+    return height if isinstance(height, int) and 0 < height <= _MOST_WHOLE_FRAMES else 0
 
 
 def channels_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from attack.planting import rehash
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, load_dataset_card
 from rsbench.dataset.estimate import estimate_dataset
-from rsbench.dataset.files import read_png, sha256
+from rsbench.dataset.files import read_png, sha256, write_png
 from rsbench.dataset.generation import STEPS, generate_dataset
 from rsbench.dataset.sequence import read_dataset
 from rsbench.dataset.verification import verify_dataset
@@ -236,6 +239,26 @@ def test_a_frame_without_any_surface_is_an_error(tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "away").exists()
 
 
+def test_a_camera_through_a_wall_is_refused(small: Small, tmp_path: Path) -> None:
+    """The rig stands 8 m before the end of a box that is 6 m wide, and looks there, a little askew."""
+    card = load_dataset_card(str(small.card)).only(["a"])
+    along = MotionCard(rotation_deg=0.0, rotation_axis=(0, 0, 1), translation=16.0, translation_axis=(0, 0, -1))
+    fast = replace(card, motion=along)
+    with pytest.raises(
+        RsbenchError, match=r"^sequence a: the left camera goes through a surface at time "
+    ) as told:
+        generate_dataset(fast, tmp_path / "out")
+    found = re.search(r"at time ([0-9.]+); choose another motion", str(told.value))
+    # The left camera is 0.15 m nearer to the wall times the sine of the view; steps are 1.8 / 128 long.
+    at = 8.0 * float(np.linalg.norm([0.3, 6.0, -0.2])) / 6.0 / 16.0
+    assert found is not None and -0.001 < at - float(found[1]) < 1.8 / 128 + 0.001
+    for baseline, blocked in ((5.8, False), (6.2, True)):
+        wide = replace(card, baseline=baseline, motion=replace(along, translation=0.0))
+        with nullcontext() if not blocked else pytest.raises(RsbenchError, match="surface between the middle"):
+            generate_dataset(wide, tmp_path / f"{baseline}")
+    assert not (tmp_path / "out/a").exists()
+
+
 def test_dataset_manifest_lists_every_file(smoke_dataset: Path) -> None:
     manifest = json.loads((smoke_dataset / "dataset.json").read_text())
     assert set(manifest["files"]) == set(bytes_of(smoke_dataset)) - {"dataset.json"}
@@ -253,10 +276,24 @@ def test_full_frames_keep_the_stack_that_the_frame_is_stitched_from(small: Small
     for row in range(12):
         whole = read_png(stacked.folder / f"gs_stack/right_1/{row:04d}.png")
         np.testing.assert_array_equal(whole[row], frame[row])
+    scenes = [small.card.parent / "a.toml"]
+    (report,) = verify_dataset(tmp_path / "stack", rerender="all", scenes=scenes)
+    assert report.faults == () and report.notes[0].endswith("the same bits")
     lost = stacked.folder / "gs_stack/left_0/0003.png"
     lost.unlink()
-    (report,) = verify_dataset(tmp_path / "stack")
-    assert any("0003.png: missing" in fault for fault in report.faults)
+    for file, first, last in (("right_0/0005.png", 5, 5), ("right_1/0000.png", 7, 7), ("left_1/0002.png", 3, 11)):
+        image = read_png(stacked.folder / "gs_stack" / file)
+        image[first : last + 1] = 255 - image[first : last + 1]
+        write_png(stacked.folder / "gs_stack" / file, image)
+    rehash(tmp_path / "stack")
+    (report,) = verify_dataset(tmp_path / "stack", rerender="all", scenes=scenes)
+    for words in (
+        "a/sequence.json: files does not list gs_stack/left_0/0003.png",
+        "gs_stack/right_0: row 5: 1 images differ in their own row from rs/right_0.png",
+        "gs_stack/right_1/0000.png: differs from gs/right_1.png",
+        "gs_stack/left_1: row 9: the image differs from what is rendered again",
+    ):
+        assert any(fault.startswith(words) for fault in report.faults), (words, report.faults)
 
 
 def test_changed_scene_is_not_taken_for_the_old_one(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from attack.planting import rehash
 
 from rsbench.cards import parse_card
 from rsbench.dataset import generation
@@ -17,7 +18,7 @@ from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.files import write_png
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_sequence
-from rsbench.dataset.verification import verify_dataset
+from rsbench.dataset.verification import rerender, verify_dataset
 from rsbench.dataset.verification.content import read_content
 from rsbench.dataset.verification.sensors import sensor_faults
 from rsbench.dataset.verification.shots import Shot
@@ -110,6 +111,25 @@ FAULTS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
     "brighter": lambda seen, clean: np.minimum(seen.astype(int) + 12, 255).astype(np.uint8),
     "one row replaced": lambda seen, clean: np.concatenate([seen[:40], 255 - seen[40:41], seen[41:]]),
 }
+
+
+def test_rows_of_a_sensor_are_made_again(
+    made: dict[str, Path], tmp_path: Path, built_scene: Callable[[str], Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bit for bit; so a sharp frame with noise of the right size but of other random numbers is found."""
+    monkeypatch.setattr(rerender, "load_scene", lambda path: built_scene("room"))
+    (report,) = verify_dataset(made["exposed"].parent, 4, rerender="auto")
+    assert report.faults == () and report.notes[0].endswith("the same bits")
+    copy = tmp_path / "dataset"
+    shutil.copytree(made["exposed"].parent, copy)
+    sequence = read_sequence(copy / "room-twist")
+    light = _linear(sequence.clean_image("left", 1).astype(np.float64))
+    noise = np.random.default_rng(3).normal(0.0, 1.0, light.shape) * np.sqrt(NOISY.variance(light))
+    forged = np.round(255.0 * _srgb(np.clip(light + noise, 0.0, 1.0))).astype(np.uint8)
+    write_png(copy / "room-twist/rs/left_1.png", forged)
+    rehash(copy)
+    (report,) = verify_dataset(copy, 4, rerender="auto")
+    assert any(fault.startswith("rs/left_1.png: ") and "rendered again" in fault for fault in report.faults)
 
 
 # A blur of a fine texture hides how much noise there is; rows that are rendered again tell.

@@ -20,6 +20,7 @@ from rsbench.dataset.verification.poses import pose_faults
 from rsbench.dataset.verification.rerender import Again, Rerender
 from rsbench.dataset.verification.sensors import sensor_faults
 from rsbench.dataset.verification.shots import PAIRS
+from rsbench.dataset.verification.stacks import stack_faults
 from rsbench.dataset.verification.surfaces import surface_faults
 from rsbench.dataset.verification.timing import timing_faults
 from rsbench.errors import RsbenchError
@@ -97,6 +98,7 @@ def verify_sequence(
         faults += pose_faults(sequence)
         content = read_content(sequence, missing)
         faults += [*content.faults, *twin_faults(content)]
+        faults += stack_faults(content, missing, stride)
         faults += sensor_faults(sequence, content.maps, content.pictures, missing)
         comparison = Comparison(content, stride)
         for agreement in comparison.pairs():

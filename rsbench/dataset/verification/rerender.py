@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,11 +20,13 @@ from rsbench.cards import list_cards, parse_card
 from rsbench.core.projection import row_poses
 from rsbench.dataset.generation import image_seed
 from rsbench.dataset.scene_hashes import scene_hash
+from rsbench.dataset.sequence import whole_frames
 from rsbench.dataset.verification.channels import channels_again
 from rsbench.dataset.verification.content import Content, clean_file
 from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.dataset.verification.images import CHANGES, Picture
 from rsbench.dataset.verification.shots import SHOTS, DepthMap, Shot
+from rsbench.dataset.verification.stacks import stack_rows
 from rsbench.dataset.verification.surfaces import surfaces_again
 from rsbench.errors import RsbenchError
 from rsbench.renderers.options import RendererOptions
@@ -159,6 +162,50 @@ def _checks(
         for made in (channels_again, surfaces_again):
             again = made(content.sequence, shot, rows, frame.depth, SceneRays(scene), told)
             yield from (_Check(*check) for check in again)
+        if shot.shutter == "rs":
+            yield from _frame_checks(content, scene, options, shot, rows, told)
+
+
+def _frame_checks(
+    content: Content, scene: MitsubaScene, options: RendererOptions, shot: Shot, rows: list[int], told: set[str]
+) -> Iterator[_Check]:
+    """What lies beside a clean rolling-shutter frame: what its sensor makes of it, and the stack of whole frames.
+
+    Each row of a sensor has random numbers of its own, and so its bits without the others.
+    """
+    from rsbench.renderers.image import to_srgb8
+    from rsbench.renderers.sensed import sensed_rows
+
+    sequence, chosen, elsewhere = content.sequence, _of_image(content, options, shot), not _made_here(content)
+    with contextlib.suppress(RsbenchError):  # told already: a file that cannot be read
+        if sequence.sensor is not None and shot.image not in told:
+            seen = Picture.of(shot, sequence.image(*shot[:3]), noisy=False)
+            geometry = sequence.rig, sequence.shutter, sequence.motion
+            sensed = sensed_rows(
+                scene, *geometry, sequence.sensor, sequence.frame_period_s, shot.side, shot.frame, chosen, rows
+            )
+            yield _image_check(shot.image, seen, to_srgb8(sensed, 1.0), rows, elsewhere)
+    with contextlib.suppress(RsbenchError):
+        if whole_frames(sequence.manifest):
+            yield _stack_check(content, scene, chosen, shot, rows)
+
+
+def _stack_check(
+    content: Content, scene: MitsubaScene, chosen: RendererOptions, shot: Shot, rows: list[int]
+) -> _Check:
+    """Of whole frames at the poses of some rows, other rows: each of these rows at the pose of another."""
+    from rsbench.renderers.image import to_srgb8
+    from rsbench.renderers.render import render
+
+    sequence, of = content.sequence, rows[::-1]
+    seen = Picture.of(shot, stack_rows(sequence, shot, rows, of), noisy=False)
+    R, t = (
+        each.copy() for each in row_poses(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame)
+    )
+    R[rows], t[rows] = R[of], t[of]
+    rendered = to_srgb8(render(scene, sequence.rig.camera, R, t, chosen, rows=rows).image, chosen.exposure)
+    noisy = chosen.integrator == "path" and not _made_here(content)
+    return _image_check(f"gs_stack/{shot.side}_{shot.frame}", seen, rendered, rows, noisy)
 
 
 def _made_here(content: Content) -> bool:
@@ -170,13 +217,17 @@ def _made_here(content: Content) -> bool:
     return all(made_by.get(key) == value for key, value in here.items())
 
 
+def _of_image(content: Content, options: RendererOptions, shot: Shot) -> RendererOptions:
+    sequence = content.sequence
+    seed = image_seed(int(sequence.manifest.get("seed", 0)), sequence.name, shot.side, shot.frame)
+    return replace(options, seed=seed, method="single-pass", full_frames=False)
+
+
 def _render(content: Content, scene: MitsubaScene, options: RendererOptions, shot: Shot, rows: list[int]) -> Frame:
     """Rows of a shot, with the bits that they have in the whole image."""
     from rsbench.renderers.render import render
 
-    sequence = content.sequence
-    seed = image_seed(int(sequence.manifest.get("seed", 0)), sequence.name, shot.side, shot.frame)
-    chosen = replace(options, seed=seed, method="single-pass", full_frames=False)
+    sequence, chosen = content.sequence, _of_image(content, options, shot)
     R, t = row_poses(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame)
     if shot.shutter == "gs":
         line = sequence.shutter.first_line(shot.side)

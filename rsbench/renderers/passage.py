@@ -1,0 +1,41 @@
+"""Whether the cameras of a rig can go their way: no lens goes through a wall."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rsbench.core.motion import Motion
+from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.se3 import inverse
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.renderers.scene import MitsubaScene
+from rsbench.renderers.segments import REACH, SceneRays
+
+
+def obstacle(scene: MitsubaScene, rig: StereoRig, shutter: RollingShutter, motion: Motion) -> str:
+    """What stands in the way of a camera, in words; "" where the way is free.
+
+    Followed in straight steps, from the middle of the rig at time 0 to each camera, and on its way until the last
+    row of frame 1 is read. A rig that starts inside a solid and stays there meets nothing.
+    """
+    tau = np.linspace(0.0, 1.0 + shutter.readout_ratio, 1 + 2 * shutter.height)
+    for side in SIDES:
+        centres = inverse(rig.cam_from_world(motion, tau, side)).t
+        step = first_crossing(scene, np.concatenate([np.zeros((1, 3)), centres]))
+        if step == 0:
+            return f"there is a surface between the middle of the rig and the {side} camera"
+        if step is not None:
+            return f"the {side} camera goes through a surface at time {tau[step - 1]:.3f}"
+    return ""
+
+
+def first_crossing(scene: MitsubaScene, points: FloatArray) -> int | None:
+    """The first straight step, from point k of (n, 3), metres, to the next, that meets a surface; None: none."""
+    steps = np.diff(points, axis=0)
+    moving = np.flatnonzero(np.any(steps, axis=1))
+    if not len(moving):
+        return None
+    starts = points[moving]
+    met = moving[SceneRays(scene).blocked(starts, starts + steps[moving] / REACH)]
+    return int(met[0]) if len(met) else None
