@@ -134,16 +134,16 @@ def _attacks(
     if "environment" in wanted:
         yield _timed("surroundings", partial(_surroundings, arena, references, extent, seed))
     if "verify" in wanted:
-        yield _timed("verify", _verify)
+        yield _timed("verify", partial(_verify, seed))
 
 
-def _verify() -> Tally:
+def _verify(seed: int) -> Tally:
     """Planted faults and sound sequences, counted by what ``attack.verifying`` prints."""
     from attack.cases import Tally
 
     tests = str(Path(__file__).parents[1])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(tests).parent), tests])}
-    command = [sys.executable, "-m", "attack.verifying"]
+    command = [sys.executable, "-m", "attack.verifying", "--seed", str(seed)]
     result = subprocess.run(command, env=environment, capture_output=True, text=True)
     tally = Tally()
     for name, count in re.findall(r"^(planted faults|sound sequences): (\d+)", result.stdout, re.MULTILINE):

@@ -1,14 +1,17 @@
 """Sound sequences of random cards, in which verify must find nothing.
 
 Cameras, rigs, shutters, motions of every model, renderers, scenes and viewpoints are drawn; motions go to 20
-degrees and a metre per frame, through walls if they must; one scene has hardly any texture. Small, so that there
-can be many. There are no glossy surfaces: rsbench's scenes have none.
+degrees and a metre per frame, and one scene has hardly any texture. A motion through a wall or into the sky,
+which ``generate`` refuses, is drawn again. Small, so that there can be many. No surface is glossy: none of
+rsbench's scenes has one.
 """
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from unittest.mock import patch
@@ -20,12 +23,15 @@ from rsbench.cards import list_cards
 from rsbench.dataset import generation
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.verification import verify_dataset
+from rsbench.errors import RsbenchError
 from rsbench.scenes.load import load_scene, read_scene_card
 from rsbench.scenes.model import Scene
 
 MODELS = ("linear", "twist", "accelerated", "spline")
 PER_DATASET = 10
 """Sequences of one viewpoint, camera, shutter and renderer."""
+MOST_DRAWS = 50
+"""Motions of one sequence, of which ``generate`` must take one."""
 RENDERERS = {
     "one": 'integrator = "sunsky"\nsamples = 1\n',
     "four": 'integrator = "sunsky"\nsamples = 4\n',
@@ -77,8 +83,29 @@ def _motion(rng: np.random.Generator) -> MotionCard:
     )
 
 
-def false_alarms(count: int, folder: Path, seed: int = 0) -> Iterator[tuple[str, int, list[str]]]:
-    """Of each dataset its name, how many sequences it has, and what verify found in them."""
+def _generated(card: DatasetCard, out: Path) -> int:
+    """Make a dataset, with other motions where ``generate`` refuses one; returns how many it did."""
+    rng = np.random.default_rng(card.seed)
+    for draws in range(MOST_DRAWS * len(card.sequence)):
+        try:
+            generation.generate_dataset(card, out)
+        except RsbenchError as error:
+            blocked = re.match(
+                r"sequence (\S+): (the \S+ camera goes through a surface|\S+ shows no surface)", str(error)
+            )
+            if not blocked:
+                raise
+            others = (
+                replace(each, motion=_motion(rng)) if each.name == blocked[1] else each for each in card.sequence
+            )
+            card = replace(card, sequence=tuple(others)).expanded()
+        else:
+            return draws
+    raise RuntimeError(f"{card.name}: every motion is refused")
+
+
+def false_alarms(count: int, folder: Path, seed: int = 0) -> Iterator[tuple[str, int, int, list[str]]]:
+    """Of each dataset its name, how many sequences it has, motions that were refused, and what verify found."""
     from rsbench.renderers import scene
 
     kept: dict[object, scene.MitsubaScene] = {}
@@ -98,8 +125,8 @@ def false_alarms(count: int, folder: Path, seed: int = 0) -> Iterator[tuple[str,
     ):
         for card in random_cards(count, folder, seed):
             out = folder / card.name
-            generation.generate_dataset(card, out)
+            refused = _generated(card, out)
             found = [f"{report.name}: {fault}" for report in verify_dataset(out) for fault in report.faults]
-            yield f"{card.name} ({Path(card.renderer).stem})", len(card.sequence), found
+            yield f"{card.name} ({Path(card.renderer).stem})", len(card.sequence), refused, found
             if not found:
                 shutil.rmtree(out)

@@ -35,12 +35,13 @@ def missed_faults(root: Path) -> int:
 
 def alarms(root: Path, count: int, seed: int) -> int:
     """How many findings verify has in ``count`` sound sequences."""
-    start, made, alarmed = time.perf_counter(), 0, 0
-    for name, sequences, faults in false_alarms(count, root, seed):
-        made, alarmed = made + sequences, alarmed + len(faults)
+    start, made, alarmed, walls = time.perf_counter(), 0, 0, 0
+    for name, sequences, refused, faults in false_alarms(count, root, seed):
+        made, alarmed, walls = made + sequences, alarmed + len(faults), walls + refused
         for fault in faults:
             say(f"  false alarm: {name}: {fault}")
-    say(f"sound sequences: {made}, {alarmed} false alarms; {time.perf_counter() - start:.0f} s")
+    seconds = time.perf_counter() - start
+    say(f"sound sequences: {made}, {alarmed} false alarms; {walls} motions refused; {seconds:.0f} s")
     return alarmed
 
 

@@ -146,7 +146,8 @@ class Comparison:
                 told.add(shot)
                 yield fault
         sound = [each for each in self.likenesses if not {each.source, each.target} & {*blamed, *told}]
-        for shot, fault in likeness_faults(content.sequence, content.maps, content.pictures, sound, elsewhere):
+        heard = images.heard(sound)
+        for shot, fault in likeness_faults(content.sequence, content.maps, content.pictures, heard, elsewhere):
             told.add(shot)
             yield fault
         for shot, votes in self.votes.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations
 
 import cv2
@@ -31,11 +31,13 @@ _UNLIKE, _UNLIKE_WHOLE = 0.5, 0.22
 and of all pixels of a pair, where it has 0.17."""
 _BETTER, _GAIN = 0.8, 0.5
 """A change of the image that brings the mean difference below 0.8 of what it was, and 0.5 codes down, is what was
-done to it: clean data has 1.4 at the least."""
+done to it: clean data has 1.4 at the least where there is texture. Below 0.8 of what one colour leaves, too: a
+part that is only darker, or has less noise, is nearer to noise than the right one is, but no nearer than that."""
 _LEAST_EVIDENCE = 3
-"""Bands of pairs, each direction by itself, below which an image is not blamed: a small one errs by chance."""
-_CHANCE = 6.0
-"""Standard deviations of a band's mean by which noise may favour one of the changes."""
+"""Bands of pairs, each direction by itself, below which an image is not blamed unless two partners disagree with
+it: a small one errs by chance."""
+_CHANCE = 3.0
+"""Standard errors of a band's gain by which chance may favour one of the changes."""
 _TILE, _BAD_IN_TILE = 16, 0.6
 _SAMPLES = 60_000
 
@@ -83,8 +85,6 @@ class Picture:
     """(H, W, 3) 8-bit codes."""
     noise: float
     """Standard deviation of what looks like noise in it, codes."""
-    doubt: float
-    """That, where the renderer draws random numbers; else 0."""
     low: Colours
     """(H, W, 3) smallest of the 3 x 3 pixels around, less what noise may add; ``high`` likewise."""
     high: Colours
@@ -98,7 +98,6 @@ class Picture:
             shot,
             colours,
             noise,
-            noise if noisy else 0.0,
             cv2.erode(colours, around) - beyond,
             cv2.dilate(colours, around) + beyond,
         )
@@ -124,8 +123,12 @@ class Likeness:
     """(B,) share of them that the other frame's neighbourhood does not span."""
     costs: NDArray[np.float64]
     """(C, B) mean absolute difference of each of ``CHANGES``, codes."""
-    doubt: float
-    """Standard deviation of the noise of both, codes; 0 where they have none."""
+    errors: NDArray[np.float64]
+    """(C, B) standard error of what each change gains over none."""
+    plain: NDArray[np.float64]
+    """(B,) what the best single colour would cost."""
+    refuted: BoolArray | None = None
+    """(C, B) changes of the source that another partner of it clearly speaks against, see ``heard``."""
 
     @property
     def judged(self) -> BoolArray:
@@ -134,11 +137,19 @@ class Likeness:
     @property
     def better(self) -> NDArray[np.int64]:
         """(B,) number of the change that explains a band better than none; 0 for none."""
-        best = np.argmin(self.costs, axis=0)
-        least = np.min(self.costs, axis=0)
-        chance = _CHANCE * self.doubt / np.sqrt(np.maximum(self.pixels, 1.0))
-        decisive = (least < _BETTER * self.costs[0]) & (least < self.costs[0] - _GAIN - chance)
+        costs = self.costs if self.refuted is None else np.where(self.refuted, np.inf, self.costs)
+        best, bands = np.argmin(costs, axis=0), np.arange(costs.shape[1])
+        least, needed = costs[best, bands], np.maximum(_GAIN, _CHANCE * self.errors[best, bands])
+        typical = np.minimum(self.costs[0], self.plain)
+        decisive = (least < _BETTER * typical) & (least < self.costs[0] - needed)
         return np.where(decisive, best, 0)
+
+    @property
+    def worse(self) -> BoolArray:
+        """(C, B) changes that make the likeness of a band worse, as clearly as ``better`` ones make it better."""
+        least, needed = self.costs[0], np.maximum(_GAIN, _CHANCE * self.errors)
+        clear = (least < _BETTER * self.costs) & (least < self.costs - needed)
+        return np.asarray(clear & self.judged)
 
     @property
     def unlike(self) -> BoolArray:
@@ -203,8 +214,7 @@ def compare(
     share = np.bincount(bands[y], weights=beyond, minlength=count) / np.maximum(pixels, 1)
     every = slice(None, None, max(1, len(y) // _SAMPLES))
     costs = _costs(source.colours, y[every], x[every], shown[every], bands[y[every]], count)
-    doubt = float(np.hypot(source.doubt, target.doubt))
-    return Likeness(source.shot, target.shot, pixels.astype(np.float64), share, costs, doubt)
+    return Likeness(source.shot, target.shot, pixels.astype(np.float64), share, *costs)
 
 
 def _costs(
@@ -214,14 +224,34 @@ def _costs(
     shown: Colours,
     bands: NDArray[np.int64],
     count: int,
-) -> NDArray[np.float64]:
-    """(C, B) mean over the pixels of each band of the capped difference from ``shown`` (n, 3)."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Of the capped difference from ``shown`` (n, 3), means over the pixels of each band: (C, B) of each change,
+    (C, B) standard errors of its gain over none, (B,) of the band's middle colour."""
     size = np.maximum(np.bincount(bands, minlength=count), 1)
-    costs = []
+
+    def mean(values: Colours) -> NDArray[np.float64]:
+        return np.asarray(np.bincount(bands, weights=values, minlength=count) / size)
+
+    as_is, costs, errors = difference(image[y, x], shown), [], []
     for change in CHANGES:
         unlike = difference(change.undone(image, y, x), shown)
-        costs.append(np.bincount(bands, weights=unlike, minlength=count) / size)
-    return np.stack(costs)
+        costs.append(mean(unlike))
+        spread = mean((as_is - unlike) ** 2) - (mean(as_is) - costs[-1]) ** 2
+        errors.append(np.sqrt(np.maximum(spread, 0.0) / size))
+    middle = np.zeros((count, 3), np.float32)
+    for band in np.unique(bands):
+        middle[band] = np.median(shown[bands == band], axis=0)
+    return np.stack(costs), np.stack(errors), mean(difference(middle[bands], shown))
+
+
+def heard(likenesses: list[Likeness]) -> list[Likeness]:
+    """The same, where no change of an image stands that another partner refutes: what is wrong with an image, all
+    see; but a texture finer than a pixel is another one from each place."""
+    result = []
+    for each in likenesses:
+        others = [other.worse for other in likenesses if other.source == each.source and other is not each]
+        result.append(replace(each, refuted=np.any(others, axis=0)) if others else each)
+    return result
 
 
 def culprits(likenesses: list[Likeness]) -> Iterator[tuple[Shot, list[Likeness]]]:
@@ -231,7 +261,8 @@ def culprits(likenesses: list[Likeness]) -> Iterator[tuple[Shot, list[Likeness]]
         counts = Counter(shot for each in left for shot in (each.source, each.target))
         worst = max(counts, key=lambda shot: counts[shot])
         pairs = [each for each in left if worst in (each.source, each.target)]
-        if sum(int(np.sum(each.unlike)) for each in pairs) >= _LEAST_EVIDENCE:
+        partners = {shot for each in pairs for shot in (each.source, each.target)} - {worst}
+        if len(partners) > 1 or sum(int(np.sum(each.unlike)) for each in pairs) >= _LEAST_EVIDENCE:
             yield worst, pairs
         left = [each for each in left if worst not in (each.source, each.target)]
 
