@@ -95,6 +95,8 @@ def whole_frames(manifest: Mapping[str, Any]) -> int:
     if not (isinstance(renderer, dict) and renderer.get("full_frames") is True and isinstance(camera, dict)):
         return 0
     height = camera.get("height")
+    if any(manifest.get(key) in ("left", "right") for key in ("scan", "right_scan")):
+        return 0  # its lines are columns
     return height if isinstance(height, int) and 0 < height <= _MOST_WHOLE_FRAMES else 0
 
 

@@ -22,7 +22,8 @@ def stack_faults(content: Content, missing: Collection[str], stride: int = 1) ->
     ``stride``-th image is read."""
     sequence = content.sequence
     for shot, picture in content.pictures.items():
-        if shot.shutter != "rs" or not whole_frames(sequence.manifest):
+        rows_scanned = sequence.shutter.axis(shot.side) == 1
+        if shot.shutter != "rs" or not rows_scanned or not whole_frames(sequence.manifest):
             continue
         rows = range(0, sequence.rig.camera.height, stride)
         wrong = np.zeros(sequence.rig.camera.height, dtype=np.bool_)
@@ -37,7 +38,11 @@ def stack_faults(content: Content, missing: Collection[str], stride: int = 1) ->
                 continue
             wrong[row] = not np.array_equal(image[row], picture.colours[row])
             twin = content.pictures.get(shot._replace(shutter="gs"))
-            if row == 0 and twin is not None and not np.array_equal(image, twin.colours):
+            if (
+                row == sequence.shutter.first_line(shot.side)
+                and twin is not None
+                and not np.array_equal(image, twin.colours)
+            ):
                 yield finding(file, f"differs from {twin.shot.image}, which has the same pose")
         if np.any(wrong):
             what = f"{np.sum(wrong)} images differ in their own row from {clean_file(sequence, shot)}"
