@@ -86,7 +86,7 @@ def test_an_axis_is_numbers_or_random() -> None:
 
 def test_the_strata_share_scenes_and_axes() -> None:
     cards = [load_dataset_card(name) for name in STRATA]
-    assert all(len(card.sequence) == 9 for card in cards)
+    assert all(len(card.sequence) == 30 for card in cards)
     for sequences in zip(*(card.sequence for card in cards), strict=True):
         assert len({sequence.name for sequence in sequences}) == 1
         axes = {sequence.motion.rotation_axis for sequence in sequences if sequence.motion}
