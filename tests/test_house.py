@@ -297,6 +297,12 @@ def test_the_wheel_carries_cards_documents_and_type_marker(tmp_path: Path) -> No
     assert not any("__pycache__" in name or name.startswith("tests/") for name in names)
 
 
+def test_no_two_modules_have_one_name() -> None:
+    """Whoever looks for a file by its name finds it."""
+    names = [path.name for path in (ROOT / "rsbench").rglob("*.py") if path.name != "__init__.py"]
+    assert sorted({name for name in names if names.count(name) > 1}) == []
+
+
 def test_the_changelog_knows_this_version() -> None:
     assert f"## [{rsbench.__version__}]" in (ROOT / "CHANGELOG.md").read_text("utf-8")
 

@@ -20,8 +20,8 @@ from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_sequence
 from rsbench.dataset.verification import rerender, verify_dataset
 from rsbench.dataset.verification.content import read_content
+from rsbench.dataset.verification.landing import Shot
 from rsbench.dataset.verification.sensors import sensor_faults
-from rsbench.dataset.verification.shots import Shot
 from rsbench.errors import RsbenchError
 from rsbench.renderers.electrons import Sensor
 from rsbench.scenes.model import Scene

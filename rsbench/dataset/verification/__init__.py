@@ -13,16 +13,16 @@ from rsbench.cards import card_path
 from rsbench.dataset.files import read_json
 from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.verification import structure
-from rsbench.dataset.verification.channels import channel_faults
+from rsbench.dataset.verification.channel_checks import channel_faults
 from rsbench.dataset.verification.content import Comparison, images_elsewhere, read_content, twin_faults
 from rsbench.dataset.verification.findings import DepthAgreement, Progress, SequenceReport
+from rsbench.dataset.verification.landing import PAIRS
 from rsbench.dataset.verification.poses import pose_faults
 from rsbench.dataset.verification.rerender import Again, Rerender
 from rsbench.dataset.verification.sensors import sensor_faults
-from rsbench.dataset.verification.shots import PAIRS
 from rsbench.dataset.verification.stacks import stack_faults
-from rsbench.dataset.verification.surfaces import surface_faults
-from rsbench.dataset.verification.timing import timing_faults
+from rsbench.dataset.verification.surface_checks import surface_faults
+from rsbench.dataset.verification.timing_checks import timing_faults
 from rsbench.errors import RsbenchError
 
 __all__ = [

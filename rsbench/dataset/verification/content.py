@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from rsbench.dataset.files import read_png
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.verification import depth, images
+from rsbench.dataset.verification import depth, image_checks
 from rsbench.dataset.verification.depth_causes import likely_cause
 from rsbench.dataset.verification.findings import DepthAgreement, finding, rows_of
 from rsbench.dataset.verification.image_causes import Elsewhere, likeness_faults
+from rsbench.dataset.verification.landing import PAIRS, SHOTS, DepthMap, Shot, land
 from rsbench.dataset.verification.png import png_fault
-from rsbench.dataset.verification.shots import PAIRS, SHOTS, DepthMap, Shot, land
 from rsbench.errors import RsbenchError
 from rsbench.reading import inside
 
@@ -26,7 +26,7 @@ class Content:
 
     sequence: Sequence
     maps: dict[Shot, DepthMap] = field(default_factory=dict)
-    pictures: dict[Shot, images.Picture] = field(default_factory=dict)
+    pictures: dict[Shot, image_checks.Picture] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
 
 
@@ -49,7 +49,7 @@ def read_content(sequence: Sequence, missing: Collection[str] = ()) -> Content:
             fault = png_fault(inside(sequence.folder, file), file, size)
             content.faults += [fault] if fault else []
             if fault is None:
-                content.pictures[shot] = images.Picture.of(
+                content.pictures[shot] = image_checks.Picture.of(
                     shot, read_png(inside(sequence.folder, file), size), noisy
                 )
         except RsbenchError as error:
@@ -96,14 +96,14 @@ class Comparison:
     stride: int
     agreements: list[tuple[Shot, Shot, DepthAgreement]] = field(default_factory=list)
     verdicts: dict[Shot, depth.MapVerdict] = field(default_factory=dict)
-    likenesses: list[images.Likeness] = field(default_factory=list)
-    votes: dict[Shot, images.ImageVotes] = field(default_factory=dict)
+    likenesses: list[image_checks.Likeness] = field(default_factory=list)
+    votes: dict[Shot, image_checks.ImageVotes] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         camera = self.content.sequence.rig.camera
         self.verdicts = {shot: depth.MapVerdict(each, self.stride) for shot, each in self.content.maps.items()}
         self.votes = {
-            shot: images.ImageVotes.none((camera.height, camera.width)) for shot in self.content.pictures
+            shot: image_checks.ImageVotes.none((camera.height, camera.width)) for shot in self.content.pictures
         }
 
     def pairs(self) -> Iterator[DepthAgreement | None]:
@@ -118,7 +118,7 @@ class Comparison:
             self.agreements.append((source, target, agreement))
             if {source, target} <= pictures.keys():
                 self.likenesses.append(
-                    images.compare(
+                    image_checks.compare(
                         pictures[source], pictures[target], maps[source], landing, self.votes[source], self.stride
                     )
                 )
@@ -141,17 +141,17 @@ class Comparison:
         """Images compared through depth that is in order; a wrong map would accuse its image too."""
         content, told = self.content, set()
         for shot, picture in content.pictures.items():
-            fault = images.colour_fault(picture, content.pictures)
+            fault = image_checks.colour_fault(picture, content.pictures)
             if fault:
                 told.add(shot)
                 yield fault
         sound = [each for each in self.likenesses if not {each.source, each.target} & {*blamed, *told}]
-        heard = images.heard(sound)
+        heard = image_checks.heard(sound)
         for shot, fault in likeness_faults(content.sequence, content.maps, content.pictures, heard, elsewhere):
             told.add(shot)
             yield fault
         for shot, votes in self.votes.items():
-            rows = images.tile_rows(votes)
+            rows = image_checks.tile_rows(votes)
             if shot not in told and shot not in blamed and np.any(rows):
                 what = "a part of these rows shows other colours than two partners at the same surface"
                 yield finding(shot.image, what, rows_of(rows))

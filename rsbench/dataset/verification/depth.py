@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.dataset.verification.findings import DepthAgreement, finding
-from rsbench.dataset.verification.shots import DEPTH_TOLERANCE, BoolArray, DepthMap, Landing, Shot
+from rsbench.dataset.verification.landing import DEPTH_TOLERANCE, BoolArray, DepthMap, Landing, Shot
 
 Bits = NDArray[np.uint8]
 

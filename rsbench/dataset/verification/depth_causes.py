@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.verification.shots import DEPTH_TOLERANCE, SHOTS, BoolArray, DepthMap, Shot, land
+from rsbench.dataset.verification.landing import DEPTH_TOLERANCE, SHOTS, BoolArray, DepthMap, Shot, land
 
 _TRIED_PIXELS = 20_000
 _PLAIN = 0.8

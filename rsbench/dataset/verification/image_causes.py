@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.verification.findings import finding, rows_of
-from rsbench.dataset.verification.images import (
+from rsbench.dataset.verification.image_checks import (
     CHANGES,
     Likeness,
     Picture,
@@ -19,7 +19,7 @@ from rsbench.dataset.verification.images import (
     noise_of,
     show,
 )
-from rsbench.dataset.verification.shots import BoolArray, DepthMap, Shot, land
+from rsbench.dataset.verification.landing import BoolArray, DepthMap, Shot, land
 
 Elsewhere = Callable[[Shot], Iterable[tuple[str, NDArray[np.uint8]]]]
 """Names and images of other sequences that may have been exchanged with a shot's."""

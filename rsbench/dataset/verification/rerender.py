@@ -21,13 +21,13 @@ from rsbench.core.projection import row_poses
 from rsbench.dataset.generation import image_seed
 from rsbench.dataset.scene_hashes import scene_hash
 from rsbench.dataset.sequence import whole_frames
-from rsbench.dataset.verification.channels import channels_again
+from rsbench.dataset.verification.channel_checks import channels_again
 from rsbench.dataset.verification.content import Content, clean_file
 from rsbench.dataset.verification.findings import finding, rows_of
-from rsbench.dataset.verification.images import CHANGES, Picture
-from rsbench.dataset.verification.shots import SHOTS, DepthMap, Shot
+from rsbench.dataset.verification.image_checks import CHANGES, Picture
+from rsbench.dataset.verification.landing import SHOTS, DepthMap, Shot
 from rsbench.dataset.verification.stacks import stack_rows
-from rsbench.dataset.verification.surfaces import surfaces_again
+from rsbench.dataset.verification.surface_checks import surfaces_again
 from rsbench.errors import RsbenchError
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene, read_scene_card

@@ -12,9 +12,9 @@ from rsbench.core.projection import back_project, project_at
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.verification.findings import finding, rows_of
-from rsbench.dataset.verification.images import Picture
+from rsbench.dataset.verification.image_checks import Picture
+from rsbench.dataset.verification.landing import FAR, DepthMap, Shot
 from rsbench.dataset.verification.png import png_fault
-from rsbench.dataset.verification.shots import FAR, DepthMap, Shot
 from rsbench.errors import RsbenchError
 from rsbench.reading import inside
 from rsbench.renderers.electrons import Sensor, fall_off

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.dataset.verification.findings import finding
-from rsbench.dataset.verification.shots import DEPTH_TOLERANCE, BoolArray, DepthMap, Landing, Shot
+from rsbench.dataset.verification.landing import DEPTH_TOLERANCE, BoolArray, DepthMap, Landing, Shot
 
 Colours = NDArray[np.float32]
 _BEYOND = 6.0

@@ -16,7 +16,7 @@ from rsbench.dataset.channels import INSTANCE_TABLE, surface_file
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.shots import Shot
 from rsbench.dataset.verification.findings import finding, rows_of
-from rsbench.dataset.verification.shots import BoolArray, DepthMap, land
+from rsbench.dataset.verification.landing import BoolArray, DepthMap, land
 from rsbench.errors import RsbenchError
 
 _UNIT = 1e-5

@@ -15,7 +15,7 @@ from rsbench.dataset.channels import PAIR_CHANNELS, STEP_PX, PairChannel, PixelC
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.shots import FAR, Shot
 from rsbench.dataset.verification.findings import finding, rows_of
-from rsbench.dataset.verification.shots import BoolArray, DepthMap, land
+from rsbench.dataset.verification.landing import BoolArray, DepthMap, land
 from rsbench.errors import RsbenchError
 
 Float32Array = NDArray[np.float32]
