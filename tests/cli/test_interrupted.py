@@ -135,4 +135,6 @@ def stop(run: Run, how: signal.Signals, code: int) -> None:
     assert time.monotonic() - start < STOP_S
     assert run.process.returncode == code
     assert "interrupted; the same command resumes" in errors and "Traceback" not in errors
+    while run.processes() and time.monotonic() - start < STOP_S:  # children of children see its end a moment later
+        time.sleep(0.02)
     assert not run.processes()
