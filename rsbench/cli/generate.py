@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -80,10 +79,10 @@ def generate(
     dataset = load_dataset_card(card)
     if sequence:
         dataset = dataset.only(sequence)
-    if shard:
+    if shard is not None:
         dataset = dataset.shard(*_part(shard))
-    if channels:
-        dataset = replace(dataset, channels=named_channels(channels))
+    if channels is not None:
+        dataset = dataset.with_channels(named_channels(channels))
     if not estimate:
         check_out(out)
     backend = start_backend()

@@ -222,6 +222,17 @@ class DatasetCard(Scanning):
                 raise RsbenchError(f"dataset {self.name}: no sequence {name!r}; there are: {', '.join(known)}")
         return replace(self, sequence=tuple(known[name] for name in names))
 
+    def with_channels(self, names: tuple[Channel, ...]) -> DatasetCard:
+        """The same card with these channels instead of its own.
+
+        Raises:
+            RsbenchError: its cameras cannot have one of them.
+        """
+        try:
+            return replace(self, channels=names)
+        except ValueError as error:
+            raise RsbenchError(f"dataset {self.name}: {error}") from error
+
     def shard(self, part: int, parts: int) -> DatasetCard:
         """The same card with every ``parts``-th sequence, from the ``part``-th, counted from 1.
 

@@ -98,7 +98,7 @@ def named_channels(text: str) -> tuple[Channel, ...]:
         matching = [channel for channel in CHANNELS if channel == name.strip()]
         if not matching or matching[0] in found:
             raise RsbenchError(
-                f"--channels {text}: {name!r}: allowed are {', '.join(CHANNELS)}, each once, or all"
+                f"--channels {text}: {name!r}: allowed are {', '.join(CHANNELS)}, each once, or all, or none"
             )
         found += matching
     return tuple(found)

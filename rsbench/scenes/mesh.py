@@ -21,7 +21,7 @@ from rsbench.reading import FILE_BYTES, check_amount, check_size
 from rsbench.scenes.gltf import TextureTransform
 from rsbench.scenes.mesh_limits import check_mesh_file
 from rsbench.scenes.model import FloatArray, Material, SceneBuilder, SceneMesh
-from rsbench.scenes.staging import standing, surroundings
+from rsbench.scenes.staging import box_of, standing, surroundings
 
 # Rows turn file axes into a right-handed frame with z up.
 _Z_UP = {
@@ -81,6 +81,8 @@ class MeshBuilder(SceneBuilder):
         try:
             with np.errstate(all="ignore"):  # what is not finite is refused by name
                 meshes = self._meshes(path)
+                if np.array_equal(*box_of(meshes)):
+                    raise RsbenchError(f"mesh file {path}: all of it lies in one point")
                 if self.place == "origin":
                     meshes = standing(meshes, self.size)
                 return meshes + surroundings(meshes, self.ground, self.backdrop, seed)

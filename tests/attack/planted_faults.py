@@ -50,11 +50,7 @@ from rsbench.cards import load_card
 from rsbench.core.motion import TwistMotion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.files import (
-    sha256,
-    write_depth,
-    write_png,
-)
+from rsbench.dataset.files import sha256, write_depth, write_png
 from rsbench.dataset.sequence import read_sequence
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene
