@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -25,9 +26,12 @@ _FEW, _OF_A_ROW = 1e-3, 0.25
 """Shares of pixels that may differ: in the image, those at its borders that rounding moves across; in a row."""
 _SURFACE, _BEHIND = 5e-5, 3e-4
 """Relative distance below which a pixel sees the target's surface, and beyond which it is behind it."""
-_FEW_THIN, _FEW_GAPS = 0.01, 0.3
-"""Of the pixels on flat surfaces of the target, and behind them: what is thinner than a pixel hides points between
-the target's pixels, or shows them."""
+_FEW_THIN, _FEW_GAPS, _FEW_SHOWN = 0.01, 0.3, 3e-3
+"""Of the pixels on flat surfaces of the target, of those behind them, and of all in view: what is thinner than a
+pixel hides points between the target's pixels, or shows them. Where little is hidden, such as joints between tiles
+may be most of it."""
+_OF_A_THIN_ROW, _OF_ITS_WIDTH = 0.5, 0.125
+"""Such things may lie along a row: shares of its pixels that are told of, and of all its pixels."""
 _FEW_AGAIN = 5e-3
 """Of rows made again: on another processor, rounding of depth moves points across edges now and then."""
 _LEAST = 8
@@ -153,16 +157,17 @@ def _mask_faults(
     lost = np.isnan(derived.values[..., 0])
     everywhere = np.ones(classes.shape, dtype=np.bool_)
     unsolved, empty = classes == PixelClass.UNSOLVED, np.isin(classes, _NO_VALUE)
-    hidden = np.isin(classes, _HIDDEN)
+    hidden, of_sky = np.isin(classes, _HIDDEN), np.isin(classes, _OF_SKY)
     seen_there = target_of(channel, shot).depth
-    for words, wrong, among, few in (
-        ("not solved", unsolved, everywhere, _FEW),
-        ("wrongly in or out of view", ~unsolved & (empty != lost), everywhere, _FEW),
-        (f"wrongly sky or surface by {shot.depth}", ~empty & (np.isin(classes, _OF_SKY) != sky), everywhere, _FEW),
-        (f"hidden, but visible by {seen_there}", hidden, ~empty & (derived.hidden == 0), _FEW_THIN),
-        (f"visible, but hidden by {seen_there}", ~empty & ~hidden, derived.hidden == 1, _FEW_GAPS),
+    surface, behind = ~empty & (derived.hidden == 0), derived.hidden == 1
+    for words, wrong, among, many in (
+        ("not solved", unsolved, everywhere, _many),
+        ("wrongly in or out of view", ~unsolved & (empty != lost), everywhere, _many),
+        (f"wrongly sky or surface by {shot.depth}", ~empty & (of_sky != sky), everywhere, _many),
+        (f"hidden, but visible by {seen_there}", hidden, surface, _many_thin),
+        (f"visible, but hidden by {seen_there}", ~empty & ~hidden, behind, partial(_many_gaps, ~empty)),
     ):
-        if _many(wrong & among, among, few):
+        if many(wrong & among, among):
             rows = _rows(wrong & among, stride, height)
             yield finding(file, f"{_percent(wrong & among, among)} are {words}", rows)
 
@@ -182,16 +187,29 @@ def _derived(
     return _Derived(values, hidden.astype(np.float32))
 
 
-def _many(wrong: BoolArray, among: BoolArray, few: float = _FEW) -> bool:
+def _many(
+    wrong: BoolArray, among: BoolArray, few: float = _FEW, of_a_row: float = _OF_A_ROW, of_its_width: float = 0.0
+) -> bool:
     """Whether too many pixels (H, W) are wrong among these, in the image or in one of its rows."""
     in_row, of_row = np.sum(wrong, axis=1), np.sum(among, axis=1)
-    rows = np.any(in_row > np.maximum(max(_OF_A_ROW, few) * of_row, _LEAST))
+    rows = np.any(in_row > np.maximum(of_a_row * of_row, max(_LEAST, of_its_width * wrong.shape[1])))
     return bool(np.sum(wrong) > max(few * np.sum(among), _LEAST) or rows)
+
+
+def _many_thin(wrong: BoolArray, among: BoolArray) -> bool:
+    return _many(wrong, among, _FEW_THIN, _OF_A_THIN_ROW, _OF_ITS_WIDTH)
+
+
+def _many_gaps(in_view: BoolArray, wrong: BoolArray, behind: BoolArray) -> bool:
+    """Too many for what is hidden, and for what is ``in_view`` (H, W)."""
+    of_hidden = _many(wrong, behind, _FEW_GAPS, _OF_A_THIN_ROW, _OF_ITS_WIDTH)
+    return of_hidden and _many(wrong, in_view, _FEW_SHOWN, _OF_A_THIN_ROW, _OF_ITS_WIDTH)
 
 
 def _percent(wrong: BoolArray, among: BoolArray) -> str:
     count = int(np.sum(among))
-    return f"{100 * np.sum(wrong) / max(count, 1):.2g} % of {count} pixels"
+    share = 100 * np.sum(wrong) / max(count, 1)
+    return f"{share:.0f} % of {count} pixels" if share >= 10 else f"{share:.2g} % of {count} pixels"
 
 
 def _rows(wrong: BoolArray, stride: int, height: int) -> str:

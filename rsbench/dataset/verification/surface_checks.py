@@ -25,7 +25,7 @@ _LEVEL, _FEW_BENT = 0.05, 0.02
 """Cosine between a normal and its surface, which bends by less where it counts as flat; and the share of flat
 pixels that may be beyond, at creases of less than that."""
 _SURFACE, _FEW_OTHERS = 5e-5, 0.02
-"""As in ``channels``; things that touch, such as tiles, change within a pixel."""
+"""As in ``channel_checks``; what is thinner than a pixel may lie between four that see something else."""
 _FEW_AGAIN, _LEAST = 5e-3, 8
 
 
@@ -100,9 +100,16 @@ def _likeness_faults(
     landing = land(sequence, maps[shot], maps[partner])
     with np.errstate(invalid="ignore"):
         same = np.abs(landing.relative) < _SURFACE
-    x, y = np.round(landing.pixels[same]).astype(int).T
+    # One of the four pixels around must see the same: between them, things that touch change.
+    height, width = same.shape
+    x, y = np.floor(landing.pixels[same]).astype(int).T
+    around = [
+        instances[partner][np.clip(y + down, 0, height - 1), np.clip(x + across, 0, width - 1)]
+        for down in (0, 1)
+        for across in (0, 1)
+    ]
     other = np.zeros(same.shape, dtype=np.bool_)
-    other[same] = instances[partner][y, x] != instances[shot][same]
+    other[same] = ~np.any(np.equal(around, instances[shot][same]), axis=0)
     if np.sum(other) > max(_FEW_OTHERS * np.sum(same), _LEAST):
         file, there = (surface_file("instances", each.side, each.frame) for each in (shot, partner))
         share = f"{100 * np.sum(other) / np.sum(same):.2g} % of {np.sum(same)} pixels"
@@ -112,7 +119,7 @@ def _likeness_faults(
 def surfaces_again(
     sequence: Sequence, shot: Shot, rows: list[int], depth: NDArray[np.float32], rays: Rays, told: Collection[str]
 ) -> Iterator[tuple[str, str, bool]]:
-    """As ``channels.channels_again``, of normals and instances."""
+    """As ``channel_checks.channels_again``, of normals and instances."""
     names = [name for name in ("normals", "instances") if shot.shutter == "rs" and name in sequence.channels]
     truth = surface_truth(sequence, shot, depth, rays, rows) if names else None
     for name in names:
