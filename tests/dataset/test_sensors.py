@@ -10,7 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from attack.planting import rehash
+from small_scenes import write_box_scene, write_small_card
 
 from rsbench.cards import parse_card
 from rsbench.dataset import generation
@@ -152,6 +154,22 @@ def test_frames_that_the_sensor_cannot_have_made_are_named(
     write_png(copy / shot.image, np.ascontiguousarray(bad))
     found = list(sensor_faults(read_sequence(copy), content.maps, content.pictures, ()))
     assert len(found) == 1 and found[0].startswith("rs/left_1.png: ")
+
+
+def test_an_exposure_without_noise_is_no_fault(tmp_path: Path) -> None:
+    """On walls of one colour the frame and its twin are equal: there is no noise to miss."""
+    scene = write_box_scene(tmp_path, "grey")
+    box = trimesh.creation.box((6.0, 10.0, 4.0))
+    box.invert()
+    box.visual.face_colors = np.full((12, 4), (180, 180, 180, 255), dtype=np.uint8)
+    box.export(tmp_path / "grey.glb")
+    card = write_small_card(tmp_path, [scene])
+    card.write_text(
+        card.read_text().replace("[camera]", "frame_period_s = 0.1\n[sensor]\nexposure_s = 0.004\n[camera]")
+    )
+    generate_dataset(load_dataset_card(str(card)), tmp_path / "out")
+    content = read_content(read_sequence(tmp_path / "out" / "grey"), set())
+    assert list(sensor_faults(content.sequence, content.maps, content.pictures, ())) == []
 
 
 def test_a_card_says_what_its_sensor_cannot_be() -> None:

@@ -78,7 +78,8 @@ def _fault(
     share = fall_off(sensor, width, height, np.arange(height))[..., None]
     low, high = (linear_of_codes(way(clean, around)) * share for way in (cv2.erode, cv2.dilate))
     seen = linear_of_codes(image)
-    sigma = np.sqrt(sensor.variance(high) + _rounding(image) + _rounding(clean))
+    own, rounded = sensor.variance(high), _rounding(image) + _rounding(clean)
+    sigma = np.sqrt(own + rounded)
     slack = _BEYOND_SIGMA * sigma
     beyond = (seen < np.minimum(low, 1.0) - slack) | (seen > np.minimum(high, 1.0) + slack)
     rows = np.mean(beyond, axis=(1, 2)) > _ROW_SHARE
@@ -87,7 +88,8 @@ def _fault(
             f"{100 * np.mean(beyond):.2f} % of the values are beyond {_BEYOND_SIGMA:g} sigma of what {twin} allows"
         )
         return finding(shot.image, what, rows_of(rows))
-    smooth = (high - low < sigma) & (low > _UNCLIPPED[0]) & (high < _UNCLIPPED[1])
+    # Rounding is no noise: without any beside it, equal values are rounded alike.
+    smooth = (high - low < sigma) & (low > _UNCLIPPED[0]) & (high < _UNCLIPPED[1]) & (own > rounded)
     if np.sum(smooth) < _LEAST_VALUES:
         return None
     ratio = float(np.var(((seen - 0.5 * (low + high)) / sigma)[smooth]))
