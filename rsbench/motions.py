@@ -30,6 +30,7 @@ MOTIONS: Kind[Motion, NoOptions] = Kind(
         "twist": "rsbench.core.motion:TwistMotion",
         "accelerated": "rsbench.core.motion:AcceleratedMotion",
         "spline": "rsbench.core.spline_motion:SplineMotion",
+        "trajectory": "rsbench.core.trajectory_motion:TrajectoryMotion",
     },
 )
 _SAME = 1e-9

@@ -25,6 +25,9 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench generate paper --out data/flow --channels disparity,flow
 
+  rsbench generate smoke --out data/walk --trajectory walk.txt [dim](along your own poses, one pair of frames
+  after the other: lines of timestamp tx ty tz qx qy qz qw)[/dim]
+
   rsbench generate smoke --out data/stack --full-frames    [dim](keeps every row's whole image)[/dim]"""
 
 
@@ -48,6 +51,12 @@ _Channels = Annotated[
     str | None,
     typer.Option(help="Channels of truth in place of the card's, with commas between; or all; or none."),
 ]
+_Trajectory = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Poses (TUM format) along which the rig moves, in place of the card's motion."
+    ),
+]
 _Rehash = Annotated[
     bool, typer.Option("--rehash", help="Read all that is there again, not only what has another size or time.")
 ]
@@ -65,6 +74,7 @@ def generate(
     workers: Annotated[int, typer.Option(min=1, help="Processes; each renders whole sequences.")] = 1,
     full_frames: _FullFrames = False,
     channels: _Channels = None,
+    trajectory: _Trajectory = None,
     rehash: _Rehash = False,
     estimate: _Estimate = False,
 ) -> None:
@@ -76,7 +86,7 @@ def generate(
     from rsbench.dataset.generation import STEPS, generate_dataset
     from rsbench.renderers.backend import start_backend
 
-    dataset = load_dataset_card(card)
+    dataset = load_dataset_card(card, trajectory)
     if sequence:
         dataset = dataset.only(sequence)
     if shard is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,13 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.dataset.channels import Channel, check_channels
 from rsbench.dataset.sequence import sequence_manifest
+from rsbench.dataset.trajectory import TrajectoryCard, pairs_along
 from rsbench.errors import RsbenchError
 from rsbench.imports import search
 from rsbench.motions import drawn_parameters, fixed_endpoint, make_motion
 from rsbench.reading import check_name, check_size
 from rsbench.renderers.electrons import Sensor
+from rsbench.scenes.model import Start
 
 Vector = tuple[float, float, float]
 Axis = Vector | str
@@ -129,6 +132,8 @@ class SequenceCard:
     """Replaces the dataset's baseline, metres."""
     seed: int | None = None
     """Replaces the dataset's seed."""
+    start: Start | None = None
+    """Of the body at time 0, where that is not at the viewpoint: made from a trajectory."""
 
     def __post_init__(self) -> None:
         check_name(self.name)
@@ -145,7 +150,10 @@ class DatasetCard(Scanning):
     """Full distance between the cameras, metres."""
     readout_ratio: float
     frame_period_s: float = 0.1
-    motion: MotionCard
+    motion: MotionCard | None = None
+    """Required, unless each sequence has its own or there is a trajectory."""
+    trajectory: TrajectoryCard | None = None
+    """Moves the rig along the poses of a file instead."""
     renderer: str = "default"
     """Name of a renderer card, or a path to one."""
     sensor: Sensor | None = None
@@ -175,12 +183,20 @@ class DatasetCard(Scanning):
             raise ValueError("seeds and the seed of a sequence exclude each other")
         if len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds = {list(self.seeds)}: must differ from each other")
+        self._check_motions()
         names = [sequence.name for sequence in self.sequence]
         if not names:
             raise ValueError("a dataset needs at least one [[sequence]]")
         for name, count in Counter(names).items():
             if count > 1:
                 raise ValueError(f"two sequences are named {name!r}")
+
+    def _check_motions(self) -> None:
+        own = [sequence.name for sequence in self.sequence if sequence.motion is not None]
+        if self.trajectory is not None and (self.motion is not None or own):
+            raise ValueError(f"trajectory and motion{' of ' + own[0] if own else ''} exclude each other")
+        if self.trajectory is None and self.motion is None and len(own) < len(self.sequence):
+            raise ValueError("'motion' is required")
 
     def rig_of(self, sequence: SequenceCard) -> StereoRig:
         camera = PinholeCamera.centred(self.camera.width, self.camera.height, self.camera.focal)
@@ -192,7 +208,13 @@ class DatasetCard(Scanning):
         return self.shutter_of(self.camera.width, self.camera.height, self.readout_ratio)
 
     def motion_of(self, sequence: SequenceCard) -> Motion:
-        return (sequence.motion or self.motion).motion()
+        return self._motion_card(sequence).motion()
+
+    def _motion_card(self, sequence: SequenceCard) -> MotionCard:
+        card = sequence.motion or self.motion
+        if card is None:
+            raise ValueError(f"{sequence.name}: the trajectory was not followed yet; load_dataset_card does it")
+        return card
 
     def seed_of(self, sequence: SequenceCard) -> int:
         return self.seed if sequence.seed is None else sequence.seed
@@ -247,24 +269,58 @@ class DatasetCard(Scanning):
             )
         return replace(self, sequence=self.sequence[part - 1 :: parts])
 
-    def expanded(self) -> DatasetCard:
-        """One sequence per seed, and every random axis drawn: a card that says all that it will make."""
-        if not self.seeds:
-            return replace(self, sequence=tuple(self._drawn(sequence) for sequence in self.sequence))
-        repeated = tuple(
-            self._drawn(replace(sequence, name=f"{sequence.name}-{seed}", seed=seed))
-            for sequence in self.sequence
-            for seed in self.seeds
+    def along(self, file: Path) -> DatasetCard:
+        """The same card with a trajectory from this file in place of all motions; other keys of its own stay."""
+        own = self.trajectory or TrajectoryCard(file="")
+        sequences = tuple(replace(sequence, motion=None) for sequence in self.sequence)
+        return replace(self, motion=None, trajectory=replace(own, file=str(file.absolute())), sequence=sequences)
+
+    def expanded(self, folder: Path = Path()) -> DatasetCard:
+        """A card that says all that it will make: one sequence per seed and pair of frames, random axes drawn.
+
+        Args:
+            folder: of the card, where the file of a trajectory is looked for.
+
+        Raises:
+            RsbenchError: the file of a trajectory is wrong.
+        """
+        sequences = self.sequence
+        if self.seeds:
+            sequences = tuple(
+                replace(sequence, name=f"{sequence.name}-{seed}", seed=seed)
+                for sequence in self.sequence
+                for seed in self.seeds
+            )
+        if self.trajectory is None:
+            return replace(self, sequence=tuple(map(self._drawn, sequences)), seeds=())
+        pairs = pairs_along(self.trajectory, folder, self.frame_period_s, self._span)
+        motions = [MotionCard(model="trajectory", parameters={"poses": pair.poses.tolist()}) for pair in pairs]
+        followed = tuple(
+            replace(sequence, name=f"{sequence.name}-{number:04d}", motion=motion, start=pair.start)
+            for sequence in sequences
+            for number, (pair, motion) in enumerate(zip(pairs, motions, strict=True))
         )
-        return replace(self, sequence=repeated, seeds=())
+        return replace(self, sequence=followed, trajectory=None, seeds=())
+
+    @property
+    def _span(self) -> tuple[float, float]:
+        """From when to when something is exposed, frame periods."""
+        half = 0.0 if self.sensor is None else 0.5 * self.sensor.exposure_s / self.frame_period_s
+        return min(0.0, self.right_delay) - half, 1.0 + self.readout_ratio + max(0.0, self.right_delay) + half
 
     def _drawn(self, sequence: SequenceCard) -> SequenceCard:
-        motion = sequence.motion or self.motion
+        motion = self._motion_card(sequence)
         drawn = motion.drawn(self.seed_of(sequence), sequence.name)
         return sequence if drawn == motion else replace(sequence, motion=drawn)
 
 
-def load_dataset_card(name_or_path: str) -> DatasetCard:
-    """Dataset card by name or path, expanded; errors as ``rsbench.cards.load_card``."""
-    search(card_path("datasets", name_or_path))
-    return load_card(DatasetCard, "datasets", name_or_path).expanded()
+def load_dataset_card(name_or_path: str, trajectory: Path | None = None) -> DatasetCard:
+    """Dataset card by name or path, expanded; with ``trajectory``, moved along that file.
+
+    Raises:
+        RsbenchError: as ``rsbench.cards.load_card``, or the file of a trajectory is wrong.
+    """
+    path = card_path("datasets", name_or_path)
+    search(path)
+    card = load_card(DatasetCard, "datasets", name_or_path)
+    return (card if trajectory is None else card.along(trajectory)).expanded(path.parent)

@@ -12,7 +12,7 @@ from pathlib import Path
 from rsbench.cards import load_card
 from rsbench.core.rig import SIDES
 from rsbench.dataset.card import DatasetCard, SequenceCard
-from rsbench.dataset.generation import build_scene, render_camera, scene_name
+from rsbench.dataset.generation import build_scene, render_camera, scene_name, seen_scene
 from rsbench.dataset.sequence import FRAMES, files_of
 from rsbench.dataset.workplace import files_below
 from rsbench.renderers.options import RendererOptions
@@ -59,7 +59,7 @@ def _of_scene(card: DatasetCard, sequences: list[SequenceCard], options: Rendere
     start = time.monotonic()
     scene = build_scene(sequences[0].scene).scene
     built = time.monotonic()
-    rendered = MitsubaScene(scene.seen_from(scene.viewpoints[sequences[0].viewpoint]))
+    rendered = MitsubaScene(seen_scene(scene, sequences[0]))
     loaded = time.monotonic()
     own = files_of(card.manifest_of(sequences[0]))
     with tempfile.TemporaryDirectory(prefix="rsbench-") as temporary:

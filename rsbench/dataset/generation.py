@@ -134,6 +134,11 @@ def build_scene(name: str) -> _Built:
     return _Built(scene, scene_hash(scene))
 
 
+def seen_scene(scene: Scene, sequence: SequenceCard) -> Scene:
+    """A scene in the frame of the body at time 0 of a sequence."""
+    return scene.seen_from(scene.viewpoints[sequence.viewpoint], sequence.start)
+
+
 def _scene_card(name: str) -> SceneCard:
     return read_scene_card(card_path("scenes", name))[0]
 
@@ -143,12 +148,14 @@ def _plan(card: DatasetCard, sequence: SequenceCard, options: RendererOptions, s
         names = ", ".join(scene.viewpoints)
         raise RsbenchError(f"scene {sequence.scene}: no viewpoint {sequence.viewpoint!r}; there are: {names}")
     viewpoint = scene.viewpoints[sequence.viewpoint]
+    start = {} if sequence.start is None else {"start": _listed(asdict(sequence.start))}
     return card.manifest_of(sequence) | {
         "scene": {
             "name": scene.name,
             "sha256": "",
             "viewpoint": sequence.viewpoint,
             **_listed(asdict(viewpoint)),
+            **start,
         },
         "renderer": _listed(asdict(options)),
         "seed": card.seed_of(sequence),
@@ -277,8 +284,7 @@ def _render_sequence(
     from rsbench.renderers.scene import MitsubaScene
 
     backend = start_backend()
-    scene = built.scene
-    mitsuba_scene = MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint]))
+    mitsuba_scene = MitsubaScene(seen_scene(built.scene, sequence))
     if words := obstacle(mitsuba_scene, card.rig_of(sequence), card.shutter(), card.motion_of(sequence)):
         raise RsbenchError(f"sequence {sequence.name}: {words}; choose another motion, viewpoint or baseline")
     partial = out / HIDDEN / WORK / sequence.name

@@ -16,9 +16,12 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core import so3
 from rsbench.errors import RsbenchError
 
 FloatArray = NDArray[np.float64]
+_UNIT = 1e-6
+"""Quaternions may be longer or shorter than 1 by this much: rounding in a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +88,28 @@ class Viewpoint:
         return rotation, -rotation @ eye
 
 
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """Where the rig's body stands at time 0, where a trajectory and not a viewpoint says so."""
+
+    position: tuple[float, float, float]
+    """Metres, in the frame of the viewpoint: x right, y down, z forward from its eye."""
+    quaternion: tuple[float, float, float, float]
+    """(w, x, y, z): turns the body's axes into those of that frame."""
+    absolute: bool = False
+    """The frame is the scene's own instead."""
+
+    def __post_init__(self) -> None:
+        if abs(float(np.linalg.norm(self.quaternion)) - 1.0) > _UNIT:
+            raise ValueError(f"quaternion = {self.quaternion}: must be of length 1")
+
+    def world_from_scene(self, viewpoint: Viewpoint) -> tuple[FloatArray, FloatArray]:
+        """As of ``Viewpoint``: rotation (3, 3) and translation (3,)."""
+        turn, position = so3.from_quaternion(self.quaternion).T, np.asarray(self.position)
+        R, t = (np.eye(3), np.zeros(3)) if self.absolute else viewpoint.world_from_scene()
+        return turn @ R, turn @ (t - position)
+
+
 class SceneBuilder(ABC):
     """Makes the meshes of a scene. A frozen dataclass: its fields are the parameters that a scene card may set."""
 
@@ -110,9 +135,10 @@ class Scene:
     light: Light
     viewpoints: dict[str, Viewpoint] = field(default_factory=dict)
 
-    def seen_from(self, viewpoint: Viewpoint) -> Scene:
+    def seen_from(self, viewpoint: Viewpoint, start: Start | None = None) -> Scene:
         """The same scene in the world frame whose origin and axes are the body at time 0."""
-        rotation, translation = viewpoint.world_from_scene()
+        placed = viewpoint.world_from_scene() if start is None else start.world_from_scene(viewpoint)
+        rotation, translation = placed
         meshes = tuple(
             replace(
                 mesh,

@@ -56,7 +56,7 @@ def test_given_axes_stay() -> None:
 
 def test_an_axis_is_not_used_before_it_is_drawn() -> None:
     with pytest.raises(ValueError, match="random"):
-        _card().motion.motion()
+        _card().motion_of(_card().sequence[0])
 
 
 def test_axes_are_uniform_on_the_sphere() -> None:

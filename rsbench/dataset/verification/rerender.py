@@ -31,6 +31,7 @@ from rsbench.dataset.verification.surface_checks import surfaces_again
 from rsbench.errors import RsbenchError
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene, read_scene_card
+from rsbench.scenes.model import Start
 
 if TYPE_CHECKING:
     from rsbench.renderers.render import Frame
@@ -104,11 +105,18 @@ class Again:
         for key, value in asdict(card.viewpoints[viewpoint]).items():
             if list(value) != record.get(key):
                 raise RsbenchError(f"{key} of the viewpoint {viewpoint!r} is {list(value)}, not {record.get(key)}")
-        wanted = (path, path.stat().st_mtime_ns, viewpoint)
+        start = (
+            parse_card(Start, _table(record, "start"), "sequence.json: scene.start") if "start" in record else None
+        )
+        wanted = (path, path.stat().st_mtime_ns, viewpoint, start)
         if self._built is None or self._built[0] != wanted:
             self._built = None  # a scene takes hundreds of MB: not two at a time
             scene = load_scene(path)
-            self._built = wanted, scene_hash(scene), MitsubaScene(scene.seen_from(scene.viewpoints[viewpoint]))
+            self._built = (
+                wanted,
+                scene_hash(scene),
+                MitsubaScene(scene.seen_from(scene.viewpoints[viewpoint], start)),
+            )
         return self._built[2], self._built[1]
 
     def _rows(self, content: Content, options: RendererOptions) -> list[int]:

@@ -227,7 +227,8 @@ def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: Seque
     made = manifest.get("made_by")
     same_version = isinstance(made, dict) and made.get("rsbench") == __version__
     planned = {"sensor": None, "channels": None, "seed": card.seed_of(sequence)} | card.manifest_of(sequence)
-    scene: dict[str, Any] = {"viewpoint": sequence.viewpoint}
+    start = None if sequence.start is None else asdict(sequence.start)
+    scene: dict[str, Any] = {"viewpoint": sequence.viewpoint, "start": start}
     # The cards that come with another version may say other things.
     if same_version and sequence.scene in list_cards("scenes"):
         built_in, _ = read_scene_card(list_cards("scenes")[sequence.scene])

@@ -1,0 +1,174 @@
+"""A user's own trajectory: poses from a file in TUM's format, cut into pairs of frames."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rsbench.core import so3
+from rsbench.core.se3 import Pose, compose, inverse
+from rsbench.core.so3 import FloatArray
+from rsbench.core.trajectory_motion import LARGEST_TURN_DEG, turns_deg, world_from_body
+from rsbench.errors import RsbenchError
+from rsbench.reading import check_amount, read_text
+from rsbench.scenes.model import Start
+
+FORMAT = "timestamp tx ty tz qx qy qz qw"
+_NEARLY_UNIT = 0.01
+"""Quaternions are written with four digits or more; beyond, another order of their parts is more likely."""
+_AROUND = 24
+"""Poses before and after a pair that its sequence keeps: of farther ones the spline feels 0.27^24."""
+_MOST_PAIRS = 100_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrajectoryCard:
+    """The rig goes along the poses of a file: each pair of frames is a sequence of its own."""
+
+    file: str
+    """TUM's format: lines ``timestamp tx ty tz qx qy qz qw``, seconds and metres; relative to the card."""
+    absolute: bool = False
+    """The poses are in the frame of the scene (z up); otherwise the first pair starts at the viewpoint."""
+    start_s: float = 0.0
+    """Seconds from the first pose of the file to the first frame."""
+    step: float = 2.0
+    """Frame periods from one pair to the next; with 1, two pairs share a frame."""
+    pairs: int | None = None
+    """So many at most; None: all that the file holds."""
+    longest_gap_s: float = 1.0
+    """Poses that are farther apart are refused: no spline knows what was between."""
+
+    def __post_init__(self) -> None:
+        if not self.start_s >= 0.0:
+            raise ValueError(f"start_s = {self.start_s}: must not be negative")
+        for name in ("step", "longest_gap_s"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be positive")
+        if self.pairs is not None and self.pairs < 1:
+            raise ValueError(f"pairs = {self.pairs}: must be 1 or more")
+
+
+class Trajectory(NamedTuple):
+    """Poses of a body in a frame that stands still: world_from_body."""
+
+    seconds: FloatArray
+    """(n,) from the first one."""
+    poses: FloatArray
+    """(n, 7) position x, y, z, metres, and unit quaternion x, y, z, w."""
+
+
+class Pair(NamedTuple):
+    """One pair of frames on the way."""
+
+    poses: FloatArray
+    """(m, 8) as ``TrajectoryMotion`` takes them: time 0 is the start of frame 0."""
+    start: Start
+
+
+def read_trajectory(path: Path, longest_gap_s: float) -> Trajectory:
+    """Poses of a file in TUM's format; blank lines and those that begin with # say nothing.
+
+    Raises:
+        RsbenchError: it cannot be read, or a line is wrong: one line with its number and a remedy.
+    """
+    stamps, poses, lines = [], [], []
+    for number, text in enumerate(read_text(path).splitlines(), start=1):
+        words = text.split()
+        if words and not words[0].startswith("#"):
+            stamp, pose = _line(words, f"{path}: line {number}")
+            stamps.append(stamp)
+            poses.append(pose)
+            lines.append(number)
+    if len(poses) < 2:
+        raise RsbenchError(f"{path}: has {len(poses)} poses, at least 2 are needed: lines of {FORMAT}")
+    # Exact where the stamps are: seconds since 1970 leave a float a quarter of a microsecond.
+    trajectory = Trajectory(np.array([float(stamp - stamps[0]) for stamp in stamps]), np.array(poses))
+    _check_steps(trajectory, path, lines, longest_gap_s)
+    return trajectory
+
+
+def _line(words: list[str], where: str) -> tuple[Decimal, FloatArray]:
+    if len(words) != 8:
+        raise RsbenchError(f"{where}: has {len(words)} words; write the 8 numbers {FORMAT}, with blanks between")
+    try:
+        stamp, values = Decimal(words[0]), np.array([float(word) for word in words[1:]])
+        if not (stamp.is_finite() and np.all(np.isfinite(values))):
+            raise ValueError
+    except (InvalidOperation, ValueError):
+        raise RsbenchError(f"{where}: not 8 finite numbers {FORMAT}; correct it or put # before it") from None
+    length = float(np.linalg.norm(values[3:]))
+    if abs(length - 1.0) > _NEARLY_UNIT:
+        raise RsbenchError(
+            f"{where}: its quaternion has the length {length:.3g}, not 1; the order is {FORMAT}, qw last"
+        )
+    values[3:] /= length
+    return stamp, values
+
+
+def _check_steps(trajectory: Trajectory, path: Path, lines: list[int], longest_gap_s: float) -> None:
+    steps = np.diff(trajectory.seconds)
+    turns = turns_deg(trajectory.poses[:, 3:])
+    for number, step, turn in zip(lines[1:], steps, turns, strict=True):
+        where = f"{path}: line {number}"
+        if step <= 0.0:
+            raise RsbenchError(
+                f"{where}: its timestamp is not later than the one before; sort the lines, each once"
+            )
+        if step > longest_gap_s:
+            raise RsbenchError(
+                f"{where}: is {step:g} s after the pose before (longest_gap_s = {longest_gap_s:g}); timestamps "
+                "are seconds; cut the file there, or give more poses or a larger longest_gap_s in [trajectory]"
+            )
+        if turn > LARGEST_TURN_DEG:
+            raise RsbenchError(
+                f"{where}: turns by {turn:.0f} degrees from the pose before, more than {LARGEST_TURN_DEG:g}; "
+                "cut the file there or give more poses"
+            )
+
+
+def pairs_along(card: TrajectoryCard, folder: Path, period_s: float, span: tuple[float, float]) -> list[Pair]:
+    """The pairs of frames that a card makes of its file.
+
+    Args:
+        card: see there.
+        folder: of the dataset's card.
+        period_s: seconds of a frame period.
+        span: from when to when a pair needs poses: frame periods from the start of its frame 0.
+
+    Raises:
+        RsbenchError: the file is wrong, or too short for one pair.
+    """
+    path = folder / card.file
+    trajectory = read_trajectory(path, card.longest_gap_s)
+    seconds = trajectory.seconds
+    before, after = (time * period_s for time in span)
+    first, left = card.start_s - before, float(seconds[-1]) - (card.start_s - before) - after
+    if left < 0.0:
+        raise RsbenchError(
+            f"{path}: lasts {seconds[-1]:g} s; a pair of frames from start_s = {card.start_s:g} on needs "
+            f"{card.start_s - before + after:g} s: give more poses or a shorter frame_period_s"
+        )
+    count = 1 + math.floor(left / (card.step * period_s) + 1e-9)
+    count = count if card.pairs is None else min(count, card.pairs)
+    check_amount(path, "pairs of frames", count, _MOST_PAIRS)
+    rows = []
+    for k in range(count):
+        zero = first + k * card.step * period_s
+        low, high = np.searchsorted(seconds, [zero + before, zero + after])
+        near = slice(max(int(low) - _AROUND, 0), int(high) + _AROUND)
+        times = (seconds[near] - zero) / period_s
+        rows.append(np.concatenate([times[:, None], trajectory.poses[near]], axis=1))
+    places = [world_from_body(each, 0.0) for each in rows]
+    return [Pair(each, _start(place, places[0], card.absolute)) for each, place in zip(rows, places, strict=True)]
+
+
+def _start(place: Pose, first: Pose, absolute: bool) -> Start:
+    R, t = place if absolute else compose(inverse(first), place)
+    x, y, z = t.tolist()
+    a, b, c, d = so3.quaternion(R).tolist()
+    return Start(position=(x, y, z), quaternion=(a, b, c, d), absolute=absolute)
