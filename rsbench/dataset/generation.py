@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -27,9 +26,10 @@ from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channel_writer import write_channels
 from rsbench.dataset.channels import INSTANCE_TABLE
 from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_png, write_poses
-from rsbench.dataset.hashes import HASHES, FileHashes, HashedFile
+from rsbench.dataset.hashes import HASHES, FileHashes
+from rsbench.dataset.manifest import Files, write_manifest
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
-from rsbench.dataset.sequence import FORMAT, FRAMES, UNITS, files_of, is_of_sequence
+from rsbench.dataset.sequence import FRAMES, files_of, is_of_sequence
 from rsbench.dataset.shots import GivenGeometry, Shot
 from rsbench.dataset.timing import write_timing
 from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, remove, strangers, workplace
@@ -59,8 +59,6 @@ class _Built(NamedTuple):
 Build = Callable[[str], _Built]
 Plan = dict[str, Any]
 """All that decides the bytes of a sequence, as it stands in its sequence.json; but for the hash of the scene."""
-Files = dict[str, HashedFile]
-"""The files of a sequence by their paths below its folder, in the order of dataset.json."""
 
 
 def generate_dataset(
@@ -116,7 +114,7 @@ def generate_dataset(
             if done[name] == STEPS:
                 made[name] = _learned(out, name, hashes)
             _repeat(progress, name, steps)
-        _write_manifest(card, out, made)
+        write_manifest(card, out, made)
     return [sequence.name for sequence in todo]
 
 
@@ -373,32 +371,3 @@ def image_seed(seed: int, sequence: str, side: Side, frame: int) -> int:
     """Independent noise per image; rolling- and global-shutter twins share it, so that row 0 is the same."""
     text = f"{seed}/{sequence}/{side}/{frame}"
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "little")
-
-
-def _write_manifest(card: DatasetCard, out: Path, made: dict[str, Files]) -> None:
-    files = {
-        f"{sequence.name}/{name}": {"sha256": file.sha256, "size": file.size}
-        for sequence in card.sequence
-        for name, file in made[sequence.name].items()
-    }
-    content = {
-        "format": FORMAT,
-        "name": card.name,
-        "description": card.description,
-        "rsbench": __version__,
-        "mitsuba": version("mitsuba"),
-        "units": UNITS,
-        "card": asdict(card),
-        "sequences": [sequence.name for sequence in card.sequence],
-        "files": files,
-    }
-    if not _stands(out / "dataset.json", content):
-        write_json(out / "dataset.json", content)
-
-
-def _stands(path: Path, content: dict[str, Any]) -> bool:
-    """Whether a file holds this already; to read millions of lines is much faster than to write them."""
-    try:
-        return read_json(path) == json.loads(json.dumps(content))
-    except RsbenchError:
-        return False
