@@ -97,6 +97,7 @@ def test_the_readme_runs_as_printed(installed: Path, tmp_path: Path, smoke_datas
         "baseline = 0.3\nreadout_ratio = 0.8\n[camera]\nfx = 150\nfy = 150\ncx = 63.5\ncy = 47.5\n"
     )
     shorter = {
+        "rsbench verify": " --rerender no",
         "rsbench evaluate": " --solver gs-8pt",
         "rsbench simulate": " --trials 2 --solver gs-8pt --workers 1",
     }

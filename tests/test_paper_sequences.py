@@ -30,10 +30,10 @@ SCENES = ("castle", "old-town", "room")
 
 @pytest.fixture(scope="module")
 def paper(tmp_path_factory: pytest.TempPathFactory, built_scene: Callable[[str], Scene]) -> Path:
-    """The paper's sequences at half their size, for time; ``rsbench reproduce images`` has the whole."""
+    """The paper's sequences at 2/5 of their size, for time; ``rsbench reproduce images`` has the whole."""
     folder = tmp_path_factory.mktemp("paper") / "paper"
     card = load_dataset_card("paper")
-    camera = replace(card.camera, width=450, height=450, focal=card.camera.focal * 450 / card.camera.width)
+    camera = replace(card.camera, width=360, height=360, focal=card.camera.focal * 360 / card.camera.width)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(generation, "load_scene", built_scene)
         generation.generate_dataset(replace(card, camera=camera), folder)

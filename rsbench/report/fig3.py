@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SWEEPS = ("noise", "baseline", "translation", "rotation", "readout")
+CENTRES: tuple[Centre, ...] = ("median", "mean")
 _ENDINGS = {"1e-3 px": "px", "0.81 px": "normalised"}
 _X_LABELS = {
     "noise": "noise (px)",
@@ -72,9 +73,8 @@ def draw_fig3(folder: Path) -> list[Path]:
     """
     tables = read_summaries(folder, SWEEPS)
     paths = []
-    centres: tuple[Centre, ...] = ("median", "mean")
     for variant in READINGS:
-        for centre in centres:
+        for centre in CENTRES:
             paths += _draw(tables, variant, centre, folder / f"fig3-{_ENDINGS[variant]}-{centre}")
     return paths
 

@@ -31,7 +31,7 @@ class Slow(Solver):
         time.sleep(float(os.environ["RSBENCH_TEST_PAUSE"]))
         return EIGHT_POINT.estimate(correspondences, rig, shutter)
 """
-CARD = sweep_card(["gs-8pt", "{slow}"], noise_px=[0.0, 0.5, 1.0], trials=100, name="long")
+CARD = sweep_card(["gs-8pt", "{slow}"], noise_px=[0.0, 0.5, 1.0], trials=50, name="long")
 STOP_S = 6.0
 """Seconds. On a free machine it takes at most 2, of the 3 that are promised; others may keep this one busy."""
 
@@ -66,12 +66,6 @@ class Run:
                 return pid
         raise AssertionError("no worker")
 
-    def wait_for_worker(self) -> None:
-        end = time.monotonic() + 120.0
-        while len(self.processes()) < 2:
-            assert self.process.poll() is None and time.monotonic() < end
-            time.sleep(0.02)
-
     def wait_for(self, folder: Path, count: int, name: str = "trials-*.npz") -> None:
         end = time.monotonic() + 120.0
         while len(list(folder.glob(name))) < count:
@@ -88,7 +82,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths if path.name != "provenance.json"}
 
 
-def test_stopped_terminated_and_killed_it_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+def test_stopped_and_a_worker_killed_it_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
     (tmp_path / "slow_plugin.py").write_text(SLOW)
     (tmp_path / "slow.toml").write_text('class = "slow_plugin:Slow"')
     card = tmp_path / "long.toml"
@@ -106,24 +100,20 @@ def test_stopped_terminated_and_killed_it_goes_on_to_the_same_bytes(tmp_path: Pa
     stop(run, signal.SIGINT, 130)
     assert not (out / "summary.csv").exists()
 
-    run = Run("simulate", card, out, 0.03)
-    run.wait_for_worker()
-    stop(run, signal.SIGTERM, 143)
-
     run = Run("simulate", card, out, 0.0)
     errors = run.finish()
     assert run.process.returncode == 0, errors
     assert contents(out) == contents(undisturbed)
 
 
-def test_rendering_by_several_processes_stops_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendering_by_several_processes_ends_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     card = write_small_card(tmp_path, [write_box_scene(tmp_path, name) for name in "abcd"])
     # Large enough for a minute, and larger than frames may be without being asked for.
     monkeypatch.setenv("RSBENCH_LIMITS", "8")
     card.write_text(card.read_text().replace("width = 96", "width = 3000").replace("height = 64", "height = 3000"))
     run = Run("generate", card, tmp_path / "out")
     run.wait_for(tmp_path / "out" / HIDDEN / WORK, 2, "*")
-    stop(run, signal.SIGINT, 130)
+    stop(run, signal.SIGTERM, 143)
     assert list((tmp_path / "out").iterdir()) == []
 
 

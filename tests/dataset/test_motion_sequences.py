@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_scenes import write_box_scene
 
 from rsbench.cards import parse_card
 from rsbench.core.projection import row_poses
@@ -27,7 +28,7 @@ def motion_card(**fields: object) -> MotionCard:
 
 
 def test_sequences_of_every_model_are_rendered_verified_and_read_back(tmp_path: Path) -> None:
-    smoke = load_dataset_card("smoke")
+    smoke, box = load_dataset_card("smoke"), write_box_scene(tmp_path, "box")
     motions = {
         "accelerated": motion_card(model="accelerated", **COMMON),
         "shaken": motion_card(model="spline", **COMMON),
@@ -36,18 +37,22 @@ def test_sequences_of_every_model_are_rendered_verified_and_read_back(tmp_path: 
     card = replace(
         smoke,
         camera=CameraCard(width=48, height=36, focal=56.0),
-        sequence=tuple(replace(smoke.sequence[0], name=name, motion=motion) for name, motion in motions.items()),
+        sequence=tuple(
+            replace(smoke.sequence[0], name=name, scene=str(box), motion=motion)
+            for name, motion in motions.items()
+        ),
     ).expanded()
-    generate_dataset(card, tmp_path)
-    assert [report.faults for report in verify_dataset(tmp_path)] == [(), (), ()]
-    for sequence in read_dataset(tmp_path):
+    folder = tmp_path / "out"
+    generate_dataset(card, folder)
+    assert [report.faults for report in verify_dataset(folder, scenes=[box])] == [(), (), ()]
+    for sequence in read_dataset(folder):
         planned = next(card.motion_of(each) for each in card.sequence if each.name == sequence.name)
         expected = row_poses(sequence.rig, sequence.shutter, planned, "left", 1)
         np.testing.assert_array_equal(
             row_poses(sequence.rig, sequence.shutter, sequence.motion, "left", 1).t, expected.t
         )
     # The parameters are part of the truth: another acceleration does not fit the stored poses.
-    path = tmp_path / "accelerated" / "sequence.json"
+    path = folder / "accelerated" / "sequence.json"
     manifest = read_json(path)
     assert manifest["motion"]["parameters"] == {"acceleration": 0.2}
     manifest["motion"]["parameters"]["acceleration"] = 0.25
