@@ -14,6 +14,7 @@ import pytest
 from rsbench.benchmark.simulated import run_sweep, sweep_card
 from rsbench.benchmark.studies import readings
 from rsbench.benchmark.studies.claims import CLAIMS
+from rsbench.cli import reproduce as command
 from rsbench.cli.reproduce import Target, reproduce
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.report import fig3
@@ -81,3 +82,16 @@ def test_claims_and_figure_come_from_the_stored_tables(tmp_path: Path, monkeypat
     grid = pd.read_csv(out / "readings" / "settings.csv")
     assert set(grid.reading) == {"literal", "symmetric"}
     assert set(grid[grid.claim == "baseline: no impact"].setting) == {"points 9"}
+
+
+def test_everything_makes_each_folder_of_results_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made: list[str] = []
+    monkeypatch.setattr(command, "_reproduce", lambda target, *rest: made.append(target.value))
+    reproduce(Target.everything, tmp_path / "out", tmp_path / "data")
+    folders = {folder.name for folder in (Path(__file__).parents[2] / "results").iterdir() if folder.is_dir()}
+    assert {*made, "fig3"} == folders | {"image-claims"}  # claims make Figure 3 too
+    # Judged from what the others have stored.
+    assert made[-1] == "image-claims" and len(set(made)) == len(made)
+    assert [line.partition(":")[0] for line in capsys.readouterr().out.splitlines()] == made
