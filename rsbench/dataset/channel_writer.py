@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.channel_truth import Rays, pair_truth, surface_truth, target_of
+from rsbench.dataset.channel_truth import Rays, SeenSurfaces, pair_truth, surface_truth, target_of
 from rsbench.dataset.channels import (
     COMPONENTS,
     NORMAL_COMPONENTS,
@@ -42,16 +42,19 @@ def write_channels(
         depth: (H, W) of the frame, metres, 0 = no surface.
         rays: through its scene.
     """
+    if not set(names) & {*PAIR_CHANNELS, "normals", "instances"}:
+        return
+    seen = SeenSurfaces(geometry, shot, depth)
     for channel in PAIR_CHANNELS:
         if channel not in names:
             continue
-        truth = pair_truth(geometry, shot, target_of(channel, shot), depth, rays.blocked)
+        truth = pair_truth(seen, target_of(channel, shot), rays.blocked)
         values = pair_values(channel, shot, truth.offset)
         pixels = {name: values[..., k] for k, name in enumerate(COMPONENTS[channel])}
         write_exr(folder / value_file(channel, shot.side, shot.frame), pixels)
         write_png(folder / mask_file(channel, shot.side, shot.frame), truth.classes)
     if {"normals", "instances"} & set(names):
-        surfaces = surface_truth(geometry, shot, depth, rays)
+        surfaces = surface_truth(seen, rays)
         if "normals" in names:
             normals = {name: surfaces.normals[..., k] for k, name in enumerate(NORMAL_COMPONENTS)}
             write_exr(folder / surface_file("normals", shot.side, shot.frame), normals)

@@ -45,12 +45,14 @@ class SceneRays:
         import mitsuba as mi
 
         normals, instances = [], []
-        for ray, way in zip(_rays(eyes, points), [points - eyes] if _wide() else points - eyes, strict=True):
+        for ray in _rays(eyes, points):
             hit = self.scene.scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True)
-            normal = np.nan_to_num(np.array(hit.n, dtype=np.float32)).reshape(3, -1).T
-            away = np.sum(normal * way.reshape(-1, 3), axis=1, keepdims=True) > 0
-            normals.append(np.where(away, -normal, normal) + np.float32(0.0))  # no -0
-            instances.append(self._numbers(hit))
+            normal, way = (np.array(each, dtype=np.float32).reshape(3, -1) for each in (hit.n, ray.d))
+            normal *= np.where(np.sum(normal * way, axis=0) > 0, np.float32(-1.0), np.float32(1.0))
+            numbers = self._numbers(hit)
+            normal[:, numbers == 0] = 0.0
+            normals.append(normal.T + np.float32(0.0))  # no -0
+            instances.append(numbers)
         return Surfaces(np.concatenate(normals), np.concatenate(instances))
 
     def _numbers(self, hit: Any) -> NDArray[np.uint16]:
@@ -81,8 +83,11 @@ def _rays(eyes: FloatArray, points: FloatArray) -> list[Any]:
     """Rays whose parameter is 1 at the points: one array of all of them, or each alone."""
     import mitsuba as mi
 
-    origins, ways = eyes.astype(np.float32), (points - eyes).astype(np.float32)
+    origins, ways = np.zeros((2, 3, len(points)), dtype=np.float32)
+    for k in range(3):
+        origins[k] = eyes[:, k]
+        np.subtract(points[:, k], eyes[:, k], out=ways[k], casting="same_kind")
     ways[np.abs(ways) < LEAST_COMPONENT] = 0.0
     if _wide():
-        return [mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(ways.T))]
-    return [mi.Ray3f(o, d) for o, d in zip(origins.tolist(), ways.tolist(), strict=True)]
+        return [mi.Ray3f(mi.Point3f(origins), mi.Vector3f(ways))]
+    return [mi.Ray3f(o, d) for o, d in zip(origins.T.tolist(), ways.T.tolist(), strict=True)]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.channel_truth import Rays, pair_truth, target_of
+from rsbench.dataset.channel_truth import Rays, SeenSurfaces, pair_truth, target_of
 from rsbench.dataset.channel_writer import pair_values
 from rsbench.dataset.channels import PAIR_CHANNELS, STEP_PX, PairChannel, PixelClass, mask_file, value_file
 from rsbench.dataset.sequence import Sequence
@@ -104,7 +104,7 @@ def channels_again(
             classes = sequence.classes(channel, shot.side, shot.frame)[rows]
         except RsbenchError:  # told already
             continue
-        truth = pair_truth(sequence, shot, target_of(channel, shot), depth, rays.blocked, rows)
+        truth = pair_truth(SeenSurfaces(sequence, shot, depth, rows), target_of(channel, shot), rays.blocked)
         made = pair_values(channel, shot, truth.offset)
         far = np.any(~((np.abs(values - made) <= _SAME_PX) | (np.isnan(values) & np.isnan(made))), axis=-1)
         unlike = classes != truth.classes

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rsbench.core.projection import back_project
 from rsbench.core.rig import VIEWS
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.channel_truth import Rays, surface_truth
+from rsbench.dataset.channel_truth import Rays, SeenSurfaces, surface_truth
 from rsbench.dataset.channels import INSTANCE_TABLE, surface_file
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.shots import Shot
@@ -121,7 +121,7 @@ def surfaces_again(
 ) -> Iterator[tuple[str, str, bool]]:
     """As ``channel_checks.channels_again``, of normals and instances."""
     names = [name for name in ("normals", "instances") if shot.shutter == "rs" and name in sequence.channels]
-    truth = surface_truth(sequence, shot, depth, rays, rows) if names else None
+    truth = surface_truth(SeenSurfaces(sequence, shot, depth, rows), rays) if names else None
     for name in names:
         file = surface_file("normals" if name == "normals" else "instances", shot.side, shot.frame)
         if truth is None or file in told:

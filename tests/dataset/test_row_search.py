@@ -1,0 +1,119 @@
+"""The compiled search of rows against ``rs_project``, which brackets every crossing at exact poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.lens import Lens
+from rsbench.core.motion import AcceleratedMotion, LinearMotion, Motion, TwistMotion
+from rsbench.core.projection import ProjectionStatus, back_project, project_at, rs_project
+from rsbench.core.rig import StereoRig
+from rsbench.core.se3 import inverse
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.core.spline_motion import SplineMotion
+from rsbench.dataset.row_search import find
+from rsbench.dataset.shots import GivenGeometry, Shot
+from rsbench.errors import RsbenchError
+
+LENSES = (
+    None,
+    Lens(model="brown-conrady", k1=-0.2, k2=0.05, p1=0.001, p2=-0.002),
+    Lens(model="kannala-brandt", k1=-0.03, k2=0.01),
+)
+MODELS = (LinearMotion, TwistMotion, AcceleratedMotion, lambda w, d: SplineMotion(w, d, preset="drone", seed=3))
+NEAR_PX = 5e-6
+"""The residual at which the search stops, 1e-8 px, and where a spline ends between two rows, the table's error of
+1e-8 of a focal length, over a slope of the row equation above 0.2."""
+
+
+def _geometry(lens: Lens | None, motion: Motion, **scan: object) -> GivenGeometry:
+    camera = PinholeCamera(width=64, height=48, fx=60.0, fy=62.0, cx=30.0, cy=25.0, lens=lens)
+    shutter = RollingShutter(height=48, width=64, readout_ratio=0.9, **scan)  # type: ignore[arg-type]
+    return GivenGeometry(StereoRig(camera=camera, baseline=0.3), shutter, motion)
+
+
+def _points(geometry: GivenGeometry, source: Shot, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """What pixels (4, 64) of the source see at random depths, and the lines where the search starts."""
+    rows = np.sort(rng.choice(48, 4, replace=False))
+    grid = geometry.rig.camera.pixel_grid()[rows]
+    depth = np.where(rng.random((4, 64)) < 0.2, 1e7, np.exp(rng.uniform(-0.5, 3.0, (4, 64))))
+    return back_project(*geometry, source.side, source.frame, grid, depth), grid
+
+
+@settings(deadline=None, max_examples=15)
+@given(
+    lens=st.sampled_from(LENSES),
+    model=st.sampled_from(MODELS),
+    scan=st.sampled_from(("top", "bottom", "left", "right")),
+    right=st.sampled_from((None, "top", "right")),
+    delay=st.sampled_from((0.0, 0.2)),
+    target=st.sampled_from([Shot("rs", "right", 0), Shot("rs", "left", 1), Shot("rs", "right", 1)]),
+    speed=st.floats(0.0, 1.0),
+    seed=st.integers(0, 2**20),
+)
+def test_it_finds_the_pixels_that_bracketing_finds(
+    lens: Lens | None,
+    model: type[Motion],
+    scan: str,
+    right: str | None,
+    delay: float,
+    target: Shot,
+    speed: float,
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    w, d = speed * 0.15 * rng.standard_normal(3), speed * 0.4 * rng.standard_normal(3)
+    geometry = _geometry(lens, model(w, d), scan=scan, right_scan=right, right_delay=delay)
+    X, grid = _points(geometry, Shot("rs", "left", 0), rng)
+    landed = find(geometry, target, X, grid[..., geometry.shutter.axis(target.side)])
+    truth = rs_project(*geometry, target.side, target.frame, X)
+    once, never = truth.status == ProjectionStatus.SEEN, truth.status == ProjectionStatus.NEVER
+    assert not np.any(landed.unsolved)
+    np.testing.assert_allclose(landed.pixels[once], truth.pixels[once], rtol=0, atol=NEAR_PX)
+    assert np.all(np.isnan(landed.pixels[never]))
+    seen = np.isfinite(landed.pixels[..., 0])
+    assert np.all(seen[truth.status == ProjectionStatus.TWICE])
+    tau = geometry.shutter.pixel_time(landed.pixels[seen], target.frame, target.side)
+    exact = project_at(geometry.rig, geometry.motion, target.side, tau, X[seen])[:, :2]
+    np.testing.assert_allclose(landed.pixels[seen], exact, rtol=0, atol=NEAR_PX)
+    eyes = inverse(geometry.rig.cam_from_world(geometry.motion, tau, target.side)).t
+    np.testing.assert_allclose(landed.eyes[seen], eyes, rtol=0, atol=1e-9)
+
+
+def test_a_global_shutter_has_one_pose() -> None:
+    rng = np.random.default_rng(5)
+    geometry = _geometry(LENSES[1], TwistMotion([0.05, -0.1, 0.08], [0.2, -0.1, 0.3]))
+    X, grid = _points(geometry, Shot("rs", "left", 0), rng)
+    landed = find(geometry, Shot("gs", "left", 0, 24), X, grid[..., 1])
+    pixels = project_at(geometry.rig, geometry.motion, "left", 0.9 * 24 / 48, X)[..., :2]
+    inside = geometry.rig.camera.contains(pixels)
+    np.testing.assert_allclose(landed.pixels[inside], pixels[inside], rtol=0, atol=NEAR_PX)
+    assert np.all(np.isnan(landed.pixels[~inside])) and not np.any(landed.unsolved)
+
+
+def test_rows_alone_have_the_bits_that_they_have_among_others() -> None:
+    geometry = _geometry(None, LinearMotion([0.05, -0.1, 0.08], [0.2, -0.1, 0.3]))
+    X, grid = _points(geometry, Shot("rs", "left", 0), np.random.default_rng(6))
+    target = Shot("rs", "left", 1)
+    whole, some = find(geometry, target, X, grid[..., 1]), find(geometry, target, X[1:3], grid[1:3, :, 1])
+    np.testing.assert_array_equal(whole.pixels[1:3], some.pixels)
+
+
+class _Jump(LinearMotion):  # type: ignore[misc]  # final
+    """Stands somewhere else from half of the readout on."""
+
+    def body_from_world(self, tau):  # type: ignore[no-untyped-def]
+        pose = super().body_from_world(tau)
+        return pose._replace(t=pose.t + (np.asarray(tau)[..., None] > 0.4) * 0.1)
+
+
+def test_a_motion_that_jumps_is_refused() -> None:
+    geometry = _geometry(None, _Jump([0.0, 0.1, 0.0], [0.2, 0.0, 0.0]))
+    X, grid = np.full((1, 1, 3), 5.0), np.zeros((1, 1, 2))
+    with pytest.raises(RsbenchError, match="_Jump: jumps between the lines of rs/left_0"):
+        find(geometry, Shot("rs", "left", 0), X, grid[..., 1])
