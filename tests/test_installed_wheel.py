@@ -134,3 +134,9 @@ def test_the_notebook_runs(installed: Path, tmp_path: Path) -> None:
     script = tmp_path / "tour.py"
     script.write_text(f"{code}\n{_TRUTHS}", "utf-8")
     _run([sys.executable, "-W", "error", str(script)], tmp_path, installed)
+
+
+@pytest.mark.parametrize("solver", ["rs-stereo-linear", "gs-8pt"])
+def test_the_contract_holds(installed: Path, tmp_path: Path, solver: str) -> None:
+    answer = json.loads(_run(["rsbench", "check-solver", solver, "--json"], tmp_path, installed))
+    assert answer["passed"] is True

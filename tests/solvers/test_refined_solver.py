@@ -215,7 +215,7 @@ def normalised_square(estimate: MotionEstimate, motion: Motion, noise_px: float)
     return float(error @ np.linalg.solve(covariance, error))
 
 
-@pytest.mark.parametrize("noise_px", [0.1, 0.3, 1.0])
+@pytest.mark.parametrize("noise_px", [0.1, 1.0])
 @pytest.mark.parametrize("sets", ["pairs", "tracks"])
 def test_covariance_predicts_the_errors(sets: str, noise_px: float) -> None:
     """The mean of 300 normalised squared errors lies in the 99 % band of chi-squared with 6 degrees of freedom."""
