@@ -8,7 +8,9 @@ import re
 import runpy
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 import rsbench
 from rsbench.cli.docs import docs, list_documents
@@ -78,3 +80,15 @@ def test_a_mesh_becomes_a_dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     depth = sequence.depth("rs", "left", 0)
     assert depth[36:].min() > 0.0  # the ground, at least
     assert 3.5 < depth[20:40, 36:60].min() < 5.1  # the model, in the middle, 5 m away
+
+
+def test_a_dataset_becomes_one_picture(
+    smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    picture = tmp_path / "sheet.png"
+    monkeypatch.setattr("sys.argv", ["contact_sheet.py", str(smoke_dataset), str(picture)])
+    runpy.run_path(str(ROOT / "examples" / "contact_sheet.py"), run_name="__main__")
+    sheet = np.asarray(Image.open(picture))
+    for column, sequence in enumerate(rsbench.read_dataset(smoke_dataset)):
+        np.testing.assert_array_equal(sheet[:, 128 * column : 128 * (column + 1)], sequence.image("rs", "left", 0))
+    assert sheet.shape == (96, 3 * 128, 3) and not sheet[:, 2 * 128 :].any()
