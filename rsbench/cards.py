@@ -27,7 +27,16 @@ from rsbench.reading import CARD_BYTES, read_text
 
 T = TypeVar("T")
 CardKind = Literal[
-    "scenes", "renderers", "solvers", "datasets", "sweeps", "matchers", "features", "correctors", "metrics"
+    "scenes",
+    "renderers",
+    "solvers",
+    "datasets",
+    "sweeps",
+    "matchers",
+    "features",
+    "correctors",
+    "metrics",
+    "shutters",
 ]
 
 Extra = Literal["forbid", "ignore"]

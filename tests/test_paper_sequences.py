@@ -89,7 +89,7 @@ def shot(
     (sequence,) = card.only([str(request.param)]).sequence
     scene = built_scene(sequence.scene)
     rig = card.rig_of(sequence)
-    poses = row_poses(rig, card.shutter(), card.motion_of(sequence), "right", 1)
+    poses = row_poses(rig, card.shutter_for(sequence), card.motion_of(sequence), "right", 1)
     return MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint])), rig.camera, poses
 
 

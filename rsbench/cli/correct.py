@@ -28,7 +28,8 @@ EPILOG = """[bold]Examples[/bold]
 RIG.toml, for rectified images (pixels, metres; without readout_ratio it is estimated):
 
   baseline = 0.12
-  readout_ratio = 0.8        [dim]# readout time / frame period[/dim]
+  readout_ratio = 0.8        [dim]# readout time / frame period; or shutter = "gopro-hero6-4k30", of a real
+                             # camera's mode (rsbench list shutters)[/dim]
   \\[camera]
   fx = 812.3
   fy = 812.3

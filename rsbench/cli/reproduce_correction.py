@@ -143,7 +143,7 @@ def _render_right(card: str, name: str, timing: Timing, path: Path) -> None:
     options = load_card(RendererOptions, "renderers", dataset.renderer)
     start_backend()
     scene = load_scene(sequence.scene)
-    rig, shutter, motion = dataset.rig_of(sequence), dataset.shutter(), dataset.motion_of(sequence)
+    rig, shutter, motion = dataset.rig_of(sequence), dataset.shutter_for(sequence), dataset.motion_of(sequence)
     poses = right_row_poses(rig, shutter, motion, timing)
     seen = MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint]))
     frame = render(seen, rig.camera, poses.R, poses.t, options)

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from rsbench.cards import card_path, load_card
+from rsbench.cards import card_path, parse_card, read_toml
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.lens import Lens
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.dataset.channels import Channel, check_channels
+from rsbench.dataset.motion_card import MotionCard as MotionCard
 from rsbench.dataset.sequence import sequence_manifest
 from rsbench.dataset.trajectory import TrajectoryCard, pairs_along
 from rsbench.errors import RsbenchError
 from rsbench.imports import search
-from rsbench.motions import drawn_parameters, fixed_endpoint, make_motion
 from rsbench.reading import check_name, check_size
 from rsbench.renderers.electrons import Sensor
 from rsbench.scenes.model import Start
-
-Vector = tuple[float, float, float]
-Axis = Vector | str
+from rsbench.shutters import with_shutter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,82 +39,6 @@ class CameraCard:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionCard:
-    """Magnitudes and axes of one frame period's motion; the axes need not be unit vectors."""
-
-    model: str = "linear"
-    """Name of a motion model, or ``package.module:Class``."""
-    parameters: dict[str, Any] = field(default_factory=dict)
-    """Of the model; absent ones have its defaults, or are drawn for each sequence (a shake's seed)."""
-    rotation_deg: float | None = None
-    """Required, as the axis and the translation are, unless the parameters alone fix the motion."""
-    rotation_axis: Axis | None = None
-    """Or ``"random"``: drawn for each sequence from its seed and name when the card is loaded."""
-    translation: float | None = None
-    """Metres."""
-    translation_axis: Axis | None = None
-
-    def __post_init__(self) -> None:
-        names = ("rotation_deg", "rotation_axis", "translation", "translation_axis")
-        given = [name for name in names if getattr(self, name) is not None]
-        if fixed_endpoint(self.model, self.parameters) is not None:
-            if given:
-                raise ValueError(f"{given[0]}: the parameters of the model {self.model!r} fix the motion already")
-            self.motion()
-            return
-        for name in names:
-            if name not in given:
-                raise ValueError(f"{name!r} is required")
-        for name, length in (("rotation", self.rotation_deg), ("translation", self.translation)):
-            if length is not None and length < 0:
-                raise ValueError(f"{name} must not be negative, got {length}")
-            axis = getattr(self, f"{name}_axis")
-            if isinstance(axis, str) and axis != "random":
-                raise ValueError(f'{name}_axis = {axis!r}: must be three numbers or "random"')
-            if length and not isinstance(axis, str) and not np.any(axis):
-                raise ValueError(f"{name}_axis must not be zero when there is {name}")
-        make_motion(self.model, np.zeros(3), np.zeros(3), self.parameters)
-
-    def motion(self) -> Motion:
-        """The motion of the rig's body, radians and metres per frame period.
-
-        Raises ValueError when an axis was not drawn yet.
-        """
-        w, d = fixed_endpoint(self.model, self.parameters) or (
-            _scaled(self.rotation_axis, np.deg2rad(self.rotation_deg or 0.0)),
-            _scaled(self.translation_axis, self.translation or 0.0),
-        )
-        return make_motion(self.model, w, d, self.parameters)
-
-    def drawn(self, seed: int, name: str) -> MotionCard:
-        """With axes drawn, uniform on the sphere, the same whatever the lengths are; and random parameters."""
-        axes = {
-            field: _random_axis(f"{seed}/{name}/{field}")
-            for field in ("rotation_axis", "translation_axis")
-            if getattr(self, field) == "random"
-        }
-        parameters = drawn_parameters(self.model, self.parameters, _generator(f"{seed}/{name}/parameters"))
-        return replace(self, parameters=parameters, **axes)  # type: ignore[arg-type]
-
-
-def _generator(text: str) -> np.random.Generator:
-    return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little"))
-
-
-def _random_axis(text: str) -> Vector:
-    v = _generator(text).standard_normal(3)
-    x, y, z = (v / np.linalg.norm(v)).tolist()
-    return x, y, z
-
-
-def _scaled(axis: Axis | None, length: float) -> np.ndarray:
-    if axis is None or isinstance(axis, str):
-        raise ValueError('an axis is still "random"; load_dataset_card draws it')
-    v = np.asarray(axis, dtype=np.float64)
-    return v * (length / np.linalg.norm(v)) if length > 0 else np.zeros(3)
-
-
-@dataclass(frozen=True, kw_only=True)
 class SequenceCard:
     """One scene seen from one viewpoint under one motion."""
 
@@ -130,6 +50,12 @@ class SequenceCard:
     """Replaces the dataset's motion."""
     baseline: float | None = None
     """Replaces the dataset's baseline, metres."""
+    readout_ratio: float | None = None
+    """Replaces the dataset's readout ratio, as the next two do."""
+    frame_period_s: float | None = None
+    sensor: Sensor | None = None
+    scale: float = 1.0
+    """Baseline and translation are multiplied by it: for what is larger or nearer than other scenes."""
     seed: int | None = None
     """Replaces the dataset's seed."""
     start: Start | None = None
@@ -137,6 +63,25 @@ class SequenceCard:
 
     def __post_init__(self) -> None:
         check_name(self.name)
+        if not self.scale > 0.0:
+            raise ValueError(f"scale = {self.scale}: must be positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variation:
+    """What one value of an axis of a grid sets in every sequence; what is left out stays."""
+
+    motion: MotionCard | None = None
+    viewpoint: str | None = None
+    baseline: float | None = None
+    readout_ratio: float | None = None
+    frame_period_s: float | None = None
+    sensor: Sensor | None = None
+
+    def of(self, sequence: SequenceCard) -> SequenceCard:
+        """A sequence with it."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(sequence, **{name: value for name, value in values.items() if value is not None})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,19 +108,15 @@ class DatasetCard(Scanning):
     seed: int = 0
     seeds: tuple[int, ...] = ()
     """When given, every sequence is made once per seed under the name NAME-SEED; random axes change with it."""
+    grid: dict[str, dict[str, Variation]] = field(default_factory=dict)
+    """Axes of named values: every sequence is made once per combination, under the name NAME-VALUE-VALUE."""
     sequence: tuple[SequenceCard, ...] = field(default=())
 
     def __post_init__(self) -> None:
         check_size("camera", (self.camera.width, self.camera.height))
-        self.shutter()
         for sequence in self.sequence:
             self.rig_of(sequence)
-        if not self.frame_period_s > 0:
-            raise ValueError(f"frame_period_s must be positive, got {self.frame_period_s}")
-        if self.sensor is not None and self.sensor.exposure_s > self.frame_period_s:
-            raise ValueError(
-                f"sensor exposure_s = {self.sensor.exposure_s}: longer than frame_period_s = {self.frame_period_s}"
-            )
+            self._check_times(sequence)
         if len(set(self.channels)) < len(self.channels):
             raise ValueError(f"channels = {list(self.channels)}: must differ from each other")
         check_channels(self.channels, self.camera.lens is not None, self.plain)
@@ -191,6 +132,14 @@ class DatasetCard(Scanning):
             if count > 1:
                 raise ValueError(f"two sequences are named {name!r}")
 
+    def _check_times(self, sequence: SequenceCard) -> None:
+        self.shutter_for(sequence)
+        period, sensor = self.period_of(sequence), self.sensor_of(sequence)
+        if not period > 0:
+            raise ValueError(f"frame_period_s must be positive, got {period}")
+        if sensor is not None and sensor.exposure_s > period:
+            raise ValueError(f"sensor exposure_s = {sensor.exposure_s}: longer than frame_period_s = {period}")
+
     def _check_motions(self) -> None:
         own = [sequence.name for sequence in self.sequence if sequence.motion is not None]
         if self.trajectory is not None and (self.motion is not None or own):
@@ -204,8 +153,16 @@ class DatasetCard(Scanning):
         baseline = self.baseline if sequence.baseline is None else sequence.baseline
         return StereoRig(camera=camera, baseline=baseline)
 
-    def shutter(self) -> RollingShutter:
-        return self.shutter_of(self.camera.width, self.camera.height, self.readout_ratio)
+    def shutter_for(self, sequence: SequenceCard) -> RollingShutter:
+        ratio = self.readout_ratio if sequence.readout_ratio is None else sequence.readout_ratio
+        return self.shutter_of(self.camera.width, self.camera.height, ratio)
+
+    def period_of(self, sequence: SequenceCard) -> float:
+        """Seconds of a frame period."""
+        return self.frame_period_s if sequence.frame_period_s is None else sequence.frame_period_s
+
+    def sensor_of(self, sequence: SequenceCard) -> Sensor | None:
+        return self.sensor if sequence.sensor is None else sequence.sensor
 
     def motion_of(self, sequence: SequenceCard) -> Motion:
         return self._motion_card(sequence).motion()
@@ -224,11 +181,12 @@ class DatasetCard(Scanning):
         manifest = sequence_manifest(
             name=sequence.name,
             rig=self.rig_of(sequence),
-            shutter=self.shutter(),
+            shutter=self.shutter_for(sequence),
             motion=self.motion_of(sequence),
-            frame_period_s=self.frame_period_s,
+            frame_period_s=self.period_of(sequence),
         )
-        sensor = {} if self.sensor is None else {"sensor": asdict(self.sensor)}
+        own = self.sensor_of(sequence)
+        sensor = {} if own is None else {"sensor": asdict(own)}
         channels = {"channels": list(self.channels)} if self.channels else {}
         return {**manifest, **sensor, **channels}
 
@@ -284,34 +242,55 @@ class DatasetCard(Scanning):
         Raises:
             RsbenchError: the file of a trajectory is wrong.
         """
-        sequences = self.sequence
-        if self.seeds:
-            sequences = tuple(
-                replace(sequence, name=f"{sequence.name}-{seed}", seed=seed)
-                for sequence in self.sequence
-                for seed in self.seeds
-            )
-        if self.trajectory is None:
-            return replace(self, sequence=tuple(map(self._drawn, sequences)), seeds=())
-        pairs = pairs_along(self.trajectory, folder, self.frame_period_s, self._span)
-        motions = [MotionCard(model="trajectory", parameters={"poses": pair.poses.tolist()}) for pair in pairs]
-        followed = tuple(
-            replace(sequence, name=f"{sequence.name}-{number:04d}", motion=motion, start=pair.start)
-            for sequence in sequences
-            for number, (pair, motion) in enumerate(zip(pairs, motions, strict=True))
-        )
-        return replace(self, sequence=followed, trajectory=None, seeds=())
+        seeds: tuple[int | None, ...] = self.seeds or (None,)
+        made = [each for sequence in self.sequence for seed in seeds for each in self._variants(sequence, seed)]
+        if self.trajectory is not None:
+            made = [each for sequence in made for each in self._followed(sequence, self.trajectory, folder)]
+        return replace(self, sequence=tuple(made), grid={}, trajectory=None, seeds=())
 
-    @property
-    def _span(self) -> tuple[float, float]:
-        """From when to when something is exposed, frame periods."""
-        half = 0.0 if self.sensor is None else 0.5 * self.sensor.exposure_s / self.frame_period_s
-        return min(0.0, self.right_delay) - half, 1.0 + self.readout_ratio + max(0.0, self.right_delay) + half
+    def _variants(self, sequence: SequenceCard, seed: int | None) -> list[SequenceCard]:
+        """One sequence for each combination of the grid; the axes that are drawn are the same in all of them."""
+        own = sequence if seed is None else replace(sequence, seed=seed)
+        ending = () if seed is None else (str(seed),)
+        drawn_as, made = "-".join((sequence.name, *ending)), []
+        for values in product(*(axis.items() for axis in self.grid.values())):
+            varied = replace(own, name="-".join((sequence.name, *(label for label, _ in values), *ending)))
+            for _, variation in values:
+                varied = variation.of(varied)
+            made.append(self._scaled(self._drawn(varied, drawn_as)))
+        return made
 
-    def _drawn(self, sequence: SequenceCard) -> SequenceCard:
+    def _drawn(self, sequence: SequenceCard, name: str) -> SequenceCard:
+        if self.trajectory is not None:
+            return sequence
         motion = self._motion_card(sequence)
-        drawn = motion.drawn(self.seed_of(sequence), sequence.name)
+        drawn = motion.drawn(self.seed_of(sequence), name)
         return sequence if drawn == motion else replace(sequence, motion=drawn)
+
+    def _scaled(self, sequence: SequenceCard) -> SequenceCard:
+        if sequence.scale == 1.0:
+            return sequence
+        motion = None if self.trajectory is not None else self._motion_card(sequence)
+        if motion is not None and motion.translation is not None:
+            motion = replace(motion, translation=motion.translation * sequence.scale)
+        baseline = self.rig_of(sequence).baseline * sequence.scale
+        return replace(sequence, motion=motion, baseline=baseline, scale=1.0)
+
+    def _followed(self, sequence: SequenceCard, card: TrajectoryCard, folder: Path) -> list[SequenceCard]:
+        """One sequence for each pair of frames on a trajectory."""
+        period, sensor, shutter = self.period_of(sequence), self.sensor_of(sequence), self.shutter_for(sequence)
+        half = 0.0 if sensor is None else 0.5 * sensor.exposure_s / period
+        late = shutter.right_delay
+        span = min(0.0, late) - half, 1.0 + shutter.readout_ratio + max(0.0, late) + half
+        return [
+            replace(
+                sequence,
+                name=f"{sequence.name}-{number:04d}",
+                motion=MotionCard(model="trajectory", parameters={"poses": pair.poses.tolist()}),
+                start=pair.start,
+            )
+            for number, pair in enumerate(pairs_along(card, folder, period, span))
+        ]
 
 
 def load_dataset_card(name_or_path: str, trajectory: Path | None = None) -> DatasetCard:
@@ -322,5 +301,25 @@ def load_dataset_card(name_or_path: str, trajectory: Path | None = None) -> Data
     """
     path = card_path("datasets", name_or_path)
     search(path)
-    card = load_card(DatasetCard, "datasets", name_or_path)
-    return (card if trajectory is None else card.along(trajectory)).expanded(path.parent)
+    card = parse_card(DatasetCard, _with_shutters(read_toml(path), str(path)), str(path))
+    try:
+        return (card if trajectory is None else card.along(trajectory)).expanded(path.parent)
+    except ValueError as error:
+        raise RsbenchError(f"{path}: {error}") from error
+
+
+def _with_shutters(card: dict[str, Any], where: str) -> dict[str, Any]:
+    """The content of a card in which every ``shutter`` is replaced by what it means; what is wrong stays so."""
+
+    def meant(value: Any) -> Any:
+        return with_shutter(value, where) if isinstance(value, dict) else value
+
+    def values(axis: Any) -> Any:
+        return {key: meant(value) for key, value in axis.items()} if isinstance(axis, dict) else axis
+
+    card = with_shutter(card, where)
+    if isinstance(sequences := card.get("sequence"), list):
+        card["sequence"] = [meant(sequence) for sequence in sequences]
+    if isinstance(grid := card.get("grid"), dict):
+        card["grid"] = {name: values(axis) for name, axis in grid.items()}
+    return card

@@ -283,7 +283,9 @@ def _render_sequence(
 
     backend = start_backend()
     mitsuba_scene = MitsubaScene(seen_scene(built.scene, sequence))
-    if words := obstacle(mitsuba_scene, card.rig_of(sequence), card.shutter(), card.motion_of(sequence)):
+    if words := obstacle(
+        mitsuba_scene, card.rig_of(sequence), card.shutter_for(sequence), card.motion_of(sequence)
+    ):
         raise RsbenchError(f"sequence {sequence.name}: {words}; choose another motion, viewpoint or baseline")
     partial = out / HIDDEN / WORK / sequence.name
     remove(partial)  # of a worker that was killed
@@ -292,7 +294,7 @@ def _render_sequence(
     for side, frame in product(SIDES, FRAMES):
         yield from render_camera(card, sequence, options, mitsuba_scene, side, frame, partial)
     if "timing" in card.channels:
-        write_timing(partial, card.shutter(), card.frame_period_s, card.sensor)
+        write_timing(partial, card.shutter_for(sequence), card.period_of(sequence), card.sensor_of(sequence))
     if "instances" in card.channels:
         write_json(partial / INSTANCE_TABLE, {"instances": mitsuba_scene.instances})
     files = {name: sha256(partial / name) for name in files_below(partial)}
@@ -330,7 +332,7 @@ def render_camera(
     from rsbench.renderers.segments import SceneRays
     from rsbench.renderers.sensed import sensed_rows
 
-    rig, shutter = card.rig_of(sequence), card.shutter()
+    rig, shutter, sensor = card.rig_of(sequence), card.shutter_for(sequence), card.sensor_of(sequence)
     options = replace(options, seed=image_seed(card.seed_of(sequence), sequence.name, side, frame))
     poses = row_poses(rig, shutter, card.motion_of(sequence), side, frame)
     write_poses(folder / "poses" / f"{side}_{frame}.csv", shutter.line_times(frame, side), poses)
@@ -347,12 +349,12 @@ def render_camera(
                 f"sequence {sequence.name}: {side}_{frame} shows no surface at all: change the viewpoint "
                 f"{sequence.viewpoint!r} of scene {sequence.scene}, or the motion"
             )
-        place = "rs_clean" if kind == "rs" and card.sensor else kind
+        place = "rs_clean" if kind == "rs" and sensor else kind
         write_png(folder / place / f"{side}_{frame}.png", to_srgb8(rendered.image, options.exposure))
         write_depth(folder / f"{kind}_depth" / f"{side}_{frame}.exr", rendered.depth)
-        if kind == "rs" and card.sensor:
-            period, motion = card.frame_period_s, card.motion_of(sequence)
-            seen = sensed_rows(scene, rig, shutter, motion, card.sensor, period, side, frame, options)
+        if kind == "rs" and sensor:
+            period, motion = card.period_of(sequence), card.motion_of(sequence)
+            seen = sensed_rows(scene, rig, shutter, motion, sensor, period, side, frame, options)
             write_png(folder / "rs" / f"{side}_{frame}.png", to_srgb8(seen, 1.0))
         if kind == "rs":
             geometry, shot = GivenGeometry(rig, shutter, card.motion_of(sequence)), Shot("rs", side, frame)

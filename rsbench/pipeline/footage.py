@@ -20,6 +20,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig, View
 from rsbench.errors import RsbenchError
 from rsbench.reading import check_image_size, check_size, read_bytes
+from rsbench.shutters import with_shutter
 
 _SMALLEST = 32
 """Pixels of the shorter side; below that there is nothing to match."""
@@ -69,12 +70,15 @@ class RigCard:
 
 
 def read_rig_card(path: Path) -> RigCard:
-    """Rig card: ``baseline``, ``readout_ratio`` and a table ``[camera]`` with fx, fy, cx, cy.
+    """Rig card: ``baseline``, ``readout_ratio`` or ``shutter``, and a table ``[camera]`` with fx, fy, cx, cy.
 
     Raises:
         RsbenchError: one line with the file, the field, the value and what is allowed.
     """
-    return parse_card(RigCard, read_toml(path), str(path))
+    table = read_toml(path)
+    if "shutter" in table:
+        table = {key: value for key, value in with_shutter(table, str(path)).items() if key != "frame_period_s"}
+    return parse_card(RigCard, table, str(path))
 
 
 def read_frame(path: Path) -> NDArray[Any]:

@@ -66,7 +66,7 @@ def test_verify_finds_them_sound(made: dict[str, Path], name: str) -> None:
     assert report.faults == ()
     sequence = read_sequence(made[name] / "room-twist")
     card = _card(name)
-    assert sequence.rig == card.rig_of(card.sequence[0]) and sequence.shutter == card.shutter()
+    assert sequence.rig == card.rig_of(card.sequence[0]) and sequence.shutter == card.shutter_for(card.sequence[0])
 
 
 @pytest.mark.parametrize("name", CARDS)

@@ -91,7 +91,10 @@ def test_motion_keeps_its_random_axes_while_magnitudes_change() -> None:
         ({"setting": {**SETTING, "readout_ratio": 1.2}}, ["readout_ratio must lie in [0, 1]"]),
         ({"setting": {**SETTING, "noise_px": -1.0}}, ["noise_px must not be negative"]),
         ({"setting": {**SETTING, "outlier_ratio": 1.0}}, ["outlier_ratio must lie in [0, 1)"]),
-        ({"setting": {**SETTING, "motion_model": "spiral"}}, ["motion model 'spiral'", "linear, spline, twist"]),
+        (
+            {"setting": {**SETTING, "motion_model": "spiral"}},
+            ["motion model 'spiral'", "linear, spline, trajectory, twist"],
+        ),
         ({"setting": {**SETTING, "rotation_axis": [0.0, 0.0, 0.0]}}, ["rotation_axis must not be zero"]),
         ({"setting": {**SETTING, "baseline": 0.0}}, ["baseline must be a positive number"]),
         ({"variant": [{"name": "a"}, {"name": "a"}]}, ["[[variant]] needs a name of its own"]),
