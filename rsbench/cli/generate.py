@@ -49,7 +49,10 @@ _FullFrames = Annotated[
 ]
 _Channels = Annotated[
     str | None,
-    typer.Option(help="Channels of truth in place of the card's, with commas between; or all; or none."),
+    typer.Option(
+        help="Channels of truth in place of the card's, with commas between: disparity, flow, gs_flow, timing, "
+        "normals, instances, imu; or all; or none."
+    ),
 ]
 _Trajectory = Annotated[
     Path | None,

@@ -115,9 +115,15 @@ class SplineMotion(Motion):
         return self._spline.at(tau)[0]
 
     def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        (_, t), twist = self._spline.at(tau)
+        (_, t), twist, _ = self._spline.at(tau)
         w = twist[..., :3]
         return w, np.cross(w, t) + twist[..., 3:]
+
+    def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        (_, t), twist, change = self._spline.at(tau)
+        w, speed = twist[..., :3], np.cross(twist[..., :3], t) + twist[..., 3:]
+        turn = change[..., :3]
+        return turn, np.cross(turn, t) + np.cross(w, speed) + change[..., 3:]
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -148,20 +154,25 @@ class _Spline:
         later, earlier = Pose(control.R[1:], control.t[1:]), Pose(control.R[:-1], control.t[:-1])
         self.steps = se3.log(compose(later, inverse(earlier)))
 
-    def at(self, tau: ArrayLike) -> tuple[Pose, FloatArray]:
-        """Pose and spatial twist (..., 6) at times (...): dP/dtau = [twist] P."""
+    def at(self, tau: ArrayLike) -> tuple[Pose, FloatArray, FloatArray]:
+        """Pose, spatial twist (..., 6) and its derivative (..., 6) at times (...): dP/dtau = [twist] P."""
         tau = np.asarray(tau, dtype=np.float64)
         i, u = _place(tau, self.interval, len(self.steps) + 1)
         b = _cumulative(u)
         rate = (0.5 + u * (0.5 * u - 1), 0.5 + u * (1 - u), 0.5 * u * u)
-        pose, twist = Pose(self.control.R[i], self.control.t[i]), np.zeros((*tau.shape, 6))
+        rate_change = (u - 1, 1 - 2 * u, u)
+        pose, twist, change = Pose(self.control.R[i], self.control.t[i]), *np.zeros((2, *tau.shape, 6))
         for j in range(3):
             step = self.steps[i + j]
-            factor = se3.exp(b[j][..., None] * step)
-            pose = compose(factor, pose)
-            twist = se3.adjoint_apply(factor, twist) + (rate[j] / self.interval)[..., None] * step
+            factor, moved = se3.exp(b[j][..., None] * step), (rate[j] / self.interval)[..., None] * step
+            pose, twist = compose(factor, pose), se3.adjoint_apply(factor, twist)
+            change = se3.adjoint_apply(factor, change) + se3.bracket(moved, twist)
+            change = change + (rate_change[j] / self.interval**2)[..., None] * step
+            twist = twist + moved
         beyond = tau - (i + u) * self.interval
-        return compose(se3.exp(np.where(u % 1.0 == 0.0, beyond, 0.0)[..., None] * twist), pose), twist
+        inside = (tau >= 0.0) & (tau <= (len(self.steps) - 2) * self.interval)
+        going_on = compose(se3.exp(np.where(u % 1.0 == 0.0, beyond, 0.0)[..., None] * twist), pose)
+        return going_on, twist, np.where(inside[..., None], change, 0.0)
 
     def from_start(self, tau: float) -> Pose:
         """Pose at a time from that at time 0."""

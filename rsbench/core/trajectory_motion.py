@@ -67,10 +67,17 @@ class TrajectoryMotion(Motion):
         return compose(inverse(self._path.at(tau).world_from_body), self._start)
 
     def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        place, turn, speed = self._path.at(tau)
+        place, turn, speed, *_ = self._path.at(tau)
         body = inverse(place)
         t = compose(body, self._start).t
         return -turn, -np.cross(turn, t) - (body.R @ speed[..., None])[..., 0]
+
+    def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        place, turn, speed, turn_change, speed_change = self._path.at(tau)
+        body = inverse(place)
+        t, (_, t_rate) = compose(body, self._start).t, self.velocity(tau)
+        v, v_change = ((body.R @ each[..., None])[..., 0] for each in (speed, speed_change))
+        return -turn_change, np.cross(turn, v) - v_change - np.cross(turn_change, t) - np.cross(turn, t_rate)
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -93,6 +100,10 @@ class Moving(NamedTuple):
     """(..., 3) rotation rate in the body's own axes, rad per unit of time."""
     speed: FloatArray
     """(..., 3) in the axes of the world, metres per unit of time."""
+    turn_change: FloatArray
+    """(..., 3) derivative of ``turn``."""
+    speed_change: FloatArray
+    """(..., 3) derivative of ``speed``."""
 
 
 class _Path(NamedTuple):
@@ -115,14 +126,19 @@ class _Path(NamedTuple):
         tau = np.asarray(tau, dtype=np.float64)
         within = np.clip(tau, self.first, self.last)
         beyond = (tau - within)[..., None]
-        place, rate = self.spline(within), self.spline(within, 1)
+        still = (beyond == 0.0).astype(np.float64)
+        place, rate, change = self.spline(within), self.spline(within, 1), still * self.spline(within, 2)
         x, y, z, w = np.moveaxis(place[..., 3:], -1, 0)
         v, dv, dw = place[..., 3:6], rate[..., 3:6], rate[..., 6:]
         square = np.sum(place[..., 3:] ** 2, axis=-1, keepdims=True)
         # 2 q* q' of a quaternion q, whose length has no part in it.
         turn = 2.0 * (w[..., None] * dv - dw * v - np.cross(v, dv)) / square
+        ddv, ddw = change[..., 3:6], change[..., 6:]
+        growth = 2.0 * np.sum(place[..., 3:] * rate[..., 3:], axis=-1, keepdims=True) / square
+        turn_change = 2.0 * (w[..., None] * ddv - ddw * v - np.cross(v, ddv)) / square - still * growth * turn
         R = so3.from_quaternion(np.stack([w, x, y, z], axis=-1)) @ so3.exp(beyond * turn)
-        return Moving(Pose(R, place[..., :3] + beyond * rate[..., :3]), turn, rate[..., :3])
+        moved = Pose(R, place[..., :3] + beyond * rate[..., :3])
+        return Moving(moved, turn, rate[..., :3], turn_change, change[..., :3])
 
 
 def world_from_body(poses: ArrayLike, tau: ArrayLike) -> Pose:

@@ -15,6 +15,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.dataset.channels import Channel, check_channels
+from rsbench.dataset.imu import Imu
 from rsbench.dataset.motion_card import MotionCard as MotionCard
 from rsbench.dataset.sequence import sequence_manifest
 from rsbench.dataset.trajectory import TrajectoryCard, pairs_along
@@ -105,6 +106,8 @@ class DatasetCard(Scanning):
     """Exposure and noise of the rolling-shutter frames; absent, an ideal sensor's."""
     channels: tuple[Channel, ...] = ()
     """Of ground truth, beside images, depth and poses."""
+    imu: Imu | None = None
+    """The sensor of the channel ``imu``; absent, one with the defaults."""
     seed: int = 0
     seeds: tuple[int, ...] = ()
     """When given, every sequence is made once per seed under the name NAME-SEED; random axes change with it."""
@@ -188,7 +191,8 @@ class DatasetCard(Scanning):
         own = self.sensor_of(sequence)
         sensor = {} if own is None else {"sensor": asdict(own)}
         channels = {"channels": list(self.channels)} if self.channels else {}
-        return {**manifest, **sensor, **channels}
+        imu = {"imu": asdict(self.imu or Imu())} if "imu" in self.channels else {}
+        return {**manifest, **sensor, **channels, **imu}
 
     def only(self, names: list[str]) -> DatasetCard:
         """The same card with some of its sequences.

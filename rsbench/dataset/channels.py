@@ -7,13 +7,15 @@ from enum import IntEnum
 from typing import Literal, get_args
 
 from rsbench.core.rig import VIEWS
+from rsbench.dataset.imu import IMU_FILES
 from rsbench.dataset.timing import TIMING_FILES
 from rsbench.errors import RsbenchError
 
 PairChannel = Literal["disparity", "flow", "gs_flow"]
 """Where each pixel of a rolling-shutter frame lies in another picture: of the other camera at the same time
 (disparity), of the same camera at the other time (flow), and of its global-shutter twin (gs_flow)."""
-Channel = Literal["disparity", "flow", "gs_flow", "timing", "normals", "instances"]
+Channel = Literal["disparity", "flow", "gs_flow", "timing", "normals", "instances", "imu"]
+OF_ANY_CAMERA: tuple[Channel, ...] = ("timing", "imu")
 INSTANCE_TABLE = "instances.json"
 PAIR_CHANNELS: tuple[PairChannel, ...] = get_args(PairChannel)
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
@@ -48,7 +50,7 @@ def check_channels(names: Collection[str], lens: bool, plain: bool) -> None:
         ValueError: one line with the channel.
     """
     for name in CHANNELS:
-        if name in names and name != "timing" and not plain:
+        if name in names and name not in OF_ANY_CAMERA and not plain:
             raise ValueError(
                 f"channels: {name!r} is made of cameras that read rows from the top at once, and no other"
             )
@@ -82,7 +84,8 @@ def channel_files(names: Iterable[str]) -> tuple[str, ...]:
     timing = TIMING_FILES if "timing" in given else ()
     normals = (surface_file("normals", *view) for view in VIEWS if "normals" in given)
     instances = (INSTANCE_TABLE, *(surface_file("instances", *view) for view in VIEWS))
-    return (*pairs, *timing, *normals, *(instances if "instances" in given else ()))
+    imu = IMU_FILES if "imu" in given else ()
+    return (*pairs, *timing, *normals, *(instances if "instances" in given else ()), *imu)
 
 
 def named_channels(text: str) -> tuple[Channel, ...]:

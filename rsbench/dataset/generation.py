@@ -27,6 +27,7 @@ from rsbench.dataset.channel_writer import write_channels
 from rsbench.dataset.channels import INSTANCE_TABLE
 from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_png, write_poses
 from rsbench.dataset.hashes import HASHES, FileHashes
+from rsbench.dataset.imu import Imu, draw_samples, gravity_of, sample_times_ns, write_imu
 from rsbench.dataset.manifest import Files, write_manifest
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence import FRAMES, files_of, is_of_sequence
@@ -180,7 +181,7 @@ def _complete(
             f"{folder}: holds no sequence.json, so rsbench did not make it; move it away or choose another --out"
         )
     manifest = read_json(folder / "sequence.json")
-    expected = {"sensor": None, "channels": None} | _of_scene(plan, scene_hashes.of(sequence.scene))
+    expected = {"sensor": None, "channels": None, "imu": None} | _of_scene(plan, scene_hashes.of(sequence.scene))
     other = [key for key, value in expected.items() if manifest.get(key) != value]
     if other:
         raise RsbenchError(
@@ -295,6 +296,8 @@ def _render_sequence(
         yield from render_camera(card, sequence, options, mitsuba_scene, side, frame, partial)
     if "timing" in card.channels:
         write_timing(partial, card.shutter_for(sequence), card.period_of(sequence), card.sensor_of(sequence))
+    if "imu" in card.channels:
+        _write_imu(card, sequence, plan, partial)
     if "instances" in card.channels:
         write_json(partial / INSTANCE_TABLE, {"instances": mitsuba_scene.instances})
     files = {name: sha256(partial / name) for name in files_below(partial)}
@@ -312,6 +315,15 @@ def _render_sequence(
         os.rename(place, partial.with_name(f"{sequence.name}.old"))
     os.rename(partial, place)
     yield
+
+
+def _write_imu(card: DatasetCard, sequence: SequenceCard, plan: Plan, folder: Path) -> None:
+    imu, gravity = card.imu or Imu(), gravity_of(plan["scene"])
+    period = card.period_of(sequence)
+    times = sample_times_ns(imu, card.shutter_for(sequence), period, card.sensor_of(sequence))
+    seed = f"{card.seed_of(sequence)}/{sequence.name}"
+    samples = draw_samples(imu, card.motion_of(sequence), times, period, gravity, seed)
+    write_imu(folder, imu, gravity, samples)
 
 
 def render_camera(

@@ -20,21 +20,10 @@ from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.channels import (
-    CHANNELS,
-    COMPONENTS,
-    INSTANCE_TABLE,
-    NORMAL_COMPONENTS,
-    PairChannel,
-    PixelClass,
-    channel_files,
-    check_channels,
-    mask_file,
-    surface_file,
-    value_file,
-)
-from rsbench.dataset.files import read_depth, read_exr, read_grey_png, read_json, read_png, read_poses
-from rsbench.dataset.timing import MANIFEST, read_timing_table, table_file
+from rsbench.dataset.channel_reader import ChannelReader
+from rsbench.dataset.channels import CHANNELS, channel_files, check_channels
+from rsbench.dataset.files import read_depth, read_json, read_png, read_poses
+from rsbench.dataset.imu import Imu
 from rsbench.errors import RsbenchError
 from rsbench.motions import motion_record, read_motion
 from rsbench.reading import check_name, check_size, inside
@@ -140,6 +129,7 @@ class SequenceManifest(Scanning):
     row_time_s: float
     motion: MotionManifest
     sensor: Sensor | None = None
+    imu: Imu | None = None
     channels: tuple[str, ...] = ()
     files: dict[str, str] = field(default_factory=dict)
     """sha256 by the path below the sequence's folder."""
@@ -187,7 +177,7 @@ class DatasetManifest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sequence:
+class Sequence(ChannelReader):
     """A sequence folder of format 1; frames 0 and 1, sides left and right."""
 
     folder: Path
@@ -198,6 +188,8 @@ class Sequence:
     frame_period_s: float
     sensor: Sensor | None = None
     """Of the rolling-shutter frames; None: an ideal one's."""
+    imu: Imu | None = None
+    """Of the channel ``imu``."""
     channels: tuple[str, ...] = ()
     """Names of those that it has beside images, depth and poses; later versions know more."""
     manifest: dict[str, Any]
@@ -238,74 +230,6 @@ class Sequence:
         if len(tau) != (lines := self.shutter.lines(side)):
             raise RsbenchError(f"{path}: has {len(tau)} rows, the camera has {lines}")
         return tau, poses
-
-    def offsets(self, channel: PairChannel, side: Side, frame: int) -> NDArray[np.float32]:
-        """(H, W, components) px of the pixels of a rolling-shutter frame: see ``channels.PairChannel``.
-
-        Raises:
-            RsbenchError: the sequence does not have this channel, or the file cannot be read.
-        """
-        self._check_channel(channel)
-        return read_exr(inside(self.folder, value_file(channel, side, frame)), COMPONENTS[channel], self._size)
-
-    def classes(self, channel: PairChannel, side: Side, frame: int) -> NDArray[np.uint8]:
-        """(H, W) of ``channels.PixelClass``: what became of each pixel in the picture that the channel looks at.
-
-        Raises:
-            RsbenchError: as ``offsets``.
-        """
-        self._check_channel(channel)
-        path = inside(self.folder, mask_file(channel, side, frame))
-        classes = read_grey_png(path, self._size)
-        if np.any(classes > max(PixelClass)):
-            raise RsbenchError(f"{path}: holds {np.max(classes)}: the classes are 0 to {max(PixelClass)}")
-        return classes
-
-    def normals(self, side: Side, frame: int) -> NDArray[np.float32]:
-        """(H, W, 3) unit normals of what the pixels see, towards the camera, world frame; 0 where that is nothing.
-
-        RsbenchError as of ``offsets``.
-        """
-        self._check_channel("normals")
-        path = inside(self.folder, surface_file("normals", side, frame))
-        return read_exr(path, NORMAL_COMPONENTS, self._size)
-
-    def instances(self, side: Side, frame: int) -> NDArray[np.uint16]:
-        """(H, W) numbers of the meshes that the pixels see; 0 = none. RsbenchError as of ``offsets``."""
-        self._check_channel("instances")
-        return read_grey_png(inside(self.folder, surface_file("instances", side, frame)), self._size, 16)
-
-    def instance_table(self) -> list[dict[str, str]]:
-        """``name`` and ``material`` of instance 1, 2, ...; RsbenchError as of ``offsets``, or another content."""
-        self._check_channel("instances")
-        path = inside(self.folder, INSTANCE_TABLE)
-        table = read_json(path).get("instances")
-        rows: list[Any] = table if isinstance(table, list) else [None]
-        for row in rows:
-            if not isinstance(row, dict) or not all(isinstance(row.get(key), str) for key in ("name", "material")):
-                raise RsbenchError(f"{path}: instances: must be a list of tables with name and material")
-        return rows
-
-    def timing(self) -> dict[str, Any]:
-        """Content of timing.json; RsbenchError as of ``offsets``."""
-        self._check_channel("timing")
-        return read_json(inside(self.folder, MANIFEST))
-
-    def row_times_ns(self, side: Side, frame: int) -> NDArray[np.int64]:
-        """(H, 4) of each row: number, time, start and end of its exposure; RsbenchError likewise."""
-        self._check_channel("timing")
-        return read_timing_table(inside(self.folder, table_file(side, frame)), self.shutter.lines(side))
-
-    def _check_channel(self, channel: str) -> None:
-        if channel not in self.channels:
-            has = ", ".join(self.channels) or "none"
-            raise RsbenchError(
-                f"{self.folder}: has no channel {channel!r} ({has}); make it with: generate --channels {channel}"
-            )
-
-    @property
-    def _size(self) -> tuple[int, int]:
-        return self.rig.camera.width, self.rig.camera.height
 
 
 def sequence_manifest(
@@ -351,6 +275,7 @@ def read_sequence(folder: Path) -> Sequence:
             motion=read_motion(content["motion"]),
             frame_period_s=manifest.frame_period_s,
             sensor=manifest.sensor,
+            imu=manifest.imu,
             channels=manifest.channels,
             manifest=content,
         )

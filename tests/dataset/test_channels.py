@@ -202,8 +202,17 @@ def test_names_of_channels_are_checked() -> None:
         parse_card(DatasetCard, card | {"channels": ["flow", "flow"]}, "mine.toml")
 
 
+def test_help_names_every_channel() -> None:
+    import typing
+
+    from rsbench.cli import generate
+
+    (option,) = (each for each in typing.get_args(generate._Channels) if hasattr(each, "help"))
+    assert all(f" {name}" in option.help for name in CHANNELS)
+
+
 def test_values_that_are_no_class_are_refused(sequence: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
-    from rsbench.dataset import sequence as module
+    from rsbench.dataset import channel_reader as module
 
     read: Callable[..., NDArray[np.uint8]] = lambda path, size: np.full((48, 64), 9, np.uint8)  # noqa: E731
     monkeypatch.setattr(module, "read_grey_png", read)

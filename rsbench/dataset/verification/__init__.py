@@ -16,6 +16,7 @@ from rsbench.dataset.verification import structure
 from rsbench.dataset.verification.channel_checks import channel_faults
 from rsbench.dataset.verification.content import Comparison, images_elsewhere, read_content, twin_faults
 from rsbench.dataset.verification.findings import DepthAgreement, Progress, SequenceReport
+from rsbench.dataset.verification.imu_checks import imu_faults
 from rsbench.dataset.verification.landing import PAIRS
 from rsbench.dataset.verification.poses import pose_faults
 from rsbench.dataset.verification.rerender import Again, Rerender
@@ -107,6 +108,7 @@ def verify_sequence(
             steps -= 1
         faults += comparison.faults(images_elsewhere(partial(_others, listing, name)))
         faults += timing_faults(sequence, {*missing, *map(_file_of, faults)})
+        faults += imu_faults(sequence, {*missing, *map(_file_of, faults)})
         faults += channel_faults(sequence, content.maps, {*missing, *map(_file_of, faults)}, stride)
         faults += surface_faults(sequence, content.maps, {*missing, *map(_file_of, faults)})
         if again is not None:

@@ -1,0 +1,114 @@
+"""Reading the channels of ground truth of a sequence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.rig import Side, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.channels import (
+    COMPONENTS,
+    INSTANCE_TABLE,
+    NORMAL_COMPONENTS,
+    PairChannel,
+    PixelClass,
+    mask_file,
+    surface_file,
+    value_file,
+)
+from rsbench.dataset.files import read_exr, read_grey_png, read_json
+from rsbench.dataset.imu import IMU_MANIFEST, ImuSamples, read_imu
+from rsbench.dataset.timing import MANIFEST, read_timing_table, table_file
+from rsbench.errors import RsbenchError
+from rsbench.reading import inside
+
+
+class ChannelReader:
+    """What a ``Sequence`` reads of its channels; each raises RsbenchError where it does not have them."""
+
+    folder: Path
+    rig: StereoRig
+    shutter: RollingShutter
+    channels: tuple[str, ...]
+
+    def offsets(self, channel: PairChannel, side: Side, frame: int) -> NDArray[np.float32]:
+        """(H, W, components) px of the pixels of a rolling-shutter frame: see ``channels.PairChannel``.
+
+        Raises:
+            RsbenchError: the sequence does not have this channel, or the file cannot be read.
+        """
+        self._check_channel(channel)
+        return read_exr(inside(self.folder, value_file(channel, side, frame)), COMPONENTS[channel], self._size)
+
+    def classes(self, channel: PairChannel, side: Side, frame: int) -> NDArray[np.uint8]:
+        """(H, W) of ``channels.PixelClass``: what became of each pixel in the picture that the channel looks at.
+
+        Raises:
+            RsbenchError: as ``offsets``.
+        """
+        self._check_channel(channel)
+        path = inside(self.folder, mask_file(channel, side, frame))
+        classes = read_grey_png(path, self._size)
+        if np.any(classes > max(PixelClass)):
+            raise RsbenchError(f"{path}: holds {np.max(classes)}: the classes are 0 to {max(PixelClass)}")
+        return classes
+
+    def normals(self, side: Side, frame: int) -> NDArray[np.float32]:
+        """(H, W, 3) unit normals of what the pixels see, towards the camera, world frame; 0 where that is nothing.
+
+        RsbenchError as of ``offsets``.
+        """
+        self._check_channel("normals")
+        path = inside(self.folder, surface_file("normals", side, frame))
+        return read_exr(path, NORMAL_COMPONENTS, self._size)
+
+    def instances(self, side: Side, frame: int) -> NDArray[np.uint16]:
+        """(H, W) numbers of the meshes that the pixels see; 0 = none. RsbenchError as of ``offsets``."""
+        self._check_channel("instances")
+        return read_grey_png(inside(self.folder, surface_file("instances", side, frame)), self._size, 16)
+
+    def instance_table(self) -> list[dict[str, str]]:
+        """``name`` and ``material`` of instance 1, 2, ...; RsbenchError as of ``offsets``, or another content."""
+        self._check_channel("instances")
+        path = inside(self.folder, INSTANCE_TABLE)
+        table = read_json(path).get("instances")
+        rows: list[Any] = table if isinstance(table, list) else [None]
+        for row in rows:
+            if not isinstance(row, dict) or not all(isinstance(row.get(key), str) for key in ("name", "material")):
+                raise RsbenchError(f"{path}: instances: must be a list of tables with name and material")
+        return rows
+
+    def timing(self) -> dict[str, Any]:
+        """Content of timing.json; RsbenchError as of ``offsets``."""
+        self._check_channel("timing")
+        return read_json(inside(self.folder, MANIFEST))
+
+    def row_times_ns(self, side: Side, frame: int) -> NDArray[np.int64]:
+        """(H, 4) of each row: number, time, start and end of its exposure; RsbenchError likewise."""
+        self._check_channel("timing")
+        return read_timing_table(inside(self.folder, table_file(side, frame)), self.shutter.lines(side))
+
+    def inertial(self) -> ImuSamples:
+        """What the inertial sensor measured, and the truth; RsbenchError as of ``offsets``."""
+        self._check_channel("imu")
+        return read_imu(self.folder)
+
+    def imu_manifest(self) -> dict[str, Any]:
+        """Content of imu.json; RsbenchError as of ``offsets``."""
+        self._check_channel("imu")
+        return read_json(inside(self.folder, IMU_MANIFEST))
+
+    def _check_channel(self, channel: str) -> None:
+        if channel not in self.channels:
+            has = ", ".join(self.channels) or "none"
+            raise RsbenchError(
+                f"{self.folder}: has no channel {channel!r} ({has}); make it with: generate --channels {channel}"
+            )
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        return self.rig.camera.width, self.rig.camera.height

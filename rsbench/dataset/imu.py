@@ -1,0 +1,210 @@
+"""The channel ``imu``: what a gyroscope and an accelerometer at the rig's body measure, and what is true.
+
+The noise is that of IEEE Std 952 as camera calibration states it (Kalibr): white noise and a bias that walks, each
+given by its density.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.cards import parse_card
+from rsbench.core.inertial import STANDARD_GRAVITY, inertial
+from rsbench.core.motion import Motion
+from rsbench.core.rig import FRAMES, SIDES
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.files import write_bytes, write_json
+from rsbench.errors import RsbenchError
+from rsbench.reading import inside, read_text
+from rsbench.renderers.electrons import Sensor
+from rsbench.scenes.model import Start, Viewpoint
+
+IMU_MANIFEST, MEASURED, TRUE = "imu/imu.json", "imu/measured.csv", "imu/true.csv"
+IMU_FILES = (IMU_MANIFEST, MEASURED, TRUE)
+MEASURED_COLUMNS = "stamp_ns,wx,wy,wz,ax,ay,az"
+TRUE_COLUMNS = "time_ns,wx,wy,wz,ax,ay,az,bwx,bwy,bwz,bax,bay,baz"
+MARGIN_S = 0.05
+"""Measured before the first row is exposed and after the last one."""
+_NS = 1e9
+_FASTEST_HZ, _LONGEST_OFFSET_S, _WORST_DRIFT = 1e4, 1.0, 1e-2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imu:
+    """An inertial measurement unit at the rig's body; its axes are the body's.
+
+    The defaults are the noise of the ADIS16448 of the EuRoC data set (Burri et al., IJRR 2016, imu0/sensor.yaml),
+    and biases of the size that its sequences show.
+    """
+
+    rate_hz: float = 200.0
+    gyroscope_noise_density: float = 1.6968e-4
+    """White noise, rad/s/sqrt(Hz): a sample has it times sqrt(rate)."""
+    gyroscope_random_walk: float = 1.9393e-5
+    """Of the bias, rad/s^2/sqrt(Hz): from one sample to the next it walks by it times sqrt(1 / rate)."""
+    gyroscope_bias: float = 0.02
+    """Standard deviation of the bias at the first sample, rad/s."""
+    accelerometer_noise_density: float = 2.0e-3
+    """m/s^2/sqrt(Hz)."""
+    accelerometer_random_walk: float = 3.0e-3
+    """m/s^3/sqrt(Hz)."""
+    accelerometer_bias: float = 0.1
+    """m/s^2."""
+    time_offset_s: float = 0.0
+    """Its clock less the camera's, at the time of row 0 of frame 0."""
+    clock_drift: float = 0.0
+    """Seconds that its clock gains in each of the camera's."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not math.isfinite(value):
+                raise ValueError(f"imu {field.name} = {value}: must be finite")
+            if value < 0 and field.name not in ("time_offset_s", "clock_drift"):
+                raise ValueError(f"imu {field.name} = {value}: must not be negative")
+        if not 1.0 <= self.rate_hz <= _FASTEST_HZ:
+            raise ValueError(f"imu rate_hz = {self.rate_hz}: must lie in [1, {_FASTEST_HZ:g}]")
+        for name, most in (("time_offset_s", _LONGEST_OFFSET_S), ("clock_drift", _WORST_DRIFT)):
+            if abs(getattr(self, name)) > most:
+                raise ValueError(f"imu {name} = {getattr(self, name)}: must lie in [-{most:g}, {most:g}]")
+
+
+class ImuSamples(NamedTuple):
+    """Samples (n) in the order of time."""
+
+    stamps_ns: NDArray[np.int64]
+    """(n,) by the sensor's own clock."""
+    measured: FloatArray
+    """(n, 6) angular velocity, rad/s, and specific force, m/s^2, in the axes of the body."""
+    times_ns: NDArray[np.int64]
+    """(n,) true: 0 is row 0 of frame 0, as in the channel ``timing``."""
+    true: FloatArray
+    """(n, 6) likewise."""
+    bias: FloatArray
+    """(n, 6) what of ``measured - true`` is not white."""
+
+
+def sample_times_ns(
+    imu: Imu, shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None
+) -> NDArray[np.int64]:
+    """True times (n,) of the samples: whole periods of the sensor, over all exposures and ``MARGIN_S`` beyond."""
+    lines = [shutter.line_times(frame, side) for side in SIDES for frame in FRAMES]
+    first, last = (frame_period_s * reach(np.concatenate(lines)) for reach in (np.min, np.max))
+    beyond = MARGIN_S + 0.5 * (sensor.exposure_s if sensor else 0.0)
+    counts = np.arange(
+        math.floor((first - beyond) * imu.rate_hz), math.ceil((last + beyond) * imu.rate_hz) + 1, dtype=np.int64
+    )
+    return np.round(counts * (_NS / imu.rate_hz)).astype(np.int64)
+
+
+def true_samples(
+    motion: Motion, times_ns: NDArray[np.int64], frame_period_s: float, gravity: FloatArray
+) -> FloatArray:
+    """(n, 6) of ``ImuSamples.true`` at times (n,); ``gravity`` (3,) m/s^2 in the world frame."""
+    felt = inertial(motion, times_ns / (_NS * frame_period_s), frame_period_s, gravity)
+    return np.concatenate([felt.turn, felt.force], axis=1)
+
+
+def stamps_of(imu: Imu, times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """What the sensor's clock shows at true times (n,)."""
+    gained = np.round(_NS * imu.time_offset_s + imu.clock_drift * times_ns).astype(np.int64)
+    return np.asarray(times_ns + gained)
+
+
+def deviations(imu: Imu) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Standard deviations (6,) of a sample's white noise, of a step of the bias, and of the first bias."""
+    root = math.sqrt(imu.rate_hz)
+    per_kind = (
+        (imu.gyroscope_noise_density * root, imu.accelerometer_noise_density * root),
+        (imu.gyroscope_random_walk / root, imu.accelerometer_random_walk / root),
+        (imu.gyroscope_bias, imu.accelerometer_bias),
+    )
+    noise, walk, start = (np.repeat(pair, 3) for pair in per_kind)
+    return noise, walk, start
+
+
+def draw_samples(
+    imu: Imu, motion: Motion, times_ns: NDArray[np.int64], frame_period_s: float, gravity: FloatArray, seed: str
+) -> ImuSamples:
+    """Measure a motion; the same seed draws the same noise whatever the motion."""
+    digest = hashlib.sha256(f"{seed}/imu".encode()).digest()
+    rng = np.random.default_rng(int.from_bytes(digest[:16], "little"))
+    noise, walk, start = deviations(imu)
+    steps = rng.standard_normal((len(times_ns), 6)) * np.where(np.arange(len(times_ns))[:, None] > 0, walk, start)
+    bias = np.cumsum(steps, axis=0)
+    true = true_samples(motion, times_ns, frame_period_s, gravity)
+    measured = true + bias + noise * rng.standard_normal(true.shape)
+    return ImuSamples(stamps_of(imu, times_ns), measured, times_ns, true, bias)
+
+
+def gravity_of(scene: Mapping[str, Any]) -> FloatArray:
+    """(3,) m/s^2 in the world frame, of what sequence.json says of its scene, whose z points up.
+
+    Raises:
+        RsbenchError: it does not say from where it is seen.
+    """
+    place = parse_card(Viewpoint, {key: scene.get(key) for key in ("eye", "target")}, "sequence.json: scene")
+    if "start" in scene:
+        start = parse_card(Start, scene["start"], "sequence.json: scene.start")
+        return -STANDARD_GRAVITY * start.world_from_scene(place)[0][:, 2]
+    return -STANDARD_GRAVITY * place.world_from_scene()[0][:, 2]
+
+
+def imu_manifest(imu: Imu, gravity: FloatArray) -> dict[str, Any]:
+    """Content of imu.json."""
+    axes = "of the rig's body: x right, y down, z forward; the sensor is in its origin"
+    return {"axes": axes, "gravity": gravity.tolist(), **asdict(imu)}
+
+
+def write_imu(folder: Path, imu: Imu, gravity: FloatArray, samples: ImuSamples) -> None:
+    """All ``IMU_FILES`` below the folder of a sequence."""
+    write_json(folder / IMU_MANIFEST, imu_manifest(imu, gravity))
+    for file, columns, times, values in (
+        (MEASURED, MEASURED_COLUMNS, samples.stamps_ns, samples.measured),
+        (TRUE, TRUE_COLUMNS, samples.times_ns, np.concatenate([samples.true, samples.bias], axis=1)),
+    ):
+        rows = zip(times.tolist(), values.tolist(), strict=True)
+        lines = [",".join(map(repr, [time, *row])) for time, row in rows]
+        write_bytes(folder / file, ("\n".join([columns, *lines]) + "\n").encode())
+
+
+def read_imu(folder: Path) -> ImuSamples:
+    """The samples below the folder of a sequence.
+
+    Raises:
+        RsbenchError: a table that is missing or none, or two that are not of the same samples.
+    """
+    stamps, measured = _read_table(inside(folder, MEASURED), MEASURED_COLUMNS)
+    times, values = _read_table(inside(folder, TRUE), TRUE_COLUMNS)
+    if len(stamps) != len(times):
+        raise RsbenchError(f"{folder / TRUE}: has {len(times)} rows, {MEASURED} has {len(stamps)}")
+    return ImuSamples(stamps, measured, times, values[:, :6], values[:, 6:])
+
+
+def _read_table(path: Path, columns: str) -> tuple[NDArray[np.int64], FloatArray]:
+    """Times (n,), ns, and values (n, columns - 1).
+
+    Raises:
+        RsbenchError: missing, or not such a table.
+    """
+    header, *lines = read_text(path).splitlines() or [""]
+    try:
+        cells = [line.split(",") for line in lines]
+        times = np.array([int(row[0]) for row in cells], dtype=np.int64)
+        values = np.array([[float(cell) for cell in row[1:]] for row in cells])
+    except (ValueError, OverflowError) as error:
+        raise RsbenchError(f"{path}: not a table of numbers: {error}") from error
+    if header != columns or values.shape != (len(lines), columns.count(",")) or not len(lines):
+        raise RsbenchError(f"{path}: must have the columns {columns}")
+    if not np.all(np.isfinite(values)) or np.any(np.diff(times) <= 0):
+        raise RsbenchError(f"{path}: numbers must be finite and times must grow")
+    return times, values
