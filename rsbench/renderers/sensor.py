@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.errors import RsbenchError
-from rsbench.renderers.lens_rays import LensRays
+from rsbench.renderers.lens_rays import lens_rays
 
 PLUGIN = "rs_pinhole"
 LEAST_COMPONENT = 1e-15
@@ -76,10 +76,10 @@ def make_sensor(
     return sensor
 
 
-def _coordinates(sensor: Any, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
+def _coordinates(sensor: Any, x: Any, y: Any, active: Any, pixel: Any) -> tuple[Any, Any]:
     """Coordinates x / z, y / z of the ray through pixel coordinates (x, y)."""
     if sensor.lens is not None:
-        return sensor.lens.coordinates(x, y, active)
+        return sensor.lens.coordinates(x, y, sensor.lens.pixel(x, y, active) if pixel is None else pixel)
     if sensor.camera.lens is not None:  # one by one
         u, v, _ = sensor.camera.unproject([float(x), float(y)]).tolist()
         return u, v
@@ -113,7 +113,7 @@ def sensor_class() -> Any:
             self.intrinsics = [dr.opaque(mi.Float, value) for value in values]
             self.camera = camera
             if camera.lens is not None and not scalar:
-                self.lens = LensRays(camera, camera.lens)
+                self.lens = lens_rays(camera, camera.lens)
 
         def set_poses(self, table: NDArray[np.float32], columns: bool = False) -> None:
             """Table (lines, 12) or (instants, lines, 12) of ``pose_table``."""
@@ -121,13 +121,14 @@ def sensor_class() -> Any:
             self.instants = table.shape[0] if table.ndim == 3 else 1
             self.poses = table.ravel().tolist() if scalar else mi.Float(table.ravel())
 
-        def row_ray(self, x: Any, y: Any, row: Any, active: Any = True) -> tuple[Any, Any]:
+        def row_ray(self, x: Any, y: Any, row: Any, active: Any = True, pixel: Any = None) -> tuple[Any, Any]:
             """World origin and direction of the ray through pixel coordinates (x, y), at the pose of ``row``.
 
-            With instants, pose ``row + lines * instant``; with columns, rows are columns. The direction has camera
-            z = 1, so the distance to a hit in units of it is the depth z.
+            With instants, pose ``row + lines * instant``; with columns, rows are columns. ``pixel`` is that of
+            ``lens``, found once for many samples. The direction has camera z = 1, so the distance to a hit in
+            units of it is the depth z.
             """
-            u, v = _coordinates(self, x, y, active)
+            u, v = _coordinates(self, x, y, active, pixel)
             p = [self._entry(row, k, active) for k in range(12)]
             direction = [dr.fma(p[3 * i], u, dr.fma(p[3 * i + 1], v, p[3 * i + 2])) for i in range(3)]
             level = [dr.select(dr.abs(value) < LEAST_COMPONENT, 0.0, value) for value in direction]

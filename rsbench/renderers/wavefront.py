@@ -136,11 +136,12 @@ def _sunsky_band(
     grid = mi.Float(subpixel_grid(options.samples).ravel())
     count = dr.opaque(mi.UInt32, options.samples)
     x, y = mi.Float(lanes.column), mi.Float(lanes.row)
+    pixel = None if sensor.lens is None else sensor.lens.pixel(x, y, lanes.active)
 
     def add_sample(k: Any, total: Any) -> tuple[Any, Any]:
         dx, dy = dr.gather(mi.Float, grid, 2 * k), dr.gather(mi.Float, grid, 2 * k + 1)
         pose = _pose(sensor, camera, lanes, k, options)
-        origin, direction = sensor.row_ray(x + dx, y + dy, pose, lanes.active)
+        origin, direction = sensor.row_ray(x + dx, y + dy, pose, lanes.active, pixel)
         ray = mi.Ray3f(origin, dr.normalize(direction))
         return k + 1, total + sunsky_radiance(scene, ray, lanes.active)
 
