@@ -72,9 +72,9 @@ def row_seeing(sequence: Sequence, side: str, frame: int, X: Array) -> Array:
 
 
 def truth(
-    sequence: Sequence, triangles: Array, channel: PairChannel, side: str, frame: int
+    sequence: Sequence, triangles: Array, channel: PairChannel, side: str, frame: int, row: int = 0
 ) -> tuple[Array, Array]:
-    """Offsets (n, 2) x_target - x_source and classes (n,) of all pixels."""
+    """Offsets (n, 2) x_target - x_source and classes (n,) of all pixels; ``row``: of a global-shutter twin."""
     width, height = sequence.rig.camera.width, sequence.rig.camera.height
     y, x = (each.ravel().astype(float) for each in np.mgrid[:height, :width])
     pixels, h = np.column_stack([x, y]), sequence.shutter.readout_ratio / height
@@ -88,7 +88,7 @@ def truth(
         frame = 1 - frame
         tau = frame + h * row_seeing(sequence, side, frame, X)
     else:
-        tau = np.full(len(X), float(frame))
+        tau = np.full(len(X), frame + h * row)
     lost = np.isnan(tau)
     tau = np.where(lost, 0.0, tau)
     landed = look(sequence, side, tau, X)

@@ -6,18 +6,18 @@ from collections import Counter
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rsbench.cards import card_path, parse_card, read_toml
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.lens import Lens
 from rsbench.core.motion import Motion
-from rsbench.core.rig import StereoRig
+from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.dataset.channels import Channel, check_channels
 from rsbench.dataset.imu import Imu
 from rsbench.dataset.motion_card import MotionCard as MotionCard
-from rsbench.dataset.sequence import sequence_manifest
+from rsbench.dataset.sequence import MOST_TWINS, sequence_manifest
 from rsbench.dataset.trajectory import TrajectoryCard, pairs_along
 from rsbench.errors import RsbenchError
 from rsbench.imports import search
@@ -25,6 +25,8 @@ from rsbench.reading import check_name, check_size
 from rsbench.renderers.electrons import Sensor
 from rsbench.scenes.model import Start
 from rsbench.shutters import with_shutter
+
+Twin = Literal["first", "middle", "last"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,6 +108,8 @@ class DatasetCard(Scanning):
     """Exposure and noise of the rolling-shutter frames; absent, an ideal sensor's."""
     channels: tuple[Channel, ...] = ()
     """Of ground truth, beside images, depth and poses."""
+    twins: tuple[int | Twin, ...] = ()
+    """Rows, counted as they are read, whose poses global-shutter twins have beside that of the first."""
     imu: Imu | None = None
     """The sensor of the channel ``imu``; absent, one with the defaults."""
     seed: int = 0
@@ -137,6 +141,7 @@ class DatasetCard(Scanning):
 
     def _check_times(self, sequence: SequenceCard) -> None:
         self.shutter_for(sequence)
+        self.twins_of(sequence)
         period, sensor = self.period_of(sequence), self.sensor_of(sequence)
         if not period > 0:
             raise ValueError(f"frame_period_s must be positive, got {period}")
@@ -167,6 +172,20 @@ class DatasetCard(Scanning):
     def sensor_of(self, sequence: SequenceCard) -> Sensor | None:
         return self.sensor if sequence.sensor is None else sequence.sensor
 
+    def twins_of(self, sequence: SequenceCard) -> tuple[int, ...]:
+        """Rows of the twins but the first; ValueError for one that the cameras do not have."""
+        shutter = self.shutter_for(sequence)
+        lines = min(shutter.lines(side) for side in SIDES)
+        if self.twins and lines < max(shutter.lines(side) for side in SIDES):
+            raise ValueError("twins: cameras of which one reads rows and one columns have no rows in common")
+        named = {"first": 0, "middle": lines // 2, "last": lines - 1}
+        rows = [named[row] if isinstance(row, str) else row for row in self.twins]
+        if len(rows) > MOST_TWINS:
+            raise ValueError(f"twins: {len(rows)} rows: at most {MOST_TWINS}")
+        if wrong := [row for row in rows if not 0 <= row < lines]:
+            raise ValueError(f"twins: {wrong[0]}: must be first, middle, last or a row from 0 to {lines - 1}")
+        return tuple(sorted({*rows} - {0}))
+
     def motion_of(self, sequence: SequenceCard) -> Motion:
         return self._motion_card(sequence).motion()
 
@@ -192,7 +211,8 @@ class DatasetCard(Scanning):
         sensor = {} if own is None else {"sensor": asdict(own)}
         channels = {"channels": list(self.channels)} if self.channels else {}
         imu = {"imu": asdict(self.imu or Imu())} if "imu" in self.channels else {}
-        return {**manifest, **sensor, **channels, **imu}
+        twins = {"twins": list(rows)} if (rows := self.twins_of(sequence)) else {}
+        return {**manifest, **sensor, **channels, **imu, **twins}
 
     def only(self, names: list[str]) -> DatasetCard:
         """The same card with some of its sequences.

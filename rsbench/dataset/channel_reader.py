@@ -35,23 +35,26 @@ class ChannelReader:
     shutter: RollingShutter
     channels: tuple[str, ...]
 
-    def offsets(self, channel: PairChannel, side: Side, frame: int) -> NDArray[np.float32]:
+    def offsets(self, channel: PairChannel, side: Side, frame: int, row: int = 0) -> NDArray[np.float32]:
         """(H, W, components) px of the pixels of a rolling-shutter frame: see ``channels.PairChannel``.
+
+        ``row``: of ``gs_flow``, that of the twin to which it leads: 0, or one of ``twins``.
 
         Raises:
             RsbenchError: the sequence does not have this channel, or the file cannot be read.
         """
         self._check_channel(channel)
-        return read_exr(inside(self.folder, value_file(channel, side, frame)), COMPONENTS[channel], self._size)
+        path = inside(self.folder, value_file(channel, side, frame, row))
+        return read_exr(path, COMPONENTS[channel], self._size)
 
-    def classes(self, channel: PairChannel, side: Side, frame: int) -> NDArray[np.uint8]:
+    def classes(self, channel: PairChannel, side: Side, frame: int, row: int = 0) -> NDArray[np.uint8]:
         """(H, W) of ``channels.PixelClass``: what became of each pixel in the picture that the channel looks at.
 
         Raises:
             RsbenchError: as ``offsets``.
         """
         self._check_channel(channel)
-        path = inside(self.folder, mask_file(channel, side, frame))
+        path = inside(self.folder, mask_file(channel, side, frame, row))
         classes = read_grey_png(path, self._size)
         if np.any(classes > max(PixelClass)):
             raise RsbenchError(f"{path}: holds {np.max(classes)}: the classes are 0 to {max(PixelClass)}")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rsbench.core.projection import row_poses
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.channels import PairChannel, PixelClass
+from rsbench.dataset.channels import Layer, PixelClass
 from rsbench.dataset.row_search import Landed, find
 from rsbench.dataset.shots import FAR, Geometry, Shot
 from rsbench.renderers.segments import Surfaces
@@ -40,10 +40,10 @@ class PairTruth(NamedTuple):
     """(H, W) of ``PixelClass``."""
 
 
-def target_of(channel: PairChannel, source: Shot) -> Shot:
+def target_of(layer: Layer, source: Shot) -> Shot:
     """The picture in which a channel looks for the pixels of a rolling-shutter frame."""
-    targets = {"disparity": source.other_side, "flow": source.other_frame, "gs_flow": source.other_shutter}
-    return targets[channel]
+    twin = source.other_shutter._replace(row=layer.row)
+    return {"disparity": source.other_side, "flow": source.other_frame, "gs_flow": twin}[layer.channel]
 
 
 class SeenSurfaces:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,8 @@ from rsbench.dataset.channels import (
     PAIR_CHANNELS,
     STEP_PX,
     PairChannel,
-    mask_file,
+    pair_layers,
     surface_file,
-    value_file,
 )
 from rsbench.dataset.files import write_exr, write_png, write_png16
 from rsbench.dataset.shots import Geometry, Shot
@@ -31,6 +30,7 @@ def write_channels(
     shot: Shot,
     depth: NDArray[np.float32],
     rays: Rays,
+    twins: Iterable[int] = (),
 ) -> None:
     """The files of the channels of these names that tell of one rolling-shutter frame.
 
@@ -41,18 +41,17 @@ def write_channels(
         shot: the frame.
         depth: (H, W) of the frame, metres, 0 = no surface.
         rays: through its scene.
+        twins: rows of global-shutter twins to which ``gs_flow`` leads too.
     """
     if not set(names) & {*PAIR_CHANNELS, "normals", "instances"}:
         return
     seen = SeenSurfaces(geometry, shot, depth)
-    for channel in PAIR_CHANNELS:
-        if channel not in names:
-            continue
-        truth = pair_truth(seen, target_of(channel, shot), rays.blocked)
-        values = pair_values(channel, shot, truth.offset)
-        pixels = {name: values[..., k] for k, name in enumerate(COMPONENTS[channel])}
-        write_exr(folder / value_file(channel, shot.side, shot.frame), pixels)
-        write_png(folder / mask_file(channel, shot.side, shot.frame), truth.classes)
+    for layer in pair_layers(names, twins):
+        truth = pair_truth(seen, target_of(layer, shot), rays.blocked)
+        values = pair_values(layer.channel, shot, truth.offset)
+        pixels = {name: values[..., k] for k, name in enumerate(COMPONENTS[layer.channel])}
+        write_exr(folder / layer.values(shot.side, shot.frame), pixels)
+        write_png(folder / layer.mask(shot.side, shot.frame), truth.classes)
     if {"normals", "instances"} & set(names):
         surfaces = surface_truth(seen, rays)
         if "normals" in names:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from enum import IntEnum
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.imu import IMU_FILES
@@ -58,29 +58,45 @@ def check_channels(names: Collection[str], lens: bool, plain: bool) -> None:
             raise ValueError(f"channels: {name!r} is made of cameras without a lens, whose pairs share their rows")
 
 
-def value_file(channel: PairChannel, side: str, frame: int) -> str:
-    """Below the folder of a sequence, by the picture whose pixels it tells of."""
-    return f"{channel}/{side}_{frame}.exr"
+def value_file(channel: PairChannel, side: str, frame: int, row: int = 0) -> str:
+    """Below the folder of a sequence, by the picture whose pixels it tells of; ``row`` is that of a twin."""
+    return f"gs_twin_flow/{row:04d}/{side}_{frame}.exr" if row else f"{channel}/{side}_{frame}.exr"
 
 
-def mask_file(channel: PairChannel, side: str, frame: int) -> str:
-    return f"{channel}_mask/{side}_{frame}.png"
+def mask_file(channel: PairChannel, side: str, frame: int, row: int = 0) -> str:
+    return f"gs_twin_flow_mask/{row:04d}/{side}_{frame}.png" if row else f"{channel}_mask/{side}_{frame}.png"
+
+
+class Layer(NamedTuple):
+    """A channel that leads to one picture of each frame."""
+
+    channel: PairChannel
+    row: int = 0
+    """Of the global-shutter twin to which it leads."""
+
+    def values(self, side: str, frame: int) -> str:
+        """File below the folder of a sequence, as ``mask`` is."""
+        return value_file(self.channel, side, frame, self.row)
+
+    def mask(self, side: str, frame: int) -> str:
+        return mask_file(self.channel, side, frame, self.row)
+
+
+def pair_layers(names: Collection[str], twins: Iterable[int]) -> list[Layer]:
+    """Of the channels of these names."""
+    layers = [Layer(channel) for channel in PAIR_CHANNELS if channel in names]
+    return [*layers, *(Layer("gs_flow", row) for row in twins if "gs_flow" in names)]
 
 
 def surface_file(channel: Literal["normals", "instances"], side: str, frame: int) -> str:
     return f"{channel}/{side}_{frame}.{'exr' if channel == 'normals' else 'png'}"
 
 
-def channel_files(names: Iterable[str]) -> tuple[str, ...]:
+def channel_files(names: Iterable[str], twins: Iterable[int] = ()) -> tuple[str, ...]:
     """Paths below a sequence's folder of the channels of these names; those of later versions are nobody's."""
     given = set(names)
-    pairs = (
-        file(channel, *view)
-        for channel in PAIR_CHANNELS
-        if channel in given
-        for file in (value_file, mask_file)
-        for view in VIEWS
-    )
+    layers = pair_layers(given, twins)
+    pairs = (file(*view) for layer in layers for file in (layer.values, layer.mask) for view in VIEWS)
     timing = TIMING_FILES if "timing" in given else ()
     normals = (surface_file("normals", *view) for view in VIEWS if "normals" in given)
     instances = (INSTANCE_TABLE, *(surface_file("instances", *view) for view in VIEWS))

@@ -181,7 +181,9 @@ def _complete(
             f"{folder}: holds no sequence.json, so rsbench did not make it; move it away or choose another --out"
         )
     manifest = read_json(folder / "sequence.json")
-    expected = {"sensor": None, "channels": None, "imu": None} | _of_scene(plan, scene_hashes.of(sequence.scene))
+    expected = {"sensor": None, "channels": None, "imu": None, "twins": None} | _of_scene(
+        plan, scene_hashes.of(sequence.scene)
+    )
     other = [key for key, value in expected.items() if manifest.get(key) != value]
     if other:
         raise RsbenchError(
@@ -335,7 +337,7 @@ def render_camera(
     frame: int,
     folder: Path,
 ) -> Iterator[None]:
-    """One camera at one time: the rolling-shutter frame, then the global-shutter frame at its first row's pose.
+    """One camera at one time: the rolling-shutter frame, then the global-shutter frames at poses of its rows.
 
     What a sensor does is done to the rolling-shutter frame alone; its clean twin is kept.
     """
@@ -348,12 +350,13 @@ def render_camera(
     options = replace(options, seed=image_seed(card.seed_of(sequence), sequence.name, side, frame))
     poses = row_poses(rig, shutter, card.motion_of(sequence), side, frame)
     write_poses(folder / "poses" / f"{side}_{frame}.csv", shutter.line_times(frame, side), poses)
-    line, columns = shutter.first_line(side), shutter.axis(side) == 0
-    first = Pose(np.broadcast_to(poses.R[line], poses.R.shape), np.broadcast_to(poses.t[line], poses.t.shape))
+    columns, twins = shutter.axis(side) == 0, card.twins_of(sequence)
     keep = _stack_writer(folder / "gs_stack" / f"{side}_{frame}", options) if options.full_frames else None
-    for kind, pose in (("rs", poses), ("gs", first)):
+    for shot in (Shot("rs", side, frame), *(Shot("gs", side, frame, row) for row in (0, *twins))):
+        kind, line = shot.shutter, abs(shutter.first_line(side) - shot.row)
+        one = Pose(np.broadcast_to(poses.R[line], poses.R.shape), np.broadcast_to(poses.t[line], poses.t.shape))
         # A global-shutter frame needs no stitching: all its rows have one pose.
-        chosen = options if kind == "rs" else replace(options, method="single-pass")
+        chosen, pose = (options, poses) if kind == "rs" else (replace(options, method="single-pass"), one)
         on_gs_frame = keep if kind == "rs" else None
         rendered = render(scene, rig.camera, *pose, chosen, columns=columns, on_gs_frame=on_gs_frame)
         if not np.any(rendered.depth):
@@ -361,17 +364,18 @@ def render_camera(
                 f"sequence {sequence.name}: {side}_{frame} shows no surface at all: change the viewpoint "
                 f"{sequence.viewpoint!r} of scene {sequence.scene}, or the motion"
             )
-        place = "rs_clean" if kind == "rs" and sensor else kind
-        write_png(folder / place / f"{side}_{frame}.png", to_srgb8(rendered.image, options.exposure))
-        write_depth(folder / f"{kind}_depth" / f"{side}_{frame}.exr", rendered.depth)
+        clean = f"rs_clean/{side}_{frame}.png" if kind == "rs" and sensor else shot.image
+        write_png(folder / clean, to_srgb8(rendered.image, options.exposure))
+        write_depth(folder / shot.depth, rendered.depth)
         if kind == "rs" and sensor:
             period, motion = card.period_of(sequence), card.motion_of(sequence)
             seen = sensed_rows(scene, rig, shutter, motion, sensor, period, side, frame, options)
-            write_png(folder / "rs" / f"{side}_{frame}.png", to_srgb8(seen, 1.0))
+            write_png(folder / shot.image, to_srgb8(seen, 1.0))
         if kind == "rs":
-            geometry, shot = GivenGeometry(rig, shutter, card.motion_of(sequence)), Shot("rs", side, frame)
-            write_channels(folder, card.channels, geometry, shot, rendered.depth, SceneRays(scene))
-        yield
+            geometry = GivenGeometry(rig, shutter, card.motion_of(sequence))
+            write_channels(folder, card.channels, geometry, shot, rendered.depth, SceneRays(scene), twins)
+        if shot.row == 0:
+            yield
 
 
 def _stack_writer(folder: Path, options: RendererOptions) -> Callable[[int, NDArray[np.float32]], None]:

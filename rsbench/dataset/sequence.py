@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rsbench.cards import parse_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
-from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.rig import SIDES, VIEWS, Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
@@ -56,12 +56,27 @@ CLEAN_FILES = tuple(f"rs_clean/{side}_{frame}.png" for side in SIDES for frame i
 _MOST_WHOLE_FRAMES = 1 << 14
 """Of one camera and time: a number in a manifest must not ask for a list of millions."""
 _STACK = re.compile(r"gs_stack/(left|right)_[01]/[0-9]{4,}\.png")
+_TWIN = re.compile(r"gs_twin(|_depth|_flow|_flow_mask)/[0-9]{4,}/(left|right)_[01]\.(png|exr)")
+MOST_TWINS = 64
 
 
 def is_of_sequence(name: str) -> bool:
     """Whether a path below a sequence's folder is one that rsbench writes."""
     known = ("sequence.json", *RELATIVE_FILES, *CLEAN_FILES, *channel_files(CHANNELS))
-    return name in known or _STACK.fullmatch(name) is not None
+    return name in known or any(form.fullmatch(name) for form in (_STACK, _TWIN))
+
+
+def picture_file(shutter: Shutter, side: str, frame: int, row: int = 0, depth: bool = False) -> str:
+    """Below the folder of a sequence; ``row``: of a global-shutter twin, counted as rows are read."""
+    folder = f"{'gs_twin' if row else shutter}{'_depth' if depth else ''}"
+    return f"{folder}{f'/{row:04d}' if row else ''}/{side}_{frame}.{'exr' if depth else 'png'}"
+
+
+def twins_of(manifest: Mapping[str, Any]) -> tuple[int, ...]:
+    """Rows of the global-shutter twins beside that of row 0, by a sequence.json; none where it lists none."""
+    rows = manifest.get("twins")
+    listed = rows if isinstance(rows, list) and len(rows) <= MOST_TWINS else []
+    return tuple(row for row in listed if isinstance(row, int) and not isinstance(row, bool) and row > 0)
 
 
 def files_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
@@ -70,7 +85,10 @@ def files_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
     stacks = tuple(
         stack_file(side, frame, row) for side in SIDES for frame in FRAMES for row in range(whole_frames(manifest))
     )
-    return RELATIVE_FILES + clean + stacks + channel_files(channels_of(manifest))
+    rows = twins_of(manifest)
+    pictures = [("gs", *view, row, depth) for row in rows for depth in (False, True) for view in VIEWS]
+    twins = tuple(picture_file(*each) for each in pictures)  # type: ignore[arg-type]
+    return RELATIVE_FILES + clean + stacks + twins + channel_files(channels_of(manifest), rows)
 
 
 def stack_file(side: Side, frame: int, row: int) -> str:
@@ -130,6 +148,7 @@ class SequenceManifest(Scanning):
     motion: MotionManifest
     sensor: Sensor | None = None
     imu: Imu | None = None
+    twins: tuple[int, ...] = ()
     channels: tuple[str, ...] = ()
     files: dict[str, str] = field(default_factory=dict)
     """sha256 by the path below the sequence's folder."""
@@ -143,6 +162,12 @@ class SequenceManifest(Scanning):
             )
         check_size("camera", (self.camera.width, self.camera.height))
         check_channels(self.channels, self.camera.lens is not None, self.plain)
+        lines = self.camera.height if self.scan in ("top", "bottom") else self.camera.width
+        if (
+            list(self.twins) != sorted({row for row in self.twins if 0 < row < lines})
+            or len(self.twins) > MOST_TWINS
+        ):
+            raise ValueError(f"twins = {list(self.twins)}: must grow from 1 to {lines - 1}, {MOST_TWINS} at most")
         if not self.frame_period_s > 0.0:
             raise ValueError(f"frame_period_s = {self.frame_period_s}: must be positive")
 
@@ -190,6 +215,8 @@ class Sequence(ChannelReader):
     """Of the rolling-shutter frames; None: an ideal one's."""
     imu: Imu | None = None
     """Of the channel ``imu``."""
+    twins: tuple[int, ...] = ()
+    """Rows, counted as they are read, from whose poses there are global-shutter twins beside those of row 0."""
     channels: tuple[str, ...] = ()
     """Names of those that it has beside images, depth and poses; later versions know more."""
     manifest: dict[str, Any]
@@ -206,9 +233,9 @@ class Sequence(ChannelReader):
             )
         return ""
 
-    def image(self, shutter: Shutter, side: Side, frame: int) -> NDArray[np.uint8]:
-        """(H, W, 3) sRGB; ``gs`` is the global-shutter image at the pose of the frame's row 0."""
-        return read_png(inside(self.folder, f"{shutter}/{side}_{frame}.png"), self._size)
+    def image(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.uint8]:
+        """(H, W, 3) sRGB; ``gs`` is the global-shutter image at the pose of a row: 0, or one of ``twins``."""
+        return read_png(inside(self.folder, picture_file(shutter, side, frame, row)), self._size)
 
     def clean_image(self, side: Side, frame: int) -> NDArray[np.uint8]:
         """(H, W, 3) sRGB: the rolling-shutter frame of an ideal sensor, sharp and without noise."""
@@ -219,9 +246,9 @@ class Sequence(ChannelReader):
         """Left 0, right 0, left 1, right 1: the order of ``rsbench.match`` and ``rsbench.correct``."""
         return [self.image(shutter, side, frame) for frame in FRAMES for side in SIDES]
 
-    def depth(self, shutter: Shutter, side: Side, frame: int) -> NDArray[np.float32]:
-        """(H, W) z in the camera of the row that saw the pixel, metres, 0 = no surface."""
-        return read_depth(inside(self.folder, f"{shutter}_depth/{side}_{frame}.exr"), self._size)
+    def depth(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.float32]:
+        """(H, W) z in the camera of the row that saw the pixel, m, 0 = no surface; ``row`` as of ``image``."""
+        return read_depth(inside(self.folder, picture_file(shutter, side, frame, row, depth=True)), self._size)
 
     def poses(self, side: Side, frame: int) -> tuple[FloatArray, Pose]:
         """Row times (H,) and ``cam_from_world`` (H, 3, 3), (H, 3) as stored; of columns, where those are read."""
@@ -276,6 +303,7 @@ def read_sequence(folder: Path) -> Sequence:
             frame_period_s=manifest.frame_period_s,
             sensor=manifest.sensor,
             imu=manifest.imu,
+            twins=manifest.twins,
             channels=manifest.channels,
             manifest=content,
         )

@@ -15,7 +15,7 @@ from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.sequence import SHUTTERS, Shutter
+from rsbench.dataset.sequence import SHUTTERS, Shutter, picture_file
 
 FAR = 1e7
 """Where the sky is looked for, metres: no motion of a rig moves it by a hundredth of a pixel."""
@@ -52,11 +52,11 @@ class Shot(NamedTuple):
     @property
     def image(self) -> str:
         """File below the folder of the sequence, as ``depth`` is."""
-        return f"{self.shutter}/{self.side}_{self.frame}.png"
+        return picture_file(*self)
 
     @property
     def depth(self) -> str:
-        return f"{self.shutter}_depth/{self.side}_{self.frame}.exr"
+        return picture_file(*self, depth=True)
 
     @property
     def other_shutter(self) -> Shot:

@@ -18,7 +18,15 @@ from rsbench.cards import parse_card
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.channels import CHANNELS, COMPONENTS, PAIR_CHANNELS, PairChannel, PixelClass, named_channels
-from rsbench.dataset.files import read_exr, read_grey_png, write_exr, write_png, write_png16
+from rsbench.dataset.files import (
+    read_depth,
+    read_exr,
+    read_grey_png,
+    write_depth,
+    write_exr,
+    write_png,
+    write_png16,
+)
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.dataset.verification import Rerender, verify_dataset
@@ -82,7 +90,7 @@ def yard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a dataset with every channel, below that of its scene."""
     folder = tmp_path_factory.mktemp("yard")
     write_yard(folder)
-    card = yard_card(folder, channels=CHANNELS)
+    card = yard_card(folder, channels=CHANNELS, twins=("last", 24))
     generate_dataset(card, folder / "data")
     assert generate_dataset(card, folder / "data") == [], "a second run has nothing to do"
     return folder / "data"
@@ -107,17 +115,21 @@ def parts(yard: Path) -> list[str]:
     return [mesh.name for mesh in load_scene(yard.parent / "yard.toml").meshes for _ in mesh.faces]
 
 
-@pytest.mark.parametrize("channel", PAIR_CHANNELS)
-def test_every_pixel_lies_where_rays_say(sequence: Sequence, triangles: Array, channel: PairChannel) -> None:
+@pytest.mark.parametrize(
+    ("channel", "row"), [*((name, 0) for name in PAIR_CHANNELS), ("gs_flow", 24), ("gs_flow", 47)]
+)
+def test_every_pixel_lies_where_rays_say(
+    sequence: Sequence, triangles: Array, channel: PairChannel, row: int
+) -> None:
     """The bounds of the issue: 99.9 % of the visible pixels within 0.01 px, and no other class on 99.9 %."""
     seen = np.zeros(len(PixelClass), dtype=int)
     near, right = [], []
     for side, frame in VIEWS:
-        offset, classes = truth(sequence, triangles, channel, side, frame)
+        offset, classes = truth(sequence, triangles, channel, side, frame, row)
         if channel == "disparity":
             offset = offset[:, :1] * (1 if side == "right" else -1)
-        stored = sequence.offsets(channel, side, frame).reshape(offset.shape)
-        kinds = sequence.classes(channel, side, frame).ravel()
+        stored = sequence.offsets(channel, side, frame, row).reshape(offset.shape)
+        kinds = sequence.classes(channel, side, frame, row).ravel()
         known = kinds != PixelClass.OUT_OF_VIEW
         assert np.all(np.isfinite(stored[known])) and np.all(np.isnan(stored[~known]))
         both = known & (classes != PixelClass.OUT_OF_VIEW)
@@ -200,6 +212,14 @@ def test_names_of_channels_are_checked() -> None:
         parse_card(DatasetCard, card | {"channels": ["smell"]}, "mine.toml")
     with pytest.raises(RsbenchError, match="must differ"):
         parse_card(DatasetCard, card | {"channels": ["flow", "flow"]}, "mine.toml")
+
+
+def test_twins_that_cannot_be_are_refused(tmp_path: Path) -> None:
+    for twins in ((48,), (-1,), ("half",)):
+        with pytest.raises(RsbenchError, match="twins"):
+            parse_card(DatasetCard, asdict(yard_card(tmp_path)) | {"twins": list(twins)}, "mine.toml")
+    card = yard_card(tmp_path, twins=("first", "last", "middle", 24))
+    assert card.twins_of(card.sequence[0]) == (24, 47)
 
 
 def test_help_names_every_channel() -> None:
@@ -393,6 +413,38 @@ FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
             lambda classes: np.where(classes == 1, 2, np.where(classes == 2, 1, classes)).astype(np.uint8),
         ),
         ("gs_flow_mask/right_1.png", "hidden, but visible by gs_depth/right_1.exr"),
+    ),
+}
+
+
+def depth_of(file: str, factor: float) -> Callable[[Path], None]:
+    return lambda folder: write_depth(folder / file, read_depth(folder / file) * np.float32(factor))
+
+
+FAULTS |= {
+    "a twin at the pose of another row": (
+        copied("gs_twin/0047/left_0.png", "gs_twin/0024/left_0.png"),
+        ("gs_twin/0024/left_0.png", "row 24 differs from rs_clean/left_0.png"),
+    ),
+    "a twin that is the first one": (
+        copied("gs_depth/right_1.exr", "gs_twin_depth/0024/right_1.exr"),
+        ("gs_twin_depth/0024/right_1.exr", "row 24 differs"),
+    ),
+    "depth of a twin scaled": (
+        depth_of("gs_twin_depth/0024/left_1.exr", 1.001),
+        ("gs_twin_depth/0024/left_1.exr", "scaled by 1.001"),
+    ),
+    "correction flow of another twin": (
+        copied("gs_twin_flow/0024/left_0.exr", "gs_twin_flow/0047/left_0.exr"),
+        ("gs_twin_flow/0047/left_0.exr", "differ from what depth and motion make"),
+    ),
+    "a twin's mask: all is hidden": (
+        mask_of("gs_twin_flow_mask/0047/right_0.png", of_class(PixelClass.VISIBLE, PixelClass.OCCLUDED)),
+        ("gs_twin_flow_mask/0047/right_0.png", "hidden, but visible by gs_twin_depth/0047/right_0.exr"),
+    ),
+    "a twin that is not there": (
+        lambda folder: (folder / "gs_twin/0024/left_0.png").unlink(),
+        ("gs_twin/0024/left_0.png", "does not list"),
     ),
 }
 

@@ -24,6 +24,7 @@ from rsbench.dataset.verification.sensors import sensor_faults
 from rsbench.dataset.verification.stacks import stack_faults
 from rsbench.dataset.verification.surface_checks import surface_faults
 from rsbench.dataset.verification.timing_checks import timing_faults
+from rsbench.dataset.verification.twin_checks import other_twin_faults, read_twins, with_twins
 from rsbench.errors import RsbenchError
 
 __all__ = [
@@ -109,10 +110,13 @@ def verify_sequence(
         faults += comparison.faults(images_elsewhere(partial(_others, listing, name)))
         faults += timing_faults(sequence, {*missing, *map(_file_of, faults)})
         faults += imu_faults(sequence, {*missing, *map(_file_of, faults)})
-        faults += channel_faults(sequence, content.maps, {*missing, *map(_file_of, faults)}, stride)
+        twins = read_twins(sequence, missing)
+        faults += [*twins.faults, *other_twin_faults(content, twins, stride)]
+        every = with_twins(content, twins)
+        faults += channel_faults(sequence, every.maps, {*missing, *map(_file_of, faults)}, stride)
         faults += surface_faults(sequence, content.maps, {*missing, *map(_file_of, faults)})
         if again is not None:
-            found, note = again.check(content, {*missing, *map(_file_of, faults)})
+            found, note = again.check(every, {*missing, *map(_file_of, faults)})
             faults += found
             notes.append(note)
     except RsbenchError as error:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.channel_truth import Rays, SeenSurfaces, pair_truth, target_of
 from rsbench.dataset.channel_writer import pair_values
-from rsbench.dataset.channels import PAIR_CHANNELS, STEP_PX, PairChannel, PixelClass, mask_file, value_file
+from rsbench.dataset.channels import STEP_PX, Layer, PixelClass, pair_layers
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.shots import FAR, Shot
 from rsbench.dataset.verification.findings import finding, rows_of
@@ -64,22 +64,21 @@ def channel_faults(
 
     Files that are ``told`` already, missing or wrong, are not looked at; a wrong depth map would accuse others.
     """
-    for channel in PAIR_CHANNELS:
-        if channel not in sequence.channels:
-            continue
+    for layer in pair_layers(sequence.channels, sequence.twins):
+        channel, row = layer
         stored: dict[Shot, _Stored] = {}
         for side, frame in VIEWS:
-            files = value_file(channel, side, frame), mask_file(channel, side, frame)
+            files = layer.values(side, frame), layer.mask(side, frame)
             try:
                 if not set(files) & set(told):
-                    pair = sequence.offsets(channel, side, frame), sequence.classes(channel, side, frame)
+                    pair = sequence.offsets(channel, side, frame, row), sequence.classes(channel, side, frame, row)
                     stored[Shot("rs", side, frame)] = _Stored(*pair)
             except RsbenchError as error:
                 yield str(error)
         for shot in stored:
-            used = {each for each in (shot, target_of(channel, shot)) if each in maps and each.depth not in told}
+            used = {each for each in (shot, target_of(layer, shot)) if each in maps and each.depth not in told}
             if len(used) == 2:
-                yield from _pair_faults(sequence, maps, channel, shot, stored, stride)
+                yield from _pair_faults(sequence, maps, layer, shot, stored, stride)
 
 
 def channels_again(
@@ -95,16 +94,17 @@ def channels_again(
         rays: through the scene.
         told: files that are not looked at.
     """
-    for channel in PAIR_CHANNELS:
-        files = value_file(channel, shot.side, shot.frame), mask_file(channel, shot.side, shot.frame)
-        if shot.shutter != "rs" or channel not in sequence.channels or set(files) & set(told):
+    for layer in pair_layers(sequence.channels, sequence.twins) if shot.shutter == "rs" else ():
+        channel, row = layer
+        files = layer.values(shot.side, shot.frame), layer.mask(shot.side, shot.frame)
+        if set(files) & set(told):
             continue
         try:
-            values = sequence.offsets(channel, shot.side, shot.frame)[rows]
-            classes = sequence.classes(channel, shot.side, shot.frame)[rows]
+            values = sequence.offsets(channel, shot.side, shot.frame, row)[rows]
+            classes = sequence.classes(channel, shot.side, shot.frame, row)[rows]
         except RsbenchError:  # told already
             continue
-        truth = pair_truth(SeenSurfaces(sequence, shot, depth, rows), target_of(channel, shot), rays.blocked)
+        truth = pair_truth(SeenSurfaces(sequence, shot, depth, rows), target_of(layer, shot), rays.blocked)
         made = pair_values(channel, shot, truth.offset)
         far = np.any(~((np.abs(values - made) <= _SAME_PX) | (np.isnan(values) & np.isnan(made))), axis=-1)
         unlike = classes != truth.classes
@@ -122,43 +122,43 @@ def channels_again(
 def _pair_faults(
     sequence: Sequence,
     maps: Mapping[Shot, DepthMap],
-    channel: PairChannel,
+    layer: Layer,
     shot: Shot,
     stored: Mapping[Shot, _Stored],
     stride: int,
 ) -> Iterator[str]:
-    derived = _derived(sequence, maps, channel, shot, stride)
+    derived = _derived(sequence, maps, layer, shot, stride)
     values, classes = stored[shot].values[::stride, ::stride], stored[shot].classes[::stride, ::stride]
-    file = value_file(channel, shot.side, shot.frame)
+    file = layer.values(shot.side, shot.frame)
     known = ~np.isin(classes, _NO_VALUE)
     both = known & np.isfinite(derived.values[..., 0])
     wrong = np.any(~(np.abs(values - derived.values) <= _SAME_PX), axis=-1)
     if _many(wrong & both, both):
         size = np.median(np.max(np.abs(values - derived.values), axis=-1)[wrong & both])
         what = f"{_percent(wrong & both, both)} differ from what depth and motion make, typically by {size:.2g} px"
-        cause = _cause(channel, shot, stored, derived, stride)
+        cause = _cause(layer, shot, stored, derived, stride)
         yield finding(file, what, _rows(wrong & both, stride, len(stored[shot].classes)), cause)
     empty = np.isnan(values).any(axis=-1)
     if np.any(empty == known):
         what = f"{np.sum(empty & known)} pixels without a value and {np.sum(~empty & ~known)} with one too many"
-        yield finding(file, f"{what}, by {mask_file(channel, shot.side, shot.frame)}")
-    yield from _mask_faults(channel, shot, classes, maps[shot].depth[::stride, ::stride] == 0, derived, stride)
+        yield finding(file, f"{what}, by {layer.mask(shot.side, shot.frame)}")
+    yield from _mask_faults(layer, shot, classes, maps[shot].depth[::stride, ::stride] == 0, derived, stride)
 
 
 def _mask_faults(
-    channel: PairChannel,
+    layer: Layer,
     shot: Shot,
     classes: NDArray[np.uint8],
     sky: BoolArray,
     derived: _Derived,
     stride: int,
 ) -> Iterator[str]:
-    file, height = mask_file(channel, shot.side, shot.frame), len(classes) * stride
+    file, height = layer.mask(shot.side, shot.frame), len(classes) * stride
     lost = np.isnan(derived.values[..., 0])
     everywhere = np.ones(classes.shape, dtype=np.bool_)
     unsolved, empty = classes == PixelClass.UNSOLVED, np.isin(classes, _NO_VALUE)
     hidden, of_sky = np.isin(classes, _HIDDEN), np.isin(classes, _OF_SKY)
-    seen_there = target_of(channel, shot).depth
+    seen_there = target_of(layer, shot).depth
     surface, behind = ~empty & (derived.hidden == 0), derived.hidden == 1
     for words, wrong, among, many in (
         ("not solved", unsolved, everywhere, _many),
@@ -172,15 +172,13 @@ def _mask_faults(
             yield finding(file, f"{_percent(wrong & among, among)} are {words}", rows)
 
 
-def _derived(
-    sequence: Sequence, maps: Mapping[Shot, DepthMap], channel: PairChannel, shot: Shot, stride: int
-) -> _Derived:
+def _derived(sequence: Sequence, maps: Mapping[Shot, DepthMap], layer: Layer, shot: Shot, stride: int) -> _Derived:
     """Sky is a surface at ``FAR``; what has none in the target is before it nowhere."""
     depth = maps[shot].depth
     filled = DepthMap(shot, np.where(depth > 0, depth, np.float32(FAR)))
-    landing = land(sequence, filled, maps[target_of(channel, shot)], stride)
+    landing = land(sequence, filled, maps[target_of(layer, shot)], stride)
     grid = sequence.rig.camera.pixel_grid()[::stride, ::stride]
-    values = pair_values(channel, shot, landing.pixels - grid)
+    values = pair_values(layer.channel, shot, landing.pixels - grid)
     sky, relative = depth[::stride, ::stride] == 0, landing.relative
     free = np.where(sky, np.isneginf(relative), np.abs(relative) < _SURFACE)
     hidden = np.where(relative > _BEHIND, 1.0, np.where(free, 0.0, np.nan))
@@ -218,16 +216,14 @@ def _rows(wrong: BoolArray, stride: int, height: int) -> str:
     return rows_of(np.repeat(share > 0.5 * np.max(share), stride)[:height])
 
 
-def _cause(
-    channel: PairChannel, shot: Shot, stored: Mapping[Shot, _Stored], derived: _Derived, stride: int
-) -> str:
+def _cause(layer: Layer, shot: Shot, stored: Mapping[Shot, _Stored], derived: _Derived, stride: int) -> str:
     """What the stored values are instead, in words; "" where nothing explains most of them."""
     values = stored[shot].values
     sampled = values[::stride, ::stride]
     tried = {
         "zeroed": values * 0 if not np.any(np.nan_to_num(values)) else None,
         "negated": -values,
-        "x and y exchanged": values[..., ::-1] if channel != "disparity" else None,
+        "x and y exchanged": values[..., ::-1] if layer.channel != "disparity" else None,
         "shifted by one row": np.roll(values, -1, axis=0),
         "shifted by one column": np.roll(values, -1, axis=1),
         "flipped left to right": values[:, ::-1],
@@ -238,7 +234,7 @@ def _cause(
             return f"looks {words}"
     for other, held in stored.items():
         if other != shot and np.array_equal(held.values, values, equal_nan=True):
-            return f"the same as {value_file(channel, other.side, other.frame)}"
+            return f"the same as {layer.values(other.side, other.frame)}"
     ratio = float(np.nanmedian(sampled / np.where(np.abs(derived.values) < 1, np.nan, derived.values)))
     spread = np.nanmedian(np.abs(sampled - ratio * derived.values))
     return f"looks scaled by {ratio:.5g}" if abs(ratio - 1) > 1e-4 and spread < 2 * _SAME_PX else ""

@@ -33,28 +33,33 @@ class Content:
 def read_content(sequence: Sequence, missing: Collection[str] = ()) -> Content:
     """Read all eight shots but ``missing`` files, one fault for each that cannot be."""
     content = Content(sequence)
+    for shot in SHOTS:
+        read_shot(content, shot, missing)
+    return content
+
+
+def read_shot(content: Content, shot: Shot, missing: Collection[str]) -> None:
+    """Add what can be read of a shot, and the faults of what cannot."""
+    sequence = content.sequence
     renderer = sequence.manifest.get("renderer")
     noisy = isinstance(renderer, dict) and renderer.get("integrator") == "path"
     size = sequence.rig.camera.width, sequence.rig.camera.height
-    for shot in SHOTS:
-        try:
-            if shot.depth not in missing:
-                content.maps[shot] = DepthMap(shot, sequence.depth(*shot[:3]))
-        except RsbenchError as error:
-            content.faults.append(str(error))
-        file = clean_file(sequence, shot)
-        if file in missing:
-            continue
-        try:
-            fault = png_fault(inside(sequence.folder, file), file, size)
-            content.faults += [fault] if fault else []
-            if fault is None:
-                content.pictures[shot] = image_checks.Picture.of(
-                    shot, read_png(inside(sequence.folder, file), size), noisy
-                )
-        except RsbenchError as error:
-            content.faults.append(str(error))
-    return content
+    try:
+        if shot.depth not in missing:
+            content.maps[shot] = DepthMap(shot, sequence.depth(*shot))
+    except RsbenchError as error:
+        content.faults.append(str(error))
+    file = clean_file(sequence, shot)
+    if file in missing:
+        return
+    try:
+        fault = png_fault(inside(sequence.folder, file), file, size)
+        content.faults += [fault] if fault else []
+        if fault is None:
+            pixels = read_png(inside(sequence.folder, file), size)
+            content.pictures[shot] = image_checks.Picture.of(shot, pixels, noisy)
+    except RsbenchError as error:
+        content.faults.append(str(error))
 
 
 def clean_file(sequence: Sequence, shot: Shot) -> str:

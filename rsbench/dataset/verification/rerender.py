@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from rsbench import __version__
 from rsbench.cards import list_cards, parse_card
 from rsbench.core.projection import row_poses
+from rsbench.core.rig import VIEWS
 from rsbench.dataset.generation import image_seed
 from rsbench.dataset.scene_hashes import scene_hash
 from rsbench.dataset.sequence import whole_frames
@@ -156,7 +157,8 @@ def _checks(
     from rsbench.renderers.segments import SceneRays
 
     elsewhere = not _made_here(content)
-    for shot in SHOTS:
+    twins = (Shot("gs", *view, row) for row in content.sequence.twins for view in VIEWS)
+    for shot in (*SHOTS, *twins):
         if shot not in content.maps and shot not in content.pictures:
             continue
         frame = _render(content, scene, options, shot, rows)
@@ -238,7 +240,7 @@ def _render(content: Content, scene: MitsubaScene, options: RendererOptions, sho
     sequence, chosen = content.sequence, _of_image(content, options, shot)
     R, t = row_poses(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame)
     if shot.shutter == "gs":
-        line = sequence.shutter.first_line(shot.side)
+        line = abs(sequence.shutter.first_line(shot.side) - shot.row)
         R, t = np.broadcast_to(R[line], R.shape), np.broadcast_to(t[line], t.shape)
     columns = sequence.shutter.axis(shot.side) == 0
     return render(scene, sequence.rig.camera, R, t, chosen, rows=rows, columns=columns)
