@@ -60,10 +60,10 @@ class Motion(ABC):
         """``(w', t')`` (..., 3) with dR/dtau = [w']x R and dt/dtau = t'."""
 
     def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """``(w'', t'')`` (..., 3), the derivatives of ``velocity``.
+        """Angular and linear acceleration, (..., 3) each: the derivatives of ``velocity``.
 
-        Here by central differences of fourth order, which err by 3e-14 (``_STEP``^4 / 30) of the fifth derivative
-        of the velocity; rsbench's own models say theirs exactly.
+        Here by central differences of fourth order, which err by 3e-14 (the fourth power of their step, over 30)
+        of the fifth derivative of the velocity; rsbench's own models say theirs exactly.
         """
         tau = np.asarray(tau, dtype=np.float64)
         weights = {-2.0: 1.0, -1.0: -8.0, 1.0: 8.0, 2.0: -1.0}
