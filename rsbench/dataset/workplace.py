@@ -51,6 +51,7 @@ def workplace(out: Path, hidden: Path | None = None) -> Iterator[Path]:
         RsbenchError: another command works there, or the folder cannot be written.
     """
     hidden = out / HIDDEN if hidden is None else hidden
+    fresh = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
     descriptor = _take(out, hidden)
     done = threading.Event()
     threading.Thread(target=_beat, args=(hidden / _LOCK, done), daemon=True).start()
@@ -60,7 +61,7 @@ def workplace(out: Path, hidden: Path | None = None) -> Iterator[Path]:
         yield hidden
     finally:
         done.set()
-        _leave(hidden, descriptor)
+        _leave(hidden, descriptor, fresh)
 
 
 def remove(path: Path) -> None:
@@ -198,12 +199,15 @@ def _beat(lock: Path, done: threading.Event) -> None:
             os.utime(lock)
 
 
-def _leave(hidden: Path, descriptor: int) -> None:
-    """Free the lock; the hidden folder goes when it holds nothing that a later run can use."""
+def _leave(hidden: Path, descriptor: int, fresh: list[Path]) -> None:
+    """Free the lock; the hidden folder goes when it holds nothing that a later run can use, and ``fresh`` ones, of
+    which each holds the one before it, when they are empty."""
     with contextlib.suppress(OSError):
         remove(hidden / WORK)
         os.ftruncate(descriptor, 0)
         if [path.name for path in hidden.iterdir()] == [_LOCK]:
             (hidden / _LOCK).unlink()
             hidden.rmdir()
+        for folder in fresh:
+            folder.rmdir()
     os.close(descriptor)

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rsbench.caches import cpu_key
+from rsbench.imports import lifeline
 from rsbench.renderers import verdicts
 
 MINIMUM_VERSION = 17
@@ -68,6 +69,8 @@ z = dr.gather(Float, y, 63 - dr.arange(UInt32, 64))
 assert abs(float(dr.sum(z)[0]) - float(sum(list(y)))) < 1e-2
 print("version", *version)
 """
+
+_BOUND = "from rsbench.imports import end_with; end_with({line})\n"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,21 +189,24 @@ def probe(candidate: Candidate, timeout: float = 60.0) -> Verdict:
 def run_child(code: str, arguments: Sequence[str], environ: Mapping[str, str], timeout: float) -> Verdict:
     """Run Python code in a child process; it passes by printing ``version ...`` as its last line, exit code 0.
 
-    ``-P`` keeps the working directory out of the child's path; it finds modules where this process does.
+    ``-P`` keeps the working directory out of the child's path; it finds modules where this process does. On Linux
+    the child ends with this process, however that ends.
     """
     path = os.pathsep.join(folder for folder in sys.path if folder)
-    command = [sys.executable, "-P", "-c", code, *arguments]
     try:
-        done = subprocess.run(
-            command,
-            env={**os.environ, "PYTHONPATH": path, **environ},
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=timeout,
-            stdin=subprocess.DEVNULL,
-            check=False,
-        )
+        with lifeline() as line:
+            done = subprocess.run(
+                [sys.executable, "-P", "-c", _BOUND.format(line=line) + code, *arguments],
+                env={**os.environ, "PYTHONPATH": path, **environ},
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=timeout,
+                stdin=subprocess.DEVNULL,
+                check=False,
+                start_new_session=True,
+                pass_fds=(line,) if line >= 0 else (),
+            )
     except subprocess.TimeoutExpired:
         return Verdict(ok=False, reason=f"gave no answer within {timeout:g} s")
     except OSError as error:

@@ -1,34 +1,41 @@
 """Sound sequences of random cards, in which verify must find nothing.
 
-Cameras, rigs, shutters, motions of every model, renderers, scenes and viewpoints are drawn; motions go to 20
-degrees and a metre per frame, and one scene has hardly any texture. A motion through a wall or into the sky,
-which ``generate`` refuses, is drawn again. Small, so that there can be many. No surface is glossy: none of
-rsbench's scenes has one.
+Cameras and their lenses, rigs, scans, delays, sensors, channels, motions of every model, renderers, scenes and
+viewpoints are drawn; motions go to 20 degrees and a metre per frame, and one scene has hardly any texture. What
+``generate`` refuses, such as a way through a wall or into the sky, is drawn again. Small, so that there can be
+many. No surface is glossy: none of rsbench's scenes has one.
 """
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import get_args
 from unittest.mock import patch
 
 import numpy as np
 from small_scenes import write_box_scene
 
-from rsbench.cards import list_cards
+from rsbench.cards import card_path, list_cards
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.lens import Lens
+from rsbench.core.shutter import Scan, Scanning
 from rsbench.dataset import generation
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
-from rsbench.dataset.verification import verify_dataset
+from rsbench.dataset.channels import CHANNELS, Channel, check_channels
+from rsbench.dataset.verification import rerender, verify_dataset
 from rsbench.errors import RsbenchError
+from rsbench.renderers.electrons import Sensor
 from rsbench.scenes.load import load_scene, read_scene_card
 from rsbench.scenes.model import Scene
 
 MODELS = ("linear", "twist", "accelerated", "spline")
-PER_DATASET = 10
+PER_DATASET = 3
 """Sequences of one viewpoint, camera, shutter and renderer."""
 MOST_DRAWS = 50
 """Motions of one sequence, of which ``generate`` must take one."""
@@ -38,6 +45,8 @@ RENDERERS = {
     "sixteen": 'integrator = "sunsky"\nsamples = 16\nexposure = 1.6\n',
     "traced": 'integrator = "path"\nsamples = 4\nmax_depth = 3\n',
 }
+
+DIRECT = [name for name in RENDERERS if name != "traced"]
 
 
 def random_cards(count: int, folder: Path, seed: int) -> Iterator[DatasetCard]:
@@ -56,21 +65,84 @@ def random_cards(count: int, folder: Path, seed: int) -> Iterator[DatasetCard]:
 def _card(rng: np.random.Generator, number: int, scene: str, folder: Path, sequences: int) -> DatasetCard:
     path = Path(scene) if scene.endswith(".toml") else list_cards("scenes")[scene]
     viewpoint = str(rng.choice(list(read_scene_card(path)[0].viewpoints)))
-    width, height = (int(size) for size in rng.integers(48, 97, 2))
+    camera, scanning, period = _camera(rng), _scanning(rng), float(rng.uniform(0.01, 0.2))
     return DatasetCard(
         name=f"random-{number}",
-        camera=CameraCard(width=width, height=height, focal=float(width * rng.uniform(0.6, 2.0))),
+        camera=camera,
         baseline=float(rng.uniform(0.05, 0.6)),
         readout_ratio=float(rng.choice([0.0, 1.0, rng.uniform(0, 1)])),
-        frame_period_s=float(rng.uniform(0.01, 0.2)),
+        frame_period_s=period,
+        scan=scanning.scan,
+        right_scan=scanning.right_scan,
+        right_delay=scanning.right_delay,
+        sensor=_sensor(rng, period),
+        channels=_channels(rng, camera, scanning),
         motion=_motion(rng),
-        renderer=str(folder / f"{rng.choice(list(RENDERERS))}.toml"),
+        renderer=str(folder / f"{'traced' if number % 2 else rng.choice(DIRECT)}.toml"),
         seed=int(rng.integers(1000)),
         sequence=tuple(
             SequenceCard(name=f"s{k}", scene=scene, viewpoint=viewpoint, motion=_motion(rng))
             for k in range(sequences)
         ),
     ).expanded()
+
+
+def _camera(rng: np.random.Generator) -> CameraCard:
+    """Half of them with a lens; one that folds inside the image is drawn again."""
+    width, height = (int(size) for size in rng.integers(48, 97, 2))
+    focal = float(width * rng.uniform(0.6, 2.0))
+    while True:
+        camera = CameraCard(width=width, height=height, focal=focal, lens=_lens(rng))
+        with contextlib.suppress(ValueError):
+            replace(PinholeCamera.centred(width, height, focal), lens=camera.lens)
+            return camera
+
+
+def _lens(rng: np.random.Generator) -> Lens | None:
+    k = rng.uniform(-1, 1, 4)
+    kind = rng.choice(["none", "none", "brown-conrady", "kannala-brandt"])
+    if kind == "none":
+        return None
+    if kind == "brown-conrady":
+        p1, p2 = 0.005 * rng.uniform(-1, 1, 2)
+        return Lens(model="brown-conrady", k1=0.3 * k[0], k2=0.1 * k[1], p1=p1, p2=p2, k3=0.02 * k[2])
+    return Lens(model="kannala-brandt", k1=0.08 * k[0], k2=0.03 * k[1], k3=0.01 * k[2], k4=0.003 * k[3])
+
+
+def _scanning(rng: np.random.Generator) -> Scanning:
+    """Half of them from the top at once."""
+    if rng.random() < 0.5:
+        return Scanning()
+    scan, right = (get_args(Scan)[k] for k in rng.integers(len(get_args(Scan)), size=2))
+    delay = float(rng.choice([0.0, rng.uniform(-0.5, 0.5)]))
+    return Scanning(scan=scan, right_scan=rng.choice([None, right]), right_delay=delay)
+
+
+def _sensor(rng: np.random.Generator, period: float) -> Sensor | None:
+    """Half of them ideal; of the others some blur, some are noisy, some both."""
+    if rng.random() < 0.5:
+        return None
+    noisy = bool(rng.random() < 0.7)
+    return Sensor(
+        exposure_s=float(rng.choice([0.0, rng.uniform(0, 0.5), rng.uniform(0, 0.5)])) * period,
+        full_well=float(rng.uniform(2000, 30000)),
+        gain=float(2.0 ** rng.integers(4)),
+        photon_noise=noisy,
+        read_noise=float(rng.uniform(0, 5)) if noisy else 0.0,
+        dark_current=float(rng.uniform(0, 50)) if noisy else 0.0,
+        bit_depth=int(rng.choice([0, 8, 10, 12])),
+        vignetting=float(rng.choice([0.0, rng.uniform(0, 0.5)])),
+    )
+
+
+def _channels(rng: np.random.Generator, camera: CameraCard, scanning: Scanning) -> tuple[Channel, ...]:
+    """Some of those that such cameras can have."""
+    chosen: list[Channel] = []
+    for channel in CHANNELS:
+        with contextlib.suppress(ValueError):
+            check_channels((channel,), camera.lens is not None, scanning.plain)
+            chosen += [channel] if rng.random() < 0.5 else []
+    return tuple(chosen)
 
 
 def _motion(rng: np.random.Generator) -> MotionCard:
@@ -104,6 +176,15 @@ def _generated(card: DatasetCard, out: Path) -> int:
     raise RuntimeError(f"{card.name}: every motion is refused")
 
 
+def _words(card: DatasetCard) -> str:
+    """What is special about a card."""
+    words = [Path(card.sequence[0].scene).stem, Path(card.renderer).stem]
+    words += [card.camera.lens.model] if card.camera.lens else []
+    words += [] if card.plain else [f"{card.scan}/{card.right_scan}/{card.right_delay:.2f}"]
+    words += [f"exposure {card.sensor.exposure_s:.3f}"] if card.sensor else []
+    return ", ".join([*words, *card.channels])
+
+
 def false_alarms(count: int, folder: Path, seed: int = 0) -> Iterator[tuple[str, int, int, list[str]]]:
     """Of each dataset its name, how many sequences it has, motions that were refused, and what verify found."""
     from rsbench.renderers import scene
@@ -118,15 +199,21 @@ def false_alarms(count: int, folder: Path, seed: int = 0) -> Iterator[tuple[str,
             kept[key] = made(seen)
         return kept[key]
 
-    made = scene.MitsubaScene
+    made, built = scene.MitsubaScene, lru_cache(maxsize=1)(load_scene)
+
+    def loaded(name: str | Path) -> Scene:
+        return built(card_path("scenes", name))
+
     with (
-        patch.object(generation, "load_scene", lru_cache(maxsize=1)(load_scene)),
+        patch.object(generation, "load_scene", loaded),
+        patch.object(rerender, "load_scene", loaded),
         patch.object(scene, "MitsubaScene", once),
     ):
         for card in random_cards(count, folder, seed):
             out = folder / card.name
             refused = _generated(card, out)
-            found = [f"{report.name}: {fault}" for report in verify_dataset(out) for fault in report.faults]
-            yield f"{card.name} ({Path(card.renderer).stem})", len(card.sequence), refused, found
+            reports = verify_dataset(out, rerender="auto", scenes=[folder / "plain.toml"])
+            found = [f"{report.name}: {fault}" for report in reports for fault in report.faults]
+            yield f"{card.name} ({_words(card)})", len(card.sequence), refused, found
             if not found:
                 shutil.rmtree(out)

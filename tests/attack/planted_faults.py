@@ -7,6 +7,7 @@ dataset is that of datasets/smoke.toml, with the sequences "castle" and "room-tw
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,7 @@ from rsbench.core.motion import TwistMotion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.files import sha256, write_depth, write_png
-from rsbench.dataset.sequence import read_sequence
+from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene
 
@@ -107,7 +108,7 @@ def _depth_faults() -> Iterator[Fault]:
     )
     yield Fault("depth of another sequence", copied(f"{OTHER}/{rs}", rs), (rs, "differs"))
     for row in (48, 95):
-        words = ("gs_depth/left_1.exr", f"global shutter at the pose of row {row}")
+        words = ("gs_depth/left_1.exr", f"global shutter at the pose of line {row}")
         yield Fault(f"twin at the pose of row {row}", twin_at(row), words, slow=True)
     yield Fault("every depth scaled by 1.02", _every_depth(1.02), ("depth/",))
     yield Fault(
@@ -116,7 +117,7 @@ def _depth_faults() -> Iterator[Fault]:
 
 
 @lru_cache(maxsize=1)
-def _scene() -> Any:
+def scene_of_victim() -> Any:
     from rsbench.renderers.scene import MitsubaScene
 
     scene = load_scene(VICTIM)
@@ -133,7 +134,7 @@ def twin_at(row: int) -> Plant:
         sequence = read_sequence(folder / VICTIM)
         poses = row_poses(sequence.rig, sequence.shutter, sequence.motion, "left", 1)
         options = load_card(RendererOptions, "renderers", "preview")
-        frame = render_global(_scene(), sequence.rig.camera, poses.R[row], poses.t[row], options)
+        frame = render_global(scene_of_victim(), sequence.rig.camera, poses.R[row], poses.t[row], options)
         write_png(sequence.folder / "gs/left_1.png", to_srgb8(frame.image, options.exposure))
         write_depth(sequence.folder / "gs_depth/left_1.exr", frame.depth)
 
@@ -274,28 +275,28 @@ def _manifest_faults() -> Iterator[Fault]:
 
 def _consistent_faults() -> Iterator[Fault]:
     """Another truth in all places that state it: only the depth maps know better."""
-    yield Fault(
-        "another readout ratio everywhere",
-        other_geometry({"readout_ratio": 0.79}, {"card": {"readout_ratio": 0.79}}),
-        ("rs_depth/", "depth"),
-    )
-    yield Fault(
-        "another baseline everywhere",
-        other_geometry({"baseline": 0.301}, {"card": {"baseline": 0.301}}),
-        ("_depth/", "baseline"),
-    )
-    yield Fault(
-        "another focal length everywhere",
-        other_geometry({"camera": {"fx": 151.0, "fy": 151.0}}, {}),
-        ("_depth/", "depth"),
-    )
 
-    def twist(sequence: Any) -> Any:
-        from dataclasses import replace
+    def everywhere(name: str, change: Callable[[Sequence], Sequence], *words: str) -> Fault:
+        return Fault(f"another {name} everywhere", other_geometry(change), words)
 
+    def readout(sequence: Sequence) -> Sequence:
+        return replace(sequence, shutter=sequence.shutter.with_ratio(0.79))
+
+    def baseline(sequence: Sequence) -> Sequence:
+        return replace(sequence, rig=replace(sequence.rig, baseline=0.301))
+
+    def focal(sequence: Sequence) -> Sequence:
+        return replace(
+            sequence, rig=replace(sequence.rig, camera=replace(sequence.rig.camera, fx=151.0, fy=151.0))
+        )
+
+    def twist(sequence: Sequence) -> Sequence:
         return replace(sequence, motion=TwistMotion(sequence.motion.w, sequence.motion.d))
 
-    yield Fault("another motion model everywhere", other_geometry({}, {"motion_of": twist}), ("_depth/", "depth"))
+    yield everywhere("readout ratio", readout, "rs_depth/", "depth")
+    yield everywhere("baseline", baseline, "_depth/", "baseline")
+    yield everywhere("focal length", focal, "_depth/", "depth")
+    yield everywhere("motion model", twist, "_depth/", "depth")
 
 
 def _dataset_faults() -> Iterator[Fault]:

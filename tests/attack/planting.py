@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,8 @@ from rsbench.dataset.files import (
     write_png,
     write_poses,
 )
-from rsbench.dataset.sequence import read_sequence, sequence_manifest
+from rsbench.dataset.sequence import Sequence, read_sequence, sequence_manifest
+from rsbench.dataset.timing import write_timing
 from rsbench.dataset.verification import verify_sequence
 from rsbench.dataset.verification.rerender import Again
 from rsbench.dataset.verification.structure import Listing, dataset_faults
@@ -210,31 +211,26 @@ def drop(*path: Any) -> Callable[[dict[str, Any]], object]:
     return change
 
 
-def other_geometry(manifest: dict[str, Any], card: dict[str, Any]) -> Plant:
-    """sequence.json, poses and card all say another geometry than the one that was rendered."""
+def other_geometry(change: Callable[[Sequence], Sequence]) -> Plant:
+    """sequence.json, poses, times and card all say another rig, shutter or motion than that of the images."""
 
     def plant(folder: Path) -> None:
         path = folder / VICTIM / "sequence.json"
-        stored = read_json(path)
-        write_json(path, {**stored, **manifest, "camera": {**stored["camera"], **manifest.get("camera", {})}})
-        sequence = read_sequence(path.parent)
-        if "motion_of" in card:
-            sequence = card["motion_of"](sequence)
-        again = sequence_manifest(
-            name=sequence.name,
-            rig=sequence.rig,
-            shutter=sequence.shutter,
-            motion=sequence.motion,
-            frame_period_s=sequence.frame_period_s,
-        )
-        write_json(path, {**read_json(path), **again})
-        rows = np.arange(sequence.shutter.height)
+        sequence = change(read_sequence(path.parent))
+        rig, shutter, motion = sequence.rig, sequence.shutter, sequence.motion
+        kept = {key: value for key, value in read_json(path).items() if key not in asdict(shutter.scanning)}
+        period = sequence.frame_period_s
+        geometry = sequence_manifest(name=VICTIM, rig=rig, shutter=shutter, motion=motion, frame_period_s=period)
+        write_json(path, kept | geometry)
         for side, frame in VIEWS:
-            poses = row_poses(sequence.rig, sequence.shutter, sequence.motion, side, frame)
-            write_poses(path.parent / f"poses/{side}_{frame}.csv", sequence.shutter.row_time(rows, frame), poses)
+            poses = row_poses(rig, shutter, motion, side, frame)
+            write_poses(path.parent / f"poses/{side}_{frame}.csv", shutter.line_times(frame, side), poses)
+        if "timing" in sequence.channels:
+            write_timing(path.parent, shutter, period, sequence.sensor)
         dataset = read_json(folder / "dataset.json")
-        dataset["card"].update(card.get("card", {}))
-        dataset["card"]["sequence"][0].update(card.get("sequence", {}))
+        card = dataset["card"]
+        card |= {"baseline": rig.baseline, "readout_ratio": shutter.readout_ratio, **asdict(shutter.scanning)}
+        card["camera"] |= {"focal": rig.camera.fx, "lens": rig.camera.lens and asdict(rig.camera.lens)}
         write_json(folder / "dataset.json", dataset)
 
     return plant

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 from attack.clean_sequences import false_alarms
+from attack.planted_cameras import CAMERA_FAULTS, card_of
 from attack.planted_faults import FAULTS
 from attack.planting import found, planted
 from rsbench.dataset.card import load_dataset_card
@@ -21,15 +22,19 @@ def say(text: str) -> None:
 
 
 def missed_faults(root: Path) -> int:
-    """How many of ``FAULTS`` verify does not name in a copy of the smoke dataset."""
-    generate_dataset(load_dataset_card("smoke"), root / "sound")
-    start, missed = time.perf_counter(), 0
-    for fault in FAULTS:
-        named, lines = found(fault, planted(fault, root / "sound", root / "planted"))
-        if not named:
-            missed += 1
-            say(f"  missed: {fault.name}: {lines}")
-    say(f"planted faults: {len(FAULTS)}, {missed} missed; {time.perf_counter() - start:.0f} s")
+    """How many planted faults verify does not name, in the smoke dataset and in those of other cameras."""
+    bases = {"smoke": (load_dataset_card("smoke"), FAULTS)}
+    bases |= {name: (card_of(name), faults) for name, faults in CAMERA_FAULTS.items()}
+    start, count, missed = time.perf_counter(), 0, 0
+    for name, (card, faults) in bases.items():
+        generate_dataset(card, root / name)
+        for fault in faults:
+            named, lines = found(fault, planted(fault, root / name, root / "planted"))
+            count += 1
+            if not named:
+                missed += 1
+                say(f"  missed: {name}: {fault.name}: {lines}")
+    say(f"planted faults: {count}, {missed} missed; {time.perf_counter() - start:.0f} s")
     return missed
 
 

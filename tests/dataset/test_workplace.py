@@ -32,7 +32,13 @@ def test_it_is_empty_at_first_and_leaves_nothing(tmp_path: Path) -> None:
     with workplace(tmp_path / "new/out") as hidden:
         assert hidden == tmp_path / "new/out" / HIDDEN and list((hidden / WORK).iterdir()) == []
         (hidden / WORK / "half").write_text("half")
-    assert list((tmp_path / "new/out").iterdir()) == []
+    assert list(tmp_path.iterdir()) == [], "folders that it made are empty"
+    (tmp_path / "old").mkdir()
+    with workplace(tmp_path / "old/out"):
+        (tmp_path / "old/out/result").write_text("done")
+    with workplace(tmp_path / "old"):
+        pass
+    assert files_below(tmp_path) == ["old/out/result"]
 
 
 def test_what_a_later_run_can_use_stays(tmp_path: Path) -> None:

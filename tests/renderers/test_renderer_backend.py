@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes.util
 import importlib.metadata
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -179,6 +181,23 @@ def test_a_child_that_hangs_is_given_up() -> None:
     begin = time.perf_counter()
     verdict = llvm.run_child("import time; time.sleep(60)", [], {}, 0.5)
     assert not verdict.ok and "0.5 s" in verdict.reason and time.perf_counter() - begin < 20
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere nothing ends a child whose parent was killed")
+def test_a_child_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
+    deadly = (
+        "import os, signal, sys, time; open(sys.argv[1], 'w').write(str(os.getpid())); "
+        "os.kill(os.getppid(), signal.SIGKILL); time.sleep(60)"
+    )
+    started = tmp_path / "pid"
+    parent = f"from rsbench.renderers import llvm; llvm.run_child({deadly!r}, [{str(started)!r}], {{}}, 60.0)"
+    assert subprocess.run([sys.executable, "-c", parent]).returncode == -signal.SIGKILL
+    child = Path("/proc") / started.read_text() / "stat"
+    end = time.perf_counter() + 10
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        while child.read_text().rpartition(")")[2].split()[0] not in ("Z", "X"):  # dead, and not buried yet
+            assert time.perf_counter() < end, "the child lives on"
+            time.sleep(0.01)
 
 
 def test_wheel_without_its_symbolic_links_still_loads(tmp_path: Path) -> None:

@@ -108,6 +108,7 @@ def verify_sequence(
             step(name)
             steps -= 1
         faults += comparison.faults(images_elsewhere(partial(_others, listing, name)))
+        notes += comparison.notes
         faults += timing_faults(sequence, {*missing, *map(_file_of, faults)})
         faults += imu_faults(sequence, {*missing, *map(_file_of, faults)})
         twins = read_twins(sequence, missing)

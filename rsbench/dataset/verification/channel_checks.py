@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -175,7 +176,7 @@ def _mask_faults(
 def _derived(sequence: Sequence, maps: Mapping[Shot, DepthMap], layer: Layer, shot: Shot, stride: int) -> _Derived:
     """Sky is a surface at ``FAR``; what has none in the target is before it nowhere."""
     depth = maps[shot].depth
-    filled = DepthMap(shot, np.where(depth > 0, depth, np.float32(FAR)))
+    filled = replace(maps[shot], depth=np.where(depth > 0, depth, np.float32(FAR)))
     landing = land(sequence, filled, maps[target_of(layer, shot)], stride)
     grid = sequence.rig.camera.pixel_grid()[::stride, ::stride]
     values = pair_values(layer.channel, shot, landing.pixels - grid)

@@ -16,6 +16,7 @@ from rsbench.dataset.verification.findings import DepthAgreement, finding, rows_
 from rsbench.dataset.verification.image_causes import Elsewhere, likeness_faults
 from rsbench.dataset.verification.landing import PAIRS, SHOTS, DepthMap, Shot, land
 from rsbench.dataset.verification.png import png_fault
+from rsbench.dataset.verification.rough import roughly_alike
 from rsbench.errors import RsbenchError
 from rsbench.reading import inside
 
@@ -46,7 +47,7 @@ def read_shot(content: Content, shot: Shot, missing: Collection[str]) -> None:
     size = sequence.rig.camera.width, sequence.rig.camera.height
     try:
         if shot.depth not in missing:
-            content.maps[shot] = DepthMap(shot, sequence.depth(*shot))
+            content.maps[shot] = DepthMap(shot, sequence.depth(*shot), sequence.rig.camera)
     except RsbenchError as error:
         content.faults.append(str(error))
     file = clean_file(sequence, shot)
@@ -73,24 +74,38 @@ def twin_faults(content: Content) -> Iterator[str]:
 
     Where columns are read, it is the first column.
     """
-    shutter = content.sequence.shutter
     for shot in SHOTS:
-        axis, number = 1 - shutter.axis(shot.side), shutter.first_line(shot.side)
+        twin, maps, pictures = shot._replace(shutter="gs"), content.maps, content.pictures
+        axis, number = _first_line(content, shot)
         line = f"{'row' if axis == 0 else 'column'} {number}"
-        twin = shot._replace(shutter="gs")
         if shot.shutter != "rs":
             continue
-        if {shot, twin} <= content.pictures.keys():
-            rows = [np.take(content.pictures[each].colours, [number], axis) for each in (shot, twin)]
+        if {shot, twin} <= pictures.keys():
+            rows = [np.take(pictures[each].colours, [number], axis) for each in (shot, twin)]
             unlike = np.any(rows[0] != rows[1], axis=-1)
             if np.any(unlike):
                 what = f"{np.sum(unlike)} pixels differ from the global-shutter twin at the same pose"
                 yield finding(clean_file(content.sequence, shot), f"{line} differs from {twin.image}: {what}")
-        if {shot, twin} <= content.maps.keys():
-            own, other = (np.take(content.maps[each].depth, [number], axis) for each in (shot, twin))
+        if {shot, twin} <= maps.keys():
+            own, other = (np.take(maps[each].depth, [number], axis) for each in (shot, twin))
             if not np.array_equal(own, other):
                 what = f"by up to {np.max(np.abs(own - other)):.3g} m at the same pose"
-                yield finding(shot.depth, f"{line} differs from {twin.depth}: {what}")
+                cause = _first_of_twin(maps[shot].depth, maps[twin].depth)
+                yield finding(shot.depth, f"{line} differs from {twin.depth}: {what}", cause=cause)
+
+
+def _first_line(content: Content, shot: Shot) -> tuple[int, int]:
+    """Axis and number of the line of an image that is read first."""
+    shutter = content.sequence.shutter
+    return 1 - shutter.axis(shot.side), shutter.first_line(shot.side)
+
+
+def _first_of_twin(depth: NDArray[np.float32], twin: NDArray[np.float32]) -> str:
+    """Where these maps (H, W) begin to be read, in words, by the one line that they share; "" for none."""
+    ends = (("top", 0, 0), ("bottom", 0, -1), ("left", 1, 0), ("right", 1, -1))
+    lines = {side: (depth.take(place, axis), twin.take(place, axis)) for side, axis, place in ends}
+    same = [side for side, (own, other) in lines.items() if np.array_equal(own, other) and np.any(own)]
+    return f"looks read from the {same[0]}" if len(same) == 1 else ""
 
 
 @dataclass(eq=False)
@@ -103,6 +118,8 @@ class Comparison:
     verdicts: dict[Shot, depth.MapVerdict] = field(default_factory=dict)
     likenesses: list[image_checks.Likeness] = field(default_factory=list)
     votes: dict[Shot, image_checks.ImageVotes] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    """What could not be compared well, and is no fault."""
 
     def __post_init__(self) -> None:
         camera = self.content.sequence.rig.camera
@@ -135,12 +152,22 @@ class Comparison:
         if geometry:
             yield geometry
             return
-        wrong = depth.map_faults(self.verdicts)
+        wrong = self._wrong_maps()
         for shot, fault in wrong.items():
             cause = likely_cause(self.content.sequence, self.content.maps, shot, fault.rows)
             yield finding(shot.depth, fault.what, rows_of(fault.rows), cause)
         yield from depth.pair_faults(self.agreements, wrong)
         yield from self._image_faults(wrong.keys(), elsewhere)
+
+    def _wrong_maps(self) -> dict[Shot, depth.MapFault]:
+        """Faults of maps; one without a flat place is none, where it is roughly what others see."""
+        wrong = depth.map_faults(self.verdicts)
+        for shot in [shot for shot, fault in wrong.items() if fault.uncompared]:
+            if roughly_alike(self.content.sequence, self.content.maps, shot):
+                del wrong[shot]
+                what = "no place is flat enough to be compared with another frame; it is roughly what others see"
+                self.notes.append(finding(shot.depth, what))
+        return wrong
 
     def _image_faults(self, blamed: Collection[Shot], elsewhere: Elsewhere) -> Iterator[str]:
         """Images compared through depth that is in order; a wrong map would accuse its image too."""

@@ -26,12 +26,16 @@ _TYPICAL = 5e-6
 quarter of ``FLATNESS`` at most, float32 by 6e-8."""
 _BAD_SHARE, _BAD_IN_ROW, _EMPTY_SHARE = 0.2, 0.5, 0.05
 """Shares of the comparable pixels of a map, a row, that thin things may contradict: they are seen by one alone."""
+_LEAST_COMPARED = 0.02
+"""Share of a map's surface that must be comparable, or the map is looked at roughly too."""
 _MOST_BEHIND = 0.3
 """Share of a map that may lie behind what two partners see: near things hide much of it when the rig moves far."""
 _FEW = 6
 """Contradicted pixels in one row, or missing ones in a map, that thin things may leave."""
 _MANY = 4
 """Pairs, of 8 between the cameras and 16 others, that say that the geometry is wrong and not a map."""
+_ACROSS, _OVER_TIME = "baseline, camera, right_scan and right_delay", "motion, readout_ratio and scan"
+"""Keys of sequence.json on which pairs between the cameras depend, and those of one camera."""
 _TILE, _BAD_IN_TILE = 5, 12
 """A square of 5 x 5 pixels in which 12 are contradicted, and more than agree, is no edge."""
 _LEAST_WIDTH = 0.5
@@ -84,6 +88,8 @@ class MapFault:
     """(H,) where."""
     share: float
     """Of what could be compared: the map with the largest is blamed first."""
+    uncompared: bool = False
+    """Whether it has a surface, and next to nothing of it could be compared."""
 
 
 def compare(source: MapVerdict, target: MapVerdict, landing: Landing) -> DepthAgreement:
@@ -171,7 +177,7 @@ def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
         if blamed and np.any(verdict.confirmed):
             return None
         what = "nothing can be compared with another frame" if np.any(surface) else "there is no surface"
-        return MapFault(what, np.full(height, True), 0.0)
+        return MapFault(what, np.full(height, True), 0.0, uncompared=bool(np.any(surface)))
     rows = _bad_rows(bad, good, verdict.near)
     if np.any(rows):
         share = np.sum(bad[rows]) / max(1, np.sum((bad | good)[rows]))
@@ -183,6 +189,9 @@ def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
             f"depth differs typically by {typical:.1e} of itself from what others see, {_TYPICAL:.0e} is allowed"
         )
         return MapFault(what, np.full(height, True), 0.0)
+    if np.sum(bad | good) < _LEAST_COMPARED * np.sum(surface):
+        what = f"hardly anything, {np.sum(bad | good)} pixels, can be compared with another frame"
+        return MapFault(what, np.full(height, True), 0.0, uncompared=True)
     return None
 
 
@@ -232,9 +241,9 @@ def geometry_fault(pairs: Sequence[tuple[Shot, Shot, DepthAgreement]]) -> str | 
     wrong = [(source, target) for source, target, each in pairs if not _agree(each, _STRICT_SHARE)]
     across = sum(source.side != target.side for source, target in wrong)
     if not across and len(wrong) >= 2 * _MANY:
-        cause = "the two cameras agree with each other: look at motion and readout_ratio in sequence.json"
+        cause = f"the two cameras agree with each other: look at {_OVER_TIME} in sequence.json"
     elif across >= 2 * _MANY - 1:
-        cause = "the two cameras never agree: look at baseline and camera in sequence.json, or all depth is scaled"
+        cause = f"the two cameras never agree: look at {_ACROSS} in sequence.json, or all depth is scaled"
     else:
         return None
     worst = min((each for _, _, each in pairs), key=lambda each: each.share)
@@ -261,5 +270,5 @@ def pair_faults(pairs: Sequence[tuple[Shot, Shot, DepthAgreement]], blamed: Coll
             f"depth agrees with {target.depth} to {DEPTH_TOLERANCE:g} on only {100 * agreement.share:.2f} % of "
             f"{agreement.compared} visible pixels, and differs typically by {agreement.typical:.1e} of itself"
         )
-        keys = "baseline and camera" if source.side != target.side else "motion and readout_ratio"
+        keys = _ACROSS if source.side != target.side else _OVER_TIME
         yield finding(source.depth, what, cause=f"look at {keys} in sequence.json")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,22 +44,24 @@ def likely_cause(sequence: Sequence, maps: Mapping[Shot, DepthMap], shot: Shot, 
 
 def _candidates(sequence: Sequence, maps: Mapping[Shot, DepthMap], shot: Shot) -> Iterator[tuple[str, DepthMap]]:
     """Depth maps that the stored one may have been, or the shots whose depth it may be."""
-    depth = maps[shot].depth
+    stored = maps[shot]
+    depth = stored.depth
     for other in SHOTS:
         if other != shot:
-            yield f"looks like {other.depth}", DepthMap(other, depth)
-    height = len(depth)
-    for row in {1, 2, height // 4, height // 2, 3 * height // 4, height - 1} if shot.shutter == "gs" else set():
-        yield f"looks like the global shutter at the pose of row {row}", DepthMap(shot._replace(row=row), depth)
+            yield f"looks like {other.depth}", replace(stored, shot=other)
+    lines = sequence.shutter.lines(shot.side)
+    for line in {1, 2, lines // 4, lines // 2, 3 * lines // 4, lines - 1} if shot.shutter == "gs" else set():
+        words = f"looks like the global shutter at the pose of line {line}"
+        yield words, replace(stored, shot=shot._replace(row=line))
     for by in (-1, 1, -2, 2):
         plural = "s" if abs(by) > 1 else ""
-        down, right = np.roll(depth, -by, axis=0), np.roll(depth, -by, axis=1)
-        yield f"looks shifted by {abs(by)} row{plural}", DepthMap(shot, down)
-        yield f"looks shifted by {abs(by)} column{plural}", DepthMap(shot, right)
-    yield "looks flipped left to right", DepthMap(shot, np.ascontiguousarray(depth[:, ::-1]))
-    yield "looks flipped upside down", DepthMap(shot, np.ascontiguousarray(depth[::-1]))
-    rays = np.linalg.norm(sequence.rig.camera.unproject(sequence.rig.camera.pixel_grid()), axis=-1)
-    yield "looks like the distance along the ray instead of z", DepthMap(shot, (depth / rays).astype(np.float32))
+        yield f"looks shifted by {abs(by)} row{plural}", replace(stored, depth=np.roll(depth, -by, axis=0))
+        yield f"looks shifted by {abs(by)} column{plural}", replace(stored, depth=np.roll(depth, -by, axis=1))
+    yield "looks flipped left to right", replace(stored, depth=np.ascontiguousarray(depth[:, ::-1]))
+    yield "looks flipped upside down", replace(stored, depth=np.ascontiguousarray(depth[::-1]))
+    rays = np.linalg.norm(stored.camera.unproject(stored.camera.pixel_grid()), axis=-1)
+    along = (depth / rays).astype(np.float32)
+    yield "looks like the distance along the ray instead of z", replace(stored, depth=along)
 
 
 def _relative(sequence: Sequence, source: DepthMap, partner: DepthMap, rows: BoolArray) -> NDArray[np.float32]:
@@ -87,7 +90,7 @@ def _scale(
     """Factor that the depth has too much, the share that agrees without it, and the scatter that is left."""
     scale, share, spread = 1.0, 0.0, 0.0
     for _ in range(5):
-        scaled = DepthMap(source.shot, (source.depth / np.float32(scale)).astype(np.float32))
+        scaled = replace(source, depth=(source.depth / np.float32(scale)).astype(np.float32))
         relative = np.concatenate([_relative(sequence, scaled, partner, rows) for partner in partners])
         near = relative[np.abs(relative) < 0.5]
         if len(near) == 0:

@@ -27,6 +27,8 @@ _TRIED_PIXELS = 20_000
 _PLAIN, _AS_LIKE = 0.7, 1.4
 """A candidate must differ by at most this share of what the image as it is does, and by this factor of what sound
 pairs do."""
+_NEARLY = 1.25
+"""A change of the image itself that is nearly as like is what happened, not an exchange."""
 _NOISY, _NOISIER = 15.0, 3.0
 """Codes of noise that few renderings have, and how many times as noisy as the others."""
 
@@ -85,6 +87,8 @@ def _cause(
     candidates.append((f"{gain:.3g} times as bright", own / max(gain, 1e-3)))
     costs = [float(np.mean(difference(colours, shown))) for _, colours in candidates]
     best = int(np.argmin(costs))
+    changed = int(np.argmin(costs[: len(CHANGES)]))
+    best = changed if costs[changed] < _NEARLY * costs[best] else best
     if best and costs[best] < min(_PLAIN * costs[0], _AS_LIKE * _usual(likenesses)):
         return f"looks {candidates[best][0]}"
     return ""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.shots import FAR, PAIRS, SHOTS, Shot, points_of, seen_by
@@ -18,8 +19,9 @@ __all__ = ["DEPTH_TOLERANCE", "FAR", "PAIRS", "SHOTS", "BoolArray", "DepthMap", 
 DEPTH_TOLERANCE = 1e-4
 """Relative difference of two depths of one surface point that still agree."""
 FLATNESS = 2e-5
-"""Largest relative second difference of inverse depth (linear on planes) of a locally flat surface: bilinear
-interpolation errs by an eighth of it along each axis, well under the tolerance; an edge bends far more."""
+"""Largest relative second difference of inverse depth (linear on planes by ideal pixels) of a locally flat
+surface: bilinear interpolation errs by an eighth of it along each axis, well under the tolerance; an edge bends
+far more."""
 _CHUNK_PIXELS = 1 << 17
 
 BoolArray = NDArray[np.bool_]
@@ -32,6 +34,7 @@ class DepthMap:
     shot: Shot
     depth: NDArray[np.float32]
     """(H, W) metres, 0 = no surface."""
+    camera: PinholeCamera
 
     @cached_property
     def inverse(self) -> FloatArray:
@@ -40,11 +43,25 @@ class DepthMap:
         return np.where(solid, 1.0 / np.where(solid, self.depth, 1.0).astype(np.float64), np.nan)
 
     @cached_property
-    def bends(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Second differences of inverse depth: across (H, W-2), down (H-2, W), twist (H-1, W-1)."""
-        across, down = np.diff(self.inverse, 2, axis=1), np.diff(self.inverse, 2, axis=0)
-        twist = np.diff(np.diff(self.inverse, axis=0), axis=1)
-        return tuple(np.nan_to_num(np.abs(each), nan=np.inf) for each in (across, down, twist))  # type: ignore[return-value]
+    def slope(self) -> FloatArray:
+        """(H, W, 2) derivative of inverse depth by the ideal pixel, as ``_Bending.by_ideal`` has it."""
+        by_pixel = np.stack([np.gradient(self.inverse, axis=axis) for axis in (1, 0)], axis=-1)
+        return np.asarray(np.einsum("hwij,hwi->hwj", _bending(self.camera).by_ideal, by_pixel))
+
+    @cached_property
+    def bends(self) -> tuple[FloatArray, ...]:
+        """Second differences of inverse depth: across (H, W-2), down (H-2, W), twist (H-1, W-1).
+
+        Without what a lens adds: it bends the pixels of a plane.
+        """
+        found = _second_differences(self.inverse)
+        if self.camera.lens is not None and min(self.depth.shape) > 1:
+            slopes = self.slope[:, 1:-1], self.slope[1:-1], self.slope[:-1, :-1]
+            lens = _bending(self.camera).differences
+            found = tuple(
+                each - np.sum(slope * bend, axis=-1) for each, slope, bend in zip(found, slopes, lens, strict=True)
+            )
+        return tuple(np.nan_to_num(np.abs(each), nan=np.inf) for each in found)
 
     @cached_property
     def flat(self) -> BoolArray:
@@ -68,6 +85,30 @@ class DepthMap:
     def empty_blocks(self) -> BoolArray:
         """(H-3, W-3) whether pixels [y, x] to [y + 3, x + 3] see no surface at all."""
         return _window_max(self.depth, 4, 4) == 0
+
+
+class _Bending(NamedTuple):
+    """What a lens does to straight lines of pixels."""
+
+    ideal: FloatArray
+    """(H, W, 2) ideal pixels."""
+    by_ideal: FloatArray
+    """(H, W, 2, 2) [pixel, ideal]: turns central differences over pixels into a derivative by the ideal pixel."""
+    differences: tuple[FloatArray, ...]
+    """Second differences of ``ideal``, as ``DepthMap.bends``."""
+
+
+@lru_cache(maxsize=2)
+def _bending(camera: PinholeCamera) -> _Bending:
+    ideal = camera.ideal_pixels(camera.pixel_grid())
+    # Both sides of the equation are differences of the same pixels, so that it is exact on planes.
+    steps = np.stack([np.gradient(ideal, axis=axis) for axis in (1, 0)], axis=-2)
+    return _Bending(ideal, np.swapaxes(np.linalg.inv(steps), -1, -2), _second_differences(ideal))
+
+
+def _second_differences(values: FloatArray) -> tuple[FloatArray, ...]:
+    """Of (H, W, ...) across, down and twist, as ``DepthMap.bends``."""
+    return np.diff(values, 2, axis=1), np.diff(values, 2, axis=0), np.diff(np.diff(values, axis=0), axis=1)
 
 
 def _window_max(values: NDArray, rows: int, columns: int) -> NDArray:  # type: ignore[type-arg]
@@ -117,9 +158,25 @@ def _relative(target: DepthMap, pixels: FloatArray, z: FloatArray, sky: BoolArra
     flat[inner], empty[inner] = target.flat_blocks[block], target.empty_blocks[block]
     relative[empty] = np.where(sky[empty], 0.0, -np.inf)
     flat &= ~sky
-    y0, x0 = y0[flat], x0[flat]
-    fx, fy = pixels[flat, 0] - x0, pixels[flat, 1] - y0
-    top = (1 - fx) * target.inverse[y0, x0] + fx * target.inverse[y0, x0 + 1]
-    bottom = (1 - fx) * target.inverse[y0 + 1, x0] + fx * target.inverse[y0 + 1, x0 + 1]
-    relative[flat] = z[flat] * ((1 - fy) * top + fy * bottom) - 1.0
+    relative[flat] = z[flat] * _interpolated(target, pixels[flat], y0[flat], x0[flat]) - 1.0
     return relative
+
+
+def _interpolated(
+    target: DepthMap, pixels: FloatArray, y0: NDArray[np.int64], x0: NDArray[np.int64]
+) -> FloatArray:
+    """Inverse depth (n,) at pixels (n, 2) between four that see one flat surface, the first of them y0, x0."""
+    share = pixels - np.stack([x0, y0], axis=-1)
+
+    def between(values: FloatArray) -> FloatArray:
+        """Bilinear, of (H, W, ...)."""
+        fx, fy = (each.reshape(-1, *[1] * (values.ndim - 2)) for each in share.T)
+        top = (1 - fx) * values[y0, x0] + fx * values[y0, x0 + 1]
+        bottom = (1 - fx) * values[y0 + 1, x0] + fx * values[y0 + 1, x0 + 1]
+        return np.asarray((1 - fy) * top + fy * bottom)
+
+    found = between(target.inverse)
+    if target.camera.lens is None:
+        return found
+    beside = target.camera.ideal_pixels(pixels) - between(_bending(target.camera).ideal)
+    return np.asarray(found + np.sum(target.slope[y0, x0] * beside, axis=-1))

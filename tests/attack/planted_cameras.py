@@ -1,0 +1,372 @@
+"""Faults planted into sequences of cameras with a lens, of other scans and of a late right camera.
+
+The dataset of each camera holds one sequence of ``planting.VICTIM``'s name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from attack.planted_faults import scene_of_victim, twin_at
+from attack.planting import (
+    VICTIM,
+    Fault,
+    Plant,
+    depth_of,
+    drop,
+    image_of,
+    manifest_of,
+    noised,
+    other_geometry,
+    poses_of,
+    put,
+    renumbered,
+    shifted,
+    swapped,
+    times,
+)
+from rsbench.cards import load_card
+from rsbench.core.lens import Lens
+from rsbench.core.projection import row_poses
+from rsbench.core.rig import VIEWS
+from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
+from rsbench.dataset.files import read_depth, read_png, write_depth, write_exr, write_png, write_poses
+from rsbench.dataset.sequence import Sequence, read_sequence
+from rsbench.dataset.timing import write_timing
+from rsbench.renderers.options import RendererOptions
+
+Pixels = NDArray[Any]
+BROWN = Lens(model="brown-conrady", k1=-0.22, k2=0.05, p1=0.004)
+FISHEYE = Lens(model="kannala-brandt", k1=-0.05, k2=0.01)
+CAMERAS: dict[str, dict[str, Any]] = {
+    "barrel": {"lens": BROWN, "channels": ("flow", "gs_flow")},
+    "fisheye columns": {"lens": FISHEYE, "scan": "left", "right_scan": "right"},
+    "late": {"scan": "bottom", "right_delay": 0.1, "channels": ("timing",)},
+    "opposite": {"right_scan": "bottom"},
+    "thin": {"scene": "forest"},
+}
+"""What differs from the cameras of datasets/smoke.toml, by name; the last sees hardly a flat place."""
+
+
+def card_of(name: str) -> DatasetCard:
+    """The card of a camera, of one sequence."""
+    smoke, change = load_dataset_card("smoke"), dict(CAMERAS[name])
+    camera = CameraCard(width=128, height=96, focal=110.0, lens=change.pop("lens", None))
+    sequence = replace(smoke.sequence[0], name=VICTIM, scene=change.pop("scene", VICTIM))
+    return replace(smoke, camera=camera, sequence=(sequence,), **change)
+
+
+def _without_lens(sequence: Sequence) -> Sequence:
+    return _with_lens(sequence, None)
+
+
+def _with_lens(sequence: Sequence, lens: Lens | None) -> Sequence:
+    return replace(sequence, rig=replace(sequence.rig, camera=replace(sequence.rig.camera, lens=lens)))
+
+
+def _lens(**coefficients: Any) -> Callable[[Sequence], Sequence]:
+    """Other coefficients, or another model."""
+
+    def change(sequence: Sequence) -> Sequence:
+        lens = sequence.rig.camera.lens
+        assert lens is not None
+        return _with_lens(sequence, replace(lens, **coefficients))
+
+    return change
+
+
+def _read(**keys: Any) -> Callable[[Sequence], Sequence]:
+    """Another scan or delay."""
+    return lambda sequence: replace(sequence, shutter=replace(sequence.shutter, **keys))
+
+
+def _but_first_line(side: str, name: str, change: Callable[[Pixels], Pixels]) -> Callable[[Pixels], Pixels]:
+    """All but the line that the camera reads first, which the global-shutter twin knows too."""
+    shutter = card_of(name).shutter()
+    axis, line = 1 - shutter.axis(side), shutter.first_line(side)
+
+    def changed(pixels: Pixels) -> Pixels:
+        result = np.array(change(pixels.copy()))
+        place = (line,) if axis == 0 else (slice(None), line)
+        result[place] = pixels[place]
+        return result
+
+    return changed
+
+
+def _flipped(name: str, shutter: str, view: str) -> Iterator[Fault]:
+    """An image, a depth map, and both, in the direction of reading."""
+    side = view.partition("_")[0]
+    down = card_of(name).shutter().axis(side) == 1
+    flip = _but_first_line(side, name, np.flipud if down else np.fliplr)
+    words = "upside down" if down else "left to right"
+    image, depth = image_of(shutter, view, flip), depth_of(shutter, view, flip)
+    yield Fault(f"{shutter}/{view}.png flipped", image, (f"{shutter}/{view}.png", words))
+    yield Fault(f"{shutter}_depth/{view}.exr flipped", depth, (f"{shutter}_depth/{view}.exr", words))
+    yield Fault(f"{shutter} {view} flipped", _all(image, depth), (f"{shutter}_depth/{view}.exr", words))
+
+
+def _all(*plants: Plant) -> Plant:
+    def plant(folder: Path) -> None:
+        for each in plants:
+            each(folder)
+
+    return plant
+
+
+def _seen_without_lens(sequence: Sequence) -> Pixels:
+    """(H, W, 2) pixels of the image at which the camera without its lens would have its own."""
+    camera = sequence.rig.camera
+    rays = replace(camera, lens=None).unproject(camera.pixel_grid())
+    return np.nan_to_num(camera.project(rays), nan=-1e4).astype(np.float32)
+
+
+def _image_without_lens(folder: Path) -> None:
+    sequence = read_sequence(folder / VICTIM)
+    path = sequence.folder / "rs/left_0.png"
+    image = read_png(path)
+    moved = cv2.remap(image, _seen_without_lens(sequence), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    moved[0] = image[0]
+    write_png(path, np.ascontiguousarray(moved, dtype=np.uint8))
+
+
+def _depth_without_lens(folder: Path) -> None:
+    sequence = read_sequence(folder / VICTIM)
+    path = sequence.folder / "gs_depth/right_0.exr"
+    depth = read_depth(path)
+    moved = cv2.remap(
+        depth, _seen_without_lens(sequence), None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+    )
+    moved[0] = depth[0]
+    write_depth(path, np.ascontiguousarray(moved, dtype=np.float32))
+
+
+def _along_the_ray(folder: Path) -> None:
+    sequence = read_sequence(folder / VICTIM)
+    path = sequence.folder / "rs_depth/right_1.exr"
+    depth = read_depth(path)
+    rays = np.linalg.norm(sequence.rig.camera.unproject(sequence.rig.camera.pixel_grid()), axis=-1)
+    rays[0] = 1.0
+    write_depth(path, (depth * rays).astype(np.float32))
+
+
+def _flow_of_ideal_pixels(folder: Path) -> None:
+    sequence = read_sequence(folder / VICTIM)
+    camera = sequence.rig.camera
+    flow = sequence.offsets("flow", "left", 0).astype(np.float64)
+    grid = camera.pixel_grid()
+    ideal = camera.ideal_pixels(grid + flow) - camera.ideal_pixels(grid)
+    values = {"x": ideal[..., 0], "y": ideal[..., 1]}
+    write_exr(sequence.folder / "flow/left_0.exr", {key: each.astype(np.float32) for key, each in values.items()})
+
+
+def _poses_as(change: Callable[[Sequence], Sequence], view: tuple[Any, int]) -> Plant:
+    """The poses of one camera at one time as another rig or shutter has them."""
+
+    def plant(folder: Path) -> None:
+        sequence = change(read_sequence(folder / VICTIM))
+        poses = row_poses(sequence.rig, sequence.shutter, sequence.motion, *view)
+        path = folder / VICTIM / "poses" / f"{view[0]}_{view[1]}.csv"
+        write_poses(path, sequence.shutter.line_times(view[1], view[0]), poses)
+
+    return plant
+
+
+def _times_as(change: Callable[[Sequence], Sequence], names: tuple[str, ...]) -> Plant:
+    """Files of the channel ``timing`` as another shutter has them."""
+
+    def plant(folder: Path) -> None:
+        home = folder / VICTIM
+        sequence = change(read_sequence(home))
+        kept = {path: path.read_bytes() for path in [home / "timing.json", *(home / "timing").iterdir()]}
+        write_timing(home, sequence.shutter, sequence.frame_period_s, sequence.sensor)
+        for path, content in kept.items():
+            if path.relative_to(home).as_posix() not in names:
+                path.write_bytes(content)
+
+    return plant
+
+
+def _rendered_as(change: Callable[[Sequence], Sequence], shutter: str, view: tuple[Any, int]) -> Plant:
+    """Image and depth of one shot as another rig, shutter or motion makes them."""
+
+    def plant(folder: Path) -> None:
+        from rsbench.renderers.image import to_srgb8
+        from rsbench.renderers.render import render
+
+        home = folder / VICTIM
+        sequence = change(read_sequence(home))
+        side, frame = view
+        R, t = row_poses(sequence.rig, sequence.shutter, sequence.motion, side, frame)
+        if shutter == "gs":
+            line = sequence.shutter.first_line(side)
+            R, t = np.broadcast_to(R[line], R.shape), np.broadcast_to(t[line], t.shape)
+        options = load_card(RendererOptions, "renderers", "preview")
+        columns = sequence.shutter.axis(side) == 0
+        seen = render(scene_of_victim(), sequence.rig.camera, R, t, options, columns=columns)
+        write_png(home / shutter / f"{side}_{frame}.png", to_srgb8(seen.image, options.exposure))
+        write_depth(home / f"{shutter}_depth" / f"{side}_{frame}.exr", seen.depth)
+
+    return plant
+
+
+def _lens_faults() -> Iterator[Fault]:
+    own, geometry = f"{VICTIM}/sequence.json", ("sequence.json", "pairs of depth maps disagree", "camera")
+    yield Fault("no lens everywhere", other_geometry(_without_lens), geometry)
+    yield Fault("k1 of -0.21 everywhere", other_geometry(_lens(k1=-0.21)), geometry)
+    yield Fault("k2 of 0.04 everywhere", other_geometry(_lens(k2=0.04)), geometry)
+    yield Fault("p1 of 0 everywhere", other_geometry(_lens(p1=0.0)), geometry)
+    yield Fault("another model everywhere", other_geometry(_lens(model="kannala-brandt", p1=0.0)), geometry)
+    yield Fault(
+        "no lens in sequence.json", manifest_of(own, drop("camera", "lens")), ("sequence.json", "conventions")
+    )
+    changed = manifest_of(own, put("camera", "lens", "k1", -0.21))
+    yield Fault("another lens in sequence.json", changed, ("sequence.json", "camera", "the card"))
+    yield Fault(
+        "another lens in the card",
+        manifest_of("dataset.json", put("card", "camera", "lens", "k2", 0.0)),
+        ("sequence.json", "camera", "the card"),
+    )
+    yield Fault("image without the lens", _image_without_lens, ("rs/left_0.png", "other colours"))
+    yield Fault("depth without the lens", _depth_without_lens, ("gs_depth/right_0.exr", "differs"))
+    yield Fault("depth along the ray", _along_the_ray, ("rs_depth/right_1.exr", "along the ray"))
+    yield Fault("flow of ideal pixels", _flow_of_ideal_pixels, ("flow/left_0.exr", "differ from what depth"))
+    seen = _rendered_as(_without_lens, "rs", ("right", 1))
+    yield Fault("frame without the lens", seen, ("rs_depth/right_1.exr", "differs"), slow=True)
+
+
+def _column_faults() -> Iterator[Fault]:
+    name, own = "fisheye columns", f"{VICTIM}/sequence.json"
+    geometry = ("sequence.json", "pairs of depth maps disagree")
+    yield Fault("no lens everywhere", other_geometry(_without_lens), (*geometry, "camera"))
+    yield Fault("k1 of -0.04 everywhere", other_geometry(_lens(k1=-0.04)), (*geometry, "camera"))
+    yield Fault("another model everywhere", other_geometry(_lens(model="brown-conrady")), (*geometry, "camera"))
+    yield Fault(
+        "rows everywhere",
+        other_geometry(_read(scan="top", right_scan="bottom")),
+        ("rs_depth/left_1.exr", "read from the left"),
+    )
+    yield Fault(
+        "one scan for both everywhere",
+        other_geometry(_read(right_scan=None)),
+        ("rs_depth/right_0.exr", "read from the right"),
+    )
+    yield Fault(
+        "scans exchanged everywhere",
+        other_geometry(_read(scan="right", right_scan="left")),
+        ("rs_depth/left_0.exr", "read from the left"),
+    )
+    changed = manifest_of(own, put("right_scan", "left"))
+    yield Fault("another scan in sequence.json", changed, ("poses/right_0.csv", "differs from the motion"))
+    yield Fault("no scan in sequence.json", manifest_of(own, drop("scan")), ("sequence.json", "scan"))
+    order = poses_of("left_0", lambda lines: renumbered([lines[0], *lines[:0:-1]]))
+    yield Fault("poses in the other order", order, ("poses/left_0.csv", "differs from the motion"))
+    yield Fault("poses of rows", _poses_as(_read(scan="top"), ("left", 1)), ("poses/left_1.csv", "96 rows"))
+    yield from _flipped(name, "rs", "left_0")
+    yield from _flipped(name, "rs", "right_1")
+    words = ("gs_depth/left_1.exr", "global shutter at the pose of line 127")
+    yield Fault("twin at the pose of the last column", twin_at(127), words, slow=True)
+    for change, word in ((_read(scan="right"), "scan"), (_read(scan="top"), "rows")):
+        seen = _rendered_as(change, "rs", ("left", 0))
+        yield Fault(f"frame of another {word}", seen, ("rs_depth/left_0.exr", "differs"), slow=True)
+
+
+def _late_faults() -> Iterator[Fault]:
+    name, own, geometry = "late", f"{VICTIM}/sequence.json", ("sequence.json", "pairs of depth maps disagree")
+    for delay in (0.09, 0.0, -0.1):
+        changed = other_geometry(_read(right_delay=delay))
+        yield Fault(f"a delay of {delay} everywhere", changed, (*geometry, "right_delay"))
+    yield Fault(
+        "from the top everywhere",
+        other_geometry(_read(scan="top")),
+        ("rs_depth/left_0.exr", "read from the bottom"),
+    )
+    for value in (0.0, 0.09):
+        changed = manifest_of(own, put("right_delay", value))
+        yield Fault(f"right_delay = {value} in sequence.json", changed, ("poses/right_0.csv", "differs"))
+    yield Fault("a delay in frames", manifest_of(own, put("right_delay", 3.0)), ("sequence.json", "right_delay"))
+    changed = manifest_of("dataset.json", put("card", "right_delay", 0.2))
+    yield Fault("another delay in the card", changed, ("sequence.json", "right_delay"))
+    at_once = _read(right_delay=0.0)
+    yield Fault("poses without the delay", _poses_as(at_once, ("right", 1)), ("poses/right_1.csv", "differs"))
+    yield Fault(
+        "timing.json without the delay",
+        _times_as(at_once, ("timing.json",)),
+        ("timing.json", "right.reference_ns"),
+    )
+    table = "timing/right_1.csv"
+    yield Fault("times without the delay", _times_as(at_once, (table,)), (table, "time_ns"))
+    yield Fault(
+        "times from the top",
+        _times_as(_read(scan="top"), ("timing/left_0.csv",)),
+        ("timing/left_0.csv", "time_ns"),
+    )
+    late = swapped(
+        *((f"{kind}/right_0.{end}", f"{kind}/right_1.{end}") for kind, end in (("rs", "png"), ("rs_depth", "exr")))
+    )
+    yield Fault("right frames exchanged", late, ("rs_depth/right_", "looks like rs_depth/right_"))
+    yield from _flipped(name, "rs", "left_1")
+    yield from _flipped(name, "rs", "right_0")
+    words = ("gs_depth/left_1.exr", "global shutter at the pose of line 95")
+    yield Fault("twin at the pose of the top row", twin_at(0), words, slow=True)
+    for shutter in ("rs", "gs"):
+        file, seen = f"{shutter}_depth/right_0.exr", _rendered_as(at_once, shutter, ("right", 0))
+        yield Fault(f"{shutter} frame without the delay", seen, (file, "differs"), slow=True)
+
+
+def _opposite_faults() -> Iterator[Fault]:
+    for name, side, truth, change in (
+        ("both from the top", "right", "bottom", _read(right_scan=None)),
+        ("both from the bottom", "left", "top", _read(scan="bottom")),
+        ("exchanged", "left", "top", _read(scan="bottom", right_scan="top")),
+    ):
+        words = (f"rs_depth/{side}_1.exr", f"read from the {truth}")
+        yield Fault(f"scans {name} everywhere", other_geometry(change), words)
+    yield from _flipped("opposite", "rs", "right_0")
+    yield Fault(
+        "poses of the right camera from the top",
+        _poses_as(_read(right_scan=None), ("right", 0)),
+        ("poses/right_0.csv", "differs"),
+    )
+    seen = _rendered_as(_read(right_scan=None), "rs", ("right", 0))
+    yield Fault("right frame from the top", seen, ("rs_depth/right_0.exr", "differs"), slow=True)
+
+
+def _thin_faults() -> Iterator[Fault]:
+    """What is named though no place is flat."""
+    for view in ("left_0", "right_1"):
+        file = f"rs_depth/{view}.exr"
+        for name, change in (
+            ("noise of 1e-2", noised(1e-2)),
+            ("scaled by 1.02", times(1.02, slice(1, None))),
+            ("shifted by two pixels", shifted(0, 2)),
+            ("left to right", _but_first_line("left", "thin", np.fliplr)),
+        ):
+            yield Fault(f"{file} {name}", depth_of("rs", view, change), (file, "depth differs"))
+    every = _all(
+        *(
+            depth_of(shutter, f"{side}_{frame}", noised(1e-2, slice(None)))
+            for shutter in ("rs", "gs")
+            for side, frame in VIEWS
+        )
+    )
+    yield Fault("noise in every depth map", every, ("gs_depth/left_0.exr", "compared"))
+    late = swapped(("gs_depth/left_0.exr", "gs_depth/left_1.exr"))
+    yield Fault("frames exchanged", late, ("gs_depth/left_0.exr", "looks like gs_depth/left_1.exr"))
+
+
+CAMERA_FAULTS: dict[str, tuple[Fault, ...]] = {
+    "barrel": tuple(_lens_faults()),
+    "fisheye columns": tuple(_column_faults()),
+    "late": tuple(_late_faults()),
+    "opposite": tuple(_opposite_faults()),
+    "thin": tuple(_thin_faults()),
+}
+"""Of each of ``CAMERAS``."""
