@@ -357,7 +357,7 @@ def _thin_faults() -> Iterator[Fault]:
             for side, frame in VIEWS
         )
     )
-    yield Fault("noise in every depth map", every, ("gs_depth/left_0.exr", "compared"))
+    yield Fault("noise in every depth map", every, ("gs_depth/left_0.exr", "rendered again"), rendered=True)
     late = swapped(("gs_depth/left_0.exr", "gs_depth/left_1.exr"))
     yield Fault("frames exchanged", late, ("gs_depth/left_0.exr", "looks like gs_depth/left_1.exr"))
 

@@ -110,10 +110,10 @@ def _depth_faults() -> Iterator[Fault]:
     for row in (48, 95):
         words = ("gs_depth/left_1.exr", f"global shutter at the pose of line {row}")
         yield Fault(f"twin at the pose of row {row}", twin_at(row), words, slow=True)
-    yield Fault("every depth scaled by 1.02", _every_depth(1.02), ("depth/",))
-    yield Fault(
-        "every depth scaled by 1.0002", _every_depth(1.0002), ("depth/", "scaled by 1.0002"), rendered=True
-    )
+    yield Fault("every depth scaled by 1.02", _every_depth(times(1.02)), ("depth/",))
+    words = ("depth/", "scaled by 1.0002")
+    yield Fault("every depth scaled by 1.0002", _every_depth(times(1.0002)), words, rendered=True)
+    yield Fault("noise in every depth", _every_depth(noised(1e-3, slice(None))), ("depth/", "can be compared"))
 
 
 @lru_cache(maxsize=1)
@@ -141,11 +141,11 @@ def twin_at(row: int) -> Plant:
     return plant
 
 
-def _every_depth(factor: float) -> Plant:
+def _every_depth(change: Callable[[Any], Any]) -> Plant:
     def plant(folder: Path) -> None:
         for shutter in ("rs", "gs"):
             for side, frame in VIEWS:
-                depth_of(shutter, f"{side}_{frame}", times(factor))(folder)
+                depth_of(shutter, f"{side}_{frame}", change)(folder)
 
     return plant
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import time
 from collections.abc import Collection, Iterator
@@ -24,6 +25,10 @@ def stage(root: Path, cases: Collection[str]) -> Iterator[Arena]:
     """
     if "rsbench" in sys.modules:
         raise RuntimeError("rsbench is imported already, and not from the tiny checkout")
+    if (
+        signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    ):  # started in the background of a shell without job control
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # or no command would hear of it
     os.environ |= dict.fromkeys(_ONE, "1")  # a process with threads cannot be forked safely
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(cache) / "rsbench"))  # where rsbench keeps it: homes change

@@ -26,8 +26,6 @@ _TYPICAL = 5e-6
 quarter of ``FLATNESS`` at most, float32 by 6e-8."""
 _BAD_SHARE, _BAD_IN_ROW, _EMPTY_SHARE = 0.2, 0.5, 0.05
 """Shares of the comparable pixels of a map, a row, that thin things may contradict: they are seen by one alone."""
-_LEAST_COMPARED = 0.02
-"""Share of a map's surface that must be comparable, or the map is looked at roughly too."""
 _MOST_BEHIND = 0.3
 """Share of a map that may lie behind what two partners see: near things hide much of it when the rig moves far."""
 _FEW = 6
@@ -89,7 +87,7 @@ class MapFault:
     share: float
     """Of what could be compared: the map with the largest is blamed first."""
     uncompared: bool = False
-    """Whether it has a surface, and next to nothing of it could be compared."""
+    """Whether it has a surface, and nothing of it could be compared."""
 
 
 def compare(source: MapVerdict, target: MapVerdict, landing: Landing) -> DepthAgreement:
@@ -189,9 +187,6 @@ def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
             f"depth differs typically by {typical:.1e} of itself from what others see, {_TYPICAL:.0e} is allowed"
         )
         return MapFault(what, np.full(height, True), 0.0)
-    if np.sum(bad | good) < _LEAST_COMPARED * np.sum(surface):
-        what = f"hardly anything, {np.sum(bad | good)} pixels, can be compared with another frame"
-        return MapFault(what, np.full(height, True), 0.0, uncompared=True)
     return None
 
 

@@ -88,6 +88,8 @@ class Picture:
     low: Colours
     """(H, W, 3) smallest of the 3 x 3 pixels around, less what noise may add; ``high`` likewise."""
     high: Colours
+    noisy: bool = False
+    """Whether a path tracer made it, so that what looks like noise is."""
 
     @classmethod
     def of(cls, shot: Shot, image: NDArray[np.uint8], noisy: bool) -> Picture:
@@ -100,6 +102,7 @@ class Picture:
             noise,
             cv2.erode(colours, around) - beyond,
             cv2.dilate(colours, around) + beyond,
+            noisy,
         )
 
 

@@ -66,12 +66,22 @@ class DepthMap:
     @cached_property
     def flat(self) -> BoolArray:
         """(H, W) pixels whose 3 x 3 neighbourhood is one flat surface, too wide to slip between pixels."""
-        across, down, _ = self.bends
-        bend = np.maximum(_window_max(across, 3, 1), _window_max(down, 1, 3))
         flat = np.zeros(self.depth.shape, dtype=np.bool_)
-        with np.errstate(invalid="ignore"):
-            flat[1:-1, 1:-1] = bend <= FLATNESS * self.inverse[1:-1, 1:-1]
+        flat[1:-1, 1:-1] = self._bend <= FLATNESS
         return flat
+
+    @cached_property
+    def _bend(self) -> FloatArray:
+        """(H-2, W-2) relative second difference of inverse depth in 3 x 3 pixels, infinite beside no surface."""
+        across, down, _ = self.bends
+        with np.errstate(invalid="ignore"):
+            bend = np.maximum(_window_max(across, 3, 1), _window_max(down, 1, 3)) / self.inverse[1:-1, 1:-1]
+        return np.nan_to_num(bend, nan=np.inf)
+
+    def share_of_edges(self, jump: float) -> float:
+        """Share of the pixels with a surface around which inverse depth bends by more than ``jump`` of itself."""
+        solid = self.depth[1:-1, 1:-1] > 0
+        return float(np.mean(self._bend[solid] > jump)) if np.any(solid) else 0.0
 
     @cached_property
     def flat_blocks(self) -> BoolArray:

@@ -41,7 +41,7 @@ def sensor_faults(
             fault = png_fault(inside(sequence.folder, shot.image), shot.image, size)
             if fault is None:
                 seen = sequence.image(*shot[:3])
-                fault = _fault(sensor, shot, seen, pictures[shot].colours, _window(sequence, sensor, maps[shot]))
+                fault = _fault(sensor, seen, pictures[shot], _window(sequence, sensor, maps[shot]))
         except RsbenchError as error:
             fault = str(error)
         if fault:
@@ -69,16 +69,17 @@ def _window(sequence: Sequence, sensor: Sensor, depth_map: DepthMap) -> tuple[in
     return int(x), int(y)
 
 
-def _fault(
-    sensor: Sensor, shot: Shot, image: NDArray[np.uint8], clean: NDArray[np.float32], window: tuple[int, int]
-) -> str | None:
+def _fault(sensor: Sensor, image: NDArray[np.uint8], picture: Picture, window: tuple[int, int]) -> str | None:
+    shot, clean = picture.shot, picture.colours
     height, width = clean.shape[:2]
     twin = f"rs_clean/{shot.side}_{shot.frame}.png"
     around = np.ones((2 * window[1] + 1, 2 * window[0] + 1), np.uint8)
     share = fall_off(sensor, width, height, np.arange(height))[..., None]
     low, high = (linear_of_codes(way(clean, around)) * share for way in (cv2.erode, cv2.dilate))
     seen = linear_of_codes(image)
-    own, rounded = sensor.variance(high), _rounding(image) + _rounding(clean)
+    # A path tracer's noise is in both, and in each frame another.
+    traced = 12.0 * picture.noise**2 if picture.noisy else 0.0
+    own, rounded = sensor.variance(high), (1.0 + traced) * (_rounding(image) + _rounding(clean))
     sigma = np.sqrt(own + rounded)
     slack = _BEYOND_SIGMA * sigma
     beyond = (seen < np.minimum(low, 1.0) - slack) | (seen > np.minimum(high, 1.0) + slack)
