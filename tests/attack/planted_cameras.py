@@ -36,6 +36,7 @@ from rsbench.cards import load_card
 from rsbench.core.lens import Lens
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
+from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.files import read_depth, read_png, write_depth, write_exr, write_png, write_poses
 from rsbench.dataset.sequence import Sequence, read_sequence
@@ -61,6 +62,11 @@ def card_of(name: str) -> DatasetCard:
     camera = CameraCard(width=128, height=96, focal=110.0, lens=change.pop("lens", None))
     sequence = replace(smoke.sequence[0], name=VICTIM, scene=change.pop("scene", VICTIM))
     return replace(smoke, camera=camera, sequence=(sequence,), **change)
+
+
+def _shutter(name: str) -> RollingShutter:
+    card = card_of(name)
+    return card.shutter_for(card.sequence[0])
 
 
 def _without_lens(sequence: Sequence) -> Sequence:
@@ -89,7 +95,7 @@ def _read(**keys: Any) -> Callable[[Sequence], Sequence]:
 
 def _but_first_line(side: str, name: str, change: Callable[[Pixels], Pixels]) -> Callable[[Pixels], Pixels]:
     """All but the line that the camera reads first, which the global-shutter twin knows too."""
-    shutter = card_of(name).shutter()
+    shutter = _shutter(name)
     axis, line = 1 - shutter.axis(side), shutter.first_line(side)
 
     def changed(pixels: Pixels) -> Pixels:
@@ -104,7 +110,7 @@ def _but_first_line(side: str, name: str, change: Callable[[Pixels], Pixels]) ->
 def _flipped(name: str, shutter: str, view: str) -> Iterator[Fault]:
     """An image, a depth map, and both, in the direction of reading."""
     side = view.partition("_")[0]
-    down = card_of(name).shutter().axis(side) == 1
+    down = _shutter(name).axis(side) == 1
     flip = _but_first_line(side, name, np.flipud if down else np.fliplr)
     words = "upside down" if down else "left to right"
     image, depth = image_of(shutter, view, flip), depth_of(shutter, view, flip)
