@@ -99,7 +99,7 @@ class DatasetCard(Scanning):
     readout_ratio: float
     frame_period_s: float = 0.1
     motion: MotionCard | None = None
-    """Required, unless each sequence has its own or there is a trajectory."""
+    """Required, unless each sequence has its own, from the grid too, or there is a trajectory."""
     trajectory: TrajectoryCard | None = None
     """Moves the rig along the poses of a file instead."""
     renderer: str = "default"
@@ -152,7 +152,8 @@ class DatasetCard(Scanning):
         own = [sequence.name for sequence in self.sequence if sequence.motion is not None]
         if self.trajectory is not None and (self.motion is not None or own):
             raise ValueError(f"trajectory and motion{' of ' + own[0] if own else ''} exclude each other")
-        if self.trajectory is None and self.motion is None and len(own) < len(self.sequence):
+        given = any(all(value.motion for value in axis.values()) for axis in self.grid.values())
+        if self.trajectory is None and self.motion is None and len(own) < len(self.sequence) and not given:
             raise ValueError("'motion' is required")
 
     def rig_of(self, sequence: SequenceCard) -> StereoRig:
@@ -273,15 +274,16 @@ class DatasetCard(Scanning):
         return replace(self, sequence=tuple(made), grid={}, trajectory=None, seeds=())
 
     def _variants(self, sequence: SequenceCard, seed: int | None) -> list[SequenceCard]:
-        """One sequence for each combination of the grid; the axes that are drawn are the same in all of them."""
+        """One sequence for each combination of the grid. What is drawn is drawn once for each motion."""
         own = sequence if seed is None else replace(sequence, seed=seed)
         ending = () if seed is None else (str(seed),)
-        drawn_as, made = "-".join((sequence.name, *ending)), []
+        made = []
         for values in product(*(axis.items() for axis in self.grid.values())):
             varied = replace(own, name="-".join((sequence.name, *(label for label, _ in values), *ending)))
             for _, variation in values:
                 varied = variation.of(varied)
-            made.append(self._scaled(self._drawn(varied, drawn_as)))
+            moved = (label for label, variation in values if variation.motion is not None)
+            made.append(self._scaled(self._drawn(varied, "-".join((sequence.name, *moved, *ending)))))
         return made
 
     def _drawn(self, sequence: SequenceCard, name: str) -> SequenceCard:

@@ -5,17 +5,22 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rsbench.cards import load_card
 from rsbench.core.rig import SIDES
 from rsbench.dataset.card import DatasetCard, SequenceCard
-from rsbench.dataset.generation import build_scene, render_camera, scene_name, seen_scene
+from rsbench.dataset.generation import build_scene, render_camera, scene_name
 from rsbench.dataset.sequence import FRAMES, files_of
+from rsbench.dataset.stage import place_of, seen_scene
 from rsbench.dataset.workplace import files_below
 from rsbench.renderers.options import RendererOptions
+
+if TYPE_CHECKING:
+    from rsbench.renderers.scene import MitsubaScene
 
 _LISTED_BYTES = 200
 """Of a file in sequence.json and dataset.json."""
@@ -43,17 +48,21 @@ def estimate_dataset(card: DatasetCard, progress: Callable[[str], None]) -> Esti
     for scene, group in groupby(sorted(card.sequence, key=scene_name), key=scene_name):
         found.append(_of_scene(card, list(group), options, warm=bool(found)))
         progress(scene)
-    files = sum(each.files for each in found) + 1
+    total = _sum(found)
+    return replace(total, files=total.files + 1, bytes=total.bytes + _LISTED_BYTES * (total.files + 1))
+
+
+def _sum(parts: list[Estimate]) -> Estimate:
     return Estimate(
-        sequences=len(card.sequence),
-        files=files,
-        bytes=sum(each.bytes for each in found) + _LISTED_BYTES * files,
-        seconds=sum(each.seconds for each in found),
+        sequences=sum(each.sequences for each in parts),
+        files=sum(each.files for each in parts),
+        bytes=sum(each.bytes for each in parts),
+        seconds=sum(each.seconds for each in parts),
     )
 
 
 def _of_scene(card: DatasetCard, sequences: list[SequenceCard], options: RendererOptions, warm: bool) -> Estimate:
-    """Of the sequences of one scene; the first image of a process also compiles, which is counted once."""
+    """Of the sequences of one scene: a trial of each kind that takes another time or other files."""
     from rsbench.renderers.scene import MitsubaScene
 
     start = time.monotonic()
@@ -61,6 +70,21 @@ def _of_scene(card: DatasetCard, sequences: list[SequenceCard], options: Rendere
     built = time.monotonic()
     rendered = MitsubaScene(seen_scene(scene, sequences[0]))
     loaded = time.monotonic()
+    places = len({place_of(sequence) for sequence in sequences})
+    kinds: dict[str, list[SequenceCard]] = {}
+    for sequence in sequences:
+        kinds.setdefault(repr(card.sensor_of(sequence)), []).append(sequence)
+    tried: list[Estimate] = []
+    for kind in kinds.values():
+        tried.append(_of_kind(card, kind, options, rendered, warm=warm and not tried))
+    total = _sum(tried)
+    return replace(total, seconds=total.seconds + built - start + places * (loaded - built))
+
+
+def _of_kind(
+    card: DatasetCard, sequences: list[SequenceCard], options: RendererOptions, scene: MitsubaScene, warm: bool
+) -> Estimate:
+    """Of sequences of one sensor; the first image of all compiles, which is counted once."""
     own = files_of(card.manifest_of(sequences[0]))
     with tempfile.TemporaryDirectory(prefix="rsbench-") as temporary:
         for folder in {Path(name).parent for name in own}:
@@ -68,15 +92,14 @@ def _of_scene(card: DatasetCard, sequences: list[SequenceCard], options: Rendere
         times = []
         for _ in range(1 if warm else 2):
             begun = time.monotonic()
-            for _ in render_camera(card, sequences[0], options, rendered, SIDES[0], FRAMES[0], Path(temporary)):
+            for _ in render_camera(card, sequences[0], options, scene, SIDES[0], FRAMES[0], Path(temporary)):
                 pass
             times.append(time.monotonic() - begun)
         written = sum((Path(temporary) / name).stat().st_size for name in files_below(Path(temporary)))
     cameras = len(SIDES) * len(FRAMES) * len(sequences)
-    compiling = max(times[0] - times[-1], 0.0)
     return Estimate(
         sequences=len(sequences),
         files=len(sequences) * (len(own) + 1),
         bytes=cameras * written,
-        seconds=built - start + compiling + len(sequences) * (loaded - built) + cameras * times[-1],
+        seconds=max(times[0] - times[-1], 0.0) + cameras * times[-1],
     )

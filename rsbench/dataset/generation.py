@@ -12,7 +12,7 @@ from functools import lru_cache
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ from rsbench.dataset.manifest import Files, write_manifest
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence import FRAMES, files_of, is_of_sequence
 from rsbench.dataset.shots import GivenGeometry, Shot
+from rsbench.dataset.stage import Build, Built, Stage
 from rsbench.dataset.timing import write_timing
 from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, remove, strangers, workplace
 from rsbench.errors import RsbenchError
@@ -39,7 +40,6 @@ from rsbench.pipeline.isolated_jobs import finished_jobs
 from rsbench.pipeline.isolation import EntryFailure
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import SceneCard, load_scene, read_scene_card
-from rsbench.scenes.model import Scene
 
 if TYPE_CHECKING:
     from rsbench.renderers.scene import MitsubaScene
@@ -50,14 +50,6 @@ STEPS = 1 + 2 * len(SIDES) * len(FRAMES)
 """Per sequence: four rolling-shutter and four global-shutter renders, and putting it into its place."""
 
 
-class _Built(NamedTuple):
-    """A scene and its hash."""
-
-    scene: Scene
-    sha256: str
-
-
-Build = Callable[[str], _Built]
 Plan = dict[str, Any]
 """All that decides the bytes of a sequence, as it stands in its sequence.json; but for the hash of the scene."""
 
@@ -128,14 +120,9 @@ def scene_name(sequence: SequenceCard) -> str:
     return sequence.scene
 
 
-def build_scene(name: str) -> _Built:
+def build_scene(name: str) -> Built:
     scene = load_scene(name)
-    return _Built(scene, scene_hash(scene))
-
-
-def seen_scene(scene: Scene, sequence: SequenceCard) -> Scene:
-    """A scene in the frame of the body at time 0 of a sequence."""
-    return scene.seen_from(scene.viewpoints[sequence.viewpoint], sequence.start)
+    return Built(scene, scene_hash(scene))
 
 
 def _scene_card(name: str) -> SceneCard:
@@ -234,8 +221,9 @@ def _render_all(
 ) -> Iterator[tuple[str, int]]:
     """Names of sequences, with steps that were done; the last of a sequence is given when it is complete."""
     if workers <= 1 or len(todo) <= 1:
+        stage = Stage(build)
         for sequence in todo:
-            for _ in _render_sequence(card, sequence, options, plans[sequence.name], build(sequence.scene), out):
+            for _ in _render_sequence(card, sequence, options, plans[sequence.name], stage, out):
                 yield sequence.name, 1
         return
     jobs = [(sequence, plans[sequence.name]) for sequence in todo]
@@ -258,12 +246,12 @@ def _serve_renders(
 
     start_backend()
     set_threads(threads)
-    build = lru_cache(maxsize=1)(build_scene)
+    stage = Stage(lru_cache(maxsize=1)(build_scene))
 
     def render(job: tuple[SequenceCard, Plan]) -> None:
         sequence, plan = job
         try:
-            for _ in _render_sequence(card, sequence, options, plan, build(sequence.scene), out):
+            for _ in _render_sequence(card, sequence, options, plan, stage, out):
                 pass
         except RsbenchError as error:
             raise EntryFailure(str(error)) from error
@@ -276,16 +264,15 @@ def _render_sequence(
     sequence: SequenceCard,
     options: RendererOptions,
     plan: Plan,
-    built: _Built,
+    stage: Stage,
     out: Path,
 ) -> Iterator[None]:
     """Render into a folder of the workplace and move it when complete; yields after each step."""
     from rsbench.renderers.backend import start_backend
     from rsbench.renderers.passage import obstacle
-    from rsbench.renderers.scene import MitsubaScene
 
     backend = start_backend()
-    mitsuba_scene = MitsubaScene(seen_scene(built.scene, sequence))
+    mitsuba_scene, digest = stage.set_for(sequence)
     if words := obstacle(
         mitsuba_scene, card.rig_of(sequence), card.shutter_for(sequence), card.motion_of(sequence)
     ):
@@ -309,7 +296,7 @@ def _render_sequence(
         "drjit": version("drjit"),
         "variant": backend.variant,
     }
-    content = _of_scene(plan, built.sha256) | {"made_by": made_by, "files": files}
+    content = _of_scene(plan, digest) | {"made_by": made_by, "files": files}
     write_json(partial / "sequence.json", content)
     place = out / sequence.name
     if os.path.lexists(place):

@@ -89,6 +89,41 @@ def test_texels_are_as_fine_as_pixels_need(scene: Scene, name: str) -> None:
         assert 0.0004 < size < largest, mesh.name
 
 
+def nearest_surface(scene: Scene, view: str) -> float:
+    """Metres from a viewpoint to the nearest point of any triangle: inside it, or on an edge."""
+    seen = scene.seen_from(scene.viewpoints[view])
+    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in seen.meshes])
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1)
+    corners, normal = corners[length > 0], normal[length > 0] / length[length > 0, None]
+    foot, inside = (
+        normal * np.sum(corners[:, 0] * normal, axis=1, keepdims=True),
+        np.ones(len(corners), dtype=bool),
+    )
+    nearest = np.inf
+    for k in range(3):
+        start, edge = corners[:, k], corners[:, (k + 1) % 3] - corners[:, k]
+        inside &= np.sum(np.cross(edge, foot - start) * normal, axis=1) >= 0
+        along = np.clip(-np.sum(start * edge, axis=1) / np.maximum(np.sum(edge**2, axis=1), 1e-300), 0, 1)
+        nearest = min(nearest, float(np.min(np.linalg.norm(start + along[:, None] * edge, axis=1))))
+    return min(nearest, float(np.min(np.linalg.norm(foot[inside], axis=1), initial=np.inf)))
+
+
+@pytest.mark.parametrize("card", ["standard", "sweep-readout", "stress"])
+def test_no_seed_leads_a_camera_of_these_cards_into_a_wall(scene: Scene, name: str, card: str) -> None:
+    """A camera is never farther from the viewpoint than half the baseline and the whole way, wherever it turns."""
+    dataset = load_dataset_card(card)
+    for view in {sequence.viewpoint for sequence in dataset.sequence if sequence.scene == name}:
+        reach = max(
+            dataset.rig_of(sequence).baseline / 2
+            + (1 + dataset.shutter_for(sequence).readout_ratio)
+            * float(np.linalg.norm(dataset.motion_of(sequence).d))
+            for sequence in dataset.sequence
+            if (sequence.scene, sequence.viewpoint) == (name, view)
+        )
+        assert reach < nearest_surface(scene, view), view
+
+
 def first_hits(scene: Scene, view: str, rays: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distance along each ray (n, 3) from a viewpoint, in lengths of the ray; infinite where nothing is hit.
 
