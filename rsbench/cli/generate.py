@@ -28,6 +28,8 @@ EPILOG = """[bold]Examples[/bold]
   rsbench generate smoke --out data/walk --trajectory walk.txt [dim](along your own poses, one pair of frames
   after the other: lines of timestamp tx ty tz qx qy qz qw)[/dim]
 
+  rsbench generate standard --out data/test --seed 20271 [dim](a split of the same card that nobody has seen)[/dim]
+
   rsbench generate smoke --out data/stack --full-frames    [dim](keeps every row's whole image)[/dim]"""
 
 
@@ -60,6 +62,10 @@ _Trajectory = Annotated[
         metavar="FILE", help="Poses (TUM format) along which the rig moves, in place of the card's motion."
     ),
 ]
+_Seed = Annotated[
+    list[int] | None,
+    typer.Option(min=0, help="In place of the card's seeds: other motions and noise. Repeatable."),
+]
 _Rehash = Annotated[
     bool, typer.Option("--rehash", help="Read all that is there again, not only what has another size or time.")
 ]
@@ -78,6 +84,7 @@ def generate(
     full_frames: _FullFrames = False,
     channels: _Channels = None,
     trajectory: _Trajectory = None,
+    seed: _Seed = None,
     rehash: _Rehash = False,
     estimate: _Estimate = False,
 ) -> None:
@@ -89,7 +96,7 @@ def generate(
     from rsbench.dataset.generation import STEPS, generate_dataset
     from rsbench.renderers.backend import start_backend
 
-    dataset = load_dataset_card(card, trajectory)
+    dataset = load_dataset_card(card, trajectory, tuple(seed or ()))
     if sequence:
         dataset = dataset.only(sequence)
     if shard is not None:

@@ -319,8 +319,15 @@ class DatasetCard(Scanning):
         ]
 
 
-def load_dataset_card(name_or_path: str, trajectory: Path | None = None) -> DatasetCard:
-    """Dataset card by name or path, expanded; with ``trajectory``, moved along that file.
+def load_dataset_card(
+    name_or_path: str, trajectory: Path | None = None, seeds: tuple[int, ...] = ()
+) -> DatasetCard:
+    """Dataset card by name or path, expanded.
+
+    Args:
+        name_or_path: of the card.
+        trajectory: file along which the rig moves, in place of the card's motions.
+        seeds: in place of the card's.
 
     Raises:
         RsbenchError: as ``rsbench.cards.load_card``, or the file of a trajectory is wrong.
@@ -329,7 +336,8 @@ def load_dataset_card(name_or_path: str, trajectory: Path | None = None) -> Data
     search(path)
     card = parse_card(DatasetCard, _with_shutters(read_toml(path), str(path)), str(path))
     try:
-        return (card if trajectory is None else card.along(trajectory)).expanded(path.parent)
+        card = card if trajectory is None else card.along(trajectory)
+        return (replace(card, seeds=seeds) if seeds else card).expanded(path.parent)
     except ValueError as error:
         raise RsbenchError(f"{path}: {error}") from error
 

@@ -79,6 +79,19 @@ def test_a_sequence_of_the_name_draws_the_same_without_a_grid(tmp_path: Path) ->
     assert single.name == "room-mild-4" and single.motion == grid["room-mild-short-ideal-4"].motion
 
 
+def test_other_seeds_make_another_split(tmp_path: Path) -> None:
+    _card(tmp_path)
+    dev = load_dataset_card(str(tmp_path / "small.toml"))
+    test = load_dataset_card(str(tmp_path / "small.toml"), seeds=(77,))
+    assert [sequence.name for sequence in test.sequence] == [
+        sequence.name.removesuffix("4") + "77" for sequence in dev.sequence if sequence.name.endswith("4")
+    ]
+    assert not {dev.seed_of(sequence) for sequence in dev.sequence} & {sequence.seed for sequence in test.sequence}
+    with pytest.raises(RsbenchError, match="seeds and the seed of a sequence exclude each other"):
+        own = '[[sequence]]\nname = "a"\nscene = "room"\nseed = 3\nmotion = ' + MOTION % 1
+        _card(tmp_path, own)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
