@@ -1,9 +1,9 @@
-"""What the channels of ground truth cost beside the images: one camera's frames with all of them, and without.
+"""What the channels of ground truth cost beside the images: a sequence's frames with all of them, and without.
 
 Both are rendered and written in turn, so that a busy machine disturbs them alike. The ratio of the clock's times
 is the cost; that of CPU times tells what a machine with other work would show.
 
-    python benchmarks/channels.py --scene castle --runs 5
+    python benchmarks/channels.py --scene castle --runs 3
 """
 
 from __future__ import annotations
@@ -14,27 +14,34 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from rsbench.cards import load_card
+from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.channels import CHANNELS
 from rsbench.dataset.generation import build_scene, render_camera
 from rsbench.dataset.sequence import files_of
+from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
+from rsbench.scenes.model import Viewpoint
+
+Times = tuple[float, float]
 
 
-def seconds(card: DatasetCard, options: RendererOptions, scene: MitsubaScene) -> tuple[float, float]:
-    """Of the clock and of all threads, for one camera at one time."""
+def seconds(card: DatasetCard, options: RendererOptions, scene: MitsubaScene, viewpoint: Viewpoint) -> Times:
+    """Of the clock and of all threads, for the four frames and what belongs to no one frame."""
     (sequence,) = card.sequence
     with tempfile.TemporaryDirectory() as folder:
         for parent in {Path(name).parent for name in files_of(card.manifest_of(sequence))}:
             (Path(folder) / parent).mkdir(parents=True, exist_ok=True)
         begun, used = time.perf_counter(), time.process_time()
-        for _ in render_camera(card, sequence, options, scene, "left", 0, Path(folder)):
-            pass
+        for view in VIEWS:
+            for _ in render_camera(card, sequence, options, scene, *view, Path(folder)):
+                pass
+        write_sequence_channels(Path(folder), card, sequence, scene, asdict(viewpoint))
         return time.perf_counter() - begun, time.process_time() - used
 
 
@@ -43,16 +50,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--dataset", default="paper", help="whose camera, motion and renderer (default paper)")
     parser.add_argument("--scene", default="castle", help="sequence of it (default castle)")
     parser.add_argument("--channels", default=",".join(CHANNELS), help="with commas between (default all)")
-    parser.add_argument("--runs", type=int, default=5, help="runs of each (default 5)")
+    parser.add_argument("--runs", type=int, default=3, help="runs of each (default 3)")
     parser.add_argument("--limit", type=float, default=1.5, help="exit with 1 above this ratio (default 1.5)")
     given = parser.parse_args(arguments)
     plain = load_dataset_card(given.dataset).only([given.scene])
     full = replace(plain, channels=tuple(given.channels.split(",")))
     options = load_card(RendererOptions, "renderers", plain.renderer)
     built = build_scene(plain.sequence[0].scene).scene
-    scene = MitsubaScene(built.seen_from(built.viewpoints[plain.sequence[0].viewpoint]))
-    seconds(full, options, scene)  # compiles
-    runs = [(seconds(plain, options, scene), seconds(full, options, scene)) for _ in range(given.runs)]
+    viewpoint = built.viewpoints[plain.sequence[0].viewpoint]
+    scene = MitsubaScene(built.seen_from(viewpoint))
+    seconds(full, options, scene, viewpoint)  # compiles
+    runs = [tuple(seconds(card, options, scene, viewpoint) for card in (plain, full)) for _ in range(given.runs)]
     clock, cpu = (statistics.median(with_[k] / without[k] for without, with_ in runs) for k in (0, 1))
     size = f"{plain.camera.width} x {plain.camera.height}, {options.samples} samples"
     rows = [f"{given.dataset}, {given.scene}: {size}, {given.runs} runs of each; channels {given.channels}"]

@@ -5,6 +5,8 @@ Shares nothing with rsbench but the numbers of a sequence: the truth that channe
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -13,6 +15,8 @@ from rsbench.dataset.channels import PairChannel, PixelClass
 from rsbench.dataset.sequence import Sequence
 
 Array = NDArray[np.float64]
+FirstHit = Callable[[Array, Array], Array]
+"""Parameter (n,) of the first triangle along rays: origins and directions (n, 3); inf where there is none."""
 
 
 def first_hit(triangles: Array, origins: Array, ways: Array) -> Array:
@@ -72,14 +76,24 @@ def row_seeing(sequence: Sequence, side: str, frame: int, X: Array) -> Array:
 
 
 def truth(
-    sequence: Sequence, triangles: Array, channel: PairChannel, side: str, frame: int, row: int = 0
+    sequence: Sequence,
+    hit: FirstHit,
+    channel: PairChannel,
+    side: str,
+    frame: int,
+    row: int = 0,
+    chosen: NDArray[np.int64] | None = None,
 ) -> tuple[Array, Array]:
-    """Offsets (n, 2) x_target - x_source and classes (n,) of all pixels; ``row``: of a global-shutter twin."""
+    """Offsets (n, 2) x_target - x_source and classes (n,) of pixels, in the order of their rows.
+
+    ``row``: of a global-shutter twin; ``chosen`` (n,): numbers of pixels, all by default.
+    """
     width, height = sequence.rig.camera.width, sequence.rig.camera.height
     y, x = (each.ravel().astype(float) for each in np.mgrid[:height, :width])
+    y, x = (y, x) if chosen is None else (y[chosen], x[chosen])
     pixels, h = np.column_stack([x, y]), sequence.shutter.readout_ratio / height
     origins, ways = rays(sequence, side, frame + h * y, pixels)
-    depth = first_hit(triangles, origins, ways)
+    depth = hit(origins, ways)
     sky = np.isinf(depth)
     X = origins + ways * np.where(sky, 1e8, depth)[:, None]
     if channel == "disparity":
@@ -96,7 +110,7 @@ def truth(
         inside = ~lost & np.all((landed >= -0.5) & (landed <= [width - 0.5, height - 0.5]), axis=1)
     eyes, _ = rays(sequence, side, tau, pixels)
     # The eye is off the surface that ends the segment by far more than rounding: 1e-6 of the way.
-    hidden = first_hit(triangles, eyes, X - eyes) < 1 - 1e-6
+    hidden = hit(eyes, X - eyes) < 1 - 1e-6
     classes = np.where(
         sky,
         np.where(hidden, PixelClass.SKY_OCCLUDED, PixelClass.SKY),

@@ -14,6 +14,7 @@ from rsbench.dataset.channels import (
     COMPONENTS,
     INSTANCE_TABLE,
     NORMAL_COMPONENTS,
+    TRACKS,
     PairChannel,
     PixelClass,
     mask_file,
@@ -23,6 +24,7 @@ from rsbench.dataset.channels import (
 from rsbench.dataset.files import read_exr, read_grey_png, read_json
 from rsbench.dataset.imu import IMU_MANIFEST, ImuSamples, read_imu
 from rsbench.dataset.timing import MANIFEST, read_timing_table, table_file
+from rsbench.dataset.tracks import Tracks, read_tracks
 from rsbench.errors import RsbenchError
 from rsbench.reading import inside
 
@@ -99,6 +101,11 @@ class ChannelReader:
         """What the inertial sensor measured, and the truth; RsbenchError as of ``offsets``."""
         self._check_channel("imu")
         return read_imu(self.folder)
+
+    def tracks(self) -> Tracks:
+        """Surface points and where the four frames see them; RsbenchError as of ``offsets``."""
+        self._check_channel("tracks")
+        return read_tracks(inside(self.folder, TRACKS))
 
     def imu_manifest(self) -> dict[str, Any]:
         """Content of imu.json; RsbenchError as of ``offsets``."""

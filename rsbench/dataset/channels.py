@@ -14,9 +14,9 @@ from rsbench.errors import RsbenchError
 PairChannel = Literal["disparity", "flow", "gs_flow"]
 """Where each pixel of a rolling-shutter frame lies in another picture: of the other camera at the same time
 (disparity), of the same camera at the other time (flow), and of its global-shutter twin (gs_flow)."""
-Channel = Literal["disparity", "flow", "gs_flow", "timing", "normals", "instances", "imu"]
-OF_ANY_CAMERA: tuple[Channel, ...] = ("timing", "imu")
-INSTANCE_TABLE = "instances.json"
+Channel = Literal["disparity", "flow", "gs_flow", "timing", "normals", "instances", "imu", "tracks"]
+OF_ANY_CAMERA: tuple[Channel, ...] = ("timing", "imu", "tracks")
+INSTANCE_TABLE, TRACKS = "instances.json", "tracks.npz"
 PAIR_CHANNELS: tuple[PairChannel, ...] = get_args(PairChannel)
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
 COMPONENTS: dict[PairChannel, tuple[str, ...]] = {"disparity": ("d",), "flow": ("x", "y"), "gs_flow": ("x", "y")}
@@ -100,8 +100,8 @@ def channel_files(names: Iterable[str], twins: Iterable[int] = ()) -> tuple[str,
     timing = TIMING_FILES if "timing" in given else ()
     normals = (surface_file("normals", *view) for view in VIEWS if "normals" in given)
     instances = (INSTANCE_TABLE, *(surface_file("instances", *view) for view in VIEWS))
-    imu = IMU_FILES if "imu" in given else ()
-    return (*pairs, *timing, *normals, *(instances if "instances" in given else ()), *imu)
+    imu, tracks = IMU_FILES if "imu" in given else (), (TRACKS,) if "tracks" in given else ()
+    return (*pairs, *timing, *normals, *(instances if "instances" in given else ()), *imu, *tracks)
 
 
 def named_channels(text: str) -> tuple[Channel, ...]:

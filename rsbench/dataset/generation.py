@@ -24,16 +24,14 @@ from rsbench.core.rig import SIDES, Side
 from rsbench.core.se3 import Pose
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channel_writer import write_channels
-from rsbench.dataset.channels import INSTANCE_TABLE
 from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_png, write_poses
 from rsbench.dataset.hashes import HASHES, FileHashes
-from rsbench.dataset.imu import Imu, draw_samples, gravity_of, sample_times_ns, write_imu
 from rsbench.dataset.manifest import Files, write_manifest
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence import FRAMES, files_of, is_of_sequence
+from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.dataset.shots import GivenGeometry, Shot
 from rsbench.dataset.stage import Build, Built, Stage
-from rsbench.dataset.timing import write_timing
 from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, remove, strangers, workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_jobs import finished_jobs
@@ -283,12 +281,7 @@ def _render_sequence(
         (partial / folder).mkdir(parents=True, exist_ok=True)
     for side, frame in product(SIDES, FRAMES):
         yield from render_camera(card, sequence, options, mitsuba_scene, side, frame, partial)
-    if "timing" in card.channels:
-        write_timing(partial, card.shutter_for(sequence), card.period_of(sequence), card.sensor_of(sequence))
-    if "imu" in card.channels:
-        _write_imu(card, sequence, plan, partial)
-    if "instances" in card.channels:
-        write_json(partial / INSTANCE_TABLE, {"instances": mitsuba_scene.instances})
+    write_sequence_channels(partial, card, sequence, mitsuba_scene, plan["scene"])
     files = {name: sha256(partial / name) for name in files_below(partial)}
     made_by = {
         "rsbench": __version__,
@@ -304,15 +297,6 @@ def _render_sequence(
         os.rename(place, partial.with_name(f"{sequence.name}.old"))
     os.rename(partial, place)
     yield
-
-
-def _write_imu(card: DatasetCard, sequence: SequenceCard, plan: Plan, folder: Path) -> None:
-    imu, gravity = card.imu or Imu(), gravity_of(plan["scene"])
-    period = card.period_of(sequence)
-    times = sample_times_ns(imu, card.shutter_for(sequence), period, card.sensor_of(sequence))
-    seed = f"{card.seed_of(sequence)}/{sequence.name}"
-    samples = draw_samples(imu, card.motion_of(sequence), times, period, gravity, seed)
-    write_imu(folder, imu, gravity, samples)
 
 
 def render_camera(

@@ -5,23 +5,34 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 from attack.planting import drop, manifest_of, put, rehash
 from numpy.typing import NDArray
-from traced_truth import first_hit, rays, truth
+from traced_truth import first_hit, look, rays, row_seeing, truth
 
 from rsbench.cards import parse_card
-from rsbench.core.rig import VIEWS
+from rsbench.core.rig import FRAMES, SIDES, VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
-from rsbench.dataset.channels import CHANNELS, COMPONENTS, PAIR_CHANNELS, PairChannel, PixelClass, named_channels
+from rsbench.dataset.channels import (
+    CHANNELS,
+    COMPONENTS,
+    PAIR_CHANNELS,
+    TRACKS,
+    PairChannel,
+    PixelClass,
+    named_channels,
+)
 from rsbench.dataset.files import (
     read_depth,
     read_exr,
     read_grey_png,
+    save_arrays,
     write_depth,
     write_exr,
     write_png,
@@ -31,6 +42,7 @@ from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.dataset.verification import Rerender, verify_dataset
 from rsbench.errors import RsbenchError
+from rsbench.reading import load_arrays
 from rsbench.renderers.electrons import Sensor
 from rsbench.scenes.load import load_scene
 
@@ -125,7 +137,7 @@ def test_every_pixel_lies_where_rays_say(
     seen = np.zeros(len(PixelClass), dtype=int)
     near, right = [], []
     for side, frame in VIEWS:
-        offset, classes = truth(sequence, triangles, channel, side, frame, row)
+        offset, classes = truth(sequence, partial(first_hit, triangles), channel, side, frame, row)
         if channel == "disparity":
             offset = offset[:, :1] * (1 if side == "right" else -1)
         stored = sequence.offsets(channel, side, frame, row).reshape(offset.shape)
@@ -163,6 +175,31 @@ def test_normals_and_instances_are_those_of_the_triangles_that_rays_hit(
         right.append(np.max(np.abs(stored - normal * met[:, None]), axis=1) < 2e-5)
         right.append(sequence.instances(side, frame).ravel() == np.where(met, numbers[nearest], 0))
     assert np.mean(np.concatenate(right)) >= 0.999
+
+
+def test_tracks_are_where_rays_say(sequence: Sequence, triangles: Array) -> None:
+    """Surfaces to the rounding of depth to float32; rows by bisection; what is hidden by rays."""
+    tracks, views = sequence.tracks(), [(side, frame) for frame in FRAMES for side in SIDES]
+    hit, h = partial(first_hit, triangles), sequence.shutter.readout_ratio / sequence.shutter.height
+    assert np.bincount(tracks.sources).tolist() == [512] * 4
+    right = []
+    for k, (side, frame) in enumerate(views):
+        own = tracks.sources == k
+        origins, ways = rays(sequence, side, frame + h * tracks.pixels[own, k, 1], tracks.pixels[own, k])
+        X = origins + ways * hit(origins, ways)[:, None]
+        assert np.mean(np.linalg.norm(tracks.points[own] - X, axis=1) < 1e-6 * np.linalg.norm(X, axis=1)) >= 0.99
+        tau = frame + h * row_seeing(sequence, side, frame, tracks.points)
+        lost = np.isnan(tau)
+        pixels = look(sequence, side, np.where(lost, 0.0, tau), tracks.points)
+        inside = ~lost & np.all((pixels >= -0.5) & (pixels <= [63.5, 47.5]), axis=1)
+        np.testing.assert_allclose(tracks.pixels[inside, k], pixels[inside], rtol=0, atol=1e-6)
+        assert np.all(np.isnan(tracks.pixels[~inside, k]))
+        eyes, _ = rays(sequence, side, np.where(lost, 0.0, tau), pixels)
+        hidden = hit(eyes, tracks.points - eyes) < 1 - 1e-5
+        seen = np.where(hidden, PixelClass.OCCLUDED, PixelClass.VISIBLE)
+        right.append(tracks.classes[:, k] == np.where(inside, seen, PixelClass.OUT_OF_VIEW))
+    assert np.mean(right) >= 0.999
+    assert np.all(np.bincount(tracks.classes.ravel(), minlength=4)[1:] >= 50)
 
 
 def test_rows_are_timed_in_nanoseconds(sequence: Sequence) -> None:
@@ -421,7 +458,54 @@ def depth_of(file: str, factor: float) -> Callable[[Path], None]:
     return lambda folder: write_depth(folder / file, read_depth(folder / file) * np.float32(factor))
 
 
+def tracks_of(name: str, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Callable[[Path], None]:
+    def plant(folder: Path) -> None:
+        arrays = load_arrays(folder / TRACKS)
+        save_arrays(folder / TRACKS, arrays | {name: change(arrays[name].copy())})
+
+    return plant
+
+
+def one_view(k: int, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    def of(values: NDArray[Any]) -> NDArray[Any]:
+        values[:, k] = change(values[:, k])
+        return values
+
+    return of
+
+
 FAULTS |= {
+    "points scaled": (tracks_of("points", lambda X: 1.001 * X), (TRACKS, "left_0", "scaled by 1.001")),
+    "pixels of one frame moved by 0.1 px": (
+        tracks_of("pixels", one_view(3, lambda pixels: pixels + 0.1)),
+        (TRACKS, "right_1", "not where their row sees them"),
+    ),
+    "frames of tracks exchanged": (
+        tracks_of("pixels", lambda pixels: pixels[:, [2, 1, 0, 3]]),
+        (TRACKS, "left_0", "points"),
+    ),
+    "tracks of another time": (
+        tracks_of("tau", one_view(2, lambda tau: tau - 1.0)),
+        (TRACKS, "left_1", "another time than their row"),
+    ),
+    "tracks: nothing is hidden": (
+        tracks_of("classes", lambda classes: np.where(classes == 2, 1, classes).astype(np.uint8)),
+        (TRACKS, "are visible, but hidden by"),
+    ),
+    "tracks: all is hidden": (
+        tracks_of("classes", lambda classes: np.where(classes == 1, 2, classes).astype(np.uint8)),
+        (TRACKS, "are hidden, but visible by"),
+    ),
+    "tracks without points": (
+        lambda folder: save_arrays(
+            folder / TRACKS, {name: values[:0] for name, values in load_arrays(folder / TRACKS).items()}
+        ),
+        (TRACKS, "has no points"),
+    ),
+    "tracks in float32": (
+        tracks_of("pixels", lambda pixels: pixels.astype(np.float32)),
+        (TRACKS, "pixels is float32"),
+    ),
     "a twin at the pose of another row": (
         copied("gs_twin/0047/left_0.png", "gs_twin/0024/left_0.png"),
         ("gs_twin/0024/left_0.png", "row 24 differs from rs_clean/left_0.png"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from rsbench.dataset.files import read_json
 from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.verification import structure
 from rsbench.dataset.verification.channel_checks import channel_faults
-from rsbench.dataset.verification.content import Comparison, images_elsewhere, read_content, twin_faults
+from rsbench.dataset.verification.content import Comparison, Content, images_elsewhere, read_content, twin_faults
 from rsbench.dataset.verification.findings import DepthAgreement, Progress, SequenceReport
 from rsbench.dataset.verification.imu_checks import imu_faults
 from rsbench.dataset.verification.landing import PAIRS
@@ -24,6 +24,7 @@ from rsbench.dataset.verification.sensors import sensor_faults
 from rsbench.dataset.verification.stacks import stack_faults
 from rsbench.dataset.verification.surface_checks import surface_faults
 from rsbench.dataset.verification.timing_checks import timing_faults
+from rsbench.dataset.verification.track_checks import track_faults
 from rsbench.dataset.verification.twin_checks import other_twin_faults, read_twins, with_twins
 from rsbench.errors import RsbenchError
 
@@ -109,16 +110,14 @@ def verify_sequence(
             steps -= 1
         faults += comparison.faults(images_elsewhere(partial(_others, listing, name)))
         notes += comparison.notes
-        faults += timing_faults(sequence, {*missing, *map(_file_of, faults)})
-        faults += imu_faults(sequence, {*missing, *map(_file_of, faults)})
         twins = read_twins(sequence, missing)
         faults += [*twins.faults, *other_twin_faults(content, twins, stride)]
         every = with_twins(content, twins)
-        faults += channel_faults(sequence, every.maps, {*missing, *map(_file_of, faults)}, stride)
-        faults += surface_faults(sequence, content.maps, {*missing, *map(_file_of, faults)})
+        for found in _channel_checks(every, stride):
+            faults += found({*missing, *map(_file_of, faults)})
         if again is not None:
-            found, note = again.check(every, {*missing, *map(_file_of, faults)})
-            faults += found
+            other, note = again.check(every, {*missing, *map(_file_of, faults)})
+            faults += other
             notes.append(note)
     except RsbenchError as error:
         faults.append(str(error))
@@ -127,6 +126,16 @@ def verify_sequence(
     return SequenceReport(
         name=name, faults=tuple(dict.fromkeys(faults)), agreements=tuple(agreements), notes=tuple(notes)
     )
+
+
+def _channel_checks(content: Content, stride: int) -> Iterator[Callable[[Collection[str]], Iterator[str]]]:
+    """Each gives the faults of some channels, but for files that are told already."""
+    sequence, maps = content.sequence, content.maps
+    yield partial(timing_faults, sequence)
+    yield partial(imu_faults, sequence)
+    yield partial(channel_faults, sequence, maps, stride=stride)
+    yield partial(track_faults, sequence, maps)
+    yield partial(surface_faults, sequence, maps)
 
 
 def _file_of(fault: str) -> str:

@@ -29,6 +29,7 @@ from rsbench.dataset.verification.image_checks import CHANGES, Picture
 from rsbench.dataset.verification.landing import SHOTS, DepthMap, Shot
 from rsbench.dataset.verification.stacks import stack_rows
 from rsbench.dataset.verification.surface_checks import surfaces_again
+from rsbench.dataset.verification.track_checks import tracks_again
 from rsbench.errors import RsbenchError
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene, read_scene_card
@@ -174,6 +175,7 @@ def _checks(
             yield from (_Check(*check) for check in again)
         if shot.shutter == "rs":
             yield from _frame_checks(content, scene, options, shot, rows, told)
+    yield from (_Check(*check) for check in tracks_again(content.sequence, SceneRays(scene), told))
 
 
 def _frame_checks(

@@ -1,0 +1,49 @@
+"""Writing the channels that tell of a whole sequence, when its frames are there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rsbench.core.rig import VIEWS
+from rsbench.dataset.card import DatasetCard, SequenceCard
+from rsbench.dataset.channels import INSTANCE_TABLE
+from rsbench.dataset.files import read_depth, write_json
+from rsbench.dataset.imu import Imu, draw_samples, gravity_of, sample_times_ns, write_imu
+from rsbench.dataset.shots import GivenGeometry, Shot
+from rsbench.dataset.timing import write_timing
+from rsbench.dataset.tracks import make_tracks, write_tracks
+
+if TYPE_CHECKING:
+    from rsbench.renderers.scene import MitsubaScene
+
+
+def write_sequence_channels(
+    folder: Path, card: DatasetCard, sequence: SequenceCard, scene: MitsubaScene, record: Mapping[str, Any]
+) -> None:
+    """The files of the card's channels that belong to no one frame.
+
+    Args:
+        folder: of the sequence, with all of its frames.
+        card: of the dataset.
+        sequence: of the card.
+        scene: what is seen.
+        record: what sequence.json says of it.
+    """
+    from rsbench.renderers.segments import SceneRays
+
+    shutter, period, sensor = card.shutter_for(sequence), card.period_of(sequence), card.sensor_of(sequence)
+    motion, seed = card.motion_of(sequence), f"{card.seed_of(sequence)}/{sequence.name}"
+    if "timing" in card.channels:
+        write_timing(folder, shutter, period, sensor)
+    if "instances" in card.channels:
+        write_json(folder / INSTANCE_TABLE, {"instances": scene.instances})
+    if "imu" in card.channels:
+        imu, gravity = card.imu or Imu(), gravity_of(record)
+        times = sample_times_ns(imu, shutter, period, sensor)
+        write_imu(folder, imu, gravity, draw_samples(imu, motion, times, period, gravity, seed))
+    if "tracks" in card.channels:
+        depths = {view: read_depth(folder / Shot("rs", *view).depth) for view in VIEWS}
+        geometry = GivenGeometry(card.rig_of(sequence), shutter, motion)
+        write_tracks(folder, make_tracks(geometry, depths, SceneRays(scene).blocked, seed))

@@ -1,0 +1,136 @@
+"""The channel ``tracks``: surface points drawn from a seed, and where each of the four frames sees them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.projection import ProjectionStatus, back_project, rs_project
+from rsbench.core.rig import FRAMES, SIDES, View
+from rsbench.core.se3 import inverse
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.channels import TRACKS, PixelClass
+from rsbench.dataset.files import save_arrays
+from rsbench.errors import RsbenchError
+from rsbench.reading import load_arrays
+
+if TYPE_CHECKING:  # which reads tracks
+    from rsbench.dataset.shots import Geometry
+
+TRACK_VIEWS: tuple[View, ...] = tuple((side, frame) for frame in FRAMES for side in SIDES)
+"""Left 0, right 0, left 1, right 1: the order of the frames in the arrays, and of ``Sequence.images``."""
+OF_EACH_FRAME = 512
+"""Points drawn from the pixels of a frame."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tracks:
+    """Points (n) and what became of them in the four frames, in the order of ``TRACK_VIEWS``.
+
+    Raises:
+        ValueError: arrays of other shapes or types, or of points, sources or classes that cannot be.
+    """
+
+    points: FloatArray
+    """(n, 3) world frame, metres."""
+    sources: NDArray[np.uint8]
+    """(n,) number of the frame from whose pixels the point was drawn."""
+    pixels: FloatArray
+    """(n, 4, 2) px, between pixels too; NaN where a frame does not see the point."""
+    tau: FloatArray
+    """(n, 4) times at which the frames see it, frame periods; NaN likewise."""
+    classes: NDArray[np.uint8]
+    """(n, 4) of ``PixelClass``: VISIBLE, OCCLUDED (the pixel is known), OUT_OF_VIEW or UNSOLVED."""
+
+    def __post_init__(self) -> None:
+        n, f8, u1 = len(self.points), np.dtype(np.float64), np.dtype(np.uint8)
+        wanted = {"points": ((n, 3), f8), "sources": ((n,), u1), "pixels": ((n, 4, 2), f8)}
+        wanted |= {"tau": ((n, 4), f8), "classes": ((n, 4), u1)}
+        for name, (shape, kind) in wanted.items():
+            value = getattr(self, name)
+            if value.shape != shape or value.dtype != kind:
+                raise ValueError(f"{name} is {value.dtype} of shape {value.shape}: {kind} of {shape} is needed")
+        if not np.all(np.isfinite(self.points)) or np.any(self.sources >= len(TRACK_VIEWS)):
+            raise ValueError("points must be finite, and sources 0 to 3")
+        if np.any(self.classes > PixelClass.OUT_OF_VIEW):
+            raise ValueError(f"classes holds {np.max(self.classes)}: a point is of class 0 to 3")
+
+
+def make_tracks(
+    geometry: Geometry,
+    depths: Mapping[View, NDArray[np.float32]],
+    blocked: Callable[[FloatArray, FloatArray], NDArray[np.bool_]],
+    seed: str,
+) -> Tracks:
+    """Draw ``OF_EACH_FRAME`` pixels with a surface from each frame, and look for their points in all of them.
+
+    Args:
+        geometry: of the sequence.
+        depths: (H, W) of each rolling-shutter frame, metres, 0 = no surface.
+        blocked: as of ``channel_truth``.
+        seed: of the draw.
+    """
+    drawn = [_drawn(geometry, view, depths[view], f"{seed}/tracks/{view[0]}_{view[1]}") for view in TRACK_VIEWS]
+    points = np.concatenate([X for X, _ in drawn])
+    sources = np.repeat(np.arange(len(drawn), dtype=np.uint8), [len(X) for X, _ in drawn])
+    seen = [look_for(geometry, view, points, blocked) for view in TRACK_VIEWS]
+    pixels, tau, classes = (np.stack(each, axis=1) for each in zip(*seen, strict=True))
+    # A frame that sees a point twice names the first row; where it was drawn, it is the pixel of the draw.
+    for k, (view, (_, grid)) in enumerate(zip(TRACK_VIEWS, drawn, strict=True)):
+        own = sources == k
+        pixels[own, k], classes[own, k] = grid, PixelClass.VISIBLE
+        tau[own, k] = geometry.shutter.pixel_time(grid, view[1], view[0])
+    return Tracks(points=points, sources=sources, pixels=pixels, tau=tau, classes=classes)
+
+
+def _drawn(geometry: Geometry, view: View, depth: NDArray[np.float32], seed: str) -> tuple[FloatArray, FloatArray]:
+    """World points (n, 3) and the pixels (n, 2) that see them."""
+    rng = np.random.default_rng(int.from_bytes(hashlib.sha256(seed.encode()).digest()[:16], "little"))
+    solid = np.flatnonzero(depth)
+    chosen = np.sort(rng.permutation(solid)[:OF_EACH_FRAME])
+    y, x = np.divmod(chosen, depth.shape[1])
+    pixels = np.column_stack([x, y]).astype(np.float64)
+    return points_at(geometry, view, pixels, depth), pixels
+
+
+def points_at(geometry: Geometry, view: View, pixels: FloatArray, depth: NDArray[np.float32]) -> FloatArray:
+    """World points (n, 3) that whole pixels (n, 2) of a frame see."""
+    z = depth[pixels[:, 1].astype(np.int64), pixels[:, 0].astype(np.int64)]
+    return back_project(geometry.rig, geometry.shutter, geometry.motion, *view, pixels, z)
+
+
+def look_for(
+    geometry: Geometry,
+    view: View,
+    points: FloatArray,
+    blocked: Callable[[FloatArray, FloatArray], NDArray[np.bool_]],
+) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
+    """Pixels (n, 2), times (n,) and classes (n,) of points in a frame."""
+    side, frame = view
+    found = rs_project(geometry.rig, geometry.shutter, geometry.motion, side, frame, points)
+    inside = np.isfinite(found.tau)
+    eyes = inverse(geometry.rig.cam_from_world(geometry.motion, found.tau[inside], side)).t
+    lost = found.status == ProjectionStatus.NOT_CONVERGED
+    classes = np.where(lost, PixelClass.UNSOLVED, PixelClass.OUT_OF_VIEW).astype(np.uint8)
+    hidden = blocked(eyes, points[inside]) if np.any(inside) else np.zeros(0, dtype=np.bool_)
+    classes[inside] = np.where(hidden, PixelClass.OCCLUDED, PixelClass.VISIBLE)
+    return found.pixels, found.tau, classes
+
+
+def write_tracks(folder: Path, tracks: Tracks) -> None:
+    """The file of the channel below the folder of a sequence."""
+    save_arrays(folder / TRACKS, {field.name: getattr(tracks, field.name) for field in fields(tracks)})
+
+
+def read_tracks(path: Path) -> Tracks:
+    """Raises RsbenchError as ``reading.load_arrays``, and for arrays that are no tracks."""
+    try:
+        return Tracks(**load_arrays(path))
+    except (TypeError, ValueError) as error:
+        raise RsbenchError(f"{path}: {error}") from error
