@@ -14,10 +14,12 @@ from rsbench.dataset.channels import (
     COMPONENTS,
     INSTANCE_TABLE,
     NORMAL_COMPONENTS,
+    RADIANCE_COMPONENTS,
     TRACKS,
     PairChannel,
     PixelClass,
     mask_file,
+    radiance_file,
     surface_file,
     value_file,
 )
@@ -101,6 +103,18 @@ class ChannelReader:
         """What the inertial sensor measured, and the truth; RsbenchError as of ``offsets``."""
         self._check_channel("imu")
         return read_imu(self.folder)
+
+    def radiance(self, side: Side, frame: int) -> NDArray[np.float32]:
+        """(H, W, 3) linear RGB radiance of a rolling-shutter frame without its sensor.
+
+        Times the renderer's ``exposure``, 1 is white. Rounded to float16 on disk. RsbenchError as of ``offsets``.
+        """
+        self._check_channel("hdr")
+        path = inside(self.folder, radiance_file(side, frame))
+        values = read_exr(path, RADIANCE_COMPONENTS, self._size, half=True)
+        if not np.all(np.isfinite(values)) or np.any(values < 0):
+            raise RsbenchError(f"{path}: radiance must be finite and not negative")
+        return values
 
     def tracks(self) -> Tracks:
         """Surface points and where the four frames see them; RsbenchError as of ``offsets``."""

@@ -14,13 +14,18 @@ from rsbench.dataset.channels import (
     COMPONENTS,
     NORMAL_COMPONENTS,
     PAIR_CHANNELS,
+    RADIANCE_COMPONENTS,
     STEP_PX,
     PairChannel,
     pair_layers,
+    radiance_file,
     surface_file,
 )
 from rsbench.dataset.files import write_exr, write_png, write_png16
 from rsbench.dataset.shots import Geometry, Shot
+from rsbench.renderers.render import Frame
+
+_BRIGHTEST = float(np.finfo(np.float16).max)
 
 
 def write_channels(
@@ -28,7 +33,7 @@ def write_channels(
     names: Collection[str],
     geometry: Geometry,
     shot: Shot,
-    depth: NDArray[np.float32],
+    rendered: Frame,
     rays: Rays,
     twins: Iterable[int] = (),
 ) -> None:
@@ -39,13 +44,17 @@ def write_channels(
         names: of channels.
         geometry: of the sequence.
         shot: the frame.
-        depth: (H, W) of the frame, metres, 0 = no surface.
+        rendered: its light and depth.
         rays: through its scene.
         twins: rows of global-shutter twins to which ``gs_flow`` leads too.
     """
+    if "hdr" in names:
+        light = {name: rendered.image[..., k] for k, name in enumerate(RADIANCE_COMPONENTS)}
+        bright = {name: np.minimum(each, _BRIGHTEST) for name, each in light.items()}
+        write_exr(folder / radiance_file(shot.side, shot.frame), bright, half=True)
     if not set(names) & {*PAIR_CHANNELS, "normals", "instances"}:
         return
-    seen = SeenSurfaces(geometry, shot, depth)
+    seen = SeenSurfaces(geometry, shot, rendered.depth)
     for layer in pair_layers(names, twins):
         truth = pair_truth(seen, target_of(layer, shot), rays.blocked)
         values = pair_values(layer.channel, shot, truth.offset)

@@ -14,8 +14,8 @@ from rsbench.errors import RsbenchError
 PairChannel = Literal["disparity", "flow", "gs_flow"]
 """Where each pixel of a rolling-shutter frame lies in another picture: of the other camera at the same time
 (disparity), of the same camera at the other time (flow), and of its global-shutter twin (gs_flow)."""
-Channel = Literal["disparity", "flow", "gs_flow", "timing", "normals", "instances", "imu", "tracks"]
-OF_ANY_CAMERA: tuple[Channel, ...] = ("timing", "imu", "tracks")
+Channel = Literal["disparity", "flow", "gs_flow", "timing", "normals", "instances", "imu", "tracks", "hdr"]
+OF_ANY_CAMERA: tuple[Channel, ...] = ("timing", "imu", "tracks", "hdr")
 INSTANCE_TABLE, TRACKS = "instances.json", "tracks.npz"
 PAIR_CHANNELS: tuple[PairChannel, ...] = get_args(PairChannel)
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
@@ -23,6 +23,7 @@ COMPONENTS: dict[PairChannel, tuple[str, ...]] = {"disparity": ("d",), "flow": (
 """Names of the float32 channels of the EXR files."""
 
 NORMAL_COMPONENTS = ("x", "y", "z")
+RADIANCE_COMPONENTS = ("R", "G", "B")
 STEP_PX = 2.0**-10
 """Values are rounded to multiples of it, which makes the files four times smaller."""
 
@@ -92,6 +93,10 @@ def surface_file(channel: Literal["normals", "instances"], side: str, frame: int
     return f"{channel}/{side}_{frame}.{'exr' if channel == 'normals' else 'png'}"
 
 
+def radiance_file(side: str, frame: int) -> str:
+    return f"hdr/{side}_{frame}.exr"
+
+
 def channel_files(names: Iterable[str], twins: Iterable[int] = ()) -> tuple[str, ...]:
     """Paths below a sequence's folder of the channels of these names; those of later versions are nobody's."""
     given = set(names)
@@ -100,8 +105,9 @@ def channel_files(names: Iterable[str], twins: Iterable[int] = ()) -> tuple[str,
     timing = TIMING_FILES if "timing" in given else ()
     normals = (surface_file("normals", *view) for view in VIEWS if "normals" in given)
     instances = (INSTANCE_TABLE, *(surface_file("instances", *view) for view in VIEWS))
+    hdr = (radiance_file(*view) for view in VIEWS if "hdr" in given)
     imu, tracks = IMU_FILES if "imu" in given else (), (TRACKS,) if "tracks" in given else ()
-    return (*pairs, *timing, *normals, *(instances if "instances" in given else ()), *imu, *tracks)
+    return (*pairs, *timing, *normals, *(instances if "instances" in given else ()), *imu, *tracks, *hdr)
 
 
 def named_channels(text: str) -> tuple[Channel, ...]:

@@ -129,12 +129,13 @@ def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
     write_exr(path, {"Z": depth})
 
 
-def write_exr(path: Path, channels: Mapping[str, NDArray[np.float32]]) -> None:
-    """float32 channels (H, W) by name; lossless ZIP."""
+def write_exr(path: Path, channels: Mapping[str, NDArray[np.float32]], half: bool = False) -> None:
+    """float32 channels (H, W) by name, or float16 where ``half``; lossless ZIP."""
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    pixels = {name: np.ascontiguousarray(each, dtype=np.float32) for name, each in channels.items()}
+    kind = np.float16 if half else np.float32
+    pixels = {name: np.ascontiguousarray(each, dtype=kind) for name, each in channels.items()}
     content = io.BytesIO()  # OpenEXR does not tell of a full disk in one way, write_bytes does
     with OpenEXR.File(header, pixels) as file:
         file.write(content)
@@ -153,11 +154,14 @@ def read_depth(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.fl
     return depth
 
 
-def read_exr(path: Path, names: tuple[str, ...], size: tuple[int, int] | None = None) -> NDArray[np.float32]:
+def read_exr(
+    path: Path, names: tuple[str, ...], size: tuple[int, int] | None = None, half: bool = False
+) -> NDArray[np.float32]:
     """Channels (H, W, channels) float32 in the order of ``names``; ``size`` as of ``read_png``.
 
     Raises:
-        RsbenchError: missing, damaged, of another size, or with anything but these float32 channels in scanlines.
+        RsbenchError: missing, damaged, of another size, or with anything but these float32 channels in scanlines,
+            or float16 ones where ``half``.
     """
     import OpenEXR
 
@@ -172,9 +176,9 @@ def read_exr(path: Path, names: tuple[str, ...], size: tuple[int, int] | None = 
     except Exception as error:  # OpenEXR raises plain RuntimeError, ValueError and others for damaged files
         raise RsbenchError(f"{path}: damaged or not an EXR file ({str(error).splitlines()[0]})") from error
     for name, each in zip(names, pixels, strict=True):
-        if each.dtype != np.float32 or each.ndim != 2:
-            raise RsbenchError(f"{path}: must hold a float32 channel {name}")
-    return np.stack(pixels, axis=-1)
+        if each.dtype != (np.float16 if half else np.float32) or each.ndim != 2:
+            raise RsbenchError(f"{path}: must hold a float{16 if half else 32} channel {name}")
+    return np.stack(pixels, axis=-1).astype(np.float32, copy=False)
 
 
 def _check_exr_header(

@@ -344,7 +344,7 @@ def render_camera(
             write_png(folder / shot.image, to_srgb8(seen, 1.0))
         if kind == "rs":
             geometry = GivenGeometry(rig, shutter, card.motion_of(sequence))
-            write_channels(folder, card.channels, geometry, shot, rendered.depth, SceneRays(scene), twins)
+            write_channels(folder, card.channels, geometry, shot, rendered, SceneRays(scene), twins)
         if shot.row == 0:
             yield
 

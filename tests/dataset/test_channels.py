@@ -44,6 +44,7 @@ from rsbench.dataset.verification import Rerender, verify_dataset
 from rsbench.errors import RsbenchError
 from rsbench.reading import load_arrays
 from rsbench.renderers.electrons import Sensor
+from rsbench.renderers.image import to_srgb8
 from rsbench.scenes.load import load_scene
 
 Array = NDArray[np.float64]
@@ -200,6 +201,14 @@ def test_tracks_are_where_rays_say(sequence: Sequence, triangles: Array) -> None
         right.append(tracks.classes[:, k] == np.where(inside, seen, PixelClass.OUT_OF_VIEW))
     assert np.mean(right) >= 0.999
     assert np.all(np.bincount(tracks.classes.ravel(), minlength=4)[1:] >= 50)
+
+
+def test_linear_images_are_the_images_before_rounding(sequence: Sequence) -> None:
+    """Half floats err by 2^-12 of a value, by 0.03 codes: where one shade fills a picture, all of it may."""
+    for side, frame in VIEWS:
+        light, codes = sequence.radiance(side, frame), sequence.clean_image(side, frame)
+        shades = [to_srgb8(light * np.float32(factor), 0.8).astype(int) for factor in (1 - 2**-11, 1 + 2**-11)]
+        assert np.all((shades[0] <= codes) & (codes <= shades[1])) and np.max(shades[1] - shades[0]) <= 1
 
 
 def test_rows_are_timed_in_nanoseconds(sequence: Sequence) -> None:
@@ -474,7 +483,29 @@ def one_view(k: int, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Callable
     return of
 
 
+def radiance_of(view: str, change: Callable[[NDArray[np.float32]], NDArray[Any]]) -> Callable[[Path], None]:
+    def plant(folder: Path) -> None:
+        changed = change(read_exr(folder / f"hdr/{view}.exr", ("R", "G", "B"), half=True))
+        write_exr(folder / f"hdr/{view}.exr", {name: changed[..., k] for k, name in enumerate("RGB")}, half=True)
+
+    return plant
+
+
 FAULTS |= {
+    "radiance scaled": (radiance_of("left_0", lambda light: 1.05 * light), ("hdr/left_0.exr", "scaled by 1.05")),
+    "radiance in other colours": (
+        radiance_of("right_0", lambda light: light[..., ::-1]),
+        ("hdr/right_0.exr", "red and blue exchanged"),
+    ),
+    "radiance upside down": (radiance_of("left_1", np.flipud), ("hdr/left_1.exr", "upside down")),
+    "radiance of codes": (
+        radiance_of("right_1", lambda light: to_srgb8(light, 0.8) / (0.8 * 255)),
+        ("hdr/right_1.exr", "encoded as sRGB"),
+    ),
+    "radiance that is not finite": (
+        radiance_of("right_1", lambda light: light * np.inf),
+        ("hdr/right_1.exr", "finite"),
+    ),
     "points scaled": (tracks_of("points", lambda X: 1.001 * X), (TRACKS, "left_0", "scaled by 1.001")),
     "pixels of one frame moved by 0.1 px": (
         tracks_of("pixels", one_view(3, lambda pixels: pixels + 0.1)),

@@ -16,6 +16,7 @@ from rsbench.dataset.verification import structure
 from rsbench.dataset.verification.channel_checks import channel_faults
 from rsbench.dataset.verification.content import Comparison, Content, images_elsewhere, read_content, twin_faults
 from rsbench.dataset.verification.findings import DepthAgreement, Progress, SequenceReport
+from rsbench.dataset.verification.hdr_checks import hdr_faults
 from rsbench.dataset.verification.imu_checks import imu_faults
 from rsbench.dataset.verification.landing import PAIRS
 from rsbench.dataset.verification.poses import pose_faults
@@ -136,6 +137,7 @@ def _channel_checks(content: Content, stride: int) -> Iterator[Callable[[Collect
     yield partial(channel_faults, sequence, maps, stride=stride)
     yield partial(track_faults, sequence, maps)
     yield partial(surface_faults, sequence, maps)
+    yield partial(hdr_faults, sequence, content.pictures)
 
 
 def _file_of(fault: str) -> str:
