@@ -238,9 +238,9 @@ def correct(
     """The global-shutter frames that the cameras would have taken, from their four rolling-shutter frames.
 
     Args:
-        images: four images, rectified and as the sensor read them.
-        rig: the cameras.
-        readout_ratio: readout time over frame period; None has it estimated.
+        images: four images, as the sensor read them; the cameras look the same way, side by side.
+        rig: the cameras, with their lens where they have one; the result has it too.
+        readout_ratio: readout time over frame period; None has it estimated, of cameras without a lens.
         solver: finds the motion, in metres; as in ``estimate_motion``.
         matcher: name or card of the stereo matcher that finds depth.
         features: name or card of the feature matcher that finds the matches of the motion.

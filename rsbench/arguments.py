@@ -53,6 +53,17 @@ def check_ideal(rig: StereoRig, what: str) -> None:
         )
 
 
+def check_plain(rig: StereoRig, shutter: RollingShutter, what: str) -> None:
+    """Raises RsbenchError for cameras with a lens or another scan, which ``what`` does not take."""
+    check_ideal(rig, what)
+    if not shutter.plain:
+        s = shutter.scanning
+        raise RsbenchError(
+            f"scan = {s.scan!r}, right_scan = {s.right_scan!r}, right_delay = {s.right_delay}: {what} takes rows "
+            "from the top, read by both cameras at once"
+        )
+
+
 def check_rows(rig: StereoRig, shutter: RollingShutter) -> None:
     """Raises ValueError unless the shutter reads as many rows and columns as the cameras have."""
     if shutter.width not in (None, rig.camera.width):

@@ -10,6 +10,7 @@ import typer
 from rsbench.cli.kinds import named
 
 if TYPE_CHECKING:
+    from rsbench.core.rig import StereoRig
     from rsbench.core.shutter import RollingShutter
     from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import FrameSource, RigCard
@@ -25,7 +26,7 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench correct l0.png r0.png l1.png r1.png --rig rig.toml --out corrected --motion-model auto
 
-RIG.toml, for rectified images (pixels, metres; without readout_ratio it is estimated):
+RIG.toml, for images of cameras side by side (pixels, metres; without readout_ratio it is estimated):
 
   baseline = 0.12
   readout_ratio = 0.8        [dim]# readout time / frame period; or shutter = "gopro-hero6-4k30", of a real
@@ -35,6 +36,7 @@ RIG.toml, for rectified images (pixels, metres; without readout_ratio it is esti
   fy = 812.3
   cx = 479.5
   cy = 269.5
+  lens = { model = "brown-conrady", k1 = -0.2 }   [dim]# or kannala-brandt; without it: no distortion[/dim]
 
 Names: rsbench list solvers, matchers, features or correctors; a card's path ends in .toml.
 
@@ -160,13 +162,19 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
 
     order = (("left", 0), ("right", 0), ("left", 1), ("right", 1))
     images = read_four(dict(zip(order, paths, strict=True)))  # type: ignore[arg-type]
-    height, width = images["left", 0].shape[:2]
-    rig = card.rig(width, height)
+    rig = _sized(card, images["left", 0])
+    height = rig.camera.height
     options = replace(options, target_row=_target_row(target, height))
     with fresh_folder(out) as folder:
         with progress_bar("correcting", 4) as advance:
             result = correct_four(
-                images, rig, card.readout_ratio, options, advance, disparity_offset=card.disparity_offset
+                images,
+                rig,
+                card.readout_ratio,
+                options,
+                advance,
+                disparity_offset=card.disparity_offset,
+                scanning=card.scanning,
             )
         for (side, frame), fused in result.frames.items():
             write_frame(folder, f"{side}_{frame}", fused)
@@ -178,6 +186,16 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
         cards = [card_of(f"{s} {f}", images[s, f], fused) for (s, f), fused in result.frames.items()]
         _page(folder, out, result.shutter, result.readout, record["motion"], cards)
     _say(out, result.shutter, result.readout, record["motion"])
+
+
+def _sized(card: RigCard, image: Any) -> StereoRig:
+    from rsbench.errors import RsbenchError
+
+    height, width = image.shape[:2]
+    try:
+        return card.rig(width, height)
+    except ValueError as error:
+        raise RsbenchError(f"--rig: of images of {width} x {height} pixels: {error}") from error
 
 
 def _page(
@@ -239,24 +257,24 @@ def _correct_sequence(
     from dataclasses import replace
 
     from rsbench.cli.console import progress_bar
-    from rsbench.core.shutter import RollingShutter
     from rsbench.dataset.corrected_frames import fresh_folder, rig_record, write_record
+    from rsbench.pipeline.chain import check_cameras
     from rsbench.pipeline.footage import FrameSource
     from rsbench.pipeline.sliding import correct_sequence, estimate_sequence_readout
 
     left, right = FrameSource(left_path), FrameSource(right_path)
-    height, width = next(iter(left)).shape[:2]
-    rig = card.rig(width, height)
-    options = replace(options, target_row=_target_row(target, height))
+    rig = _sized(card, next(iter(left)))
+    options = replace(options, target_row=_target_row(target, rig.camera.height))
     ratio, offset, readout = card.readout_ratio, card.disparity_offset, None
+    check_cameras(rig, card.scanning, options, ratio, offset)
     with fresh_folder(out) as folder:
         if ratio is None:
             readout = estimate_sequence_readout(left, right, rig, options, offset)
             ratio, offset = readout.readout_ratio, readout.disparity_offset
-        shutter = RollingShutter(height=height, readout_ratio=ratio)
+        shutter = card.shutter_of(rig.camera.width, rig.camera.height, ratio)
         record = rig_record(rig, shutter, readout, options, offset)
         with progress_bar("correcting", max(left.count, 1)) as advance:
-            moments = correct_sequence(left, right, rig, ratio, options, offset or 0.0)
+            moments = correct_sequence(left, right, rig, ratio, options, offset or 0.0, card.scanning)
             record["frames"], cards = _write_moments(folder, moments, left, advance)
         write_record(folder, record)
         _page(folder, out, shutter, readout, None, cards)

@@ -38,6 +38,7 @@ class Target(StrEnum):
     fig4 = "fig4"
     correction = "correction"
     sgm = "sgm"
+    real = "real"
     everything = "everything"
 
 
@@ -60,6 +61,7 @@ def reproduce(
             "from stored results. sweeps: the other simulations. "
             "fig4: its Figure 4 in every scene, for three motions. correction: baselines, ours and oracles on "
             "mild, moderate, aggressive and poles. sgm: stereo matching when the cameras' rows are not in step. "
+            "real: the default pipeline on a real camera's frames, beside an ideal one's. "
             "everything: all of these, one after the other, with the time that each took."
         ),
     ],
@@ -68,7 +70,10 @@ def reproduce(
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes of simulations and corrections; default: one per core.")
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Of images: runs of each solver, with other samples.")] = 20,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Of images and real: runs of each solver, with other samples.")
+    ] = 20,
+    width: Annotated[int | None, typer.Option(help="Of real: width of the images; default: the card's.")] = None,
 ) -> None:
     """Make the committed results again: render or simulate what is missing, run, score, draw."""
     from rsbench.dataset.files import check_out
@@ -76,11 +81,13 @@ def reproduce(
     check_out(out)
     for each in _ORDER if target is Target.everything else (target,):
         start = time.monotonic()
-        _reproduce(each, out, data, workers, seeds)
+        _reproduce(each, out, data, workers, seeds, width)
         typer.echo(f"{each}: {(time.monotonic() - start) / 60.0:.1f} minutes")
 
 
-def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds: int) -> None:
+def _reproduce(
+    target: Target, out: Path, data: Path, workers: int | None, seeds: int, width: int | None
+) -> None:
     from contextlib import ExitStack
 
     from rsbench.dataset.workplace import workplace
@@ -92,6 +99,8 @@ def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds
             _images(out, data, seeds)
         elif target is Target.correction:
             _correction(out, data, workers)
+        elif target is Target.real:
+            _real(out, data, seeds, width)
         elif target in (Target.fig4, Target.sgm):
             _depth(target, out, data)
         else:
@@ -102,6 +111,12 @@ def _correction(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.cli.reproduce_correction import correction
 
     correction(out, data, workers)
+
+
+def _real(out: Path, data: Path, seeds: int, width: int | None) -> None:
+    from rsbench.cli.reproduce_correction import real
+
+    real(out, data, seeds, width)
 
 
 def _depth(target: Target, out: Path, data: Path) -> None:

@@ -1,4 +1,4 @@
-"""Targets of ``rsbench reproduce`` about depth and correction: fig4, correction, sgm."""
+"""Targets of ``rsbench reproduce`` about depth and correction: fig4, correction, sgm, real."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ STRATA = ("mild", "moderate", "aggressive", "poles")
 SCENES = ("castle", "old-town", "room")
 _FIG4 = (("paper", ""), ("moderate", "-2"), ("aggressive", "-2"))
 """Cards of the figure, and what their sequences' names add to the scene's."""
+_SHOWN = "castle-aggressive-2"
+"""Sequence in the picture of real cameras."""
 _SGM = (("mild", "castle-2"), ("moderate", "castle-2"), ("mild", "room-3"), ("moderate", "room-3"))
 
 
@@ -117,6 +119,67 @@ def sgm(out: Path, data: Path) -> None:
     write_json(folder / "provenance.json", provenance("rsbench reproduce sgm", datasets=records))
     for path in write_sgm_page(folder):
         typer.echo(f"written: {path}")
+
+
+def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
+    """The default pipeline on a real camera's frames, beside an ideal one's."""
+    from dataclasses import asdict
+
+    import pandas as pd
+
+    from rsbench.benchmark.provenance import dataset_record, provenance
+    from rsbench.benchmark.studies import real_cameras
+    from rsbench.cli.console import progress_bar
+    from rsbench.dataset.card import load_dataset_card
+    from rsbench.dataset.files import write_json, write_table
+    from rsbench.dataset.generation import STEPS, generate_dataset
+    from rsbench.errors import RsbenchError
+    from rsbench.renderers.backend import start_backend
+    from rsbench.report.real_page import write_real_page
+
+    if seeds < real_cameras.FEWEST_SEEDS:
+        raise RsbenchError(f"--seeds {seeds}: must be at least {real_cameras.FEWEST_SEEDS}")
+    folder, card = out / "real", load_dataset_card("real")
+    card = card if width is None else real_cameras.sized(card, width)
+    cards = {"ideal": real_cameras.ideal_card(card), "real": card}
+    folder.mkdir(parents=True, exist_ok=True)
+    start_backend()
+    places = {camera: data / each.name for camera, each in cards.items()}
+    for camera, each in cards.items():
+        with progress_bar(f"rendering {each.name}", STEPS * len(each.sequence)) as advance:
+            generate_dataset(each, places[camera], progress=advance)
+    with progress_bar("solving and correcting", len(cards) * len(card.sequence)) as advance:
+        motions, views = (pd.DataFrame(rows) for rows in real_cameras.study(places, seeds, advance))
+    write_table(folder / "motions.csv", motions)
+    write_table(folder / "views.csv", views)
+    # Of the stored figures, so that whoever has the files can make the summary again to the last digit.
+    stored = (pd.read_csv(folder / f"{name}.csv", keep_default_na=False) for name in ("motions", "views"))
+    write_table(folder / "summary.csv", real_cameras.summarise(*stored))
+    records = [dataset_record(place) for place in places.values()]
+    write_json(folder / "provenance.json", provenance("rsbench reproduce real", datasets=records))
+    for path in (_draw_real(places, folder), write_real_page(folder, asdict(card))):
+        typer.echo(f"written: {path}")
+
+
+def _draw_real(places: dict[str, Path], folder: Path) -> Path:
+    from rsbench.dataset.sequence import read_sequence
+    from rsbench.pipeline.chain import correct_four
+    from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.report.real_page import draw_frames
+
+    ideal, real = (read_sequence(places[camera] / _SHOWN) for camera in ("ideal", "real"))
+    views = (("left", 0), ("right", 0), ("left", 1), ("right", 1))
+    images = {(side, frame): real.image("rs", side, frame) for side, frame in views}  # type: ignore[arg-type]
+    ratio, scanning = real.shutter.readout_ratio, real.shutter.scanning
+    options = CorrectionOptions(inpaint=True)
+    corrected = correct_four(images, real.rig, ratio, options, views=(("left", 1),), scanning=scanning)
+    frames = {
+        "ideal camera": ideal.image("rs", "left", 1),
+        "real camera": images["left", 1],
+        "real, corrected": corrected.frames["left", 1].image,
+        "its global-shutter twin": real.image("gs", "left", 1),
+    }
+    return draw_frames(frames, folder / "frames.jpg")
 
 
 def _generate(card: str, data: Path) -> None:

@@ -32,6 +32,11 @@ class Scanning:
         """Whether both cameras read rows from the top at the same times."""
         return self.scan == "top" and self.right_scan in (None, "top") and self.right_delay == 0.0
 
+    @property
+    def rows_together(self) -> bool:
+        """Whether both cameras read each row at one time, from the top or from the bottom."""
+        return self.scan in ("top", "bottom") and self.right_scan in (None, self.scan) and self.right_delay == 0.0
+
     def shutter_of(self, width: int, height: int, readout_ratio: float) -> RollingShutter:
         """The shutter of images of this size; ValueError for values that cannot be."""
         columns = {self.scan, self.right_scan} & {"left", "right"}
@@ -89,7 +94,7 @@ class RollingShutter:
     @property
     def rows_together(self) -> bool:
         """Whether both cameras read each row at one time, from the top or from the bottom."""
-        return self.scan == self.scan_of("right") and self.scan in ("top", "bottom") and self.right_delay == 0.0
+        return self.scanning.rows_together
 
     @property
     def h(self) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +157,8 @@ def rig_record(
     return {
         "units": {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = infinite or unknown"},
         "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
+        "lens": None if camera.lens is None else asdict(camera.lens),
+        "scan": asdict(shutter_.scanning),
         "baseline": rig.baseline,
         "readout_ratio": shutter_.readout_ratio,
         "readout_ratio_sigma": readout.sigma if readout is not None and np.isfinite(readout.sigma) else None,

@@ -225,11 +225,10 @@ class Sequence(ChannelReader):
     @property
     def uncorrectable(self) -> str:
         """Why stereo matchers and correctors do not take such cameras; empty when they do."""
-        if self.rig.camera.lens is not None:
-            return f"camera.lens = {self.rig.camera.lens.model!r}: depth and correction take no lens yet"
-        if not self.shutter.plain:
+        if not self.shutter.rows_together:
             return (
-                "depth and correction take rows from the top, read by both cameras at once, and no other scan yet"
+                "depth and correction take cameras that read each row at once, from the top or the bottom, and no "
+                "other scan yet"
             )
         return ""
 

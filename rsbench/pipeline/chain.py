@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.arguments import check_ideal
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, StereoRig, View
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_depth import Images, Pairs, complete_depth, frame_pairs
+from rsbench.pipeline.frame_depth import Images, Pairs, complete_depth, frame_pairs, timed_pairs
 from rsbench.pipeline.frame_motion import FoundMotion, match_frames, solve_frames, solve_shutter
 from rsbench.pipeline.readout import ReadoutEstimate
 from rsbench.vision.corrector import CorrectionProblem, find_corrected
@@ -68,6 +68,7 @@ def correct_four(
     given: Given | None = None,
     views: tuple[View, ...] = VIEWS,
     disparity_offset: float | None = None,
+    scanning: Scanning | None = None,
 ) -> CorrectedFrames:
     """Correct four frames (H, W[, 3]), uint8 or uint16, of a rig over one frame period.
 
@@ -80,18 +81,22 @@ def correct_four(
         given: what is known already.
         views: the frames that are wanted.
         disparity_offset: see ``solve_frames``.
+        scanning: how the cameras read their lines; None: rows from the top, both at once.
 
     Raises:
-        RsbenchError: frames that cannot be what they are said to be, or a component of another package failed.
+        RsbenchError: frames that cannot be what they are said to be, cameras that the options do not take (see
+            ``check_cameras``), or a component of another package failed.
         NoMotionError: the matches determine no motion or readout ratio.
         ValueError: a motion is given and no readout ratio.
     """
-    check_ideal(rig, "correction")
-    given = given or Given()
+    given, scanning = given or Given(), scanning or Scanning()
+    check_cameras(rig, scanning, options, readout_ratio, disparity_offset, given.pairs is not None)
     if given.motion is not None and readout_ratio is None:
         raise ValueError("readout_ratio must be known where the motion is given: the matches would give another")
     clock, needs = _Clock(step), options.corrector.component.spec.needs
-    matches, found, shutter, readout = _solve(images, rig, readout_ratio, options, given, clock, disparity_offset)
+    matches, found, shutter, readout = _solve(
+        images, rig, readout_ratio, scanning, options, given, clock, disparity_offset
+    )
     offset = disparity_offset or 0.0 if readout is None else readout.disparity_offset
     motion = given.motion if found is None else found.motion
     pairs = (
@@ -112,10 +117,43 @@ def correct_four(
     )
 
 
+def check_cameras(
+    rig: StereoRig,
+    scanning: Scanning,
+    options: CorrectionOptions,
+    readout_ratio: float | None,
+    disparity_offset: float | None,
+    depth_is_known: bool = False,
+) -> None:
+    """Whether these cameras can be corrected with these options.
+
+    Raises:
+        RsbenchError: depth is to be found where a pair is of two times; or a readout ratio is to be found, or an
+            offset given, of cameras with a lens or another scan.
+    """
+    lens = rig.camera.lens
+    if not (depth_is_known or scanning.rows_together) and "depth" in options.corrector.component.spec.needs:
+        raise RsbenchError(
+            f"scan = {scanning.scan!r}, right_scan = {scanning.right_scan!r}, "
+            f"right_delay = {scanning.right_delay}: depth is found where both cameras read each row at once, "
+            "from the top or the bottom; no other yet"
+        )
+    if lens is None and scanning.plain:
+        return
+    what = f"camera.lens = {lens.model!r}" if lens is not None else f"scan = {scanning.scan!r}"
+    if readout_ratio is None:
+        raise RsbenchError(f"readout_ratio: must be given with {what}; it is estimated for ideal cameras alone")
+    if disparity_offset:
+        raise RsbenchError(
+            f"disparity_offset = {disparity_offset}: must be 0 with {what}; calibrate the rig again"
+        )
+
+
 def _solve(
     images: Images,
     rig: StereoRig,
     readout_ratio: float | None,
+    scanning: Scanning,
     options: CorrectionOptions,
     given: Given,
     clock: _Clock,
@@ -126,12 +164,13 @@ def _solve(
     if readout_ratio is not None and not wanted:
         clock("matching")
         clock("motion")
-        return given.matches, None, RollingShutter(height=rig.camera.height, readout_ratio=readout_ratio), None
-    matches = match_frames(images, rig, options) if given.matches is None else given.matches
+        shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
+        return given.matches, None, shutter, None
+    matches = match_frames(images, rig, options, scanning) if given.matches is None else given.matches
     clock("matching")
     found = None
     if wanted:
-        found, shutter, readout = solve_frames(matches, rig, readout_ratio, options, disparity_offset)
+        found, shutter, readout = solve_frames(matches, rig, readout_ratio, options, disparity_offset, scanning)
     else:
         shutter, readout = solve_shutter(matches, rig, readout_ratio, options, disparity_offset)
     clock("motion")
@@ -150,6 +189,10 @@ def find_depth(
     """The frames with their depth: from the other camera unless ``pairs`` has it, then from the motion."""
     if pairs is None:
         pairs = frame_pairs(images, rig, options, disparity_offset)
+    if not all(pair.timed for pair in pairs):
+        if motion is None:
+            raise ValueError("the motion must be known where depth is found through a lens")
+        pairs = timed_pairs(pairs, rig, shutter, motion)
     if options.depth_from_motion and motion is not None and not all(pair.with_motion for pair in pairs):
         pairs = complete_depth(pairs, rig, shutter, motion)
     return pairs
@@ -165,7 +208,7 @@ def correct_frames(
     views: tuple[View, ...] = VIEWS,
     disparity_offset: float = 0.0,
 ) -> dict[View, Fused]:
-    """Corrected frames of the views asked for, at the time of ``options.target_row`` of each.
+    """Corrected frames of the views asked for, at the time of ``options.target_row``, through the same lens.
 
     A global shutter leaves nothing to correct: at a readout ratio of 0 the frames come back as they are.
 

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from rsbench.cards import parse_card, read_toml
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.lens import Lens
 from rsbench.core.rig import StereoRig, View
+from rsbench.core.shutter import Scanning
 from rsbench.errors import RsbenchError
 from rsbench.reading import check_image_size, check_size, read_bytes
 from rsbench.shutters import with_shutter
@@ -32,16 +34,18 @@ _READ = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATIO
 
 @dataclass(frozen=True, kw_only=True)
 class CameraCard:
-    """Intrinsics of both cameras after rectification, pixels; the centre of the top-left pixel is (0, 0)."""
+    """Intrinsics of both cameras, pixels; the centre of the top-left pixel is (0, 0)."""
 
     fx: float
     fy: float
     cx: float
     cy: float
+    lens: Lens | None = None
+    """None: images without distortion."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RigCard:
+class RigCard(Scanning):
     """What must be known of a rig to correct its frames; the size comes from the images."""
 
     camera: CameraCard
@@ -54,6 +58,7 @@ class RigCard:
 
     def __post_init__(self) -> None:
         self.rig(1, 1)
+        self.shutter_of(1, 1, 0.0)
         if self.disparity_offset is not None and not abs(self.disparity_offset) <= _LARGEST_OFFSET_PX:
             raise ValueError(
                 f"disparity_offset = {self.disparity_offset}: must lie within {_LARGEST_OFFSET_PX:g} px; "
@@ -62,15 +67,20 @@ class RigCard:
         if self.readout_ratio is not None and not 0.0 <= self.readout_ratio <= 1.0:
             raise ValueError(f"readout_ratio = {self.readout_ratio}: must lie in [0, 1], or be absent if unknown")
 
+    @property
+    def scanning(self) -> Scanning:
+        """How its cameras read their lines."""
+        return Scanning(scan=self.scan, right_scan=self.right_scan, right_delay=self.right_delay)
+
     def rig(self, width: int, height: int) -> StereoRig:
-        """The rig with images of this size."""
+        """The rig with images of this size; ValueError where its lens cannot be one of such images."""
         c = self.camera
-        camera = PinholeCamera(width=width, height=height, fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy)
+        camera = PinholeCamera(width=width, height=height, fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy, lens=c.lens)
         return StereoRig(camera=camera, baseline=self.baseline)
 
 
 def read_rig_card(path: Path) -> RigCard:
-    """Rig card: ``baseline``, ``readout_ratio`` or ``shutter``, and a table ``[camera]`` with fx, fy, cx, cy.
+    """Rig card: ``baseline``, ``readout_ratio`` or ``shutter``, ``scan``; ``[camera]``: fx, fy, cx, cy, ``lens``.
 
     Raises:
         RsbenchError: one line with the file, the field, the value and what is allowed.

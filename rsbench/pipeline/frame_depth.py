@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,8 @@ from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.vision.motion_sweep import depth_from_motion
 from rsbench.vision.sky import sky_mask
 from rsbench.vision.stereo_depth import fill_holes
-from rsbench.vision.stereo_matcher import find_disparities
+from rsbench.vision.timed_depth import timed_depth
+from rsbench.vision.undistortion import sensor_disparities
 
 Images = Mapping[View, NDArray[Any]]
 _BRIGHT = 99.9
@@ -35,6 +36,8 @@ class FramePair:
     """(H, W) the same where ``depth`` is unknown, from the neighbours; 0 elsewhere."""
     with_motion: bool = False
     """Whether the depth that the motion gives is in it already."""
+    timed: bool = True
+    """Whether the depth counts that both cameras saw a point at two times; only with a lens they differ."""
 
 
 Pairs = tuple[FramePair, FramePair]
@@ -48,7 +51,7 @@ def frame_pair(
     options: CorrectionOptions,
     disparity_offset: float = 0.0,
 ) -> FramePair:
-    """Depth of both images (H, W[, 3]), uint8 or uint16, of one time.
+    """Depth of both images (H, W[, 3]), uint8 or uint16, of one time, on the pixels that they have.
 
     ``disparity_offset``: what a disparity is too large by, px.
 
@@ -56,7 +59,7 @@ def frame_pair(
         RsbenchError: another package's matcher failed, see ``find_disparities``.
     """
     levels = eight_bit([left, right])
-    both = find_disparities(options.matcher, levels[0], levels[1], rig)
+    both = sensor_disparities(options.matcher, levels[0], levels[1], rig)
     if disparity_offset:
         both = (both[0] - np.float32(disparity_offset), both[1] - np.float32(disparity_offset))
     return depth_of_pair(left, right, both, rig, find_sky=options.find_sky)
@@ -72,6 +75,8 @@ def depth_of_pair(
 ) -> FramePair:
     """Depth from the disparities (H, W), NaN where unknown, of both images (H, W[, 3]) of one time.
 
+    With a lens it is that of a rig at rest: ``timed_pairs`` makes it that of a moving one.
+
     ``find_sky``: put at infinity what looks like the sky.
     """
     images = dict(zip(SIDES, (left, right), strict=True))
@@ -84,7 +89,7 @@ def depth_of_pair(
         depth[side] = _depth(disparity, rig)
         filled = fill_holes(disparity)
         guess[side] = np.where(np.isnan(disparity), _depth(filled, rig), np.float32(0.0))
-    return FramePair(images=images, depth=depth, guess=guess)
+    return FramePair(images=images, depth=depth, guess=guess, timed=rig.camera.lens is None)
 
 
 def frame_pairs(
@@ -115,6 +120,22 @@ def known_depth(images: Images, depth: Mapping[View, NDArray[np.float32]]) -> Pa
     return first, second
 
 
+def timed_pairs(pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion: Motion) -> Pairs:
+    """The same frames with the depth of a rig that moves between the times of both ends of a disparity."""
+    first, second = (
+        pair
+        if pair.timed
+        else replace(
+            pair,
+            depth={s: timed_depth(pair.depth[s], rig, shutter, motion, s, frame) for s in SIDES},
+            guess={s: timed_depth(pair.guess[s], rig, shutter, motion, s, frame) for s in SIDES},
+            timed=True,
+        )
+        for frame, pair in enumerate(pairs)
+    )
+    return first, second
+
+
 def complete_depth(pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion: Motion) -> Pairs:
     """The same frames with depth from the motion where the other camera gave none."""
 
@@ -132,7 +153,7 @@ def complete_depth(pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion
 def _completed(pair: FramePair, found: dict[Side, NDArray[np.float32]]) -> FramePair:
     depth = {side: np.where(found[side] > 0.0, found[side], pair.depth[side]) for side in SIDES}
     guess = {side: np.where(found[side] > 0.0, np.float32(0.0), pair.guess[side]) for side in SIDES}
-    return FramePair(images=pair.images, depth=depth, guess=guess, with_motion=True)
+    return replace(pair, depth=depth, guess=guess, with_motion=True)
 
 
 def _depth(disparity: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:

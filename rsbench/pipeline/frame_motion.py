@@ -9,7 +9,7 @@ import numpy as np
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.correction_options import CorrectionOptions
@@ -70,7 +70,7 @@ def find_matches(images: Images, options: CorrectionOptions, sides: tuple[Side, 
 
 
 def find_matches_of_rig(
-    images: Images, rig: StereoRig, shutter: RollingShutter, options: CorrectionOptions
+    images: Images, rig: StereoRig, scanning: Scanning, options: CorrectionOptions
 ) -> Correspondences:
     """``find_matches`` of cameras as they are, in pixels of their images.
 
@@ -81,18 +81,22 @@ def find_matches_of_rig(
         RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
     """
     camera = rig.camera
-    if camera.lens is not None:
-        images = {view: undistorted(image, camera) for view, image in images.items()}
+    images = {view: undistorted(image, camera) for view, image in images.items()}
     matches = with_lens(find_matches(images, options), camera)
-    if shutter.rows_together:
+    if scanning.rows_together:
         return matches
     return Correspondences(left=matches.left, right=matches.right)
 
 
 def match_frames(
-    images: Images, rig: StereoRig, options: CorrectionOptions, *, judge_rig: bool = True
+    images: Images,
+    rig: StereoRig,
+    options: CorrectionOptions,
+    scanning: Scanning | None = None,
+    *,
+    judge_rig: bool = True,
 ) -> Correspondences:
-    """``find_matches`` of frames that a user says to be those of a rig.
+    """``find_matches_of_rig`` of frames that a user says to be those of a rig.
 
     Args:
         judge_rig: whether to look if frame 0 is a rectified pair in the right order.
@@ -100,9 +104,11 @@ def match_frames(
     Raises:
         RefusedFramesError: no texture, sides exchanged, not rectified, or not of one time.
     """
-    if judge_rig:
-        check_rig(images["left", 0], images["right", 0], rig)
-    matches = find_matches(images, options)
+    scanning = scanning or Scanning()
+    if judge_rig and scanning.rows_together:
+        left, right = (undistorted(images[side, 0], rig.camera) for side in SIDES)
+        check_rig(left, right, rig.ideal)
+    matches = find_matches_of_rig(images, rig, scanning, options)
     temporal = max(len(matches.left) + len(matches.right), 2 * len(matches.tracks))
     if temporal < _FEWEST_MATCHES:
         raise RefusedFramesError(
@@ -183,18 +189,21 @@ def solve_frames(
     readout_ratio: float | None,
     options: CorrectionOptions,
     disparity_offset: float | None = None,
+    scanning: Scanning | None = None,
 ) -> tuple[FoundMotion, RollingShutter, ReadoutEstimate | None]:
     """Motion and shutter from matches; the readout ratio is estimated when it is None.
 
     Args:
         disparity_offset: what a disparity is too large by, px; None has it estimated with the readout ratio,
             and is 0 where that is known.
+        scanning: how the cameras read; must be plain where the readout ratio is estimated.
 
     Raises:
         RefusedFramesError: time runs backwards in the frames.
         NoMotionError: no motion explains the matches, or they do not determine the readout ratio.
     """
     shutter, readout = solve_shutter(matches, rig, readout_ratio, options, disparity_offset)
+    shutter = (scanning or Scanning()).shutter_of(rig.camera.width, rig.camera.height, shutter.readout_ratio)
     offset = (disparity_offset or 0.0) if readout is None else readout.disparity_offset
     matches = without_offset(matches, offset)
     found = replace(find_motion(matches, rig, shutter, options), disparity_offset=offset)
@@ -252,10 +261,10 @@ def _runs_backwards(
     """Whether time runs backwards in the frames: they then fit a negative readout ratio.
 
     At a ratio near 0 there is no order to see, and a wrong ratio or focal length is no wrong order: what counts is
-    the ratio that fits best.
+    the ratio that fits best. It is not looked for with a lens or another scan: those are of calibrated cameras.
     """
     _, judge = referee(options.solver)
-    if shutter.readout_ratio < LEAST_BACKWARDS:
+    if shutter.readout_ratio < LEAST_BACKWARDS or rig.camera.lens is not None or not shutter.plain:
         return False
     if judge is not options.solver.solver:
         rng = np.random.default_rng(options.seed)

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.rig import SIDES, Side, StereoRig
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.errors import RsbenchError
-from rsbench.pipeline.chain import correct_frames, find_depth
+from rsbench.pipeline.chain import check_cameras, correct_frames, find_depth
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, check_alike
 from rsbench.pipeline.frame_depth import Images, Pairs, frame_pair
@@ -99,6 +99,7 @@ def correct_sequence(
     readout_ratio: float,
     options: CorrectionOptions,
     disparity_offset: float = 0.0,
+    scanning: Scanning | None = None,
 ) -> Iterator[CorrectedMoment]:
     """Every frame of a sequence corrected, in order; the last one with the motion from the one before.
 
@@ -107,15 +108,18 @@ def correct_sequence(
 
     Args:
         disparity_offset: what a disparity is too large by, px.
+        scanning: how the cameras read their lines; None: rows from the top, both at once.
 
     Raises:
         RefusedFramesError: the first three windows, or all, cannot be what they are said to be.
-        RsbenchError: frames that differ in size, or cannot be read.
+        RsbenchError: frames that differ in size, or cannot be read; cameras that the options do not take.
     """
-    shutter = RollingShutter(height=rig.camera.height, readout_ratio=readout_ratio)
+    scanning = scanning or Scanning()
+    check_cameras(rig, scanning, options, readout_ratio, disparity_offset)
+    shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
     last: Window | None = None
     number = -1
-    for number, window in enumerate(_windows(left, right, rig, readout_ratio, options, disparity_offset)):
+    for number, window in enumerate(_windows(left, right, rig, shutter, options, disparity_offset)):
         yield _moment(number, 0, [window] if last is None else [window, last], rig, shutter, options)
         last = window
     if last is not None:
@@ -150,7 +154,7 @@ def _windows(
     left: FrameSource,
     right: FrameSource,
     rig: StereoRig,
-    readout_ratio: float,
+    shutter: RollingShutter,
     options: CorrectionOptions,
     offset: float,
 ) -> Iterator[Window]:
@@ -165,8 +169,9 @@ def _windows(
         found, reason = None, ""
         if "motion" in needs:
             try:
-                matches = match_frames(images, rig, options, judge_rig=number < _JUDGED)
-                found, _, _ = solve_frames(matches, rig, readout_ratio, options, offset)
+                judged, scanning = number < _JUDGED, shutter.scanning
+                matches = match_frames(images, rig, options, scanning, judge_rig=judged)
+                found, _, _ = solve_frames(matches, rig, shutter.readout_ratio, options, offset, scanning)
             except NoMotionError as error:
                 reason = str(error)
             except RefusedFramesError as error:

@@ -327,7 +327,7 @@ def _draw_depth(sequence: Sequence, folder: Path, matcher: str) -> Drawn:
     stored = folder / "depth" / f"{matcher}.npz"
     if stored.is_file():
         found = load_disparities(stored, sequence.rig)
-        depth = depth_of(found[f"{_SHOWN[0]}_{_SHOWN[1]}"], sequence.rig)
+        depth = depth_of(found[f"{_SHOWN[0]}_{_SHOWN[1]}"], sequence, *_SHOWN)
         error = np.where(surface & (depth > 0), np.abs(depth - truth), np.nan)
         drawn["depth"] = (inverse(depth), f"Depth by {matcher} (dark: invalid)")
         drawn["depth-error"] = (

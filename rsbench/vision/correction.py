@@ -5,6 +5,9 @@ two steps are one map in the pixel and its inverse depth, ``h = M_y (x, y, 1) + 
 ``M_y = K R K^-1``, ``b_y = K t`` and ``R, t`` the target pose from row y's pose, so a surface at infinity
 (rho = 0) needs no special case: it moves by rotation alone and every other surface hides it. The images are
 resampled once, at source coordinates interpolated over the mesh of pixel centres (``forward_warp``).
+
+A lens changes where the maps begin and end, not how often an image is resampled: source and target are both images
+of the camera with its lens, and times belong to the pixels of the source as the sensor has it.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision import forward_warp
+from rsbench.vision.optics import optics_of
 from rsbench.vision.resample import Interpolation, resample
 
 _IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
@@ -62,19 +66,21 @@ class Corrected:
 def relative_row_maps(
     camera: PinholeCamera, source_poses: Pose, target_pose: Pose, source_camera: PinholeCamera | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """``M`` (H, 3, 3) and ``b`` (H, 3) px m: homogeneous target pixel = M_y (x, y, 1) + b_y / depth.
+    """``M`` (lines, 3, 3) and ``b`` (lines, 3) px m: homogeneous target pixel = M_y (x, y, 1) + b_y / depth.
 
-    ``source_poses`` are ``cam_from_world`` of every row, ``target_pose`` of the target camera. ``source_camera``
-    is the frame's when it is another one.
+    Pixels are ideal ones. ``source_poses`` are ``cam_from_world`` of every line, ``target_pose`` of the target
+    camera. ``source_camera`` is the frame's when it is another one.
     """
     R, t = compose(target_pose, inverse(source_poses))
-    return camera.K @ R @ np.linalg.inv((source_camera or camera).K), t @ camera.K.T
+    K = camera.ideal.K
+    return K @ R @ np.linalg.inv((source_camera or camera).ideal.K), t @ K.T
 
 
-def warp_gain(camera: PinholeCamera, source_poses: Pose, target_pose: Pose) -> FloatArray:
-    """(H,) px m: a step of inverse depth moves a pixel of a row by about this times it, f |t|."""
+def warp_gain(camera: PinholeCamera, source_poses: Pose, target_pose: Pose, columns: bool = False) -> FloatArray:
+    """(H, 1) px m, (1, W) of ``columns``: a step of inverse depth moves a pixel by about this times it, f |t|."""
     lengths = np.linalg.norm(compose(target_pose, inverse(source_poses)).t, axis=-1)
-    return np.asarray(max(camera.fx, camera.fy) * lengths)
+    gain = np.asarray(max(camera.fx, camera.fy) * lengths)
+    return gain[np.newaxis] if columns else gain[:, np.newaxis]
 
 
 def inverse_depth(depth: NDArray[Any], sky_mask: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
@@ -96,24 +102,26 @@ def warp(
     sky_mask: NDArray[np.bool_] | None = None,
     options: WarpOptions | None = None,
     source_camera: PinholeCamera | None = None,
+    columns: bool = False,
 ) -> Corrected:
-    """Warp a frame with one pose per row to any pose of the same camera model; z-buffered.
+    """Warp a frame with one pose per line to any pose of the same camera model; z-buffered.
 
-    ``image`` (H, W) or (H, W, C) of uint8, uint16 or float32; ``depth`` (H, W) is z in each row's own camera,
+    ``image`` (H, W) or (H, W, C) of uint8, uint16 or float32; ``depth`` (H, W) is z in each line's own camera,
     metres: inf is infinitely far, and 0, negative or NaN unknown, unless ``sky_mask`` (H, W) puts the pixel at
-    infinity. Poses are ``cam_from_world``, (H, 3, 3) and (H, 3), and (3, 3) and (3,). ``source_camera``, of the
-    same size, is the frame's where its principal point is another one. Raises ValueError on other shapes or types.
+    infinity. Poses are ``cam_from_world``, (lines, 3, 3) and (lines, 3), and (3, 3) and (3,); lines are rows, or
+    ``columns``. ``source_camera``, of the same size and lens, is the frame's where its principal point is another
+    one; there is none with a lens. Raises ValueError on other shapes or types.
     """
     options = options or WarpOptions()
-    _check(image, depth, camera, source_poses, sky_mask)
+    _check(image, depth, camera, source_poses, sky_mask, columns)
     M, b = relative_row_maps(camera, source_poses, target_pose, source_camera)
-    rho = inverse_depth(depth, sky_mask)
-    gain = warp_gain(camera, source_poses, target_pose)
+    rho, optics = inverse_depth(depth, sky_mask), optics_of(camera, columns)
+    gain = np.broadcast_to(warp_gain(camera, source_poses, target_pose, columns), rho.shape)
     joined = forward_warp.connect(rho, options.tear_px / np.maximum(gain, np.finfo(np.float64).tiny))
     source_map = np.full((*rho.shape, 2), np.nan, dtype=np.float32)
     buffer = np.full(rho.shape, -1.0, dtype=np.float32)
-    forward_warp.draw_mesh(rho, joined, M, b, source_map, buffer)
-    forward_warp.draw_cells(rho, joined, M, b, source_map, buffer)
+    forward_warp.draw_mesh(rho, joined, M, b, *optics, source_map, buffer)
+    forward_warp.draw_cells(rho, joined, M, b, *optics, source_map, buffer)
     mask = buffer >= 0.0
     return Corrected(
         image=resample(image, source_map, options.interpolation),
@@ -138,13 +146,12 @@ def correct_frame(
 ) -> Corrected:
     """Rolling-shutter frame (H, W[, C]) to the global-shutter image of the same camera at ``target_tau``.
 
-    ``target_tau`` is in frame periods; by default the time of row 0, ``frame``. ``depth`` (H, W) and the errors
+    ``target_tau`` is in frame periods; by default that of the first line read. ``depth`` (H, W) and the errors
     are those of ``warp``.
     """
-    tau = _target_time(frame, target_tau)
-    target = rig.cam_from_world(motion, tau, side)
-    poses = row_poses(rig, shutter, motion, side, frame)
-    return warp(image, depth, rig.camera, poses, target, sky_mask=sky_mask, options=options)
+    target = rig.cam_from_world(motion, _target_time(shutter, side, frame, target_tau), side)
+    poses, columns = row_poses(rig, shutter, motion, side, frame), shutter.axis(side) == 0
+    return warp(image, depth, rig.camera, poses, target, sky_mask=sky_mask, options=options, columns=columns)
 
 
 def correction_flow(
@@ -163,17 +170,17 @@ def correction_flow(
     ``x_target - x_source`` on the grid of the source; NaN where the depth is unknown or the point is behind the
     target camera. Arguments as in ``correct_frame``.
     """
-    poses = row_poses(rig, shutter, motion, side, frame)
-    _check(None, depth, rig.camera, poses, sky_mask)
-    target = rig.cam_from_world(motion, _target_time(frame, target_tau), side)
+    poses, columns = row_poses(rig, shutter, motion, side, frame), shutter.axis(side) == 0
+    _check(None, depth, rig.camera, poses, sky_mask, columns)
+    target = rig.cam_from_world(motion, _target_time(shutter, side, frame, target_tau), side)
     M, b = relative_row_maps(rig.camera, poses, target)
     moved = np.zeros((3, *depth.shape))
-    forward_warp.move_rows(inverse_depth(depth, sky_mask), M, b, moved)
+    forward_warp.move_pixels(inverse_depth(depth, sky_mask), M, b, *optics_of(rig.camera, columns), moved)
     return np.asarray(np.moveaxis(moved[:2], 0, -1) - rig.camera.pixel_grid(), dtype=np.float32)
 
 
-def _target_time(frame: int, target_tau: float | None) -> float:
-    tau = float(frame) if target_tau is None else float(target_tau)
+def _target_time(shutter: RollingShutter, side: Side, frame: int, target_tau: float | None) -> float:
+    tau = float(shutter.start(frame, side)) if target_tau is None else float(target_tau)
     if not math.isfinite(tau):
         raise ValueError(f"target_tau must be a finite time in frame periods, got {target_tau}")
     return tau
@@ -191,6 +198,7 @@ def _check(
     camera: PinholeCamera,
     source_poses: Pose,
     sky_mask: NDArray[np.bool_] | None,
+    columns: bool,
 ) -> None:
     size = (camera.height, camera.width)
     if image is not None:
@@ -200,7 +208,8 @@ def _check(
             raise ValueError(f"image must be uint8, uint16 or float32, got {image.dtype}")
     if depth.shape != size or not np.issubdtype(depth.dtype, np.floating):
         raise ValueError(f"depth must be floating point of shape {size}, got {depth.dtype} {depth.shape}")
-    if source_poses.R.shape != (camera.height, 3, 3) or source_poses.t.shape != (camera.height, 3):
-        raise ValueError(f"source_poses must have one pose per row, {camera.height}, got {source_poses.R.shape}")
+    lines = camera.width if columns else camera.height
+    if source_poses.R.shape != (lines, 3, 3) or source_poses.t.shape != (lines, 3):
+        raise ValueError(f"source_poses must have one pose per line, {lines}, got {source_poses.R.shape}")
     if sky_mask is not None and (sky_mask.shape != size or sky_mask.dtype != np.bool_):
         raise ValueError(f"sky_mask must be bool of shape {size}, got {sky_mask.dtype} {sky_mask.shape}")

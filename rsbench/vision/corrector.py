@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench import plugins
+from rsbench.arguments import check_plain
 from rsbench.core import projection
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
@@ -23,6 +24,7 @@ from rsbench.plugins import Entry, Kind, RunOptions
 from rsbench.vision.fusion import Fused, Origin
 
 Knowledge = Literal["motion", "depth"]
+Cameras = Literal["ideal", "any"]
 Depths = Mapping[View, NDArray[np.float32]]
 
 
@@ -36,6 +38,8 @@ class CorrectorSpec:
     """Where it was published."""
     assumes: str
     """What must hold for it to work, in words."""
+    cameras: Cameras = "ideal"
+    """``ideal``: without a lens, rows read from the top by both at once; others are refused by name. ``any``."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "needs", frozenset(self.needs))
@@ -43,6 +47,8 @@ class CorrectorSpec:
         for value in self.needs:
             if value not in allowed:
                 raise ValueError(f"needs: {value!r} is nothing that is known; there are: {', '.join(allowed)}")
+        if self.cameras not in get_args(Cameras):
+            raise ValueError(f"cameras = {self.cameras!r}: must be one of {', '.join(get_args(Cameras))}")
         for field in ("reference", "assumes"):
             if not isinstance(getattr(self, field), str) or not getattr(self, field):
                 raise ValueError(f"{field} = {getattr(self, field)!r}: must be a text")
@@ -57,7 +63,7 @@ class CorrectionProblem:
     rig: StereoRig
     shutter: RollingShutter
     target_row: float
-    """A corrected frame shows the time at which its rolling-shutter frame read this row."""
+    """A corrected frame shows the time at which its camera had read so many lines: this row, from the top."""
     motion: Motion | None
     """Of the rig's body, metres; None when the corrector does not need it."""
     depth: Depths | None
@@ -76,13 +82,16 @@ class CorrectionProblem:
         return replace(self.rig.camera, cx=self.rig.camera.cx + shift)
 
     def row_poses(self, view: View) -> Pose:
-        """``cam_from_world`` (H, 3, 3), (H, 3) of every row of a frame. Raises ValueError without a motion."""
+        """``cam_from_world`` (lines, 3, 3), (lines, 3) of every line of a frame, a row or a column.
+
+        Raises ValueError without a motion.
+        """
         return projection.row_poses(self.rig, self.shutter, self._motion(), *view)
 
     def target_pose(self, view: View) -> Pose:
         """``cam_from_world`` of the corrected frame. Raises ValueError without a motion."""
         side, frame = view
-        tau = self.shutter.row_time(self.target_row, frame)
+        tau = self.shutter.time_after(self.target_row, frame, side)
         return self.rig.cam_from_world(self._motion(), tau, side)
 
     def _motion(self) -> Motion:
@@ -140,6 +149,8 @@ def find_corrected(entry: CorrectorEntry, problem: CorrectionProblem, views: Seq
         RsbenchError: another package's corrector raised, or answered something else: one line with its name.
     """
     where = f"{CORRECTORS.singular} {entry.name!r}"
+    if entry.component.spec.cameras == "ideal":
+        check_plain(problem.rig, problem.shutter, where)
     with plugins.blame(CORRECTORS, entry):
         found = entry.component.correct(problem, views)
     if not isinstance(found, dict) or set(found) != set(views):

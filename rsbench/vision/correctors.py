@@ -39,6 +39,7 @@ class FusionCorrector(Corrector):
         needs={"motion", "depth"},
         reference="Wang, Fan, Dai, eq. 11, with the holes filled (rsbench)",
         assumes="a scene that stands still; sharp edges of depth are as good as the depth",
+        cameras="any",
     )
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
@@ -71,13 +72,13 @@ class FusionCorrector(Corrector):
         ]
 
     def _placed(self, problem: CorrectionProblem, view: View, source: SourceView) -> SourceView:
-        """The frame with a depth in the rows where no depth would move a pixel by more than ``tear_px``."""
+        """The frame with a depth in the lines where no depth would move a pixel by more than ``tear_px``."""
         known = source.depth[source.depth > 0.0]
         if problem.guess is None or known.size == 0:
             return source
         nearest = _NEARER * float(np.quantile(known, 1.0 - _NEAREST_SHARE))
-        gain = warp_gain(problem.rig.camera, source.poses, problem.target_pose(view))
-        certain = (source.depth == 0.0) & (gain[:, None] <= self.warp.tear_px * nearest)
+        gain = warp_gain(problem.rig.camera, source.poses, problem.target_pose(view), source.columns)
+        certain = (source.depth == 0.0) & (gain <= self.warp.tear_px * nearest)
         guess = np.where(problem.guess[view] > 0.0, problem.guess[view], np.float32(np.inf))
         return replace(source, depth=np.where(certain, guess, source.depth))
 
@@ -86,7 +87,8 @@ def _source(problem: CorrectionProblem, view: View, poses: Pose, origin: Origin)
     depth = problem.guess if origin is Origin.GUESSED else problem.depth
     if depth is None:
         raise ValueError("the depth is not known: 'depth' must be among the needs of the corrector")
-    return SourceView(image=problem.images[view], depth=depth[view], poses=poses, origin=origin)
+    columns = problem.shutter.axis(view[0]) == 0
+    return SourceView(image=problem.images[view], depth=depth[view], poses=poses, origin=origin, columns=columns)
 
 
 @final
@@ -100,6 +102,7 @@ class RotationCorrector(Corrector):
         needs={"motion"},
         reference="Forssen, Ringaby, Rectifying rolling shutter video from hand-held devices, CVPR 2010",
         assumes="a scene so far away that translation moves no pixel",
+        cameras="any",
     )
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
@@ -118,15 +121,24 @@ class PlaneCorrector(Corrector):
         needs={"motion", "depth"},
         reference="Wang, Fan, Dai, eq. 11, at the depth of one plane (rsbench)",
         assumes="a scene that is one plane",
+        cameras="any",
     )
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
         if problem.depth is None:
             raise ValueError("the depth is not known: 'depth' must be among the needs of the corrector")
         depth = problem.depth
-        return {view: _alone(problem, view, plane_depth(depth[view]), self.warp) for view in views}
+        return {
+            view: _alone(problem, view, plane_depth(depth[view], problem.rig.camera), self.warp) for view in views
+        }
 
 
 def _alone(problem: CorrectionProblem, view: View, depth: F32, options: WarpOptions) -> Fused:
-    source = SourceView(image=problem.images[view], depth=depth, poses=problem.row_poses(view), origin=Origin.HERE)
+    source = SourceView(
+        image=problem.images[view],
+        depth=depth,
+        poses=problem.row_poses(view),
+        origin=Origin.HERE,
+        columns=problem.shutter.axis(view[0]) == 0,
+    )
     return fuse([source], problem.rig.camera, problem.target_pose(view), options)

@@ -1,8 +1,10 @@
 # mypy: disable-error-code="untyped-decorator"
 """The compiled loops of z-buffered forward warping: a mesh of pixel centres drawn at the target camera.
 
-Every source pixel centre is moved by its row's map, ``h = M_y (x, y, 1) + rho b_y`` with ``rho = 1 / depth``, to
-the target pixel ``h_xy / h_z`` with inverse depth ``rho / h_z``. Four neighbouring centres make two triangles;
+Every source pixel centre is moved by its line's map, ``h = M_y (x, y, 1) + rho b_y`` with ``rho = 1 / depth``, to
+the target pixel ``h_xy / h_z`` with inverse depth ``rho / h_z``; lines are rows, or columns where those are read.
+With a lens (x, y) is the ideal pixel of the centre, and the target pixel where the lens shows ``h_xy / h_z``. Four
+neighbouring centres make two triangles;
 source coordinates and inverse depth are interpolated affinely over each triangle at the target pixel centres it
 covers. Inverse depth is affine in the image of a plane, so that is exact; source coordinates are not (the map is
 projective and curved by the shutter), but over one pixel the deviation is an eighth of the map's second
@@ -18,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.compiled import compiled
+from rsbench.vision.optics import Flag, Table, line_of, look, see
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -45,8 +48,8 @@ def _continues(step: float, before: float, after: float, limit: float) -> bool:
 def connect(rho: F32, limit: F64) -> U8:
     """(H, W) bits RIGHT and BELOW: the neighbours that lie on the same surface.
 
-    ``rho`` (H, W) is inverse depth, NaN where unknown; ``limit`` (H,) the largest unexplained step of inverse
-    depth between neighbours, per row.
+    ``rho`` (H, W) is inverse depth, NaN where unknown; ``limit`` (H, W) the largest unexplained step of inverse
+    depth between a pixel and its neighbours.
     """
     height, width = rho.shape
     joined = np.zeros((height, width), dtype=np.uint8)
@@ -55,40 +58,46 @@ def connect(rho: F32, limit: F64) -> U8:
             step = rho[y, x + 1] - rho[y, x]
             before = rho[y, x] - rho[y, x - 1] if x > 0 else np.nan
             after = rho[y, x + 2] - rho[y, x + 1] if x + 2 < width else np.nan
-            if _continues(step, before, after, limit[y]):
+            if _continues(step, before, after, min(limit[y, x], limit[y, x + 1])):
                 joined[y, x] = RIGHT
     for y in range(height - 1):
-        tightest = min(limit[y], limit[y + 1])
         for x in range(width):
             step = rho[y + 1, x] - rho[y, x]
             before = rho[y, x] - rho[y - 1, x] if y > 0 else np.nan
             after = rho[y + 2, x] - rho[y + 1, x] if y + 2 < height else np.nan
-            if _continues(step, before, after, tightest):
+            if _continues(step, before, after, min(limit[y, x], limit[y + 1, x])):
                 joined[y, x] |= BELOW
     return joined
 
 
 @compiled(error_model="numpy", inline="always")
-def _move(M: F64, b: F64, x: int, y: int, rho: float) -> tuple[float, float, float]:
-    """Target pixel and inverse depth; NaN behind the target camera or where rho is NaN."""
-    z = M[y, 2, 0] * x + M[y, 2, 1] * y + M[y, 2, 2] + rho * b[y, 2]
+def move(
+    M: F64, b: F64, ideal: Table, lens: Table, columns: Flag, x: int, y: int, rho: float
+) -> tuple[float, float, float]:
+    """Target pixel and inverse depth of a source pixel; NaN behind the target camera or where rho is NaN."""
+    line = line_of(columns, x, y)
+    gx, gy = look(ideal, x, y)
+    z = M[line, 2, 0] * gx + M[line, 2, 1] * gy + M[line, 2, 2] + rho * b[line, 2]
     s = 1.0 / z if z > 0.0 else np.nan
-    u = M[y, 0, 0] * x + M[y, 0, 1] * y + M[y, 0, 2] + rho * b[y, 0]
-    v = M[y, 1, 0] * x + M[y, 1, 1] * y + M[y, 1, 2] + rho * b[y, 1]
-    return u * s, v * s, rho * s
+    u = M[line, 0, 0] * gx + M[line, 0, 1] * gy + M[line, 0, 2] + rho * b[line, 0]
+    v = M[line, 1, 0] * gx + M[line, 1, 1] * gy + M[line, 1, 2] + rho * b[line, 1]
+    px, py = see(lens, u * s, v * s)
+    return px, py, rho * s
 
 
 @compiled(error_model="numpy")
-def move_rows(rho: F32, M: F64, b: F64, moved: F64) -> None:
+def move_pixels(rho: F32, M: F64, b: F64, ideal: Table, lens: Table, columns: Flag, moved: F64) -> None:
     """Fill ``moved`` (3, H, W) with target x, y and inverse depth of every source pixel centre."""
     height, width = rho.shape
     for y in range(height):
         for x in range(width):
-            moved[0, y, x], moved[1, y, x], moved[2, y, x] = _move(M, b, x, y, rho[y, x])
+            moved[0, y, x], moved[1, y, x], moved[2, y, x] = move(M, b, ideal, lens, columns, x, y, rho[y, x])
 
 
 @compiled(error_model="numpy")
-def draw_mesh(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F32) -> None:
+def draw_mesh(
+    rho: F32, joined: U8, M: F64, b: F64, ideal: Table, lens: Table, columns: Flag, source_map: F32, buffer: F32
+) -> None:
     """Draw the triangles of all joined neighbours into ``source_map`` (H, W, 2) and ``buffer`` (H, W).
 
     ``buffer`` holds inverse depth at the target, -1 where nothing is drawn yet; the larger one wins.
@@ -98,7 +107,7 @@ def draw_mesh(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F32
     for y in range(height):
         upper, lower = rows[(y + 1) & 1], rows[y & 1]
         for x in range(width):
-            lower[x, 0], lower[x, 1], lower[x, 2] = _move(M, b, x, y, rho[y, x])
+            lower[x, 0], lower[x, 1], lower[x, 2] = move(M, b, ideal, lens, columns, x, y, rho[y, x])
         if y == 0:
             continue
         for x in range(width - 1):
@@ -176,7 +185,9 @@ def _quad(
 
 
 @compiled(error_model="numpy")
-def draw_cells(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F32) -> None:
+def draw_cells(
+    rho: F32, joined: U8, M: F64, b: F64, ideal: Table, lens: Table, columns: Flag, source_map: F32, buffer: F32
+) -> None:
     """Draw the cells of pixels that are not joined to four neighbours, behind ``draw_mesh``'s result.
 
     A cell reaches half a pixel beyond the centre along its own surface: the boundary between two surfaces is
@@ -199,21 +210,33 @@ def draw_cells(rho: F32, joined: U8, M: F64, b: F64, source_map: F32, buffer: F3
             ahead = y + 1 if below else y
             behind = y - 1 if above else y
             along_y = (rho[ahead, x] - rho[behind, x]) / max(ahead - behind, 1)
-            _cell(rho, x, y, along_x, along_y, M, b, source_map, buffer)
+            _cell(rho, x, y, along_x, along_y, M, b, ideal, lens, columns, source_map, buffer)
 
 
 @compiled(error_model="numpy")
 def _cell(
-    rho: F32, x: int, y: int, along_x: float, along_y: float, M: F64, b: F64, source_map: F32, buffer: F32
+    rho: F32,
+    x: int,
+    y: int,
+    along_x: float,
+    along_y: float,
+    M: F64,
+    b: F64,
+    ideal: Table,
+    lens: Table,
+    columns: Flag,
+    source_map: F32,
+    buffer: F32,
 ) -> None:
     """Draw the parallelogram that the square of half a pixel around source pixel (x, y) becomes."""
     height, width = buffer.shape
-    ax, ay, az = _move(M, b, x, y, rho[y, x])
-    bx, by, bz = _move(M, b, x + 1, y, rho[y, x] + along_x)
-    # The next row has another pose, also the cell of the last row, whose lower neighbour does not exist.
+    ax, ay, az = move(M, b, ideal, lens, columns, x, y, rho[y, x])
+    # The next line has another pose, also at the last one, whose next neighbour does not exist. A row's goes on.
+    right = -1 if x + 1 == width and not (columns is None and lens is None) else 1
+    bx, by, bz = move(M, b, ideal, lens, columns, x + right, y, rho[y, x] + right * along_x)
     step = 1 if y + 1 < height else -1
-    cx, cy, cz = _move(M, b, x, y + step, rho[y, x] + step * along_y)
-    ux, uy, uz = bx - ax, by - ay, bz - az
+    cx, cy, cz = move(M, b, ideal, lens, columns, x, y + step, rho[y, x] + step * along_y)
+    ux, uy, uz = right * (bx - ax), right * (by - ay), right * (bz - az)
     vx, vy, vz = step * (cx - ax), step * (cy - ay), step * (cz - az)
     scale = 1.0 / (ux * vy - uy * vx)
     if not abs(scale) < _DEGENERATE:

@@ -23,6 +23,8 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.correction import Corrected, WarpOptions, inverse_depth, relative_row_maps, warp
+from rsbench.vision.forward_warp import move
+from rsbench.vision.optics import Flag, Table, across_lines, line_of, look, optics_of, see
 from rsbench.vision.resample import resample
 from rsbench.vision.stereo_depth import known_beside
 
@@ -53,10 +55,12 @@ class SourceView:
     depth: NDArray[np.float32]
     """(H, W) metres; inf is infinitely far, 0 or NaN unknown."""
     poses: Pose
-    """``cam_from_world`` of every row."""
+    """``cam_from_world`` of every line."""
     origin: Origin
     camera: PinholeCamera | None = None
     """Where it is not the target's: a rig whose disparities are off has two principal points."""
+    columns: bool = False
+    """Whether lines are columns."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,7 +108,7 @@ def fuse(
     Raises ValueError as ``rsbench.vision.correction.warp``.
     """
     first, others = views[0], views[1:]
-    corrected = warp(first.image, first.depth, camera, first.poses, target_pose, options=options)
+    corrected = _warped(first, first.depth, camera, target_pose, options)
     image, depth = corrected.image.copy(), corrected.depth.copy()
     origin = np.where(corrected.mask, np.uint8(first.origin), np.uint8(Origin.NOBODY))
     measured = [view for view in others if view.origin is not Origin.GUESSED]
@@ -204,7 +208,7 @@ def _look_up(
     M, b = relative_row_maps(view.camera or camera, target_pose, view.poses, camera)
     places = np.full((*wanted.shape, 2), np.nan, dtype=np.float32)
     expected = np.zeros(wanted.shape, dtype=np.float32)
-    _find_in_rows(rho, wanted, M, b, places, expected)
+    _find_in_lines(rho, wanted, M, b, *optics_of(camera, view.columns), places, expected)
     # Half a pixel past the last centre still belongs to the frame, and rounds beyond it in float32.
     nearest = np.rint(np.where(np.isfinite(places), places, 0.0)).astype(np.intp)
     x, y = np.moveaxis(np.clip(nearest, 0, (camera.width - 1, camera.height - 1)), -1, 0)
@@ -221,33 +225,40 @@ def _differ(a: NDArray[Any], b: NDArray[Any], where: Mask) -> Mask:
 
 
 @compiled(error_model="numpy")
-def _find_in_rows(
+def _find_in_lines(
     rho: NDArray[np.float32],
     wanted: Mask,
     M: FloatArray,
     b: FloatArray,
+    ideal: Table,
+    lens: Table,
+    columns: Flag,
     places: NDArray[np.float32],
     seen_rho: NDArray[np.float32],
 ) -> None:
     """Where a rolling-shutter frame sees points given by pixel and inverse depth ``rho`` (H, W) of the target.
 
     Fills ``places`` (H, W, 2), px, and ``seen_rho`` (H, W), the inverse depth there, of the ``wanted`` pixels
-    whose points lie inside the frame. ``M`` (H, 3, 3) and ``b`` (H, 3) take them to the camera of each row.
+    whose points lie inside the frame. ``M`` (lines, 3, 3) and ``b`` (lines, 3) take them to each line's camera.
     """
     height, width = rho.shape
+    lines = len(M)
     for y in range(height):
         for x in range(width):
             if not wanted[y, x]:
                 continue
-            row, u, v, s = y, np.nan, np.nan, np.nan
+            gx, gy = look(ideal, x, y)
+            line, u, v, s = line_of(columns, x, y), np.nan, np.nan, np.nan
             for _ in range(_ROW_STEPS):
-                z = M[row, 2, 0] * x + M[row, 2, 1] * y + M[row, 2, 2] + rho[y, x] * b[row, 2]
+                z = M[line, 2, 0] * gx + M[line, 2, 1] * gy + M[line, 2, 2] + rho[y, x] * b[line, 2]
                 s = 1.0 / z if z > 0.0 else np.nan
-                u = (M[row, 0, 0] * x + M[row, 0, 1] * y + M[row, 0, 2] + rho[y, x] * b[row, 0]) * s
-                v = (M[row, 1, 0] * x + M[row, 1, 1] * y + M[row, 1, 2] + rho[y, x] * b[row, 1]) * s
-                if not -height < v < 2 * height:  # NaN included
+                u = (M[line, 0, 0] * gx + M[line, 0, 1] * gy + M[line, 0, 2] + rho[y, x] * b[line, 0]) * s
+                v = (M[line, 1, 0] * gx + M[line, 1, 1] * gy + M[line, 1, 2] + rho[y, x] * b[line, 1]) * s
+                u, v = see(lens, u, v)
+                along = across_lines(columns, u, v)
+                if not -lines < along < 2 * lines:  # NaN included
                     break
-                row = min(max(int(v + 0.5), 0), height - 1)
+                line = min(max(int(along + 0.5), 0), lines - 1)
             if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
                 places[y, x, 0], places[y, x, 1], seen_rho[y, x] = u, v, rho[y, x] * s
 
@@ -259,9 +270,25 @@ def _warp_into(
     M, b = relative_row_maps(camera, view.poses, target_pose, view.camera)
     wanted = cv2.dilate(holes.astype(np.uint8), np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8))
     depth = np.zeros_like(view.depth)
-    if _keep_landing(view.depth, inverse_depth(view.depth), M, b, wanted, depth) == 0:
+    optics = optics_of(camera, view.columns)
+    if _keep_landing(view.depth, inverse_depth(view.depth), M, b, *optics, wanted, depth) == 0:
         return None
-    return warp(view.image, depth, camera, view.poses, target_pose, options=options, source_camera=view.camera)
+    return _warped(view, depth, camera, target_pose, options)
+
+
+def _warped(
+    view: SourceView, depth: NDArray[Any], camera: PinholeCamera, target_pose: Pose, options: WarpOptions | None
+) -> Corrected:
+    return warp(
+        view.image,
+        depth,
+        camera,
+        view.poses,
+        target_pose,
+        options=options,
+        source_camera=view.camera,
+        columns=view.columns,
+    )
 
 
 @compiled(error_model="numpy")
@@ -270,24 +297,23 @@ def _keep_landing(
     rho: NDArray[np.float32],
     M: FloatArray,
     b: FloatArray,
+    ideal: Table,
+    lens: Table,
+    columns: Flag,
     wanted: NDArray[np.uint8],
     kept: NDArray[np.float32],
 ) -> int:
     """Copy to ``kept`` the depth (H, W) of pixels that land on wanted target pixels (H, W); how many these are.
 
-    ``rho`` is inverse depth, NaN where unknown; ``M`` (H, 3, 3) and ``b`` (H, 3) as of ``relative_row_maps``.
+    ``rho`` is inverse depth, NaN where unknown; ``M`` and ``b`` as of ``relative_row_maps``.
     """
     height, width = depth.shape
     count = 0
     for y in range(height):
         for x in range(width):
-            near = rho[y, x]
-            z = M[y, 2, 0] * x + M[y, 2, 1] * y + M[y, 2, 2] + near * b[y, 2]
-            if not z > 0.0:  # NaN included
-                continue
-            u = (M[y, 0, 0] * x + M[y, 0, 1] * y + M[y, 0, 2] + near * b[y, 0]) / z + 0.5
-            v = (M[y, 1, 0] * x + M[y, 1, 1] * y + M[y, 1, 2] + near * b[y, 1]) / z + 0.5
-            if 0.0 <= u < width and 0.0 <= v < height and wanted[int(v), int(u)] != 0:
+            u, v, _ = move(M, b, ideal, lens, columns, x, y, rho[y, x])
+            u, v = u + 0.5, v + 0.5
+            if 0.0 <= u < width and 0.0 <= v < height and wanted[int(v), int(u)] != 0:  # NaN is outside
                 kept[y, x] = depth[y, x]
                 count += 1
     return count

@@ -25,6 +25,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.correction import inverse_depth
 from rsbench.vision.images import grey_u8
+from rsbench.vision.optics import Flag, Table, across_lines, line_of, look, optics_of, see
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -41,16 +42,20 @@ _AGREE_PX = 1.5
 
 
 class _Geometry(NamedTuple):
-    """Rows' maps of a pixel (x, y, 1) of inverse depth rho to the other frame's: A (G x + rho c) + rho B."""
+    """Lines' maps of ideal pixels (x, y, 1) of inverse depth rho to the other frame's: A (G x + rho c) + rho B."""
 
     G: FloatArray
-    """(H, 3, 3)."""
+    """(lines, 3, 3)."""
     c: FloatArray
-    """(H, 3)."""
+    """(lines, 3)."""
     A: FloatArray
-    """(H, 3, 3) of the other frame's rows."""
+    """(lines, 3, 3) of the other frame's lines."""
     B: FloatArray
-    """(H, 3)."""
+    """(lines, 3)."""
+    ideal: Table
+    """Of ``Optics``, as the next two."""
+    lens: Table
+    columns: Flag
 
 
 def depth_from_motion(
@@ -79,11 +84,12 @@ def depth_from_motion(
     censuses = [_census(grey) for grey in greys]
     rhos = [inverse_depth(depth) for depth in depths]
     maps = []
-    K, inverse_K = rig.camera.K, np.linalg.inv(rig.camera.K)
+    K, optics = rig.camera.ideal.K, optics_of(rig.camera, shutter.axis(side) == 0)
+    inverse_K = np.linalg.inv(K)
     for frame in (0, 1):
         here, there = poses[frame], poses[1 - frame]
         back = np.swapaxes(here.R, -1, -2)
-        maps.append(_Geometry(back @ inverse_K, centres[frame], K @ there.R, there.t @ K.T))
+        maps.append(_Geometry(back @ inverse_K, centres[frame], K @ there.R, there.t @ K.T, *optics))
         y, x = (places.astype(np.int32) for places in np.nonzero(unknown[frame]))
         both = (greys[frame], greys[1 - frame], censuses[frame], censuses[1 - frame])
         rhos[frame][y, x] = _search(y, x, both, maps[frame], count, 1.0 / gain)
@@ -105,10 +111,10 @@ def _search(
     cost, weight = np.zeros(size, dtype=np.float32), np.zeros(size, dtype=np.float32)
     weight[y, x] = 1.0
     weight = cv2.boxFilter(weight, -1, window, borderType=cv2.BORDER_CONSTANT)[y, x]
-    rows, best = y.copy(), np.full(len(y), -1, dtype=np.int32)
+    lines, best = (x if maps.columns else y).copy(), np.full(len(y), -1, dtype=np.int32)
     costs = np.full((len(y), 4), np.inf, dtype=np.float32)
     for k in range(count):
-        _fill_costs(y, x, rows, *both, *maps, k * step, cost)
+        _fill_costs(y, x, lines, *both, *maps, k * step, cost)  # type: ignore[arg-type]
         mean = cv2.boxFilter(cost, -1, window, borderType=cv2.BORDER_CONSTANT)[y, x] / weight
         _keep_best(k, mean, best, costs)
     before, least, after = costs[:, 1], costs[:, 0], costs[:, 2]
@@ -132,16 +138,29 @@ def _census(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
 
 @compiled(error_model="numpy", inline="always")
 def _land(
-    x: int, y: int, rho: float, row: int, G: FloatArray, c: FloatArray, A: FloatArray, B: FloatArray
+    x: int,
+    y: int,
+    rho: float,
+    line: int,
+    G: FloatArray,
+    c: FloatArray,
+    A: FloatArray,
+    B: FloatArray,
+    ideal: Table,
+    lens: Table,
+    columns: Flag,
 ) -> tuple[float, float, float]:
-    """Pixel and depth factor in the other frame's camera of ``row``; NaN behind it."""
-    p = G[y, 0, 0] * x + G[y, 0, 1] * y + G[y, 0, 2] + rho * c[y, 0]
-    q = G[y, 1, 0] * x + G[y, 1, 1] * y + G[y, 1, 2] + rho * c[y, 1]
-    r = G[y, 2, 0] * x + G[y, 2, 1] * y + G[y, 2, 2] + rho * c[y, 2]
-    z = A[row, 2, 0] * p + A[row, 2, 1] * q + A[row, 2, 2] * r + rho * B[row, 2]
+    """Pixel and depth factor in the other frame's camera of ``line``; NaN behind it."""
+    own = line_of(columns, x, y)
+    gx, gy = look(ideal, x, y)
+    p = G[own, 0, 0] * gx + G[own, 0, 1] * gy + G[own, 0, 2] + rho * c[own, 0]
+    q = G[own, 1, 0] * gx + G[own, 1, 1] * gy + G[own, 1, 2] + rho * c[own, 1]
+    r = G[own, 2, 0] * gx + G[own, 2, 1] * gy + G[own, 2, 2] + rho * c[own, 2]
+    z = A[line, 2, 0] * p + A[line, 2, 1] * q + A[line, 2, 2] * r + rho * B[line, 2]
     s = 1.0 / z if z > 0.0 else np.nan
-    u = (A[row, 0, 0] * p + A[row, 0, 1] * q + A[row, 0, 2] * r + rho * B[row, 0]) * s
-    v = (A[row, 1, 0] * p + A[row, 1, 1] * q + A[row, 1, 2] * r + rho * B[row, 1]) * s
+    u = (A[line, 0, 0] * p + A[line, 0, 1] * q + A[line, 0, 2] * r + rho * B[line, 0]) * s
+    v = (A[line, 1, 0] * p + A[line, 1, 1] * q + A[line, 1, 2] * r + rho * B[line, 1]) * s
+    u, v = see(lens, u, v)
     return u, v, s
 
 
@@ -159,7 +178,7 @@ def _ones(bits: np.uint32) -> float:
 def _fill_costs(
     y: NDArray[np.int32],
     x: NDArray[np.int32],
-    rows: NDArray[np.int32],
+    lines: NDArray[np.int32],
     grey: NDArray[np.uint8],
     other: NDArray[np.uint8],
     census: NDArray[np.uint32],
@@ -168,16 +187,21 @@ def _fill_costs(
     c: FloatArray,
     A: FloatArray,
     B: FloatArray,
+    ideal: Table,
+    lens: Table,
+    columns: Flag,
     rho: float,
     cost: F32,
 ) -> None:
-    """Cost of one inverse depth at every pixel (n,); ``rows`` (n,) are the rows where the last one landed."""
+    """Cost of one inverse depth at every pixel (n,); ``lines`` (n,) are those where the last one landed."""
     height, width = grey.shape
+    count = len(A)
     for i in range(len(y)):
-        # One step along the curve changes the row by one at most: its pose is that of the last landing.
-        u, v, _ = _land(x[i], y[i], rho, rows[i], G, c, A, B)
-        if -height < v < 2 * height:
-            rows[i] = min(max(int(v + 0.5), 0), height - 1)
+        # One step along the curve changes the line by one at most: its pose is that of the last landing.
+        u, v, _ = _land(x[i], y[i], rho, lines[i], G, c, A, B, ideal, lens, columns)
+        along = across_lines(columns, u, v)
+        if -count < along < 2 * count:
+            lines[i] = min(max(int(along + 0.5), 0), count - 1)
         value = _NOWHERE
         if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
             ty, tx = int(v + 0.5), int(u + 0.5)
@@ -207,21 +231,26 @@ def _keep_agreeing(
     c: FloatArray,
     A: FloatArray,
     B: FloatArray,
+    ideal: Table,
+    lens: Table,
+    columns: Flag,
     tolerance: float,
     depth: F32,
 ) -> None:
     """Write the depth of ``wanted`` pixels whose inverse depth the other frame confirms where it sees them."""
     height, width = rho.shape
+    lines = len(A)
     for y in range(height):
         for x in range(width):
             if not wanted[y, x] or not rho[y, x] >= 0.0:
                 continue
-            row, u, v, s = y, np.nan, np.nan, np.nan
+            line, u, v, s = line_of(columns, x, y), np.nan, np.nan, np.nan
             for _ in range(6):
-                u, v, s = _land(x, y, rho[y, x], row, G, c, A, B)
-                if not -height < v < 2 * height:
+                u, v, s = _land(x, y, rho[y, x], line, G, c, A, B, ideal, lens, columns)
+                along = across_lines(columns, u, v)
+                if not -lines < along < 2 * lines:
                     break
-                row = min(max(int(v + 0.5), 0), height - 1)
+                line = min(max(int(along + 0.5), 0), lines - 1)
             inside = -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5
             if inside and abs(other[int(v + 0.5), int(u + 0.5)] - rho[y, x] * s) <= tolerance:
                 depth[y, x] = 1.0 / rho[y, x] if rho[y, x] > 0.0 else np.inf

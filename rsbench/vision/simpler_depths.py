@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -19,15 +20,17 @@ _NEAREST_SHARE = 0.999
 _CHUNK_ROWS = 100
 
 
-def plane_depth(depth: NDArray[Any]) -> F32:
-    """Depth (H, W) of the plane that fits a depth map (H, W) best: inverse depth affine in the pixel.
+def plane_depth(depth: NDArray[Any], camera: PinholeCamera | None = None) -> F32:
+    """Depth (H, W) of the plane that fits a depth map (H, W) best: inverse depth affine in the (ideal) pixel.
 
     Iterated least squares on absolute differences, so that the larger surface wins; 0 and NaN are unknown, inf is
-    infinitely far. Where the plane lies behind the camera the result is inf. A correction with it is a
-    homography per row.
+    infinitely far. Where the plane lies behind the camera the result is inf. A correction with it is a homography
+    per row. ``camera`` matters where it has a lens.
     """
     height, width = depth.shape
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, width), np.linspace(-1.0, 1.0, height))
+    if camera is not None and camera.lens is not None:
+        x, y = np.moveaxis(camera.unproject(camera.pixel_grid())[..., :2], -1, 0)
     basis = np.stack([np.ones_like(x), x, y], axis=-1)
     known = depth > 0.0
     if np.count_nonzero(known) < 3:

@@ -254,13 +254,17 @@ def seen_by_other(depth: NDArray[Any], other_depth: NDArray[Any], rig: StereoRig
     """Pixels (H, W) whose point the other camera sees too, from the true depth of both, metres.
 
     It does when its own disparity at that place is the same to a pixel: nothing nearer hides the point, which lies
-    inside the picture. A rolling shutter changes nothing: both cameras read a row at the same time.
+    inside the picture. A rolling shutter changes nothing where both cameras read a row at the same time; with a
+    lens the two times are so near that the difference is lost in that pixel.
     """
-    sign = 1.0 if side == "left" else -1.0
+    camera, sign = rig.camera, 1.0 if side == "left" else -1.0
     disparity, other = (np.nan_to_num(rig.disparity(z)) for z in (depth, other_depth))
-    partner = np.rint(np.arange(depth.shape[1]) - sign * disparity).astype(np.int64)
-    inside = (disparity > 0.0) & (partner >= 0) & (partner < depth.shape[1])
-    there = np.take_along_axis(other, np.clip(partner, 0, depth.shape[1] - 1), axis=1)
+    ideal = camera.ideal_pixels(camera.pixel_grid())
+    partner = camera.lens_pixels(np.stack([ideal[..., 0] - sign * disparity, ideal[..., 1]], axis=-1))
+    x, y = np.moveaxis(np.rint(np.nan_to_num(partner, nan=-1.0)).astype(np.int64), -1, 0)
+    height, width = depth.shape
+    inside = (disparity > 0.0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    there = other[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
     return inside & (np.abs(there - disparity) <= 1.0)
 
 

@@ -102,17 +102,19 @@ class World:
         depth = np.min([nothing, *(s.distance(centre, rays) for s in self.surfaces)], axis=0)
         return depth, centre, rays
 
-    def see(self, poses: Pose) -> tuple[FloatArray, FloatArray]:
-        """Image (H, W, 3) in [0, 1] and depth (H, W), inf where nothing is met, through one pose per row."""
-        by_row = Pose(poses.R[:, None], poses.t[:, None])
-        depth, centre, rays = self.depth_along(by_row, self.rig.camera.pixel_grid())
+    def see(self, poses: Pose, columns: bool = False) -> tuple[FloatArray, FloatArray]:
+        """Image (H, W, 3) in [0, 1] and depth (H, W), inf where nothing is met, through one pose per line."""
+        axis = 0 if columns else 1
+        by_line = Pose(np.expand_dims(poses.R, axis), np.expand_dims(poses.t, axis))
+        depth, centre, rays = self.depth_along(by_line, self.rig.camera.pixel_grid())
         hit = np.isfinite(depth)
         image = self.texture(centre + np.where(hit, depth, 0.0)[..., None] * rays)
         far = self.texture(40.0 * self.texture.shortest * rays / np.linalg.norm(rays, axis=-1, keepdims=True))
         return np.where(hit[..., None], image, far if self.sky else 0.0), depth
 
     def rolling(self, side: Side, frame: int) -> tuple[FloatArray, FloatArray]:
-        return self.see(row_poses(self.rig, self.shutter, self.motion, side, frame))
+        poses = row_poses(self.rig, self.shutter, self.motion, side, frame)
+        return self.see(poses, self.shutter.axis(side) == 0)
 
     def still(self, side: Side, tau: float) -> tuple[FloatArray, FloatArray]:
         """The global-shutter image and depth at one time."""

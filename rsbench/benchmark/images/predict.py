@@ -21,7 +21,7 @@ from rsbench.benchmark.images.store import Artefact, read_record
 from rsbench.benchmark.seeds import generator
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
-from rsbench.core.rig import FRAMES, SIDES, VIEWS, StereoRig, View
+from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side, StereoRig, View
 from rsbench.dataset.corrected_frames import write_origin
 from rsbench.dataset.files import (
     MATCH_SETS,
@@ -44,7 +44,9 @@ from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.registry import SOLVERS, SolverEntry
 from rsbench.solvers.engine.warm_up import warm_up
 from rsbench.vision.corrector import CORRECTORS
-from rsbench.vision.stereo_matcher import STEREO_MATCHERS, find_disparities
+from rsbench.vision.stereo_matcher import STEREO_MATCHERS
+from rsbench.vision.timed_depth import timed_depth
+from rsbench.vision.undistortion import sensor_disparities
 
 Step = Callable[[str], None]
 
@@ -98,7 +100,9 @@ class Bench:
         artefact.start()
         images, start = self.images, time.perf_counter()
         try:
-            matches = find_matches_of_rig(images, self.sequence.rig, self.sequence.shutter, self.plan.chain)
+            matches = find_matches_of_rig(
+                images, self.sequence.rig, self.sequence.shutter.scanning, self.plan.chain
+            )
         except RsbenchError as error:
             artefact.finish({"features": entry.name, "success": False, "reason": str(error), "matches": {}})
             return
@@ -168,7 +172,7 @@ class Bench:
         }
         try:
             for frame in FRAMES:
-                both = find_disparities(entry, images["left", frame], images["right", frame], self.sequence.rig)
+                both = sensor_disparities(entry, images["left", frame], images["right", frame], self.sequence.rig)
                 found[f"left_{frame}"], found[f"right_{frame}"] = both
         except RsbenchError as error:
             artefact.finish(record | {"success": False, "reason": str(error)})
@@ -192,7 +196,9 @@ class Bench:
         images, start = self.images, time.perf_counter()
         ratio = self.sequence.shutter.readout_ratio
         try:
-            frames = correct_four(images, self.sequence.rig, ratio, recipe.chain, given=given).frames
+            scanning = self.sequence.shutter.scanning
+            found = correct_four(images, self.sequence.rig, ratio, recipe.chain, given=given, scanning=scanning)
+            frames = found.frames
         except RsbenchError as error:
             artefact.finish(record | {"success": False, "reason": str(error)})
             return
@@ -300,6 +306,14 @@ def true_pairs(sequence: Sequence, images: Images) -> Pairs:
     return known_depth(images, {view: np.where(z > 0, z, np.float32(np.inf)) for view, z in truth.items()})
 
 
-def depth_of(disparity: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:
-    """Depth (H, W), metres, 0 where the disparity is not known: the depth convention of the dataset."""
-    return np.nan_to_num(rig.depth(disparity), nan=0.0).astype(np.float32)
+def depth_of(disparity: NDArray[np.float32], sequence: Sequence, side: Side, frame: int) -> NDArray[np.float32]:
+    """Depth (H, W), metres, 0 where the disparity is not known: the depth convention of the dataset.
+
+    With a lens the true motion says where the rig was at both ends of a disparity: a matcher is scored, no motion.
+    """
+    rig = sequence.rig
+    depth = np.nan_to_num(rig.depth(disparity), nan=0.0).astype(np.float32)
+    if rig.camera.lens is None:
+        return depth
+    found = timed_depth(depth, rig, sequence.shutter, sequence.motion, side, frame)
+    return np.where(np.isfinite(found), found, np.float32(0.0))

@@ -153,7 +153,9 @@ class Scorer:
         for name, part in (("all", np.ones_like(seen)), ("visible", seen), ("occluded", ~seen)):
             case = None
             if disparity is not None:
-                case = DepthCase(depth=depth_of(disparity, rig), truth=truth, pixels=part, rig=rig)
+                case = DepthCase(
+                    depth=depth_of(disparity, self.sequence, *view), truth=truth, pixels=part, rig=rig
+                )
             keys = {"matcher": matcher, "side": side, "frame": frame, "pixels": name, "success": case is not None}
             yield keys | self._metrics(case, DepthCase)
 
@@ -208,5 +210,6 @@ class Scorer:
         given = Given(motion=self.sequence.motion, pairs=true_pairs(self.sequence, images))
         options = CorrectionOptions(corrector=load_corrector("single-view"), depth_from_motion=False)
         ratio = self.sequence.shutter.readout_ratio
-        found = correct_four(images, self.sequence.rig, ratio, options, given=given)
+        scanning = self.sequence.shutter.scanning
+        found = correct_four(images, self.sequence.rig, ratio, options, given=given, scanning=scanning)
         return {view: fused.origin == Origin.HERE for view, fused in found.frames.items()}

@@ -1,0 +1,196 @@
+"""The default pipeline on the frames of a real camera and, beside them, on those of an ideal one.
+
+Both cameras move alike through the same scenes. The real one has a lens, exposes each row for a while, and counts
+photons. Motion is solved with several seeds of the robust loop. Frames are corrected with the motion of the seed
+whose largest error, in stated standard deviations, is the median of all seeds', and of the one where it is largest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from rsbench.benchmark.scoring import pose_errors
+from rsbench.benchmark.seeds import generator
+from rsbench.core.motion import Motion
+from rsbench.core.rig import VIEWS, View
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.card import DatasetCard
+from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.chain import correct_frames, find_depth
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import Pairs, frame_pairs
+from rsbench.pipeline.frame_motion import FoundMotion, NoMotionError, find_matches_of_rig, find_motion
+from rsbench.vision.fusion import Origin
+from rsbench.vision.quality import psnr
+
+Row = dict[str, Any]
+FEWEST_SEEDS = 10
+BEYOND = 4.0
+"""Stated standard deviations beyond which an error is not what was stated."""
+_CORRECTED: tuple[View, ...] = (("left", 0), ("left", 1))
+_FAILED = {"e_R_deg": 180.0, "e_T_deg": 180.0, "sigmas": math.inf}
+_LOST = {"psnr": 0.0, "psnr_clean": 0.0, "coverage": 0.0}
+
+
+def ideal_card(card: DatasetCard) -> DatasetCard:
+    """The same sequences as an ideal camera sees them."""
+    return replace(card, name=f"{card.name}-ideal", sensor=None, camera=replace(card.camera, lens=None))
+
+
+def sized(card: DatasetCard, width: int) -> DatasetCard:
+    """The same sequences in images of this width, of the same field of view.
+
+    Raises:
+        RsbenchError: so narrow that there is nothing to match.
+    """
+    scale = width / card.camera.width
+    if width < 64:
+        raise RsbenchError(f"--width {width}: must be at least 64 px")
+    height = max(round(card.camera.height * scale), 1)
+    return replace(card, camera=replace(card.camera, width=width, height=height, focal=card.camera.focal * scale))
+
+
+def study(datasets: Mapping[str, Path], seeds: int, step: Callable[[str], None]) -> tuple[list[Row], list[Row]]:
+    """A row for each seed, and one for each corrected view, of all sequences of the dataset of each camera.
+
+    Raises:
+        RsbenchError: a dataset cannot be read.
+    """
+    motions: list[Row] = []
+    views: list[Row] = []
+    for camera, folder in datasets.items():
+        for sequence in read_dataset(folder):
+            scene, stratum, _ = sequence.name.rsplit("-", 2)
+            key = {"camera": camera, "scene": scene, "stratum": stratum, "sequence": sequence.name}
+            found = study_sequence(sequence, seeds)
+            motions += [key | row for row in found[0]]
+            views += [key | row for row in found[1]]
+            step(f"{camera} {sequence.name}")
+    return motions, views
+
+
+def study_sequence(sequence: Sequence, seeds: int) -> tuple[list[Row], list[Row]]:
+    """Errors of every seed, and scores of the corrected views."""
+    options, rig, shutter = CorrectionOptions(), sequence.rig, sequence.shutter
+    images = {view: sequence.image("rs", *view) for view in VIEWS}
+    matches = find_matches_of_rig(images, rig, shutter.scanning, options)
+    found: list[FoundMotion | None] = []
+    for seed in range(seeds):
+        rng = generator(options.seed, "real", sequence.name, seed)
+        try:
+            found.append(find_motion(matches, rig, shutter, options, rng))
+        except NoMotionError:
+            found.append(None)
+    rows = [{"seed": seed, **_errors(sequence, one)} for seed, one in enumerate(found)]
+    order = np.argsort([row["sigmas"] for row in rows], kind="stable")
+    pairs = frame_pairs(images, rig, options)
+    views = [row | {"seed": "none"} for row in _uncorrected(sequence)]
+    for name, seed in (("median", order[len(order) // 2]), ("worst", order[-1])):
+        one = found[seed]
+        scores = _corrected(sequence, images, pairs, None if one is None else one.motion, options)
+        views += [row | {"seed": name} for row in scores]
+    return rows, views
+
+
+def _errors(sequence: Sequence, found: FoundMotion | None) -> Row:
+    if found is None:
+        return {"success": False, **_FAILED, "inliers": 0}
+    motion, truth, covariance = found.motion, sequence.motion, found.robust.estimate.covariance
+    errors = pose_errors(motion.w, motion.d, true_w=truth.w, true_d=truth.d, rig=sequence.rig)
+    off = np.concatenate([motion.w - truth.w, motion.d - truth.d])
+    return {
+        "success": True,
+        "e_R_deg": float(errors["e_R_deg"]),
+        "e_T_deg": float(errors["e_T_deg"]),
+        "sigmas": math.inf if covariance is None else largest_in_sigmas(off, covariance),
+        "inliers": found.robust.inlier_count,
+    }
+
+
+def largest_in_sigmas(off: FloatArray, covariance: FloatArray) -> float:
+    """The largest of errors (n,), each over its own stated standard deviation, from a covariance (n, n)."""
+    return float(np.max(np.abs(off) / np.sqrt(np.diag(covariance))))
+
+
+def _uncorrected(sequence: Sequence) -> list[Row]:
+    rows = []
+    for side, frame in _CORRECTED:
+        twin = sequence.image("gs", side, frame)
+        score = psnr(sequence.image("rs", side, frame), twin), psnr(sequence.clean_image(side, frame), twin)
+        rows.append({"side": side, "frame": frame, "psnr": score[0], "psnr_clean": score[1], "coverage": 1.0})
+    return rows
+
+
+def _corrected(
+    sequence: Sequence,
+    images: Mapping[View, NDArray[np.uint8]],
+    pairs: Pairs,
+    motion: Motion | None,
+    options: CorrectionOptions,
+) -> list[Row]:
+    """PSNR of the pixels that are drawn, of the frames and, moved in the same way, of the clean ones."""
+    keys = [{"side": side, "frame": frame} for side, frame in _CORRECTED]
+    if motion is None:
+        return [key | _LOST for key in keys]
+    rig, shutter = sequence.rig, sequence.shutter
+    pairs = find_depth(images, rig, shutter, motion, options, pairs)
+    found = correct_frames(images, pairs, rig, shutter, motion, options, _CORRECTED)
+    clean = found
+    if sequence.sensor is not None:
+        sharp = {view: sequence.clean_image(*view) for view in VIEWS}
+        clean = correct_frames(sharp, pairs, rig, shutter, motion, options, _CORRECTED)
+    rows = []
+    for key, view in zip(keys, _CORRECTED, strict=True):
+        twin, drawn = sequence.image("gs", *view), found[view].origin != Origin.NOBODY
+        both = drawn & (clean[view].origin != Origin.NOBODY)
+        scores = {
+            "psnr": psnr(found[view].image, twin, drawn),
+            "psnr_clean": psnr(clean[view].image, twin, both),
+            "coverage": float(np.mean(drawn)),
+        }
+        rows.append(key | scores)
+    return rows
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kept:
+    """In how many sequences the stated errors were kept by every seed."""
+
+    kept: int
+    sequences: int
+
+
+def kept_sequences(motions: pd.DataFrame, camera: str) -> Kept:
+    """Sequences in which no seed lands beyond ``BEYOND`` stated standard deviations."""
+    worst = motions[motions["camera"] == camera].groupby("sequence")["sigmas"].max()
+    return Kept(kept=int(np.count_nonzero(worst <= BEYOND)), sequences=len(worst))
+
+
+def summarise(motions: pd.DataFrame, views: pd.DataFrame) -> pd.DataFrame:
+    """One row for each scene, stratum and camera: medians over sequences and seeds, and over views."""
+    keys = ["scene", "stratum", "camera"]
+    rows = []
+    for values, group in motions.groupby(keys, sort=False):
+        seen = views
+        for key, value in zip(keys, values, strict=True):
+            seen = seen[seen[key] == value]
+        row = dict(zip(keys, values, strict=True)) | {"sequences": group["sequence"].nunique()}
+        row |= {"seeds": group["seed"].nunique(), "failures": int(np.count_nonzero(~group["success"]))}
+        row |= {name: float(group[name].median()) for name in ("e_R_deg", "e_T_deg")}
+        row["e_R_worst_deg"], row["e_T_worst_deg"] = float(group["e_R_deg"].max()), float(group["e_T_deg"].max())
+        row["sigmas"] = float(group["sigmas"].max())
+        for name in ("none", "median", "worst"):
+            own = seen[seen["seed"] == name]
+            row[f"psnr_{name}"] = float(own["psnr"].mean())
+            row[f"psnr_clean_{name}"] = float(own["psnr_clean"].mean())
+        rows.append(row | {"coverage": float(seen[seen["seed"] == "median"]["coverage"].mean())})
+    return pd.DataFrame(rows)
