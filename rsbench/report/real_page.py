@@ -82,7 +82,8 @@ def _errors(summary: pd.DataFrame) -> str:
         for row in rows:
             cells = [name, row["camera"], f"{row['failures']} of {row['sequences'] * row['seeds']}"]
             cells += [f"{row['e_R_worst_deg']:.3f}", f"{row['e_T_worst_deg']:.3f}", f"{row['sigmas']:.1f}"]
-            lines.append(f"| {' | '.join([*cells, f'{row["psnr_worst"]:.1f}'])} |")
+            cells.append(f"{row['psnr_worst']:.1f}")
+            lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
