@@ -85,9 +85,7 @@ def reproduce(
         typer.echo(f"{each}: {(time.monotonic() - start) / 60.0:.1f} minutes")
 
 
-def _reproduce(
-    target: Target, out: Path, data: Path, workers: int | None, seeds: int, width: int | None
-) -> None:
+def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds: int, width: int | None) -> None:
     from contextlib import ExitStack
 
     from rsbench.dataset.workplace import workplace

@@ -2,7 +2,7 @@
 
 Both cameras move alike through the same scenes. The real one has a lens, exposes each row for a while, and counts
 photons. Motion is solved with several seeds of the robust loop. Frames are corrected with the motion of the seed
-whose largest error, in stated standard deviations, is the median of the seeds', and of the one where it is largest.
+whose largest error, in stated standard deviations, is the median of all, and of the seed where it is largest.
 """
 
 from __future__ import annotations
