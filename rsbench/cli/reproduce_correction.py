@@ -149,11 +149,15 @@ def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
         with progress_bar(f"rendering {each.name}", STEPS * len(each.sequence)) as advance:
             generate_dataset(each, places[camera], progress=advance)
     with progress_bar("solving and correcting", len(cards) * len(card.sequence)) as advance:
-        motions, views = (pd.DataFrame(rows) for rows in real_cameras.study(places, seeds, advance))
+        motions, views = (
+            pd.DataFrame(rows) for rows in real_cameras.study(places, seeds, advance, data / "real-rows")
+        )
     write_table(folder / "motions.csv", motions)
     write_table(folder / "views.csv", views)
     # Of the stored figures, so that whoever has the files can make the summary again to the last digit.
-    stored = (pd.read_csv(folder / f"{name}.csv", keep_default_na=False) for name in ("motions", "views"))
+    stored = (
+        pd.read_csv(folder / f"{name}.csv", keep_default_na=False, na_values=[""]) for name in ("motions", "views")
+    )
     write_table(folder / "summary.csv", real_cameras.summarise(*stored))
     records = [dataset_record(place) for place in places.values()]
     write_json(folder / "provenance.json", provenance("rsbench reproduce real", datasets=records))
@@ -162,14 +166,14 @@ def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
 
 
 def _draw_real(places: dict[str, Path], folder: Path) -> Path:
+    from rsbench.core.rig import VIEWS
     from rsbench.dataset.sequence import read_sequence
     from rsbench.pipeline.chain import correct_four
     from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.report.real_page import draw_frames
 
     ideal, real = (read_sequence(places[camera] / _SHOWN) for camera in ("ideal", "real"))
-    views = (("left", 0), ("right", 0), ("left", 1), ("right", 1))
-    images = {(side, frame): real.image("rs", side, frame) for side, frame in views}  # type: ignore[arg-type]
+    images = {view: real.image("rs", *view) for view in VIEWS}
     ratio, scanning = real.shutter.readout_ratio, real.shutter.scanning
     options = CorrectionOptions(inpaint=True)
     corrected = correct_four(images, real.rig, ratio, options, views=(("left", 1),), scanning=scanning)

@@ -125,8 +125,8 @@ def test_the_whole_way_through_a_lens(made: dict[str, Path], tmp_path: Path) -> 
     depth = read_scores(tmp_path, "depth")
     seen = depth[depth["pixels"] == "visible"]
     assert np.all(seen["success"]) and seen["bad_1px"].median() < 0.15 and seen["coverage"].median() > 0.7
-    images = read_scores(tmp_path, "correction")
-    images = images[(images["pixels"] == "visible")].groupby(["solver", "matcher"])["psnr"].mean()
+    scores = read_scores(tmp_path, "correction")
+    images = scores[scores["pixels"] == "visible"].groupby(["solver", "matcher"])["psnr"].mean()
     # The twin has the same lens: nothing but the resampling of these small images is between them.
     assert images["rs-stereo-refined-twist", "sgm"] > images["none", "none"] + 3.0
     assert images["true", "true"] > images["rs-stereo-refined-twist", "sgm"] - 0.5

@@ -104,7 +104,7 @@ def test_flow_is_back_projection_and_projection(scene: Any, case: str) -> None:
     geometry: Any = (real.rig, real.shutter, real.motion, "right", 1)
     _, depth = real.rolling("right", 1)
     grid = real.rig.camera.pixel_grid()
-    X = back_project(*geometry, grid, depth)
+    X = back_project(real.rig, real.shutter, real.motion, "right", 1, grid, depth)
     expected = project_at(real.rig, real.motion, "right", 1.3, X)[..., :2] - grid
     np.testing.assert_allclose(correction_flow(depth, *geometry, target_tau=1.3), expected, atol=1e-4)
 

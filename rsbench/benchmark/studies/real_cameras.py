@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
+from rsbench.benchmark.studies.kept_rows import KeptRows, Row
 from rsbench.core.motion import Motion
 from rsbench.core.rig import VIEWS, View
 from rsbench.core.so3 import FloatArray
@@ -32,12 +32,11 @@ from rsbench.pipeline.frame_motion import FoundMotion, NoMotionError, find_match
 from rsbench.vision.fusion import Origin
 from rsbench.vision.quality import psnr
 
-Row = dict[str, Any]
 FEWEST_SEEDS = 10
 BEYOND = 4.0
 """Stated standard deviations beyond which an error is not what was stated."""
 _CORRECTED: tuple[View, ...] = (("left", 0), ("left", 1))
-_FAILED = {"e_R_deg": 180.0, "e_T_deg": 180.0, "sigmas": math.inf}
+_FAILED = {"e_R_deg": 180.0, "e_T_deg": 180.0, "sigmas": math.nan}
 _LOST = {"psnr": 0.0, "psnr_clean": 0.0, "coverage": 0.0}
 
 
@@ -59,8 +58,12 @@ def sized(card: DatasetCard, width: int) -> DatasetCard:
     return replace(card, camera=replace(card.camera, width=width, height=height, focal=card.camera.focal * scale))
 
 
-def study(datasets: Mapping[str, Path], seeds: int, step: Callable[[str], None]) -> tuple[list[Row], list[Row]]:
+def study(
+    datasets: Mapping[str, Path], seeds: int, step: Callable[[str], None], kept: Path
+) -> tuple[list[Row], list[Row]]:
     """A row for each seed, and one for each corrected view, of all sequences of the dataset of each camera.
+
+    A folder ``kept`` holds what is done of a run that is cut off.
 
     Raises:
         RsbenchError: a dataset cannot be read.
@@ -71,11 +74,20 @@ def study(datasets: Mapping[str, Path], seeds: int, step: Callable[[str], None])
         for sequence in read_dataset(folder):
             scene, stratum, _ = sequence.name.rsplit("-", 2)
             key = {"camera": camera, "scene": scene, "stratum": stratum, "sequence": sequence.name}
-            found = study_sequence(sequence, seeds)
+            found = _kept(sequence, seeds, folder, kept / camera)
             motions += [key | row for row in found[0]]
             views += [key | row for row in found[1]]
             step(f"{camera} {sequence.name}")
     return motions, views
+
+
+def _kept(sequence: Sequence, seeds: int, dataset: Path, folder: Path) -> tuple[list[Row], list[Row]]:
+    store = KeptRows(folder=folder, dataset=dataset, seed=seeds, solver=CorrectionOptions().solver.name)
+    rows = store.read(sequence.name)
+    if rows is None:
+        rows = (*study_sequence(sequence, seeds), [])
+        store.write(sequence.name, rows)
+    return rows[0], rows[1]
 
 
 def study_sequence(sequence: Sequence, seeds: int) -> tuple[list[Row], list[Row]]:
@@ -111,7 +123,7 @@ def _errors(sequence: Sequence, found: FoundMotion | None) -> Row:
         "success": True,
         "e_R_deg": float(errors["e_R_deg"]),
         "e_T_deg": float(errors["e_T_deg"]),
-        "sigmas": math.inf if covariance is None else largest_in_sigmas(off, covariance),
+        "sigmas": math.nan if covariance is None else largest_in_sigmas(off, covariance),
         "inliers": found.robust.inlier_count,
     }
 
@@ -170,8 +182,9 @@ class Kept:
 
 
 def kept_sequences(motions: pd.DataFrame, camera: str) -> Kept:
-    """Sequences in which no seed lands beyond ``BEYOND`` stated standard deviations."""
-    worst = motions[motions["camera"] == camera].groupby("sequence")["sigmas"].max()
+    """Sequences in which no seed fails or lands beyond ``BEYOND`` stated standard deviations."""
+    own = motions[motions["camera"] == camera]
+    worst = own["sigmas"].fillna(math.inf).groupby(own["sequence"]).max()
     return Kept(kept=int(np.count_nonzero(worst <= BEYOND)), sequences=len(worst))
 
 
