@@ -60,14 +60,14 @@ def _pairs(summary: pd.DataFrame) -> list[tuple[str, pd.Series, pd.Series]]:
 
 def _table(summary: pd.DataFrame) -> str:
     lines = [
-        "| scene, motion | e_R ideal | e_R real (deg) | e_T ideal | e_T real (deg) | PSNR before | ideal "
-        "| real, clean | real as it is (dB) | drawn |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| scene, motion | e_R (deg): ideal, real | e_T (deg): ideal, real | PSNR (dB), ideal: before, after "
+        "| real: before, after | real, clean: after | drawn |",
+        "|---|---|---|---|---|---|---|",
     ]
     for name, ideal, real in _pairs(summary):
-        cells = [name, *(f"{row[e]:.3f}" for e in ("e_R_deg", "e_T_deg") for row in (ideal, real))]
-        cells += [f"{ideal['psnr_none']:.1f}", f"{ideal['psnr_median']:.1f}"]
-        cells += [f"{real['psnr_clean_median']:.1f}", f"{real['psnr_median']:.1f}", f"{real['coverage']:.1%}"]
+        cells = [name, *(f"{ideal[e]:.3f}, {real[e]:.3f}" for e in ("e_R_deg", "e_T_deg"))]
+        cells += [f"{row['psnr_none']:.1f}, {row['psnr_median']:.1f}" for row in (ideal, real)]
+        cells += [f"{real['psnr_clean_median']:.1f}", f"{real['coverage']:.1%}"]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
