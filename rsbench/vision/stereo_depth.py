@@ -259,7 +259,8 @@ def seen_by_other(depth: NDArray[Any], other_depth: NDArray[Any], rig: StereoRig
     """
     camera, sign = rig.camera, 1.0 if side == "left" else -1.0
     disparity, other = (np.nan_to_num(rig.disparity(z)) for z in (depth, other_depth))
-    ideal = camera.ideal_pixels(camera.pixel_grid())
+    row, column = np.indices(depth.shape)
+    ideal = camera.ideal_pixels(np.stack([column, row], axis=-1))
     partner = camera.lens_pixels(np.stack([ideal[..., 0] - sign * disparity, ideal[..., 1]], axis=-1))
     x, y = np.moveaxis(np.rint(np.nan_to_num(partner, nan=-1.0)).astype(np.int64), -1, 0)
     height, width = depth.shape
