@@ -145,8 +145,8 @@ class DatasetCard(Scanning):
         period, sensor = self.period_of(sequence), self.sensor_of(sequence)
         if not period > 0:
             raise ValueError(f"frame_period_s must be positive, got {period}")
-        if sensor is not None and sensor.exposure_s > period:
-            raise ValueError(f"sensor exposure_s = {sensor.exposure_s}: longer than frame_period_s = {period}")
+        if sensor is not None and sensor.longest_s > period:
+            raise ValueError(f"sensor exposure_s = {sensor.longest_s}: longer than frame_period_s = {period}")
 
     def _check_motions(self) -> None:
         own = [sequence.name for sequence in self.sequence if sequence.motion is not None]
@@ -209,7 +209,7 @@ class DatasetCard(Scanning):
             frame_period_s=self.period_of(sequence),
         )
         own = self.sensor_of(sequence)
-        sensor = {} if own is None else {"sensor": asdict(own)}
+        sensor = {} if own is None else {"sensor": own.record}
         channels = {"channels": list(self.channels)} if self.channels else {}
         imu = {"imu": asdict(self.imu or Imu())} if "imu" in self.channels else {}
         twins = {"twins": list(rows)} if (rows := self.twins_of(sequence)) else {}
@@ -305,7 +305,7 @@ class DatasetCard(Scanning):
     def _followed(self, sequence: SequenceCard, card: TrajectoryCard, folder: Path) -> list[SequenceCard]:
         """One sequence for each pair of frames on a trajectory."""
         period, sensor, shutter = self.period_of(sequence), self.sensor_of(sequence), self.shutter_for(sequence)
-        half = 0.0 if sensor is None else 0.5 * sensor.exposure_s / period
+        half = 0.0 if sensor is None else 0.5 * sensor.longest_s / period
         late = shutter.right_delay
         span = min(0.0, late) - half, 1.0 + shutter.readout_ratio + max(0.0, late) + half
         return [

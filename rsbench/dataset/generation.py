@@ -340,7 +340,7 @@ def render_camera(
         write_depth(folder / shot.depth, rendered.depth)
         if kind == "rs" and sensor:
             period, motion = card.period_of(sequence), card.motion_of(sequence)
-            seen = sensed_rows(scene, rig, shutter, motion, sensor, period, side, frame, options)
+            seen = sensed_rows(scene, rig, shutter, motion, sensor.of(side, frame), period, side, frame, options)
             write_png(folder / shot.image, to_srgb8(seen, 1.0))
         if kind == "rs":
             geometry = GivenGeometry(rig, shutter, card.motion_of(sequence))

@@ -99,7 +99,7 @@ def sample_times_ns(
     """True times (n,) of the samples: whole periods of the sensor, over all exposures and ``MARGIN_S`` beyond."""
     lines = [shutter.line_times(frame, side) for side in SIDES for frame in FRAMES]
     first, last = (frame_period_s * reach(np.concatenate(lines)) for reach in (np.min, np.max))
-    beyond = MARGIN_S + 0.5 * (sensor.exposure_s if sensor else 0.0)
+    beyond = MARGIN_S + 0.5 * (sensor.longest_s if sensor else 0.0)
     counts = np.arange(
         math.floor((first - beyond) * imu.rate_hz), math.ceil((last + beyond) * imu.rate_hz) + 1, dtype=np.int64
     )

@@ -35,7 +35,7 @@ def timing_manifest(shutter: RollingShutter, frame_period_s: float, sensor: Sens
         side: {
             "readout_ns": readout_ns,
             "line_delay_ns": readout_ns / shutter.lines(side),
-            "exposure_ns": _NS * (sensor.exposure_s if sensor else 0.0),
+            "exposure_ns": _NS * (sensor.of(side, 0).exposure_s if sensor else 0.0),
             "scan": shutter.scan_of(side),
             "reference_row": shutter.first_line(side),
             "reference_ns": [_NS * frame_period_s * float(shutter.start(frame, side)) for frame in FRAMES],
@@ -52,7 +52,7 @@ def timing_table(
     """(H, 4) in the order of ``COLUMNS``, whole nanoseconds; of columns where the camera reads those."""
     rows = np.arange(shutter.lines(side))
     middle = _NS * frame_period_s * shutter.line_times(frame, side)
-    half = 0.5 * _NS * (sensor.exposure_s if sensor else 0.0)
+    half = 0.5 * _NS * (sensor.of(side, frame).exposure_s if sensor else 0.0)
     return np.round(np.stack([rows, middle, middle - half, middle + half], axis=1)).astype(np.int64)
 
 

@@ -8,7 +8,8 @@ the variance of a pixel is ``mean + dark + read_noise^2 + step^2 / 12``, with ``
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +24,11 @@ _RANGES: dict[str, tuple[float, float]] = {
     "dark_current": (0.0, 1e9),
     "bit_depth": (0, 16),
     "vignetting": (0.0, 1.0),
+    "right_exposure_s": (0.0, 3600.0),
+    "right_gain": (1e-3, 1e6),
+    "right_brightness": (1e-3, 1e3),
 }
+_BRIGHTNESS = (1e-3, 1e3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,12 +54,48 @@ class Sensor:
     """Of the digital numbers; 0: they are not rounded."""
     vignetting: float = 0.0
     """Share of the light that the corners lose; it grows with the square of the distance from the centre."""
+    brightness: tuple[float, float] = (1.0, 1.0)
+    """Of frames 0 and 1 over that of the clean twin: what an automatic exposure does from frame to frame."""
+    right_brightness: float = 1.0
+    """Of the right camera over the left one."""
+    right_exposure_s: float | None = None
+    """Of the right camera; None: as the left one. So is the next."""
+    right_gain: float | None = None
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
-            if not (math.isfinite(value) and low <= value <= high):
+            if value is not None and not (math.isfinite(value) and low <= value <= high):
                 raise ValueError(f"sensor {name} = {value}: allowed is {low:g} to {high:g}")
+        low, high = _BRIGHTNESS
+        if not all(math.isfinite(value) and low <= value <= high for value in self.brightness):
+            raise ValueError(f"sensor brightness = {list(self.brightness)}: allowed is {low:g} to {high:g}")
+
+    def of(self, side: str, frame: int) -> Sensor:
+        """The sensor of one camera at one time, both of whose frames and cameras are alike."""
+        right = side == "right"
+        exposure_s = self.right_exposure_s if right and self.right_exposure_s is not None else self.exposure_s
+        gain = self.right_gain if right and self.right_gain is not None else self.gain
+        light = self.brightness[frame] * (self.right_brightness if right else 1.0)
+        alike = {
+            "brightness": (light, light),
+            "right_brightness": 1.0,
+            "right_exposure_s": None,
+            "right_gain": None,
+        }
+        return replace(self, exposure_s=exposure_s, gain=gain, **alike)  # type: ignore[arg-type]
+
+    @property
+    def longest_s(self) -> float:
+        """Seconds of the longer exposure of the two cameras."""
+        return max(self.exposure_s, self.right_exposure_s or 0.0)
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """As JSON holds it; what both cameras and frames share is told once."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        own = {name: value for name, value in values.items() if name not in _UNEQUAL or value != _UNEQUAL[name]}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in own.items()}
 
     @property
     def white(self) -> float:
@@ -76,11 +117,16 @@ class Sensor:
         return np.asarray((shot + self.read_noise**2 + step**2 / 12) / self.white**2, dtype=np.float64)
 
 
+_UNEQUAL = {"brightness": (1.0, 1.0), "right_brightness": 1.0, "right_exposure_s": None, "right_gain": None}
+"""By which cameras and frames differ, and what it is where they do not."""
+
+
 def fall_off(sensor: Sensor, width: int, height: int, rows: ArrayLike) -> NDArray[np.float64]:
-    """Share of the light that the lens lets through to rows (n) of an image: (n, width)."""
+    """Light on rows (n) of an image over that of its clean twin: (n, width); of one camera and time."""
     x, y = np.arange(width) - (width - 1) / 2, np.asarray(rows) - (height - 1) / 2
     corner = ((width - 1) / 2) ** 2 + ((height - 1) / 2) ** 2
-    return np.asarray(1.0 - sensor.vignetting * (x**2 + y[:, None] ** 2) / max(corner, 1.0), dtype=np.float64)
+    share = 1.0 - sensor.vignetting * (x**2 + y[:, None] ** 2) / max(corner, 1.0)
+    return np.asarray(sensor.brightness[0] * share, dtype=np.float64)
 
 
 def expose(
@@ -92,7 +138,7 @@ def expose(
 
     Args:
         linear: (n, width, 3) light over white, before the lens' fall-off.
-        sensor: see there.
+        sensor: of this camera and time.
         seed: of the image, not negative.
         height: rows of the whole image.
         rows: (n) their numbers.

@@ -37,7 +37,7 @@ def sensed_rows(
         rig: camera and baseline.
         shutter: the middle of a row's exposure is its time.
         motion: of the rig's body.
-        sensor: see there.
+        sensor: of this camera and frame.
         frame_period_s: seconds of a frame period, in which the motion counts.
         side: of the rig.
         frame: 0 or 1.

@@ -15,6 +15,7 @@ from attack.planting import rehash
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.cards import parse_card
+from rsbench.core.rig import VIEWS
 from rsbench.dataset import generation
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.files import write_png
@@ -30,6 +31,8 @@ from rsbench.scenes.model import Scene
 
 NOISY = Sensor(full_well=6000, gain=4, photon_noise=True, read_noise=2.5, bit_depth=10)
 
+UNEVEN = replace(NOISY, right_gain=12, right_exposure_s=0.01, brightness=(1.0, 0.6), right_brightness=0.8)
+
 
 def _card(sensor: Sensor | None, **fields: object) -> DatasetCard:
     smoke = load_dataset_card("smoke")
@@ -39,8 +42,8 @@ def _card(sensor: Sensor | None, **fields: object) -> DatasetCard:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory, built_scene: Callable[[str], Scene]) -> dict[str, Path]:
-    """Folders of one sequence with an ideal sensor, with noise, and with noise and an exposure."""
-    sensors = {"ideal": None, "noisy": NOISY, "exposed": replace(NOISY, exposure_s=0.02)}
+    """Folders of one sequence: an ideal sensor, one with noise, with an exposure too, and two unlike cameras."""
+    sensors = {"ideal": None, "noisy": NOISY, "exposed": replace(NOISY, exposure_s=0.02), "uneven": UNEVEN}
     folders = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(generation, "load_scene", built_scene)
@@ -95,8 +98,28 @@ def test_an_exposure_blurs_what_moves(made: dict[str, Path]) -> None:
     assert steps[1] < 0.9 * steps[0]
 
 
+def test_unlike_cameras_show_the_light_of_their_frames(made: dict[str, Path]) -> None:
+    sequence = read_sequence(made["uneven"])
+    assert sequence.sensor == UNEVEN
+    light = {("left", 0): 1.0, ("left", 1): 0.6, ("right", 0): 0.8, ("right", 1): 0.48}
+    for view in VIEWS:
+        seen, clean = _linear(sequence.image("rs", *view)), _linear(sequence.clean_image(*view))
+        middle = (clean > 0.05) & (clean < 0.8)
+        # 3 % noise of a pixel, thousands of pixels, and a blur that moves light across the bounds.
+        assert np.median(seen[middle] / clean[middle]) == pytest.approx(light[view], rel=0.02)
+
+
+def test_another_brightness_than_the_sensor_s_is_named(made: dict[str, Path]) -> None:
+    sequence = read_sequence(made["uneven"])
+    content = read_content(sequence)
+    wrong = replace(sequence, sensor=replace(UNEVEN, brightness=(1.0, 0.7)))
+    named = [fault.partition(":")[0] for fault in sensor_faults(wrong, content.maps, content.pictures, ())]
+    # The right camera's blur and noise hide it; its rows that are rendered again tell.
+    assert "rs/left_1.png" in named and set(named) <= {"rs/left_1.png", "rs/right_1.png"}
+
+
 def test_such_sequences_are_verified(made: dict[str, Path]) -> None:
-    for name in ("noisy", "exposed"):
+    for name in ("noisy", "exposed", "uneven"):
         (report,) = verify_dataset(made[name].parent)
         assert report.faults == ()
 

@@ -46,6 +46,29 @@ def test_an_ideal_sensor_changes_nothing_but_clips_white() -> None:
     np.testing.assert_allclose(expose(image, Sensor(), 0, 7, np.arange(7)), np.minimum(image, 1.0), atol=1e-15)
 
 
+def test_cameras_and_frames_may_differ() -> None:
+    uneven = replace(PHONE, right_gain=8, right_exposure_s=0.02, brightness=(1.0, 0.5), right_brightness=0.8)
+    left, right = uneven.of("left", 0), uneven.of("right", 1)
+    assert left == PHONE
+    assert (right.gain, right.exposure_s, right.white) == (8, 0.02, 750.0)
+    assert right.of("left", 0) == right.of("left", 1) == right, "of one camera and time there is no other"
+    assert uneven.longest_s == 0.02
+    # Half the light of the frame, four fifths of the camera; the noise is that of so much light at its own gain.
+    seen = _flat(0.6, replace(right, bit_depth=0))
+    expected = float(replace(right, bit_depth=0).variance(0.6 * 0.4))
+    n = seen.size
+    assert abs(seen.mean() - 0.6 * 0.4) < 5 * np.sqrt(expected / n)
+    assert abs(seen.var() / expected - 1) < 5 * np.sqrt(2.1 / n)
+
+
+def test_what_all_share_is_recorded_as_ever() -> None:
+    """Sequences of before had no keys for what differs."""
+    assert "right_gain" not in PHONE.record and "brightness" not in PHONE.record
+    assert PHONE.record["gain"] == 4
+    uneven = replace(PHONE, brightness=(1.0, 0.5))
+    assert uneven.record == PHONE.record | {"brightness": [1.0, 0.5]}
+
+
 def test_a_row_has_the_same_bits_by_itself() -> None:
     image = np.random.default_rng(1).random((12, 9, 3), dtype=np.float32)
     sensor = replace(PHONE, vignetting=0.3)

@@ -193,8 +193,9 @@ def _frame_checks(
         if sequence.sensor is not None and shot.image not in told:
             seen = Picture.of(shot, sequence.image(*shot[:3]), noisy=False)
             geometry = sequence.rig, sequence.shutter, sequence.motion
+            sensor = sequence.sensor.of(shot.side, shot.frame)
             sensed = sensed_rows(
-                scene, *geometry, sequence.sensor, sequence.frame_period_s, shot.side, shot.frame, chosen, rows
+                scene, *geometry, sensor, sequence.frame_period_s, shot.side, shot.frame, chosen, rows
             )
             yield _image_check(shot.image, seen, to_srgb8(sensed, 1.0), rows, elsewhere)
     with contextlib.suppress(RsbenchError):

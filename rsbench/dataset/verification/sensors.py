@@ -25,7 +25,10 @@ _BEYOND_SIGMA, _BEYOND_SHARE, _ROW_SHARE = 5.0, 5e-3, 0.1
 samples of a texture finer than a pixel, or behind a thin near edge, which the twin does not show."""
 _LEAST_VALUES, _VARIANCE_RANGE = 1000, (0.85, 1.2)
 """The variance of 1000 values is known to 4.5 %; five times that, and what a smooth surface changes in a blur."""
+_MOST_BIAS = 0.75
+"""Of the mean, in sigma: where the twin is uneven by less than one sigma, its middle is off by half at most."""
 _UNCLIPPED = (0.03, 0.75)
+_WHITE = 255.0
 
 
 def sensor_faults(
@@ -41,7 +44,8 @@ def sensor_faults(
             fault = png_fault(inside(sequence.folder, shot.image), shot.image, size)
             if fault is None:
                 seen = sequence.image(*shot[:3])
-                fault = _fault(sensor, seen, pictures[shot], _window(sequence, sensor, maps[shot]))
+                own = sensor.of(shot.side, shot.frame)
+                fault = _fault(own, seen, pictures[shot], _window(sequence, own, maps[shot]))
         except RsbenchError as error:
             fault = str(error)
         if fault:
@@ -75,14 +79,17 @@ def _fault(sensor: Sensor, image: NDArray[np.uint8], picture: Picture, window: t
     twin = f"rs_clean/{shot.side}_{shot.frame}.png"
     around = np.ones((2 * window[1] + 1, 2 * window[0] + 1), np.uint8)
     share = fall_off(sensor, width, height, np.arange(height))[..., None]
-    low, high = (linear_of_codes(way(clean, around)) * share for way in (cv2.erode, cv2.dilate))
+    least, most = (way(clean, around) for way in (cv2.erode, cv2.dilate))
+    low = linear_of_codes(least) * share
+    # How bright white is, the twin does not say.
+    high = np.where(most < _WHITE, np.minimum(linear_of_codes(most) * share, 1.0), 1.0)
     seen = linear_of_codes(image)
     # A path tracer's noise is in both, and in each frame another.
     traced = 12.0 * picture.noise**2 if picture.noisy else 0.0
-    own, rounded = sensor.variance(high), (1.0 + traced) * (_rounding(image) + _rounding(clean))
+    own, rounded = sensor.variance(high), (1.0 + traced) * (_rounding(image) + share**2 * _rounding(clean))
     sigma = np.sqrt(own + rounded)
     slack = _BEYOND_SIGMA * sigma
-    beyond = (seen < np.minimum(low, 1.0) - slack) | (seen > np.minimum(high, 1.0) + slack)
+    beyond = (seen < np.minimum(low, 1.0) - slack) | (seen > high + slack)
     rows = np.mean(beyond, axis=(1, 2)) > _ROW_SHARE
     if np.mean(beyond) > _BEYOND_SHARE or np.any(rows):
         what = (
@@ -93,7 +100,11 @@ def _fault(sensor: Sensor, image: NDArray[np.uint8], picture: Picture, window: t
     smooth = (high - low < sigma) & (low > _UNCLIPPED[0]) & (high < _UNCLIPPED[1]) & (own > rounded)
     if np.sum(smooth) < _LEAST_VALUES:
         return None
-    ratio = float(np.var(((seen - 0.5 * (low + high)) / sigma)[smooth]))
+    beside = ((seen - 0.5 * (low + high)) / sigma)[smooth]
+    if abs(bias := float(np.mean(beside))) > _MOST_BIAS:
+        what = f"is {'brighter' if bias > 0 else 'darker'} than its sensor shows {twin}, by {abs(bias):.2f} sigma"
+        return finding(shot.image, what)
+    ratio = float(np.var(beside))
     if not _VARIANCE_RANGE[0] < ratio < _VARIANCE_RANGE[1]:
         return finding(
             shot.image, f"its noise has {ratio:.2f} times the variance of the sensor's, seen beside {twin}"
