@@ -45,7 +45,8 @@ def make_up(card: Path, out: Path) -> None:
     from rsbench.dataset import generation
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.sequence import RELATIVE_FILES
-    from rsbench.renderers import scene
+    from rsbench.dataset.stage import Built
+    from rsbench.renderers import passage, scene
 
     def render(*arguments: Any) -> Iterator[None]:
         side, frame, folder = arguments[-3:]
@@ -55,9 +56,10 @@ def make_up(card: Path, out: Path) -> None:
         yield
         yield
 
-    nothing = SimpleNamespace(viewpoints={"default": None}, seen_from=lambda viewpoint: viewpoint)
-    vars(generation)["_build"] = lambda name: generation._Built(nothing, "0" * 64)  # type: ignore[arg-type]
-    vars(generation)["_render_camera"] = render
+    nothing = SimpleNamespace(viewpoints={"default": None}, seen_from=lambda *place: place)
+    vars(generation)["build_scene"] = lambda name: Built(nothing, "0" * 64)  # type: ignore[arg-type]
+    vars(generation)["render_camera"] = render
+    vars(passage)["obstacle"] = lambda *moving: ""
     vars(scene)["MitsubaScene"] = lambda scene: None
     generation.generate_dataset(load_dataset_card(str(card)), out)
 
@@ -66,8 +68,9 @@ def resume(card: Path, out: Path, rehash: bool) -> None:
     """In a process of its own: resume, and print seconds and the largest memory, MB."""
     from rsbench.dataset import generation
     from rsbench.dataset.card import load_dataset_card
+    from rsbench.dataset.stage import Built
 
-    vars(generation)["_build"] = lambda name: generation._Built(None, "0" * 64)  # type: ignore[arg-type]
+    vars(generation)["build_scene"] = lambda name: Built(None, "0" * 64)  # type: ignore[arg-type]
     start, processor = time.perf_counter(), time.process_time()
     assert generation.generate_dataset(load_dataset_card(str(card)), out, rehash=rehash) == []
     seconds, processor = time.perf_counter() - start, time.process_time() - processor
