@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.projection import ProjectionStatus, RSProjection, project_at, rs_project
+from rsbench.core.projection import RSProjection, project_at, rs_project
 from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channel_truth import Rays
@@ -21,9 +21,9 @@ from rsbench.errors import RsbenchError
 
 _SAME, _SAME_PX = 1e-9, 1e-6
 """Relative distance of points, and px: roundings, and the 1e-9 px to which rows are solved over a small slope."""
-_BEFORE, _BEHIND, _FEW = 1e-2, 1e-2, 0.02
+_BEFORE, _BEHIND, _FEW = 1e-2, 1e-2, 0.15
 """Relative distance beyond which a point is before or behind all that the pixels around it see; the share that may
-be, by what is thinner than a pixel."""
+be, by what is thinner than a pixel: leaves far away, and gaps between them."""
 _FEW_AGAIN, _LEAST = 5e-3, 4
 
 
@@ -69,7 +69,7 @@ def _pixel_faults(sequence: Sequence, tracks: Tracks, k: int, found: RSProjectio
     """Known where and only where a row sees the point; and where that row sees it."""
     pixels, tau, classes, view = tracks.pixels[:, k], tracks.tau[:, k], tracks.classes[:, k], TRACK_VIEWS[k]
     known, own = np.isin(classes, (PixelClass.VISIBLE, PixelClass.OCCLUDED)), tracks.sources == k
-    seen = found.status != ProjectionStatus.NEVER
+    seen = np.isfinite(found.tau)
     wrong = (known != np.all(np.isfinite(pixels), axis=1)) | (known != (seen | own)) | (known != np.isfinite(tau))
     if np.any(wrong):
         yield finding(file, f"{np.sum(wrong)} points are wrongly in or out of view")
