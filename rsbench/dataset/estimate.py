@@ -45,8 +45,9 @@ def estimate_dataset(card: DatasetCard, progress: Callable[[str], None]) -> Esti
     """
     options = load_card(RendererOptions, "renderers", card.renderer)
     found: list[Estimate] = []
+    warm: set[str] = set()
     for scene, group in groupby(sorted(card.sequence, key=scene_name), key=scene_name):
-        found.append(_of_scene(card, list(group), options, warm=bool(found)))
+        found.append(_of_scene(card, list(group), options, warm))
         progress(scene)
     total = _sum(found)
     return replace(total, files=total.files + 1, bytes=total.bytes + _LISTED_BYTES * (total.files + 1))
@@ -61,8 +62,10 @@ def _sum(parts: list[Estimate]) -> Estimate:
     )
 
 
-def _of_scene(card: DatasetCard, sequences: list[SequenceCard], options: RendererOptions, warm: bool) -> Estimate:
-    """Of the sequences of one scene: a trial of each kind that takes another time or other files."""
+def _of_scene(
+    card: DatasetCard, sequences: list[SequenceCard], options: RendererOptions, warm: set[str]
+) -> Estimate:
+    """Of the sequences of one scene: a trial with each sensor. ``warm``: those whose kernels are compiled."""
     from rsbench.renderers.scene import MitsubaScene
 
     start = time.monotonic()
@@ -75,8 +78,9 @@ def _of_scene(card: DatasetCard, sequences: list[SequenceCard], options: Rendere
     for sequence in sequences:
         kinds.setdefault(repr(card.sensor_of(sequence)), []).append(sequence)
     tried: list[Estimate] = []
-    for kind in kinds.values():
-        tried.append(_of_kind(card, kind, options, rendered, warm=warm and not tried))
+    for kind, alike in kinds.items():
+        tried.append(_of_kind(card, alike, options, rendered, warm=kind in warm))
+        warm.add(kind)
     total = _sum(tried)
     return replace(total, seconds=total.seconds + built - start + places * (loaded - built))
 
@@ -84,7 +88,7 @@ def _of_scene(card: DatasetCard, sequences: list[SequenceCard], options: Rendere
 def _of_kind(
     card: DatasetCard, sequences: list[SequenceCard], options: RendererOptions, scene: MitsubaScene, warm: bool
 ) -> Estimate:
-    """Of sequences of one sensor; the first image of all compiles, which is counted once."""
+    """Of sequences of one sensor; its first image compiles, which is counted once."""
     own = files_of(card.manifest_of(sequences[0]))
     with tempfile.TemporaryDirectory(prefix="rsbench-") as temporary:
         for folder in {Path(name).parent for name in own}:

@@ -1,0 +1,41 @@
+"""What ``--estimate`` tries and counts; that it is near what is rendered: test_generation.py."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rsbench.dataset import estimate
+from rsbench.dataset.card import DatasetCard, SequenceCard, load_dataset_card
+from rsbench.dataset.sequence import files_of
+from rsbench.dataset.stage import Built
+from rsbench.renderers import scene as renderer
+
+
+def test_every_sensor_of_a_scene_is_tried_and_stands_for_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = []
+
+    def render(card: DatasetCard, sequence: SequenceCard, *rest: Any) -> Iterator[None]:
+        side, frame, folder = rest[-3:]
+        real = card.sensor_of(sequence) is not None
+        tried.append((sequence.scene, real))
+        Path(folder, "rs", f"{side}_{frame}.png").write_bytes(b"x" * (300 if real else 100))
+        yield
+
+    place: Any = SimpleNamespace(viewpoints={"default": None, "windows": None}, seen_from=lambda *place: place)
+    monkeypatch.setattr(estimate, "build_scene", lambda name: Built(place, ""))
+    monkeypatch.setattr(estimate, "render_camera", render)
+    monkeypatch.setattr(renderer, "MitsubaScene", lambda seen: seen)
+    card = load_dataset_card("standard")
+    found = estimate.estimate_dataset(card, lambda scene: None)
+    scenes = {sequence.scene for sequence in card.sequence}
+    assert set(tried) == {(scene, real) for scene in scenes for real in (False, True)}
+    # The first picture of each sensor is made twice, for it compiles.
+    assert len(tried) == 2 * len(scenes) + 2
+    files = 1 + sum(1 + len(files_of(card.manifest_of(sequence))) for sequence in card.sequence)
+    assert (found.sequences, found.files) == (216, files)
+    assert found.bytes == 4 * 108 * (100 + 300) + 200 * files
