@@ -15,7 +15,7 @@ PairChannel = Literal["disparity", "flow", "gs_flow"]
 """Where each pixel of a rolling-shutter frame lies in another picture: of the other camera at the same time
 (disparity), of the same camera at the other time (flow), and of its global-shutter twin (gs_flow)."""
 Channel = Literal["disparity", "flow", "gs_flow", "timing", "normals", "instances", "imu", "tracks", "hdr"]
-OF_ANY_CAMERA: tuple[Channel, ...] = ("timing", "imu", "tracks", "hdr")
+
 INSTANCE_TABLE, TRACKS = "instances.json", "tracks.npz"
 PAIR_CHANNELS: tuple[PairChannel, ...] = get_args(PairChannel)
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
@@ -50,13 +50,14 @@ def check_channels(names: Collection[str], lens: bool, plain: bool) -> None:
     Raises:
         ValueError: one line with the channel.
     """
-    for name in CHANNELS:
-        if name in names and name not in OF_ANY_CAMERA and not plain:
-            raise ValueError(
-                f"channels: {name!r} is made of cameras that read rows from the top at once, and no other"
-            )
-        if name in names and name == "disparity" and lens:
-            raise ValueError(f"channels: {name!r} is made of cameras without a lens, whose pairs share their rows")
+    if "disparity" not in names:
+        return
+    if not plain:
+        raise ValueError(
+            "channels: 'disparity' is made of cameras that read rows from the top at once, and no other"
+        )
+    if lens:
+        raise ValueError("channels: 'disparity' is made of cameras without a lens, whose pairs share their rows")
 
 
 def value_file(channel: PairChannel, side: str, frame: int, row: int = 0) -> str:
