@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run_here
 
 from rsbench.benchmark.images.evaluation import open_evaluation, read_scores
 from rsbench.benchmark.images.plan import EvaluationOptions
@@ -22,14 +24,16 @@ from rsbench.core.rig import SIDES, VIEWS
 from rsbench.dataset import generation
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.channels import Channel
+from rsbench.dataset.files import read_png
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.sequence import FRAMES, read_sequence
+from rsbench.dataset.sequence import FRAMES, Sequence, read_sequence
 from rsbench.dataset.verification import verify_dataset
 from rsbench.dataset.verification.poses import pose_faults
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.scenes.model import Scene
+from rsbench.vision.quality import psnr
 
 BARREL = Lens(model="brown-conrady", k1=-0.22, k2=0.05, p1=0.001)
 FISHEYE = Lens(model="kannala-brandt", k1=-0.03, k2=0.01)
@@ -133,6 +137,53 @@ def test_the_whole_way_through_a_lens(made: dict[str, Path], tmp_path: Path) -> 
     # The twin has the same lens: nothing but the resampling of these small images is between them.
     assert images["rs-stereo-refined-twist", "sgm"] > images["none", "none"] + 3.0
     assert images["true", "true"] > images["rs-stereo-refined-twist", "sgm"] - 0.5
+
+
+RIG = """
+baseline = {baseline}
+readout_ratio = {ratio}
+[camera]
+fx = 110.0
+fy = 110.0
+cx = 63.5
+cy = 47.5
+lens = {{ model = "brown-conrady", k1 = -0.22, k2 = 0.05, p1 = 0.001 }}
+"""
+
+
+def _correct(sequence: Sequence, rig: Path, out: Path) -> subprocess.CompletedProcess[str]:
+    frames = [sequence.folder / "rs" / f"{side}_{frame}.png" for frame in FRAMES for side in SIDES]
+    return run_here("correct", *frames, "--rig", rig, "--out", out, "--solver", "rs-stereo-refined-twist")
+
+
+def test_correct_takes_frames_with_distortion(made: dict[str, Path], tmp_path: Path) -> None:
+    sequence, rig = read_sequence(made["barrel"] / "room-twist"), tmp_path / "rig.toml"
+    rig.write_text(RIG.format(baseline=sequence.rig.baseline, ratio=sequence.shutter.readout_ratio))
+    done = _correct(sequence, rig, tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    twin, frame = sequence.image("gs", "left", 1), sequence.image("rs", "left", 1)
+    corrected = read_png(tmp_path / "out" / "corrected" / "left_1.png")
+    drawn = read_png(tmp_path / "out" / "mask" / "left_1.png")[..., 0] == 255
+    assert np.mean(drawn) > 0.8
+    # The twin has the lens, and so has the corrected frame.
+    assert psnr(corrected, twin, drawn) > psnr(frame, twin, drawn) + 3.0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("readout_ratio = 0.8", "", "readout_ratio: must be given with camera.lens = 'brown-conrady'"),
+        ("[camera]", "right_delay = 0.1\n[camera]", "right_delay = 0.1: depth is found where both cameras read"),
+        ("[camera]", "disparity_offset = 1.0\n[camera]", "disparity_offset = 1.0: must be 0 with camera.lens"),
+        ("k1 = -0.22", "k1 = -0.9", "--rig: of images of 128 x 96 pixels: camera lens: the brown-conrady"),
+    ],
+)
+def test_correct_refuses_by_name(made: dict[str, Path], tmp_path: Path, old: str, new: str, said: str) -> None:
+    sequence, rig = read_sequence(made["barrel"] / "room-twist"), tmp_path / "rig.toml"
+    rig.write_text(RIG.format(baseline=0.3, ratio=0.8).replace(old, new))
+    done = _correct(sequence, rig, tmp_path / "out")
+    assert done.returncode == 2 and said in done.stderr and done.stderr.count("\n") == 1, done.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_late_camera_has_no_depth_and_says_why(made: dict[str, Path], tmp_path: Path) -> None:
