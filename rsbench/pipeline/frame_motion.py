@@ -106,8 +106,7 @@ def match_frames(
     """
     scanning = scanning or Scanning()
     if judge_rig and scanning.rows_together:
-        left, right = (undistorted(images[side, 0], rig.camera) for side in SIDES)
-        check_rig(left, right, rig.ideal)
+        check_rig(images["left", 0], images["right", 0], rig)
     matches = find_matches_of_rig(images, rig, scanning, options)
     temporal = max(len(matches.left) + len(matches.right), 2 * len(matches.tracks))
     if temporal < _FEWEST_MATCHES:

@@ -18,6 +18,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.frame_depth import eight_bit
 from rsbench.vision.features import Gate, MatchOptions, detect, match
+from rsbench.vision.undistortion import undistorted
 
 _FEWEST = 30
 """Left-right matches below which nothing is said of the rig."""
@@ -86,7 +87,7 @@ def row_pattern(stereo: FloatArray, rig: StereoRig) -> RowPattern | None:
 
 
 def check_rig(left: NDArray[np.generic], right: NDArray[np.generic], rig: StereoRig) -> None:
-    """Whether two images (H, W[, 3]) can be the left and the right one of a rectified rig at one time.
+    """Whether two images (H, W[, 3]) can be the left and right one of a rectified rig at one time, lens or not.
 
     Too few matches say nothing.
 
@@ -94,25 +95,29 @@ def check_rig(left: NDArray[np.generic], right: NDArray[np.generic], rig: Stereo
         RefusedFramesError: the sides are exchanged, the lens is not undistorted, or the rows do not agree.
     """
     height, width = left.shape[:2]
-    options = MatchOptions()
-    a, b = (detect(level, options) for level in eight_bit([left, right]))
+    options, camera = MatchOptions(), rig.camera
+    a, b = (detect(undistorted(level, camera), options) for level in eight_bit([left, right]))
     anywhere = Gate(dx=(-float(width), float(width)), dy=(-float(height), float(height)))
     pairs = match(a, b, anywhere, options)
-    if len(pairs) < _FEWEST:
+    ends = a.points[pairs[:, 0]], b.points[pairs[:, 1]]
+    # Beyond the borders of what the lens shows there is a mirror of it.
+    shown = np.logical_and.reduce([camera.contains(camera.lens_pixels(end)) for end in ends])
+    if np.count_nonzero(shown) < _FEWEST:
         return
-    judge_stereo(
-        np.concatenate([a.points[pairs[:, 0]], b.points[pairs[:, 1]]], axis=1), rig, options.row_tolerance
-    )
+    judge_stereo(np.concatenate(ends, axis=1)[shown], rig, options.row_tolerance)
 
 
 def judge_stereo(stereo: FloatArray, rig: StereoRig, row_tolerance: float) -> None:
-    """``check_rig`` of left-right matches (n, 4) that were looked for in the whole image."""
+    """``check_rig`` of left-right matches (n, 4), ideal px, that were looked for in the whole image.
+
+    Distortion is looked for where no lens is given: a given one is taken for calibrated.
+    """
     share = float(np.mean(np.abs(stereo[:, 1] - stereo[:, 3]) <= row_tolerance))
-    pattern = row_pattern(stereo, rig)
+    pattern = row_pattern(stereo, rig) if rig.camera.lens is None else None
     if pattern is not None and _is_distorted(pattern, share):
         raise RefusedFramesError(
             f"the row differences of left and right matches show a lens that was not undistorted (k1 about "
-            f"{pattern.distortion:.2f}); undistort and rectify the images first"
+            f"{pattern.distortion:.2f}); give the lens, or undistort and rectify the images first"
         )
     if share < _SAME_ROW:
         raise RefusedFramesError(
