@@ -77,6 +77,7 @@ def _card(rng: np.random.Generator, number: int, scene: str, folder: Path, seque
         right_delay=scanning.right_delay,
         sensor=_sensor(rng, period),
         channels=_channels(rng, camera, scanning),
+        twins=("middle", "last") if rng.random() < 0.3 and _in_one_direction(scanning) else (),
         motion=_motion(rng),
         renderer=str(folder / f"{'traced' if number % 2 else rng.choice(DIRECT)}.toml"),
         seed=int(rng.integers(1000)),
@@ -116,6 +117,11 @@ def _scanning(rng: np.random.Generator) -> Scanning:
     scan, right = (get_args(Scan)[k] for k in rng.integers(len(get_args(Scan)), size=2))
     delay = float(rng.choice([0.0, rng.uniform(-0.5, 0.5)]))
     return Scanning(scan=scan, right_scan=rng.choice([None, right]), right_delay=delay)
+
+
+def _in_one_direction(scanning: Scanning) -> bool:
+    """Whether both cameras read rows, or both columns."""
+    return len({scan in ("top", "bottom") for scan in (scanning.scan, scanning.right_scan or scanning.scan)}) == 1
 
 
 def _sensor(rng: np.random.Generator, period: float) -> Sensor | None:
@@ -182,6 +188,7 @@ def _words(card: DatasetCard) -> str:
     words += [card.camera.lens.model] if card.camera.lens else []
     words += [] if card.plain else [f"{card.scan}/{card.right_scan}/{card.right_delay:.2f}"]
     words += [f"exposure {card.sensor.exposure_s:.3f}"] if card.sensor else []
+    words += ["twins"] if card.twins else []
     return ", ".join([*words, *card.channels])
 
 

@@ -355,7 +355,7 @@ def _thin_faults() -> Iterator[Fault]:
             ("shifted by two pixels", shifted(0, 2)),
             ("left to right", _but_first_line("left", "thin", np.fliplr)),
         ):
-            yield Fault(f"{file} {name}", depth_of("rs", view, change), (file, "depth differs"))
+            yield Fault(f"{file} {name}", depth_of("rs", view, change), (file, "differs"))
     every = _all(
         *(
             depth_of(shutter, f"{side}_{frame}", noised(1e-2, slice(None)))

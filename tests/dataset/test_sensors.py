@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 from attack.planting import rehash
+from numpy.typing import NDArray
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.cards import parse_card
@@ -21,8 +22,9 @@ from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.files import write_png
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_sequence
-from rsbench.dataset.verification import rerender, verify_dataset
+from rsbench.dataset.verification import rerender, sensors, verify_dataset
 from rsbench.dataset.verification.content import read_content
+from rsbench.dataset.verification.image_checks import Picture
 from rsbench.dataset.verification.landing import Shot
 from rsbench.dataset.verification.sensors import sensor_faults
 from rsbench.errors import RsbenchError
@@ -193,6 +195,28 @@ def test_an_exposure_without_noise_is_no_fault(tmp_path: Path) -> None:
     generate_dataset(load_dataset_card(str(card)), tmp_path / "out")
     content = read_content(read_sequence(tmp_path / "out" / "grey"), set())
     assert list(sensor_faults(content.sequence, content.maps, content.pictures, ())) == []
+
+
+def _flat(code: int) -> NDArray[np.uint8]:
+    return np.full((40, 40, 3), code, np.uint8)
+
+
+def test_what_a_sensor_may_show_beyond_its_clean_twin() -> None:
+    """Of a twin that is white where the light was brighter, of a path tracer's noise, and of what comes in."""
+    shot, rng = Shot("rs", "left", 0), np.random.default_rng(3)
+    rough = [np.clip(120 + 6 * rng.standard_normal((40, 40, 3)), 0, 255).astype(np.uint8) for _ in range(2)]
+    below, above = np.split(_flat(60), [2])[1], _flat(200)[:2]
+    blurred = np.concatenate([above, below])
+    for sensor, image, clean, noisy, window, allowed in (
+        (Sensor(vignetting=0.5), _flat(255), _flat(255), False, (0, 0), True),
+        (Sensor(vignetting=0.5), _flat(250), _flat(250), False, (0, 0), False),
+        (Sensor(), rough[0], rough[1], True, (0, 0), True),
+        (Sensor(), rough[0], rough[1], False, (0, 0), False),
+        (Sensor(exposure_s=0.01), blurred, _flat(60), False, (0, 2), True),
+        (Sensor(exposure_s=0.01), blurred, _flat(60), False, (0, 1), False),
+    ):
+        found = sensors._fault(sensor, image, Picture.of(shot, clean, noisy), window)
+        assert (found is None) == allowed, (sensor, noisy, window, found)
 
 
 def test_a_card_says_what_its_sensor_cannot_be() -> None:

@@ -196,13 +196,19 @@ def _many(
 
 
 def _many_thin(wrong: BoolArray, among: BoolArray) -> bool:
-    return _many(wrong, among, _FEW_THIN, _OF_A_THIN_ROW, _OF_ITS_WIDTH)
+    return _many(wrong, among, _or_a_line(_FEW_THIN, among), _OF_A_THIN_ROW, _OF_ITS_WIDTH)
 
 
 def _many_gaps(in_view: BoolArray, wrong: BoolArray, behind: BoolArray) -> bool:
     """Too many for what is hidden, and for what is ``in_view`` (H, W)."""
     of_hidden = _many(wrong, behind, _FEW_GAPS, _OF_A_THIN_ROW, _OF_ITS_WIDTH)
-    return of_hidden and _many(wrong, in_view, _FEW_SHOWN, _OF_A_THIN_ROW, _OF_ITS_WIDTH)
+    few = _or_a_line(_FEW_SHOWN, in_view)
+    return of_hidden and _many(wrong, in_view, few, _OF_A_THIN_ROW, _OF_ITS_WIDTH)
+
+
+def _or_a_line(few: float, among: BoolArray) -> float:
+    """A share of these pixels, at least that of one joint from end to end of the picture."""
+    return max(few, max(among.shape) / max(1, int(np.sum(among))))
 
 
 def _percent(wrong: BoolArray, among: BoolArray) -> str:

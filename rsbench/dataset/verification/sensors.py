@@ -90,11 +90,14 @@ def _fault(sensor: Sensor, image: NDArray[np.uint8], picture: Picture, window: t
     sigma = np.sqrt(own + rounded)
     slack = _BEYOND_SIGMA * sigma
     beyond = (seen < np.minimum(low, 1.0) - slack) | (seen > high + slack)
-    rows = np.mean(beyond, axis=(1, 2)) > _ROW_SHARE
-    if np.mean(beyond) > _BEYOND_SHARE or np.any(rows):
-        what = (
-            f"{100 * np.mean(beyond):.2f} % of the values are beyond {_BEYOND_SIGMA:g} sigma of what {twin} allows"
-        )
+    # What the twin does not show may come in over its borders.
+    inner = np.s_[window[1] : height - window[1], window[0] : width - window[0]]
+    if not beyond[inner].size:
+        return None
+    many, rows = float(np.mean(beyond[inner])), np.zeros(height, dtype=np.bool_)
+    rows[inner[0]] = np.mean(beyond[inner], axis=(1, 2)) > _ROW_SHARE
+    if many > _BEYOND_SHARE or np.any(rows):
+        what = f"{100 * many:.2f} % of the values are beyond {_BEYOND_SIGMA:g} sigma of what {twin} allows"
         return finding(shot.image, what, rows_of(rows))
     # Rounding is no noise: without any beside it, equal values are rounded alike.
     smooth = (high - low < sigma) & (low > _UNCLIPPED[0]) & (high < _UNCLIPPED[1]) & (own > rounded)
