@@ -64,12 +64,13 @@ def start_backend(preference: Preference = "auto") -> Backend:
 
     Raises:
         RsbenchError: unknown preference; a backend asked for by name does not work here; another backend has
-            already been started in this process.
+            already been started in this process; the working folder is gone.
     """
     global _started
     wanted = _wanted(preference)
     with _lock:
         if _started is None:
+            _check_working_folder()
             chosen, candidate = _adopted() or _choose(wanted)
             if candidate is not None:
                 llvm.load(candidate)
@@ -80,6 +81,14 @@ def start_backend(preference: Preference = "auto") -> Backend:
                 f"renderer backend {wanted!r} cannot start: this process already renders with {_started.variant}"
             )
         return _started
+
+
+def _check_working_folder() -> None:
+    """Without one Mitsuba ends the process as it is imported."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise RsbenchError(f"the working folder, which must exist: {error.strerror}; go to another") from error
 
 
 def _wanted(preference: str) -> Preference:

@@ -225,7 +225,8 @@ def _digest(path: Path) -> str:
 def contents(folder: Path) -> dict[str, str]:
     """Hashes of all files of a result, hidden ones too.
 
-    Left out are ``MACHINE``, the lock, seconds/ of sweeps, and what motion.json and its page say of seconds.
+    Left out are ``MACHINE``, the lock, seconds/ of sweeps, what motion.json and its page say of seconds, and the
+    command on a page, which names ``--out``.
     """
     found = {}
     for path in sorted(folder.rglob("*")):
@@ -238,6 +239,6 @@ def contents(folder: Path) -> dict[str, str]:
             record.pop("seconds", None)
             found[name] = json.dumps(record)
         elif path.name == "report.html":
-            page = re.sub(r"&#34;seconds&#34;: {[^}]*}", "", path.read_text("utf-8"))
+            page = re.sub(r"&#34;(seconds&#34;: {[^}]*}|command&#34;: .*)", "", path.read_text("utf-8"))
             found[name] = hashlib.sha256(page.encode()).hexdigest()
     return found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes.util
+import errno
 import importlib.metadata
 import json
 import os
@@ -181,6 +182,16 @@ def test_a_child_that_hangs_is_given_up() -> None:
     begin = time.perf_counter()
     verdict = llvm.run_child("import time; time.sleep(60)", [], {}, 0.5)
     assert not verdict.ok and "0.5 s" in verdict.reason and time.perf_counter() - begin < 20
+
+
+def test_a_working_folder_that_is_gone_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone() -> str:
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory")
+
+    monkeypatch.setattr(backend, "_started", None)
+    monkeypatch.setattr(os, "getcwd", gone)
+    with pytest.raises(RsbenchError, match="the working folder, which must exist: No such file or directory"):
+        start_backend()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere nothing ends a child whose parent was killed")

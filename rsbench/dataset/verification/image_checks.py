@@ -74,6 +74,9 @@ CHANGES = (
     Change("turned upside down", flip_x=True, flip_y=True),
     *(Change("channels exchanged", order=order) for order in _PERMUTATIONS),
 )
+_SHIFTS = slice(1, 5)
+"""A path tracer's frame and its global-shutter twin, whose pixels have the same noise, cannot tell these: where
+the surface moves by about a pixel, the noise looks shifted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +133,9 @@ class Likeness:
     """(C, B) standard error of what each change gains over none."""
     plain: NDArray[np.float64]
     """(B,) what the best single colour would cost."""
-    refuted: BoolArray | None = None
-    """(C, B) changes of the source that another partner of it clearly speaks against, see ``heard``."""
+    refuted: BoolArray
+    """(C, B) changes of the source that this pair cannot tell, or that another partner clearly speaks against, see
+    ``heard``."""
 
     @property
     def judged(self) -> BoolArray:
@@ -140,7 +144,7 @@ class Likeness:
     @property
     def better(self) -> NDArray[np.int64]:
         """(B,) number of the change that explains a band better than none; 0 for none."""
-        costs = self.costs if self.refuted is None else np.where(self.refuted, np.inf, self.costs)
+        costs = np.where(self.refuted, np.inf, self.costs)
         best, bands = np.argmin(costs, axis=0), np.arange(costs.shape[1])
         least, needed = costs[best, bands], np.maximum(_GAIN, _CHANCE * self.errors[best, bands])
         typical = np.minimum(self.costs[0], self.plain)
@@ -217,7 +221,10 @@ def compare(
     share = np.bincount(bands[y], weights=beyond, minlength=count) / np.maximum(pixels, 1)
     every = slice(None, None, max(1, len(y) // _SAMPLES))
     costs = _costs(source.colours, y[every], x[every], shown[every], bands[y[every]], count)
-    return Likeness(source.shot, target.shot, pixels.astype(np.float64), share, *costs)
+    refuted = np.zeros(costs[0].shape, dtype=np.bool_)
+    if source.noisy and source.shot[1:3] == target.shot[1:3]:
+        refuted[_SHIFTS] = True
+    return Likeness(source.shot, target.shot, pixels.astype(np.float64), share, *costs, refuted)
 
 
 def _costs(
@@ -253,7 +260,7 @@ def heard(likenesses: list[Likeness]) -> list[Likeness]:
     result = []
     for each in likenesses:
         others = [other.worse for other in likenesses if other.source == each.source and other is not each]
-        result.append(replace(each, refuted=np.any(others, axis=0)) if others else each)
+        result.append(replace(each, refuted=np.any([each.refuted, *others], axis=0)))
     return result
 
 

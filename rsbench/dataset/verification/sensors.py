@@ -22,7 +22,8 @@ from rsbench.renderers.image import linear_of_codes
 
 _BEYOND_SIGMA, _BEYOND_SHARE, _ROW_SHARE = 5.0, 5e-3, 0.1
 """Of Gaussian noise 6e-7 are beyond, of Poisson numbers in the dark more; and a blur sees what lies between the
-samples of a texture finer than a pixel, or behind a thin near edge, which the twin does not show."""
+samples of a texture finer than a pixel, or behind a thin near edge, which the twin does not show. This share
+is for four samples, and grows with the distance between them."""
 _LEAST_VALUES, _VARIANCE_RANGE = 1000, (0.85, 1.2)
 """The variance of 1000 values is known to 4.5 %; five times that, and what a smooth surface changes in a blur."""
 _MOST_BIAS = 0.75
@@ -44,15 +45,23 @@ def sensor_faults(
             fault = png_fault(inside(sequence.folder, shot.image), shot.image, size)
             if fault is None:
                 seen = sequence.image(*shot[:3])
-                own = sensor.of(shot.side, shot.frame)
-                fault = _fault(own, seen, pictures[shot], _window(sequence, own, maps[shot]))
+                own, spacing = sensor.of(shot.side, shot.frame), _spacing(sequence)
+                window = _window(sequence, own, maps[shot], spacing)
+                fault = _fault(own, seen, pictures[shot], window, spacing)
         except RsbenchError as error:
             fault = str(error)
         if fault:
             yield fault
 
 
-def _window(sequence: Sequence, sensor: Sensor, depth_map: DepthMap) -> tuple[int, int]:
+def _spacing(sequence: Sequence) -> float:
+    """Pixels between the samples of the clean twin, which shows nothing that lies between."""
+    renderer = sequence.manifest.get("renderer")
+    samples = renderer.get("samples") if isinstance(renderer, dict) else None
+    return float(samples**-0.5) if isinstance(samples, int) and samples > 0 else 1.0
+
+
+def _window(sequence: Sequence, sensor: Sensor, depth_map: DepthMap, spacing: float) -> tuple[int, int]:
     """How far (x, y) a surface may be, in whole pixels, from where the row's time sees it, while it is exposed."""
     if not sensor.exposure_s:
         return 0, 0
@@ -68,12 +77,14 @@ def _window(sequence: Sequence, sensor: Sensor, depth_map: DepthMap) -> tuple[in
         np.abs(project_at(sequence.rig, sequence.motion, shot.side, tau + sign * half, X)[..., :2] - grid)
         for sign in (-1.0, 1.0)
     ]
-    # One more: a pixel is an area, and thin near things lie between the points looked at.
-    x, y = np.ceil(np.nanmax(np.stack(moved), axis=(0, 1, 2))).astype(int) + 1
+    # One more: a pixel is an area, and thin near things lie between the points looked at; and between samples.
+    x, y = np.ceil(np.nanmax(np.stack(moved), axis=(0, 1, 2))).astype(int) + 1 + int(spacing)
     return int(x), int(y)
 
 
-def _fault(sensor: Sensor, image: NDArray[np.uint8], picture: Picture, window: tuple[int, int]) -> str | None:
+def _fault(
+    sensor: Sensor, image: NDArray[np.uint8], picture: Picture, window: tuple[int, int], spacing: float = 0.5
+) -> str | None:
     shot, clean = picture.shot, picture.colours
     height, width = clean.shape[:2]
     twin = f"rs_clean/{shot.side}_{shot.frame}.png"
@@ -96,7 +107,7 @@ def _fault(sensor: Sensor, image: NDArray[np.uint8], picture: Picture, window: t
         return None
     many, rows = float(np.mean(beyond[inner])), np.zeros(height, dtype=np.bool_)
     rows[inner[0]] = np.mean(beyond[inner], axis=(1, 2)) > _ROW_SHARE
-    if many > _BEYOND_SHARE or np.any(rows):
+    if many > _BEYOND_SHARE * max(1.0, 2.0 * spacing) or np.any(rows):
         what = f"{100 * many:.2f} % of the values are beyond {_BEYOND_SIGMA:g} sigma of what {twin} allows"
         return finding(shot.image, what, rows_of(rows))
     # Rounding is no noise: without any beside it, equal values are rounded alike.

@@ -9,7 +9,7 @@ import numpy as np
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.shots import Shot
-from rsbench.dataset.verification.content import Content, clean_file, read_shot
+from rsbench.dataset.verification.content import Content, clean_file, read_shot, spare_pixels
 from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.dataset.verification.landing import DEPTH_TOLERANCE, BoolArray, land
 
@@ -49,12 +49,12 @@ def _shared_line_faults(content: Content, twins: Content, source: Shot, twin: Sh
             np.take(each.colours, line, axis) for each in (twins.pictures[twin], content.pictures[source])
         )
         unlike = np.any(own != other, axis=-1)
-        if np.any(unlike):
+        if np.sum(unlike) > spare_pixels(axis, unlike.size):
             of = clean_file(content.sequence, source)
             yield finding(twin.image, f"{words} {of}: {np.sum(unlike)} pixels at the same pose")
     if source in content.maps and twin in twins.maps:
         own, other = (np.take(each.depth, line, axis) for each in (twins.maps[twin], content.maps[source]))
-        if not np.array_equal(own, other):
+        if np.sum(own != other) > spare_pixels(axis, own.size):
             far = np.max(np.abs(own - other))
             yield finding(twin.depth, f"{words} {source.depth}: by up to {far:.3g} m at the same pose")
 
