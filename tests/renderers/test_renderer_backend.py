@@ -174,7 +174,8 @@ def test_unsuitable_system_llvm_ends_only_the_child() -> None:
     if not old:
         pytest.skip(f"no LLVM older than {llvm.MINIMUM_VERSION} on this machine")
     for path in old:
-        verdict = llvm.probe(Candidate(path=path, source="system"))
+        # LLVM 14 loops now and then instead of failing.
+        verdict = llvm.probe(Candidate(path=path, source="system"), timeout=3.0)
         assert not verdict.ok and verdict.reason
 
 
