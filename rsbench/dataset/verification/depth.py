@@ -14,6 +14,7 @@ from rsbench.dataset.verification.landing import DEPTH_TOLERANCE, BoolArray, Dep
 
 Bits = NDArray[np.uint8]
 
+UNCOMPARED = "nothing can be compared with another frame"
 NEAR_MISS = 1e-3
 """A surface hidden by less than this is a disagreement, not an occlusion; shallow reliefs hide by little more."""
 _SPARE_PIXELS, _SPARE_SHARE = 30, 0.3
@@ -174,7 +175,7 @@ def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
     if not np.any(bad | good):
         if blamed and np.any(verdict.confirmed):
             return None
-        what = "nothing can be compared with another frame" if np.any(surface) else "there is no surface"
+        what = UNCOMPARED if np.any(surface) else "there is no surface"
         return MapFault(what, np.full(height, True), 0.0, uncompared=bool(np.any(surface)))
     rows = _bad_rows(bad, good, verdict.near)
     if np.any(rows):

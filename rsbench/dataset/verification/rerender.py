@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 
 Rerender = Literal["no", "auto", "all"]
 """No row, some rows of every image where that takes seconds, or all rows."""
+SAME = (": the same bits", ": the same but for rounding")
+"""Ends of the note where nothing differs."""
 _ROWS = 16
 """Of an image, with ``auto``."""
 _MOST_RAYS = 2e8
@@ -89,7 +91,7 @@ class Again:
             what = f"not one file is what its scene looks like when rendered again, {wrong[0].fault}"
             return [finding("sequence.json", what, cause=cause)], done
         same = all(check.same_bits for check in checks)
-        done += ": the same bits" if same else "" if wrong else ": the same but for rounding"
+        done += SAME[0] if same else "" if wrong else SAME[1]
         return [check.fault for check in wrong if check.file not in told], done
 
     def _scene(self, record: Mapping[str, Any]) -> tuple[MitsubaScene, str]:

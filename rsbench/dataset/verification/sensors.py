@@ -95,8 +95,8 @@ def _fault(
     # How bright white is, the twin does not say.
     high = np.where(most < _WHITE, np.minimum(linear_of_codes(most) * share, 1.0), 1.0)
     seen = linear_of_codes(image)
-    # A path tracer's noise is in both, and in each frame another.
-    traced = 12.0 * picture.noise**2 if picture.noisy else 0.0
+    # A path tracer's noise is in both, and in each frame another; one sample of a pixel is a draw likewise.
+    traced = 12.0 * picture.noise**2 if picture.noisy or spacing >= 1.0 else 0.0
     own, rounded = sensor.variance(high), (1.0 + traced) * (_rounding(image) + share**2 * _rounding(clean))
     sigma = np.sqrt(own + rounded)
     slack = _BEYOND_SIGMA * sigma
