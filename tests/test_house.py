@@ -319,6 +319,22 @@ def test_readme_figures_are_those_of_the_committed_results() -> None:
     assert [row for row in rows if row not in published] == []
 
 
+def test_readme_real_cameras_are_those_of_the_study() -> None:
+    section = (ROOT / "README.md").read_text("utf-8").partition("### Real cameras")[2].partition("\n### ")[0]
+    published = (ROOT / "results" / "real" / "README.md").read_text("utf-8")
+    rows = [line.removesuffix("|") for line in section.splitlines() if re.match(r"\| [a-z-]+, (mild|aggressive) ", line)]
+    assert len(rows) == 8 and all(row in published for row in rows)
+    summary = csv.DictReader((ROOT / "results" / "real" / "summary.csv").read_text("utf-8").splitlines())
+    assert max(float(row["sigmas"]) for row in summary) < 4.0, "8 of 8"
+
+
+def test_readme_card_is_one(tmp_path: Path) -> None:
+    (text,) = re.findall(r"^```toml\n(.*?)^```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    (tmp_path / "mine.toml").write_text(text, "utf-8")
+    card = load_dataset_card(str(tmp_path / "mine.toml"))
+    assert card.camera.lens is not None and card.sensor is not None and "imu" in card.channels
+
+
 def test_readme_corrections_are_those_of_the_study() -> None:
     """Covered / all PSNR, and the interval of what ours gains on the covered pixels, of each stratum."""
     lines = (ROOT / "results" / "correction" / "summary.csv").read_text("utf-8").splitlines()

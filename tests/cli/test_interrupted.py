@@ -114,7 +114,7 @@ def test_rendering_by_several_processes_ends_at_once(tmp_path: Path, monkeypatch
     run = Run("generate", card, tmp_path / "out")
     run.wait_for(tmp_path / "out" / HIDDEN / WORK, 2, "*")
     stop(run, signal.SIGTERM, 143)
-    assert list((tmp_path / "out").iterdir()) == []
+    assert not (tmp_path / "out").exists()
 
 
 def stop(run: Run, how: signal.Signals, code: int) -> None:

@@ -134,7 +134,7 @@ def test_a_kill_between_the_old_and_the_new_leaves_one_of_them(
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "rename", kill)
-        patch.setattr("rsbench.dataset.workplace._leave", lambda hidden, descriptor: os.close(descriptor))
+        patch.setattr("rsbench.dataset.workplace._leave", lambda hidden, descriptor, fresh: os.close(descriptor))
         patch.setattr("rsbench.dataset.corrected_frames.remove", stop)
         with pytest.raises(KilledError):
             write(out, "second")

@@ -24,6 +24,8 @@ _SAME, _SAME_PX = 1e-9, 1e-6
 _BEFORE, _BEHIND, _FEW = 1e-2, 1e-2, 0.15
 """Relative distance beyond which a point is before or behind all that the pixels around it see; the share that may
 be, by what is thinner than a pixel: leaves far away, and gaps between them."""
+_NEARLY_ALL = 0.8
+"""Of the points that lie so, the share whose class cannot be such leaves' and gaps' doing."""
 _FEW_AGAIN, _LEAST = 5e-3, 4
 
 
@@ -91,12 +93,13 @@ def _hiding_faults(tracks: Tracks, k: int, found: RSProjection, depth: DepthMap,
     known = np.isfinite(found.tau) & (tracks.sources != k)
     low, high = _around(depth.depth, found.pixels[known])
     z, classes = found.depth[known], tracks.classes[known, k]
-    for words, bad in (
-        ("are visible, but hidden by", (classes == PixelClass.VISIBLE) & (z > high * (1 + _BEHIND))),
-        ("are hidden, but visible by", (classes == PixelClass.OCCLUDED) & (z < low * (1 + _BEFORE))),
+    for words, so, wrong in (
+        ("are visible, but hidden by", z > high * (1 + _BEHIND), PixelClass.VISIBLE),
+        ("are hidden, but visible by", z < low * (1 + _BEFORE), PixelClass.OCCLUDED),
     ):
-        if np.sum(bad) > max(_FEW * np.sum(known), _LEAST):
-            yield finding(file, f"{np.sum(bad)} of {np.sum(known)} points {words} {depth.shot.depth}")
+        bad = int(np.sum(classes[so] == wrong))
+        if bad > max(min(_FEW * np.sum(known), _NEARLY_ALL * np.sum(so)), _LEAST):
+            yield finding(file, f"{bad} of {np.sum(known)} points {words} {depth.shot.depth}")
 
 
 def _around(depth: NDArray[np.float32], pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
