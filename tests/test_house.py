@@ -322,7 +322,11 @@ def test_readme_figures_are_those_of_the_committed_results() -> None:
 def test_readme_real_cameras_are_those_of_the_study() -> None:
     section = (ROOT / "README.md").read_text("utf-8").partition("### Real cameras")[2].partition("\n### ")[0]
     published = (ROOT / "results" / "real" / "README.md").read_text("utf-8")
-    rows = [line.removesuffix("|") for line in section.splitlines() if re.match(r"\| [a-z-]+, (mild|aggressive) ", line)]
+    rows = [
+        line.removesuffix("|")
+        for line in section.splitlines()
+        if re.match(r"\| [a-z-]+, (mild|aggressive) ", line)
+    ]
     assert len(rows) == 8 and all(row in published for row in rows)
     summary = csv.DictReader((ROOT / "results" / "real" / "summary.csv").read_text("utf-8").splitlines())
     assert max(float(row["sigmas"]) for row in summary) < 4.0, "8 of 8"

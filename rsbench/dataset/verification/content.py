@@ -82,16 +82,22 @@ def twin_faults(content: Content) -> Iterator[str]:
             continue
         if {shot, twin} <= pictures.keys():
             rows = [np.take(pictures[each].colours, [number], axis) for each in (shot, twin)]
-            unlike = np.any(rows[0] != rows[1], axis=-1)
+            apart = np.max(np.abs(rows[0].astype(np.float64) - rows[1]), axis=-1)
+            unlike = apart > _rounding(axis, 1.0)
             if np.sum(unlike) > spare_pixels(axis, unlike.size):
                 what = f"{np.sum(unlike)} pixels differ from the global-shutter twin at the same pose"
                 yield finding(clean_file(content.sequence, shot), f"{line} differs from {twin.image}: {what}")
         if {shot, twin} <= maps.keys():
             own, other = (np.take(maps[each].depth, [number], axis) for each in (shot, twin))
-            if np.sum(own != other) > spare_pixels(axis, own.size):
+            if np.sum(np.abs(own - other) > _rounding(axis, 1e-6) * other) > spare_pixels(axis, own.size):
                 what = f"by up to {np.max(np.abs(own - other)):.3g} m at the same pose"
                 cause = _first_of_twin(maps[shot].depth, maps[twin].depth)
                 yield finding(shot.depth, f"{line} differs from {twin.depth}: {what}", cause=cause)
+
+
+def _rounding(axis: int, most: float) -> float:
+    """How much the values of a line that two images share may differ anywhere: see ``spare_pixels``."""
+    return 0.0 if axis == 0 else most
 
 
 def spare_pixels(axis: int, size: int) -> int:

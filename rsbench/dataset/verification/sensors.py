@@ -99,7 +99,7 @@ def _fault(
     traced = 12.0 * picture.noise**2 if picture.noisy or spacing >= 1.0 else 0.0
     own, rounded = sensor.variance(high), (1.0 + traced) * (_rounding(image) + share**2 * _rounding(clean))
     sigma = np.sqrt(own + rounded)
-    slack = _BEYOND_SIGMA * sigma
+    slack = _BEYOND_SIGMA * np.sqrt(own + rounded + 2.0 * share**2 * _sampling(clean, spacing))
     beyond = (seen < np.minimum(low, 1.0) - slack) | (seen > high + slack)
     # What the twin does not show may come in over its borders.
     inner = np.s_[window[1] : height - window[1], window[0] : width - window[0]]
@@ -124,6 +124,13 @@ def _fault(
             shot.image, f"its noise has {ratio:.2f} times the variance of the sensor's, seen beside {twin}"
         )
     return None
+
+
+def _sampling(clean: NDArray[np.uint8] | NDArray[np.float32], spacing: float) -> FloatArray:
+    """Variance of linear values (...) that are means of 1 / spacing^2 samples of what the pixels around show."""
+    around = np.ones((3, 3), np.uint8)
+    least, most = (linear_of_codes(way(clean, around)) for way in (cv2.erode, cv2.dilate))
+    return np.asarray((spacing * (most - least)) ** 2 / 12.0, dtype=np.float64)
 
 
 def _rounding(codes: NDArray[np.uint8] | NDArray[np.float32]) -> FloatArray:
