@@ -10,22 +10,14 @@ import re
 import shutil
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from small_scenes import SCENE, write_box_scene
 
+from rsbench.cards import CardKind
+
 ROOT = Path(__file__).parents[2]
-KINDS = (
-    "scenes",
-    "renderers",
-    "solvers",
-    "datasets",
-    "sweeps",
-    "matchers",
-    "features",
-    "correctors",
-    "metrics",
-)
+KINDS = get_args(CardKind)
 CAMERA = {"width": 96, "height": 64, "focal": 80.0}
 RIG = "baseline = 0.3\nreadout_ratio = 0.8\n[camera]\nfx = 80.0\nfy = 80.0\ncx = 47.5\ncy = 31.5\n"
 SOLVERS = ("gs-8pt", "rs-stereo-linear", "rs-stereo-refined", "rs-stereo")
