@@ -22,11 +22,15 @@ def main() -> None:
     parser.add_argument("dataset", type=Path, help="folder with a dataset.json")
     parser.add_argument("picture", type=Path, help="file to write")
     chosen = parser.parse_args()
-    frames = [sequence.image("rs", "left", 0) for sequence in rsbench.read_dataset(chosen.dataset)]
+    try:
+        frames = [sequence.image("rs", "left", 0) for sequence in rsbench.read_dataset(chosen.dataset)]
+    except rsbench.RsbenchError as error:
+        parser.error(str(error))
     frames += [np.zeros_like(frames[0])] * (-len(frames) % COLUMNS)
     rows = [np.hstack(frames[first : first + COLUMNS]) for first in range(0, len(frames), COLUMNS)]
     sheet = cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR)
-    cv2.imwrite(str(chosen.picture), sheet, [cv2.IMWRITE_JPEG_QUALITY, 82])
+    _, content = cv2.imencode(chosen.picture.suffix, sheet, [cv2.IMWRITE_JPEG_QUALITY, 82])
+    chosen.picture.write_bytes(content.tobytes())
 
 
 if __name__ == "__main__":
