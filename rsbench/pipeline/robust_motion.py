@@ -243,7 +243,10 @@ def _conclude(
             threshold = _adapted(problem, model, threshold, options)
             inliers = np.abs(problem.residuals(model)) <= threshold
     final = problem.conclude(model, inliers)
-    if _cost(problem, final, threshold) > _WORSE * max(_cost(problem, found[0], threshold), 1.0):
+    knows_less = final.metric and not found[0].metric
+    if not knows_less and _cost(problem, final, threshold) > _WORSE * max(
+        _cost(problem, found[0], threshold), 1.0
+    ):
         # A solver that more matches make worse: what the search found stands.
         return found
     return final, np.abs(problem.residuals(final)) <= threshold, threshold

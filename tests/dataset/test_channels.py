@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -27,8 +27,11 @@ from rsbench.dataset.channels import (
     named_channels,
 )
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
 from rsbench.dataset.verification import Rerender, verify_dataset
+from rsbench.dataset.verification.content import Comparison, read_content
+from rsbench.dataset.verification.landing import Shot
+from rsbench.dataset.verification.rerender import Again
 from rsbench.errors import RsbenchError
 from rsbench.renderers.electrons import Sensor
 from rsbench.renderers.image import to_srgb8
@@ -290,3 +293,23 @@ def test_a_planted_fault_is_named(yard: Path, tmp_path: Path, name: str) -> None
     again: Rerender = "all" if "made again" in words else "no"
     (report,) = verify_dataset(tmp_path / "data", rerender=again, scenes=[yard.parent / "yard.toml"])
     assert any(all(word in fault for word in words) for fault in report.faults), report.faults
+
+
+def test_a_map_that_others_contradict_is_acquitted_when_it_is_what_rays_meet(yard: Path) -> None:
+    """The accused is rendered again, all of it; who else is wrong is then found without it."""
+    sequence = read_sequence(yard / "yard")
+    content, again = read_content(sequence, ()), Again("auto", [yard.parent / "yard.toml"])
+    one, other = Shot("rs", "left", 0), Shot("gs", "left", 0)
+    assert all(again.is_right(content, shot) for shot in content.maps)
+    assert not Again("auto").is_right(content, one), "a scene that is not known acquits nobody"
+    depth = content.maps[other].depth.copy()
+    depth[20:30] *= 1.0005
+    content.maps[other] = replace(content.maps[other], depth=depth)
+    assert again.is_right(content, one) and not again.is_right(content, other)
+    compared = Comparison(content, 1)
+    assert len(list(compared.pairs())) > 0
+    wrong = list(compared.faults(lambda shot: iter(()), partial(again.is_right, content)))
+    assert any(fault.startswith("gs_depth/left_0.exr: ") for fault in wrong)
+    # Whoever is acquitted is not named, and not believed to be wrong.
+    assert not [fault for fault in compared.faults(lambda shot: iter(()), lambda shot: True) if "_depth/" in fault]
+    assert any("rendered again, all of it" in note for note in compared.notes)

@@ -131,7 +131,10 @@ def test_every_solver_runs_in_the_loop(name: str) -> None:
 @final
 @dataclass(frozen=True, kw_only=True)
 class SpoiledByMany(Solver):
-    """The eight-point algorithm, 10 degrees off when it is given more than 40 matches."""
+    """The eight-point algorithm, off when it is given more than 40 matches, of which alone it may know metres."""
+
+    off_deg: float = 10.0
+    metric_of_many: bool = False
 
     @property
     def spec(self) -> SolverSpec:
@@ -143,7 +146,7 @@ class SpoiledByMany(Solver):
         found = load_solver("gs-8pt").estimate(correspondences, rig, shutter)
         if not found.success or len(correspondences.left) <= 40:
             return found
-        return replace(found, w=found.w + np.radians(10.0))
+        return replace(found, w=found.w + np.radians(self.off_deg), metric=self.metric_of_many)
 
 
 @pytest.mark.parametrize("adapt", [False, True])
@@ -159,6 +162,10 @@ def test_a_solver_that_more_matches_make_worse_keeps_what_the_search_found(adapt
     assert found.estimate.success
     assert found.inlier_count > 0.7 * len(given.left)  # 160 of 200 are right
     assert np.degrees(rotation_error(found.estimate.w, motion.w)) < 1.0
+    # Not when it alone knows the length: minimal samples of some solvers do not, and a scaled one is no better.
+    solver = SpoiledByMany(off_deg=0.3, metric_of_many=True)
+    knowing = estimate_motion(given, RIG, slow, solver, options, np.random.default_rng(0))
+    assert knowing.estimate.success and knowing.estimate.metric
 
 
 @pytest.mark.parametrize("sets", ["pairs", "tracks"])

@@ -15,13 +15,12 @@ from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.verification import structure
 from rsbench.dataset.verification.channel_checks import channel_faults
 from rsbench.dataset.verification.content import Comparison, Content, images_elsewhere, read_content, twin_faults
-from rsbench.dataset.verification.depth import UNCOMPARED
 from rsbench.dataset.verification.findings import DepthAgreement, Progress, SequenceReport
 from rsbench.dataset.verification.hdr_checks import hdr_faults
 from rsbench.dataset.verification.imu_checks import imu_faults
 from rsbench.dataset.verification.landing import PAIRS
 from rsbench.dataset.verification.poses import pose_faults
-from rsbench.dataset.verification.rerender import SAME, Again, Rerender
+from rsbench.dataset.verification.rerender import Again, Rerender
 from rsbench.dataset.verification.sensors import sensor_faults
 from rsbench.dataset.verification.stacks import stack_faults
 from rsbench.dataset.verification.surface_checks import surface_faults
@@ -110,7 +109,8 @@ def verify_sequence(
             agreements += [agreement] if agreement else []
             step(name)
             steps -= 1
-        faults += comparison.faults(images_elsewhere(partial(_others, listing, name)))
+        acquits = (lambda shot: False) if again is None else partial(again.is_right, content)
+        faults += comparison.faults(images_elsewhere(partial(_others, listing, name)), acquits)
         notes += comparison.notes
         twins = read_twins(sequence, missing)
         faults += [*twins.faults, *other_twin_faults(content, twins, stride)]
@@ -121,8 +121,6 @@ def verify_sequence(
             other, note = again.check(every, {*missing, *map(_file_of, faults)})
             faults += other
             notes.append(note)
-            if note.endswith(SAME):  # rows of a map that cannot be compared with others are right
-                faults = [fault for fault in faults if UNCOMPARED not in fault]
     except RsbenchError as error:
         faults.append(str(error))
     for _ in range(steps):

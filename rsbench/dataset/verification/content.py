@@ -160,22 +160,29 @@ class Comparison:
                 )
             yield agreement
 
-    def faults(self, elsewhere: Elsewhere) -> Iterator[str]:
-        """What the pairs show, each with its likely cause."""
+    def faults(self, elsewhere: Elsewhere, is_right: Callable[[Shot], bool] = lambda shot: False) -> Iterator[str]:
+        """What the pairs show, each with its likely cause; ``is_right`` acquits a depth map that they accuse."""
         geometry = depth.geometry_fault(self.agreements)
         if geometry:
             yield geometry
             return
-        wrong = self._wrong_maps()
+        wrong = self._wrong_maps(is_right)
         for shot, fault in wrong.items():
             cause = likely_cause(self.content.sequence, self.content.maps, shot, fault.rows)
             yield finding(shot.depth, fault.what, rows_of(fault.rows), cause)
         yield from depth.pair_faults(self.agreements, wrong)
         yield from self._image_faults(wrong.keys(), elsewhere)
 
-    def _wrong_maps(self) -> dict[Shot, depth.MapFault]:
+    def _wrong_maps(self, is_right: Callable[[Shot], bool]) -> dict[Shot, depth.MapFault]:
         """Faults of maps; one without a flat place is none, where it is roughly what others see."""
-        wrong = depth.map_faults(self.verdicts)
+        wrong, right = depth.map_faults(self.verdicts), set[Shot]()
+        while acquitted := {shot for shot in wrong if is_right(shot)}:
+            right |= acquitted
+            wrong = depth.map_faults(self.verdicts, right)
+        for shot in right:
+            self.notes.append(
+                finding(shot.depth, "others contradict it, and it is what is rendered again, all of it")
+            )
         for shot in [shot for shot, fault in wrong.items() if fault.uncompared]:
             if roughly_alike(self.content.sequence, self.content.maps, shot):
                 del wrong[shot]

@@ -14,7 +14,6 @@ from rsbench.dataset.verification.landing import DEPTH_TOLERANCE, BoolArray, Dep
 
 Bits = NDArray[np.uint8]
 
-UNCOMPARED = "nothing can be compared with another frame"
 NEAR_MISS = 1e-3
 """A surface hidden by less than this is a disagreement, not an occlusion; shallow reliefs hide by little more."""
 _SPARE_PIXELS, _SPARE_SHARE = 30, 0.3
@@ -143,11 +142,18 @@ def _mark_holes(target: MapVerdict, pixels: NDArray[np.float32], bit: np.uint8) 
     target.holes[y[missing], x[missing]] |= bit
 
 
-def map_faults(verdicts: Mapping[Shot, MapVerdict]) -> dict[Shot, MapFault]:
-    """The maps that are wrong: the worst first, and then the others without what it says of them."""
+def map_faults(verdicts: Mapping[Shot, MapVerdict], right: Collection[Shot] = ()) -> dict[Shot, MapFault]:
+    """The maps that are wrong: the worst first, and then the others without what it says of them.
+
+    Those that are known to be ``right`` are none of them.
+    """
     found: dict[Shot, MapFault] = {}
     while True:
-        left = {shot: fault for shot in verdicts.keys() - found.keys() if (fault := _fault(verdicts[shot], found))}
+        left = {
+            shot: fault
+            for shot in verdicts.keys() - found.keys() - {*right}
+            if (fault := _fault(verdicts[shot], found))
+        }
         if not left:
             return {shot: found[shot] for shot in verdicts if shot in found}
         worst = max(sorted(left), key=lambda shot: left[shot].share)
@@ -175,7 +181,7 @@ def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
     if not np.any(bad | good):
         if blamed and np.any(verdict.confirmed):
             return None
-        what = UNCOMPARED if np.any(surface) else "there is no surface"
+        what = "nothing can be compared with another frame" if np.any(surface) else "there is no surface"
         return MapFault(what, np.full(height, True), 0.0, uncompared=bool(np.any(surface)))
     rows = _bad_rows(bad, good, verdict.near)
     if np.any(rows):

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 Rerender = Literal["no", "auto", "all"]
 """No row, some rows of every image where that takes seconds, or all rows."""
-SAME = (": the same bits", ": the same but for rounding")
+_ALIKE = (": the same bits", ": the same but for rounding")
 """Ends of the note where nothing differs."""
 _ROWS = 16
 """Of an image, with ``auto``."""
@@ -91,8 +91,21 @@ class Again:
             what = f"not one file is what its scene looks like when rendered again, {wrong[0].fault}"
             return [finding("sequence.json", what, cause=cause)], done
         same = all(check.same_bits for check in checks)
-        done += SAME[0] if same else "" if wrong else SAME[1]
+        done += _ALIKE[0] if same else "" if wrong else _ALIKE[1]
         return [check.fault for check in wrong if check.file not in told], done
+
+    def is_right(self, content: Content, shot: Shot) -> bool:
+        """Whether a depth map is what its scene looks like, at every pixel: that takes but one ray for each."""
+        manifest = content.sequence.manifest
+        try:
+            options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
+            scene, _ = self._scene(_table(manifest, "scene"))
+        except RsbenchError:  # told by ``check``
+            return False
+        stored, rows = content.maps[shot].depth, list(range(content.sequence.rig.camera.height))
+        quick = replace(options, samples=1, integrator="sunsky")
+        rendered = _render(content, scene, quick, shot, rows).depth
+        return bool(np.all(np.abs(stored - rendered) <= _SAME_DEPTH * np.maximum(stored, rendered)))
 
     def _scene(self, record: Mapping[str, Any]) -> tuple[MitsubaScene, str]:
         """The scene of a sequence in the renderer, and its hash."""
