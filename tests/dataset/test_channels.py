@@ -22,10 +22,12 @@ from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCa
 from rsbench.dataset.channels import (
     CHANNELS,
     PAIR_CHANNELS,
+    TRACKS,
     PairChannel,
     PixelClass,
     named_channels,
 )
+from rsbench.dataset.files import read_grey_png, write_png
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
 from rsbench.dataset.verification import Rerender, verify_dataset
@@ -313,3 +315,19 @@ def test_a_map_that_others_contradict_is_acquitted_when_it_is_what_rays_meet(yar
     # Whoever is acquitted is not named, and not believed to be wrong.
     assert not [fault for fault in compared.faults(lambda shot: iter(()), lambda shot: True) if "_depth/" in fault]
     assert any("rendered again, all of it" in note for note in compared.notes)
+
+
+def test_channels_that_depth_contradicts_are_cleared_when_they_are_what_rays_make(
+    yard: Path, tmp_path: Path
+) -> None:
+    """All of a file, bit for bit: one pixel that is not is enough to leave it accused."""
+    accused = {"flow/right_1.exr", "gs_flow_mask/left_0.png", "normals/left_1.exr", TRACKS}
+    again = Again("auto", [yard.parent / "yard.toml"])
+    assert again.cleared(read_content(read_sequence(yard / "yard"), ()), accused) == accused
+    shutil.copytree(yard / "yard", tmp_path / "yard")
+    mask = read_grey_png(tmp_path / "yard/gs_flow_mask/left_0.png").copy()
+    mask[11, 7] = 2 if mask[11, 7] != 2 else 1
+    write_png(tmp_path / "yard/gs_flow_mask/left_0.png", mask)
+    content = read_content(read_sequence(tmp_path / "yard"), ())
+    assert again.cleared(content, accused) == accused - {"gs_flow_mask/left_0.png"}
+    assert Again("auto").cleared(content, accused) == set(), "a scene that is not known clears nothing"

@@ -15,7 +15,7 @@ from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.verification import structure
 from rsbench.dataset.verification.channel_checks import channel_faults
 from rsbench.dataset.verification.content import Comparison, Content, images_elsewhere, read_content, twin_faults
-from rsbench.dataset.verification.findings import DepthAgreement, Progress, SequenceReport
+from rsbench.dataset.verification.findings import DepthAgreement, Progress, SequenceReport, finding
 from rsbench.dataset.verification.hdr_checks import hdr_faults
 from rsbench.dataset.verification.imu_checks import imu_faults
 from rsbench.dataset.verification.landing import PAIRS
@@ -115,8 +115,9 @@ def verify_sequence(
         twins = read_twins(sequence, missing)
         faults += [*twins.faults, *other_twin_faults(content, twins, stride)]
         every = with_twins(content, twins)
-        for found in _channel_checks(every, stride):
-            faults += found({*missing, *map(_file_of, faults)})
+        accused, cleared = _of_channels(every, stride, {*missing, *map(_file_of, faults)}, again)
+        faults += accused
+        notes += cleared
         if again is not None:
             other, note = again.check(every, {*missing, *map(_file_of, faults)})
             faults += other
@@ -128,6 +129,18 @@ def verify_sequence(
     return SequenceReport(
         name=name, faults=tuple(dict.fromkeys(faults)), agreements=tuple(agreements), notes=tuple(notes)
     )
+
+
+def _of_channels(
+    content: Content, stride: int, told: set[str], again: Again | None
+) -> tuple[list[str], list[str]]:
+    """Faults of channels, but for files that are told already; and notes of the accused that are right."""
+    faults: list[str] = []
+    for found in _channel_checks(content, stride):
+        faults += found({*told, *map(_file_of, faults)})
+    cleared = again.cleared(content, set(map(_file_of, faults))) if again is not None and faults else set()
+    notes = [finding(file, "others contradict it, and it is what is made again, all of it") for file in cleared]
+    return [fault for fault in faults if _file_of(fault) not in cleared], sorted(notes)
 
 
 def _channel_checks(content: Content, stride: int) -> Iterator[Callable[[Collection[str]], Iterator[str]]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from itertools import pairwise
@@ -19,6 +19,7 @@ from rsbench import __version__
 from rsbench.cards import list_cards, parse_card
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
+from rsbench.dataset.channels import TRACKS
 from rsbench.dataset.generation import image_seed
 from rsbench.dataset.scene_hashes import scene_hash
 from rsbench.dataset.sequence import whole_frames
@@ -96,16 +97,36 @@ class Again:
 
     def is_right(self, content: Content, shot: Shot) -> bool:
         """Whether a depth map is what its scene looks like, at every pixel: that takes but one ray for each."""
+        with contextlib.suppress(RsbenchError):  # told by ``check``
+            stored, (_, rendered) = content.maps[shot].depth, self._depth(content, shot)
+            return bool(np.all(np.abs(stored - rendered) <= _SAME_DEPTH * np.maximum(stored, rendered)))
+        return False
+
+    def cleared(self, content: Content, accused: Collection[str]) -> set[str]:
+        """Of files of channels those that are the same, bit for bit, when all of them is made again by rays."""
+        from rsbench.renderers.segments import SceneRays
+
+        sequence, same = content.sequence, set[str]()
+        rows = list(range(sequence.rig.camera.height))
+        with contextlib.suppress(RsbenchError):
+            for shot in [each for each in SHOTS if each.shutter == "rs"]:
+                if any(f"/{shot.side}_{shot.frame}." in file for file in accused):
+                    scene, depth = self._depth(content, shot)
+                    for made in (channels_again, surfaces_again):
+                        again = made(sequence, shot, rows, depth, SceneRays(scene), ())
+                        same |= {file for file, _, alike in again if alike}
+            if TRACKS in accused:
+                scene, _ = self._scene(_table(sequence.manifest, "scene"))
+                same |= {file for file, _, alike in tracks_again(sequence, SceneRays(scene), ()) if alike}
+        return same & set(accused)
+
+    def _depth(self, content: Content, shot: Shot) -> tuple[MitsubaScene, NDArray[np.float32]]:
+        """The scene of a sequence, and a whole depth map of it."""
         manifest = content.sequence.manifest
-        try:
-            options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
-            scene, _ = self._scene(_table(manifest, "scene"))
-        except RsbenchError:  # told by ``check``
-            return False
-        stored, rows = content.maps[shot].depth, list(range(content.sequence.rig.camera.height))
+        options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
+        scene, _ = self._scene(_table(manifest, "scene"))
         quick = replace(options, samples=1, integrator="sunsky")
-        rendered = _render(content, scene, quick, shot, rows).depth
-        return bool(np.all(np.abs(stored - rendered) <= _SAME_DEPTH * np.maximum(stored, rendered)))
+        return scene, _render(content, scene, quick, shot, list(range(content.sequence.rig.camera.height))).depth
 
     def _scene(self, record: Mapping[str, Any]) -> tuple[MitsubaScene, str]:
         """The scene of a sequence in the renderer, and its hash."""
