@@ -127,31 +127,26 @@ def _all(*plants: Plant) -> Plant:
     return plant
 
 
-def _seen_without_lens(sequence: Sequence) -> Pixels:
-    """(H, W, 2) pixels of the image at which the camera without its lens would have its own."""
+def _seen_without_lens(sequence: Sequence, values: NDArray[Any], way: int, border: int) -> NDArray[Any]:
+    """An image or map (H, W, ...) as the camera without its lens would have it, but for its row 0."""
     camera = sequence.rig.camera
     rays = replace(camera, lens=None).unproject(camera.pixel_grid())
-    return np.nan_to_num(camera.project(rays), nan=-1e4).astype(np.float32)
+    pixels = np.nan_to_num(camera.project(rays), nan=-1e4).astype(np.float32)
+    moved = cv2.remap(values, pixels, None, way, borderMode=border)
+    moved[0] = values[0]
+    return np.ascontiguousarray(moved, dtype=values.dtype)
 
 
 def _image_without_lens(folder: Path) -> None:
     sequence = read_sequence(folder / VICTIM)
     path = sequence.folder / "rs/left_0.png"
-    image = read_png(path)
-    moved = cv2.remap(image, _seen_without_lens(sequence), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-    moved[0] = image[0]
-    write_png(path, np.ascontiguousarray(moved, dtype=np.uint8))
+    write_png(path, _seen_without_lens(sequence, read_png(path), cv2.INTER_LINEAR, cv2.BORDER_REFLECT))
 
 
 def _depth_without_lens(folder: Path) -> None:
     sequence = read_sequence(folder / VICTIM)
     path = sequence.folder / "gs_depth/right_0.exr"
-    depth = read_depth(path)
-    moved = cv2.remap(
-        depth, _seen_without_lens(sequence), None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
-    )
-    moved[0] = depth[0]
-    write_depth(path, np.ascontiguousarray(moved, dtype=np.float32))
+    write_depth(path, _seen_without_lens(sequence, read_depth(path), cv2.INTER_NEAREST, cv2.BORDER_REPLICATE))
 
 
 def _along_the_ray(folder: Path) -> None:
