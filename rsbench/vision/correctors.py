@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import final
 
@@ -16,12 +14,15 @@ from rsbench.core.se3 import Pose
 from rsbench.vision.correction import WarpOptions, warp_gain
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
 from rsbench.vision.fusion import Fused, Origin, SourceView, fuse
+from rsbench.vision.side_by_side import side_by_side
 from rsbench.vision.simpler_depths import plane_depth
 
 F32 = NDArray[np.float32]
 _NEAREST_SHARE = 0.999
 _NEARER = 0.5
 """What has no depth may be nearer than the nearest that has: down to this share of its depth."""
+_FUSION_BYTES = 150.0
+"""Per pixel of a frame: what is carried over from the four, float32 and float64."""
 
 
 @final
@@ -50,8 +51,9 @@ class FusionCorrector(Corrector):
             sources[0] = self._placed(problem, view, sources[0])
             return fuse(sources, problem.rig.camera, problem.target_pose(view), self.warp)
 
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            return dict(zip(views, pool.map(corrected, views), strict=True))
+        camera = problem.rig.camera
+        found = side_by_side(corrected, views, camera.width * camera.height, _FUSION_BYTES)
+        return dict(zip(views, found, strict=True))
 
     def _sources(self, problem: CorrectionProblem, view: View, poses: Mapping[View, Pose]) -> list[SourceView]:
         """The images that a corrected view is made of, in the order in which they are trusted."""

@@ -25,9 +25,12 @@ from rsbench.core.so3 import FloatArray
 from rsbench.vision.feature_matcher import FeatureMatcher
 from rsbench.vision.images import grey_u8
 from rsbench.vision.nearest import best_two
+from rsbench.vision.side_by_side import side_by_side
 
 Indices = NDArray[np.int64]
 _MOST_FEATURES = 100_000
+_DETECTION_BYTES = 300.0
+"""Per pixel: the pyramids of twice the size, float32, and of their differences."""
 _RANGES = {
     "max_features": (0, _MOST_FEATURES),
     "contrast_threshold": (0.0, 1.0),
@@ -152,9 +155,10 @@ def match_stereo_frames(
     tolerance = options.row_tolerance
     beside = Gate(dx=(-disparity, -np.finfo(np.float64).tiny), dy=(-tolerance, tolerance))
     # OpenCV, the BLAS and the compiled loop let go of the GIL.
+    pixels = left_0.shape[0] * left_0.shape[1]
+    l0, r0, l1, r1 = side_by_side(lambda image: detect(image, options), images.values(), pixels, _DETECTION_BYTES)
+    tasks = ((l0, l1, anywhere), (r0, r1, anywhere), (l0, r0, beside), (l1, r1, beside))
     with ThreadPoolExecutor() as pool:
-        l0, r0, l1, r1 = pool.map(lambda image: detect(image, options), images.values())
-        tasks = ((l0, l1, anywhere), (r0, r1, anywhere), (l0, r0, beside), (l1, r1, beside))
         left, right, stereo_0, stereo_1 = pool.map(lambda t: match(t[0], t[1], t[2], options), tasks)
     tracks = close_loops(left, right, stereo_0, stereo_1)
     if options.drop_contradicted:

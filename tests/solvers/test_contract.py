@@ -196,7 +196,7 @@ def test_a_child_process_gives_the_same_findings(tmp_path: Path) -> None:
     body = "print('hello'); os.write(2, b'low'); correspondences.left[0] = 0.0; return right"
     finding = check_solver(bad_entry(tmp_path, "child", body))[0]
     assert finding.verdict == "failed" and "read-only" in finding.why
-    findings = check_solver(bad_entry(tmp_path, "quiet child", "os.write(1, b'from C'); return right"))
+    findings = check_solver(bad_entry(tmp_path, "quiet child", "os.write(1, b'from C\\n'); return right"))
     assert found(findings, "is quiet") == Finding(check="is quiet", verdict="warning", why="prints: 'from C'")
     assert [each.verdict for each in findings[:-1]] == ["passed"] * (len(CHECKS) - 1)
 
