@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from rsbench.dataset.channels import (
     COMPONENTS,
+    MATCHER,
     TRACKS,
     PixelClass,
+    matches_file,
 )
 from rsbench.dataset.files import (
     read_depth,
@@ -26,6 +28,9 @@ from rsbench.dataset.files import (
     write_png,
     write_png16,
 )
+from rsbench.dataset.match_truth import Arranged, labelled
+from rsbench.dataset.matches import MatchClass, Matching, save_matches
+from rsbench.dataset.sequence import read_sequence
 from rsbench.reading import load_arrays
 from rsbench.renderers.image import to_srgb8
 
@@ -203,12 +208,52 @@ def depth_of(file: str, factor: float) -> Callable[[Path], None]:
     return lambda folder: write_depth(folder / file, read_depth(folder / file) * np.float32(factor))
 
 
-def tracks_of(name: str, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Callable[[Path], None]:
+def arrays_of(file: str, change: Callable[[dict[str, NDArray[Any]]], object]) -> Callable[[Path], None]:
+    """``change`` may change the arrays in their places, or replace them in the table."""
+
     def plant(folder: Path) -> None:
-        arrays = load_arrays(folder / TRACKS)
-        save_arrays(folder / TRACKS, arrays | {name: change(arrays[name].copy())})
+        arrays = {name: values.copy() for name, values in load_arrays(folder / file).items()}
+        change(arrays)
+        save_arrays(folder / file, arrays)
 
     return plant
+
+
+def tracks_of(name: str, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Callable[[Path], None]:
+    return arrays_of(TRACKS, lambda arrays: arrays.update({name: change(arrays[name])}))
+
+
+def matches_of(name: str, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Callable[[Path], None]:
+    return arrays_of(_MATCHES, lambda arrays: arrays.update({name: change(arrays[name])}))
+
+
+def perfect(arrays: dict[str, NDArray[Any]]) -> None:
+    """Every match moved to its true place, and told so: what no check of the labels alone can see."""
+    seen = np.isfinite(arrays["error"])
+    arrays["pixels"][seen, 1], arrays["error"][seen] = arrays["truth"][seen], 0.0
+    wrong = seen & (arrays["classes"] == MatchClass.WRONG)
+    arrays["classes"][wrong] = MatchClass.RIGHT
+
+
+class Depths:
+    """Rays that meet what they are told to, one pair of frames after the other, and nothing before it."""
+
+    def __init__(self, depth: NDArray[np.float64]) -> None:
+        self.left = np.where(depth > 0, depth, np.inf)
+
+    def share(self, eyes: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+        met, self.left = self.left[: len(eyes)], self.left[len(eyes) :]
+        return met
+
+    def blocked(self, eyes: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return np.zeros(len(eyes), dtype=np.bool_)
+
+
+def farther(folder: Path) -> None:
+    """Keypoints that see what is a tenth farther away, with all that follows from it."""
+    arrays = load_arrays(folder / _MATCHES)
+    found, rays = Arranged(*(arrays[name] for name in Arranged._fields)), Depths(1.1 * arrays["depth"])
+    save_matches(folder / _MATCHES, labelled(read_sequence(folder), 0, found, Matching().bound_px, rays))
 
 
 def one_view(k: int, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Callable[[NDArray[Any]], NDArray[Any]]:
@@ -227,7 +272,33 @@ def radiance_of(view: str, change: Callable[[NDArray[np.float32]], NDArray[Any]]
     return plant
 
 
+_MATCHES = matches_file(0)
 FAULTS |= {
+    "matches moved by half a pixel": (
+        matches_of("pixels", lambda pixels: pixels + 0.5),
+        (_MATCHES, "left", "not where their row sees the point"),
+    ),
+    "matches without errors": (
+        matches_of("error", lambda error: 0.1 * error),
+        (_MATCHES, "stereo_0", "not the distance from the true place"),
+    ),
+    "matches: all that is seen is right": (
+        matches_of("classes", lambda classes: np.where(classes == 5, 1, classes).astype(np.uint8)),
+        (_MATCHES, "not what error and depth make, within 3 px"),
+    ),
+    "matches: all is hidden": (
+        matches_of("classes", lambda classes: np.where(classes == 1, 2, classes).astype(np.uint8)),
+        (_MATCHES, "are hidden, but in sight by rs_depth/left_1.exr"),
+    ),
+    "matches that nobody found, all of them right": (
+        arrays_of(_MATCHES, perfect),
+        (_MATCHES, "are not found in the images"),
+    ),
+    "matches of surfaces that are farther away": (
+        farther,
+        (_MATCHES, "stereo_0", "keypoints is not that of rs_depth/left_0.exr"),
+    ),
+    "another bound of matches": (manifest_of(MATCHER, put("bound_px", 9.0)), (MATCHER, "bound_px = 9.0")),
     "radiance scaled": (radiance_of("left_0", lambda light: 1.05 * light), ("hdr/left_0.exr", "scaled by 1.05")),
     "radiance in other colours": (
         radiance_of("right_0", lambda light: light[..., ::-1]),

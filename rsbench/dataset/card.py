@@ -16,6 +16,7 @@ from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.dataset.channels import Channel, check_channels
 from rsbench.dataset.imu import Imu
+from rsbench.dataset.matches import Matching
 from rsbench.dataset.motion_card import MotionCard as MotionCard
 from rsbench.dataset.sequence import MOST_TWINS, sequence_manifest
 from rsbench.dataset.trajectory import TrajectoryCard, pairs_along
@@ -112,6 +113,8 @@ class DatasetCard(Scanning):
     """Rows, counted as they are read, whose poses global-shutter twins have beside that of the first."""
     imu: Imu | None = None
     """The sensor of the channel ``imu``; absent, one with the defaults."""
+    matches: Matching | None = None
+    """Of the channel ``matches``; absent, the defaults."""
     seed: int = 0
     seeds: tuple[int, ...] = ()
     """When given, every sequence is made once per seed under the name NAME-SEED; random axes change with it."""
@@ -212,8 +215,9 @@ class DatasetCard(Scanning):
         sensor = {} if own is None else {"sensor": own.record}
         channels = {"channels": list(self.channels)} if self.channels else {}
         imu = {"imu": asdict(self.imu or Imu())} if "imu" in self.channels else {}
+        matches = {"matches": asdict(self.matches or Matching())} if "matches" in self.channels else {}
         twins = {"twins": list(rows)} if (rows := self.twins_of(sequence)) else {}
-        return {**manifest, **sensor, **channels, **imu, **twins}
+        return {**manifest, **sensor, **channels, **imu, **matches, **twins}
 
     def only(self, names: list[str]) -> DatasetCard:
         """The same card with some of its sequences.

@@ -13,18 +13,21 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.channels import (
     COMPONENTS,
     INSTANCE_TABLE,
+    MATCHER,
     NORMAL_COMPONENTS,
     RADIANCE_COMPONENTS,
     TRACKS,
     PairChannel,
     PixelClass,
     mask_file,
+    matches_file,
     radiance_file,
     surface_file,
     value_file,
 )
 from rsbench.dataset.files import read_exr, read_grey_png, read_json
 from rsbench.dataset.imu import IMU_MANIFEST, ImuSamples, read_imu
+from rsbench.dataset.matches import LabelledMatches, read_matches
 from rsbench.dataset.timing import MANIFEST, read_timing_table, table_file
 from rsbench.dataset.tracks import Tracks, read_tracks
 from rsbench.errors import RsbenchError
@@ -120,6 +123,19 @@ class ChannelReader:
         """Surface points and where the four frames see them; RsbenchError as of ``offsets``."""
         self._check_channel("tracks")
         return read_tracks(inside(self.folder, TRACKS))
+
+    def matches(self, first: int = 0) -> LabelledMatches:
+        """What a feature matcher found in frame ``first`` and the next, and what is true.
+
+        RsbenchError as of ``offsets``.
+        """
+        self._check_channel("matches")
+        return read_matches(inside(self.folder, matches_file(first)))
+
+    def matcher(self) -> dict[str, Any]:
+        """Content of matches/matcher.json: who matched; RsbenchError as of ``offsets``."""
+        self._check_channel("matches")
+        return read_json(inside(self.folder, MATCHER))
 
     def imu_manifest(self) -> dict[str, Any]:
         """Content of imu.json; RsbenchError as of ``offsets``."""

@@ -14,9 +14,12 @@ from rsbench.errors import RsbenchError
 PairChannel = Literal["disparity", "flow", "gs_flow"]
 """Where each pixel of a rolling-shutter frame lies in another picture: of the other camera at the same time
 (disparity), of the same camera at the other time (flow), and of its global-shutter twin (gs_flow)."""
-Channel = Literal["disparity", "flow", "gs_flow", "timing", "normals", "instances", "imu", "tracks", "hdr"]
+Channel = Literal[
+    "disparity", "flow", "gs_flow", "timing", "normals", "instances", "imu", "tracks", "hdr", "matches"
+]
 
 INSTANCE_TABLE, TRACKS = "instances.json", "tracks.npz"
+MATCHER = "matches/matcher.json"
 PAIR_CHANNELS: tuple[PairChannel, ...] = get_args(PairChannel)
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
 COMPONENTS: dict[PairChannel, tuple[str, ...]] = {"disparity": ("d",), "flow": ("x", "y"), "gs_flow": ("x", "y")}
@@ -94,6 +97,11 @@ def surface_file(channel: Literal["normals", "instances"], side: str, frame: int
     return f"{channel}/{side}_{frame}.{'exr' if channel == 'normals' else 'png'}"
 
 
+def matches_file(first: int) -> str:
+    """Of frame ``first`` and the next."""
+    return f"matches/{first}.npz"
+
+
 def radiance_file(side: str, frame: int) -> str:
     return f"hdr/{side}_{frame}.exr"
 
@@ -107,8 +115,13 @@ def channel_files(names: Iterable[str], twins: Iterable[int] = ()) -> tuple[str,
     normals = (surface_file("normals", *view) for view in VIEWS if "normals" in given)
     instances = (INSTANCE_TABLE, *(surface_file("instances", *view) for view in VIEWS))
     hdr = (radiance_file(*view) for view in VIEWS if "hdr" in given)
-    imu, tracks = IMU_FILES if "imu" in given else (), (TRACKS,) if "tracks" in given else ()
-    return (*pairs, *timing, *normals, *(instances if "instances" in given else ()), *imu, *tracks, *hdr)
+    whole: dict[str, tuple[str, ...]] = {
+        "imu": IMU_FILES,
+        "tracks": (TRACKS,),
+        "matches": (MATCHER, matches_file(0)),
+    }
+    of_sequence = (file for name, files in whole.items() if name in given for file in files)
+    return (*pairs, *timing, *normals, *(instances if "instances" in given else ()), *of_sequence, *hdr)
 
 
 def named_channels(text: str) -> tuple[Channel, ...]:

@@ -27,6 +27,7 @@ from rsbench.dataset.channel_writer import write_channels
 from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_png, write_poses
 from rsbench.dataset.hashes import HASHES, FileHashes
 from rsbench.dataset.manifest import Files, write_manifest
+from rsbench.dataset.matches import Matching
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence import FRAMES, files_of, is_of_sequence
 from rsbench.dataset.sequence_channels import write_sequence_channels
@@ -38,6 +39,7 @@ from rsbench.pipeline.isolated_jobs import finished_jobs
 from rsbench.pipeline.isolation import EntryFailure
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import SceneCard, load_scene, read_scene_card
+from rsbench.vision.feature_matcher import load_features
 
 if TYPE_CHECKING:
     from rsbench.renderers.scene import MitsubaScene
@@ -77,13 +79,15 @@ def generate_dataset(
 
     Raises:
         RsbenchError: ``out`` cannot be written, another command works there, or it holds a dataset of another
-            card or files of others in a sequence that is damaged; a scene, viewpoint or renderer of the card
-            does not exist.
+            card or files of others in a sequence that is damaged; a scene, viewpoint, renderer or feature
+            matcher of the card does not exist.
         LostJobsError: see ``finished_jobs``.
     """
     options = load_card(RendererOptions, "renderers", card.renderer)
     if full_frames:
         options = replace(options, method="stitched", full_frames=True)
+    if "matches" in card.channels:
+        load_features((card.matches or Matching()).features)  # before hours of rendering
     scenes = lru_cache(maxsize=None)(_scene_card)
     plans = {each.name: _plan(card, each, options, scenes(each.scene)) for each in card.sequence}
     with workplace(out) as hidden:
@@ -166,9 +170,8 @@ def _complete(
             f"{folder}: holds no sequence.json, so rsbench did not make it; move it away or choose another --out"
         )
     manifest = read_json(folder / "sequence.json")
-    expected = {"sensor": None, "channels": None, "imu": None, "twins": None} | _of_scene(
-        plan, scene_hashes.of(sequence.scene)
-    )
+    expected = {"sensor": None, "channels": None, "imu": None, "matches": None, "twins": None}
+    expected |= _of_scene(plan, scene_hashes.of(sequence.scene))
     other = [key for key, value in expected.items() if manifest.get(key) != value]
     if other:
         raise RsbenchError(

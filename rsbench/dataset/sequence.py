@@ -24,6 +24,7 @@ from rsbench.dataset.channel_reader import ChannelReader
 from rsbench.dataset.channels import CHANNELS, channel_files, check_channels
 from rsbench.dataset.files import read_depth, read_json, read_png, read_poses
 from rsbench.dataset.imu import Imu
+from rsbench.dataset.matches import Matching
 from rsbench.errors import RsbenchError
 from rsbench.motions import motion_record, read_motion
 from rsbench.reading import check_name, check_size, inside
@@ -148,6 +149,7 @@ class SequenceManifest(Scanning):
     motion: MotionManifest
     sensor: Sensor | None = None
     imu: Imu | None = None
+    matches: Matching | None = None
     twins: tuple[int, ...] = ()
     channels: tuple[str, ...] = ()
     files: dict[str, str] = field(default_factory=dict)
@@ -215,6 +217,8 @@ class Sequence(ChannelReader):
     """Of the rolling-shutter frames; None: an ideal one's."""
     imu: Imu | None = None
     """Of the channel ``imu``."""
+    matching: Matching | None = None
+    """Of the channel ``matches``."""
     twins: tuple[int, ...] = ()
     """Rows, counted as they are read, from whose poses there are global-shutter twins beside those of row 0."""
     channels: tuple[str, ...] = ()
@@ -302,6 +306,7 @@ def read_sequence(folder: Path) -> Sequence:
             frame_period_s=manifest.frame_period_s,
             sensor=manifest.sensor,
             imu=manifest.imu,
+            matching=manifest.matches,
             twins=manifest.twins,
             channels=manifest.channels,
             manifest=content,

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import DatasetCard, SequenceCard
-from rsbench.dataset.channels import INSTANCE_TABLE
-from rsbench.dataset.files import read_depth, write_json
+from rsbench.dataset.channels import INSTANCE_TABLE, MATCHER, matches_file
+from rsbench.dataset.files import read_depth, read_png, write_json
 from rsbench.dataset.imu import Imu, draw_samples, gravity_of, sample_times_ns, write_imu
+from rsbench.dataset.matches import Matching, save_matches
 from rsbench.dataset.shots import GivenGeometry, Shot
 from rsbench.dataset.timing import write_timing
 from rsbench.dataset.tracks import make_tracks, write_tracks
@@ -35,6 +36,7 @@ def write_sequence_channels(
 
     shutter, period, sensor = card.shutter_for(sequence), card.period_of(sequence), card.sensor_of(sequence)
     motion, seed = card.motion_of(sequence), f"{card.seed_of(sequence)}/{sequence.name}"
+    geometry = GivenGeometry(card.rig_of(sequence), shutter, motion)
     if "timing" in card.channels:
         write_timing(folder, shutter, period, sensor)
     if "instances" in card.channels:
@@ -45,5 +47,11 @@ def write_sequence_channels(
         write_imu(folder, imu, gravity, draw_samples(imu, motion, times, period, gravity, seed))
     if "tracks" in card.channels:
         depths = {view: read_depth(folder / Shot("rs", *view).depth) for view in VIEWS}
-        geometry = GivenGeometry(card.rig_of(sequence), shutter, motion)
         write_tracks(folder, make_tracks(geometry, depths, SceneRays(scene).blocked, seed))
+    if "matches" in card.channels:
+        from rsbench.dataset.match_truth import make_matches, matcher_record
+
+        images = {view: read_png(folder / Shot("rs", *view).image) for view in VIEWS}
+        matching = card.matches or Matching()
+        write_json(folder / MATCHER, matcher_record(matching))
+        save_matches(folder / matches_file(0), make_matches(geometry, 0, images, matching, SceneRays(scene)))

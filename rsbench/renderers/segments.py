@@ -40,6 +40,12 @@ class SceneRays:
             found.append(np.atleast_1d(np.array(self.scene.scene.ray_test(ray), dtype=np.bool_)))
         return np.concatenate(found)
 
+    def share(self, eyes: FloatArray, points: FloatArray) -> FloatArray:
+        """Share (n,) of the way to the points, or beyond them, at which the first surface is met; inf: at none."""
+        hits = [self.scene.scene.ray_intersect_preliminary(ray, coherent=True) for ray in _rays(eyes, points)]
+        met = np.concatenate([np.atleast_1d(np.array(hit.t, dtype=np.float64)) for hit in hits])
+        return np.where(np.isfinite(met), met, np.inf)
+
     def surfaces(self, eyes: FloatArray, points: FloatArray) -> Surfaces:
         """What is met on the way to the points and beyond."""
         import mitsuba as mi

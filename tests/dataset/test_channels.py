@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -25,16 +26,20 @@ from rsbench.dataset.channels import (
     TRACKS,
     PairChannel,
     PixelClass,
+    matches_file,
     named_channels,
 )
 from rsbench.dataset.files import read_grey_png, write_png
 from rsbench.dataset.generation import generate_dataset
+from rsbench.dataset.matches import MATCHED, MatchClass
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
 from rsbench.dataset.verification import Rerender, verify_dataset
 from rsbench.dataset.verification.content import Comparison, read_content
 from rsbench.dataset.verification.landing import Shot
 from rsbench.dataset.verification.rerender import Again
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.renderers.electrons import Sensor
 from rsbench.renderers.image import to_srgb8
 from rsbench.scenes.load import load_scene
@@ -195,6 +200,53 @@ def test_tracks_are_where_rays_say(sequence: Sequence, triangles: Array) -> None
     assert np.all(np.bincount(tracks.classes.ravel(), minlength=4)[1:] >= 50)
 
 
+def test_matches_are_labelled_as_rays_say(sequence: Sequence, triangles: Array) -> None:
+    """Keypoints lie between pixels: depth to the rounding of rays to float32, rows by bisection, hidden by rays."""
+    matches, hit = sequence.matches(), partial(first_hit, triangles)
+    h, seen = sequence.shutter.readout_ratio / sequence.shutter.height, []
+    for k, ((side, frame), (other, later)) in enumerate(MATCHED.values()):
+        pixels, depth, place, error, classes = matches.of_pair(k)
+        origins, ways = rays(sequence, side, frame + h * pixels[:, 0, 1], pixels[:, 0])
+        z = hit(origins, ways)
+        solid = np.isfinite(z)
+        assert np.array_equal(solid, depth > 0) and np.all(solid == (classes != MatchClass.NO_SURFACE))
+        np.testing.assert_allclose(depth[solid], z[solid], rtol=1e-6)
+        X = origins + ways * np.where(solid, z, 1e8)[:, None]
+        tau = later + h * row_seeing(sequence, other, later, X)
+        inside = np.isfinite(tau)
+        tau = np.where(inside, tau, 0.0)
+        truth = look(sequence, other, tau, X)
+        inside &= np.all((truth >= -0.5) & (truth <= [63.5, 47.5]), axis=1)
+        # 1e-6 of the depth moves what is nearest, 3 m away, by 6e-6 px.
+        np.testing.assert_allclose(place[inside], truth[inside], rtol=0, atol=1e-4)
+        assert np.all(np.isnan(place[~inside])) and np.all(np.isnan(error[~inside]))
+        distance = np.linalg.norm(pixels[:, 1] - truth, axis=1)
+        np.testing.assert_allclose(error[inside], distance[inside], rtol=0, atol=1e-4)
+        eyes, _ = rays(sequence, other, tau, truth)
+        hidden = hit(eyes, X - eyes) < 1 - 1e-5
+        kinds = [~solid, ~inside, hidden, distance <= 3.0]
+        names = (MatchClass.NO_SURFACE, MatchClass.OUT_OF_VIEW, MatchClass.OCCLUDED, MatchClass.RIGHT)
+        assert np.array_equal(classes, np.select(kinds, names, MatchClass.WRONG))
+        seen.append(np.bincount(classes, minlength=6))
+    counts = np.sum(seen, axis=0)
+    assert counts[MatchClass.RIGHT] >= 20 and np.all(counts[[MatchClass.OCCLUDED, MatchClass.NO_SURFACE]] >= 2)
+
+
+def test_matches_are_those_that_a_solver_is_given(sequence: Sequence) -> None:
+    matches = sequence.matches()
+    images = {view: sequence.image("rs", *view) for view in VIEWS}
+    found = find_matches_of_rig(images, sequence.rig, sequence.shutter.scanning, CorrectionOptions())
+    given, tracks = matches.correspondences(), matches.tracks
+    assert np.array_equal(given.tracks, found.tracks) and len(found.tracks) >= 3
+    for name in MATCHED:
+        rows, other = (np.unique(getattr(each, name), axis=0) for each in (given, found))
+        assert np.array_equal(rows, other) and len(rows) == len(getattr(given, name))
+    kept = matches.correspondences((matches.classes == MatchClass.RIGHT) & (tracks != 1))
+    assert len(kept.left) == np.sum((matches.classes == 1) & (tracks != 1) & (matches.sets == 0))
+    assert len(kept.tracks) < len(given.tracks) and not np.any(np.all(kept.tracks == given.tracks[1], axis=1))
+    assert sequence.matcher()["versions"]["opencv"] == cv2.__version__
+
+
 def test_linear_images_are_the_images_before_rounding(sequence: Sequence) -> None:
     """Half floats err by 2^-12 of a value, by 0.03 codes: where one shade fills a picture, all of it may."""
     for side, frame in VIEWS:
@@ -321,7 +373,7 @@ def test_channels_that_depth_contradicts_are_cleared_when_they_are_what_rays_mak
     yard: Path, tmp_path: Path
 ) -> None:
     """All of a file, bit for bit: one pixel that is not is enough to leave it accused."""
-    accused = {"flow/right_1.exr", "gs_flow_mask/left_0.png", "normals/left_1.exr", TRACKS}
+    accused = {"flow/right_1.exr", "gs_flow_mask/left_0.png", "normals/left_1.exr", TRACKS, matches_file(0)}
     again = Again("auto", [yard.parent / "yard.toml"])
     assert again.cleared(read_content(read_sequence(yard / "yard"), ()), accused) == accused
     shutil.copytree(yard / "yard", tmp_path / "yard")

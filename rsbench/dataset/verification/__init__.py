@@ -19,6 +19,7 @@ from rsbench.dataset.verification.findings import DepthAgreement, Progress, Sequ
 from rsbench.dataset.verification.hdr_checks import hdr_faults
 from rsbench.dataset.verification.imu_checks import imu_faults
 from rsbench.dataset.verification.landing import PAIRS
+from rsbench.dataset.verification.match_checks import match_faults, matched_again
 from rsbench.dataset.verification.poses import pose_faults
 from rsbench.dataset.verification.rerender import Again, Rerender
 from rsbench.dataset.verification.sensors import sensor_faults
@@ -118,6 +119,9 @@ def verify_sequence(
         accused, cleared = _of_channels(every, stride, {*missing, *map(_file_of, faults)}, again)
         faults += accused
         notes += cleared
+        strange, unasked = matched_again(sequence, {*missing, *map(_file_of, faults)})
+        faults += strange
+        notes += unasked
         if again is not None:
             other, note = again.check(every, {*missing, *map(_file_of, faults)})
             faults += other
@@ -152,6 +156,7 @@ def _channel_checks(content: Content, stride: int) -> Iterator[Callable[[Collect
     yield partial(track_faults, sequence, maps)
     yield partial(surface_faults, sequence, maps)
     yield partial(hdr_faults, sequence, content.pictures)
+    yield partial(match_faults, sequence, maps)
 
 
 def _file_of(fault: str) -> str:

@@ -14,7 +14,18 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.shots import FAR, PAIRS, SHOTS, Shot, points_of, seen_by
 
-__all__ = ["DEPTH_TOLERANCE", "FAR", "PAIRS", "SHOTS", "BoolArray", "DepthMap", "Landing", "Shot", "land"]
+__all__ = [
+    "DEPTH_TOLERANCE",
+    "FAR",
+    "PAIRS",
+    "SHOTS",
+    "BoolArray",
+    "DepthMap",
+    "Landing",
+    "Shot",
+    "land",
+    "relative_depth",
+]
 
 DEPTH_TOLERANCE = 1e-4
 """Relative difference of two depths of one surface point that still agree."""
@@ -152,11 +163,11 @@ def land(sequence: Sequence, source: DepthMap, target: DepthMap, stride: int = 1
         guess = grid[rows][..., sequence.shutter.axis(target.shot.side)]
         seen, z, _ = seen_by(sequence, target.shot, X, guess)
         pixels[rows] = seen
-        relative[rows] = _relative(target, seen, z, sky)
+        relative[rows] = relative_depth(target, seen, z, sky)
     return Landing(pixels, relative)
 
 
-def _relative(target: DepthMap, pixels: FloatArray, z: FloatArray, sky: BoolArray) -> FloatArray:
+def relative_depth(target: DepthMap, pixels: FloatArray, z: FloatArray, sky: BoolArray) -> FloatArray:
     """See ``Landing.relative``; of points (...) with depth ``z`` seen at ``pixels`` (..., 2) of the target."""
     height, width = target.depth.shape
     relative = np.full(z.shape, np.nan)

@@ -19,7 +19,7 @@ from rsbench import __version__
 from rsbench.cards import list_cards, parse_card
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.channels import TRACKS
+from rsbench.dataset.channels import TRACKS, matches_file
 from rsbench.dataset.generation import image_seed
 from rsbench.dataset.scene_hashes import scene_hash
 from rsbench.dataset.sequence import whole_frames
@@ -28,6 +28,7 @@ from rsbench.dataset.verification.content import Content, clean_file
 from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.dataset.verification.image_checks import CHANGES, Picture
 from rsbench.dataset.verification.landing import SHOTS, DepthMap, Shot
+from rsbench.dataset.verification.match_checks import matches_again
 from rsbench.dataset.verification.stacks import stack_rows
 from rsbench.dataset.verification.surface_checks import surfaces_again
 from rsbench.dataset.verification.track_checks import tracks_again
@@ -113,11 +114,12 @@ class Again:
                 if any(f"/{shot.side}_{shot.frame}." in file for file in accused):
                     scene, depth = self._depth(content, shot)
                     for made in (channels_again, surfaces_again):
-                        again = made(sequence, shot, rows, depth, SceneRays(scene), ())
-                        same |= {file for file, _, alike in again if alike}
-            if TRACKS in accused:
-                scene, _ = self._scene(_table(sequence.manifest, "scene"))
-                same |= {file for file, _, alike in tracks_again(sequence, SceneRays(scene), ()) if alike}
+                        checks = made(sequence, shot, rows, depth, SceneRays(scene), ())
+                        same |= {file for file, _, alike in checks if alike}
+            for file, again in ((TRACKS, tracks_again), (matches_file(0), matches_again)):
+                if file in accused:
+                    scene, _ = self._scene(_table(sequence.manifest, "scene"))
+                    same |= {name for name, _, alike in again(sequence, SceneRays(scene), ()) if alike}
         return same & set(accused)
 
     def _depth(self, content: Content, shot: Shot) -> tuple[MitsubaScene, NDArray[np.float32]]:
@@ -211,7 +213,8 @@ def _checks(
             yield from (_Check(*check) for check in again)
         if shot.shutter == "rs":
             yield from _frame_checks(content, scene, options, shot, rows, told)
-    yield from (_Check(*check) for check in tracks_again(content.sequence, SceneRays(scene), told))
+    for of_points in (tracks_again, matches_again):
+        yield from (_Check(*check) for check in of_points(content.sequence, SceneRays(scene), told))
 
 
 def _frame_checks(

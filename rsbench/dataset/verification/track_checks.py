@@ -91,7 +91,7 @@ def _pixel_faults(sequence: Sequence, tracks: Tracks, k: int, found: RSProjectio
 def _hiding_faults(tracks: Tracks, k: int, found: RSProjection, depth: DepthMap, file: str) -> Iterator[str]:
     """Visible points are not far behind the pixels around them, hidden ones not before all of them."""
     known = np.isfinite(found.tau) & (tracks.sources != k)
-    low, high = _around(depth.depth, found.pixels[known])
+    low, high = depths_around(depth.depth, found.pixels[known])
     z, classes = found.depth[known], tracks.classes[known, k]
     for words, so, wrong in (
         ("are visible, but hidden by", z > high * (1 + _BEHIND), PixelClass.VISIBLE),
@@ -102,7 +102,7 @@ def _hiding_faults(tracks: Tracks, k: int, found: RSProjection, depth: DepthMap,
             yield finding(file, f"{bad} of {np.sum(known)} points {words} {depth.shot.depth}")
 
 
-def _around(depth: NDArray[np.float32], pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+def depths_around(depth: NDArray[np.float32], pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Least and largest depth (n,) of the 4 x 4 pixels around pixels (n, 2); sky is infinitely far."""
     far = np.where(depth > 0, depth.astype(np.float64), np.inf)
     x, y = np.floor(pixels).astype(np.int64).T
