@@ -201,7 +201,7 @@ def test_tracks_are_where_rays_say(sequence: Sequence, triangles: Array) -> None
 
 
 def test_matches_are_labelled_as_rays_say(sequence: Sequence, triangles: Array) -> None:
-    """Keypoints lie between pixels: depth to the rounding of rays to float32, rows by bisection, hidden by rays."""
+    """Between pixels: depth to the rounding of rays to float32, rows by bisection, what is hidden by rays."""
     matches, hit = sequence.matches(), partial(first_hit, triangles)
     h, seen = sequence.shutter.readout_ratio / sequence.shutter.height, []
     for k, ((side, frame), (other, later)) in enumerate(MATCHED.values()):

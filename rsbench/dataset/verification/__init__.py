@@ -119,9 +119,6 @@ def verify_sequence(
         accused, cleared = _of_channels(every, stride, {*missing, *map(_file_of, faults)}, again)
         faults += accused
         notes += cleared
-        strange, unasked = matched_again(sequence, {*missing, *map(_file_of, faults)})
-        faults += strange
-        notes += unasked
         if again is not None:
             other, note = again.check(every, {*missing, *map(_file_of, faults)})
             faults += other
@@ -138,13 +135,17 @@ def verify_sequence(
 def _of_channels(
     content: Content, stride: int, told: set[str], again: Again | None
 ) -> tuple[list[str], list[str]]:
-    """Faults of channels, but for files that are told already; and notes of the accused that are right."""
+    """Faults of channels, but for files that are told already; and notes: of the accused that are right, and more.
+
+    Rays say nothing of what the pictures do not show, and so clear nobody of it.
+    """
     faults: list[str] = []
     for found in _channel_checks(content, stride):
         faults += found({*told, *map(_file_of, faults)})
+    unfound, notes = matched_again(content.sequence, {*told, *map(_file_of, faults)})
     cleared = again.cleared(content, set(map(_file_of, faults))) if again is not None and faults else set()
-    notes = [finding(file, "others contradict it, and it is what is made again, all of it") for file in cleared]
-    return [fault for fault in faults if _file_of(fault) not in cleared], sorted(notes)
+    notes += [finding(file, "others contradict it, and it is what is made again, all of it") for file in cleared]
+    return [*(fault for fault in faults if _file_of(fault) not in cleared), *unfound], sorted(notes)
 
 
 def _channel_checks(content: Content, stride: int) -> Iterator[Callable[[Collection[str]], Iterator[str]]]:
