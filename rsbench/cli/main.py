@@ -18,6 +18,7 @@ from rsbench.cli import (
     evaluate,
     faults,
     generate,
+    leaderboard,
     reproduce,
     show,
     simulate,
@@ -75,6 +76,7 @@ for module in (
     evaluate,
     correct,
     simulate,
+    leaderboard,
     reproduce,
     docs,
 ):

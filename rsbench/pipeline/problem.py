@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -18,7 +18,7 @@ from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.errors import RsbenchError
 from rsbench.reading import FILE_BYTES, check_amount, load_arrays, parse_json, read_text
 
-_COLUMNS = {
+COLUMNS = {
     "left": "x0, y0, x1, y1",
     "right": "x0, y0, x1, y1",
     "stereo_0": "xl, yl, xr, yr",
@@ -94,6 +94,21 @@ def read_problem(path: str | Path) -> Problem:
     return problems[0]
 
 
+def problem_record(problem: Problem) -> dict[str, Any]:
+    """A problem as JSON holds it: ``parse_problem`` reads it. Sets without a match are left out, but not all."""
+    camera, shutter = problem.rig.camera, problem.shutter
+    lens = {} if camera.lens is None else {"lens": asdict(camera.lens)}
+    sets = {key: getattr(problem.correspondences, key).tolist() for key in COLUMNS}
+    return {
+        "name": problem.name,
+        "camera": {key: getattr(camera, key) for key in _CAMERA} | lens,
+        "baseline": problem.rig.baseline,
+        "readout_ratio": shutter.readout_ratio,
+        **({} if shutter.plain else asdict(shutter.scanning)),
+        **({key: rows for key, rows in sets.items() if rows} or {"left": []}),
+    }
+
+
 def _read_file(path: Path) -> Iterator[Problem | RsbenchError]:
     try:
         if path.suffix == ".npz":
@@ -166,9 +181,9 @@ def parse_problem(text: str, where: str, name: str = "") -> Problem:
     data = parse_json(text, where)  # reads NaN, which parse_card refuses with the field's name
     content = parse_card(_Content, data, where)
     _check_sets(data, where)
-    for key, columns in _COLUMNS.items():
+    for key, columns in COLUMNS.items():
         _check_widths(getattr(content, key), key, columns, where)
-    sets = {key: getattr(content, key) for key in _COLUMNS}
+    sets = {key: getattr(content, key) for key in COLUMNS}
     return _problem(
         content.camera,
         content.baseline,
@@ -182,8 +197,8 @@ def parse_problem(text: str, where: str, name: str = "") -> Problem:
 
 def _check_sets(data: Mapping[str, Any], where: str) -> None:
     """Empty sets are a problem without an answer; none at all is a slip."""
-    if not any(key in data for key in _COLUMNS):
-        raise RsbenchError(f"{where}: no matches: at least one of {', '.join(_COLUMNS)} is required")
+    if not any(key in data for key in COLUMNS):
+        raise RsbenchError(f"{where}: no matches: at least one of {', '.join(COLUMNS)} is required")
 
 
 def _check_widths(rows: _Rows, name: str, columns: str, where: str) -> None:
@@ -214,7 +229,7 @@ def _problem(
 def _from_npz(path: Path) -> Problem:
     """A problem in arrays: ``camera`` (6,) as width, height, fx, fy, cx, cy, and the other keys as in JSON."""
     arrays = load_arrays(path)
-    known = ("camera", "baseline", "readout_ratio", "name", *_COLUMNS)
+    known = ("camera", "baseline", "readout_ratio", "name", *COLUMNS)
     for key in arrays:
         if key not in known:
             raise RsbenchError(f"{path}: unknown key {key!r}{choices(key, known)}")
@@ -234,7 +249,7 @@ def _from_npz(path: Path) -> Problem:
     width, height, *rest = size.tolist()
     values = {"width": int(width), "height": int(height), **dict(zip(_CAMERA[2:], rest, strict=True))}
     camera = parse_card(PinholeCamera, values, f"{path}: camera")
-    sets = {key: arrays[key] for key in _COLUMNS if key in arrays}
+    sets = {key: arrays[key] for key in COLUMNS if key in arrays}
     baseline, ratio = float(arrays["baseline"].item()), float(arrays["readout_ratio"].item())
     name = str(arrays["name"]) if "name" in arrays else path.stem
     return _problem(camera, baseline, ratio, Scanning(), sets, name, str(path))

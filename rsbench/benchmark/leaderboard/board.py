@@ -1,0 +1,273 @@
+"""A board: a folder of scored entries, kept with their predictions, that two people can merge.
+
+    board.json                                    the format
+    <protocol>/<split>/split.json                 which split it is; facts of its problems where those are public
+    <protocol>/<split>/entries/<method>/predictions.jsonl, scores.csv, entry.json
+
+An entry is written under another name and renamed, so that it is there whole or not at all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rsbench.benchmark.leaderboard.exporting import split_record
+from rsbench.benchmark.leaderboard.marking import mark
+from rsbench.benchmark.leaderboard.protocols import AUC_DEG, PROTOCOLS
+from rsbench.benchmark.leaderboard.splits import Split
+from rsbench.benchmark.leaderboard.submissions import Header, Submission, read_submission
+from rsbench.cards import parse_card
+from rsbench.dataset.files import read_table, write_bytes, write_json, write_table
+from rsbench.dataset.workplace import WORK, workplace
+from rsbench.errors import RsbenchError
+from rsbench.reading import NAME, read_bytes, read_json
+
+FORMAT = 1
+FILES = ("predictions.jsonl", "scores.csv", "entry.json")
+"""Of an entry; the last one says of the others what they are."""
+NUMBERS = (
+    "e_R_deg",
+    "e_T_deg",
+    "e_s",
+    "metres",
+    "e_row_deg",
+    "error_deg",
+    *(f"auc_{limit}" for limit in AUC_DEG),
+    "flip",
+    "failure",
+    "nees",
+    "seconds",
+)
+"""Columns of scores.csv that hold numbers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """What entry.json must hold; it holds more."""
+
+    format: int
+    header: Header
+    predictions_sha256: str
+    fingerprint: str
+    """Of the split."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scored:
+    """An entry of a board."""
+
+    folder: Path
+    header: Header
+    predictions_sha256: str
+    scores: pd.DataFrame
+    """One row for each problem, see ``marking.mark``."""
+
+
+def add(board: Path, predictions: Path, split: Split, made: dict[str, Any], *, replace: bool = False) -> Scored:
+    """Score a file of predictions and keep both.
+
+    Args:
+        made: how it came about, for entry.json.
+        replace: whether an entry of that name may be replaced.
+
+    Raises:
+        RsbenchError: the file is at fault; an entry of that name has other predictions; the board cannot be
+            written, or another command is at work there.
+    """
+    submission, data = read_submission(predictions, split), read_bytes(predictions)
+    with workplace(board) as hidden:
+        _open(board)
+        folder = place(board, split.protocol.id, split.name) / "entries" / submission.header.method
+        if not replace:
+            _refuse_another(folder, hashlib.sha256(data).hexdigest())
+        _write_split(board, split)
+        _put(hidden / WORK / "entry", folder, _contents(submission, data, split, made))
+    return _read_entry(folder)
+
+
+def _contents(
+    submission: Submission, data: bytes, split: Split, made: dict[str, Any]
+) -> tuple[bytes, pd.DataFrame, dict[str, Any]]:
+    record = {
+        "format": FORMAT,
+        "header": asdict(submission.header),
+        "predictions_sha256": hashlib.sha256(data).hexdigest(),
+        "fingerprint": split.fingerprint,
+        "made": made,
+    }
+    return data, mark(submission, split), record
+
+
+def _put(new: Path, folder: Path, contents: tuple[bytes, pd.DataFrame, dict[str, Any]]) -> None:
+    """Write an entry aside, and rename it to its place."""
+    data, scores, record = contents
+    new.mkdir(parents=True)
+    write_bytes(new / FILES[0], data)
+    write_table(new / FILES[1], scores)
+    write_json(new / FILES[2], record)
+    _move(new, folder)
+
+
+def _move(new: Path, folder: Path) -> None:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    if folder.is_symlink() or folder.exists():
+        os.replace(folder, new.with_name(f"{new.name}~"))  # no name of an entry
+    os.replace(new, folder)
+
+
+def place(board: Path, protocol: str, split: str) -> Path:
+    """Folder of a split."""
+    return board / protocol / split
+
+
+def _open(board: Path) -> None:
+    """Make a board of a folder that is empty or is one.
+
+    Raises:
+        RsbenchError: the folder holds something else.
+    """
+    path = board / "board.json"
+    if path.is_file():
+        _check_board(board)
+        return
+    if any(each.name != ".rsbench" for each in board.iterdir()):
+        raise RsbenchError(f"{board}: is no board (no board.json) and not empty; choose another --board")
+    write_json(path, {"format": FORMAT})
+
+
+def _check_board(board: Path) -> None:
+    path = board / "board.json"
+    if not path.is_file():
+        raise RsbenchError(f"{board}: is no board (no board.json); rsbench leaderboard submit makes one")
+    if (found := read_json(path).get("format")) != FORMAT:
+        raise RsbenchError(f"{path}: format = {found!r}: must be {FORMAT}")
+
+
+def _write_split(board: Path, split: Split) -> None:
+    path = place(board, split.protocol.id, split.name) / "split.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    facts = {truth.name: truth.facts for truth in split.truths} if split.public else {}
+    write_json(path, {**split_record(split), "facts": facts})
+
+
+def _refuse_another(folder: Path, sha256: str) -> None:
+    if folder.is_dir() and read_json(folder / FILES[2]).get("predictions_sha256") != sha256:
+        raise RsbenchError(
+            f"{folder}: is an entry of that name with other predictions; rename the method, or replace the entry "
+            "with --replace"
+        )
+
+
+# Reading
+
+
+def splits_of(board: Path) -> list[tuple[str, str]]:
+    """Protocols and names of the splits of a board, in the order of tracks.
+
+    Raises:
+        RsbenchError: it is no board.
+    """
+    _check_board(board)
+    found = []
+    for protocol in (each.id for each in PROTOCOLS.values()):
+        found += [(protocol, folder.name) for folder in _folders(board / protocol)]
+    return found
+
+
+def entries_of(board: Path, protocol: str, split: str) -> list[Scored]:
+    """Entries of a split, by name.
+
+    Raises:
+        RsbenchError: an entry is damaged.
+    """
+    return [_read_entry(folder) for folder in _folders(place(board, protocol, split) / "entries")]
+
+
+def _folders(folder: Path) -> Iterator[Path]:
+    """Folders below one whose names can be those of ours, sorted; links are none."""
+    if folder.is_dir() and not folder.is_symlink():
+        for path in sorted(folder.iterdir()):
+            if NAME.fullmatch(path.name) and path.is_dir() and not path.is_symlink():
+                yield path
+
+
+def _read_entry(folder: Path) -> Scored:
+    for name in FILES:
+        if (folder / name).is_symlink() or not (folder / name).is_file():
+            raise RsbenchError(
+                f"{folder / name}: must be a file of its own; remove the entry, and submit it again"
+            )
+    path = folder / FILES[2]
+    record = parse_card(Recorded, read_json(path), str(path), extra="ignore")
+    named = (record.header.protocol, record.header.split, record.header.method)
+    if named != (folder.parents[2].name, folder.parents[1].name, folder.name):
+        raise RsbenchError(f"{path}: header: names {'/'.join(named)}, which is not where it lies")
+    columns = ("problem", "scene", "success")
+    scores = read_table(folder / FILES[1], columns, NUMBERS, dtype={"problem": str, "scene": str})
+    if scores["problem"].duplicated().any() or np.any(~np.isfinite(scores[[f"auc_{x}" for x in AUC_DEG]])):
+        raise RsbenchError(f"{folder / FILES[1]}: is damaged; rsbench leaderboard rescore makes it again")
+    return Scored(folder=folder, header=record.header, predictions_sha256=record.predictions_sha256, scores=scores)
+
+
+# Merging, and scoring again
+
+
+def merge(other: Path, board: Path) -> list[str]:
+    """Copy the entries of another board that are not here yet; returns what was copied.
+
+    Scores are copied as they are: ``rescore`` tells whether the truth agrees.
+
+    Raises:
+        RsbenchError: an entry of one name has two predictions; one of the boards is none, or damaged.
+    """
+    theirs = [
+        (scored, place(board, protocol, split) / "entries" / scored.header.method)
+        for protocol, split in splits_of(other)
+        for scored in entries_of(other, protocol, split)
+    ]
+    copied = []
+    with workplace(board) as hidden:
+        _open(board)
+        for scored, folder in theirs:
+            _refuse_another(folder, scored.predictions_sha256)
+        for number, (scored, folder) in enumerate(theirs):
+            if not folder.exists():
+                new = hidden / WORK / str(number)
+                shutil.copytree(scored.folder, new, ignore=lambda _, names: [n for n in names if n not in FILES])
+                about = folder.parents[1] / "split.json"
+                if not about.exists():
+                    about.parent.mkdir(parents=True, exist_ok=True)
+                    write_json(about, read_json(scored.folder.parents[1] / "split.json"))
+                _move(new, folder)
+                copied.append("/".join(folder.parts[-4:-2]) + f"/{folder.name}")
+    return copied
+
+
+def rescore(board: Path, split: Split) -> dict[str, list[str]]:
+    """Score the stored predictions of a split again; no method runs.
+
+    Returns:
+        For each entry whose scores were others, the columns that changed.
+    """
+    changed: dict[str, list[str]] = {}
+    with workplace(board) as hidden:
+        for scored in entries_of(board, split.protocol.id, split.name):
+            path = scored.folder / FILES[0]
+            submission, data = read_submission(path, split), read_bytes(path)
+            made = read_json(scored.folder / FILES[2]).get("made", {})
+            new = hidden / WORK / scored.header.method
+            _put(new, scored.folder, _contents(submission, data, split, made))
+            now = _read_entry(scored.folder).scores
+            columns = [str(name) for name in now if not now[name].equals(scored.scores.get(name, pd.Series()))]
+            if columns:
+                changed[scored.header.method] = columns
+    return changed

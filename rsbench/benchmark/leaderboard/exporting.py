@@ -1,0 +1,85 @@
+"""Inputs for any language: CSV, npz and JSON of the same problems, and the truth of a public split.
+
+What is written is all that a method may know; docs/submit.md describes the files.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.benchmark.leaderboard.splits import Split
+from rsbench.benchmark.leaderboard.submissions import truth_text
+from rsbench.dataset.files import save_arrays, write_bytes, write_json
+from rsbench.pipeline.problem import COLUMNS, Problem, problem_record
+
+RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "readout_ratio")
+"""Columns of problems.csv after the name."""
+
+
+def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:
+    """Write the problems of a split into a folder, and its truth where that is public.
+
+    Raises:
+        RsbenchError: a file cannot be written.
+    """
+    given = list(problems)
+    out.mkdir(parents=True, exist_ok=True)
+    records = [problem_record(problem) for problem in given]
+    write_bytes(out / "problems.jsonl", "".join(json.dumps(each) + "\n" for each in records).encode())
+    write_bytes(out / "problems.csv", _csv(("name", *RIG), ((p.name, *_rig(p)) for p in given)))
+    for key, columns in COLUMNS.items():
+        rows = [(p.name, *row) for p in given for row in getattr(p.correspondences, key).tolist()]
+        if rows:
+            write_bytes(out / f"{key}.csv", _csv(("name", *columns.split(", ")), rows))
+    save_arrays(out / "problems.npz", _arrays(given))
+    if split.public:
+        write_bytes(out / "truth.jsonl", truth_text(split).encode())
+    write_json(out / "split.json", split_record(split))
+
+
+def split_record(split: Split) -> dict[str, Any]:
+    """What is told of a split before anything is scored."""
+    return {
+        "protocol": split.protocol.id,
+        "split": split.name,
+        "fingerprint": split.fingerprint,
+        "problems": len(split.truths),
+        "given": split.protocol.given,
+        "allowed": list(split.protocol.allowed),
+    }
+
+
+def _rig(problem: Problem) -> tuple[float, ...]:
+    camera = problem.rig.camera
+    values = (getattr(camera, key) for key in RIG[:6])
+    return (*values, problem.rig.baseline, problem.shutter.readout_ratio)
+
+
+def _csv(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
+    """Numbers with all their digits."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return text.getvalue().encode()
+
+
+def _arrays(problems: list[Problem]) -> dict[str, NDArray[Any]]:
+    """``names`` (n,), ``rig`` (n, 8) as ``RIG``; sets (m, 4 or 8), ``<set>_problem`` (m,): whose each row is."""
+    arrays: dict[str, NDArray[Any]] = {
+        "names": np.array([problem.name for problem in problems]),
+        "rig": np.array([_rig(problem) for problem in problems]),
+    }
+    for key in COLUMNS:
+        sets = [getattr(problem.correspondences, key) for problem in problems]
+        arrays[key] = np.concatenate(sets)
+        arrays[f"{key}_problem"] = np.repeat(np.arange(len(sets)), [len(each) for each in sets])
+    return arrays

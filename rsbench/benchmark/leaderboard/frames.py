@@ -1,0 +1,60 @@
+"""Inputs from rendered frames: given matches, or the frames themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import VIEWS
+from rsbench.dataset.files import write_bytes
+from rsbench.dataset.sequence import Sequence, picture_file, read_dataset
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.pipeline.problem import Problem
+from rsbench.reading import inside, read_bytes
+from rsbench.vision.feature_matcher import load_features
+
+FEATURES = "sift"
+"""Whose matches the protocol pose-1 gives."""
+
+
+def matched_problems(data: Path) -> Iterator[Problem]:
+    """Each sequence with its given matches; none where the frames show no texture."""
+    options = CorrectionOptions(features=load_features(FEATURES))
+    for sequence in read_dataset(data):
+        yield _problem(sequence, _matches(sequence, options))
+
+
+def bare_problems(data: Path) -> Iterator[Problem]:
+    """Each sequence without matches: its rig and its shutter."""
+    for sequence in read_dataset(data):
+        yield _problem(sequence, Correspondences())
+
+
+def write_frames(data: Path, out: Path) -> None:
+    """Copy the rolling-shutter frames, as ``frames/<problem>/left_0.png`` to ``right_1.png``.
+
+    Raises:
+        RsbenchError: a frame is missing or is no image of the camera's size, or cannot be written.
+    """
+    for sequence in read_dataset(data):
+        folder = out / "frames" / sequence.name
+        folder.mkdir(parents=True, exist_ok=True)
+        for side, frame in VIEWS:
+            sequence.image("rs", side, frame)  # that it can be read
+            path = inside(sequence.folder, picture_file("rs", side, frame))
+            write_bytes(folder / f"{side}_{frame}.png", read_bytes(path))
+
+
+def _problem(sequence: Sequence, matches: Correspondences) -> Problem:
+    return Problem(name=sequence.name, correspondences=matches, rig=sequence.rig, shutter=sequence.shutter)
+
+
+def _matches(sequence: Sequence, options: CorrectionOptions) -> Correspondences:
+    images = {view: sequence.image("rs", *view) for view in VIEWS}
+    try:
+        return find_matches_of_rig(images, sequence.rig, sequence.shutter.scanning, options)
+    except RsbenchError:  # frames without texture: an empty problem, which every method fails
+        return Correspondences()

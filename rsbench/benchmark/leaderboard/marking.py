@@ -1,0 +1,99 @@
+"""Scores of a submission, one row for each problem of its split: by the one scorer, and by nothing else.
+
+A problem without an answer is a failure, and a failure scores the worst value of everything.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rsbench.benchmark.leaderboard.protocols import AUC_DEG, FLIP_DEG
+from rsbench.benchmark.leaderboard.splits import Split, Truth
+from rsbench.benchmark.leaderboard.submissions import Answer, Submission
+from rsbench.benchmark.scoring import answered, pose_errors
+from rsbench.core import so3
+from rsbench.core.metrics import translation_of_offset
+from rsbench.core.so3 import FloatArray
+from rsbench.motions import make_motion
+
+_TIMES = 33
+"""Row times, from the first row of frame 0 to the last of frame 1, at which poses are compared."""
+Row = dict[str, Any]
+
+
+def mark(submission: Submission, split: Split) -> pd.DataFrame:
+    """One row for each problem, in the order of the split; the columns are those of docs/score-files.md."""
+    model = submission.header.motion_model
+    return pd.DataFrame([_row(truth, submission.answers.get(truth.name), model) for truth in split.truths])
+
+
+def _row(truth: Truth, answer: Answer | None, model: str) -> Row:
+    w, d = _vectors(answer)
+    success = answer is not None and bool(answered(w, d, answer.success))
+    point = "body" if answer is None else answer.reference_point
+    metric = answer is not None and answer.metric
+    errors = pose_errors(
+        w,
+        d,
+        true_w=truth.motion.w,
+        true_d=truth.motion.d,
+        rig=truth.rig,
+        success=success,
+        metric=metric,
+        reference_point=point,
+    )
+    found = {name: float(value) for name, value in errors.items()}
+    worst = float(np.fmax(found["e_R_deg"], found["e_T_deg"]))
+    return {
+        "problem": truth.name,
+        "scene": truth.scene,
+        "success": success,
+        **found,
+        "metres": _metres(d, truth, point) if success and metric else math.nan if success else math.inf,
+        "e_row_deg": _row_angle(w, d, truth, model) if success else 180.0,
+        "error_deg": worst,
+        **{f"auc_{limit}": max(0.0, 1.0 - worst / limit) for limit in AUC_DEG},
+        "flip": float(success and found["e_T_deg"] > FLIP_DEG),
+        "failure": float(not success),
+        "nees": _nees(answer, w, d, truth) if answer is not None and success and metric else math.nan,
+        "seconds": math.nan if answer is None or answer.seconds is None else answer.seconds,
+    }
+
+
+def _vectors(answer: Answer | None) -> tuple[FloatArray, FloatArray]:
+    if answer is None or answer.w is None or answer.d is None:
+        return np.full(3, np.nan), np.full(3, np.nan)
+    return np.array(answer.w), np.array(answer.d)
+
+
+def _true_d(truth: Truth, point: str) -> FloatArray:
+    if point == "body":
+        return truth.motion.d
+    return translation_of_offset(truth.motion.w, truth.motion.d, truth.rig.offset("left"))
+
+
+def _metres(d: FloatArray, truth: Truth, point: str) -> float:
+    return float(np.linalg.norm(d - _true_d(truth, point)))
+
+
+def _row_angle(w: FloatArray, d: FloatArray, truth: Truth, model: str) -> float:
+    """The largest angle between estimated and true poses of a row, degrees."""
+    times = np.linspace(0.0, 1.0 + truth.shutter.readout_ratio, _TIMES)
+    estimated = make_motion(model, w, d).body_from_world(times).R
+    true = truth.motion.body_from_world(times).R
+    return float(np.rad2deg(np.max(so3.angle(estimated @ np.swapaxes(true, -1, -2)))))
+
+
+def _nees(answer: Answer, w: FloatArray, d: FloatArray, truth: Truth) -> float:
+    """Squared error of (w, d) by the covariance that was stated: on average 6 where that is right."""
+    if answer.covariance is None:
+        return math.nan
+    error = np.concatenate([w - truth.motion.w, d - _true_d(truth, answer.reference_point)])
+    values, vectors = np.linalg.eigh(np.array(answer.covariance))
+    if not values[0] > 0.0:
+        return math.inf
+    return float(np.sum((vectors.T @ error) ** 2 / values))

@@ -1,0 +1,198 @@
+"""Running cards: predictions first, each kept as soon as it is made; scores come after, and run no method.
+
+A method sees what is exported, and nothing else. Each answer of a card is a file whose identity says from which
+method, inputs, options and code it came: what is current is kept, so a killed run goes on where it was. Cards of
+other packages run in processes of their own with a limit of time; what they do wrong is a failure with the reason.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rsbench.benchmark.images.store import identity_of, read_record
+from rsbench.benchmark.leaderboard.exporting import write_inputs
+from rsbench.benchmark.leaderboard.protocols import Protocol
+from rsbench.benchmark.leaderboard.splits import Split
+from rsbench.benchmark.leaderboard.submissions import submission_text
+from rsbench.benchmark.provenance import numeric_version, processor
+from rsbench.benchmark.simulated.trials import Information, enter
+from rsbench.dataset.files import sha256, write_bytes, write_json
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.answer import Extra, solve_problem
+from rsbench.pipeline.isolated_jobs import finished_jobs
+from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.pipeline.problem import Problem, read_problems
+from rsbench.pipeline.robust_motion import RobustOptions
+from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.solvers.engine.warm_up import warm_up
+
+_EXTRAS: tuple[Extra, ...] = ("covariance",)
+CHUNK = 10
+"""Problems of one job."""
+_USES: dict[Information, tuple[str, ...]] = {
+    "left pairs": ("left",),
+    "left and right pairs": ("left", "right"),
+    "linked pairs": ("left", "right", "links"),
+    "tracks": ("left", "right", "links"),
+}
+_KEPT = (
+    "name",
+    "success",
+    "reason",
+    "w",
+    "d",
+    "metric",
+    "reference_point",
+    "direction_known",
+    "covariance",
+    "seconds",
+)
+"""Of an answer of ``solve_problem``."""
+
+
+class _Job(NamedTuple):
+    card: str
+    first: int
+    path: Path
+
+    def __str__(self) -> str:
+        return f"{self.card}, problems {self.first} to {self.first + CHUNK - 1}"
+
+
+def uses_of(entry: SolverEntry) -> tuple[str, ...]:
+    """What a solver uses, by what it declares."""
+    return _USES[enter(entry).information] + (("readout",) if entry.solver.spec.shutter == "rolling" else ())
+
+
+def prepare_inputs(split: Split, problems: Callable[[], Iterator[Problem]], folder: Path) -> None:
+    """Export a split into a folder, unless it holds that already."""
+    stored = read_record(folder / "split.json")
+    if stored is None or stored.get("fingerprint") != split.fingerprint:
+        write_inputs(split, problems(), folder)
+
+
+def run_cards(
+    cards: Sequence[str],
+    split: Split,
+    inputs: Path,
+    work: Path,
+    *,
+    workers: int = 1,
+    time_limit_s: float | None = None,
+    step: Callable[[str], None] = lambda word: None,
+) -> list[Path]:
+    """Run solvers on exported inputs; returns for each a file of predictions in ``work``, ready to be submitted.
+
+    Raises:
+        RsbenchError: no such solver; it uses what the protocol does not give; processes died twice over the same
+            problems: what is done is kept.
+    """
+    entries = {card: load_solver_entry(card) for card in cards}
+    for entry in entries.values():
+        _check_uses(split.protocol, entry)
+    data, count = sha256(inputs / "problems.jsonl"), len(split.truths)
+    jobs, identities = [], {}
+    for card, entry in entries.items():
+        identities[card] = _identity(entry, split, data)
+        for first in range(0, count, CHUNK):
+            job = _Job(card, first, work / entry.name / f"{identities[card][:16]}-{first:05d}.json")
+            if read_record(job.path) is None:
+                jobs.append(job)
+            else:
+                step(entry.name)
+    if jobs:
+        warm_up({entry.solver.spec.motion_model for entry in entries.values()})
+    one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
+    with closing(finished_jobs(_serve, jobs, workers, one_thread, inputs, time_limit_s)) as found:
+        for job, _ in found:
+            step(entries[job.card].name)
+    return [_joined(entry, split, work, identities[card]) for card, entry in entries.items()]
+
+
+def steps_of(cards: Sequence[str], split: Split) -> int:
+    """How often ``run_cards`` reports progress."""
+    return len(cards) * -(-len(split.truths) // CHUNK)
+
+
+def _check_uses(protocol: Protocol, entry: SolverEntry) -> None:
+    try:
+        protocol.check_uses(uses_of(entry))
+    except ValueError as error:
+        raise RsbenchError(f"solver {entry.name!r}: {error}") from error
+
+
+def _identity(entry: SolverEntry, split: Split, data: str) -> str:
+    return identity_of(
+        source=numeric_version(),
+        solver=entry.key,
+        options=asdict(entry.options),
+        robust=asdict(RobustOptions()),
+        protocol=split.protocol.id,
+        data=data,
+    )
+
+
+def _joined(entry: SolverEntry, split: Split, work: Path, identity: str) -> Path:
+    """The chunks of a solver as one submission."""
+    spec = entry.solver.spec
+    header: dict[str, Any] = {
+        "protocol": split.protocol.id,
+        "split": split.name,
+        "method": entry.name,
+        "uses": uses_of(entry),
+        "description": entry.description[:300],
+        "paper": spec.reference[:300],
+        "code": "rsbench" if entry.built_in else "",
+        "hardware": f"{processor()}, 1 thread"[:300],
+        "motion_model": spec.motion_model if spec.motion_model in ("linear", "twist") else "linear",
+    }
+    answers: list[dict[str, Any]] = []
+    for first in range(0, len(split.truths), CHUNK):
+        record = read_record(work / entry.name / f"{identity[:16]}-{first:05d}.json") or {}
+        answers += record.get("answers", [])
+    path = work / entry.name / "predictions.jsonl"
+    write_bytes(path, submission_text(header, iter(answers)).encode())
+    return path
+
+
+# In the child
+
+
+def _serve(inputs: Path, time_limit_s: float | None) -> Callable[[_Job], None]:
+    use_one_thread()
+    warm_up()
+    runner = SolverRunner(time_limit_s=time_limit_s, single_thread=True)  # as long as this process
+    problems = [_good(each) for each in read_problems(inputs / "problems.jsonl", sys.stdin)]
+
+    def run(job: _Job) -> None:
+        try:
+            entry = load_solver_entry(job.card)
+            answers = [_answer(problem, entry, runner) for problem in problems[job.first : job.first + CHUNK]]
+        except RsbenchError as error:
+            raise EntryFailure(str(error)) from error
+        job.path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(job.path, {"answers": answers})
+
+    return run
+
+
+def _good(problem: Problem | RsbenchError) -> Problem:
+    if isinstance(problem, RsbenchError):
+        raise EntryFailure(str(problem))
+    return problem
+
+
+def _answer(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
+    """Samples are drawn by the names of problem and solver: they do not depend on the order or on the workers."""
+    text = f"leaderboard {problem.name} {entry.name}"
+    seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+    found = solve_problem(problem, entry, RobustOptions(), runner, seed, extras=_EXTRAS)
+    kept = {key: found[key] for key in _KEPT}
+    return {**kept, "seconds": round(found["seconds"], 6), "reason": str(found["reason"])[:300]}

@@ -1,0 +1,226 @@
+"""The problems of a split with their truth: drawn from a seed, or those of a rendered dataset.
+
+A split is known by its name and a fingerprint of its truth. The fingerprint can be announced before a
+competition: whoever is told the seed or is given the dataset afterwards finds the same one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsbench.benchmark.leaderboard.protocols import Protocol
+from rsbench.benchmark.seeds import generator
+from rsbench.benchmark.simulated.simulation import Simulation, simulate
+from rsbench.benchmark.simulated.sweep_card import Setting
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.motion import Motion
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.sequence import Sequence, read_dataset, read_dataset_manifest
+from rsbench.errors import RsbenchError
+from rsbench.motions import motion_record
+from rsbench.pipeline.problem import Problem, problem_record
+from rsbench.reading import check_name, read_text
+
+PUBLIC_SEED = 1
+"""Of the split ``dev``: its truth is known to everybody."""
+POINTS_PROBLEMS = 250
+_SHORTEST_SECRET = 16
+"""Characters of a seed file: shorter ones could be tried."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Truth:
+    """The true motion of one problem, and what is known of it."""
+
+    name: str
+    rig: StereoRig
+    shutter: RollingShutter
+    motion: Motion
+    scene: str
+    """Problems of one scene are not independent: intervals count scenes."""
+    facts: dict[str, float | str]
+    """What scores may be drawn against."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Split:
+    """The truth of all problems of a protocol."""
+
+    protocol: Protocol
+    label: str
+    """``dev``, ``test``, or the name of the dataset."""
+    public: bool
+    """Whether the truth may be told."""
+    truths: tuple[Truth, ...]
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of the protocol, the rigs and the true motions."""
+        content = [self.protocol.id, *(_identity(truth) for truth in self.truths)]
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def name(self) -> str:
+        """The label, and enough of the fingerprint that no two splits are taken for one."""
+        return f"{self.label}-{self.fingerprint[:8]}"
+
+    @cached_property
+    def by_name(self) -> dict[str, Truth]:
+        return {truth.name: truth for truth in self.truths}
+
+
+def _identity(truth: Truth) -> dict[str, Any]:
+    problem = Problem(name=truth.name, correspondences=Correspondences(), rig=truth.rig, shutter=truth.shutter)
+    return {**problem_record(problem), "motion": motion_record(truth.motion)}
+
+
+# Simulated points
+
+
+def points_split(protocol: Protocol, secret: Path | None = None) -> Split:
+    """The split ``dev``, or with a file that holds a secret seed the split ``test``.
+
+    Raises:
+        RsbenchError: the file cannot be read, or its text could be guessed.
+    """
+    seed = PUBLIC_SEED if secret is None else secret_seed(secret)
+    truths = tuple(_drawn(seed, number) for number in range(POINTS_PROBLEMS))
+    label = "dev" if secret is None else "test"
+    return Split(protocol=protocol, label=label, public=secret is None, truths=truths)
+
+
+def secret_seed(path: Path) -> int:
+    """The seed that a text stands for.
+
+    Raises:
+        RsbenchError: the file cannot be read, or its text is too short to be a secret.
+    """
+    text = read_text(path, 4096).strip()
+    if len(text) < _SHORTEST_SECRET:
+        raise RsbenchError(
+            f"{path}: holds {len(text)} characters: a secret seed needs {_SHORTEST_SECRET}, drawn at random"
+        )
+    return int.from_bytes(hashlib.sha256(text.encode()).digest(), "big")
+
+
+def simulated_problem(seed: int, number: int) -> Problem:
+    """The matches of one problem: tracks alone, of which a method takes what it uses.
+
+    Raises:
+        RsbenchError: the motion leaves too few points in view; another seed is needed.
+    """
+    setting = _setting(seed, number)
+    try:
+        found = _simulated(setting, seed, number)
+    except ValueError as error:
+        raise RsbenchError(f"problem {_name(number)}: {error}; choose another seed") from error
+    return Problem(name=_name(number), correspondences=found.correspondences, rig=found.rig, shutter=found.shutter)
+
+
+def _simulated(setting: Setting, seed: int, number: int) -> Simulation:
+    motion = _motion(setting, seed, number)
+    rng = generator(seed, "leaderboard", "scene", number)
+    return simulate(setting.rig(), setting.shutter(), motion, replace(setting.options(True), pairs=0), rng)
+
+
+def _name(number: int) -> str:
+    return f"p{number:03d}"
+
+
+def _motion(setting: Setting, seed: int, number: int) -> Motion:
+    return setting.motion(generator(seed, "leaderboard", "motion", number))
+
+
+def _setting(seed: int, number: int) -> Setting:
+    """Every size at random over what phones, drones and cars do; the camera is the paper's."""
+    rng = generator(seed, "leaderboard", "setting", number)
+
+    def between(low: float, high: float) -> float:
+        """As often in each factor."""
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+    return Setting(
+        width=900,
+        height=900,
+        focal=810.0,
+        depth=(2.0, 10.0),
+        rotation_deg=between(0.2, 8.0),
+        translation=between(0.05, 0.5),
+        baseline=between(0.1, 0.6),
+        noise_px=between(0.05, 1.0),
+        readout_ratio=float(rng.uniform(0.1, 1.0)),
+        points=int(rng.integers(40, 201)),
+        outlier_ratio=float(rng.choice([0.0, 0.1, 0.3, 0.5])),
+        shape="plane" if rng.random() < 0.2 else "box",
+    )
+
+
+def _drawn(seed: int, number: int) -> Truth:
+    setting = _setting(seed, number)
+    facts = {
+        **_sizes(_motion(setting, seed, number), setting.rig(), setting.shutter()),
+        "noise_px": setting.noise_px,
+        "outliers": setting.outlier_ratio,
+        "points": setting.points,
+        "shape": setting.shape,
+    }
+    return Truth(
+        name=_name(number),
+        rig=setting.rig(),
+        shutter=setting.shutter(),
+        motion=_motion(setting, seed, number),
+        scene=_name(number),
+        facts=facts,
+    )
+
+
+def _sizes(motion: Motion, rig: StereoRig, shutter: RollingShutter) -> dict[str, float | str]:
+    return {
+        "rotation_deg": float(np.rad2deg(np.linalg.norm(motion.w))),
+        "translation_m": float(np.linalg.norm(motion.d)),
+        "readout_ratio": shutter.readout_ratio,
+        "baseline_m": rig.baseline,
+    }
+
+
+# Rendered frames
+
+
+def dataset_split(protocol: Protocol, folder: Path, *, public: bool = True) -> Split:
+    """The sequences of a dataset.
+
+    Raises:
+        RsbenchError: the dataset cannot be read, or its name cannot be that of a split.
+    """
+    name = read_dataset_manifest(folder).name
+    try:
+        check_name(name)
+    except ValueError as error:
+        raise RsbenchError(f"{folder / 'dataset.json'}: {error}") from error
+    truths = tuple(_rendered(sequence) for sequence in read_dataset(folder))
+    return Split(protocol=protocol, label=name, public=public, truths=truths)
+
+
+def _rendered(sequence: Sequence) -> Truth:
+    scene = sequence.manifest.get("scene")
+    named = scene.get("name") if isinstance(scene, dict) else None
+    facts = {
+        **_sizes(sequence.motion, sequence.rig, sequence.shutter),
+        "sensor": "ideal" if sequence.sensor is None else "real",
+    }
+    return Truth(
+        name=sequence.name,
+        rig=sequence.rig,
+        shutter=sequence.shutter,
+        motion=sequence.motion,
+        scene=str(named or sequence.name),
+        facts=facts,
+    )

@@ -1,0 +1,298 @@
+"""Predictions of strangers: JSON lines, a header and an answer for each problem. Every fault is a line of its own.
+
+Nothing that stands there is believed: sizes are limited before anything is decoded, names are looked up among
+those of the split and are never paths, and numbers are finite. docs/submit.md is the format.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from rsbench.benchmark.leaderboard.protocols import protocol_of_id
+from rsbench.benchmark.leaderboard.splits import Split
+from rsbench.benchmark.simulated.misreadings import misreading
+from rsbench.cards import choices, parse_card
+from rsbench.errors import RsbenchError
+from rsbench.reading import MB, check_name, parse_json, read_text
+
+SUBMISSION_BYTES = 16 * MB
+"""Of a file of motions: 20 kB for each of 800 problems."""
+_LINE_CHARACTERS = 1 << 16
+_TEXT_CHARACTERS = 300
+_MOST_FAULTS = 50
+_OF_SOLVE = (
+    *("solver", "d_unit", "d_body", "motion_model", "shutter", "assumes", "inliers", "matches", "stereo_alone"),
+    *("threshold_px", "iterations", "noise_px", "inlier_indices", "model_choice"),
+)
+"""Keys that an answer of ``rsbench solve --json`` has beside those that are read."""
+_NAMED = 3
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Header:
+    """The first line: which split it is about, what the method is and what it uses."""
+
+    protocol: str
+    split: str
+    method: str
+    uses: tuple[str, ...]
+    version: str = ""
+    description: str = ""
+    authors: str = ""
+    paper: str = ""
+    code: str = ""
+    licence: str = ""
+    hardware: str = ""
+    tuned_on: str = ""
+    """Data by which its parameters were chosen."""
+    motion_model: Literal["linear", "twist"] = "linear"
+    """That ``w`` and ``d`` are meant in, between the rows."""
+
+    def __post_init__(self) -> None:
+        try:
+            check_name(self.method)
+        except ValueError as error:
+            raise ValueError(str(error).replace("name =", "method =", 1)) from error
+        protocol_of_id(self.protocol).check_uses(self.uses)
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, str) and (len(value) > _TEXT_CHARACTERS or not value.isprintable()):
+                raise ValueError(f"{field.name}: must be one line of at most {_TEXT_CHARACTERS} characters")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """One motion or failure, as ``rsbench solve --json`` prints it."""
+
+    name: str
+    """Of the problem."""
+    success: bool = True
+    reason: str = ""
+    w: Vector | None = None
+    d: Vector | None = None
+    metric: bool = False
+    reference_point: Literal["body", "left"] = "body"
+    direction_known: bool = True
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("w", "d"):
+            if self.success and getattr(self, name) is None:
+                raise ValueError(f"{name}: a success needs three numbers; a failure says success = false")
+        if self.seconds is not None and self.seconds < 0.0:
+            raise ValueError(f"seconds = {self.seconds}: must not be negative")
+        if self.covariance is not None and (
+            len(self.covariance) != 6 or any(len(row) != 6 for row in self.covariance)
+        ):
+            raise ValueError("covariance: must be 6 x 6 numbers, of w and d")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Submission:
+    """A file without faults."""
+
+    header: Header
+    answers: Mapping[str, Answer]
+    """By the name of the problem."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Findings:
+    """What a check found."""
+
+    submission: Submission | None
+    """None where there are faults."""
+    faults: tuple[str, ...]
+    """Each a line with file, line, field, value and remedy."""
+    notes: tuple[str, ...]
+    """What may be meant: it is scored as it stands."""
+
+
+def read_submission(path: Path, split: Split) -> Submission:
+    """A file of predictions.
+
+    Raises:
+        RsbenchError: it is at fault; the line says how often.
+    """
+    found = check_submission(path, split)
+    if found.submission is None:
+        more = len(found.faults) - 1
+        rest = f" (and {more} more: rsbench leaderboard check {path})" if more else ""
+        raise RsbenchError(f"{found.faults[0]}{rest}")
+    return found.submission
+
+
+def check_submission(path: Path, split: Split) -> Findings:
+    """Everything that is wrong with a file of predictions, or looks so."""
+    faults: list[str] = []
+    header: Header | None = None
+    answers: dict[str, Answer] = {}
+    lines: dict[str, int] = {}
+    try:
+        for number, text in _lines(path):
+            where = f"{path}:{number}"
+            try:
+                if header is None:
+                    header = _header(text, where, split)
+                    continue
+                answer = _answer(text, where, split)
+                if answer.name in answers:
+                    first = lines[answer.name]
+                    raise RsbenchError(f"{where}: name = {answer.name!r}: is that of line {first} too; keep one")
+                answers[answer.name], lines[answer.name] = answer, number
+            except RsbenchError as error:
+                faults.append(str(error))
+                if header is None or len(faults) == _MOST_FAULTS:
+                    break
+        if header is None and not faults:
+            faults.append(f"{path}: is empty: the first line must be the header (rsbench leaderboard template)")
+    except RsbenchError as error:
+        faults.append(str(error))
+    if header is None or faults:
+        return Findings(submission=None, faults=tuple(faults), notes=())
+    submission = Submission(header=header, answers=answers)
+    return Findings(submission=submission, faults=(), notes=tuple(_notes(submission, split, path)))
+
+
+def track_of(path: Path) -> str:
+    """The track that the first line of a file names.
+
+    Raises:
+        RsbenchError: the file cannot be read, or its first line names no protocol.
+    """
+    number, text = next(_lines(path), (1, "{}"))
+    data = parse_json(text, f"{path}:{number}")
+    name = data.get("protocol")
+    if not isinstance(name, str):
+        raise RsbenchError(
+            f"{path}:{number}: protocol = {name!r}: the first line is a header, which names it "
+            "(rsbench leaderboard template)"
+        )
+    try:
+        return protocol_of_id(name).track
+    except RsbenchError as error:
+        raise RsbenchError(f"{path}:{number}: {error}") from error
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    if path.exists() and not path.is_file():  # a folder; or a pipe, which might never end
+        raise RsbenchError(f"{path}: is no file: give the file of JSON lines")
+    for number, line in enumerate(read_text(path, SUBMISSION_BYTES).split("\n"), start=1):
+        if len(line) > _LINE_CHARACTERS:
+            raise RsbenchError(
+                f"{path}:{number}: has {len(line)} characters: a line has at most {_LINE_CHARACTERS}"
+            )
+        if line.strip():
+            yield number, line
+
+
+def _header(text: str, where: str, split: Split) -> Header:
+    data = parse_json(text, where)
+    if "method" not in data and "name" in data:
+        raise RsbenchError(f"{where}: is an answer: the first line is the header (rsbench leaderboard template)")
+    header = parse_card(Header, data, where)
+    for field, is_now, must_be in (
+        ("protocol", header.protocol, split.protocol.id),
+        ("split", header.split, split.name),
+    ):
+        if is_now != must_be:
+            raise RsbenchError(f"{where}: {field} = {is_now!r}: the truth at hand is that of {must_be!r}")
+    return header
+
+
+def _answer(text: str, where: str, split: Split) -> Answer:
+    data: dict[str, Any] = {key: value for key, value in parse_json(text, where).items() if key not in _OF_SOLVE}
+    name = data.get("name")
+    if isinstance(name, str) and name not in split.by_name:
+        near = choices(name, split.by_name).partition("; there are")[0]
+        raise RsbenchError(f"{where}: name = {json.dumps(name[:100])}: is no problem of {split.name}{near}")
+    return parse_card(Answer, data, where)
+
+
+# What may be meant
+
+
+def _notes(submission: Submission, split: Split, path: Path) -> Iterator[str]:
+    missing = [truth.name for truth in split.truths if truth.name not in submission.answers]
+    if missing:
+        yield f"{path}: no answer for {len(missing)} of {_few(missing, len(split.truths))}: they count as failures"
+    answers = [answer for answer in submission.answers.values() if answer.success]
+    turns = [answer.name for answer in answers if np.linalg.norm(_of(answer.w)) > np.pi]
+    if turns:
+        yield (
+            f"{path}: norm(w) is more than half a turn in {len(turns)} of {_few(turns, len(answers))}: w is in "
+            "rad, not in degrees"
+        )
+    if split.public:
+        mistaken = _mistaken(answers, split)
+        if mistaken:
+            words, count = mistaken
+            yield f"{path}: {count} of {len(answers)} motions are near to another reading of the truth: {words}"
+
+
+def _few(names: list[str], total: int) -> str:
+    return f"{total} ({', '.join(names[:_NAMED])}{', ...' if len(names) > _NAMED else ''})"
+
+
+def _of(vector: Vector | None) -> np.ndarray:
+    return np.array(vector, dtype=np.float64)
+
+
+def _mistaken(answers: list[Answer], split: Split) -> tuple[str, int] | None:
+    """The slip that explains most of the motions, and how many; None when no slip does."""
+    found: Counter[str] = Counter()
+    for answer in answers:
+        truth = split.by_name[answer.name]
+        given = _of(answer.w), _of(answer.d), truth.motion.w, truth.motion.d
+        words = misreading(*given, truth.rig, answer.reference_point)
+        if words:
+            found[words] += 1
+    words, count = found.most_common(1)[0] if found else ("", 0)
+    return (words, count) if 2 * count > len(answers) else None
+
+
+# Writing
+
+
+def submission_text(header: Mapping[str, Any], answers: Iterator[Mapping[str, Any]]) -> str:
+    """JSON lines that ``check_submission`` reads."""
+    return "".join(json.dumps(line, allow_nan=False) + "\n" for line in (header, *answers))
+
+
+def template_text(split: Split, method: str = "my-method") -> str:
+    """An example without a fault: one motion, and a failure for every other problem."""
+    header = {
+        "protocol": split.protocol.id,
+        "split": split.name,
+        "method": method,
+        "uses": ["left"],
+        **{key: "" for key in ("version", "authors", "paper", "code", "licence", "hardware", "tuned_on")},
+    }
+    first, *rest = (truth.name for truth in split.truths)
+    motion = {"name": first, "w": [0.01, -0.02, 0.005], "d": [0.1, 0.0, 0.2], "metric": False}
+    failures = [{"name": name, "success": False, "reason": "not tried"} for name in rest]
+    return submission_text(header, iter([{**motion, "reference_point": "left"}, *failures]))
+
+
+def truth_text(split: Split) -> str:
+    """The truth as a submission: it scores the best value of everything."""
+    header = {
+        "protocol": split.protocol.id,
+        "split": split.name,
+        "method": "truth",
+        "uses": ["truth"],
+        "description": "The true motion",
+    }
+    answers = (
+        {"name": t.name, "w": t.motion.w.tolist(), "d": t.motion.d.tolist(), "metric": True} for t in split.truths
+    )
+    return submission_text(header, answers)

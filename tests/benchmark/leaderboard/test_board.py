@@ -1,0 +1,327 @@
+"""What must hold of scores and boards, whatever is handed in."""
+
+from __future__ import annotations
+
+import csv
+import json
+import random
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from leaderboards import Line, named, small_split, truth_lines, write
+
+from rsbench.benchmark.leaderboard import running
+from rsbench.benchmark.leaderboard.board import add, entries_of, merge, rescore, splits_of
+from rsbench.benchmark.leaderboard.exporting import write_inputs
+from rsbench.benchmark.leaderboard.marking import mark
+from rsbench.benchmark.leaderboard.protocols import AUC_DEG, KNOWLEDGE, PROTOCOLS
+from rsbench.benchmark.leaderboard.running import run_cards, uses_of
+from rsbench.benchmark.leaderboard.splits import Split, dataset_split, points_split, simulated_problem
+from rsbench.benchmark.leaderboard.standings import standings, table
+from rsbench.benchmark.leaderboard.submissions import read_submission
+from rsbench.core.projection import rs_project
+from rsbench.dataset.files import load_arrays
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.problem import Problem, read_problems
+from rsbench.solvers.engine.registry import load_solver_entry
+
+ROOT = Path(__file__).parents[3]
+SPLIT = small_split()
+TRUTH = truth_lines(SPLIT)
+
+
+def _noisy(size: float, seed: int = 0) -> list[Line]:
+    rng = np.random.default_rng(seed)
+    answers = [{**line, "w": (np.array(line["w"]) + size * rng.standard_normal(3)).tolist()} for line in TRUTH[1:]]
+    return [TRUTH[0], *answers]
+
+
+def _scores(path: Path, lines: list[Line], split: Split = SPLIT) -> pd.DataFrame:
+    return mark(read_submission(write(path / "mine.jsonl", lines), split), split)
+
+
+# Scores
+
+
+def test_the_truth_is_best_and_nothing_is_worst(tmp_path: Path) -> None:
+    best, worst = _scores(tmp_path, TRUTH), _scores(tmp_path, TRUTH[:1])
+    other = _scores(tmp_path, _noisy(0.02))
+    for limit in AUC_DEG:
+        assert best[f"auc_{limit}"].min() > 1.0 - 1e-6 and worst[f"auc_{limit}"].max() == 0.0
+        assert np.all((other[f"auc_{limit}"] >= 0.0) & (other[f"auc_{limit}"] <= 1.0))
+    for name, most in {
+        "e_R_deg": 180.0,
+        "e_T_deg": 180.0,
+        "e_s": np.inf,
+        "metres": np.inf,
+        "e_row_deg": 180.0,
+    }.items():
+        assert best[name].max() < 1e-5 and np.all(worst[name] == most)
+        assert np.all(other[name].between(best[name] - 1e-9, worst[name]))
+    assert worst["failure"].all() and not best["failure"].any() and not worst["success"].any()
+
+
+def test_a_stated_failure_scores_what_no_answer_does(tmp_path: Path) -> None:
+    failures = [{"name": line["name"], "success": False, "reason": "no"} for line in TRUTH[1:]]
+    pd.testing.assert_frame_equal(_scores(tmp_path, [TRUTH[0], *failures]), _scores(tmp_path, TRUTH[:1]))
+
+
+def test_order_does_not_matter(tmp_path: Path) -> None:
+    lines = _noisy(0.01)
+    shuffled = [lines[0], *random.Random(0).sample(lines[1:], len(lines) - 1)]
+    pd.testing.assert_frame_equal(_scores(tmp_path, shuffled), _scores(tmp_path, lines))
+
+
+def test_auc_is_the_area_below_the_curve(tmp_path: Path) -> None:
+    scores = _scores(tmp_path, _noisy(0.03))
+    for limit in AUC_DEG:
+        x = np.linspace(0.0, limit, 20_001)
+        recall = np.mean(scores["error_deg"].to_numpy()[:, None] <= x, axis=0)
+        # The rule of the trapezoid errs by half a step at each of the jumps.
+        assert abs(np.trapezoid(recall, x) / limit - scores[f"auc_{limit}"].mean()) < 1e-4
+
+
+def test_the_left_camera_is_another_point(tmp_path: Path) -> None:
+    """The left camera's true motion, found from its poses, scores as the body's does."""
+    lines = [TRUTH[0]]
+    for truth, line in zip(SPLIT.truths, TRUTH[1:], strict=True):
+        start, end = (truth.rig.cam_from_world(truth.motion, tau, "left") for tau in (0.0, 1.0))
+        d = end.t - end.R @ start.R.T @ start.t
+        lines.append({**line, "d": d.tolist(), "reference_point": "left"})
+    scores = _scores(tmp_path, lines)
+    assert scores["error_deg"].max() < 1e-5 and scores["metres"].max() < 1e-9
+
+
+def test_the_error_of_rows_grows_with_the_readout(tmp_path: Path) -> None:
+    """About one axis the last row of frame 1 is off by (1 + readout ratio) times e_R."""
+    lines = [TRUTH[0], *({**line, "w": (1.01 * np.array(line["w"])).tolist()} for line in TRUTH[1:])]
+    scores = _scores(tmp_path, lines)
+    ratio = np.array([truth.shutter.readout_ratio for truth in SPLIT.truths])
+    np.testing.assert_allclose(scores["e_row_deg"], (1.0 + ratio) * scores["e_R_deg"], rtol=1e-6)
+
+
+def test_stated_covariances_are_judged(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    half = rng.standard_normal((6, 6)) * 1e-3
+    covariance = (half @ half.T).tolist()
+    lines, squares = [TRUTH[0]], []
+    for line in TRUTH[1:]:
+        error = rng.standard_normal(6) * 1e-3
+        squares.append(error @ np.linalg.solve(half @ half.T, error))
+        theta = np.array([*line["w"], *line["d"]]) + error
+        lines.append({**line, "w": theta[:3].tolist(), "d": theta[3:].tolist(), "covariance": covariance})
+    np.testing.assert_allclose(_scores(tmp_path, lines)["nees"], squares, rtol=1e-6)
+
+
+# Boards
+
+
+def test_entries_stand_alone_and_copies_tie(tmp_path: Path) -> None:
+    board = tmp_path / "board"
+    add(board, write(tmp_path / "a.jsonl", named(_noisy(0.02), "a")), SPLIT, {})
+    (alone,) = entries_of(board, "points-1", SPLIT.name)
+    for name, lines in (("copy", _noisy(0.02)), ("better", _noisy(0.001)), ("worse", _noisy(0.3))):
+        add(board, write(tmp_path / "a.jsonl", named(lines, name)), SPLIT, {})
+    add(board, write(tmp_path / "a.jsonl", TRUTH), SPLIT, {})
+    entries = entries_of(board, "points-1", SPLIT.name)
+    pd.testing.assert_frame_equal({e.header.method: e for e in entries}["a"].scores, alone.scores)
+    found = {line.scored.header.method: line for line in standings(entries)}
+    assert "copy" in found["a"].ties and "a" in found["copy"].ties and found["a"].rank == found["copy"].rank
+    assert found["truth"].rank is None and list(found)[-1] == "truth"
+    assert next(iter(found)) == "better" and found["better"].peers == 4
+    numbers = table(list(found.values()))
+    assert list(numbers["method"]) == list(found) and numbers["rank"].isna().sum() == 1
+
+
+def test_boards_merge_and_names_clash(tmp_path: Path) -> None:
+    boards = [tmp_path / "one", tmp_path / "two"]
+    for board, name, size in ((boards[0], "a", 0.01), (boards[1], "b", 0.02), (boards[1], "a", 0.01)):
+        add(board, write(tmp_path / "x.jsonl", named(_noisy(size), name)), SPLIT, {})
+    assert merge(boards[1], boards[0]) == [f"points-1/{SPLIT.name}/b"]
+    assert merge(boards[1], boards[0]) == []
+    assert [e.header.method for e in entries_of(boards[0], *splits_of(boards[0])[0])] == ["a", "b"]
+    assert rescore(boards[0], SPLIT) == {}
+    clash = write(tmp_path / "x.jsonl", named(_noisy(0.5), "b"))
+    with pytest.raises(RsbenchError, match="with other predictions"):
+        add(boards[0], clash, SPLIT, {})
+    add(boards[1], clash, SPLIT, {}, replace=True)
+    with pytest.raises(RsbenchError, match="with other predictions"):
+        merge(boards[1], boards[0])
+
+
+def test_scores_that_were_changed_are_named(tmp_path: Path) -> None:
+    board = tmp_path / "board"
+    scored = add(board, write(tmp_path / "x.jsonl", named(_noisy(0.01), "a")), SPLIT, {})
+    path = scored.folder / "scores.csv"
+    forged = pd.read_csv(path).assign(auc_5=1.0)
+    forged.to_csv(path, index=False)
+    assert rescore(board, SPLIT) == {"a": ["auc_5"]}
+    assert rescore(board, SPLIT) == {}
+
+
+def test_what_is_no_board_stays_as_it_is(tmp_path: Path) -> None:
+    path = write(tmp_path / "x.jsonl", named(_noisy(0.01), "a"))
+    with pytest.raises(RsbenchError, match="is no board"):
+        add(tmp_path, path, SPLIT, {})
+    assert [each.name for each in tmp_path.iterdir()] == ["x.jsonl"]
+
+
+def test_a_strangers_board_leads_nowhere(tmp_path: Path) -> None:
+    """Links and entries under other names than their own are refused, and nothing is copied."""
+    theirs, secret = tmp_path / "theirs", tmp_path / "secret"
+    secret.write_text("secret", "utf-8")
+    scored = add(theirs, write(tmp_path / "x.jsonl", named(_noisy(0.01), "a")), SPLIT, {})
+    (scored.folder / "predictions.jsonl").unlink()
+    (scored.folder / "predictions.jsonl").symlink_to(secret)
+    with pytest.raises(RsbenchError, match="must be a file of its own"):
+        merge(theirs, tmp_path / "mine")
+    scored.folder.rename(scored.folder.with_name("b"))
+    with pytest.raises(RsbenchError):
+        merge(theirs, tmp_path / "mine")
+    assert not list((tmp_path / "mine").rglob("predictions.jsonl"))
+
+
+# Splits and inputs
+
+
+def test_problems_are_of_their_truth() -> None:
+    """Without noise and outliers each track is a point: its four pixels are those that the true motion shows."""
+    truth = next(t for t in points_split(PROTOCOLS["points"]).truths if t.facts["outliers"] == 0.0)
+    tracks = simulated_problem(1, int(truth.name[1:])).correspondences.tracks
+    assert len(tracks) == truth.facts["points"]
+    noise = float(truth.facts["noise_px"])
+    start = truth.rig.cam_from_world(truth.motion, truth.shutter.row_time(tracks[:, 1], 0), "left")
+    depth = truth.rig.depth(tracks[:, 0] - tracks[:, 2])
+    near = depth < 3.0  # where the noise of a disparity moves a point little
+    in_cam = truth.rig.camera.unproject(tracks[:, :2]) * depth[:, None]
+    world = (np.swapaxes(start.R, 1, 2) @ (in_cam - start.t)[:, :, None])[:, :, 0]
+    seen = rs_project(truth.rig, truth.shutter, truth.motion, "left", 1, world[near]).pixels
+    assert np.count_nonzero(near) > 3
+    assert np.nanmedian(np.abs(seen - tracks[near, 4:6])) < 10.0 * noise
+
+
+def test_secrets_make_splits_of_their_own(tmp_path: Path) -> None:
+    protocol = PROTOCOLS["points"]
+    (tmp_path / "seed").write_text("a text that nobody can guess\n", "utf-8")
+    secret, again = (points_split(protocol, tmp_path / "seed") for _ in range(2))
+    assert secret.fingerprint == again.fingerprint != points_split(protocol).fingerprint
+    assert secret.name.startswith("test-") and not secret.public
+    (tmp_path / "seed").write_text("12345", "utf-8")
+    with pytest.raises(RsbenchError, match="seed: holds 5 characters"):
+        points_split(protocol, tmp_path / "seed")
+
+
+def test_the_public_split_stays_as_it_was_announced() -> None:
+    """Predictions of others are of these problems: what changes them is another protocol."""
+    assert points_split(PROTOCOLS["points"]).name == "dev-23a6433c"
+
+
+def test_all_inputs_are_the_same_numbers(tmp_path: Path) -> None:
+    problems = [simulated_problem(1, number) for number in range(3)]
+    write_inputs(small_split(3), iter(problems), tmp_path)
+    read = list(read_problems(tmp_path / "problems.jsonl", sys.stdin))
+    arrays = load_arrays(tmp_path / "problems.npz")
+    rows = list(csv.reader((tmp_path / "tracks.csv").read_text("utf-8").splitlines()))[1:]
+    lines = list(csv.DictReader((tmp_path / "problems.csv").read_text("utf-8").splitlines()))
+    for k, (problem, given) in enumerate(zip(problems, read, strict=True)):
+        assert isinstance(given, Problem)
+        assert (given.name, given.rig, given.shutter) == (problem.name, problem.rig, problem.shutter)
+        for found in (
+            given.correspondences.tracks,
+            arrays["tracks"][arrays["tracks_problem"] == k],
+            np.array([[float(x) for x in row[1:]] for row in rows if row[0] == problem.name]),
+        ):
+            np.testing.assert_array_equal(found, problem.correspondences.tracks)
+        assert arrays["names"][k] == lines[k]["name"] == problem.name
+        assert arrays["rig"][k].tolist() == [float(x) for x in list(lines[k].values())[1:]]
+    assert (tmp_path / "truth.jsonl").is_file()
+
+
+def test_a_secret_split_is_exported_without_its_truth(tmp_path: Path) -> None:
+    (tmp_path / "seed").write_text("a text that nobody can guess", "utf-8")
+    split = points_split(PROTOCOLS["points"], tmp_path / "seed")
+    write_inputs(split, iter([simulated_problem(3, 0)]), tmp_path / "out")
+    told = b"".join(path.read_bytes() for path in (tmp_path / "out").iterdir() if path.suffix != ".npz")
+    assert not (tmp_path / "out" / "truth.jsonl").exists()
+    for truth in split.truths:
+        assert all(repr(float(x)).encode() not in told for x in (*truth.motion.w, *truth.motion.d))
+
+
+# Running
+
+
+@pytest.mark.parametrize(
+    ("card", "uses"),
+    [
+        ("gs-8pt", ("left",)),
+        ("gs-8pt-scaled", ("left", "readout")),
+        ("rs-stereo-refined-pairs", ("left", "right", "readout")),
+        ("gs-stereo-tracks", ("left", "right", "links")),
+        ("rs-stereo-refined", ("left", "right", "links", "readout")),
+    ],
+)
+def test_cards_say_what_they_use(card: str, uses: tuple[str, ...]) -> None:
+    assert uses_of(load_solver_entry(card)) == uses
+
+
+def _here(serve: Any, jobs: Any, workers: int, environment: object, *arguments: object) -> Any:
+    """``finished_jobs`` without a child."""
+    run = serve(*arguments)
+    yield from ((job, run(job)) for job in jobs)
+
+
+def test_runs_are_the_same_however_they_are_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With two workers, and in this process after the loss of half of it."""
+    write_inputs(SPLIT, (simulated_problem(1, number) for number in range(12)), tmp_path / "in")
+    steps: list[str] = []
+    work = tmp_path / "work"
+    (path,) = run_cards(["gs-8pt"], SPLIT, tmp_path / "in", work, workers=2, step=steps.append)
+    first = [{**json.loads(line), "seconds": 0} for line in path.read_text("utf-8").splitlines()]
+    chunks = sorted(work.glob("gs-8pt/*.json"))
+    assert len(steps) == len(chunks) == 2
+    kept = chunks[0].read_bytes()
+    chunks[1].unlink()
+    monkeypatch.setattr(running, "finished_jobs", _here)
+    run_cards(["gs-8pt"], SPLIT, tmp_path / "in", work)
+    again = [{**json.loads(line), "seconds": 0} for line in path.read_text("utf-8").splitlines()]
+    assert again == first and chunks[0].read_bytes() == kept
+    scores = mark(read_submission(path, SPLIT), SPLIT)
+    assert scores["auc_10"].mean() > 0.3  # the conventions of inputs and answers agree
+
+
+# Documents
+
+
+def test_the_documented_script_needs_no_rsbench(smoke_dataset: Path, tmp_path: Path) -> None:
+    from commands import run_here
+
+    text = (ROOT / "docs" / "submit.md").read_text("utf-8")
+    script = text.partition("```python\n# submit.py\n")[2].partition("```")[0]
+    assert len(script.splitlines()) <= 22
+    (tmp_path / "submit.py").write_text(script, "utf-8")
+    data = ("--data", smoke_dataset)
+    assert run_here("leaderboard", "export", "pose-own", *data, "--out", tmp_path / "inputs").returncode == 0
+    hide = "import runpy, sys; sys.modules['rsbench'] = None; runpy.run_path('submit.py')"
+    subprocess.run([sys.executable, "-c", hide], cwd=tmp_path, check=True)
+    checked = run_here("leaderboard", "check", tmp_path / "mine.jsonl", *data)
+    assert checked.returncode == 0, checked.stderr
+    shown = run_here("leaderboard", "submit", tmp_path / "mine.jsonl", "--board", tmp_path / "board", *data)
+    assert "opencv-sift-5pt" in shown.stdout
+    split = dataset_split(PROTOCOLS["pose-own"], smoke_dataset)
+    (entry,) = entries_of(tmp_path / "board", "pose-own-1", split.name)
+    # A solver for global shutters, on small frames, but nearer to the truth than "no motion": in our conventions.
+    still = [truth.facts["rotation_deg"] for truth in split.truths]
+    assert np.all(entry.scores["e_R_deg"] < still) and entry.scores["e_R_deg"].min() < 0.5
+
+
+def test_protocols_are_documented() -> None:
+    text = (ROOT / "docs" / "protocols.md").read_text("utf-8")
+    for protocol in PROTOCOLS.values():
+        cells = f"| `{protocol.track}` | `{protocol.id}` | {protocol.given} | {', '.join(protocol.allowed)} |"
+        assert cells in text
+    assert all(f"`{name}`" in text for name in KNOWLEDGE if name != "gyro")

@@ -1,0 +1,90 @@
+"""Intervals and ranks hold as often as they say, on scores whose true means are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import ttest_rel
+
+from rsbench.benchmark.leaderboard.ranking import better, mean_interval, ranks, scene_means, ties
+
+ANY = frozenset({"left"})
+
+
+def test_scenes_count_alike() -> None:
+    values = np.array([[1.0, 3.0, 10.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_array_equal(scene_means(values, ["b", "b", "a"]), [[10.0, 2.0], [1.0, 0.0]])
+
+
+@pytest.mark.parametrize(("scenes", "problems"), [(9, 24), (250, 1)])
+def test_the_interval_of_a_mean_covers_it(scenes: int, problems: int) -> None:
+    """Scores in [0, 1] with a part that is common to a scene, as skewed as those of tables."""
+    rng = np.random.default_rng(scenes)
+    trials, truth = 3000, 0.75
+    ease = rng.beta(6.0 * truth, 6.0 * (1.0 - truth), (trials, scenes, 1))  # mean: truth
+    scores = np.clip(rng.beta(4.0 * ease, 4.0 * (1.0 - ease), (trials, scenes, problems)), 0.0, 1.0)
+    found = [mean_interval(means) for means in scores.mean(axis=2)]
+    share = np.mean([low <= truth <= high for low, high in found])
+    assert 0.93 <= share <= 0.97
+
+
+def _tables(rng: np.random.Generator, truth: np.ndarray, scenes: int, trials: int) -> np.ndarray:
+    """Scenes' means (trials, entries, scenes) with a difficulty that entries share."""
+    common = 0.1 * rng.standard_normal((trials, 1, scenes))
+    return truth[None, :, None] + common + 0.05 * rng.standard_normal((trials, len(truth), scenes))
+
+
+def test_all_ranks_hold_at_once() -> None:
+    """In 95 % of tables or more all intervals hold the true ranks: two true ties, and gaps of all sizes."""
+    truth = np.array([0.5, 0.5, 0.53, 0.6, 0.7, 0.7, 0.9])
+    lowest = np.array([1 + np.count_nonzero(truth > x) for x in truth])
+    highest = np.array([np.count_nonzero(truth >= x) for x in truth])
+    trials, held, told = 1000, 0, 0
+    for means in _tables(np.random.default_rng(0), truth, 9, trials):
+        found = ranks(means.mean(axis=1), better(means), [ANY] * len(truth))
+        held += all(r.low <= a and r.high >= b for r, a, b in zip(found, lowest, highest, strict=True))
+        told += sum(r.high - r.low < len(truth) - 1 for r in found)
+    assert held / trials >= 0.95 - 3.0 * np.sqrt(0.95 * 0.05 / trials)
+    assert told > 5 * trials  # they say something
+
+
+def test_pairs_are_those_of_scipy_and_of_holm() -> None:
+    means = _tables(np.random.default_rng(1), np.array([0.5, 0.52, 0.6, 0.62]), 8, 1)[0]
+    pairs = [(i, j) for i in range(4) for j in range(4) if i < j]
+    chances = {pair: ttest_rel(means[pair[0]], means[pair[1]]).pvalue for pair in pairs}
+    falls = set()
+    for k, pair in enumerate(sorted(pairs, key=lambda p: chances[p])):
+        if chances[pair] > 0.05 / (len(pairs) - k):
+            break
+        falls.add(pair)
+    beats = better(means)
+    assert 0 < len(falls) < len(pairs)
+    for i, j in pairs:
+        assert (beats[i, j] or beats[j, i]) == ((i, j) in falls)
+        assert not beats[i, j] or means[i].mean() > means[j].mean()
+
+
+def test_a_copy_ties_and_one_scene_tells_nothing() -> None:
+    rng = np.random.default_rng(2)
+    one = rng.random(9)
+    beats = better(np.stack([one, one, one - 0.2]))
+    assert ties(beats, 0) == [1] and beats[0, 2] and beats[1, 2]
+    assert not np.any(better(np.array([[0.1], [0.9]])))
+    assert mean_interval(np.array([0.4])) == (-np.inf, np.inf)
+
+
+def test_who_uses_less_is_not_ranked_below_who_uses_more() -> None:
+    scores, beats = np.array([0.9, 0.5, 0.4]), np.array([[0, 1, 1], [0, 0, 1], [0, 0, 0]], dtype=np.bool_)
+    uses = [frozenset({"left", "right"}), frozenset({"left"}), frozenset({"left", "gyro"})]
+    assert ranks(scores, beats, uses) == [(1, 1, 1), (1, 1, 1), (2, 2, 2)]
+
+
+@given(st.integers(1, 8), st.integers(1, 6), st.integers(0, 1000))
+def test_a_place_lies_in_its_interval(entries: int, scenes: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    means = rng.random((entries, scenes))
+    uses = [frozenset(rng.choice(["left", "right", "links"], 2)) for _ in range(entries)]
+    for rank in ranks(means.mean(axis=1), better(means), uses):
+        assert 1 <= rank.low <= rank.place <= rank.high <= entries
