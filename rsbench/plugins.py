@@ -24,6 +24,7 @@ from typing import Any, Generic, TypeVar
 from pydantic.errors import PydanticUserError
 
 from rsbench.cards import CardKind, card_path, check_values, choices, list_cards, parse_card, read_toml
+from rsbench.entry_points import entry_points_by_name, package_of
 from rsbench.errors import RsbenchError
 from rsbench.identity import component_key, own_source_version, source_version
 from rsbench.imports import blaming, import_target, in_words, try_import
@@ -174,8 +175,8 @@ def offers(kind: Kind[Any, Any]) -> list[Offer]:
     own = [Offer(name=name, origin="rsbench", path=path) for name, path in cards.items()]
     own += [Offer(name=name, origin="rsbench") for name in kind.built_in if name not in cards]
     installed = [
-        Offer(name=name, origin=_package(point), point=point)
-        for name, points in _entry_points(kind).items()
+        Offer(name=name, origin=package_of(point), point=point)
+        for name, points in entry_points_by_name(kind.group).items()
         for point in points
     ]
     return sorted([*own, *installed], key=lambda offer: offer.name)
@@ -282,40 +283,6 @@ def _from_card(kind: Kind[Component, Options], path: Path) -> Entry[Component, O
         parameters=content.parameters,
         key=component_key(component, content.parameters),
     )
-
-
-# What others' packages say
-
-
-def _entry_points(kind: Kind[Any, Any]) -> dict[str, list[metadata.EntryPoint]]:
-    found: dict[str, list[metadata.EntryPoint]] = {}
-    for point in _all_points(kind.group):
-        same = found.setdefault(point.name, [])
-        if all(other.value != point.value for other in same):
-            same.append(point)
-    return found
-
-
-def _all_points(group: str) -> list[metadata.EntryPoint]:
-    """Entry points of a group. A package whose files about itself cannot be read has none, and stops no other."""
-    try:
-        return list(metadata.entry_points(group=group))
-    except Exception:
-        points, seen = [], set()
-        for package in metadata.distributions():
-            with contextlib.suppress(Exception):
-                if (name := str(package.metadata["Name"]).lower()) not in seen:
-                    points += [point for point in package.entry_points if point.group == group]
-                    seen.add(name)
-        return points
-
-
-def _package(point: metadata.EntryPoint) -> str:
-    try:
-        name = point.dist.name if point.dist is not None else None
-    except Exception:  # files about the package are missing or cannot be read
-        name = None
-    return name or "a package"
 
 
 def _owner(offer: Offer) -> str:

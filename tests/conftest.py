@@ -92,6 +92,40 @@ def built_scene() -> Callable[[str], Scene]:
     return lru_cache(maxsize=1)(load_scene)
 
 
+@pytest.fixture(scope="module")
+def scenes_once(built_scene: Callable[[str], Scene], give_back: Callable[[], None]) -> Iterator[None]:
+    """Sequences of one scene of ours, seen from one place, share it in the renderer: loading it takes seconds."""
+    from rsbench.cards import card_path
+    from rsbench.dataset import generation
+    from rsbench.dataset.verification import rerender
+    from rsbench.renderers import scene
+    from rsbench.scenes.load import load_scene
+
+    made, kept = scene.MitsubaScene, {}  # type: ignore[var-annotated]
+
+    def loaded(card: str | Path) -> Scene:
+        return (
+            built_scene(Path(card).stem)
+            if card_path("scenes", Path(card).stem) == Path(card)
+            else load_scene(card)
+        )
+
+    def once(seen: Scene) -> scene.MitsubaScene:
+        key = seen.name, seen.light  # the light in the frame of the view tells views apart
+        if key not in kept:
+            kept.clear()  # hundreds of MB: not two at a time
+            kept[key] = made(seen)
+        return kept[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(generation, "load_scene", built_scene)
+        patch.setattr(rerender, "load_scene", loaded)
+        patch.setattr(scene, "MitsubaScene", once)
+        yield
+    kept.clear()
+    give_back()
+
+
 @pytest.fixture(scope="session")
 def smoke_dataset(tmp_path_factory: pytest.TempPathFactory, built_scene: Callable[[str], Scene]) -> Path:
     """The dataset of datasets/smoke.toml, rendered once per test run, by whichever process needs it first."""

@@ -16,12 +16,12 @@ from rsbench.cards import load_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.projection import row_poses
 from rsbench.core.se3 import Pose
-from rsbench.dataset import generation
 from rsbench.dataset.card import load_dataset_card
+from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.verification import verify_dataset
+from rsbench.renderers import scene as renderer_scene
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import render
-from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
@@ -29,14 +29,12 @@ SCENES = ("castle", "old-town", "room")
 
 
 @pytest.fixture(scope="module")
-def paper(tmp_path_factory: pytest.TempPathFactory, built_scene: Callable[[str], Scene]) -> Path:
+def paper(tmp_path_factory: pytest.TempPathFactory, scenes_once: None) -> Path:
     """The paper's sequences at 2/5 of their size, for time; ``rsbench reproduce images`` has the whole."""
     folder = tmp_path_factory.mktemp("paper") / "paper"
     card = load_dataset_card("paper")
     camera = replace(card.camera, width=360, height=360, focal=card.camera.focal * 360 / card.camera.width)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generation, "load_scene", built_scene)
-        generation.generate_dataset(replace(card, camera=camera), folder)
+    generate_dataset(replace(card, camera=camera), folder)
     return folder
 
 
@@ -49,7 +47,7 @@ def scores(paper: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, p
 
 
 def test_depth_of_all_frames_agrees(paper: Path) -> None:
-    for report in verify_dataset(paper, stride=4):
+    for report in verify_dataset(paper, stride=4, rerender="no"):
         assert report.faults == ()
         assert all(agreement.p99 < 1e-4 for agreement in report.agreements)
 
@@ -76,12 +74,15 @@ def test_correction_loses_little_to_true_motion_and_gains_much_over_none(
     assert np.all(estimated.psnr.to_numpy() > uncorrected.psnr.to_numpy() + 6.0)
 
 
-Shot = tuple[MitsubaScene, PinholeCamera, Pose]
+Shot = tuple[renderer_scene.MitsubaScene, PinholeCamera, Pose]
 
 
 @pytest.fixture(scope="module", params=["castle", "room"])
 def shot(
-    request: pytest.FixtureRequest, built_scene: Callable[[str], Scene], give_back: Callable[[], None]
+    request: pytest.FixtureRequest,
+    built_scene: Callable[[str], Scene],
+    scenes_once: None,
+    give_back: Callable[[], None],
 ) -> Shot:
     """A scene and the rows of its second right frame; of module scope, so that one scene goes before the next."""
     give_back()
@@ -90,14 +91,15 @@ def shot(
     scene = built_scene(sequence.scene)
     rig = card.rig_of(sequence)
     poses = row_poses(rig, card.shutter_for(sequence), card.motion_of(sequence), "right", 1)
-    return MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint])), rig.camera, poses
+    seen = scene.seen_from(scene.viewpoints[sequence.viewpoint])
+    return renderer_scene.MitsubaScene(seen), rig.camera, poses
 
 
 @pytest.mark.parametrize("integrator", ["sunsky", "path"])
 def test_single_pass_equals_stitched_on_the_paper_frame(shot: Shot, integrator: str) -> None:
     scene, camera, poses = shot
     preset = "default" if integrator == "sunsky" else "path"
-    options = replace(load_card(RendererOptions, "renderers", preset), samples=1 if integrator == "path" else 16)
+    options = replace(load_card(RendererOptions, "renderers", preset), samples=1 if integrator == "path" else 4)
     rows = np.linspace(0, 899, 20).astype(int).tolist()
     geometry = scene, camera, poses.R, poses.t
     whole = render(*geometry, replace(options, method="single-pass"))

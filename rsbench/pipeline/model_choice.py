@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import logsumexp
+import scipy
 
 from rsbench.cards import choices
 from rsbench.core.correspondences import Correspondences
@@ -103,11 +103,11 @@ def choose_model(
         correspondences = join_stereo(correspondences).correspondences
     fits, spread = _fits(Errors(correspondences, rig, shutter, start), start, rig)
     evidence = {
-        name: float(logsumexp(found) - np.log(len(found)))
+        name: float(scipy.special.logsumexp(found) - np.log(len(found)))
         for name in MODELS
         for found in [[fit.log_evidence(spread) for fit in fits if fit.candidate.name == name]]
     }
-    total = logsumexp(list(evidence.values()))
+    total = scipy.special.logsumexp(list(evidence.values()))
     probability = {
         name: float(np.exp(evidence[name] - total)) for name in sorted(MODELS, key=lambda n: -evidence[n])
     }

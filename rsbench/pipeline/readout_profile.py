@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
@@ -77,7 +77,7 @@ class Profile:
         """Ratio and offset of the smallest cost near these."""
         bounds = (max(ratio - _REACH, -1.0), min(ratio + _REACH, 1.0))
         if not self._free:
-            found = minimize_scalar(
+            found = scipy.optimize.minimize_scalar(
                 self._cost, bounds=bounds, method="bounded", options={"xatol": 1e-5}, args=(offset,)
             )
             return float(found.x), offset

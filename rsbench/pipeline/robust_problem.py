@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtr, gammaincinv
+import scipy
 
 from rsbench.core.correspondences import BoolArray, Correspondences, repeated, track_pairs, unlinked_pairs
 from rsbench.core.rig import SIDES, StereoRig
@@ -232,7 +232,7 @@ class RobustProblem:
 @functools.cache
 def _quantile(freedom: int) -> float:
     """Of chi-squared, with the probability that a normal variable lies within 2.5 standard deviations."""
-    return float(2.0 * gammaincinv(0.5 * freedom, float(chdtr(1, SIGMAS**2))))
+    return float(2.0 * scipy.special.gammaincinv(0.5 * freedom, float(scipy.special.chdtr(1, SIGMAS**2))))
 
 
 @functools.cache
@@ -245,5 +245,6 @@ def _track_scale() -> float:
 def _moment(freedom: int) -> float:
     """Mean square of a scaled residual below its threshold, at a noise of 1 px."""
     quantile = _quantile(freedom)
+    chdtr = scipy.special.chdtr
     truncated = freedom * chdtr(freedom + 2, quantile) / chdtr(freedom, quantile)
     return float(truncated) * SIGMAS**2 / quantile

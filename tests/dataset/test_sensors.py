@@ -17,19 +17,17 @@ from small_scenes import write_box_scene, write_small_card
 
 from rsbench.cards import parse_card
 from rsbench.core.rig import VIEWS
-from rsbench.dataset import generation
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.files import write_png
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_sequence
-from rsbench.dataset.verification import rerender, sensors, verify_dataset
+from rsbench.dataset.verification import sensors, verify_dataset
 from rsbench.dataset.verification.content import read_content
 from rsbench.dataset.verification.image_checks import Picture
 from rsbench.dataset.verification.landing import Shot
 from rsbench.dataset.verification.sensors import sensor_faults
 from rsbench.errors import RsbenchError
 from rsbench.renderers.electrons import Sensor
-from rsbench.scenes.model import Scene
 
 NOISY = Sensor(full_well=6000, gain=4, photon_noise=True, read_noise=2.5, bit_depth=10)
 
@@ -43,16 +41,14 @@ def _card(sensor: Sensor | None, **fields: object) -> DatasetCard:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory, built_scene: Callable[[str], Scene]) -> dict[str, Path]:
+def made(tmp_path_factory: pytest.TempPathFactory, scenes_once: None) -> dict[str, Path]:
     """Folders of one sequence: an ideal sensor, one with noise, with an exposure too, and two unlike cameras."""
     sensors = {"ideal": None, "noisy": NOISY, "exposed": replace(NOISY, exposure_s=0.02), "uneven": UNEVEN}
     folders = {}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generation, "load_scene", built_scene)
-        for name, sensor in sensors.items():
-            folders[name] = tmp_path_factory.mktemp("sensors") / name
-            generate_dataset(_card(sensor), folders[name])
-            assert generate_dataset(_card(sensor), folders[name]) == [], "a second run has nothing to do"
+    for name, sensor in sensors.items():
+        folders[name] = tmp_path_factory.mktemp("sensors") / name
+        generate_dataset(_card(sensor), folders[name])
+        assert generate_dataset(_card(sensor), folders[name]) == [], "a second run has nothing to do"
     return {name: folder / "room-twist" for name, folder in folders.items()}
 
 
@@ -140,11 +136,8 @@ FAULTS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
 }
 
 
-def test_rows_of_a_sensor_are_made_again(
-    made: dict[str, Path], tmp_path: Path, built_scene: Callable[[str], Scene], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_of_a_sensor_are_made_again(made: dict[str, Path], tmp_path: Path) -> None:
     """Bit for bit; so a sharp frame with noise of the right size but of other random numbers is found."""
-    monkeypatch.setattr(rerender, "load_scene", lambda path: built_scene("room"))
     (report,) = verify_dataset(made["exposed"].parent, 4, rerender="auto")
     assert report.faults == () and report.notes[0].endswith("the same bits")
     copy = tmp_path / "dataset"

@@ -121,7 +121,7 @@ def entry(name: str, target: str) -> metadata.EntryPoint:
 
 def install(monkeypatch: pytest.MonkeyPatch, solver: object, *names: str) -> None:
     entries = [entry(name, f"package{k}:Solver") for k, name in enumerate(names)]
-    monkeypatch.setattr(metadata, "entry_points", lambda group: entries)
+    monkeypatch.setattr("rsbench.entry_points.points_of", lambda group, folders: entries)
     monkeypatch.setattr(metadata.EntryPoint, "load", lambda self: solver)
 
 

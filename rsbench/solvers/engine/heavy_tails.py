@@ -15,10 +15,11 @@ weights; P. Huber, Robust Statistics, 1981, 7.2: leverages up to 0.2 are safe).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import gammaln, ndtr, stdtrit
+import scipy  # loads scipy.special with its first use: as long as all else that a solver needs
 
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.each import Each, each_term
@@ -33,7 +34,7 @@ _REACH = 10.0
 _SAFE_LEVERAGE, _TIMES_THE_MEAN = 0.2, 3.0
 _LEVERAGE_STEPS = 4
 _SCALE_STEPS, _SCALE_FLAT = 50, 1e-4
-_ONE_SIGMA = float(ndtr(1.0))
+_ONE_SIGMA = 0.5 * (1.0 + math.erf(1.0 / math.sqrt(2.0)))
 _LEAST_SLOPE = 0.1
 _LEAST_SCALE_PX = 1e-9
 _TRACK_FREEDOM, _PAIR_FREEDOM, _PARAMETERS = 5, 1, 6
@@ -83,7 +84,7 @@ class HeavyTailed(Packed):
 
     def noise_variance(self, cost: float) -> float:
         """Of a coordinate, px^2, without tails: as of a normal error, two in three are below its root."""
-        return (self.scale * float(stdtrit(self.nu, _ONE_SIGMA))) ** 2
+        return (self.scale * float(scipy.special.stdtrit(self.nu, _ONE_SIGMA))) ** 2
 
     def covariance(self, theta: FloatArray, cost: float, H: FloatArray) -> FloatArray | None:
         """Covariance (6, 6) of theta at the minimum, whatever the distribution of the errors; None for none.
@@ -154,6 +155,7 @@ def _scale(squares: FloatArray, p: FloatArray, nu: float, scale: float) -> float
 
 def _likelihood(squares: FloatArray, p: FloatArray, nu: float, scale: float) -> float:
     """Logarithm, without terms that are the same for all nu and scales."""
+    gammaln = scipy.special.gammaln
     norm = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * p * np.log(nu * scale**2)
     return float(np.sum(norm - 0.5 * (nu + p) * np.log1p(squares / (nu * scale**2))))
 
