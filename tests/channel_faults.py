@@ -11,7 +11,10 @@ import numpy as np
 from attack.planting import drop, manifest_of, put
 from numpy.typing import NDArray
 
+from rsbench.core import so3
+from rsbench.dataset.affine import AffineFrames, jacobians_of, save_affine
 from rsbench.dataset.channels import (
+    AFFINE,
     COMPONENTS,
     MATCHER,
     TRACKS,
@@ -273,7 +276,31 @@ def radiance_of(view: str, change: Callable[[NDArray[np.float32]], NDArray[Any]]
 
 
 _MATCHES = matches_file(0)
+
+
+def affine_of(name: str, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Callable[[Path], None]:
+    return arrays_of(AFFINE, lambda arrays: arrays.update({name: change(arrays[name])}))
+
+
+def on_another_plane(folder: Path) -> None:
+    """All normals turned by 20 degrees, and derivatives of these planes."""
+    sequence, normals = read_sequence(folder), load_arrays(folder / AFFINE)["normals"]
+    turned = normals @ so3.exp(np.array([0.35, 0.0, 0.0]))
+    save_affine(
+        folder / AFFINE, AffineFrames(jacobians=jacobians_of(sequence, sequence.tracks(), turned), normals=turned)
+    )
+
+
 FAULTS |= {
+    "affine frames transposed": (
+        affine_of("jacobians", lambda J: np.swapaxes(J, 2, 3)),
+        (AFFINE, "left_1", "looks transposed"),
+    ),
+    "affine frames stretched": (
+        affine_of("jacobians", lambda J: J @ np.diag([1.0, 1.01])),
+        (AFFINE, "right_1", "not those of plane, motion and row times"),
+    ),
+    "affine frames on another plane": (on_another_plane, (AFFINE, "left_0", "not upright on the surface")),
     "matches moved by half a pixel": (
         matches_of("pixels", lambda pixels: pixels + 0.5),
         (_MATCHES, "left", "not where their row sees the point"),

@@ -53,7 +53,7 @@ _Channels = Annotated[
     str | None,
     typer.Option(
         help="Channels of truth in place of the card's, with commas between: disparity, flow, gs_flow, timing, "
-        "normals, instances, imu, tracks, hdr, matches; or all; or none."
+        "normals, instances, imu, tracks, affine, hdr, matches; or all; or none."
     ),
 ]
 _Trajectory = Annotated[

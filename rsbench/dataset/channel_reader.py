@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.affine import AffineFrames, read_affine
 from rsbench.dataset.channels import (
+    AFFINE,
     COMPONENTS,
     INSTANCE_TABLE,
     MATCHER,
@@ -136,6 +138,11 @@ class ChannelReader:
         """Content of matches/matcher.json: who matched; RsbenchError as of ``offsets``."""
         self._check_channel("matches")
         return read_json(inside(self.folder, MATCHER))
+
+    def affine(self) -> AffineFrames:
+        """How the surroundings of the tracks' points lie in the frames; RsbenchError as of ``offsets``."""
+        self._check_channel("affine")
+        return read_affine(inside(self.folder, AFFINE))
 
     def imu_manifest(self) -> dict[str, Any]:
         """Content of imu.json; RsbenchError as of ``offsets``."""

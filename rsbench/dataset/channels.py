@@ -15,10 +15,10 @@ PairChannel = Literal["disparity", "flow", "gs_flow"]
 """Where each pixel of a rolling-shutter frame lies in another picture: of the other camera at the same time
 (disparity), of the same camera at the other time (flow), and of its global-shutter twin (gs_flow)."""
 Channel = Literal[
-    "disparity", "flow", "gs_flow", "timing", "normals", "instances", "imu", "tracks", "hdr", "matches"
+    "disparity", "flow", "gs_flow", "timing", "normals", "instances", "imu", "tracks", "affine", "hdr", "matches"
 ]
 
-INSTANCE_TABLE, TRACKS = "instances.json", "tracks.npz"
+INSTANCE_TABLE, TRACKS, AFFINE = "instances.json", "tracks.npz", "affine.npz"
 MATCHER = "matches/matcher.json"
 PAIR_CHANNELS: tuple[PairChannel, ...] = get_args(PairChannel)
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
@@ -53,6 +53,8 @@ def check_channels(names: Collection[str], lens: bool, plain: bool) -> None:
     Raises:
         ValueError: one line with the channel.
     """
+    if "affine" in names and "tracks" not in names:
+        raise ValueError("channels: 'affine' is of the points of 'tracks': ask for both")
     if "disparity" not in names:
         return
     if not plain:
@@ -118,6 +120,7 @@ def channel_files(names: Iterable[str], twins: Iterable[int] = ()) -> tuple[str,
     whole: dict[str, tuple[str, ...]] = {
         "imu": IMU_FILES,
         "tracks": (TRACKS,),
+        "affine": (AFFINE,),
         "matches": (MATCHER, matches_file(0)),
     }
     of_sequence = (file for name, files in whole.items() if name in given for file in files)

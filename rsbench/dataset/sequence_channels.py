@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsbench.core.rig import VIEWS
+from rsbench.dataset.affine import make_affine, save_affine
 from rsbench.dataset.card import DatasetCard, SequenceCard
-from rsbench.dataset.channels import INSTANCE_TABLE, MATCHER, matches_file
+from rsbench.dataset.channels import AFFINE, INSTANCE_TABLE, MATCHER, matches_file
 from rsbench.dataset.files import read_depth, read_png, write_json
 from rsbench.dataset.imu import Imu, draw_samples, gravity_of, sample_times_ns, write_imu
 from rsbench.dataset.matches import Matching, save_matches
@@ -47,7 +48,10 @@ def write_sequence_channels(
         write_imu(folder, imu, gravity, draw_samples(imu, motion, times, period, gravity, seed))
     if "tracks" in card.channels:
         depths = {view: read_depth(folder / Shot("rs", *view).depth) for view in VIEWS}
-        write_tracks(folder, make_tracks(geometry, depths, SceneRays(scene).blocked, seed))
+        tracks = make_tracks(geometry, depths, SceneRays(scene).blocked, seed)
+        write_tracks(folder, tracks)
+        if "affine" in card.channels:
+            save_affine(folder / AFFINE, make_affine(geometry, tracks, SceneRays(scene)))
     if "matches" in card.channels:
         from rsbench.dataset.match_truth import make_matches, matcher_record
 

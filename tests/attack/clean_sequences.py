@@ -146,7 +146,7 @@ def _channels(rng: np.random.Generator, camera: CameraCard, scanning: Scanning) 
     chosen: list[Channel] = []
     for channel in CHANNELS:
         with contextlib.suppress(ValueError):
-            check_channels((channel,), camera.lens is not None, scanning.plain)
+            check_channels((*chosen, channel), camera.lens is not None, scanning.plain)
             chosen += [channel] if rng.random() < 0.5 else []
     return tuple(chosen)
 

@@ -13,6 +13,7 @@ from rsbench.cards import card_path
 from rsbench.dataset.files import read_json
 from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.verification import structure
+from rsbench.dataset.verification.affine_checks import affine_faults
 from rsbench.dataset.verification.channel_checks import channel_faults
 from rsbench.dataset.verification.content import Comparison, Content, images_elsewhere, read_content, twin_faults
 from rsbench.dataset.verification.findings import DepthAgreement, Progress, SequenceReport, finding
@@ -155,6 +156,7 @@ def _channel_checks(content: Content, stride: int) -> Iterator[Callable[[Collect
     yield partial(imu_faults, sequence)
     yield partial(channel_faults, sequence, maps, stride=stride)
     yield partial(track_faults, sequence, maps)
+    yield partial(affine_faults, sequence, maps)
     yield partial(surface_faults, sequence, maps)
     yield partial(hdr_faults, sequence, content.pictures)
     yield partial(match_faults, sequence, maps)

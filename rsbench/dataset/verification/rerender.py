@@ -19,10 +19,11 @@ from rsbench import __version__
 from rsbench.cards import list_cards, parse_card
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.channels import TRACKS, matches_file
+from rsbench.dataset.channels import AFFINE, TRACKS, matches_file
 from rsbench.dataset.generation import image_seed
 from rsbench.dataset.scene_hashes import scene_hash
 from rsbench.dataset.sequence import whole_frames
+from rsbench.dataset.verification.affine_checks import affine_again
 from rsbench.dataset.verification.channel_checks import channels_again
 from rsbench.dataset.verification.content import Content, clean_file
 from rsbench.dataset.verification.findings import finding, rows_of
@@ -116,7 +117,7 @@ class Again:
                     for made in (channels_again, surfaces_again):
                         checks = made(sequence, shot, rows, depth, SceneRays(scene), ())
                         same |= {file for file, _, alike in checks if alike}
-            for file, again in ((TRACKS, tracks_again), (matches_file(0), matches_again)):
+            for file, again in ((TRACKS, tracks_again), (AFFINE, affine_again), (matches_file(0), matches_again)):
                 if file in accused:
                     scene, _ = self._scene(_table(sequence.manifest, "scene"))
                     same |= {name for name, _, alike in again(sequence, SceneRays(scene), ()) if alike}
@@ -213,7 +214,7 @@ def _checks(
             yield from (_Check(*check) for check in again)
         if shot.shutter == "rs":
             yield from _frame_checks(content, scene, options, shot, rows, told)
-    for of_points in (tracks_again, matches_again):
+    for of_points in (tracks_again, affine_again, matches_again):
         yield from (_Check(*check) for check in of_points(content.sequence, SceneRays(scene), told))
 
 

@@ -21,7 +21,7 @@ from rsbench.errors import RsbenchError
 
 _UNIT = 1e-5
 """Of a length: the rounding of float32."""
-_LEVEL, _FEW_BENT = 0.05, 0.02
+LEVEL, FEW_BENT = 0.05, 0.02
 """Cosine between a normal and its surface, which bends by less where it counts as flat; and the share of flat
 pixels that may be beyond, at creases of less than that."""
 _SURFACE, _FEW_OTHERS = 5e-5, 0.02
@@ -70,9 +70,9 @@ def _normal_faults(
     bent = np.zeros(solid.shape, dtype=np.bool_)
     for step in (X[1:-1, 2:] - X[1:-1, :-2], X[2:, 1:-1] - X[:-2, 1:-1]):
         cosine = np.sum(step * normals[1:-1, 1:-1], axis=-1) / np.linalg.norm(step, axis=-1)
-        bent[1:-1, 1:-1] |= np.abs(cosine) > _LEVEL
+        bent[1:-1, 1:-1] |= np.abs(cosine) > LEVEL
     flat = depth_map.flat
-    if np.sum(bent & flat) > max(_FEW_BENT * np.sum(flat), _LEAST):
+    if np.sum(bent & flat) > max(FEW_BENT * np.sum(flat), _LEAST):
         share = f"{100 * np.sum(bent & flat) / np.sum(flat):.2g} % of the flat pixels"
         what = f"{share} have a normal that is not upright on the surface of {depth_map.shot.depth}"
         yield finding(file, what, _rows(bent & flat))
