@@ -169,6 +169,14 @@ def show(
 
 
 @board_app.command()
+def build(board: _Board, out: Annotated[Path, typer.Option(help="Folder of the site.")]) -> None:
+    """Write the board as a static site, with each table as CSV, Markdown and LaTeX."""
+    from rsbench.report.board_page import build_site
+
+    typer.echo(f"page: {build_site(board, out)}")
+
+
+@board_app.command()
 def merge(
     other: Annotated[Path, typer.Argument(metavar="OTHER", help="Board to copy from.")], board: _Board
 ) -> None:

@@ -61,6 +61,17 @@ class Recorded:
     """Of the split."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class About:
+    """What split.json must hold; it holds more."""
+
+    protocol: str
+    split: str
+    fingerprint: str
+    facts: dict[str, dict[str, float | str]]
+    """Of each problem; none where they are secret."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scored:
     """An entry of a board."""
@@ -183,6 +194,16 @@ def splits_of(board: Path) -> list[tuple[str, str]]:
     return found
 
 
+def about_split(folder: Path) -> About:
+    """What the split.json of a folder of a board says.
+
+    Raises:
+        RsbenchError: it is not there, or damaged.
+    """
+    path = folder / "split.json"
+    return parse_card(About, read_json(path), str(path), extra="ignore")
+
+
 def entries_of(board: Path, protocol: str, split: str) -> list[Scored]:
     """Entries of a split, by name.
 
@@ -213,7 +234,8 @@ def _read_entry(folder: Path) -> Scored:
         raise RsbenchError(f"{path}: header: names {'/'.join(named)}, which is not where it lies")
     columns = ("problem", "scene", "success")
     scores = read_table(folder / FILES[1], columns, NUMBERS, dtype={"problem": str, "scene": str})
-    if scores["problem"].duplicated().any() or np.any(~np.isfinite(scores[[f"auc_{x}" for x in AUC_DEG]])):
+    shares = scores[[*(f"auc_{limit}" for limit in AUC_DEG), "flip", "failure"]].to_numpy()
+    if scores["problem"].duplicated().any() or not np.all((shares >= 0.0) & (shares <= 1.0)):
         raise RsbenchError(f"{folder / FILES[1]}: is damaged; rsbench leaderboard rescore makes it again")
     return Scored(folder=folder, header=record.header, predictions_sha256=record.predictions_sha256, scores=scores)
 
@@ -234,6 +256,7 @@ def merge(other: Path, board: Path) -> list[str]:
         for protocol, split in splits_of(other)
         for scored in entries_of(other, protocol, split)
     ]
+    told = {scored.folder.parents[1]: about_split(scored.folder.parents[1]) for scored, _ in theirs}
     copied = []
     with workplace(board) as hidden:
         _open(board)
@@ -246,7 +269,7 @@ def merge(other: Path, board: Path) -> list[str]:
                 about = folder.parents[1] / "split.json"
                 if not about.exists():
                     about.parent.mkdir(parents=True, exist_ok=True)
-                    write_json(about, read_json(scored.folder.parents[1] / "split.json"))
+                    write_json(about, asdict(told[scored.folder.parents[1]]))
                 _move(new, folder)
                 copied.append("/".join(folder.parts[-4:-2]) + f"/{folder.name}")
     return copied

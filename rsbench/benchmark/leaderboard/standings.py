@@ -126,6 +126,6 @@ def table(lines: Sequence[Standing]) -> pd.DataFrame:
         row |= dict(zip(("rank", "rank_low", "rank_high"), line.rank or (None, None, None), strict=True))
         for name, (value, low, high) in line.means.items():
             row |= {name: value, f"{name}_low": low, f"{name}_high": high}
-        rows.append(row | line.medians | {"ties": " ".join(line.ties), "tuned_on": header.tuned_on})
+        rows.append(row | line.medians | {"ties": " ".join(line.ties)})
     integers = ["peers", "rank", "rank_low", "rank_high"]
     return pd.DataFrame(rows).astype(dict.fromkeys(integers, "Int64")) if rows else pd.DataFrame()

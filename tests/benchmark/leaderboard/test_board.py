@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from commands import run_here
 from leaderboards import Line, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard import running
@@ -294,12 +295,29 @@ def test_runs_are_the_same_however_they_are_cut(tmp_path: Path, monkeypatch: pyt
     assert scores["auc_10"].mean() > 0.3  # the conventions of inputs and answers agree
 
 
+def test_frames_with_given_matches(smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Through the command line: the matches that are exported are enough for a motion of rendered frames."""
+    monkeypatch.setattr(running, "finished_jobs", _here)
+    where = ("--data", smoke_dataset, "--board", tmp_path / "board")
+    ran = run_here("leaderboard", "run", "pose", *where, "--entry", "rs-stereo-refined", "--entry", "gs-8pt")
+    assert ran.returncode == 0, ran.stderr
+    split = dataset_split(PROTOCOLS["pose"], smoke_dataset)
+    assert {truth.scene for truth in split.truths} == {"castle", "room"}
+    write(tmp_path / "truth.jsonl", truth_lines(split))
+    assert run_here("leaderboard", "submit", tmp_path / "truth.jsonl", *where).returncode == 0
+    found = {each.header.method: each.scores for each in entries_of(tmp_path / "board", "pose-1", split.name)}
+    assert list(found) == ["gs-8pt", "rs-stereo-refined", "truth"]
+    assert found["truth"]["error_deg"].max() < 1e-5
+    still = np.array([truth.facts["rotation_deg"] for truth in split.truths])
+    assert np.all(found["rs-stereo-refined"]["e_R_deg"] < 0.2 * still)
+    shown = run_here("leaderboard", "show", "--board", tmp_path / "board", "--csv").stdout
+    assert [line.partition(",")[0] for line in shown.splitlines()[1:]] == ["gs-8pt", "rs-stereo-refined", "truth"]
+
+
 # Documents
 
 
 def test_the_documented_script_needs_no_rsbench(smoke_dataset: Path, tmp_path: Path) -> None:
-    from commands import run_here
-
     text = (ROOT / "docs" / "submit.md").read_text("utf-8")
     script = text.partition("```python\n# submit.py\n")[2].partition("```")[0]
     assert len(script.splitlines()) <= 22
