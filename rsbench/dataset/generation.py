@@ -145,7 +145,7 @@ def _plan(card: DatasetCard, sequence: SequenceCard, options: RendererOptions, s
             **_listed(asdict(viewpoint)),
             **start,
         },
-        "renderer": _listed(asdict(options)),
+        "renderer": _listed(options.record),
         "seed": card.seed_of(sequence),
     }
 
@@ -344,7 +344,7 @@ def render_camera(
         if kind == "rs" and sensor:
             period, motion = card.period_of(sequence), card.motion_of(sequence)
             seen = sensed_rows(scene, rig, shutter, motion, sensor.of(side, frame), period, side, frame, options)
-            write_png(folder / shot.image, to_srgb8(seen, 1.0))
+            write_png(folder / shot.image, seen)
         if kind == "rs":
             geometry = GivenGeometry(rig, shutter, card.motion_of(sequence))
             write_channels(folder, card.channels, geometry, shot, rendered, SceneRays(scene), twins)

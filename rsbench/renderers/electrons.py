@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+Mosaic = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
+_MOSAIC_BITS = 16
+"""Of what a mosaic reads where numbers are not rounded: they are interpolated as whole numbers."""
 _BLACK_SHARE = 1 / 16
 """Of the digital range lies below black, so that noise in the dark is not clipped there."""
 _RANGES: dict[str, tuple[float, float]] = {
@@ -23,9 +26,11 @@ _RANGES: dict[str, tuple[float, float]] = {
     "read_noise": (0.0, 1e6),
     "dark_current": (0.0, 1e9),
     "bit_depth": (0, 16),
+    "jpeg_quality": (0, 100),
     "vignetting": (0.0, 1.0),
     "right_exposure_s": (0.0, 3600.0),
     "right_gain": (1e-3, 1e6),
+    "right_jpeg_quality": (0, 100),
     "right_brightness": (1e-3, 1e3),
 }
 _BRIGHTNESS = (1e-3, 1e3)
@@ -59,14 +64,24 @@ class Sensor:
     right_brightness: float = 1.0
     """Of the right camera over the left one."""
     right_exposure_s: float | None = None
-    """Of the right camera; None: as the left one. So is the next."""
+    """Of the right camera; None: as the left one. So are the next."""
     right_gain: float | None = None
+    mosaic: Mosaic = "none"
+    """Colours of the filters before the first two pixels of the first two rows, repeated over the image; "none":
+    each pixel tells all three colours."""
+    right_mosaic: Mosaic | None = None
+    jpeg_quality: int = 0
+    """Of the image that leaves the camera, 1 to 100; 0: it is not compressed."""
+    right_jpeg_quality: int | None = None
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and low <= value <= high):
                 raise ValueError(f"sensor {name} = {value}: allowed is {low:g} to {high:g}")
+        for name in ("mosaic", "right_mosaic"):
+            if (value := getattr(self, name)) not in (*get_args(Mosaic), None):
+                raise ValueError(f"sensor {name} = {value!r}: allowed are {', '.join(get_args(Mosaic))}")
         low, high = _BRIGHTNESS
         if not all(math.isfinite(value) and low <= value <= high for value in self.brightness):
             raise ValueError(f"sensor brightness = {list(self.brightness)}: allowed is {low:g} to {high:g}")
@@ -74,16 +89,11 @@ class Sensor:
     def of(self, side: str, frame: int) -> Sensor:
         """The sensor of one camera at one time, both of whose frames and cameras are alike."""
         right = side == "right"
-        exposure_s = self.right_exposure_s if right and self.right_exposure_s is not None else self.exposure_s
-        gain = self.right_gain if right and self.right_gain is not None else self.gain
+        own: dict[str, Any] = {name: getattr(self, f"right_{name}") if right else None for name in _BY_CAMERA}
         light = self.brightness[frame] * (self.right_brightness if right else 1.0)
-        alike = {
-            "brightness": (light, light),
-            "right_brightness": 1.0,
-            "right_exposure_s": None,
-            "right_gain": None,
-        }
-        return replace(self, exposure_s=exposure_s, gain=gain, **alike)  # type: ignore[arg-type]
+        alike: dict[str, Any] = {"brightness": (light, light), "right_brightness": 1.0}
+        alike |= {f"right_{name}": None for name in _BY_CAMERA}
+        return replace(self, **{name: value for name, value in own.items() if value is not None}, **alike)
 
     @property
     def longest_s(self) -> float:
@@ -92,9 +102,9 @@ class Sensor:
 
     @property
     def record(self) -> dict[str, Any]:
-        """As JSON holds it; what both cameras and frames share is told once."""
+        """As JSON holds it; what both cameras and frames share is told once, later keys where they say more."""
         values = {each.name: getattr(self, each.name) for each in fields(self)}
-        own = {name: value for name, value in values.items() if name not in _UNEQUAL or value != _UNEQUAL[name]}
+        own = {name: value for name, value in values.items() if name not in _UNTOLD or value != _UNTOLD[name]}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in own.items()}
 
     @property
@@ -103,22 +113,43 @@ class Sensor:
         return self.full_well / self.gain
 
     @property
+    def bits(self) -> int:
+        """Of the digital numbers; 0: there are none."""
+        return self.bit_depth or (0 if self.mosaic == "none" else _MOSAIC_BITS)
+
+    @property
     def levels(self) -> tuple[int, int]:
         """Digital numbers of black and white."""
-        top = 2**self.bit_depth - 1
+        top = 2**self.bits - 1
         return round(_BLACK_SHARE * top), top
 
     def variance(self, light: ArrayLike) -> NDArray[np.float64]:
-        """Of linear values (...), white = 1, where ``light`` falls on the sensor; away from black and white."""
+        """Of linear values (...), white = 1, where ``light`` falls on the sensor; away from black and white.
+
+        Of a pixel as it is read: neither interpolated from a mosaic nor compressed.
+        """
         black, top = self.levels
         dark = self.dark_current * self.exposure_s
         shot = self.white * np.asarray(light, dtype=np.float64) + dark if self.photon_noise else 0.0
-        step = self.white / (top - black) if self.bit_depth else 0.0
+        step = self.white / (top - black) if self.bits else 0.0
         return np.asarray((shot + self.read_noise**2 + step**2 / 12) / self.white**2, dtype=np.float64)
 
 
-_UNEQUAL = {"brightness": (1.0, 1.0), "right_brightness": 1.0, "right_exposure_s": None, "right_gain": None}
-"""By which cameras and frames differ, and what it is where they do not."""
+_BY_CAMERA = ("exposure_s", "gain", "mosaic", "jpeg_quality")
+_UNTOLD = {
+    "brightness": (1.0, 1.0),
+    "right_brightness": 1.0,
+    "mosaic": "none",
+    "jpeg_quality": 0,
+    **{f"right_{name}": None for name in _BY_CAMERA},
+}
+"""What records leave out, and with which values: there is none of it."""
+
+
+def filters(mosaic: Mosaic, width: int, rows: ArrayLike) -> NDArray[np.intp]:
+    """Channels (n, width), 0 to 2, of the filters before the pixels of rows (n)."""
+    tile = np.array(["RGB".index(colour) for colour in mosaic]).reshape(2, 2)
+    return tile[np.asarray(rows)[:, None] % 2, np.arange(width) % 2]
 
 
 def fall_off(sensor: Sensor, width: int, height: int, rows: ArrayLike) -> NDArray[np.float64]:
@@ -136,6 +167,9 @@ def expose(
 
     Each row has random numbers of its own, so that it has the same bits by itself and in the whole image.
 
+    Returns:
+        (n, width, 3); (n, width, 1) where a mosaic lets one colour through to each pixel.
+
     Args:
         linear: (n, width, 3) light over white, before the lens' fall-off.
         sensor: of this camera and time.
@@ -145,10 +179,12 @@ def expose(
     """
     rows = np.asarray(rows)
     light = np.asarray(linear, dtype=np.float64) * fall_off(sensor, linear.shape[1], height, rows)[..., None]
+    if sensor.mosaic != "none":
+        light = np.take_along_axis(light, filters(sensor.mosaic, light.shape[1], rows)[..., None], axis=-1)
     numbered = zip(rows, light, strict=True)
     read = np.stack([_read_out(line, sensor, np.random.default_rng([seed, row])) for row, line in numbered])
     black, top = sensor.levels
-    if not sensor.bit_depth:
+    if not sensor.bits:
         return np.minimum(read, 1.0)
     numbers = np.clip(np.round(read * (top - black)) + black, 0, top)
     return (numbers - black) / (top - black)

@@ -6,12 +6,12 @@ exposed frame is the mean of the frames of its instants, up to the Monte Carlo e
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
 from rsbench.core.so3 import FloatArray
+from rsbench.renderers.subpixel import golden_step
 
 LEAST_INSTANTS = 64
 """A blur of 64 px is then drawn without gaps."""
@@ -38,12 +38,6 @@ def instant_of(seed: Any, pixel: Any, sample: Any, samples: int, instants: int) 
 
     turn, salt = mi.sample_tea_32(seed, pixel)
     within, _ = mi.sample_tea_32(salt, sample)
-    part = (sample * _step(samples) + turn % samples) % samples
+    part = (sample * golden_step(samples) + turn % samples) % samples
     per_part = instants // samples
     return part * per_part + within % per_part
-
-
-def _step(samples: int) -> int:
-    """Coprime with ``samples`` and near their golden section: neighbouring samples are seen far apart in time."""
-    golden = round(0.618 * samples)
-    return next(step for step in range(max(1, golden), 2 * samples + 2) if math.gcd(step, samples) == 1)

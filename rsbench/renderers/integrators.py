@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
 from rsbench.renderers.scene import MitsubaScene
 
 
-def sunsky_radiance(scene: MitsubaScene, ray: Any, active: Any = True) -> Any:
+def sunsky_radiance(scene: MitsubaScene, ray: Any, active: Any = True, ways: Sequence[Any] = ()) -> Any:
     """Radiance (RGB) along unit rays: a sun with hard shadows and a hemisphere sky on diffuse surfaces.
 
     L = albedo (E_sun / pi max(n.s, 0) visible + S (0.6 + 0.4 n.up)), with S the cosine-weighted mean of the sky,
     so that level ground in the open has its exact sky irradiance and a wall three fifths of it. It draws no random
-    number: the same ray has the same radiance, in every renderer, process and number of threads.
+    number: the same ray has the same radiance, in every renderer, process and number of threads. With ``ways``,
+    points on the unit sphere, the sky's part is that of ``_seen_sky``: all is direct light as ``path`` has it.
     """
     import drjit as dr
     import mitsuba as mi
@@ -31,8 +33,34 @@ def sunsky_radiance(scene: MitsubaScene, ray: Any, active: Any = True) -> Any:
     lit = on_surface & (facing > 0)
     hidden = scene.scene.ray_test(hit.spawn_ray(sky.sun_direction), coherent=True, active=lit)
     sun = sky.sun_radiance * dr.select(lit, dr.select(hidden, 0, facing), 0)
-    ambient = sky.overhead * dr.fma(dr.dot(normal, sky.up), 0.4, 0.6)
+    if ways:
+        ambient = _seen_sky(scene, hit, normal, ways, on_surface)
+    else:
+        ambient = sky.overhead * dr.fma(dr.dot(normal, sky.up), 0.4, 0.6)
     return dr.select(on_surface, albedo * (sun + ambient), sky.seen_along(ray.d))
+
+
+_WITHIN = 0.9999
+"""Of the sphere's radius: the opposite of a normal would leave no direction."""
+
+
+def _seen_sky(scene: MitsubaScene, hit: Any, normal: Any, ways: Sequence[Any], active: Any) -> Any:
+    """Radiance that a white open surface would have from the sky, times the share of its light that nothing hides.
+
+    A unit normal plus a point on the unit sphere is a direction that the cosine law draws; of those directions the
+    sky's light is summed with and without what hides it. Their ratio is exact where nothing or all is hidden.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    seen, whole = mi.Color3f(0.0), mi.Color3f(0.0)
+    for way in ways:
+        direction = dr.normalize(normal + _WITHIN * way)
+        light = scene.sky.seen_along(direction)
+        hidden = scene.scene.ray_test(hit.spawn_ray(direction), active=active)
+        seen += dr.select(hidden, 0, light)
+        whole += light
+    return scene.sky.on_open_surface(normal) * dr.select(whole > 0, seen / whole, 0)
 
 
 @cache

@@ -6,6 +6,7 @@ The same formulas as the wavefront, sample for sample; only rounding differs.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from rsbench.renderers.exposure import instant_of
 from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.renderers.subpixel import subpixel_grid
+from rsbench.renderers.subpixel import sky_ways, subpixel_grid
 
 Float32Array = NDArray[np.float32]
 
@@ -61,7 +62,13 @@ def _sunsky(
     import drjit as dr
     import mitsuba as mi
 
-    return sunsky_radiance(scene, mi.Ray3f(origin, dr.normalize(direction)))
+    ways = [mi.Vector3f(*way) for way in _ways(options.samples, options.sky_rays)[sample]]
+    return sunsky_radiance(scene, mi.Ray3f(origin, dr.normalize(direction)), ways=ways)
+
+
+@cache
+def _ways(samples: int, rays: int) -> Any:
+    return sky_ways(samples, rays).tolist() if rays else [[]] * samples
 
 
 def _path(

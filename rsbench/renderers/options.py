@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal, get_args
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args
 
 from rsbench.errors import RsbenchError
 
 Method = Literal["single-pass", "stitched"]
 Integrator = Literal["sunsky", "path"]
-_MOST_SAMPLES, _LONGEST_PATH = 1 << 16, 1 << 10
+_MOST_SAMPLES, _LONGEST_PATH, _MOST_SKY_RAYS = 1 << 16, 1 << 10, 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +34,8 @@ class RendererOptions:
     """Multiplies the linear image before it becomes 8-bit sRGB; the same for every frame."""
     seed: int = 0
     """Of the random numbers that ``path`` draws."""
+    sky_rays: int = 0
+    """Of ``sunsky``, from what each sample sees: whether surfaces hide the sky there; 0: nothing hides it."""
     full_frames: bool = False
     """``stitched`` renders every row of every global-shutter image, and not only the kept one."""
 
@@ -46,10 +48,17 @@ class RendererOptions:
             )
         if not 1 <= self.max_depth <= _LONGEST_PATH:
             raise RsbenchError(f"renderer max_depth = {self.max_depth}: allowed are 1 to {_LONGEST_PATH}")
+        if not 0 <= self.sky_rays <= _MOST_SKY_RAYS:
+            raise RsbenchError(f"renderer sky_rays = {self.sky_rays}: allowed are 0 to {_MOST_SKY_RAYS}")
         if not (math.isfinite(self.exposure) and self.exposure > 0):
             raise RsbenchError(f"renderer exposure = {self.exposure}: a positive number is needed")
         if not 0 <= self.seed < 2**32:
             raise RsbenchError(f"renderer seed = {self.seed}: allowed is 0 to 4294967295")
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """As JSON holds it; what came later only where there is any."""
+        return {name: value for name, value in asdict(self).items() if name != "sky_rays" or value}
 
 
 def _one_of(field: str, value: str, allowed: tuple[str, ...]) -> None:

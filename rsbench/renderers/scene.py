@@ -91,6 +91,19 @@ class Sky:
 
         return self.horizon + (self.zenith - self.horizon) * dr.maximum(dr.dot(direction, self.up), 0)
 
+    def on_open_surface(self, normal: Any) -> Any:
+        """Radiance of a white diffuse surface with unit normals from all of the sky, and the horizon below it.
+
+        The integral of max(n.w, 0) max(up.w, 0) over all directions w is 2 / 3 (sin a + (pi - a) cos a), with a
+        between n and up: Cho and Saul, Kernel methods for deep learning, NIPS 2009, in three dimensions.
+        """
+        import drjit as dr
+
+        level = dr.clip(dr.dot(normal, self.up), -1, 1)
+        angle = dr.acos(level)
+        share = (dr.sqrt(1 - level * level) + (dr.pi - angle) * level) * (2 / (3 * dr.pi))
+        return self.horizon + (self.zenith - self.horizon) * share
+
 
 def mean_sky(light: Light) -> NDArray[np.float64]:
     """Cosine-weighted mean radiance (3,) of the sky over the upper hemisphere: E / pi of level ground.

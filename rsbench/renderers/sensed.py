@@ -1,4 +1,4 @@
-"""A rolling-shutter frame as a sensor delivers it: exposed for a while, with the sensor's noise."""
+"""A rolling-shutter frame as a camera delivers it: exposed, with noise, interpolated and compressed."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.renderers.electrons import Sensor, expose
 from rsbench.renderers.exposure import instant_count, instant_times
 from rsbench.renderers.options import RendererOptions
+from rsbench.renderers.processing import processed, rows_needed
 from rsbench.renderers.render import render
 from rsbench.renderers.scene import MitsubaScene
 
@@ -29,8 +30,8 @@ def sensed_rows(
     frame: int,
     options: RendererOptions,
     rows: Sequence[int] | None = None,
-) -> NDArray[np.float64]:
-    """Linear values (rows, width, 3) of rows of a frame, all by default; white = 1, black a little noisy.
+) -> NDArray[np.uint8]:
+    """Rows (rows, width, 3) of a frame, all by default; 8-bit sRGB.
 
     Args:
         scene: in the world frame of the motion.
@@ -52,5 +53,7 @@ def sensed_rows(
     chosen = range(shutter.height) if rows is None else rows
     R, t = rig.cam_from_world(motion, tau, side)
     options, columns = replace(options, full_frames=False), shutter.axis(side) == 0
-    light = render(scene, rig.camera, R, t, options, exposed=exposed, rows=chosen, columns=columns).image
-    return expose(light * np.float32(options.exposure), sensor, options.seed, shutter.height, chosen)
+    needed = rows_needed(sensor, chosen, shutter.height)
+    light = render(scene, rig.camera, R, t, options, exposed=exposed, rows=needed, columns=columns).image
+    read = expose(light * np.float32(options.exposure), sensor, options.seed, shutter.height, needed)
+    return processed(read, sensor, shutter.height, needed, chosen)

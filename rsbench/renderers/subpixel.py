@@ -7,6 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+_GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
+
 
 def subpixel_grid(samples: int) -> NDArray[np.float32]:
     """Offsets (samples, 2) from the pixel centre, in (-0.5, 0.5), px: the same in every pixel, never random.
@@ -20,3 +22,22 @@ def subpixel_grid(samples: int) -> NDArray[np.float32]:
     x = (i + (j + 0.5) / k) / k - 0.5
     y = (j + (i + 0.5) / k) / k - 0.5
     return np.stack([x, y], axis=-1).astype(np.float32)
+
+
+def sky_ways(samples: int, rays: int) -> NDArray[np.float32]:
+    """Points (samples, rays, 3) on the unit sphere, evenly spread over all and over those of each sample.
+
+    A Fibonacci lattice, whose heights go round the samples in steps of their golden section, so that no side of a
+    pixel looks higher than another.
+    """
+    total = samples * rays
+    height = 1.0 - (2.0 * np.arange(total) + 1.0) / total
+    turn, level = _GOLDEN * np.arange(total), np.sqrt(1.0 - height**2)
+    points = np.stack([level * np.cos(turn), level * np.sin(turn), height], axis=-1).astype(np.float32)
+    return points.reshape(rays, samples, 3).swapaxes(0, 1)[np.arange(samples) * golden_step(samples) % samples]
+
+
+def golden_step(count: int) -> int:
+    """Coprime with ``count`` and near its golden section: neighbours are brought far apart."""
+    golden = round(0.618 * count)
+    return next(step for step in range(max(1, golden), 2 * count + 2) if math.gcd(step, count) == 1)

@@ -19,7 +19,7 @@ from rsbench.renderers.exposure import instant_of
 from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.renderers.subpixel import subpixel_grid
+from rsbench.renderers.subpixel import sky_ways, subpixel_grid
 
 PACKET = 16
 """Lanes that are traced together at most (AVX-512)."""
@@ -134,7 +134,8 @@ def _sunsky_band(
 
     lanes = _Lanes.of(rows, camera.width)
     grid = mi.Float(subpixel_grid(options.samples).ravel())
-    count = dr.opaque(mi.UInt32, options.samples)
+    count, rays = dr.opaque(mi.UInt32, options.samples), options.sky_rays
+    table = mi.Float(sky_ways(options.samples, rays).ravel()) if rays else None
     x, y = mi.Float(lanes.column), mi.Float(lanes.row)
     pixel = None if sensor.lens is None else sensor.lens.pixel(x, y, lanes.active)
 
@@ -143,7 +144,8 @@ def _sunsky_band(
         pose = _pose(sensor, camera, lanes, k, options)
         origin, direction = sensor.row_ray(x + dx, y + dy, pose, lanes.active, pixel)
         ray = mi.Ray3f(origin, dr.normalize(direction))
-        return k + 1, total + sunsky_radiance(scene, ray, lanes.active)
+        ways = [_entry(table, k * rays + j) for j in range(rays)]
+        return k + 1, total + sunsky_radiance(scene, ray, lanes.active, ways)
 
     _, total = dr.while_loop(
         state=(dr.zeros(mi.UInt32, dr.width(lanes.row)), dr.zeros(mi.Color3f, dr.width(lanes.row))),
@@ -152,6 +154,14 @@ def _sunsky_band(
         labels=("sample", "total"),
     )
     return lanes.image([*total], camera.width)[0] / np.float32(options.samples)
+
+
+def _entry(table: Any, number: Any) -> Any:
+    """Vector of a table of three numbers each."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return mi.Vector3f(*(dr.gather(mi.Float, table, 3 * number + k) for k in range(3)))
 
 
 def _path_band(

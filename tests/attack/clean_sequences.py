@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 from unittest.mock import patch
 
 import numpy as np
@@ -30,7 +30,7 @@ from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCa
 from rsbench.dataset.channels import CHANNELS, Channel, check_channels
 from rsbench.dataset.verification import rerender, verify_dataset
 from rsbench.errors import RsbenchError
-from rsbench.renderers.electrons import Sensor
+from rsbench.renderers.electrons import Mosaic, Sensor
 from rsbench.scenes.load import load_scene, read_scene_card
 from rsbench.scenes.model import Scene
 
@@ -138,7 +138,17 @@ def _sensor(rng: np.random.Generator, period: float) -> Sensor | None:
         dark_current=float(rng.uniform(0, 50)) if noisy else 0.0,
         bit_depth=int(rng.choice([0, 8, 10, 12])),
         vignetting=float(rng.choice([0.0, rng.uniform(0, 0.5)])),
+        **_processing(rng),
     )
+
+
+def _processing(rng: np.random.Generator) -> dict[str, Any]:
+    """A third each: what all sensors had once, both cameras alike, and unlike."""
+    own: dict[str, Any] = {}
+    for side in ("", "right_")[: int(rng.integers(3))]:
+        own[f"{side}mosaic"] = get_args(Mosaic)[rng.integers(len(get_args(Mosaic)))]
+        own[f"{side}jpeg_quality"] = int(rng.choice([0, *rng.integers([1, 50], [50, 101])]))
+    return own
 
 
 def _channels(rng: np.random.Generator, camera: CameraCard, scanning: Scanning) -> tuple[Channel, ...]:

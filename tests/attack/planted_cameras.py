@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attack.planted_faults import scene_of_victim, twin_at
+from attack.planted_sensors import CAMERA, SENSOR_FAULTS
 from attack.planting import (
     VICTIM,
     Fault,
@@ -52,8 +53,9 @@ CAMERAS: dict[str, dict[str, Any]] = {
     "late": {"scan": "bottom", "right_delay": 0.1, "channels": ("timing",)},
     "opposite": {"right_scan": "bottom"},
     "thin": {"scene": "forest"},
+    "processed": {"sensor": CAMERA},
 }
-"""What differs from the cameras of datasets/smoke.toml, by name; the last sees hardly a flat place."""
+"""What differs from the cameras of datasets/smoke.toml, by name; ``thin`` sees hardly a flat place."""
 
 
 def card_of(name: str) -> DatasetCard:
@@ -369,5 +371,6 @@ CAMERA_FAULTS: dict[str, tuple[Fault, ...]] = {
     "late": tuple(_late_faults()),
     "opposite": tuple(_opposite_faults()),
     "thin": tuple(_thin_faults()),
+    "processed": SENSOR_FAULTS,
 }
 """Of each of ``CAMERAS``."""

@@ -18,7 +18,7 @@ from small_scenes import write_box_scene, write_small_card
 from rsbench.cards import parse_card
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
-from rsbench.dataset.files import write_png
+from rsbench.dataset.files import read_png, write_png
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_sequence
 from rsbench.dataset.verification import sensors, verify_dataset
@@ -28,9 +28,13 @@ from rsbench.dataset.verification.landing import Shot
 from rsbench.dataset.verification.sensors import sensor_faults
 from rsbench.errors import RsbenchError
 from rsbench.renderers.electrons import Sensor
+from rsbench.renderers.processing import compressed
 
 NOISY = Sensor(full_well=6000, gain=4, photon_noise=True, read_noise=2.5, bit_depth=10)
 
+CAMERA = replace(
+    NOISY, exposure_s=0.01, right_exposure_s=0.0, mosaic="GRBG", right_mosaic="BGGR", right_jpeg_quality=80
+)
 UNEVEN = replace(NOISY, right_gain=12, right_exposure_s=0.01, brightness=(1.0, 0.6), right_brightness=0.8)
 
 
@@ -42,8 +46,9 @@ def _card(sensor: Sensor | None, **fields: object) -> DatasetCard:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory, scenes_once: None) -> dict[str, Path]:
-    """Folders of one sequence: an ideal sensor, one with noise, with an exposure too, and two unlike cameras."""
-    sensors = {"ideal": None, "noisy": NOISY, "exposed": replace(NOISY, exposure_s=0.02), "uneven": UNEVEN}
+    """Folders of one sequence: an ideal sensor, one with noise, with an exposure too, and two pairs unlike."""
+    exposed = replace(NOISY, exposure_s=0.02)
+    sensors = {"ideal": None, "noisy": NOISY, "exposed": exposed, "uneven": UNEVEN, "camera": CAMERA}
     folders = {}
     for name, sensor in sensors.items():
         folders[name] = tmp_path_factory.mktemp("sensors") / name
@@ -53,7 +58,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, scenes_once: None) -> dict[st
 
 
 def test_the_clean_twin_is_the_frame_of_an_ideal_sensor(made: dict[str, Path]) -> None:
-    for name in ("noisy", "exposed"):
+    for name in ("noisy", "exposed", "camera"):
         for file in ("left_0.png", "right_1.png"):
             assert (made[name] / "rs_clean" / file).read_bytes() == (made["ideal"] / "rs" / file).read_bytes()
         for file in ("rs_depth/left_1.exr", "gs/left_1.png", "gs_depth/right_0.exr", "poses/left_1.csv"):
@@ -117,7 +122,7 @@ def test_another_brightness_than_the_sensor_s_is_named(made: dict[str, Path]) ->
 
 
 def test_such_sequences_are_verified(made: dict[str, Path]) -> None:
-    for name in ("noisy", "exposed", "uneven"):
+    for name in ("noisy", "exposed", "uneven", "camera"):
         (report,) = verify_dataset(made[name].parent)
         assert report.faults == ()
 
@@ -138,8 +143,9 @@ FAULTS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
 
 def test_rows_of_a_sensor_are_made_again(made: dict[str, Path], tmp_path: Path) -> None:
     """Bit for bit; so a sharp frame with noise of the right size but of other random numbers is found."""
-    (report,) = verify_dataset(made["exposed"].parent, 4, rerender="auto")
-    assert report.faults == () and report.notes[0].endswith("the same bits")
+    for name in ("exposed", "camera"):
+        (report,) = verify_dataset(made[name].parent, 4, rerender="auto")
+        assert report.faults == () and report.notes[0].endswith("the same bits")
     copy = tmp_path / "dataset"
     shutil.copytree(made["exposed"].parent, copy)
     sequence = read_sequence(copy / "room-twist")
@@ -172,6 +178,35 @@ def test_frames_that_the_sensor_cannot_have_made_are_named(
     write_png(copy / shot.image, np.ascontiguousarray(bad))
     found = list(sensor_faults(read_sequence(copy), content.maps, content.pictures, ()))
     assert len(found) == 1 and found[0].startswith("rs/left_1.png: ")
+
+
+def _with_a_clean_row(seen: np.ndarray, clean: np.ndarray) -> np.ndarray:
+    return np.concatenate([seen[:41], clean[41:42], seen[42:]])
+
+
+PROCESSED: dict[str, tuple[str, Callable[[np.ndarray, np.ndarray], np.ndarray], str]] = {
+    "clean": ("left", lambda seen, clean: clean, "looks like no mosaic"),
+    "of another mosaic": ("left", lambda seen, clean: np.roll(seen, 1, axis=0), "looks like BGGR"),
+    "compressed": ("left", lambda seen, clean: compressed(seen, 85), "not interpolated from a mosaic GRBG"),
+    "black": ("right", lambda seen, clean: np.zeros_like(seen), "beyond 5 sigma"),
+    "not compressed": ("right", lambda seen, clean: clean, "looks not compressed"),
+    "of another quality": ("right", lambda seen, clean: compressed(seen, 60), "looks like quality 60"),
+    "a row replaced": ("right", _with_a_clean_row, "rows 40-47"),
+    "darker": ("right", lambda seen, clean: compressed(seen // np.uint8(2), 80), "beyond 5 sigma"),
+}
+
+
+@pytest.mark.parametrize("fault", PROCESSED)
+def test_frames_that_were_processed_otherwise_are_named(made: dict[str, Path], fault: str, tmp_path: Path) -> None:
+    side, change, words = PROCESSED[fault]
+    sequence = read_sequence(made["camera"])
+    content = read_content(sequence)
+    copy = tmp_path / sequence.name
+    shutil.copytree(made["camera"], copy)
+    file = f"rs/{side}_1.png"
+    write_png(copy / file, change(read_png(copy / file), read_png(copy / f"rs_clean/{side}_1.png")))
+    (found,) = sensor_faults(read_sequence(copy), content.maps, content.pictures, ())
+    assert found.startswith(f"{file}: ") and words in found, found
 
 
 def test_an_exposure_without_noise_is_no_fault(tmp_path: Path) -> None:

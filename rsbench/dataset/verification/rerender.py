@@ -48,6 +48,8 @@ _ALIKE = (": the same bits", ": the same but for rounding")
 """Ends of the note where nothing differs."""
 _ROWS = 16
 """Of an image, with ``auto``."""
+_COMPRESSED = 4
+"""Of the rows of a compressed frame one in so many: each takes 48 rows of the sensor."""
 _MOST_RAYS = 2e8
 """Of a sequence, with ``auto``: fewer rows where the samples are many."""
 _SAME_DEPTH = 2e-6
@@ -223,9 +225,9 @@ def _frame_checks(
 ) -> Iterator[_Check]:
     """What lies beside a clean rolling-shutter frame: what its sensor makes of it, and the stack of whole frames.
 
-    Each row of a sensor has random numbers of its own, and so its bits without the others.
+    Each row of a sensor has random numbers of its own, and so its bits without the others; of an image that was
+    interpolated or compressed, with those around.
     """
-    from rsbench.renderers.image import to_srgb8
     from rsbench.renderers.sensed import sensed_rows
 
     sequence, chosen, elsewhere = content.sequence, _of_image(content, options, shot), not _made_here(content)
@@ -234,10 +236,11 @@ def _frame_checks(
             seen = Picture.of(shot, sequence.image(*shot[:3]), noisy=False)
             geometry = sequence.rig, sequence.shutter, sequence.motion
             sensor = sequence.sensor.of(shot.side, shot.frame)
+            some = rows[::_COMPRESSED] if sensor.jpeg_quality and len(rows) < sequence.shutter.height else rows
             sensed = sensed_rows(
-                scene, *geometry, sensor, sequence.frame_period_s, shot.side, shot.frame, chosen, rows
+                scene, *geometry, sensor, sequence.frame_period_s, shot.side, shot.frame, chosen, some
             )
-            yield _image_check(shot.image, seen, to_srgb8(sensed, 1.0), rows, elsewhere)
+            yield _image_check(shot.image, seen, sensed, some, elsewhere)
     with contextlib.suppress(RsbenchError):
         if whole_frames(sequence.manifest):
             yield _stack_check(content, scene, chosen, shot, rows)

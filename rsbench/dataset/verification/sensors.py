@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,10 +16,12 @@ from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.dataset.verification.image_checks import Picture
 from rsbench.dataset.verification.landing import FAR, DepthMap, Shot
 from rsbench.dataset.verification.png import png_fault
+from rsbench.dataset.verification.processing_checks import processing_fault
 from rsbench.errors import RsbenchError
 from rsbench.reading import inside
-from rsbench.renderers.electrons import Sensor, fall_off
+from rsbench.renderers.electrons import Sensor, expose, fall_off
 from rsbench.renderers.image import linear_of_codes
+from rsbench.renderers.processing import compressed, processed, rows_needed, shares_of_noise
 
 _BEYOND_SIGMA, _BEYOND_SHARE, _ROW_SHARE = 5.0, 5e-3, 0.1
 """Of Gaussian noise 6e-7 are beyond, of Poisson numbers in the dark more; and a blur sees what lies between the
@@ -26,6 +29,10 @@ samples of a texture finer than a pixel, or behind a thin near edge, which the t
 is for four samples, and grows with the distance between them."""
 _LEAST_VALUES, _VARIANCE_RANGE = 1000, (0.85, 1.2)
 """The variance of 1000 values is known to 4.5 %; five times that, and what a smooth surface changes in a blur."""
+_COMPRESSED_RANGE, _BLOCKS_ALIKE = (0.5, 2.0), 10
+"""Of a compressed image over that of the clean twin after the same; its noise is that of blocks, not of values."""
+_JPEG_REACH = 17
+"""Pixels over which JPEG spreads what it leaves out: a block of colours of half the resolution, and one more."""
 _MOST_BIAS = 0.75
 """Of the mean, in sigma: where the twin is uneven by less than one sigma, its middle is off by half at most."""
 _UNCLIPPED = (0.03, 0.75)
@@ -83,47 +90,125 @@ def _window(sequence: Sequence, sensor: Sensor, depth_map: DepthMap, spacing: fl
 
 
 def _fault(
-    sensor: Sensor, image: NDArray[np.uint8], picture: Picture, window: tuple[int, int], spacing: float = 0.5
+    sensor: Sensor,
+    image: NDArray[np.uint8],
+    picture: Picture,
+    window: tuple[int, int],
+    spacing: float = 0.5,
 ) -> str | None:
-    shot, clean = picture.shot, picture.colours
-    height, width = clean.shape[:2]
-    twin = f"rs_clean/{shot.side}_{shot.frame}.png"
-    around = np.ones((2 * window[1] + 1, 2 * window[0] + 1), np.uint8)
-    share = fall_off(sensor, width, height, np.arange(height))[..., None]
-    least, most = (way(clean, around) for way in (cv2.erode, cv2.dilate))
-    low = linear_of_codes(least) * share
-    # How bright white is, the twin does not say.
-    high = np.where(most < _WHITE, np.minimum(linear_of_codes(most) * share, 1.0), 1.0)
-    seen = linear_of_codes(image)
-    # A path tracer's noise is in both, and in each frame another; one sample of a pixel is a draw likewise.
-    traced = 12.0 * picture.noise**2 if picture.noisy or spacing >= 1.0 else 0.0
-    own, rounded = sensor.variance(high), (1.0 + traced) * (_rounding(image) + share**2 * _rounding(clean))
-    sigma = np.sqrt(own + rounded)
-    slack = _BEYOND_SIGMA * np.sqrt(own + rounded + 2.0 * share**2 * _sampling(clean, spacing))
-    beyond = (seen < np.minimum(low, 1.0) - slack) | (seen > high + slack)
-    # What the twin does not show may come in over its borders.
-    inner = np.s_[window[1] : height - window[1], window[0] : width - window[0]]
+    """What is wrong with an image of ``picture``'s shot; ``window`` is how far (x, y) its blur may reach, px."""
+    bounds = _Bounds.of(sensor, image, picture, window, spacing)
+    return (
+        _beyond(bounds, image, picture.shot, spacing)
+        or processing_fault(image, sensor, picture.shot.image)
+        or _noise_fault(bounds, sensor, image, picture)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Bounds:
+    """What a sensor may show, linear values (H, W, 3) where white is 1."""
+
+    low: FloatArray
+    """The darkest and the brightest light that may come to a pixel."""
+    high: FloatArray
+    own: FloatArray
+    """Variance of the sensor's noise."""
+    rounded: FloatArray
+    """Variance by rounding, and by the noise of the twin."""
+    slack: FloatArray
+    inner: tuple[slice, slice]
+    """Pixels to which nothing comes from beyond the borders, which the twin does not show."""
+
+    @classmethod
+    def of(
+        cls,
+        sensor: Sensor,
+        image: NDArray[np.uint8],
+        picture: Picture,
+        window: tuple[int, int],
+        spacing: float,
+    ) -> _Bounds:
+        clean, beside = picture.colours, int(sensor.mosaic != "none")
+        height, width = clean.shape[:2]
+        x, y = window[0] + beside, window[1] + beside
+        around = np.ones((2 * y + 1, 2 * x + 1), np.uint8)
+        share = fall_off(sensor, width, height, np.arange(height))[..., None]
+        least, most = (way(clean, around) for way in (cv2.erode, cv2.dilate))
+        low = linear_of_codes(least) * share
+        # How bright white is, the twin does not say.
+        high = np.where(most < _WHITE, np.minimum(linear_of_codes(most) * share, 1.0), 1.0)
+        # A path tracer's noise is in both, and in each frame another; one sample of a pixel is a draw likewise.
+        traced = 12.0 * picture.noise**2 if picture.noisy or spacing >= 1.0 else 0.0
+        own = sensor.variance(high)
+        rounded = (1.0 + traced) * (_rounding(image) + share**2 * _rounding(clean))
+        unsure = own + rounded + 2.0 * share**2 * _sampling(clean, spacing)
+        if sensor.jpeg_quality:
+            unsure += cv2.dilate(_compression(sensor, clean), around)
+        own = own * shares_of_noise(sensor.mosaic, width, height)
+        inner = np.s_[y : height - y, x : width - x]
+        return cls(low, high, own, rounded, _BEYOND_SIGMA * np.sqrt(unsure), inner)
+
+
+def _beyond(bounds: _Bounds, image: NDArray[np.uint8], shot: Shot, spacing: float) -> str | None:
+    seen, inner = linear_of_codes(image), bounds.inner
+    beyond = (seen < np.minimum(bounds.low, 1.0) - bounds.slack) | (seen > bounds.high + bounds.slack)
     if not beyond[inner].size:
         return None
-    many, rows = float(np.mean(beyond[inner])), np.zeros(height, dtype=np.bool_)
+    many, rows = float(np.mean(beyond[inner])), np.zeros(len(image), dtype=np.bool_)
     rows[inner[0]] = np.mean(beyond[inner], axis=(1, 2)) > _ROW_SHARE
-    if many > _BEYOND_SHARE * max(1.0, 2.0 * spacing) or np.any(rows):
-        what = f"{100 * many:.2f} % of the values are beyond {_BEYOND_SIGMA:g} sigma of what {twin} allows"
-        return finding(shot.image, what, rows_of(rows))
-    # Rounding is no noise: without any beside it, equal values are rounded alike.
-    smooth = (high - low < sigma) & (low > _UNCLIPPED[0]) & (high < _UNCLIPPED[1]) & (own > rounded)
-    if np.sum(smooth) < _LEAST_VALUES:
+    if many <= _BEYOND_SHARE * max(1.0, 2.0 * spacing) and not np.any(rows):
         return None
-    beside = ((seen - 0.5 * (low + high)) / sigma)[smooth]
+    what = f"{100 * many:.2f} % of the values are beyond {_BEYOND_SIGMA:g} sigma of what {_twin(shot)} allows"
+    return finding(shot.image, what, rows_of(rows))
+
+
+def _noise_fault(bounds: _Bounds, sensor: Sensor, image: NDArray[np.uint8], picture: Picture) -> str | None:
+    """Light and noise where the twin is smooth. Rounding is no noise: without any beside it, equal values are
+    rounded alike."""
+    low, high, shot = bounds.low, bounds.high, picture.shot
+    sigma = np.sqrt(bounds.own + bounds.rounded)
+    smooth = (high - low < sigma) & (low > _UNCLIPPED[0]) & (high < _UNCLIPPED[1]) & (bounds.own > bounds.rounded)
+    if sensor.mosaic != "none":
+        inside = np.zeros_like(smooth)
+        inside[bounds.inner] = True
+        smooth &= inside
+    if np.sum(smooth) < _LEAST_VALUES * (_BLOCKS_ALIKE if sensor.jpeg_quality else 1):
+        return None
+    beside = ((linear_of_codes(image) - 0.5 * (low + high)) / sigma)[smooth]
     if abs(bias := float(np.mean(beside))) > _MOST_BIAS:
-        what = f"is {'brighter' if bias > 0 else 'darker'} than its sensor shows {twin}, by {abs(bias):.2f} sigma"
-        return finding(shot.image, what)
-    ratio = float(np.var(beside))
-    if not _VARIANCE_RANGE[0] < ratio < _VARIANCE_RANGE[1]:
-        return finding(
-            shot.image, f"its noise has {ratio:.2f} times the variance of the sensor's, seen beside {twin}"
-        )
-    return None
+        way = "brighter" if bias > 0 else "darker"
+        return finding(shot.image, f"is {way} than its sensor shows {_twin(shot)}, by {abs(bias):.2f} sigma")
+    ratio, (least, most) = float(np.var(beside)), _VARIANCE_RANGE
+    if sensor.jpeg_quality:
+        made = linear_of_codes(_made_of(picture.colours, sensor))
+        ratio /= float(np.var(((made - 0.5 * (low + high)) / sigma)[smooth]))
+        least, most = _COMPRESSED_RANGE
+    if least < ratio < most:
+        return None
+    what = f"its noise has {ratio:.2f} times the variance of the sensor's, seen beside {_twin(shot)}"
+    return finding(shot.image, what)
+
+
+def _twin(shot: Shot) -> str:
+    return f"rs_clean/{shot.side}_{shot.frame}.png"
+
+
+def _made_of(clean: NDArray[np.uint8] | NDArray[np.float32], sensor: Sensor) -> NDArray[np.uint8]:
+    """What the sensor makes of the light of a clean twin, with noise of its kind."""
+    rows = range(len(clean))
+    light = linear_of_codes(clean).astype(np.float32)
+    return processed(
+        expose(light, sensor, 0, len(clean), rows), sensor, len(clean), rows_needed(sensor, rows, len(clean)), rows
+    )
+
+
+def _compression(sensor: Sensor, clean: NDArray[np.uint8] | NDArray[np.float32]) -> FloatArray:
+    """Variance (H, W, 3) of linear values by JPEG, near each pixel: of the clean twin behind the same sensor."""
+    before = _made_of(clean, replace(sensor, jpeg_quality=0))
+    after = compressed(before, sensor.jpeg_quality)
+    error = (linear_of_codes(after) - linear_of_codes(before)) ** 2
+    return np.asarray(cv2.blur(error, (_JPEG_REACH, _JPEG_REACH)), dtype=np.float64)
 
 
 def _sampling(clean: NDArray[np.uint8] | NDArray[np.float32], spacing: float) -> FloatArray:

@@ -238,7 +238,7 @@ def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: Seque
             scene |= asdict(built_in.viewpoints[sequence.viewpoint])
     options: dict[str, Any] = {}
     if same_version and card.renderer in list_cards("renderers"):
-        options = asdict(load_card(RendererOptions, "renderers", card.renderer))
+        options = load_card(RendererOptions, "renderers", card.renderer).record
         # `generate --full-frames` replaces these two.
         options = {key: value for key, value in options.items() if key not in ("method", "full_frames")}
     for key, value in planned.items():
