@@ -12,7 +12,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.errors import RsbenchError
 from rsbench.renderers.image import to_srgb8
 from rsbench.renderers.options import Integrator, RendererOptions
-from rsbench.renderers.render import render_global
+from rsbench.renderers.render import render, render_global
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.renderers.subpixel import subpixel_grid
 from rsbench.scenes.model import Light, Material, Scene, SceneMesh
@@ -203,3 +203,50 @@ def test_bad_scenes_are_refused_in_one_line(quad: Any) -> None:
         picture(Light(sun_direction=(0.0, 0.0, 0.0)))
     with pytest.raises(RsbenchError, match="up"):
         picture(Light(sun_direction=(0.0, 0.0, 1.0), up=(0.0, float("nan"), 0.0)))
+
+
+SKY = Light(sun_direction=UP, sun_irradiance=BLACK, sky_zenith=(0.2, 0.4, 0.9), sky_horizon=(0.8, 0.8, 0.7), up=UP)
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, -1.0), (0.0, -0.6, -0.8), (0.0, 0.28, -0.96)])
+def test_an_open_surface_has_all_light_of_the_sky(quad: Any, normal: tuple[float, float, float]) -> None:
+    """Against a sum over directions; with few of its own the ratio of the renderer is exact all the same."""
+    z = 1.0 - (2.0 * np.arange(40_000) + 1.0) / 40_000
+    turn, level = np.arange(40_000) * 2.399963, np.sqrt(1 - z**2)
+    ways = np.stack([level * np.cos(turn), level * np.sin(turn), z], axis=-1)
+    height = np.maximum(-ways[:, 1:2], 0.0)
+    radiance = np.array(SKY.sky_horizon) + (np.array(SKY.sky_zenith) - SKY.sky_horizon) * height
+    expected = 4 * np.mean(radiance * np.maximum(ways @ normal, 0.0)[:, None], axis=0)
+    white = Material(name="w", colour=(1, 1, 1))
+    image = picture(SKY, wall(quad, material=white, normals=np.tile(normal, (4, 1))), sky_rays=1, samples=1)
+    np.testing.assert_allclose(image, np.broadcast_to(expected, image.shape), rtol=2e-3)
+
+
+def test_a_wall_hides_its_part_of_the_sky(quad: Any) -> None:
+    """Of a white sky, level ground at x from a wall of height h and no end has (1 + cos(atan(h / x))) / 2."""
+    white = Material(name="w", colour=(1, 1, 1))
+    ground = quad([[-1e3, 1, 1e3], [1e3, 1, 1e3], [1e3, 1, -1e3], [-1e3, 1, -1e3]], white)
+    dark = Material(name="b", colour=BLACK)
+    edge = quad([[1.5, -1, 1e3], [1.5, -1, -1e3], [1.5, 1, -1e3], [1.5, 1, 1e3]], dark)
+    image = picture(WHITE_SKY, ground, edge, sky_rays=32)[20, 2:20:3, 0]
+    at = (np.arange(2, 20, 3) - CAMERA.cx) / (20 - CAMERA.cy)
+    # 512 directions; a row of a lattice more or less on each side of the edge: 2 / sqrt(512) at most.
+    expected = 0.5 * (1 + np.cos(np.arctan(2.0 / (1.5 - at))))
+    np.testing.assert_allclose(image, expected, atol=0.03)
+
+
+def test_a_hidden_sky_is_that_of_the_path_tracer(town: Scene) -> None:
+    """With direct light only; 4 % is the deviation of a pixel of 64 samples, of which there are hundreds."""
+    scene, camera = MitsubaScene(town), PinholeCamera.centred(40, 30, 30.0)
+    options = RendererOptions(sky_rays=4)
+    seen = render_global(scene, camera, np.eye(3), np.zeros(3), options)
+    traced = render_global(
+        scene, camera, np.eye(3), np.zeros(3), replace(options, integrator="path", samples=64, max_depth=2)
+    )
+    on = seen.depth > 0
+    assert np.mean(seen.image[on]) == pytest.approx(np.mean(traced.image[on]), rel=0.01)
+    rough = np.median(np.abs(seen.image[on] / traced.image[on] - 1))
+    assert rough < 0.08
+    poses = np.broadcast_to(np.eye(3), (30, 3, 3)), np.zeros((30, 3))
+    rows = render(scene, camera, *poses, options, rows=[3, 17]).image
+    np.testing.assert_array_equal(rows, seen.image[[3, 17]])

@@ -36,6 +36,7 @@ def test_every_card_that_comes_along_is_valid() -> None:
         ("max_depth", 0, "allowed are 1 to"),
         ("exposure", -1.0, "positive"),
         ("seed", -1, "4294967295"),
+        ("sky_rays", 65, "0 to 64"),
         ("sample", 4, "samples"),
     ],
 )
