@@ -42,6 +42,9 @@ _Data = Annotated[
 _Secret = Annotated[
     Path | None, typer.Option("--seed-file", metavar="FILE", help="Text from which a secret test split is drawn.")
 ]
+_Hidden = Annotated[
+    bool, typer.Option("--secret", help="The dataset's truth is not to be told: not exported, not used by check.")
+]
 _Board = Annotated[Path, typer.Option(help="Folder of the board.")]
 _File = Annotated[Path, typer.Argument(metavar="FILE", help="Predictions: JSON lines.")]
 
@@ -52,13 +55,14 @@ def export(
     out: Annotated[Path, typer.Option(help="Folder for the inputs.")],
     data: _Data = None,
     seed_file: _Secret = None,
+    secret: _Hidden = False,
 ) -> None:
     """Write the inputs of a track for any language; of a public split the truth too."""
     from rsbench.benchmark.leaderboard.exporting import write_inputs
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.workplace import workplace
 
-    split = _split(track, data, seed_file)
+    split = _split(track, data, seed_file, secret)
     with workplace(out), progress_bar(f"exporting {split.name}", len(split.truths)) as advance:
         if data is not None and "images" in split.protocol.allowed:
             from rsbench.benchmark.leaderboard.frames import write_frames
@@ -78,11 +82,11 @@ def template(track: _Track, data: _Data = None, seed_file: _Secret = None) -> No
 
 
 @board_app.command()
-def check(file: _File, data: _Data = None, seed_file: _Secret = None) -> None:
+def check(file: _File, data: _Data = None, seed_file: _Secret = None, secret: _Hidden = False) -> None:
     """Say all that is wrong with a file of predictions. Exit code 2: it cannot be scored; 1: it can, but look."""
     from rsbench.benchmark.leaderboard.submissions import check_submission
 
-    found = check_submission(file, _split(_track_of(file), data, seed_file))
+    found = check_submission(file, _split(_track_of(file), data, seed_file, secret))
     for fault in found.faults:
         typer.echo(f"fault: {' '.join(fault.split())}", err=True)
     for note in found.notes:
@@ -98,6 +102,7 @@ def submit(
     board: _Board,
     data: _Data = None,
     seed_file: _Secret = None,
+    secret: _Hidden = False,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
 ) -> None:
     """Score a file of predictions and add it to a board."""
@@ -105,7 +110,7 @@ def submit(
     from rsbench.benchmark.leaderboard.submissions import check_submission
     from rsbench.benchmark.provenance import provenance
 
-    split = _split(_track_of(file), data, seed_file)
+    split = _split(_track_of(file), data, seed_file, secret)
     for note in check_submission(file, split).notes:
         typer.echo(f"note: {note}", err=True)
     scored = add(board, file, split, provenance("rsbench leaderboard submit"), replace=replace)
@@ -122,19 +127,20 @@ def run(
     board: _Board,
     data: _Data = None,
     seed_file: _Secret = None,
+    secret: _Hidden = False,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     time_limit: Annotated[
         float | None, typer.Option(min=0.001, help="Seconds per problem for solvers of other packages.")
     ] = None,
 ) -> None:
     """Run solvers of cards on a track, keep what they predict, and score it. An interrupted run goes on there."""
-    from rsbench.benchmark.leaderboard.board import add
+    from rsbench.benchmark.leaderboard.board import RUN, add, made_by
     from rsbench.benchmark.leaderboard.running import prepare_inputs, run_cards, steps_of
     from rsbench.benchmark.provenance import provenance
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.workplace import workplace
 
-    split = _split(track, data, seed_file)
+    split = _split(track, data, seed_file, secret)
     if "images" in split.protocol.allowed:
         raise RsbenchError(f"track {track!r}: solvers of cards take given matches; run them on the track 'pose'")
     with workplace(board) as hidden, progress_bar(f"running {split.name}", steps_of(entry, split)) as advance:
@@ -145,7 +151,7 @@ def run(
             entry, split, place / "inputs", place, workers=workers, time_limit_s=time_limit, step=advance
         )
     for file in files:
-        add(board, file, split, provenance("rsbench leaderboard run"), replace=True)
+        add(board, file, split, provenance(RUN), replace=made_by(board, split, file.parent.name) == RUN)
     _show(board, split.protocol.id, split.name, None)
 
 
@@ -166,6 +172,23 @@ def show(
     for protocol, split in splits_of(board):
         if wanted in (None, protocol):
             _show(board, protocol, split, at_most, csv=csv)
+
+
+@board_app.command()
+def oracles(track: _Track, board: _Board, data: _Data = None, seed_file: _Secret = None) -> None:
+    """Add the truth and, on the track points, what the Cramer-Rao bound allows, as rows without a rank."""
+    from rsbench.benchmark.leaderboard.board import add_texts
+    from rsbench.benchmark.leaderboard.oracles import bound_text
+    from rsbench.benchmark.leaderboard.splits import seed_of
+    from rsbench.benchmark.leaderboard.submissions import truth_text
+    from rsbench.benchmark.provenance import provenance
+
+    split = _split(track, data, seed_file)
+    if not split.public:
+        raise RsbenchError(f"split {split.name}: its truth is secret, and would be told as an entry of the board")
+    texts = [truth_text(split), *([bound_text(split, seed_of(None))] if data is None else [])]
+    add_texts(board, texts, split, provenance("rsbench leaderboard oracles"))
+    _show(board, split.protocol.id, split.name, "truth")
 
 
 @board_app.command()
@@ -199,7 +222,7 @@ def rescore(track: _Track, board: _Board, data: _Data = None, seed_file: _Secret
         raise typer.Exit(1)
 
 
-def _split(track: str, data: Path | None, secret: Path | None) -> Split:
+def _split(track: str, data: Path | None, seed_file: Path | None, secret: bool = False) -> Split:
     from rsbench.benchmark.leaderboard.protocols import protocol_of_track
     from rsbench.benchmark.leaderboard.splits import dataset_split, points_split
 
@@ -207,21 +230,23 @@ def _split(track: str, data: Path | None, secret: Path | None) -> Split:
     if track == "points":
         if data is not None:
             raise RsbenchError(f"--data {data}: the problems of points are simulated; leave it out")
-        return points_split(protocol, secret)
+        if secret and seed_file is None:
+            raise RsbenchError("--secret: of the track 'points' a --seed-file makes a secret split; leave it out")
+        return points_split(protocol, seed_file)
     if data is None:
         raise RsbenchError(
             f"--data: the track {track!r} needs the folder of a dataset; make one with rsbench generate"
         )
-    if secret is not None:
-        raise RsbenchError(f"--seed-file {secret}: a dataset has its own seed; leave it out")
-    return dataset_split(protocol, data)
+    if seed_file is not None:
+        raise RsbenchError(f"--seed-file {seed_file}: a dataset has its own seed; leave it out, and say --secret")
+    return dataset_split(protocol, data, public=not secret)
 
 
 def _problems(split: Split, data: Path | None, secret: Path | None) -> Iterator[Problem]:
-    from rsbench.benchmark.leaderboard.splits import PUBLIC_SEED, secret_seed, simulated_problem
+    from rsbench.benchmark.leaderboard.splits import seed_of, simulated_problem
 
     if data is None:
-        seed = PUBLIC_SEED if secret is None else secret_seed(secret)
+        seed = seed_of(secret)
         return (simulated_problem(seed, number) for number in range(len(split.truths)))
     from rsbench.benchmark.leaderboard.frames import bare_problems, matched_problems
 

@@ -12,7 +12,8 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,8 @@ from rsbench.errors import RsbenchError
 from rsbench.reading import NAME, read_bytes, read_json
 
 FORMAT = 1
+RUN = "rsbench leaderboard run"
+"""Entries that were made by it may be made again; what people handed in is not replaced in silence."""
 FILES = ("predictions.jsonl", "scores.csv", "entry.json")
 """Of an entry; the last one says of the others what they are."""
 NUMBERS = (
@@ -103,6 +106,24 @@ def add(board: Path, predictions: Path, split: Split, made: dict[str, Any], *, r
         _write_split(board, split)
         _put(hidden / WORK / "entry", folder, _contents(submission, data, split, made))
     return _read_entry(folder)
+
+
+def add_texts(board: Path, texts: Sequence[str], split: Split, made: dict[str, Any]) -> None:
+    """``add`` for predictions that are no files yet; entries of their names are replaced."""
+    with tempfile.TemporaryDirectory() as folder:
+        for text in texts:
+            path = Path(folder) / "predictions.jsonl"
+            write_bytes(path, text.encode())
+            add(board, path, split, made, replace=True)
+
+
+def made_by(board: Path, split: Split, method: str) -> str:
+    """The command that made an entry; ``RUN`` where there is none."""
+    path = place(board, split.protocol.id, split.name) / "entries" / method / FILES[2]
+    if not path.is_file():
+        return RUN
+    made = read_json(path).get("made")
+    return str(made.get("command", "")) if isinstance(made, dict) else ""
 
 
 def _contents(

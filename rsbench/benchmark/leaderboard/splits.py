@@ -91,18 +91,20 @@ def points_split(protocol: Protocol, secret: Path | None = None) -> Split:
     Raises:
         RsbenchError: the file cannot be read, or its text could be guessed.
     """
-    seed = PUBLIC_SEED if secret is None else secret_seed(secret)
+    seed = seed_of(secret)
     truths = tuple(_drawn(seed, number) for number in range(POINTS_PROBLEMS))
     label = "dev" if secret is None else "test"
     return Split(protocol=protocol, label=label, public=secret is None, truths=truths)
 
 
-def secret_seed(path: Path) -> int:
-    """The seed that a text stands for.
+def seed_of(path: Path | None) -> int:
+    """The seed that the text of a file stands for; without one, that of the public split.
 
     Raises:
         RsbenchError: the file cannot be read, or its text is too short to be a secret.
     """
+    if path is None:
+        return PUBLIC_SEED
     text = read_text(path, 4096).strip()
     if len(text) < _SHORTEST_SECRET:
         raise RsbenchError(
@@ -123,6 +125,28 @@ def simulated_problem(seed: int, number: int) -> Problem:
     except ValueError as error:
         raise RsbenchError(f"problem {_name(number)}: {error}; choose another seed") from error
     return Problem(name=_name(number), correspondences=found.correspondences, rig=found.rig, shutter=found.shutter)
+
+
+def exact_problem(seed: int, number: int) -> tuple[Problem, float]:
+    """The matches of a problem without noise and without the outliers, and the noise that they get, px.
+
+    Raises:
+        RsbenchError: as ``simulated_problem``.
+    """
+    setting = _setting(seed, number)
+    try:
+        found = _simulated(setting.exact(), seed, number)
+    except ValueError as error:
+        raise RsbenchError(f"problem {_name(number)}: {error}; choose another seed") from error
+    # Outliers are displaced after the noise, and the draws are common: without noise the same are.
+    right = found.correspondences.tracks[~found.outliers["tracks"]]
+    problem = Problem(
+        name=_name(number),
+        correspondences=Correspondences(tracks=right),
+        rig=found.rig,
+        shutter=found.shutter,
+    )
+    return problem, setting.noise_px
 
 
 def _simulated(setting: Setting, seed: int, number: int) -> Simulation:

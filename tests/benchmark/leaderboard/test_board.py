@@ -13,16 +13,23 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from commands import run_here
+from commands import assert_refused, run_here
 from leaderboards import Line, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.board import add, entries_of, merge, rescore, splits_of
 from rsbench.benchmark.leaderboard.exporting import write_inputs
 from rsbench.benchmark.leaderboard.marking import mark
+from rsbench.benchmark.leaderboard.oracles import bound_text
 from rsbench.benchmark.leaderboard.protocols import AUC_DEG, KNOWLEDGE, PROTOCOLS
 from rsbench.benchmark.leaderboard.running import run_cards, uses_of
-from rsbench.benchmark.leaderboard.splits import Split, dataset_split, points_split, simulated_problem
+from rsbench.benchmark.leaderboard.splits import (
+    Split,
+    dataset_split,
+    exact_problem,
+    points_split,
+    simulated_problem,
+)
 from rsbench.benchmark.leaderboard.standings import standings, table
 from rsbench.benchmark.leaderboard.submissions import read_submission
 from rsbench.core.projection import rs_project
@@ -253,6 +260,35 @@ def test_a_secret_split_is_exported_without_its_truth(tmp_path: Path) -> None:
         assert all(repr(float(x)).encode() not in told for x in (*truth.motion.w, *truth.motion.d))
 
 
+def test_motions_at_the_bound_err_as_it_says(tmp_path: Path) -> None:
+    """Their squared errors over the bound's covariance are chi-squared with six degrees of freedom: mean 6."""
+    split = small_split(40)
+    path = tmp_path / "x.jsonl"
+    path.write_text(bound_text(split, 1), "utf-8")
+    scores = mark(read_submission(path, split), split)
+    assert scores["success"].all()
+    assert abs(scores["nees"].mean() - 6.0) < 3.0 * np.sqrt(12.0 / 40)  # its variance is 12
+    # The bound of tracks without the outliers: no noisy pixel is among the exact ones, and no outlier.
+    exact, noise = exact_problem(1, 0)
+    given = simulated_problem(1, 0).correspondences.tracks
+    near = np.min(np.max(np.abs(exact.correspondences.tracks[:, None] - given[None]), axis=2), axis=1)
+    assert len(exact.correspondences.tracks) == round(
+        (1.0 - float(split.truths[0].facts["outliers"])) * len(given)
+    )
+    assert np.all(near < 6.0 * noise) and np.all(near > 0.0)
+
+
+def test_a_secret_dataset_is_exported_without_its_truth(smoke_dataset: Path, tmp_path: Path) -> None:
+    where = ("--data", smoke_dataset, "--out", tmp_path / "out", "--secret")
+    assert run_here("leaderboard", "export", "pose-own", *where).returncode == 0
+    split = dataset_split(PROTOCOLS["pose-own"], smoke_dataset)
+    files = [path for path in (tmp_path / "out").rglob("*") if path.suffix in (".csv", ".json", ".jsonl")]
+    told = b"".join(path.read_bytes() for path in files)
+    assert len(files) == 3 and split.fingerprint.encode() in told
+    for truth in split.truths:
+        assert all(repr(float(x)).encode() not in told for x in (*truth.motion.w, *truth.motion.d))
+
+
 # Running
 
 
@@ -312,6 +348,13 @@ def test_frames_with_given_matches(smoke_dataset: Path, tmp_path: Path, monkeypa
     assert np.all(found["rs-stereo-refined"]["e_R_deg"] < 0.2 * still)
     shown = run_here("leaderboard", "show", "--board", tmp_path / "board", "--csv").stdout
     assert [line.partition(",")[0] for line in shown.splitlines()[1:]] == ["gs-8pt", "rs-stereo-refined", "truth"]
+    # What people handed in is not replaced by a run; what a run made is.
+    (tmp_path / "truth.jsonl").write_text(json.dumps({**truth_lines(split)[0], "method": "gs-8pt"}), "utf-8")
+    assert run_here("leaderboard", "submit", tmp_path / "truth.jsonl", *where).returncode == 2
+    assert run_here("leaderboard", "submit", tmp_path / "truth.jsonl", *where, "--replace").returncode == 0
+    assert run_here("leaderboard", "run", "pose", *where, "--entry", "rs-stereo-refined").returncode == 0
+    refused = run_here("leaderboard", "run", "pose", *where, "--entry", "gs-8pt")
+    assert_refused(refused, "gs-8pt", "with other predictions")
 
 
 # Documents
