@@ -44,7 +44,7 @@ def make_up(card: Path, out: Path) -> None:
     """A dataset whose images, depths and poses are a few bytes each."""
     from rsbench.dataset import generation
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.sequence import RELATIVE_FILES
+    from rsbench.dataset.layout import RELATIVE_FILES
     from rsbench.dataset.stage import Built
     from rsbench.renderers import passage, scene
 

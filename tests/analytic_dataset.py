@@ -14,12 +14,13 @@ from rsbench.cards import load_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses
-from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.rig import FRAMES, SIDES, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.files import sha256, write_depth, write_json, write_png, write_poses
-from rsbench.dataset.sequence import FRAMES, RELATIVE_FILES, UNITS, sequence_manifest
+from rsbench.dataset.layout import RELATIVE_FILES
+from rsbench.dataset.sequence import UNITS, sequence_manifest
 from rsbench.renderers.options import RendererOptions
 
 PLANES = ((np.array([0.05, 1.0, -0.15]), 1.2), (np.array([0.1, 0.05, 1.0]), 9.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +26,8 @@ EPILOG = """[bold]Examples[/bold]
   rsbench correct --left left.mp4 --right right.mp4 --rig rig.toml --out corrected --target middle
 
   rsbench correct l0.png r0.png l1.png r1.png --rig rig.toml --out corrected --motion-model auto
+
+  rsbench correct data/footage/castle --out corrected     [dim](a sequence of a dataset, which knows its rig)[/dim]
 
 RIG.toml, for images of cameras side by side (pixels, metres; without readout_ratio it is estimated):
 
@@ -51,7 +54,10 @@ _MODEL = "Motion model: auto, which the matches prefer, or a name. Default: the 
 
 def correct(
     frames: Annotated[
-        list[Path] | None, typer.Argument(metavar="LEFT_0 RIGHT_0 LEFT_1 RIGHT_1", help="Four images.")
+        list[Path] | None,
+        typer.Argument(
+            metavar="LEFT_0 RIGHT_0 LEFT_1 RIGHT_1", help="Four images; or the folder of a rendered sequence."
+        ),
     ] = None,
     rig: Annotated[Path | None, typer.Option(metavar="RIG.toml", help="Camera, baseline, readout ratio.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the results.")] = None,
@@ -71,30 +77,92 @@ def correct(
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
 ) -> None:
     """Correct your own rolling-shutter stereo frames: two times of a rig, or a whole sequence."""
-    from rsbench.errors import RsbenchError
-    from rsbench.pipeline.footage import read_rig_card
     from rsbench.pipeline.frame_motion import NoMotionError
     from rsbench.pipeline.isolated_parts import Isolation
 
-    if rig is None or out is None:
-        raise RsbenchError(f"--{'rig' if rig is None else 'out'}: is required")
-    card = read_rig_card(rig)
+    given = _given(frames, rig, out, left, right)
     others = {"find_sky": sky, "inpaint": inpaint, "seed": seed, "motion_model": motion_model}
     options = _options(features, solver, matcher, corrector, fill, **others)
-    four = frames is not None and len(frames) == 4 and not (left or right)
-    if not four and (frames or not (left and right)):
-        count = f"{len(frames)} images; " if frames else ""
-        raise RsbenchError(f"frames: {count}give LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right")
     try:
         with Isolation() as isolation:
             options = isolation.chain(options)
-            if frames:
-                _correct_four(frames, card, out, target, options)
-            elif left and right:
-                _correct_sequence(left, right, card, out, target, options)
+            if given.four:
+                _correct_four(given.four, given.card, given.out, target, options)
+            else:
+                _correct_sequence(*given.footage(), given.card, given.out, target, options)
     except NoMotionError as error:
         typer.echo(f"rsbench: not corrected: {error}", err=True)
         raise typer.Exit(1) from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Given:
+    """What is to be corrected, and where to."""
+
+    card: RigCard
+    out: Path
+    four: list[Path]
+    """Left 0, right 0, left 1, right 1; or, of footage, nothing."""
+    left: list[Path] | Path
+    """Its images, or a folder or video."""
+    right: list[Path] | Path
+
+    def footage(self) -> tuple[FrameSource, FrameSource]:
+        """Of the left and the right camera."""
+        from rsbench.pipeline.footage import FrameSource
+
+        left, right = (
+            FrameSource.of_files(each) if isinstance(each, list) else FrameSource(each)
+            for each in (self.left, self.right)
+        )
+        return left, right
+
+
+def _given(
+    frames: list[Path] | None, rig: Path | None, out: Path | None, left: Path | None, right: Path | None
+) -> _Given:
+    """Raises RsbenchError for another combination of arguments."""
+    from rsbench.errors import RsbenchError
+    from rsbench.pipeline.footage import read_rig_card
+
+    rendered = frames is not None and len(frames) == 1 and frames[0].is_dir()
+    if out is None or (rig is None and not rendered):
+        raise RsbenchError(f"--{'out' if rig is not None or rendered else 'rig'}: is required")
+    if frames and rendered:
+        if rig or left or right:
+            raise RsbenchError(f"{frames[0]}: is a sequence, which knows its frames and rig; leave the others out")
+        return _of_sequence(frames[0], out)
+    assert rig is not None
+    card = read_rig_card(rig)
+    if frames is not None and len(frames) == 4 and not (left or right):
+        return _Given(card=card, out=out, four=frames, left=[], right=[])
+    if frames or not (left and right):
+        count = f"{len(frames)} images; " if frames else ""
+        raise RsbenchError(
+            f"frames: {count}give LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right, or a sequence's folder"
+        )
+    return _Given(card=card, out=out, four=[], left=left, right=right)
+
+
+def _of_sequence(folder: Path, out: Path) -> _Given:
+    """The rolling-shutter frames of a sequence of a dataset."""
+    from rsbench.core.rig import SIDES
+    from rsbench.dataset.layout import picture_file
+    from rsbench.dataset.sequence import read_dataset_manifest, read_sequence
+    from rsbench.errors import RsbenchError
+    from rsbench.pipeline.footage import rig_card_of
+
+    if not (folder / "sequence.json").is_file():
+        names = read_dataset_manifest(folder).sequences
+        if len(names) > 1:
+            raise RsbenchError(f"{folder}: is a dataset; give one of its sequences: {', '.join(names)}")
+        folder = folder / names[0]
+    sequence = read_sequence(folder)
+    left, right = (
+        [folder / picture_file("rs", side, frame) for frame in range(sequence.frames)] for side in SIDES
+    )
+    card = rig_card_of(sequence.rig, sequence.shutter)
+    return _Given(card=card, out=out, four=[], left=left, right=right)
 
 
 def _options(
@@ -252,17 +320,15 @@ def _say(
 
 
 def _correct_sequence(
-    left_path: Path, right_path: Path, card: RigCard, out: Path, target: str, options: CorrectionOptions
+    left: FrameSource, right: FrameSource, card: RigCard, out: Path, target: str, options: CorrectionOptions
 ) -> None:
     from dataclasses import replace
 
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.corrected_frames import fresh_folder, rig_record, write_record
     from rsbench.pipeline.chain import check_cameras
-    from rsbench.pipeline.footage import FrameSource
     from rsbench.pipeline.sliding import correct_sequence, estimate_sequence_readout
 
-    left, right = FrameSource(left_path), FrameSource(right_path)
     rig = _sized(card, next(iter(left)))
     options = replace(options, target_row=_target_row(target, rig.camera.height))
     ratio, offset, readout = card.readout_ratio, card.disparity_offset, None

@@ -93,7 +93,7 @@ def generate(
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.channels import named_channels
     from rsbench.dataset.files import check_out
-    from rsbench.dataset.generation import STEPS, generate_dataset
+    from rsbench.dataset.generation import generate_dataset, steps_of
     from rsbench.renderers.backend import start_backend
 
     dataset = load_dataset_card(card, trajectory, tuple(seed or ()))
@@ -111,7 +111,7 @@ def generate(
     if estimate:
         typer.echo(_estimated(dataset, full_frames))
         return
-    steps = STEPS * len(dataset.sequence)
+    steps = steps_of(dataset) * len(dataset.sequence)
     with progress_bar(f"rendering {dataset.name}", steps) as advance:
         rendered = generate_dataset(
             dataset, out, workers=workers, full_frames=full_frames, rehash=rehash, progress=advance

@@ -132,7 +132,7 @@ def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.files import write_json, write_table
-    from rsbench.dataset.generation import STEPS, generate_dataset
+    from rsbench.dataset.generation import generate_dataset, steps_of
     from rsbench.errors import RsbenchError
     from rsbench.renderers.backend import start_backend
     from rsbench.report.real_page import write_real_page
@@ -146,7 +146,7 @@ def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
     start_backend()
     places = {camera: data / each.name for camera, each in cards.items()}
     for camera, each in cards.items():
-        with progress_bar(f"rendering {each.name}", STEPS * len(each.sequence)) as advance:
+        with progress_bar(f"rendering {each.name}", steps_of(each) * len(each.sequence)) as advance:
             generate_dataset(each, places[camera], progress=advance)
     with progress_bar("solving and correcting", len(cards) * len(card.sequence)) as advance:
         motions, views = (

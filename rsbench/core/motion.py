@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rsbench.core import so3
-from rsbench.core.se3 import Pose
+from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 
 _STEP = 1e-3
@@ -84,6 +84,20 @@ class Motion(ABC):
         """What |w'| and |t'| do not exceed at times from ``first`` to ``last``; None when that is not known."""
         return None
 
+    def from_time(self, start: float) -> Motion:
+        """The same way, seen from the body at time ``start``, which is time 0 of the new one."""
+        return self if start == 0.0 else LaterMotion.of(self, start)
+
+    @property
+    def lasts(self) -> float:
+        """Until when the model says how the rig moves, frame periods; it then goes on at the speed that it has."""
+        return float("inf")
+
+    @classmethod
+    def lasting(cls, parameters: Mapping[str, Any], periods: float) -> dict[str, Any]:
+        """The parameters, with those left out that decide how long it ``lasts`` such that it is so long."""
+        return dict(parameters)
+
     @classmethod
     def endpoint(cls, parameters: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
         """``(w, d)`` where the parameters alone fix them; None where they are free, as in most models.
@@ -146,6 +160,9 @@ class TwistMotion(Motion):
         w, speed = self.velocity(tau)
         return np.zeros(speed.shape), np.cross(w, speed)
 
+    def from_time(self, start: float) -> Motion:
+        return self  # a screw looks the same from everywhere on it
+
     def fastest(self, first: float, last: float) -> tuple[float, float] | None:
         return float(np.linalg.norm(self.w)), float(np.linalg.norm(self.v))
 
@@ -198,3 +215,52 @@ class AcceleratedMotion(Motion):
     def fastest(self, first: float, last: float) -> tuple[float, float] | None:
         speed = float(np.max(np.abs(self.speed([first, last]))))
         return speed * float(np.linalg.norm(self.w)), speed * float(np.linalg.norm(self.d))
+
+
+@final
+@dataclass(frozen=True, eq=False, init=False)
+class LaterMotion(Motion):
+    """Another motion from a later time on: what it is for a pair of frames in the middle of a sequence."""
+
+    name: ClassVar[str] = "later"
+    motion: Motion
+    start: float
+    """Time of ``motion`` that is time 0 here, frame periods."""
+
+    def __init__(self, w: ArrayLike, d: ArrayLike, motion: Motion, start: float) -> None:
+        super().__init__(w, d)
+        object.__setattr__(self, "motion", motion)
+        object.__setattr__(self, "start", start)
+
+    @classmethod
+    def of(cls, motion: Motion, start: float) -> LaterMotion:
+        """With the w and d of the period that begins at ``start``."""
+        first, last = (motion.body_from_world(start + period) for period in (0.0, 1.0))
+        R, t = compose(last, inverse(first))
+        return cls(so3.log(R), t, motion, start)
+
+    @cached_property
+    def _world(self) -> Pose:
+        return inverse(self.motion.body_from_world(self.start))
+
+    def body_from_world(self, tau: ArrayLike) -> Pose:
+        return compose(self.motion.body_from_world(np.asarray(tau) + self.start), self._world)
+
+    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        w, speed = self.motion.velocity(np.asarray(tau) + self.start)
+        return w, speed + np.cross(w, self._beside(tau))
+
+    def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        later = np.asarray(tau) + self.start
+        (w, _), (turn, change) = self.motion.velocity(later), self.motion.accelerations(later)
+        beside = self._beside(tau)
+        return turn, change + np.cross(turn, beside) + np.cross(w, np.cross(w, beside))
+
+    def _beside(self, tau: ArrayLike) -> FloatArray:
+        """(..., 3) what the new world's origin adds to the body's translation; it turns with the body."""
+        R, _ = self.motion.body_from_world(np.asarray(tau) + self.start)
+        return R @ self._world.t
+
+    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
+        found = self.motion.fastest(first + self.start, last + self.start)
+        return None if found is None else (found[0], found[1] + found[0] * float(np.linalg.norm(self._world.t)))

@@ -18,9 +18,17 @@ from rsbench.core.so3 import FloatArray
 Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 View = tuple[Side, int]
-"""Side and frame, 0 or 1."""
+"""Side and frame, from 0."""
 FRAMES = (0, 1)
-VIEWS: tuple[View, ...] = tuple(product(SIDES, FRAMES))
+"""Of a pair, of which all estimates are."""
+
+
+def views_of(frames: int) -> tuple[View, ...]:
+    """Both cameras at so many times, the left one first."""
+    return tuple(product(SIDES, range(frames)))
+
+
+VIEWS = views_of(len(FRAMES))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,11 +29,12 @@ from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 
 LAST = 2.0
-"""Rows of frame 1 are read until then, at the latest."""
+"""Rows of frame 1 are read until then, at the latest: how long a shake is that does not say."""
 _TOLERANCE = 1e-12
 _SAME = 1e-9
 """Largest difference of w and d that are still those of given poses."""
 _MAX_ITERATIONS = 100
+_LONGEST = 1e4
 
 
 class Shake(NamedTuple):
@@ -82,10 +83,12 @@ class SplineMotion(Motion):
         interval: float | None = None,
         shake: ArrayLike | None = None,
         poses: ArrayLike | None = None,
+        periods: float | None = None,
     ) -> None:
         """From ``preset`` ("handheld") and ``seed`` (0), or ``interval`` and one of ``shake`` and ``poses``.
 
         Args:
+            periods: until when a preset's shake lasts, frame periods; a longer one begins as a shorter one does.
             poses: (n, 6) rotation vectors (radians) and translations (metres) of the body's control poses;
                 w and d must be their ``endpoint``.
 
@@ -97,6 +100,7 @@ class SplineMotion(Motion):
         if float(np.linalg.norm(self.w)) >= np.pi:
             raise ValueError(f"w of a spline must be below a half turn, got {self.w.tolist()}")
         given = {"preset": preset, "seed": seed, "interval": interval, "shake": shake, "poses": poses}
+        given["periods"] = periods
         parameters = {key: value for key, value in given.items() if value is not None}
         fixed = self.endpoint(parameters)
         if fixed is not None and np.max(np.abs(np.concatenate(fixed) - [*self.w, *self.d])) > _SAME:
@@ -131,6 +135,15 @@ class SplineMotion(Motion):
 
     def fastest(self, first: float, last: float) -> tuple[float, float] | None:
         return self._spline.fastest(first, last)
+
+    @property
+    def lasts(self) -> float:
+        return self.interval * (len(self.shake) - 3)
+
+    @classmethod
+    def lasting(cls, parameters: Mapping[str, Any], periods: float) -> dict[str, Any]:
+        drawn = not any(key in parameters for key in ("shake", "poses", "periods"))
+        return {**parameters, "periods": periods} if drawn else dict(parameters)
 
     @classmethod
     def endpoint(cls, parameters: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
@@ -206,11 +219,14 @@ def _shake(parameters: Mapping[str, Any]) -> tuple[float, FloatArray]:
         raise ValueError(f"seed = {seed!r}: must be a whole number, not negative")
     if "interval" in parameters:
         raise ValueError("interval goes with shake or poses; a preset has its own")
+    periods = parameters.get("periods", LAST)
+    if isinstance(periods, bool) or not isinstance(periods, int | float) or not LAST <= periods <= _LONGEST:
+        raise ValueError(f"periods = {periods!r}: must be a number from {LAST:g} to {_LONGEST:g}")
     interval, rotation_deg, translation = PRESETS[preset]
     digest = hashlib.sha256(f"{preset}/{seed}".encode()).digest()
     rng = np.random.default_rng(int.from_bytes(digest[:16], "little"))
     sigma = np.concatenate([np.deg2rad(rotation_deg), translation])
-    return interval, sigma * rng.standard_normal((least_poses(interval), 6))
+    return interval, sigma * rng.standard_normal((least_poses(interval, periods), 6))
 
 
 def _given_spline(parameters: Mapping[str, Any]) -> _Spline:
@@ -254,9 +270,9 @@ def _cumulative(u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return (5 + u * (3 + u * (u - 3))) / 6, (1 + u * (3 + u * (3 - 2 * u))) / 6, u**3 / 6
 
 
-def least_poses(interval: float) -> int:
-    """Control poses that reach time 2."""
-    return int(np.ceil(LAST / interval - 1e-9)) + 3
+def least_poses(interval: float, periods: float = LAST) -> int:
+    """Control poses that reach a time."""
+    return int(np.ceil(periods / interval - 1e-9)) + 3
 
 
 def _twists(value: ArrayLike, interval: float, name: str) -> FloatArray:

@@ -80,6 +80,10 @@ class TrajectoryMotion(Motion):
         return -turn_change, np.cross(turn, v) - v_change - np.cross(turn_change, t) - np.cross(turn, t_rate)
 
     @property
+    def lasts(self) -> float:
+        return float(self.poses[-1, 0])
+
+    @property
     def parameters(self) -> dict[str, Any]:
         return {"poses": self.poses.tolist()}
 

@@ -23,7 +23,7 @@ from rsbench.core.rig import View
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.files import save_arrays
-from rsbench.dataset.tracks import TRACK_VIEWS, Tracks
+from rsbench.dataset.tracks import Tracks, track_views
 from rsbench.errors import RsbenchError
 from rsbench.reading import load_arrays
 
@@ -69,7 +69,7 @@ class AffineFrames:
 def make_affine(geometry: Geometry, tracks: Tracks, rays: Meets) -> AffineFrames:
     """The affine frames of tracks, on the surfaces that rays through their pixels meet."""
     normals = np.zeros_like(tracks.points)
-    for k, (side, _) in enumerate(TRACK_VIEWS):
+    for k, (side, _) in enumerate(track_views(geometry.frames)):
         own = tracks.sources == k
         if np.any(own):
             eyes = inverse(geometry.rig.cam_from_world(geometry.motion, tracks.tau[own, k], side)).t
@@ -80,7 +80,8 @@ def make_affine(geometry: Geometry, tracks: Tracks, rays: Meets) -> AffineFrames
 def jacobians_of(geometry: Geometry, tracks: Tracks, normals: FloatArray) -> FloatArray:
     """``AffineFrames.jacobians`` (n, v, 2, 2) of tracks on planes with these normals (n, 3)."""
     along = _plane_basis(normals)
-    moves = [_moves(geometry, view, tracks, k, along) for k, view in enumerate(TRACK_VIEWS)]
+    views = enumerate(track_views(geometry.frames))
+    moves = [_moves(geometry, view, tracks, k, along) for k, view in views]
     by_plane = np.stack(moves, axis=1)
     source = by_plane[np.arange(len(normals)), tracks.sources]
     jacobians = by_plane @ inverse_2x2(source)[:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import product
@@ -12,18 +13,19 @@ from rsbench.cards import card_path, parse_card, read_toml
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.lens import Lens
 from rsbench.core.motion import Motion
-from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.rig import FRAMES, SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.dataset.channels import Channel, check_channels
 from rsbench.dataset.imu import Imu
+from rsbench.dataset.layout import MOST_FRAMES, MOST_TWINS
 from rsbench.dataset.matches import Matching
 from rsbench.dataset.motion_card import MotionCard as MotionCard
-from rsbench.dataset.sequence import MOST_TWINS, sequence_manifest
-from rsbench.dataset.trajectory import TrajectoryCard, pairs_along
+from rsbench.dataset.sequence import sequence_manifest
+from rsbench.dataset.trajectory import TrajectoryCard, parts_along
 from rsbench.errors import RsbenchError
 from rsbench.imports import search
 from rsbench.reading import check_name, check_size
-from rsbench.renderers.electrons import Sensor
+from rsbench.renderers.electrons import Sensor, check_brightness
 from rsbench.scenes.model import Start
 from rsbench.shutters import with_shutter
 
@@ -99,6 +101,8 @@ class DatasetCard(Scanning):
     """Full distance between the cameras, metres."""
     readout_ratio: float
     frame_period_s: float = 0.1
+    frames: int = len(FRAMES)
+    """Of each camera."""
     motion: MotionCard | None = None
     """Required, unless each sequence has its own, from the grid too, or there is a trajectory."""
     trajectory: TrajectoryCard | None = None
@@ -124,6 +128,8 @@ class DatasetCard(Scanning):
 
     def __post_init__(self) -> None:
         check_size("camera", (self.camera.width, self.camera.height))
+        if not len(FRAMES) <= self.frames <= MOST_FRAMES:
+            raise ValueError(f"frames = {self.frames}: must lie in [{len(FRAMES)}, {MOST_FRAMES}]")
         for sequence in self.sequence:
             self.rig_of(sequence)
             self._check_times(sequence)
@@ -150,6 +156,8 @@ class DatasetCard(Scanning):
             raise ValueError(f"frame_period_s must be positive, got {period}")
         if sensor is not None and sensor.longest_s > period:
             raise ValueError(f"sensor exposure_s = {sensor.longest_s}: longer than frame_period_s = {period}")
+        if sensor is not None:
+            check_brightness(sensor, self.frames)
 
     def _check_motions(self) -> None:
         own = [sequence.name for sequence in self.sequence if sequence.motion is not None]
@@ -197,7 +205,15 @@ class DatasetCard(Scanning):
         card = sequence.motion or self.motion
         if card is None:
             raise ValueError(f"{sequence.name}: the trajectory was not followed yet; load_dataset_card does it")
-        return card
+        return card if self.frames == len(FRAMES) else card.lasting(math.ceil(self._span(sequence)[1]))
+
+    def _span(self, sequence: SequenceCard) -> tuple[float, float]:
+        """From when to when its rows are exposed, frame periods."""
+        period, sensor, shutter = self.period_of(sequence), self.sensor_of(sequence), self.shutter_for(sequence)
+        half = 0.0 if sensor is None else 0.5 * sensor.longest_s / period
+        late = shutter.right_delay
+        last = self.frames - 1 + shutter.readout_ratio
+        return min(0.0, late) - half, last + max(0.0, late) + half
 
     def seed_of(self, sequence: SequenceCard) -> int:
         return self.seed if sequence.seed is None else sequence.seed
@@ -210,6 +226,7 @@ class DatasetCard(Scanning):
             shutter=self.shutter_for(sequence),
             motion=self.motion_of(sequence),
             frame_period_s=self.period_of(sequence),
+            frames=self.frames,
         )
         own = self.sensor_of(sequence)
         sensor = {} if own is None else {"sensor": own.record}
@@ -263,7 +280,7 @@ class DatasetCard(Scanning):
         return replace(self, motion=None, trajectory=replace(own, file=str(file.absolute())), sequence=sequences)
 
     def expanded(self, folder: Path = Path()) -> DatasetCard:
-        """A card that says all that it will make: one sequence per seed and pair of frames, random axes drawn.
+        """A card that says all that it will make: one sequence per seed and part of a way, random axes drawn.
 
         Args:
             folder: of the card, where the file of a trajectory is looked for.
@@ -295,6 +312,11 @@ class DatasetCard(Scanning):
             return sequence
         motion = self._motion_card(sequence)
         drawn = motion.drawn(self.seed_of(sequence), name)
+        lasts, end = drawn.motion().lasts, self._span(sequence)[1]
+        if self.frames > len(FRAMES) and lasts < end:
+            raise ValueError(
+                f"{name}: motion {drawn.model!r} lasts {lasts:g} frame periods; {self.frames} frames need {end:g}"
+            )
         return sequence if drawn == motion else replace(sequence, motion=drawn)
 
     def _scaled(self, sequence: SequenceCard) -> SequenceCard:
@@ -307,11 +329,8 @@ class DatasetCard(Scanning):
         return replace(sequence, motion=motion, baseline=baseline, scale=1.0)
 
     def _followed(self, sequence: SequenceCard, card: TrajectoryCard, folder: Path) -> list[SequenceCard]:
-        """One sequence for each pair of frames on a trajectory."""
-        period, sensor, shutter = self.period_of(sequence), self.sensor_of(sequence), self.shutter_for(sequence)
-        half = 0.0 if sensor is None else 0.5 * sensor.longest_s / period
-        late = shutter.right_delay
-        span = min(0.0, late) - half, 1.0 + shutter.readout_ratio + max(0.0, late) + half
+        """One sequence for each so many frames on a trajectory."""
+        parts = parts_along(card, folder, self.period_of(sequence), self._span(sequence), self.frames)
         return [
             replace(
                 sequence,
@@ -319,7 +338,7 @@ class DatasetCard(Scanning):
                 motion=MotionCard(model="trajectory", parameters={"poses": pair.poses.tolist()}),
                 start=pair.start,
             )
-            for number, pair in enumerate(pairs_along(card, folder, period, span))
+            for number, pair in enumerate(parts)
         ]
 
 

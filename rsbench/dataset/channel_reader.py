@@ -19,16 +19,16 @@ from rsbench.dataset.channels import (
     NORMAL_COMPONENTS,
     RADIANCE_COMPONENTS,
     TRACKS,
+    Layer,
     PairChannel,
     PixelClass,
-    mask_file,
     matches_file,
     radiance_file,
     surface_file,
-    value_file,
 )
 from rsbench.dataset.files import read_exr, read_grey_png, read_json
 from rsbench.dataset.imu import IMU_MANIFEST, ImuSamples, read_imu
+from rsbench.dataset.layout import frames_of
 from rsbench.dataset.matches import LabelledMatches, read_matches
 from rsbench.dataset.timing import MANIFEST, read_timing_table, table_file
 from rsbench.dataset.tracks import Tracks, read_tracks
@@ -43,27 +43,37 @@ class ChannelReader:
     rig: StereoRig
     shutter: RollingShutter
     channels: tuple[str, ...]
+    frames: int
+    first: int
+    manifest: dict[str, Any]
 
-    def offsets(self, channel: PairChannel, side: Side, frame: int, row: int = 0) -> NDArray[np.float32]:
+    def offsets(
+        self, channel: PairChannel, side: Side, frame: int, row: int = 0, back: bool = False
+    ) -> NDArray[np.float32]:
         """(H, W, components) px of the pixels of a rolling-shutter frame: see ``channels.PairChannel``.
 
-        ``row``: of ``gs_flow``, that of the twin to which it leads: 0, or one of ``twins``.
+        ``row``: of ``gs_flow``, that of the twin to which it leads: 0, or one of ``twins``. ``back``: of ``flow``,
+        to the frame before, as from the last frame in any case.
 
         Raises:
             RsbenchError: the sequence does not have this channel, or the file cannot be read.
         """
         self._check_channel(channel)
-        path = inside(self.folder, value_file(channel, side, frame, row))
+        layer = self._layer(channel, frame, row, back)
+        path = inside(self.folder, layer.values(side, frame + self.first))
         return read_exr(path, COMPONENTS[channel], self._size)
 
-    def classes(self, channel: PairChannel, side: Side, frame: int, row: int = 0) -> NDArray[np.uint8]:
+    def classes(
+        self, channel: PairChannel, side: Side, frame: int, row: int = 0, back: bool = False
+    ) -> NDArray[np.uint8]:
         """(H, W) of ``channels.PixelClass``: what became of each pixel in the picture that the channel looks at.
 
         Raises:
             RsbenchError: as ``offsets``.
         """
         self._check_channel(channel)
-        path = inside(self.folder, mask_file(channel, side, frame, row))
+        layer = self._layer(channel, frame, row, back)
+        path = inside(self.folder, layer.mask(side, frame + self.first))
         classes = read_grey_png(path, self._size)
         if np.any(classes > max(PixelClass)):
             raise RsbenchError(f"{path}: holds {np.max(classes)}: the classes are 0 to {max(PixelClass)}")
@@ -75,13 +85,14 @@ class ChannelReader:
         RsbenchError as of ``offsets``.
         """
         self._check_channel("normals")
-        path = inside(self.folder, surface_file("normals", side, frame))
+        path = inside(self.folder, surface_file("normals", side, frame + self.first))
         return read_exr(path, NORMAL_COMPONENTS, self._size)
 
     def instances(self, side: Side, frame: int) -> NDArray[np.uint16]:
         """(H, W) numbers of the meshes that the pixels see; 0 = none. RsbenchError as of ``offsets``."""
         self._check_channel("instances")
-        return read_grey_png(inside(self.folder, surface_file("instances", side, frame)), self._size, 16)
+        path = inside(self.folder, surface_file("instances", side, frame + self.first))
+        return read_grey_png(path, self._size, 16)
 
     def instance_table(self) -> list[dict[str, str]]:
         """``name`` and ``material`` of instance 1, 2, ...; RsbenchError as of ``offsets``, or another content."""
@@ -115,16 +126,16 @@ class ChannelReader:
         Times the renderer's ``exposure``, 1 is white. Rounded to float16 on disk. RsbenchError as of ``offsets``.
         """
         self._check_channel("hdr")
-        path = inside(self.folder, radiance_file(side, frame))
+        path = inside(self.folder, radiance_file(side, frame + self.first))
         values = read_exr(path, RADIANCE_COMPONENTS, self._size, half=True)
         if not np.all(np.isfinite(values)) or np.any(values < 0):
             raise RsbenchError(f"{path}: radiance must be finite and not negative")
         return values
 
     def tracks(self) -> Tracks:
-        """Surface points and where the four frames see them; RsbenchError as of ``offsets``."""
+        """Surface points and where the frames see them; RsbenchError as of ``offsets``."""
         self._check_channel("tracks")
-        return read_tracks(inside(self.folder, TRACKS))
+        return read_tracks(inside(self.folder, TRACKS), self.frames)
 
     def matches(self, first: int = 0) -> LabelledMatches:
         """What a feature matcher found in frame ``first`` and the next, and what is true.
@@ -132,7 +143,7 @@ class ChannelReader:
         RsbenchError as of ``offsets``.
         """
         self._check_channel("matches")
-        return read_matches(inside(self.folder, matches_file(first)))
+        return read_matches(inside(self.folder, matches_file(first + self.first)))
 
     def matcher(self) -> dict[str, Any]:
         """Content of matches/matcher.json: who matched; RsbenchError as of ``offsets``."""
@@ -148,6 +159,14 @@ class ChannelReader:
         """Content of imu.json; RsbenchError as of ``offsets``."""
         self._check_channel("imu")
         return read_json(inside(self.folder, IMU_MANIFEST))
+
+    def _layer(self, channel: PairChannel, frame: int, row: int, back: bool) -> Layer:
+        """Which leads from a frame to the next or to the one before."""
+        if back and (channel != "flow" or frame == 0):
+            raise RsbenchError(f"{self.folder}: {channel} of frame {frame} leads to no frame before")
+        last = frames_of(self.manifest) - 1
+        leads_back = channel == "flow" and (back or frame == self.frames - 1)
+        return Layer(channel, row, leads_back and frame + self.first != last)
 
     def _check_channel(self, channel: str) -> None:
         if channel not in self.channels:

@@ -40,10 +40,11 @@ class PairTruth(NamedTuple):
     """(H, W) of ``PixelClass``."""
 
 
-def target_of(layer: Layer, source: Shot) -> Shot:
-    """The picture in which a channel looks for the pixels of a rolling-shutter frame."""
+def target_of(layer: Layer, source: Shot, frames: int) -> Shot:
+    """The picture in which a channel of a sequence of so many frames looks for the pixels of one of them."""
     twin = source.other_shutter._replace(row=layer.row)
-    return {"disparity": source.other_side, "flow": source.other_frame, "gs_flow": twin}[layer.channel]
+    over_time = source.frame_before if layer.back else source.next_frame(frames)
+    return {"disparity": source.other_side, "flow": over_time, "gs_flow": twin}[layer.channel]
 
 
 class SeenSurfaces:

@@ -55,8 +55,10 @@ def write_channels(
     if not set(names) & {*PAIR_CHANNELS, "normals", "instances"}:
         return
     seen = SeenSurfaces(geometry, shot, rendered.depth)
-    for layer in pair_layers(names, twins):
-        truth = pair_truth(seen, target_of(layer, shot), rays.blocked)
+    for layer in pair_layers(names, twins, geometry.frames):
+        if shot[1:3] not in layer.views(geometry.frames):
+            continue
+        truth = pair_truth(seen, target_of(layer, shot, geometry.frames), rays.blocked)
         values = pair_values(layer.channel, shot, truth.offset)
         pixels = {name: values[..., k] for k, name in enumerate(COMPONENTS[layer.channel])}
         write_exr(folder / layer.values(shot.side, shot.frame), pixels)

@@ -6,14 +6,15 @@ from collections.abc import Collection, Iterable
 from enum import IntEnum
 from typing import Literal, NamedTuple, get_args
 
-from rsbench.core.rig import VIEWS
+from rsbench.core.rig import FRAMES, View, views_of
 from rsbench.dataset.imu import IMU_FILES
-from rsbench.dataset.timing import TIMING_FILES
+from rsbench.dataset.timing import timing_files
 from rsbench.errors import RsbenchError
 
 PairChannel = Literal["disparity", "flow", "gs_flow"]
 """Where each pixel of a rolling-shutter frame lies in another picture: of the other camera at the same time
-(disparity), of the same camera at the other time (flow), and of its global-shutter twin (gs_flow)."""
+(disparity), of the same camera at the next time (flow; of the last frame, at the time before), and of its
+global-shutter twin (gs_flow)."""
 Channel = Literal[
     "disparity", "flow", "gs_flow", "timing", "normals", "instances", "imu", "tracks", "affine", "hdr", "matches"
 ]
@@ -65,34 +66,40 @@ def check_channels(names: Collection[str], lens: bool, plain: bool) -> None:
         raise ValueError("channels: 'disparity' is made of cameras without a lens, whose pairs share their rows")
 
 
-def value_file(channel: PairChannel, side: str, frame: int, row: int = 0) -> str:
-    """Below the folder of a sequence, by the picture whose pixels it tells of; ``row`` is that of a twin."""
-    return f"gs_twin_flow/{row:04d}/{side}_{frame}.exr" if row else f"{channel}/{side}_{frame}.exr"
-
-
-def mask_file(channel: PairChannel, side: str, frame: int, row: int = 0) -> str:
-    return f"gs_twin_flow_mask/{row:04d}/{side}_{frame}.png" if row else f"{channel}_mask/{side}_{frame}.png"
-
-
 class Layer(NamedTuple):
-    """A channel that leads to one picture of each frame."""
+    """A channel that leads from frames to one picture each."""
 
     channel: PairChannel
     row: int = 0
     """Of the global-shutter twin to which it leads."""
+    back: bool = False
+    """Of ``flow``: from the frames between the first and the last to the one before."""
 
     def values(self, side: str, frame: int) -> str:
         """File below the folder of a sequence, as ``mask`` is."""
-        return value_file(self.channel, side, frame, self.row)
+        return f"{self._folder}{self._row}/{side}_{frame}.exr"
 
     def mask(self, side: str, frame: int) -> str:
-        return mask_file(self.channel, side, frame, self.row)
+        return f"{self._folder}_mask{self._row}/{side}_{frame}.png"
+
+    @property
+    def _folder(self) -> str:
+        return "gs_twin_flow" if self.row else f"{self.channel}_back" if self.back else self.channel
+
+    @property
+    def _row(self) -> str:
+        return f"/{self.row:04d}" if self.row else ""
+
+    def views(self, frames: int) -> tuple[View, ...]:
+        """Of a sequence of so many frames those that it leads from."""
+        return tuple(view for view in views_of(frames) if not self.back or 0 < view[1] < frames - 1)
 
 
-def pair_layers(names: Collection[str], twins: Iterable[int]) -> list[Layer]:
-    """Of the channels of these names."""
+def pair_layers(names: Collection[str], twins: Iterable[int], frames: int = len(FRAMES)) -> list[Layer]:
+    """Of the channels of these names in a sequence of so many frames."""
     layers = [Layer(channel) for channel in PAIR_CHANNELS if channel in names]
-    return [*layers, *(Layer("gs_flow", row) for row in twins if "gs_flow" in names)]
+    back = [Layer("flow", back=True)] if "flow" in names and frames > len(FRAMES) else []
+    return [*layers, *back, *(Layer("gs_flow", row) for row in twins if "gs_flow" in names)]
 
 
 def surface_file(channel: Literal["normals", "instances"], side: str, frame: int) -> str:
@@ -108,20 +115,20 @@ def radiance_file(side: str, frame: int) -> str:
     return f"hdr/{side}_{frame}.exr"
 
 
-def channel_files(names: Iterable[str], twins: Iterable[int] = ()) -> tuple[str, ...]:
+def channel_files(names: Iterable[str], twins: Iterable[int] = (), frames: int = len(FRAMES)) -> tuple[str, ...]:
     """Paths below a sequence's folder of the channels of these names; those of later versions are nobody's."""
-    given = set(names)
-    layers = pair_layers(given, twins)
-    pairs = (file(*view) for layer in layers for file in (layer.values, layer.mask) for view in VIEWS)
-    timing = TIMING_FILES if "timing" in given else ()
-    normals = (surface_file("normals", *view) for view in VIEWS if "normals" in given)
-    instances = (INSTANCE_TABLE, *(surface_file("instances", *view) for view in VIEWS))
-    hdr = (radiance_file(*view) for view in VIEWS if "hdr" in given)
+    given, views = set(names), views_of(frames)
+    layers = pair_layers(given, twins, frames)
+    pairs = (file(*view) for each in layers for file in (each.values, each.mask) for view in each.views(frames))
+    timing = timing_files(frames) if "timing" in given else ()
+    normals = (surface_file("normals", *view) for view in views if "normals" in given)
+    instances = (INSTANCE_TABLE, *(surface_file("instances", *view) for view in views))
+    hdr = (radiance_file(*view) for view in views if "hdr" in given)
     whole: dict[str, tuple[str, ...]] = {
         "imu": IMU_FILES,
         "tracks": (TRACKS,),
         "affine": (AFFINE,),
-        "matches": (MATCHER, matches_file(0)),
+        "matches": (MATCHER, *map(matches_file, range(frames - 1))),
     }
     of_sequence = (file for name, files in whole.items() if name in given for file in files)
     return (*pairs, *timing, *normals, *(instances if "instances" in given else ()), *of_sequence, *hdr)

@@ -14,7 +14,7 @@ from rsbench.cards import load_card
 from rsbench.core.rig import SIDES
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.generation import build_scene, render_camera, scene_name
-from rsbench.dataset.sequence import FRAMES, files_of
+from rsbench.dataset.layout import files_of
 from rsbench.dataset.stage import place_of, seen_scene
 from rsbench.dataset.workplace import files_below
 from rsbench.renderers.options import RendererOptions
@@ -93,14 +93,14 @@ def _of_kind(
     with tempfile.TemporaryDirectory(prefix="rsbench-") as temporary:
         for folder in {Path(name).parent for name in own}:
             (Path(temporary) / folder).mkdir(parents=True, exist_ok=True)
-        times = []
+        times, middle = [], (card.frames - 1) // 2
         for _ in range(1 if warm else 2):
             begun = time.monotonic()
-            for _ in render_camera(card, sequences[0], options, scene, SIDES[0], FRAMES[0], Path(temporary)):
+            for _ in render_camera(card, sequences[0], options, scene, SIDES[0], middle, Path(temporary)):
                 pass
             times.append(time.monotonic() - begun)
         written = sum((Path(temporary) / name).stat().st_size for name in files_below(Path(temporary)))
-    cameras = len(SIDES) * len(FRAMES) * len(sequences)
+    cameras = len(SIDES) * card.frames * len(sequences)
     return Estimate(
         sequences=len(sequences),
         files=len(sequences) * (len(own) + 1),

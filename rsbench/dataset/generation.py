@@ -10,7 +10,6 @@ from contextlib import closing
 from dataclasses import asdict, replace
 from functools import lru_cache
 from importlib.metadata import version
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,16 +19,16 @@ from numpy.typing import NDArray
 from rsbench import __version__
 from rsbench.cards import card_path, load_card
 from rsbench.core.projection import row_poses
-from rsbench.core.rig import SIDES, Side
+from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.se3 import Pose
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channel_writer import write_channels
 from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_png, write_poses
 from rsbench.dataset.hashes import HASHES, FileHashes
+from rsbench.dataset.layout import clean_file, files_of, is_of_sequence
 from rsbench.dataset.manifest import Files, write_manifest
 from rsbench.dataset.matches import Matching
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
-from rsbench.dataset.sequence import FRAMES, files_of, is_of_sequence
 from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.dataset.shots import GivenGeometry, Shot
 from rsbench.dataset.stage import Build, Built, Stage
@@ -45,9 +44,12 @@ if TYPE_CHECKING:
     from rsbench.renderers.scene import MitsubaScene
 
 Progress = Callable[[str], None]
-"""Called with the name of the sequence after each of its ``STEPS``."""
-STEPS = 1 + 2 * len(SIDES) * len(FRAMES)
-"""Per sequence: four rolling-shutter and four global-shutter renders, and putting it into its place."""
+"""Called with the name of the sequence after each of its ``steps_of``."""
+
+
+def steps_of(card: DatasetCard) -> int:
+    """Of each sequence: a rolling-shutter and a global-shutter render of each camera and time, and placing it."""
+    return 1 + 2 * len(SIDES) * card.frames
 
 
 Plan = dict[str, Any]
@@ -100,13 +102,13 @@ def generate_dataset(
             files = _complete(out, sequence, plans[sequence.name], scene_hashes, hashes)
             if files is not None:
                 made[sequence.name] = files
-                _repeat(progress, sequence.name, STEPS)
+                _repeat(progress, sequence.name, steps_of(card))
         hashes.flush()
         todo = [sequence for sequence in card.sequence if sequence.name not in made]
         done: Counter[str] = Counter()
         for name, steps in _render_all(card, sorted(todo, key=scene_name), options, plans, build, out, workers):
             done[name] += steps
-            if done[name] == STEPS:
+            if done[name] == steps_of(card):
                 made[name] = _learned(out, name, hashes)
             _repeat(progress, name, steps)
         write_manifest(card, out, made)
@@ -170,7 +172,7 @@ def _complete(
             f"{folder}: holds no sequence.json, so rsbench did not make it; move it away or choose another --out"
         )
     manifest = read_json(folder / "sequence.json")
-    expected = {"sensor": None, "channels": None, "imu": None, "matches": None, "twins": None}
+    expected = dict.fromkeys(("sensor", "channels", "imu", "matches", "twins", "frames"))
     expected |= _of_scene(plan, scene_hashes.of(sequence.scene))
     other = [key for key, value in expected.items() if manifest.get(key) != value]
     if other:
@@ -232,7 +234,7 @@ def _render_all(
     found = finished_jobs(_serve_renders, jobs, workers, {}, card, options, out, threads, name=_job_name)
     with closing(found):
         for (sequence, _), _ in found:
-            yield sequence.name, STEPS
+            yield sequence.name, steps_of(card)
 
 
 def _job_name(job: tuple[SequenceCard, Plan]) -> str:
@@ -275,14 +277,14 @@ def _render_sequence(
     backend = start_backend()
     mitsuba_scene, digest = stage.set_for(sequence)
     if words := obstacle(
-        mitsuba_scene, card.rig_of(sequence), card.shutter_for(sequence), card.motion_of(sequence)
+        mitsuba_scene, card.rig_of(sequence), card.shutter_for(sequence), card.motion_of(sequence), card.frames
     ):
         raise RsbenchError(f"sequence {sequence.name}: {words}; choose another motion, viewpoint or baseline")
     partial = out / HIDDEN / WORK / sequence.name
     remove(partial)  # of a worker that was killed
     for folder in {Path(name).parent for name in files_of(plan)}:
         (partial / folder).mkdir(parents=True, exist_ok=True)
-    for side, frame in product(SIDES, FRAMES):
+    for side, frame in views_of(card.frames):
         yield from render_camera(card, sequence, options, mitsuba_scene, side, frame, partial)
     write_sequence_channels(partial, card, sequence, mitsuba_scene, plan["scene"])
     files = {name: sha256(partial / name) for name in files_below(partial)}
@@ -338,7 +340,7 @@ def render_camera(
                 f"sequence {sequence.name}: {side}_{frame} shows no surface at all: change the viewpoint "
                 f"{sequence.viewpoint!r} of scene {sequence.scene}, or the motion"
             )
-        clean = f"rs_clean/{side}_{frame}.png" if kind == "rs" and sensor else shot.image
+        clean = clean_file(side, frame) if kind == "rs" and sensor else shot.image
         write_png(folder / clean, to_srgb8(rendered.image, options.exposure))
         write_depth(folder / shot.depth, rendered.depth)
         if kind == "rs" and sensor:
@@ -346,7 +348,7 @@ def render_camera(
             seen = sensed_rows(scene, rig, shutter, motion, sensor.of(side, frame), period, side, frame, options)
             write_png(folder / shot.image, seen)
         if kind == "rs":
-            geometry = GivenGeometry(rig, shutter, card.motion_of(sequence))
+            geometry = GivenGeometry(rig, shutter, card.motion_of(sequence), card.frames)
             write_channels(folder, card.channels, geometry, shot, rendered, SceneRays(scene), twins)
         if shot.row == 0:
             yield

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rsbench.cards import parse_card
 from rsbench.core.inertial import STANDARD_GRAVITY, inertial
 from rsbench.core.motion import Motion
-from rsbench.core.rig import FRAMES, SIDES
+from rsbench.core.rig import views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.files import write_bytes, write_json
@@ -94,10 +94,10 @@ class ImuSamples(NamedTuple):
 
 
 def sample_times_ns(
-    imu: Imu, shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None
+    imu: Imu, shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, frames: int
 ) -> NDArray[np.int64]:
     """True times (n,) of the samples: whole periods of the sensor, over all exposures and ``MARGIN_S`` beyond."""
-    lines = [shutter.line_times(frame, side) for side in SIDES for frame in FRAMES]
+    lines = [shutter.line_times(frame, side) for side, frame in views_of(frames)]
     first, last = (frame_period_s * reach(np.concatenate(lines)) for reach in (np.min, np.max))
     beyond = MARGIN_S + 0.5 * (sensor.longest_s if sensor else 0.0)
     counts = np.arange(

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rsbench import __version__
+from rsbench.core.rig import FRAMES
 from rsbench.dataset.card import DatasetCard
 from rsbench.dataset.files import read_json, write_json
 from rsbench.dataset.hashes import HashedFile
@@ -34,12 +35,18 @@ def write_manifest(card: DatasetCard, out: Path, made: Mapping[str, Files]) -> N
         "rsbench": __version__,
         "mitsuba": version("mitsuba"),
         "units": UNITS,
-        "card": asdict(card),
+        "card": _record(card),
         "sequences": [sequence.name for sequence in card.sequence],
         "files": files,
     }
     if not _stands(out / "dataset.json", content):
         write_json(out / "dataset.json", content)
+
+
+def _record(card: DatasetCard) -> dict[str, Any]:
+    """The card, complete; two frames are told by nothing, as before there could be more."""
+    own = asdict(card)
+    return own if card.frames > len(FRAMES) else {key: value for key, value in own.items() if key != "frames"}
 
 
 def _stands(path: Path, content: dict[str, Any]) -> bool:

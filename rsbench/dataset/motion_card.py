@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rsbench.core.motion import Motion
-from rsbench.motions import drawn_parameters, fixed_endpoint, make_motion
+from rsbench.motions import drawn_parameters, fixed_endpoint, make_motion, motion_model
 
 Vector = tuple[float, float, float]
 Axis = Vector | str
@@ -62,6 +62,10 @@ class MotionCard:
             _scaled(self.translation_axis, self.translation or 0.0),
         )
         return make_motion(self.model, w, d, self.parameters)
+
+    def lasting(self, periods: float) -> MotionCard:
+        """With what a model needs to go on as it is until a time, where the card does not say it."""
+        return replace(self, parameters=motion_model(self.model).lasting(self.parameters, periods))
 
     def drawn(self, seed: int, name: str) -> MotionCard:
         """With axes drawn, uniform on the sphere, the same whatever the lengths are; and random parameters."""

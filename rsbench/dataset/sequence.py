@@ -3,123 +3,49 @@
 from __future__ import annotations
 
 import os
-import re
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Collection
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.cards import parse_card
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import Motion
-from rsbench.core.rig import SIDES, VIEWS, Side, StereoRig
-from rsbench.core.se3 import Pose
+from rsbench.core.motion import LaterMotion, Motion
+from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig, views_of
+from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channel_reader import ChannelReader
-from rsbench.dataset.channels import CHANNELS, channel_files, check_channels
+from rsbench.dataset.channels import check_channels
 from rsbench.dataset.files import read_depth, read_json, read_png, read_poses
 from rsbench.dataset.imu import Imu
+from rsbench.dataset.layout import MOST_FRAMES, MOST_TWINS, Shutter, clean_file, picture_file
 from rsbench.dataset.matches import Matching
 from rsbench.errors import RsbenchError
 from rsbench.motions import motion_record, read_motion
 from rsbench.reading import check_name, check_size, inside
-from rsbench.renderers.electrons import Sensor
+from rsbench.renderers.electrons import Sensor, check_brightness
 
 FORMAT = 1
-CONVENTIONS, WITH_LENS = 1, 2
-"""Of pixels and times. Those of a lens, another scan or a late right camera are others, which earlier versions of
-rsbench, that would take them for ideal, refuse to read."""
+CONVENTIONS, WITH_LENS, OF_FRAMES = 1, 2, 3
+"""Of pixels and times. Those of a lens, another scan or a late right camera are others, and so are those of more
+than two frames: earlier versions of rsbench, that would take them for ideal or for two, refuse to read them."""
 UNITS = {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = no surface"}
 """What dataset.json tells people who find the folder."""
-FRAMES = (0, 1)
-Shutter = Literal["rs", "gs"]
-SHUTTERS: tuple[Shutter, Shutter] = ("rs", "gs")
 
-RELATIVE_FILES = tuple(
-    f"{folder}/{side}_{frame}.{suffix}"
-    for folder, suffix in (
-        ("rs", "png"),
-        ("rs_depth", "exr"),
-        ("gs", "png"),
-        ("gs_depth", "exr"),
-        ("poses", "csv"),
-    )
-    for side in SIDES
-    for frame in FRAMES
-)
-CLEAN_FILES = tuple(f"rs_clean/{side}_{frame}.png" for side in SIDES for frame in FRAMES)
-"""Only where a sensor is not ideal: the rolling-shutter frames that an ideal one would have seen."""
-_MOST_WHOLE_FRAMES = 1 << 14
-"""Of one camera and time: a number in a manifest must not ask for a list of millions."""
-_STACK = re.compile(r"gs_stack/(left|right)_[01]/[0-9]{4,}\.png")
-_TWIN = re.compile(r"gs_twin(|_depth|_flow|_flow_mask)/[0-9]{4,}/(left|right)_[01]\.(png|exr)")
-MOST_TWINS = 64
-
-
-def is_of_sequence(name: str) -> bool:
-    """Whether a path below a sequence's folder is one that rsbench writes."""
-    known = ("sequence.json", *RELATIVE_FILES, *CLEAN_FILES, *channel_files(CHANNELS))
-    return name in known or any(form.fullmatch(name) for form in (_STACK, _TWIN))
-
-
-def picture_file(shutter: Shutter, side: str, frame: int, row: int = 0, depth: bool = False) -> str:
-    """Below the folder of a sequence; ``row``: of a global-shutter twin, counted as rows are read."""
-    folder = f"{'gs_twin' if row else shutter}{'_depth' if depth else ''}"
-    return f"{folder}{f'/{row:04d}' if row else ''}/{side}_{frame}.{'exr' if depth else 'png'}"
-
-
-def twins_of(manifest: Mapping[str, Any]) -> tuple[int, ...]:
-    """Rows of the global-shutter twins beside that of row 0, by a sequence.json; none where it lists none."""
-    rows = manifest.get("twins")
-    listed = rows if isinstance(rows, list) and len(rows) <= MOST_TWINS else []
-    return tuple(row for row in listed if isinstance(row, int) and not isinstance(row, bool) and row > 0)
-
-
-def files_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
-    """Paths that a sequence must have, by its sequence.json."""
-    clean = CLEAN_FILES if manifest.get("sensor") else ()
-    stacks = tuple(
-        stack_file(side, frame, row) for side in SIDES for frame in FRAMES for row in range(whole_frames(manifest))
-    )
-    rows = twins_of(manifest)
-    pictures = [("gs", *view, row, depth) for row in rows for depth in (False, True) for view in VIEWS]
-    twins = tuple(picture_file(*each) for each in pictures)  # type: ignore[arg-type]
-    return RELATIVE_FILES + clean + stacks + twins + channel_files(channels_of(manifest), rows)
-
-
-def stack_file(side: Side, frame: int, row: int) -> str:
-    """The whole global-shutter image at a row's pose, where a dataset keeps those."""
-    return f"gs_stack/{side}_{frame}/{row:04d}.png"
-
-
-def whole_frames(manifest: Mapping[str, Any]) -> int:
-    """How many whole frames each camera has at each time, by a sequence.json: one for each row, or none."""
-    renderer, camera = manifest.get("renderer"), manifest.get("camera")
-    if not (isinstance(renderer, dict) and renderer.get("full_frames") is True and isinstance(camera, dict)):
-        return 0
-    height = camera.get("height")
-    if any(manifest.get(key) in ("left", "right") for key in ("scan", "right_scan")):
-        return 0  # its lines are columns
-    return height if isinstance(height, int) and 0 < height <= _MOST_WHOLE_FRAMES else 0
-
-
-def channels_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
-    """Names of the channels that a sequence.json lists, unknown ones too; what is no list of names has none."""
-    names = manifest.get("channels")
-    return tuple(name for name in names if isinstance(name, str)) if isinstance(names, list) else ()
-
-
+_OF_PAIRS = ("disparity", "flow", "gs_flow", "instances", "hdr", "matches")
 Vector = tuple[float, float, float]
 M = TypeVar("M")
 
 
-def conventions_of(camera: PinholeCamera, plain: bool) -> int:
+def conventions_of(camera: PinholeCamera, plain: bool, frames: int) -> int:
     """The conventions of such cameras; ``plain``: both read rows from the top at once."""
+    if frames > len(FRAMES):
+        return OF_FRAMES
     return CONVENTIONS if plain and camera.lens is None else WITH_LENS
 
 
@@ -144,6 +70,7 @@ class SequenceManifest(Scanning):
     baseline: float
     readout_ratio: float
     frame_period_s: float
+    frames: int = len(FRAMES)
     readout_time_s: float
     row_time_s: float
     motion: MotionManifest
@@ -157,10 +84,12 @@ class SequenceManifest(Scanning):
 
     def __post_init__(self) -> None:
         check_name(self.name)
-        if self.conventions != (needed := conventions_of(self.camera, self.plain)):
+        if not len(FRAMES) <= self.frames <= MOST_FRAMES:
+            raise ValueError(f"frames = {self.frames}: must lie in [{len(FRAMES)}, {MOST_FRAMES}]")
+        if self.conventions != (needed := conventions_of(self.camera, self.plain, self.frames)):
             raise ValueError(
                 f"conventions = {self.conventions}: {needed} is needed; this version reads {CONVENTIONS}, and "
-                f"{WITH_LENS} with a lens, another scan or a late camera"
+                f"{WITH_LENS} with a lens, another scan or a late camera, {OF_FRAMES} with more than two frames"
             )
         check_size("camera", (self.camera.width, self.camera.height))
         check_channels(self.channels, self.camera.lens is not None, self.plain)
@@ -170,6 +99,8 @@ class SequenceManifest(Scanning):
             or len(self.twins) > MOST_TWINS
         ):
             raise ValueError(f"twins = {list(self.twins)}: must grow from 1 to {lines - 1}, {MOST_TWINS} at most")
+        if self.sensor is not None:
+            check_brightness(self.sensor, self.frames)
         if not self.frame_period_s > 0.0:
             raise ValueError(f"frame_period_s = {self.frame_period_s}: must be positive")
 
@@ -205,7 +136,7 @@ class DatasetManifest:
 
 @dataclass(frozen=True, kw_only=True)
 class Sequence(ChannelReader):
-    """A sequence folder of format 1; frames 0 and 1, sides left and right."""
+    """A sequence folder of format 1, or two successive frames of one; sides left and right, frames from 0."""
 
     folder: Path
     name: str
@@ -223,8 +154,48 @@ class Sequence(ChannelReader):
     """Rows, counted as they are read, from whose poses there are global-shutter twins beside those of row 0."""
     channels: tuple[str, ...] = ()
     """Names of those that it has beside images, depth and poses; later versions know more."""
+    frames: int = len(FRAMES)
+    """How many each camera has."""
+    first: int = 0
+    """Of a pair: frame 0 of it is this one of the folder."""
     manifest: dict[str, Any]
     """Content of sequence.json."""
+
+    def pairs(self) -> list[Sequence]:
+        """Each two successive frames as a sequence of their own, such as ``castle.3`` of frames 3 and 4.
+
+        Its world is the body at its own time 0, and its motion is what is left of the way, seen from there. Of the
+        channels it has those that tell of one frame or lead to another. Of two frames there is one: the sequence.
+        """
+        if self.frames == len(FRAMES):
+            return [self]
+        channels = tuple(name for name in self.channels if name in _OF_PAIRS)
+        return [
+            replace(
+                self,
+                name=f"{self.name}.{first}",
+                motion=self.motion.from_time(first),
+                frames=len(FRAMES),
+                first=first,
+                channels=channels,
+            )
+            for first in range(self.frames - 1)
+        ]
+
+    @property
+    def whole(self) -> str:
+        """Name of the sequence to which a pair belongs."""
+        return os.path.basename(os.path.abspath(self.folder))
+
+    @property
+    def data_model(self) -> str:
+        """Name of the motion model that the whole way follows."""
+        return (self.motion.motion if isinstance(self.motion, LaterMotion) else self.motion).name
+
+    def frame_files(self, folders: Collection[str]) -> list[Path]:
+        """All files of its frames in these folders, sorted."""
+        ends = tuple(f"{side}_{frame + self.first}" for side, frame in views_of(self.frames))
+        return sorted(path for name in folders for path in (self.folder / name).iterdir() if path.stem in ends)
 
     @property
     def uncorrectable(self) -> str:
@@ -238,41 +209,53 @@ class Sequence(ChannelReader):
 
     def image(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.uint8]:
         """(H, W, 3) sRGB; ``gs`` is the global-shutter image at the pose of a row: 0, or one of ``twins``."""
-        return read_png(inside(self.folder, picture_file(shutter, side, frame, row)), self._size)
+        return read_png(inside(self.folder, picture_file(shutter, side, frame + self.first, row)), self._size)
 
     def clean_image(self, side: Side, frame: int) -> NDArray[np.uint8]:
         """(H, W, 3) sRGB: the rolling-shutter frame of an ideal sensor, sharp and without noise."""
-        kind = "rs" if self.sensor is None else "rs_clean"
-        return read_png(inside(self.folder, f"{kind}/{side}_{frame}.png"), self._size)
+        if self.sensor is None:
+            return self.image("rs", side, frame)
+        return read_png(inside(self.folder, clean_file(side, frame + self.first)), self._size)
 
     def images(self, shutter: Shutter = "rs") -> list[NDArray[np.uint8]]:
-        """Left 0, right 0, left 1, right 1: the order of ``rsbench.match`` and ``rsbench.correct``."""
-        return [self.image(shutter, side, frame) for frame in FRAMES for side in SIDES]
+        """Left 0, right 0, left 1, right 1, and so on: the order of ``rsbench.match`` and ``rsbench.correct``."""
+        return [self.image(shutter, side, frame) for frame in range(self.frames) for side in SIDES]
 
     def depth(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.float32]:
         """(H, W) z in the camera of the row that saw the pixel, m, 0 = no surface; ``row`` as of ``image``."""
-        return read_depth(inside(self.folder, picture_file(shutter, side, frame, row, depth=True)), self._size)
+        file = picture_file(shutter, side, frame + self.first, row, depth=True)
+        return read_depth(inside(self.folder, file), self._size)
 
     def poses(self, side: Side, frame: int) -> tuple[FloatArray, Pose]:
         """Row times (H,) and ``cam_from_world`` (H, 3, 3), (H, 3) as stored; of columns, where those are read."""
-        path = inside(self.folder, f"poses/{side}_{frame}.csv")
+        path = inside(self.folder, f"poses/{side}_{frame + self.first}.csv")
         tau, poses = read_poses(path)
         if len(tau) != (lines := self.shutter.lines(side)):
             raise RsbenchError(f"{path}: has {len(tau)} rows, the camera has {lines}")
-        return tau, poses
+        if self.first:
+            whole = read_motion(self.manifest["motion"])
+            poses = compose(poses, inverse(whole.body_from_world(self.first)))
+        return tau - self.first, poses
 
 
 def sequence_manifest(
-    *, name: str, rig: StereoRig, shutter: RollingShutter, motion: Motion, frame_period_s: float
+    *,
+    name: str,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    frame_period_s: float,
+    frames: int = len(FRAMES),
 ) -> dict[str, Any]:
     """The geometric part of sequence.json, with units in the names where they are not metres and radians."""
     camera = rig.camera
     fields = ("width", "height", "fx", "fy", "cx", "cy")
     readout_s = shutter.readout_ratio * frame_period_s
     lens = {} if camera.lens is None else {"lens": asdict(camera.lens)}
+    count = {"frames": frames} if frames > len(FRAMES) else {}
     return {
         "format": FORMAT,
-        "conventions": conventions_of(camera, shutter.plain),
+        "conventions": conventions_of(camera, shutter.plain, frames),
         "name": name,
         "camera": {field: getattr(camera, field) for field in fields} | lens,
         "baseline": rig.baseline,
@@ -281,6 +264,7 @@ def sequence_manifest(
         "readout_time_s": readout_s,
         "row_time_s": readout_s / shutter.lines("left"),
         "motion": motion_record(motion),
+        **count,
     } | ({} if shutter.plain else asdict(shutter.scanning))
 
 
@@ -308,6 +292,7 @@ def read_sequence(folder: Path) -> Sequence:
             imu=manifest.imu,
             matching=manifest.matches,
             twins=manifest.twins,
+            frames=manifest.frames,
             channels=manifest.channels,
             manifest=content,
         )
@@ -322,6 +307,19 @@ def read_dataset(folder: Path) -> list[Sequence]:
         RsbenchError: not a finished dataset, or a sequence that cannot be read.
     """
     return [read_sequence(inside(folder, name)) for name in read_dataset_manifest(folder).sequences]
+
+
+def read_pairs(folder: Path) -> list[Sequence]:
+    """All pairs of successive frames of a dataset, each a sequence of two: what is scored.
+
+    Raises:
+        RsbenchError: as ``read_dataset``, or two of these have one name.
+    """
+    pairs = [pair for sequence in read_dataset(folder) for pair in sequence.pairs()]
+    for name, count in Counter(pair.name for pair in pairs).items():
+        if count > 1:
+            raise RsbenchError(f"{folder}: {name!r} is a sequence and a pair of frames of another; rename it")
+    return pairs
 
 
 def read_dataset_manifest(folder: Path) -> DatasetManifest:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsbench.core.rig import VIEWS
+from rsbench.core.rig import VIEWS, views_of
 from rsbench.dataset.affine import make_affine, save_affine
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channels import AFFINE, INSTANCE_TABLE, MATCHER, matches_file
@@ -37,17 +37,17 @@ def write_sequence_channels(
 
     shutter, period, sensor = card.shutter_for(sequence), card.period_of(sequence), card.sensor_of(sequence)
     motion, seed = card.motion_of(sequence), f"{card.seed_of(sequence)}/{sequence.name}"
-    geometry = GivenGeometry(card.rig_of(sequence), shutter, motion)
+    geometry = GivenGeometry(card.rig_of(sequence), shutter, motion, card.frames)
     if "timing" in card.channels:
-        write_timing(folder, shutter, period, sensor)
+        write_timing(folder, shutter, period, sensor, card.frames)
     if "instances" in card.channels:
         write_json(folder / INSTANCE_TABLE, {"instances": scene.instances})
     if "imu" in card.channels:
         imu, gravity = card.imu or Imu(), gravity_of(record)
-        times = sample_times_ns(imu, shutter, period, sensor)
+        times = sample_times_ns(imu, shutter, period, sensor, card.frames)
         write_imu(folder, imu, gravity, draw_samples(imu, motion, times, period, gravity, seed))
     if "tracks" in card.channels:
-        depths = {view: read_depth(folder / Shot("rs", *view).depth) for view in VIEWS}
+        depths = {view: read_depth(folder / Shot("rs", *view).depth) for view in views_of(card.frames)}
         tracks = make_tracks(geometry, depths, SceneRays(scene).blocked, seed)
         write_tracks(folder, tracks)
         if "affine" in card.channels:
@@ -55,7 +55,9 @@ def write_sequence_channels(
     if "matches" in card.channels:
         from rsbench.dataset.match_truth import make_matches, matcher_record
 
-        images = {view: read_png(folder / Shot("rs", *view).image) for view in VIEWS}
-        matching = card.matches or Matching()
+        matching, rays = card.matches or Matching(), SceneRays(scene)
         write_json(folder / MATCHER, matcher_record(matching))
-        save_matches(folder / matches_file(0), make_matches(geometry, 0, images, matching, SceneRays(scene)))
+        for first in range(card.frames - 1):
+            views = [(side, first + frame) for side, frame in VIEWS]
+            images = {view: read_png(folder / Shot("rs", *view).image) for view in views}
+            save_matches(folder / matches_file(first), make_matches(geometry, first, images, matching, rays))

@@ -1,8 +1,8 @@
-"""The eight pictures of a sequence, what they see where, and from where."""
+"""The pictures of a sequence, what they see where, and from where."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import product
 from typing import NamedTuple, Protocol
 
@@ -15,8 +15,9 @@ from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.sequence import SHUTTERS, Shutter, picture_file
+from rsbench.dataset.layout import SHUTTERS, Shutter, picture_file
 
+_NEAREST = 32
 FAR = 1e7
 """Where the sky is looked for, metres: no motion of a rig moves it by a hundredth of a pixel."""
 
@@ -30,6 +31,8 @@ class Geometry(Protocol):
     def shutter(self) -> RollingShutter: ...
     @property
     def motion(self) -> Motion: ...
+    @property
+    def frames(self) -> int: ...
 
 
 class GivenGeometry(NamedTuple):
@@ -38,6 +41,7 @@ class GivenGeometry(NamedTuple):
     rig: StereoRig
     shutter: RollingShutter
     motion: Motion
+    frames: int = len(FRAMES)
 
 
 class Shot(NamedTuple):
@@ -66,18 +70,46 @@ class Shot(NamedTuple):
     def other_side(self) -> Shot:
         return self._replace(side="right" if self.side == "left" else "left")
 
+    def next_frame(self, frames: int) -> Shot:
+        """At the next time, of so many; of the last one, at the time before."""
+        return self._replace(frame=self.frame + (1 if self.frame < frames - 1 else -1))
+
     @property
-    def other_frame(self) -> Shot:
-        return self._replace(frame=1 - self.frame)
+    def frame_before(self) -> Shot:
+        return self._replace(frame=self.frame - 1)
 
     def partners(self) -> Iterator[Shot]:
-        """Those that see most of the same: of the other shutter, the other camera, the other time."""
-        yield from (self.other_shutter, self.other_side, self.other_frame)
+        """Those that see most of the same: of the other shutter, the other camera, the time after and before.
+
+        The last two need not be there.
+        """
+        after = self._replace(frame=self.frame + 1)
+        yield from (self.other_shutter, self.other_side, after, self.frame_before)
 
 
-SHOTS = tuple(Shot(*each) for each in product(SHUTTERS, SIDES, FRAMES))
-PAIRS = tuple((source, target) for source in SHOTS for target in source.partners())
-"""Each shot against its three partners."""
+Times = tuple[int, int]
+"""Numbers of two successive frames."""
+
+
+def shots_of(times: Iterable[int]) -> tuple[Shot, ...]:
+    """All pictures of these frames, but for twins of later rows."""
+    return tuple(Shot(*each) for each in product(SHUTTERS, SIDES, times))
+
+
+def pairs_of(times: Times) -> tuple[tuple[Shot, Shot], ...]:
+    """Each shot of two frames against its three partners."""
+    both = shots_of(times)
+    return tuple((source, target) for source in both for target in source.partners() if target in both)
+
+
+def near_shots(shot: Shot, frames: int) -> list[Shot]:
+    """Other shots of a sequence of so many frames, the nearest in time first; of long ones not all."""
+    times = sorted(range(frames), key=lambda frame: abs(frame - shot.frame))[:_NEAREST]
+    return [each for time in times for each in shots_of((time,)) if each != shot]
+
+
+SHOTS, PAIRS = shots_of(FRAMES), pairs_of(FRAMES)
+"""Of a sequence of two frames."""
 
 
 class Seen(NamedTuple):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side
+from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.files import write_bytes, write_json
 from rsbench.errors import RsbenchError
@@ -25,10 +25,14 @@ def table_file(side: str, frame: int) -> str:
     return f"timing/{side}_{frame}.csv"
 
 
-TIMING_FILES = (MANIFEST, *(table_file(*view) for view in VIEWS))
+def timing_files(frames: int) -> tuple[str, ...]:
+    """All of them, of a sequence of so many frames."""
+    return (MANIFEST, *(table_file(*view) for view in views_of(frames)))
 
 
-def timing_manifest(shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None) -> dict[str, Any]:
+def timing_manifest(
+    shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, frames: int
+) -> dict[str, Any]:
     """Content of timing.json: of each camera what makes its tables; times count from that of row 0 of frame 0."""
     readout_ns = _NS * shutter.readout_ratio * frame_period_s
     cameras = {
@@ -38,7 +42,7 @@ def timing_manifest(shutter: RollingShutter, frame_period_s: float, sensor: Sens
             "exposure_ns": _NS * (sensor.of(side, 0).exposure_s if sensor else 0.0),
             "scan": shutter.scan_of(side),
             "reference_row": shutter.first_line(side),
-            "reference_ns": [_NS * frame_period_s * float(shutter.start(frame, side)) for frame in FRAMES],
+            "reference_ns": [_NS * frame_period_s * float(shutter.start(frame, side)) for frame in range(frames)],
         }
         for side in SIDES
     }
@@ -56,10 +60,12 @@ def timing_table(
     return np.round(np.stack([rows, middle, middle - half, middle + half], axis=1)).astype(np.int64)
 
 
-def write_timing(folder: Path, shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None) -> None:
-    """All ``TIMING_FILES`` below the folder of a sequence."""
-    write_json(folder / MANIFEST, timing_manifest(shutter, frame_period_s, sensor))
-    for side, frame in VIEWS:
+def write_timing(
+    folder: Path, shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, frames: int
+) -> None:
+    """All ``timing_files`` below the folder of a sequence."""
+    write_json(folder / MANIFEST, timing_manifest(shutter, frame_period_s, sensor, frames))
+    for side, frame in views_of(frames):
         table = timing_table(shutter, frame_period_s, sensor, side, frame)
         lines = [",".join(map(str, line)) for line in table.tolist()]
         write_bytes(folder / table_file(side, frame), ("\n".join([COLUMNS, *lines]) + "\n").encode())

@@ -6,13 +6,13 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.projection import ProjectionStatus, back_project, rs_project
-from rsbench.core.rig import FRAMES, SIDES, View
+from rsbench.core.rig import SIDES, View
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import TRACKS, PixelClass
@@ -23,15 +23,23 @@ from rsbench.reading import load_arrays
 if TYPE_CHECKING:  # which reads tracks
     from rsbench.dataset.shots import Geometry
 
-TRACK_VIEWS: tuple[View, ...] = tuple((side, frame) for frame in FRAMES for side in SIDES)
-"""Left 0, right 0, left 1, right 1: the order of the frames in the arrays, and of ``Sequence.images``."""
-OF_EACH_FRAME = 512
-"""Points drawn from the pixels of a frame."""
+IN_ALL = 2048
+"""Points drawn from the pixels of all frames, of each as many."""
+
+
+def track_views(frames: int) -> tuple[View, ...]:
+    """Left 0, right 0, left 1, right 1, ...: the order of the frames in the arrays, and of ``Sequence.images``."""
+    return tuple((side, frame) for frame in range(frames) for side in SIDES)
+
+
+def _source_type(views: int) -> np.dtype[Any]:
+    """Of the numbers of frames."""
+    return np.min_scalar_type(views - 1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tracks:
-    """Points (n) and what became of them in the four frames, in the order of ``TRACK_VIEWS``.
+    """Points (n) and what became of them in all frames (v), in the order of ``track_views``.
 
     Raises:
         ValueError: arrays of other shapes or types, or of points, sources or classes that cannot be.
@@ -39,25 +47,26 @@ class Tracks:
 
     points: FloatArray
     """(n, 3) world frame, metres."""
-    sources: NDArray[np.uint8]
+    sources: NDArray[np.unsignedinteger[Any]]
     """(n,) number of the frame from whose pixels the point was drawn."""
     pixels: FloatArray
-    """(n, 4, 2) px, between pixels too; NaN where a frame does not see the point."""
+    """(n, v, 2) px, between pixels too; NaN where a frame does not see the point."""
     tau: FloatArray
-    """(n, 4) times at which the frames see it, frame periods; NaN likewise."""
+    """(n, v) times at which the frames see it, frame periods; NaN likewise."""
     classes: NDArray[np.uint8]
-    """(n, 4) of ``PixelClass``: VISIBLE, OCCLUDED (the pixel is known), OUT_OF_VIEW or UNSOLVED."""
+    """(n, v) of ``PixelClass``: VISIBLE, OCCLUDED (the pixel is known), OUT_OF_VIEW or UNSOLVED."""
 
     def __post_init__(self) -> None:
         n, f8, u1 = len(self.points), np.dtype(np.float64), np.dtype(np.uint8)
-        wanted = {"points": ((n, 3), f8), "sources": ((n,), u1), "pixels": ((n, 4, 2), f8)}
-        wanted |= {"tau": ((n, 4), f8), "classes": ((n, 4), u1)}
+        v = self.tau.shape[1] if self.tau.ndim == 2 and self.tau.shape[1] else 4
+        wanted = {"points": ((n, 3), f8), "sources": ((n,), _source_type(v)), "pixels": ((n, v, 2), f8)}
+        wanted |= {"tau": ((n, v), f8), "classes": ((n, v), u1)}
         for name, (shape, kind) in wanted.items():
             value = getattr(self, name)
             if value.shape != shape or value.dtype != kind:
                 raise ValueError(f"{name} is {value.dtype} of shape {value.shape}: {kind} of {shape} is needed")
-        if not np.all(np.isfinite(self.points)) or np.any(self.sources >= len(TRACK_VIEWS)):
-            raise ValueError("points must be finite, and sources 0 to 3")
+        if not np.all(np.isfinite(self.points)) or np.any(self.sources >= v):
+            raise ValueError(f"points must be finite, and sources 0 to {v - 1}")
         if np.any(self.classes > PixelClass.OUT_OF_VIEW):
             raise ValueError(f"classes holds {np.max(self.classes)}: a point is of class 0 to 3")
 
@@ -68,7 +77,7 @@ def make_tracks(
     blocked: Callable[[FloatArray, FloatArray], NDArray[np.bool_]],
     seed: str,
 ) -> Tracks:
-    """Draw ``OF_EACH_FRAME`` pixels with a surface from each frame, and look for their points in all of them.
+    """Draw pixels with a surface from each frame, ``IN_ALL`` together, and look for their points in all of them.
 
     Args:
         geometry: of the sequence.
@@ -76,24 +85,28 @@ def make_tracks(
         blocked: as of ``channel_truth``.
         seed: of the draw.
     """
-    drawn = [_drawn(geometry, view, depths[view], f"{seed}/tracks/{view[0]}_{view[1]}") for view in TRACK_VIEWS]
+    views = track_views(geometry.frames)
+    count = max(1, IN_ALL // len(views))
+    drawn = [_drawn(geometry, view, depths[view], f"{seed}/tracks/{view[0]}_{view[1]}", count) for view in views]
     points = np.concatenate([X for X, _ in drawn])
-    sources = np.repeat(np.arange(len(drawn), dtype=np.uint8), [len(X) for X, _ in drawn])
-    seen = [look_for(geometry, view, points, blocked) for view in TRACK_VIEWS]
+    sources = np.repeat(np.arange(len(drawn), dtype=_source_type(len(views))), [len(X) for X, _ in drawn])
+    seen = [look_for(geometry, view, points, blocked) for view in views]
     pixels, tau, classes = (np.stack(each, axis=1) for each in zip(*seen, strict=True))
     # A frame that sees a point twice names the first row; where it was drawn, it is the pixel of the draw.
-    for k, (view, (_, grid)) in enumerate(zip(TRACK_VIEWS, drawn, strict=True)):
+    for k, (view, (_, grid)) in enumerate(zip(views, drawn, strict=True)):
         own = sources == k
         pixels[own, k], classes[own, k] = grid, PixelClass.VISIBLE
         tau[own, k] = geometry.shutter.pixel_time(grid, view[1], view[0])
     return Tracks(points=points, sources=sources, pixels=pixels, tau=tau, classes=classes)
 
 
-def _drawn(geometry: Geometry, view: View, depth: NDArray[np.float32], seed: str) -> tuple[FloatArray, FloatArray]:
+def _drawn(
+    geometry: Geometry, view: View, depth: NDArray[np.float32], seed: str, count: int
+) -> tuple[FloatArray, FloatArray]:
     """World points (n, 3) and the pixels (n, 2) that see them."""
     rng = np.random.default_rng(int.from_bytes(hashlib.sha256(seed.encode()).digest()[:16], "little"))
     solid = np.flatnonzero(depth)
-    chosen = np.sort(rng.permutation(solid)[:OF_EACH_FRAME])
+    chosen = np.sort(rng.permutation(solid)[:count])
     y, x = np.divmod(chosen, depth.shape[1])
     pixels = np.column_stack([x, y]).astype(np.float64)
     return points_at(geometry, view, pixels, depth), pixels
@@ -128,9 +141,14 @@ def write_tracks(folder: Path, tracks: Tracks) -> None:
     save_arrays(folder / TRACKS, {field.name: getattr(tracks, field.name) for field in fields(tracks)})
 
 
-def read_tracks(path: Path) -> Tracks:
-    """Raises RsbenchError as ``reading.load_arrays``, and for arrays that are no tracks."""
+def read_tracks(path: Path, frames: int) -> Tracks:
+    """Of so many frames; RsbenchError as ``reading.load_arrays``, and for arrays that are no such tracks."""
     try:
-        return Tracks(**load_arrays(path))
+        tracks = Tracks(**load_arrays(path))
     except (TypeError, ValueError) as error:
         raise RsbenchError(f"{path}: {error}") from error
+    if tracks.tau.shape[1] != len(track_views(frames)):
+        raise RsbenchError(
+            f"{path}: is of {tracks.tau.shape[1]} views, the sequence has {len(track_views(frames))}"
+        )
+    return tracks

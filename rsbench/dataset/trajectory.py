@@ -1,4 +1,4 @@
-"""A user's own trajectory: poses from a file in TUM's format, cut into pairs of frames."""
+"""A user's own trajectory: poses from a file in TUM's format, cut into sequences of so many frames."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ FORMAT = "timestamp tx ty tz qx qy qz qw"
 _NEARLY_UNIT = 0.01
 """Quaternions are written with four digits or more; beyond, another order of their parts is more likely."""
 _AROUND = 24
-"""Poses before and after a pair that its sequence keeps: of farther ones the spline feels 0.27^24."""
-_MOST_PAIRS = 100_000
+"""Poses before and after that a sequence keeps: of farther ones the spline feels 0.27^24."""
+_MOST_PARTS = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrajectoryCard:
-    """The rig goes along the poses of a file: each pair of frames is a sequence of its own."""
+    """The rig goes along the poses of a file: each two frames, or as many as the card says, are a sequence."""
 
     file: str
     """TUM's format: lines ``timestamp tx ty tz qx qy qz qw``, seconds and metres; relative to the card."""
     absolute: bool = False
-    """The poses are in the frame of the scene (z up); otherwise the first pair starts at the viewpoint."""
+    """The poses are in the frame of the scene (z up); otherwise the first sequence starts at the viewpoint."""
     start_s: float = 0.0
     """Seconds from the first pose of the file to the first frame."""
-    step: float = 2.0
-    """Frame periods from one pair to the next; with 1, two pairs share a frame."""
+    step: float | None = None
+    """Frame periods from one sequence to the next; None: as many as it has frames. One less, and two share one."""
     pairs: int | None = None
     """So many at most; None: all that the file holds."""
     longest_gap_s: float = 1.0
@@ -47,8 +47,9 @@ class TrajectoryCard:
         if not self.start_s >= 0.0:
             raise ValueError(f"start_s = {self.start_s}: must not be negative")
         for name in ("step", "longest_gap_s"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be positive")
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise ValueError(f"{name} = {value}: must be positive")
         if self.pairs is not None and self.pairs < 1:
             raise ValueError(f"pairs = {self.pairs}: must be 1 or more")
 
@@ -62,8 +63,8 @@ class Trajectory(NamedTuple):
     """(n, 7) position x, y, z, metres, and unit quaternion x, y, z, w."""
 
 
-class Pair(NamedTuple):
-    """One pair of frames on the way."""
+class Part(NamedTuple):
+    """The frames of one sequence on the way."""
 
     poses: FloatArray
     """(m, 8) as ``TrajectoryMotion`` takes them: time 0 is the start of frame 0."""
@@ -131,40 +132,45 @@ def _check_steps(trajectory: Trajectory, path: Path, lines: list[int], longest_g
             )
 
 
-def pairs_along(card: TrajectoryCard, folder: Path, period_s: float, span: tuple[float, float]) -> list[Pair]:
-    """The pairs of frames that a card makes of its file.
+def parts_along(
+    card: TrajectoryCard, folder: Path, period_s: float, span: tuple[float, float], frames: int
+) -> list[Part]:
+    """The sequences that a card makes of its file.
 
     Args:
         card: see there.
         folder: of the dataset's card.
         period_s: seconds of a frame period.
-        span: from when to when a pair needs poses: frame periods from the start of its frame 0.
+        span: from when to when a sequence needs poses: frame periods from the start of its frame 0.
+        frames: of a sequence.
 
     Raises:
-        RsbenchError: the file is wrong, or too short for one pair.
+        RsbenchError: the file is wrong, or too short for one sequence.
     """
     path = folder / card.file
     trajectory = read_trajectory(path, card.longest_gap_s)
-    seconds = trajectory.seconds
+    seconds, step = trajectory.seconds, frames if card.step is None else card.step
     before, after = (time * period_s for time in span)
     first, left = card.start_s - before, float(seconds[-1]) - (card.start_s - before) - after
+    words = "a pair of frames" if frames == 2 else f"{frames} frames"
     if left < 0.0:
         raise RsbenchError(
-            f"{path}: lasts {seconds[-1]:g} s; a pair of frames from start_s = {card.start_s:g} on needs "
-            f"{card.start_s - before + after:g} s: give more poses or a shorter frame_period_s"
+            f"{path}: lasts {seconds[-1]:g} s; {words} from start_s = {card.start_s:g} on "
+            f"need{'s' if frames == 2 else ''} {card.start_s - before + after:g} s: give more poses or a shorter "
+            "frame_period_s"
         )
-    count = 1 + math.floor(left / (card.step * period_s) + 1e-9)
+    count = 1 + math.floor(left / (step * period_s) + 1e-9)
     count = count if card.pairs is None else min(count, card.pairs)
-    check_amount(path, "pairs of frames", count, _MOST_PAIRS)
+    check_amount(path, "sequences", count, _MOST_PARTS)
     rows = []
     for k in range(count):
-        zero = first + k * card.step * period_s
+        zero = first + k * step * period_s
         low, high = np.searchsorted(seconds, [zero + before, zero + after])
         near = slice(max(int(low) - _AROUND, 0), int(high) + _AROUND)
         times = (seconds[near] - zero) / period_s
         rows.append(np.concatenate([times[:, None], trajectory.poses[near]], axis=1))
     places = [world_from_body(each, 0.0) for each in rows]
-    return [Pair(each, _start(place, places[0], card.absolute)) for each, place in zip(rows, places, strict=True)]
+    return [Part(each, _start(place, places[0], card.absolute)) for each, place in zip(rows, places, strict=True)]
 
 
 def _start(place: Pose, first: Pose, absolute: bool) -> Start:

@@ -7,7 +7,7 @@ into columns, and rows are what a rolling shutter reads.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from rsbench.cards import parse_card, read_toml
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.lens import Lens
 from rsbench.core.rig import StereoRig, View
-from rsbench.core.shutter import Scanning
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.errors import RsbenchError
 from rsbench.reading import check_image_size, check_size, read_bytes
 from rsbench.shutters import with_shutter
@@ -89,6 +89,15 @@ def read_rig_card(path: Path) -> RigCard:
     if "shutter" in table:
         table = {key: value for key, value in with_shutter(table, str(path)).items() if key != "frame_period_s"}
     return parse_card(RigCard, table, str(path))
+
+
+def rig_card_of(rig: StereoRig, shutter: RollingShutter) -> RigCard:
+    """The card of cameras that are known."""
+    c = rig.camera
+    camera = CameraCard(fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy, lens=c.lens)
+    return RigCard(
+        camera=camera, baseline=rig.baseline, readout_ratio=shutter.readout_ratio, **asdict(shutter.scanning)
+    )
 
 
 def read_frame(path: Path) -> NDArray[Any]:
@@ -172,6 +181,15 @@ class FrameSource:
             video.release()
         else:
             raise RsbenchError(f"{path}: no such folder or video")
+
+    @classmethod
+    def of_files(cls, files: list[Path]) -> FrameSource:
+        """Frames of these files, in this order; RsbenchError where there are none."""
+        if not files:
+            raise RsbenchError("no frames")
+        source = cls.__new__(cls)
+        source.path, source._files, source.count = files[0].parent, files, len(files)
+        return source
 
     def _open(self) -> Any:
         video = cv2.VideoCapture(str(self.path))

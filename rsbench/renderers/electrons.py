@@ -59,8 +59,8 @@ class Sensor:
     """Of the digital numbers; 0: they are not rounded."""
     vignetting: float = 0.0
     """Share of the light that the corners lose; it grows with the square of the distance from the centre."""
-    brightness: tuple[float, float] = (1.0, 1.0)
-    """Of frames 0 and 1 over that of the clean twin: what an automatic exposure does from frame to frame."""
+    brightness: tuple[float, ...] = (1.0, 1.0)
+    """Of each frame over that of the clean twin: what an automatic exposure does from frame to frame."""
     right_brightness: float = 1.0
     """Of the right camera over the left one."""
     right_exposure_s: float | None = None
@@ -90,10 +90,15 @@ class Sensor:
         """The sensor of one camera at one time, both of whose frames and cameras are alike."""
         right = side == "right"
         own: dict[str, Any] = {name: getattr(self, f"right_{name}") if right else None for name in _BY_CAMERA}
-        light = self.brightness[frame] * (self.right_brightness if right else 1.0)
+        light = (self.brightness[frame] if self.scripted else 1.0) * (self.right_brightness if right else 1.0)
         alike: dict[str, Any] = {"brightness": (light, light), "right_brightness": 1.0}
         alike |= {f"right_{name}": None for name in _BY_CAMERA}
         return replace(self, **{name: value for name, value in own.items() if value is not None}, **alike)
+
+    @property
+    def scripted(self) -> bool:
+        """Whether frames differ in brightness, which is then that of each."""
+        return self.brightness != _UNTOLD["brightness"]
 
     @property
     def longest_s(self) -> float:
@@ -150,6 +155,13 @@ def filters(mosaic: Mosaic, width: int, rows: ArrayLike) -> NDArray[np.intp]:
     """Channels (n, width), 0 to 2, of the filters before the pixels of rows (n)."""
     tile = np.array(["RGB".index(colour) for colour in mosaic]).reshape(2, 2)
     return tile[np.asarray(rows)[:, None] % 2, np.arange(width) % 2]
+
+
+def check_brightness(sensor: Sensor, frames: int) -> None:
+    """Raises ValueError unless it says the brightness of each of so many frames, or of none."""
+    if sensor.scripted and len(sensor.brightness) != frames:
+        count = len(sensor.brightness)
+        raise ValueError(f"sensor brightness has {count} values: one for each of {frames} frames is needed")
 
 
 def fall_off(sensor: Sensor, width: int, height: int, rows: ArrayLike) -> NDArray[np.float64]:

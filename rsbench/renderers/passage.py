@@ -13,13 +13,13 @@ from rsbench.renderers.scene import MitsubaScene
 from rsbench.renderers.segments import REACH, SceneRays
 
 
-def obstacle(scene: MitsubaScene, rig: StereoRig, shutter: RollingShutter, motion: Motion) -> str:
+def obstacle(scene: MitsubaScene, rig: StereoRig, shutter: RollingShutter, motion: Motion, frames: int) -> str:
     """What stands in the way of a camera, in words; "" where the way is free.
 
     Followed in straight steps, from the middle of the rig at time 0 to each camera, and on its way until the last
-    row of frame 1 is read. A rig that starts inside a solid and stays there meets nothing.
+    row of the last of so many frames is read. A rig that starts inside a solid and stays there meets nothing.
     """
-    tau = np.linspace(0.0, 1.0 + shutter.readout_ratio, 1 + 2 * shutter.height)
+    tau = np.linspace(0.0, frames - 1 + shutter.readout_ratio, 1 + 2 * (frames - 1) * shutter.height)
     for side in SIDES:
         centres = inverse(rig.cam_from_world(motion, tau, side)).t
         step = first_crossing(scene, np.concatenate([np.zeros((1, 3)), centres]))

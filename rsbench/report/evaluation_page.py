@@ -18,7 +18,7 @@ from rsbench.benchmark.statistics import median_and_quartiles
 from rsbench.core.rig import View
 from rsbench.dataset.corrected_frames import read_origin
 from rsbench.dataset.files import load_arrays, load_matches, read_json, read_png, write_bytes
-from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.dataset.workplace import named
 from rsbench.errors import RsbenchError
 from rsbench.report import pictures
@@ -157,7 +157,7 @@ def write_report(dataset: Path, out: Path) -> Path:
     except (KeyError, TypeError, ValueError) as error:
         raise RsbenchError(f"{out / 'provenance.json'}: is not that of an evaluation; evaluate again") from error
     sections = []
-    for sequence in read_dataset(dataset):
+    for sequence in read_pairs(dataset):
         drawn = draw_sequence(sequence, out / "predictions" / sequence.name, chosen)
         folder = out / "pictures" / sequence.name
         folder.mkdir(parents=True, exist_ok=True)

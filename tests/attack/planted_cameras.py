@@ -189,7 +189,7 @@ def _times_as(change: Callable[[Sequence], Sequence], names: tuple[str, ...]) ->
         home = folder / VICTIM
         sequence = change(read_sequence(home))
         kept = {path: path.read_bytes() for path in [home / "timing.json", *(home / "timing").iterdir()]}
-        write_timing(home, sequence.shutter, sequence.frame_period_s, sequence.sensor)
+        write_timing(home, sequence.shutter, sequence.frame_period_s, sequence.sensor, sequence.frames)
         for path, content in kept.items():
             if path.relative_to(home).as_posix() not in names:
                 path.write_bytes(content)

@@ -226,7 +226,7 @@ def other_geometry(change: Callable[[Sequence], Sequence]) -> Plant:
             poses = row_poses(rig, shutter, motion, side, frame)
             write_poses(path.parent / f"poses/{side}_{frame}.csv", shutter.line_times(frame, side), poses)
         if "timing" in sequence.channels:
-            write_timing(path.parent, shutter, period, sequence.sensor)
+            write_timing(path.parent, shutter, period, sequence.sensor, sequence.frames)
         dataset = read_json(folder / "dataset.json")
         card = dataset["card"]
         card |= {"baseline": rig.baseline, "readout_ratio": shutter.readout_ratio, **asdict(shutter.scanning)}

@@ -18,8 +18,9 @@ from rsbench.core.se3 import inverse, transform
 from rsbench.core.shutter import Scanning
 from rsbench.dataset.affine import AffineFrames, jacobians_of
 from rsbench.dataset.shots import Geometry, GivenGeometry
-from rsbench.dataset.tracks import TRACK_VIEWS, Tracks
+from rsbench.dataset.tracks import Tracks, track_views
 
+TRACK_VIEWS = track_views(2)
 Array = NDArray[np.float64]
 CAMERA = PinholeCamera.centred(640, 480, 500.0)
 BARREL = Lens(model="brown-conrady", k1=-0.2, k2=0.05, p1=0.001)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from rsbench.core.projection import ProjectionStatus, back_project, rs_project_near
-from rsbench.core.rig import SIDES
+from rsbench.core.rig import FRAMES, SIDES
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.card import load_dataset_card
-from rsbench.dataset.sequence import FRAMES, read_dataset
+from rsbench.dataset.sequence import read_dataset
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Scene
 

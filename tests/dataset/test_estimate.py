@@ -11,7 +11,7 @@ import pytest
 
 from rsbench.dataset import estimate
 from rsbench.dataset.card import DatasetCard, SequenceCard, load_dataset_card
-from rsbench.dataset.sequence import files_of
+from rsbench.dataset.layout import files_of
 from rsbench.dataset.stage import Built
 from rsbench.renderers import scene as renderer
 

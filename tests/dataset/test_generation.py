@@ -22,7 +22,7 @@ from small_scenes import write_box_scene, write_small_card
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, load_dataset_card
 from rsbench.dataset.estimate import estimate_dataset
 from rsbench.dataset.files import read_png, sha256, write_png
-from rsbench.dataset.generation import STEPS, generate_dataset
+from rsbench.dataset.generation import generate_dataset, steps_of
 from rsbench.dataset.sequence import read_dataset
 from rsbench.dataset.verification import verify_dataset
 from rsbench.dataset.workplace import HIDDEN
@@ -149,7 +149,7 @@ def test_progress_counts_every_step_of_a_finished_dataset(small: Small, tmp_path
     for _ in ("rendered", "found"):
         steps: list[str] = []
         generate_dataset(card, out, progress=steps.append)
-        assert steps == ["a"] * STEPS + ["b"] * STEPS
+        assert steps == ["a"] * steps_of(card) + ["b"] * steps_of(card)
 
 
 def test_unwritable_folder_is_named(small: Small, tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ MOTION = SplineMotion([0.05, -0.1, 0.08], [0.2, -0.1, 0.3], preset="handheld", s
 IMU = Imu(time_offset_s=0.0031, clock_drift=1e-4)
 SCENE = {"eye": [0.0, -4.0, 1.2], "target": [0.2, 3.0, 0.1]}
 SENSOR = Sensor(exposure_s=0.004)
-TIMES = sample_times_ns(IMU, SHUTTER, 0.1, SENSOR)
+TIMES = sample_times_ns(IMU, SHUTTER, 0.1, SENSOR, 2)
 
 
 def drawn(seed: str, imu: Imu = IMU) -> ImuSamples:

@@ -19,12 +19,12 @@ from rsbench.cards import parse_card
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.lens import Lens
 from rsbench.core.projection import back_project, rs_project_near
-from rsbench.core.rig import SIDES, VIEWS
+from rsbench.core.rig import FRAMES, SIDES, VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.channels import Channel
 from rsbench.dataset.files import read_png
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.sequence import FRAMES, Sequence, read_sequence
+from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.verification import verify_dataset
 from rsbench.dataset.verification.poses import pose_faults
 from rsbench.errors import RsbenchError

@@ -42,7 +42,7 @@ def _points(geometry: GivenGeometry, source: Shot, rng: np.random.Generator) -> 
     rows = np.sort(rng.choice(48, 4, replace=False))
     grid = geometry.rig.camera.pixel_grid()[rows]
     depth = np.where(rng.random((4, 64)) < 0.2, 1e7, np.exp(rng.uniform(-0.5, 3.0, (4, 64))))
-    return back_project(*geometry, source.side, source.frame, grid, depth), grid
+    return back_project(*geometry[:3], source.side, source.frame, grid, depth), grid
 
 
 @settings(deadline=None, max_examples=15)
@@ -71,7 +71,7 @@ def test_it_finds_the_pixels_that_bracketing_finds(
     geometry = _geometry(lens, model(w, d), scan=scan, right_scan=right, right_delay=delay)
     X, grid = _points(geometry, Shot("rs", "left", 0), rng)
     landed = find(geometry, target, X, grid[..., geometry.shutter.axis(target.side)])
-    truth = rs_project(*geometry, target.side, target.frame, X)
+    truth = rs_project(*geometry[:3], target.side, target.frame, X)
     once, never = truth.status == ProjectionStatus.SEEN, truth.status == ProjectionStatus.NEVER
     assert not np.any(landed.unsolved)
     np.testing.assert_allclose(landed.pixels[once], truth.pixels[once], rtol=0, atol=NEAR_PX)

@@ -18,7 +18,7 @@ from rsbench.core.trajectory_motion import world_from_body
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.files import read_json, write_json
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.trajectory import TrajectoryCard, pairs_along, read_trajectory
+from rsbench.dataset.trajectory import TrajectoryCard, parts_along, read_trajectory
 from rsbench.dataset.verification import verify_dataset
 from rsbench.errors import RsbenchError
 from rsbench.scenes.model import Viewpoint
@@ -74,7 +74,7 @@ def test_every_pose_of_the_file_is_hit_at_its_own_time(tmp_path: Path, walk: Pat
 def test_pairs_follow_each_other_as_the_card_says(walk: Path) -> None:
     def starts(**keys: float) -> FloatArray:
         card = TrajectoryCard(file="walk.txt", absolute=True, **keys)  # type: ignore[arg-type]
-        return np.array([pair.start.position for pair in pairs_along(card, walk.parent, 0.1, (-0.1, 1.9))])
+        return np.array([pair.start.position for pair in parts_along(card, walk.parent, 0.1, (-0.1, 1.9), 2)])
 
     # A pair takes 0.2 s, and begins 0.01 s after the first pose, for it is exposed from then on.
     for found, times in (
@@ -91,7 +91,7 @@ def test_what_a_sequence_keeps_of_a_long_file_is_enough(tmp_path: Path) -> None:
     poses = Pose(so3.exp(np.cumsum(rng.normal(0, 0.05, (count, 3)), axis=0)), rng.normal(0, 1, (count, 3)))
     path = _write(tmp_path / "long.txt", poses)
     whole = read_trajectory(path, 1.0)
-    pair = pairs_along(TrajectoryCard(file="long.txt", start_s=5.0), tmp_path, 0.1, (0.0, 2.0))[0]
+    pair = parts_along(TrajectoryCard(file="long.txt", start_s=5.0), tmp_path, 0.1, (0.0, 2.0), 2)[0]
     assert len(pair.poses) < 64
     tau = np.linspace(0, 2, 50)
     all_rows = np.column_stack([(whole.seconds - 5.0) / 0.1, whole.poses])
@@ -101,7 +101,7 @@ def test_what_a_sequence_keeps_of_a_long_file_is_enough(tmp_path: Path) -> None:
 
 
 def test_an_absolute_pose_is_one_of_the_scene(walk: Path) -> None:
-    pair = pairs_along(TrajectoryCard(file="walk.txt", absolute=True), walk.parent, 0.1, (0.0, 2.0))[1]
+    pair = parts_along(TrajectoryCard(file="walk.txt", absolute=True), walk.parent, 0.1, (0.0, 2.0), 2)[1]
     R, t = pair.start.world_from_scene(Viewpoint(eye=(9, 9, 9), target=(0, 0, 0)))
     place = _walk(np.array(0.2))
     np.testing.assert_allclose(R @ (place.t + place.R @ [0.1, 0.2, 0.3]) + t, [0.1, 0.2, 0.3], atol=1e-9)
@@ -130,7 +130,7 @@ def test_a_wrong_file_is_one_line_with_its_number(tmp_path: Path, lines: list[st
     path = tmp_path / "walk.txt"
     path.write_text("\n".join(lines))
     with pytest.raises(RsbenchError, match=words) as caught:
-        pairs_along(TrajectoryCard(file="walk.txt"), tmp_path, 0.1, (0.0, 1.8))
+        parts_along(TrajectoryCard(file="walk.txt"), tmp_path, 0.1, (0.0, 1.8), 2)
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
 
 

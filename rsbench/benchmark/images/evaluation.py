@@ -18,7 +18,7 @@ from rsbench.benchmark.metric_plugins import DepthCase, ImageCase, PoseCase
 from rsbench.benchmark.provenance import dataset_record, provenance
 from rsbench.dataset.files import read_json, read_table, write_json, write_table
 from rsbench.dataset.hashes import HASHES, FileHashes
-from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.dataset.workplace import workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_parts import Isolation
@@ -114,7 +114,7 @@ def open_evaluation(dataset: Path, out: Path, options: EvaluationOptions) -> Eva
     Raises:
         RsbenchError: the dataset cannot be read, a component is wrong, or ``out`` cannot be written.
     """
-    sequences = read_dataset(dataset)
+    sequences = read_pairs(dataset)
     plan = make_plan(options, sequences)
     try:
         (out / "scores").mkdir(parents=True, exist_ok=True)

@@ -100,7 +100,7 @@ def make_plan(options: EvaluationOptions, sequences: list[Sequence]) -> Plan:
         if name in (TRUE, NONE):
             raise RsbenchError(f"{name!r} is the name of no entry: tables use it for oracles; rename it")
     _check_metres(chain, solvers)
-    chosen = _chosen(options.only, [s.name for s in sequences], [s.name for s in solvers])
+    chosen = _chosen(options.only, {s.name: s.whole for s in sequences}, [s.name for s in solvers])
     return Plan(
         solvers=solvers,
         chain=chain,
@@ -133,16 +133,15 @@ def _check_metres(chain: CorrectionOptions, solvers: tuple[SolverEntry, ...]) ->
 
 
 def _chosen(
-    only: tuple[str, ...], sequences: list[str], solvers: list[str]
+    only: tuple[str, ...], sequences: Mapping[str, str], solvers: list[str]
 ) -> tuple[frozenset[str], frozenset[str]]:
-    """Names of the sequences and of the solvers to work on."""
+    """Names of the sequences and of the solvers to work on; a sequence of many frames stands for its pairs."""
+    known = [*dict.fromkeys([*sequences.values(), *sequences]), *solvers]
     for name in only:
-        if name not in (*sequences, *solvers):
-            raise RsbenchError(
-                f"--only {name}: is neither a sequence nor a solver{choices(name, [*sequences, *solvers])}"
-            )
+        if name not in known:
+            raise RsbenchError(f"--only {name}: is neither a sequence nor a solver{choices(name, known)}")
     return (
-        frozenset(name for name in sequences if name in only) or frozenset(sequences),
+        frozenset(name for name, whole in sequences.items() if {name, whole} & {*only}) or frozenset(sequences),
         frozenset(name for name in solvers if name in only) or frozenset(solvers),
     )
 
@@ -206,10 +205,7 @@ class Places:
 
     def _hash_of(self, *channels: str) -> str:
         folder = self.sequence.folder
-        paths = [
-            folder / "sequence.json",
-            *sorted(path for name in channels for path in (folder / name).iterdir()),
-        ]
+        paths = [folder / "sequence.json", *self.sequence.frame_files(channels)]
         return hashlib.sha256("".join(map(self._file_hash, paths)).encode()).hexdigest()
 
     def matches(self) -> Artefact:

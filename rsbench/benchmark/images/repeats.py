@@ -10,7 +10,7 @@ from pathlib import Path
 from rsbench.benchmark.images.plan import EvaluationOptions, Plan, make_plan
 from rsbench.benchmark.images.predict import Bench, Step
 from rsbench.dataset.hashes import HASHES, FileHashes
-from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_jobs import finished_jobs
 from rsbench.pipeline.isolated_solver import SolverRunner
@@ -74,7 +74,7 @@ def _serve(dataset: Path, out: Path, options: EvaluationOptions) -> Callable[[Jo
     """What repeats, in a child."""
     use_one_thread()
     try:
-        sequences = read_dataset(dataset)
+        sequences = read_pairs(dataset)
         plan = make_plan(options, sequences)
     except RsbenchError as error:
         raise EntryFailure(str(error)) from error

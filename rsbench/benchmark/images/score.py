@@ -105,7 +105,7 @@ class Scorer:
                     "solver": record["solver"],
                     "seed": record["seed"],
                     "shutter": record["shutter"],
-                    "data_model": self.sequence.motion.name,
+                    "data_model": self.sequence.data_model,
                     "assumed_model": record["motion_model"],
                     "uses": "+".join(record["uses"]),
                     "success": case is not None,

@@ -8,7 +8,8 @@ from pathlib import Path
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.files import write_bytes
-from rsbench.dataset.sequence import Sequence, picture_file, read_dataset
+from rsbench.dataset.layout import picture_file
+from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_matches_of_rig
@@ -23,13 +24,13 @@ FEATURES = "sift"
 def matched_problems(data: Path) -> Iterator[Problem]:
     """Each sequence with its given matches; none where the frames show no texture."""
     options = CorrectionOptions(features=load_features(FEATURES))
-    for sequence in read_dataset(data):
+    for sequence in read_pairs(data):
         yield _problem(sequence, _matches(sequence, options))
 
 
 def bare_problems(data: Path) -> Iterator[Problem]:
     """Each sequence without matches: its rig and its shutter."""
-    for sequence in read_dataset(data):
+    for sequence in read_pairs(data):
         yield _problem(sequence, Correspondences())
 
 
@@ -39,12 +40,12 @@ def write_frames(data: Path, out: Path) -> None:
     Raises:
         RsbenchError: a frame is missing or is no image of the camera's size, or cannot be written.
     """
-    for sequence in read_dataset(data):
+    for sequence in read_pairs(data):
         folder = out / "frames" / sequence.name
         folder.mkdir(parents=True, exist_ok=True)
         for side, frame in VIEWS:
             sequence.image("rs", side, frame)  # that it can be read
-            path = inside(sequence.folder, picture_file("rs", side, frame))
+            path = inside(sequence.folder, picture_file("rs", side, frame + sequence.first))
             write_bytes(folder / f"{side}_{frame}.png", read_bytes(path))
 
 

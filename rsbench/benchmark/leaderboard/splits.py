@@ -23,7 +23,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.dataset.sequence import Sequence, read_dataset, read_dataset_manifest
+from rsbench.dataset.sequence import Sequence, read_dataset_manifest, read_pairs
 from rsbench.errors import RsbenchError
 from rsbench.motions import motion_record
 from rsbench.pipeline.problem import Problem, problem_record
@@ -229,7 +229,7 @@ def dataset_split(protocol: Protocol, folder: Path, *, public: bool = True) -> S
         check_name(name)
     except ValueError as error:
         raise RsbenchError(f"{folder / 'dataset.json'}: {error}") from error
-    truths = tuple(_rendered(sequence) for sequence in read_dataset(folder))
+    truths = tuple(_rendered(sequence) for sequence in read_pairs(folder))
     return Split(protocol=protocol, label=name, public=public, truths=truths)
 
 

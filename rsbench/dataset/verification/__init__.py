@@ -3,32 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rsbench import arguments
 from rsbench.cards import card_path
+from rsbench.core.rig import FRAMES
 from rsbench.dataset.files import read_json
 from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.verification import structure
-from rsbench.dataset.verification.affine_checks import affine_faults
-from rsbench.dataset.verification.channel_checks import channel_faults
-from rsbench.dataset.verification.content import Comparison, Content, images_elsewhere, read_content, twin_faults
-from rsbench.dataset.verification.findings import DepthAgreement, Progress, SequenceReport, finding
-from rsbench.dataset.verification.hdr_checks import hdr_faults
+from rsbench.dataset.verification.content import images_elsewhere
+from rsbench.dataset.verification.findings import DepthAgreement, Progress, SequenceReport
 from rsbench.dataset.verification.imu_checks import imu_faults
-from rsbench.dataset.verification.landing import PAIRS
-from rsbench.dataset.verification.match_checks import match_faults, matched_again
 from rsbench.dataset.verification.poses import pose_faults
 from rsbench.dataset.verification.rerender import Again, Rerender
-from rsbench.dataset.verification.sensors import sensor_faults
-from rsbench.dataset.verification.stacks import stack_faults
-from rsbench.dataset.verification.surface_checks import surface_faults
 from rsbench.dataset.verification.timing_checks import timing_faults
-from rsbench.dataset.verification.track_checks import track_faults
-from rsbench.dataset.verification.twin_checks import other_twin_faults, read_twins, with_twins
+from rsbench.dataset.verification.walk import STEPS, Walk, file_of
 from rsbench.errors import RsbenchError
 
 __all__ = [
@@ -40,7 +32,6 @@ __all__ = [
     "verify_sequence",
 ]
 
-_STEPS = 1 + len(PAIRS)
 _MOST_ELSEWHERE = 8
 """Other sequences among whose images an exchanged one is looked for."""
 
@@ -82,7 +73,14 @@ def verify_dataset(
 
 def verification_steps(manifest: Mapping[str, Any]) -> int:
     """How often ``verify_dataset`` reports progress on the dataset of this dataset.json."""
-    return _STEPS * len(structure.Listing.of(Path(), manifest).names)
+    listing = structure.Listing.of(Path(), manifest)
+    return _steps(listing) * len(listing.names)
+
+
+def _steps(listing: structure.Listing) -> int:
+    """Of each sequence."""
+    frames = len(FRAMES) if isinstance(listing.card, str) else listing.card.frames
+    return 1 + STEPS * (frames - 1)
 
 
 def verify_sequence(
@@ -94,76 +92,33 @@ def verify_sequence(
 ) -> SequenceReport:
     """Check one sequence of a dataset; the rest as of ``verify_dataset``."""
     faults = list(structure.file_faults(listing, name))
-    agreements: list[DepthAgreement] = []
-    notes: list[str] = []
-    steps = _STEPS
+    walk: Walk | None = None
+    steps = _steps(listing)
+
+    def counted(sequence: str) -> None:
+        nonlocal steps
+        steps -= 1
+        if steps >= 0:  # its frames may be more than the card says
+            step(sequence)
+
     try:
         missing = {fault.removesuffix(": missing").removeprefix(f"{name}/") for fault in faults}
         sequence = read_sequence(listing.folder / name)
         faults += structure.sequence_faults(sequence, name, listing)
         faults += pose_faults(sequence)
-        content = read_content(sequence, missing)
-        faults += [*content.faults, *twin_faults(content)]
-        faults += stack_faults(content, missing, stride)
-        faults += sensor_faults(sequence, content.maps, content.pictures, missing)
-        comparison = Comparison(content, stride)
-        for agreement in comparison.pairs():
-            agreements += [agreement] if agreement else []
-            step(name)
-            steps -= 1
-        acquits = (lambda shot: False) if again is None else partial(again.is_right, content)
-        faults += comparison.faults(images_elsewhere(partial(_others, listing, name)), acquits)
-        notes += comparison.notes
-        twins = read_twins(sequence, missing)
-        faults += [*twins.faults, *other_twin_faults(content, twins, stride)]
-        every = with_twins(content, twins)
-        accused, cleared = _of_channels(every, stride, {*missing, *map(_file_of, faults)}, again)
-        faults += accused
-        notes += cleared
-        if again is not None:
-            other, note = again.check(every, {*missing, *map(_file_of, faults)})
-            faults += other
-            notes.append(note)
+        faults += timing_faults(sequence, {*missing, *map(file_of, faults)})
+        faults += imu_faults(sequence, {*missing, *map(file_of, faults)})
+        elsewhere = images_elsewhere(sequence, partial(_others, listing, name))
+        walk = Walk(sequence, missing, elsewhere, stride, again, faults)
+        walk.go(counted)
     except RsbenchError as error:
         faults.append(str(error))
     for _ in range(steps):
         step(name)
+    agreements, notes = ((), ()) if walk is None else (walk.agreements.values(), walk.notes)
     return SequenceReport(
         name=name, faults=tuple(dict.fromkeys(faults)), agreements=tuple(agreements), notes=tuple(notes)
     )
-
-
-def _of_channels(
-    content: Content, stride: int, told: set[str], again: Again | None
-) -> tuple[list[str], list[str]]:
-    """Faults of channels, but for files that are told already; and notes: of the accused that are right, and more.
-
-    Rays say nothing of what the pictures do not show, and so clear nobody of it.
-    """
-    faults: list[str] = []
-    for found in _channel_checks(content, stride):
-        faults += found({*told, *map(_file_of, faults)})
-    unfound, notes = matched_again(content.sequence, {*told, *map(_file_of, faults)})
-    cleared = again.cleared(content, set(map(_file_of, faults))) if again is not None and faults else set()
-    notes += [finding(file, "others contradict it, and it is what is made again, all of it") for file in cleared]
-    return [*(fault for fault in faults if _file_of(fault) not in cleared), *unfound], sorted(notes)
-
-
-def _channel_checks(content: Content, stride: int) -> Iterator[Callable[[Collection[str]], Iterator[str]]]:
-    """Each gives the faults of some channels, but for files that are told already."""
-    sequence, maps = content.sequence, content.maps
-    yield partial(timing_faults, sequence)
-    yield partial(imu_faults, sequence)
-    yield partial(channel_faults, sequence, maps, stride=stride)
-    yield partial(track_faults, sequence, maps)
-    yield partial(affine_faults, sequence, maps)
-    yield partial(surface_faults, sequence, maps)
-    yield partial(hdr_faults, sequence, content.pictures)
-    yield partial(match_faults, sequence, maps)
-
-
-def _file_of(fault: str) -> str:
-    return fault.partition(": ")[0]
 
 
 def _others(listing: structure.Listing, name: str) -> Iterator[Sequence]:

@@ -8,12 +8,13 @@ import numpy as np
 
 from rsbench.core.lens import inverse_2x2
 from rsbench.core.projection import back_project
+from rsbench.core.rig import FRAMES
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.affine import AffineFrames, Meets, jacobians_of, make_affine
 from rsbench.dataset.channels import AFFINE, TRACKS
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.shots import Shot
-from rsbench.dataset.tracks import TRACK_VIEWS, Tracks
+from rsbench.dataset.tracks import Tracks, track_views
 from rsbench.dataset.verification.findings import finding
 from rsbench.dataset.verification.landing import DepthMap
 from rsbench.dataset.verification.surface_checks import FEW_BENT, LEVEL
@@ -26,8 +27,13 @@ _SAME = 1e-6
 _FEW_AGAIN, _FEW_LOST, _LEAST = 5e-3, 0.02, 4
 
 
-def affine_faults(sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str]) -> Iterator[str]:
-    """What affine frames show that tracks, depth maps and motion cannot have made, but for files ``told``."""
+def affine_faults(
+    sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str], times: tuple[int, ...] = FRAMES
+) -> Iterator[str]:
+    """What affine frames show that tracks, depth maps and motion cannot have made, but for files ``told``.
+
+    Derivatives are looked at once, with frame 0 among these ``times``; normals with the maps that there are.
+    """
     if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(told):
         return
     try:
@@ -38,13 +44,14 @@ def affine_faults(sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Colle
     if affine.jacobians.shape[:2] != tracks.tau.shape:
         yield finding(AFFINE, f"is of {affine.jacobians.shape[:2]} points and views, tracks of {tracks.tau.shape}")
         return
-    yield from _jacobian_faults(sequence, affine, tracks)
+    if 0 in times:
+        yield from _jacobian_faults(sequence, affine, tracks)
     lost = np.all(affine.normals == 0.0, axis=1)
     off = ~lost & (np.abs(np.linalg.norm(affine.normals, axis=1) - 1.0) > _UNIT)
     if np.any(off) or np.sum(lost) > max(_FEW_LOST * len(lost), _LEAST):
         yield finding(AFFINE, f"{np.sum(off)} normals are not of length 1, and {np.sum(lost)} are 0")
         return
-    for k, view in enumerate(TRACK_VIEWS):
+    for k, view in enumerate(track_views(sequence.frames)):
         shot, own = Shot("rs", *view), (tracks.sources == k) & ~lost
         if shot in maps and shot.depth not in told:
             yield from _normal_faults(sequence, maps[shot], affine.normals[own], tracks.pixels[own, k])
@@ -52,7 +59,7 @@ def affine_faults(sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Colle
 
 def _jacobian_faults(sequence: Sequence, affine: AffineFrames, tracks: Tracks) -> Iterator[str]:
     made = jacobians_of(sequence, tracks, affine.normals)
-    for k, (side, frame) in enumerate(TRACK_VIEWS):
+    for k, (side, frame) in enumerate(track_views(sequence.frames)):
         own, stored = made[:, k], affine.jacobians[:, k]
         file = f"{AFFINE}: {side}_{frame}"
         empty = np.any(np.isnan(stored), axis=(1, 2)) != np.any(np.isnan(own), axis=(1, 2))

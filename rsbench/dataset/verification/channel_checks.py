@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.rig import VIEWS
+from rsbench.core.rig import FRAMES
 from rsbench.dataset.channel_truth import Rays, SeenSurfaces, pair_truth, target_of
 from rsbench.dataset.channel_writer import pair_values
 from rsbench.dataset.channels import STEP_PX, Layer, PixelClass, pair_layers
@@ -59,27 +59,40 @@ class _Derived(NamedTuple):
 
 
 def channel_faults(
-    sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str], stride: int = 1
+    sequence: Sequence,
+    maps: Mapping[Shot, DepthMap],
+    told: Collection[str],
+    stride: int = 1,
+    times: tuple[int, ...] = FRAMES,
+    new: tuple[int, ...] = FRAMES,
 ) -> Iterator[str]:
     """What the channels of a sequence show that its depth maps and motion cannot have made.
 
-    Files that are ``told`` already, missing or wrong, are not looked at; a wrong depth map would accuse others.
+    Files that are ``told`` already, missing or wrong, are not looked at; a wrong depth map would accuse others. Of
+    channels between two frames of these ``times``, or within one, at least one of which is ``new``.
     """
-    for layer in pair_layers(sequence.channels, sequence.twins):
-        channel, row = layer
+    for layer in pair_layers(sequence.channels, sequence.twins, sequence.frames):
         stored: dict[Shot, _Stored] = {}
-        for side, frame in VIEWS:
-            files = layer.values(side, frame), layer.mask(side, frame)
+        for side, frame in layer.views(sequence.frames):
+            files, shot = (layer.values(side, frame), layer.mask(side, frame)), Shot("rs", side, frame)
+            both = {frame, target_of(layer, shot, sequence.frames).frame}
             try:
-                if not set(files) & set(told):
-                    pair = sequence.offsets(channel, side, frame, row), sequence.classes(channel, side, frame, row)
-                    stored[Shot("rs", side, frame)] = _Stored(*pair)
+                if both <= {*times} and both & {*new} and not set(files) & set(told):
+                    stored[shot] = _stored(sequence, layer, shot)
             except RsbenchError as error:
                 yield str(error)
         for shot in stored:
-            used = {each for each in (shot, target_of(layer, shot)) if each in maps and each.depth not in told}
+            there = target_of(layer, shot, sequence.frames)
+            used = {each for each in (shot, there) if each in maps and each.depth not in told}
             if len(used) == 2:
                 yield from _pair_faults(sequence, maps, layer, shot, stored, stride)
+
+
+def _stored(sequence: Sequence, layer: Layer, shot: Shot) -> _Stored:
+    """Raises RsbenchError where a file cannot be read."""
+    channel, row, back = layer
+    where = channel, shot.side, shot.frame, row, back
+    return _Stored(sequence.offsets(*where), sequence.classes(*where))
 
 
 def channels_again(
@@ -95,18 +108,17 @@ def channels_again(
         rays: through the scene.
         told: files that are not looked at.
     """
-    for layer in pair_layers(sequence.channels, sequence.twins) if shot.shutter == "rs" else ():
-        channel, row = layer
+    frames = sequence.frames
+    for layer in pair_layers(sequence.channels, sequence.twins, frames) if shot.shutter == "rs" else ():
         files = layer.values(shot.side, shot.frame), layer.mask(shot.side, shot.frame)
-        if set(files) & set(told):
+        if set(files) & set(told) or shot[1:3] not in layer.views(frames):
             continue
         try:
-            values = sequence.offsets(channel, shot.side, shot.frame, row)[rows]
-            classes = sequence.classes(channel, shot.side, shot.frame, row)[rows]
+            values, classes = (each[rows] for each in _stored(sequence, layer, shot))
         except RsbenchError:  # told already
             continue
-        truth = pair_truth(SeenSurfaces(sequence, shot, depth, rows), target_of(layer, shot), rays.blocked)
-        made = pair_values(channel, shot, truth.offset)
+        truth = pair_truth(SeenSurfaces(sequence, shot, depth, rows), target_of(layer, shot, frames), rays.blocked)
+        made = pair_values(layer.channel, shot, truth.offset)
         far = np.any(~((np.abs(values - made) <= _SAME_PX) | (np.isnan(values) & np.isnan(made))), axis=-1)
         unlike = classes != truth.classes
         everywhere = np.ones(far.shape, dtype=np.bool_)
@@ -143,12 +155,14 @@ def _pair_faults(
     if np.any(empty == known):
         what = f"{np.sum(empty & known)} pixels without a value and {np.sum(~empty & ~known)} with one too many"
         yield finding(file, f"{what}, by {layer.mask(shot.side, shot.frame)}")
-    yield from _mask_faults(layer, shot, classes, maps[shot].depth[::stride, ::stride] == 0, derived, stride)
+    there, sky = target_of(layer, shot, sequence.frames), maps[shot].depth[::stride, ::stride] == 0
+    yield from _mask_faults(layer, shot, there, classes, sky, derived, stride)
 
 
 def _mask_faults(
     layer: Layer,
     shot: Shot,
+    there: Shot,
     classes: NDArray[np.uint8],
     sky: BoolArray,
     derived: _Derived,
@@ -159,14 +173,13 @@ def _mask_faults(
     everywhere = np.ones(classes.shape, dtype=np.bool_)
     unsolved, empty = classes == PixelClass.UNSOLVED, np.isin(classes, _NO_VALUE)
     hidden, of_sky = np.isin(classes, _HIDDEN), np.isin(classes, _OF_SKY)
-    seen_there = target_of(layer, shot).depth
     surface, behind = ~empty & (derived.hidden == 0), derived.hidden == 1
     for words, wrong, among, many in (
         ("not solved", unsolved, everywhere, _many),
         ("wrongly in or out of view", ~unsolved & (empty != lost), everywhere, _many),
         (f"wrongly sky or surface by {shot.depth}", ~empty & (of_sky != sky), everywhere, _many),
-        (f"hidden, but visible by {seen_there}", hidden, surface, _many_thin),
-        (f"visible, but hidden by {seen_there}", ~empty & ~hidden, behind, partial(_many_gaps, ~empty)),
+        (f"hidden, but visible by {there.depth}", hidden, surface, _many_thin),
+        (f"visible, but hidden by {there.depth}", ~empty & ~hidden, behind, partial(_many_gaps, ~empty)),
     ):
         if many(wrong & among, among):
             rows = _rows(wrong & among, stride, height)
@@ -177,7 +190,7 @@ def _derived(sequence: Sequence, maps: Mapping[Shot, DepthMap], layer: Layer, sh
     """Sky is a surface at ``FAR``; what has none in the target is before it nowhere."""
     depth = maps[shot].depth
     filled = replace(maps[shot], depth=np.where(depth > 0, depth, np.float32(FAR)))
-    landing = land(sequence, filled, maps[target_of(layer, shot)], stride)
+    landing = land(sequence, filled, maps[target_of(layer, shot, sequence.frames)], stride)
     grid = sequence.rig.camera.pixel_grid()[::stride, ::stride]
     values = pair_values(layer.channel, shot, landing.pixels - grid)
     sky, relative = depth[::stride, ::stride] == 0, landing.relative

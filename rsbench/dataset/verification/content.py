@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core.rig import FRAMES
 from rsbench.dataset.files import read_png
+from rsbench.dataset.layout import clean_file
 from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.shots import SHOTS, near_shots, pairs_of, shots_of
 from rsbench.dataset.verification import depth, image_checks
 from rsbench.dataset.verification.depth_causes import likely_cause
 from rsbench.dataset.verification.findings import DepthAgreement, finding, rows_of
-from rsbench.dataset.verification.image_causes import Elsewhere, likeness_faults
-from rsbench.dataset.verification.landing import PAIRS, SHOTS, DepthMap, Shot, land
+from rsbench.dataset.verification.image_causes import Elsewhere as Elsewhere
+from rsbench.dataset.verification.image_causes import likeness_faults
+from rsbench.dataset.verification.landing import DepthMap, Shot, land
 from rsbench.dataset.verification.png import png_fault
 from rsbench.dataset.verification.rough import roughly_alike
 from rsbench.errors import RsbenchError
@@ -29,12 +34,25 @@ class Content:
     maps: dict[Shot, DepthMap] = field(default_factory=dict)
     pictures: dict[Shot, image_checks.Picture] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
+    times: tuple[int, ...] = ()
+    """Numbers of the frames that were read."""
+
+    def followed_by(self, other: Content, told: Collection[str]) -> Content:
+        """What was read last and the next, but for files that are ``told``: they accuse the next ones no more."""
+        last = self.times[-1:]
+        maps = {shot: each for shot, each in self.maps.items() if shot.frame in last and shot.depth not in told}
+        pictures = {
+            shot: each
+            for shot, each in self.pictures.items()
+            if shot.frame in last and not {shot.image, clean_picture(self.sequence, shot)} & {*told}
+        }
+        return Content(self.sequence, maps | other.maps, pictures | other.pictures, times=last + other.times)
 
 
-def read_content(sequence: Sequence, missing: Collection[str] = ()) -> Content:
-    """Read all eight shots but ``missing`` files, one fault for each that cannot be."""
-    content = Content(sequence)
-    for shot in SHOTS:
+def read_content(sequence: Sequence, missing: Collection[str] = (), times: tuple[int, ...] = FRAMES) -> Content:
+    """Read all shots of some frames but ``missing`` files, one fault for each that cannot be."""
+    content = Content(sequence, times=times)
+    for shot in shots_of(times):
         read_shot(content, shot, missing)
     return content
 
@@ -50,7 +68,7 @@ def read_shot(content: Content, shot: Shot, missing: Collection[str]) -> None:
             content.maps[shot] = DepthMap(shot, sequence.depth(*shot), sequence.rig.camera)
     except RsbenchError as error:
         content.faults.append(str(error))
-    file = clean_file(sequence, shot)
+    file = clean_picture(sequence, shot)
     if file in missing:
         return
     try:
@@ -63,10 +81,10 @@ def read_shot(content: Content, shot: Shot, missing: Collection[str]) -> None:
         content.faults.append(str(error))
 
 
-def clean_file(sequence: Sequence, shot: Shot) -> str:
+def clean_picture(sequence: Sequence, shot: Shot) -> str:
     """The image of a shot that shows light alone: where a sensor blurs and errs, its clean twin."""
     blurred = sequence.sensor is not None and shot.shutter == "rs"
-    return f"rs_clean/{shot.side}_{shot.frame}.png" if blurred else shot.image
+    return clean_file(shot.side, shot.frame) if blurred else shot.image
 
 
 def twin_faults(content: Content) -> Iterator[str]:
@@ -74,7 +92,7 @@ def twin_faults(content: Content) -> Iterator[str]:
 
     Where columns are read, it is the first column.
     """
-    for shot in SHOTS:
+    for shot in shots_of(content.times):
         twin, maps, pictures = shot._replace(shutter="gs"), content.maps, content.pictures
         axis, number = _first_line(content, shot)
         line = f"{'row' if axis == 0 else 'column'} {number}"
@@ -86,7 +104,7 @@ def twin_faults(content: Content) -> Iterator[str]:
             unlike = apart > _rounding(axis, 1.0)
             if np.sum(unlike) > spare_pixels(axis, unlike.size):
                 what = f"{np.sum(unlike)} pixels differ from the global-shutter twin at the same pose"
-                yield finding(clean_file(content.sequence, shot), f"{line} differs from {twin.image}: {what}")
+                yield finding(clean_picture(content.sequence, shot), f"{line} differs from {twin.image}: {what}")
         if {shot, twin} <= maps.keys():
             own, other = (np.take(maps[each].depth, [number], axis) for each in (shot, twin))
             if np.sum(np.abs(own - other) > _rounding(axis, 1e-6) * other) > spare_pixels(axis, own.size):
@@ -145,7 +163,7 @@ class Comparison:
     def pairs(self) -> Iterator[DepthAgreement | None]:
         """Compare one pair after the other; None where a file of it could not be read."""
         maps, pictures = self.content.maps, self.content.pictures
-        for source, target in PAIRS:
+        for source, target in pairs_of((self.content.times[0], self.content.times[-1])):
             if not {source, target} <= maps.keys():
                 yield None
                 continue
@@ -160,12 +178,12 @@ class Comparison:
                 )
             yield agreement
 
+    def geometry(self) -> depth.GeometryFault | None:
+        """What the pairs show of sequence.json; where that is wrong they show nothing else."""
+        return depth.geometry_fault(self.agreements)
+
     def faults(self, elsewhere: Elsewhere, is_right: Callable[[Shot], bool] = lambda shot: False) -> Iterator[str]:
         """What the pairs show, each with its likely cause; ``is_right`` acquits a depth map that they accuse."""
-        geometry = depth.geometry_fault(self.agreements)
-        if geometry:
-            yield geometry
-            return
         wrong = self._wrong_maps(is_right)
         for shot, fault in wrong.items():
             cause = likely_cause(self.content.sequence, self.content.maps, shot, fault.rows)
@@ -210,10 +228,14 @@ class Comparison:
                 yield finding(shot.image, what, rows_of(rows))
 
 
-def images_elsewhere(others: Callable[[], Iterable[Sequence]]) -> Elsewhere:
-    """Images of other sequences, those of the same name first."""
+def images_elsewhere(sequence: Sequence, others: Callable[[], Iterable[Sequence]]) -> Elsewhere:
+    """Images of frames of a sequence near one, then of other sequences, those of the same name first."""
 
     def candidates(shot: Shot) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+        if sequence.frames > len(FRAMES):
+            for each in near_shots(shot, sequence.frames):
+                with contextlib.suppress(RsbenchError):
+                    yield each.image, read_png(sequence.folder / each.image)
         for other in others():
             for each in sorted(SHOTS, key=lambda one: one != shot):
                 try:

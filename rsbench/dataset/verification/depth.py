@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -238,7 +239,18 @@ def _clusters(bad: BoolArray, good: BoolArray) -> BoolArray:
     return np.asarray((cv2.dilate(spoilt, np.ones((_TILE + 1, _TILE + 1), np.uint8)) > 0) & bad)
 
 
-def geometry_fault(pairs: Sequence[tuple[Shot, Shot, DepthAgreement]]) -> str | None:
+class GeometryFault(NamedTuple):
+    """What the maps of two frames say against the geometry of sequence.json."""
+
+    what: str
+    cause: str
+    share: float
+    """Of the pixels of the worst pair that agree."""
+    over_time: bool
+    """Whether it is only the two times that disagree."""
+
+
+def geometry_fault(pairs: Sequence[tuple[Shot, Shot, DepthAgreement]]) -> GeometryFault | None:
     """What the maps say against the geometry that sequence.json states, where none of them is wrong by itself."""
     wrong = [(source, target) for source, target, each in pairs if not _agree(each, _STRICT_SHARE)]
     across = sum(source.side != target.side for source, target in wrong)
@@ -253,7 +265,7 @@ def geometry_fault(pairs: Sequence[tuple[Shot, Shot, DepthAgreement]]) -> str | 
         f"{len(wrong)} of {len(pairs)} pairs of depth maps disagree, {worst.source} and {worst.target} on "
         f"{100 * (1 - worst.share):.3g} % of {worst.compared} pixels"
     )
-    return finding("sequence.json", what, cause=cause)
+    return GeometryFault(what, cause, worst.share, not across)
 
 
 def _agree(agreement: DepthAgreement, spare: float = _SPARE_SHARE) -> bool:

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.verification.landing import DEPTH_TOLERANCE, SHOTS, BoolArray, DepthMap, Shot, land
+from rsbench.dataset.shots import near_shots
+from rsbench.dataset.verification.landing import DEPTH_TOLERANCE, BoolArray, DepthMap, Shot, land
 
 _TRIED_PIXELS = 20_000
 _PLAIN = 0.8
@@ -46,9 +47,8 @@ def _candidates(sequence: Sequence, maps: Mapping[Shot, DepthMap], shot: Shot) -
     """Depth maps that the stored one may have been, or the shots whose depth it may be."""
     stored = maps[shot]
     depth = stored.depth
-    for other in SHOTS:
-        if other != shot:
-            yield f"looks like {other.depth}", replace(stored, shot=other)
+    for other in near_shots(shot, sequence.frames):
+        yield f"looks like {other.depth}", replace(stored, shot=other)
     lines = sequence.shutter.lines(shot.side)
     for line in {1, 2, lines // 4, lines // 2, 3 * lines // 4, lines - 1} if shot.shutter == "gs" else set():
         words = f"looks like the global shutter at the pose of line {line}"

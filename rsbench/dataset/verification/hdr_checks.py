@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rsbench.dataset.channels import radiance_file
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.shots import Shot
-from rsbench.dataset.verification.content import clean_file
+from rsbench.dataset.verification.content import clean_picture
 from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.dataset.verification.image_checks import Picture
 from rsbench.errors import RsbenchError
@@ -28,7 +28,7 @@ def hdr_faults(sequence: Sequence, pictures: Mapping[Shot, Picture], told: Colle
     if "hdr" not in sequence.channels or not isinstance(exposure, float):
         return
     for shot, picture in pictures.items():
-        file, image = radiance_file(shot.side, shot.frame), clean_file(sequence, shot)
+        file, image = radiance_file(shot.side, shot.frame), clean_picture(sequence, shot)
         if shot.shutter != "rs" or {file, image} & set(told):
             continue
         try:

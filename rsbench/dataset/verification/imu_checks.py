@@ -63,7 +63,7 @@ def _manifest_faults(sequence: Sequence, imu: Imu, gravity: FloatArray) -> Itera
 
 
 def _sample_faults(sequence: Sequence, imu: Imu, gravity: FloatArray, samples: ImuSamples) -> Iterator[str]:
-    times = sample_times_ns(imu, sequence.shutter, sequence.frame_period_s, sequence.sensor)
+    times = sample_times_ns(imu, sequence.shutter, sequence.frame_period_s, sequence.sensor, sequence.frames)
     if len(times) != len(samples.times_ns) or np.any(np.abs(times - samples.times_ns) > _NEAR_NS):
         covers = f"{len(times)} samples of {imu.rate_hz:g} Hz from {times[0]} to {times[-1]} ns"
         yield finding(TRUE, f"time_ns is not that of {covers}")

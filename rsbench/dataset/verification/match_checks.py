@@ -19,6 +19,7 @@ from rsbench.dataset.match_truth import (
     Arranged,
     Meets,
     arranged,
+    at,
     classes_of,
     labelled,
     looks,
@@ -46,25 +47,30 @@ _FEW_OTHERS, _LEAST = 0.02, 4
 """Of what is compared on flat surfaces, with what is matched again on another processor, and with other rays."""
 _AGREES_PX = 1e-3
 """Of places made again by rays: depth is rounded to float32."""
-_FILE = matches_file(0)
 _OURS = f"{SiftMatcher.__module__}:{SiftMatcher.__qualname__}"
 
 
-def match_faults(sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str]) -> Iterator[str]:
-    """What the labels show that depth maps and motion cannot have made, but for files ``told``."""
+def match_faults(
+    sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str], first: int = 0
+) -> Iterator[str]:
+    """What the labels of frame ``first`` and the next show that depth maps and motion cannot have made.
+
+    But for files ``told``.
+    """
     if "matches" not in sequence.channels:
         return
     matching = sequence.matching or Matching()
     yield from _record_faults(sequence, matching, told)
-    if _FILE in told:
+    if (stored := matches_file(first)) in told:
         return
     try:
-        matches = sequence.matches()
+        matches = sequence.matches(first)
     except RsbenchError as error:
         yield str(error)
         return
-    for k, (name, (source, target)) in enumerate(MATCHED.items()):
-        part, file = matches.of_pair(k), f"{_FILE}: {name}"
+    for k, (name, views) in enumerate(MATCHED.items()):
+        source, target = (at(view, first) for view in views)
+        part, file = matches.of_pair(k), f"{stored}: {name}"
         outside = ~sequence.rig.camera.contains(part.pixels).all(axis=1)
         if np.any(outside):
             yield finding(file, f"{np.sum(outside)} matches have a keypoint beside the images")
@@ -184,49 +190,51 @@ def _points(sequence: Sequence, part: PairLabels, source: View) -> FloatArray:
     return eyes + np.where(part.depth > 0.0, part.depth, FAR)[:, None] * (ahead - eyes)
 
 
-def matched_again(sequence: Sequence, told: Collection[str]) -> tuple[list[str], list[str]]:
+def matched_again(sequence: Sequence, told: Collection[str], first: int = 0) -> tuple[list[str], list[str]]:
     """Faults of matches that the stated matcher does not find in the pictures, and notes where it was not asked.
 
     Only rsbench's own matcher is asked, in the versions that made them: what a dataset names is never imported.
     """
-    pictures = {Shot("rs", *view).image for view in VIEWS}
-    if "matches" not in sequence.channels or {*pictures, _FILE, MATCHER} & set(told):
+    shots, file = [Shot("rs", *at(view, first)) for view in VIEWS], matches_file(first)
+    if "matches" not in sequence.channels or {*(each.image for each in shots), file, MATCHER} & set(told):
         return [], []
     try:
-        stored, record = sequence.matches(), sequence.matcher()
+        stored, record = sequence.matches(first), sequence.matcher()
         if record.get("class") != _OURS or record.get("versions") != _versions():
-            return [], [f"{_FILE}: not matched again: another matcher or version made it"]
+            return [], [f"{file}: not matched again: another matcher or version made it"]
         component = parse_card(SiftMatcher, record["parameters"], f"{MATCHER}: parameters")
-        images = {view: sequence.image("rs", *view) for view in VIEWS}
-        found = matched_frames(sequence, 0, images, wrap(FEATURE_MATCHERS, component))
+        images = {each[1:3]: sequence.image(*each) for each in shots}
+        found = matched_frames(sequence, first, images, wrap(FEATURE_MATCHERS, component))
     except RsbenchError as error:
         return [str(error)], []
-    return list(_unlike_faults(stored, arranged(found))), []
+    return list(_unlike_faults(file, stored, arranged(found))), []
 
 
 def _versions() -> dict[str, str]:
     return {"rsbench": __version__, "opencv": str(cv2.__version__)}
 
 
-def _unlike_faults(stored: LabelledMatches, found: Arranged) -> Iterator[str]:
+def _unlike_faults(file: str, stored: LabelledMatches, found: Arranged) -> Iterator[str]:
     for k, name in enumerate(MATCHED):
         ours, theirs = (each.pixels[each.sets == k].reshape(-1, 4) for each in (found, stored))
         strange, missing = np.sum(~repeated(theirs, ours)), np.sum(~repeated(ours, theirs))
         if strange + missing > max(_FEW_OTHERS * (len(ours) + len(theirs)), _LEAST):
             what = f"{strange} of {len(theirs)} matches are not found in the images, and {missing} others are"
-            yield finding(f"{_FILE}: {name}", what)
+            yield finding(f"{file}: {name}", what)
 
 
-def matches_again(sequence: Sequence, rays: Meets, told: Collection[str]) -> Iterator[tuple[str, str, bool]]:
-    """As ``channel_checks.channels_again``, of matches: what rays say of each."""
-    if "matches" not in sequence.channels or _FILE in told:
+def matches_again(
+    sequence: Sequence, first: int, rays: Meets, told: Collection[str]
+) -> Iterator[tuple[str, str, bool]]:
+    """As ``channel_checks.channels_again``, of matches of frame ``first`` and the next: what rays say of each."""
+    if "matches" not in sequence.channels or (file := matches_file(first)) in told:
         return
     try:
-        stored = sequence.matches()
+        stored = sequence.matches(first)
     except RsbenchError:  # told already
         return
     as_given = Arranged(stored.sets, stored.tracks, stored.pixels)
-    made = labelled(sequence, 0, as_given, (sequence.matching or Matching()).bound_px, rays)
+    made = labelled(sequence, first, as_given, (sequence.matching or Matching()).bound_px, rays)
     with np.errstate(invalid="ignore"):
         near = np.abs(made.error - stored.error) <= _AGREES_PX
     alike = (made.classes == stored.classes) & (near | (np.isnan(made.error) & np.isnan(stored.error)))
@@ -234,4 +242,4 @@ def matches_again(sequence: Sequence, rays: Meets, told: Collection[str]) -> Ite
     what = f"{wrong} of {len(alike)} labels differ from what rays say"
     names = ("depth", "truth", "classes")
     same = all(np.array_equal(getattr(made, k), getattr(stored, k), equal_nan=True) for k in names)
-    yield _FILE, finding(_FILE, what) if wrong > max(_FEW_OTHERS * len(alike), _LEAST) else "", same
+    yield file, finding(file, what) if wrong > max(_FEW_OTHERS * len(alike), _LEAST) else "", same

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import product
 
 import numpy as np
 
 from rsbench.core import so3
 from rsbench.core.projection import row_poses
-from rsbench.core.rig import FRAMES, SIDES, Side
+from rsbench.core.rig import Side, views_of
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.files import read_pose_table
@@ -23,7 +22,7 @@ _ROUNDING = 1e-12
 
 def pose_faults(sequence: Sequence) -> Iterator[str]:
     """Stored row poses that are not the motion at the row times."""
-    for side, frame in product(SIDES, FRAMES):
+    for side, frame in views_of(sequence.frames):
         file = f"poses/{side}_{frame}.csv"
         try:
             table = read_pose_table(sequence.folder / file)
@@ -86,7 +85,7 @@ def _likely(sequence: Sequence, side: Side, frame: int, table: FloatArray) -> st
     candidates = [("shifted by one row", np.roll(own, rows, axis=0)) for rows in (-1, 1)]
     candidates += [
         (f"the poses of {other}_{number}", _table(sequence, other, number))
-        for other, number in product(SIDES, FRAMES)
+        for other, number in views_of(sequence.frames)
         if (other, number) != (side, frame) and sequence.shutter.lines(other) == len(table)
     ]
     candidates.append(("world_from_cam instead of cam_from_world", back))

@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Sequence as Many
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,17 +19,18 @@ from numpy.typing import NDArray
 from rsbench import __version__
 from rsbench.cards import list_cards, parse_card
 from rsbench.core.projection import row_poses
-from rsbench.core.rig import VIEWS
 from rsbench.dataset.channels import AFFINE, TRACKS, matches_file
 from rsbench.dataset.generation import image_seed
+from rsbench.dataset.layout import whole_frames
 from rsbench.dataset.scene_hashes import scene_hash
-from rsbench.dataset.sequence import whole_frames
+from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.shots import SHOTS, Shot, shots_of
 from rsbench.dataset.verification.affine_checks import affine_again
 from rsbench.dataset.verification.channel_checks import channels_again
-from rsbench.dataset.verification.content import Content, clean_file
+from rsbench.dataset.verification.content import Content, clean_picture
 from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.dataset.verification.image_checks import CHANGES, Picture
-from rsbench.dataset.verification.landing import SHOTS, DepthMap, Shot
+from rsbench.dataset.verification.landing import DepthMap
 from rsbench.dataset.verification.match_checks import matches_again
 from rsbench.dataset.verification.stacks import stack_rows
 from rsbench.dataset.verification.surface_checks import surfaces_again
@@ -41,6 +43,7 @@ from rsbench.scenes.model import Start
 if TYPE_CHECKING:
     from rsbench.renderers.render import Frame
     from rsbench.renderers.scene import MitsubaScene
+    from rsbench.renderers.segments import SceneRays
 
 Rerender = Literal["no", "auto", "all"]
 """No row, some rows of every image where that takes seconds, or all rows."""
@@ -66,38 +69,9 @@ class Again:
     """Renders rows of sequences again; keeps the scene of the last one."""
 
     mode: Rerender
-    scene_cards: Sequence[Path] = ()
+    scene_cards: Many[Path] = ()
     """Of scenes that are not rsbench's own. What a dataset says of its scene is a name, and never opened."""
     _built: tuple[tuple[object, ...], str, MitsubaScene] | None = field(default=None, init=False)
-
-    def check(self, content: Content, told: set[str]) -> tuple[list[str], str]:
-        """Faults of files that are not ``told`` yet, and what was done or why not."""
-        start = time.perf_counter()
-        manifest = content.sequence.manifest
-        try:
-            options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
-            scene, digest = self._scene(_table(manifest, "scene"))
-        except RsbenchError as error:
-            return [], f"no row rendered again: {error}"
-        rows = self._rows(content, options)
-        if not rows:
-            return [], "no row rendered again: its renderer takes too many samples; --rerender all does it"
-        checks = list(_checks(content, scene, options, rows, told))
-        wrong = [check for check in checks if check.fault]
-        done = (
-            f"{len(rows)} rows of each image and depth map rendered again in {time.perf_counter() - start:.1f} s"
-        )
-        if _table(manifest, "scene").get("sha256") != digest:
-            done += "; the scene built here has another sha256 than sequence.json says"
-            if wrong and _table(manifest, "made_by").get("rsbench") != __version__:
-                return [], f"{done}, and other images: another version of rsbench built it"
-        if wrong and len(wrong) == len(checks):
-            cause = "look at scene, motion, camera and renderer in sequence.json"
-            what = f"not one file is what its scene looks like when rendered again, {wrong[0].fault}"
-            return [finding("sequence.json", what, cause=cause)], done
-        same = all(check.same_bits for check in checks)
-        done += _ALIKE[0] if same else "" if wrong else _ALIKE[1]
-        return [check.fault for check in wrong if check.file not in told], done
 
     def is_right(self, content: Content, shot: Shot) -> bool:
         """Whether a depth map is what its scene looks like, at every pixel: that takes but one ray for each."""
@@ -113,27 +87,31 @@ class Again:
         sequence, same = content.sequence, set[str]()
         rows = list(range(sequence.rig.camera.height))
         with contextlib.suppress(RsbenchError):
-            for shot in [each for each in SHOTS if each.shutter == "rs"]:
+            for shot in [each for each in shots_of(content.times) if each.shutter == "rs"]:
                 if any(f"/{shot.side}_{shot.frame}." in file for file in accused):
                     scene, depth = self._depth(content, shot)
                     for made in (channels_again, surfaces_again):
                         checks = made(sequence, shot, rows, depth, SceneRays(scene), ())
                         same |= {file for file, _, alike in checks if alike}
-            for file, again in ((TRACKS, tracks_again), (AFFINE, affine_again), (matches_file(0), matches_again)):
+            scene, _ = self.scene(_table(sequence.manifest, "scene"))
+            for file, again in ((TRACKS, tracks_again), (AFFINE, affine_again)):
                 if file in accused:
-                    scene, _ = self._scene(_table(sequence.manifest, "scene"))
                     same |= {name for name, _, alike in again(sequence, SceneRays(scene), ()) if alike}
+            for first in content.times[:-1]:
+                if matches_file(first) in accused:
+                    checks = matches_again(sequence, first, SceneRays(scene), ())
+                    same |= {name for name, _, alike in checks if alike}
         return same & set(accused)
 
     def _depth(self, content: Content, shot: Shot) -> tuple[MitsubaScene, NDArray[np.float32]]:
         """The scene of a sequence, and a whole depth map of it."""
         manifest = content.sequence.manifest
         options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
-        scene, _ = self._scene(_table(manifest, "scene"))
+        scene, _ = self.scene(_table(manifest, "scene"))
         quick = replace(options, samples=1, integrator="sunsky")
         return scene, _render(content, scene, quick, shot, list(range(content.sequence.rig.camera.height))).depth
 
-    def _scene(self, record: Mapping[str, Any]) -> tuple[MitsubaScene, str]:
+    def scene(self, record: Mapping[str, Any]) -> tuple[MitsubaScene, str]:
         """The scene of a sequence in the renderer, and its hash."""
         from rsbench.renderers.scene import MitsubaScene
 
@@ -162,19 +140,6 @@ class Again:
             )
         return self._built[2], self._built[1]
 
-    def _rows(self, content: Content, options: RendererOptions) -> list[int]:
-        """One row of each of equal bands, drawn by the hash of the images: nobody knows them before they are."""
-        camera = content.sequence.rig.camera
-        if self.mode == "all":
-            return list(range(camera.height))
-        depth = options.max_depth if options.integrator == "path" else 1
-        affordable = int(_MOST_RAYS / (len(SHOTS) * camera.width * options.samples * depth))
-        count = min(_ROWS, camera.height, affordable)
-        digest = hashlib.sha256(repr(content.sequence.manifest.get("files")).encode()).digest()
-        rng = np.random.default_rng(int.from_bytes(digest[:8], "little"))
-        edges = np.linspace(0, camera.height, count + 1).astype(int)
-        return [int(rng.integers(low, high)) for low, high in pairwise(edges)]
-
 
 @dataclass(frozen=True)
 class _Check:
@@ -183,6 +148,81 @@ class _Check:
     file: str
     fault: str
     same_bits: bool
+
+
+class Redone:
+    """Rows of one sequence rendered again, some frames after the other."""
+
+    def __init__(self, again: Again, sequence: Sequence) -> None:
+        self._sequence, self._checks = sequence, list[_Check]()
+        self._begun, self._seconds, self._refusal = time.perf_counter(), 0.0, ""
+        try:
+            self._options = parse_card(
+                RendererOptions, _table(sequence.manifest, "renderer"), "sequence.json: renderer"
+            )
+            self._scene, self._digest = again.scene(_table(sequence.manifest, "scene"))
+        except RsbenchError as error:
+            self._refusal = f"no row rendered again: {error}"
+            return
+        self._rows = _rows_of(again.mode, sequence, self._options)
+        if not self._rows:
+            self._refusal = "no row rendered again: its renderer takes too many samples; --rerender all does it"
+        self._seconds = time.perf_counter() - self._begun
+
+    def add(self, content: Content, told: set[str]) -> None:
+        """Render again what was read, but for channels that are ``told`` already."""
+        if not self._refusal:
+            self._take(_checks(content, self._scene, self._options, self._rows, told))
+
+    def _take(self, checks: Iterator[_Check]) -> None:
+        start = time.perf_counter()
+        self._checks += checks
+        self._seconds += time.perf_counter() - start
+
+    def end(self, told: set[str]) -> tuple[list[str], str]:
+        """Faults of files that are not ``told`` yet, and what was done or why not."""
+        if self._refusal:
+            return [], self._refusal
+        manifest, checks = self._sequence.manifest, self._checks
+        rays, pairs = _rays(self._scene), range(self._sequence.frames - 1)
+        of_matches = (each for first in pairs for each in matches_again(self._sequence, first, rays, told))
+        of_points = (made(self._sequence, rays, told) for made in (tracks_again, affine_again))
+        again = chain(*of_points, of_matches)
+        self._take(_Check(*check) for check in again)
+        wrong = [check for check in checks if check.fault]
+        done = f"{len(self._rows)} rows of each image and depth map rendered again in {self._seconds:.1f} s"
+        if _table(manifest, "scene").get("sha256") != self._digest:
+            done += "; the scene built here has another sha256 than sequence.json says"
+            if wrong and _table(manifest, "made_by").get("rsbench") != __version__:
+                return [], f"{done}, and other images: another version of rsbench built it"
+        if wrong and len(wrong) == len(checks):
+            cause = "look at scene, motion, camera and renderer in sequence.json"
+            what = f"not one file is what its scene looks like when rendered again, {wrong[0].fault}"
+            return [finding("sequence.json", what, cause=cause)], done
+        same = all(check.same_bits for check in checks)
+        done += _ALIKE[0] if same else "" if wrong else _ALIKE[1]
+        return [check.fault for check in wrong if check.file not in told], done
+
+
+def _rays(scene: MitsubaScene) -> SceneRays:
+    from rsbench.renderers.segments import SceneRays
+
+    return SceneRays(scene)
+
+
+def _rows_of(mode: Rerender, sequence: Sequence, options: RendererOptions) -> list[int]:
+    """One row of each of equal bands, drawn by the hash of the images: nobody knows them before they are."""
+    camera = sequence.rig.camera
+    if mode == "all":
+        return list(range(camera.height))
+    depth = options.max_depth if options.integrator == "path" else 1
+    shots = len(SHOTS) * sequence.frames // 2
+    affordable = int(_MOST_RAYS / (shots * camera.width * options.samples * depth))
+    count = min(_ROWS, camera.height, affordable)
+    digest = hashlib.sha256(repr(sequence.manifest.get("files")).encode()).digest()
+    rng = np.random.default_rng(int.from_bytes(digest[:8], "little"))
+    edges = np.linspace(0, camera.height, count + 1).astype(int)
+    return [int(rng.integers(low, high)) for low, high in pairwise(edges)]
 
 
 def _table(manifest: Mapping[str, Any], key: str) -> dict[str, Any]:
@@ -199,8 +239,9 @@ def _checks(
     from rsbench.renderers.segments import SceneRays
 
     elsewhere = not _made_here(content)
-    twins = (Shot("gs", *view, row) for row in content.sequence.twins for view in VIEWS)
-    for shot in (*SHOTS, *twins):
+    own = shots_of(content.times)
+    twins = (each._replace(row=row) for row in content.sequence.twins for each in own if each.shutter == "gs")
+    for shot in (*own, *twins):
         if shot not in content.maps and shot not in content.pictures:
             continue
         frame = _render(content, scene, options, shot, rows)
@@ -209,15 +250,13 @@ def _checks(
         if shot in content.pictures:
             noisy = options.integrator == "path" and elsewhere
             rendered = to_srgb8(frame.image, options.exposure)
-            file = clean_file(content.sequence, shot)
+            file = clean_picture(content.sequence, shot)
             yield _image_check(file, content.pictures[shot], rendered, rows, noisy)
         for made in (channels_again, surfaces_again):
             again = made(content.sequence, shot, rows, frame.depth, SceneRays(scene), told)
             yield from (_Check(*check) for check in again)
         if shot.shutter == "rs":
             yield from _frame_checks(content, scene, options, shot, rows, told)
-    for of_points in (tracks_again, affine_again, matches_again):
-        yield from (_Check(*check) for check in of_points(content.sequence, SceneRays(scene), told))
 
 
 def _frame_checks(

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.dataset.files import read_png
-from rsbench.dataset.sequence import Sequence, stack_file, whole_frames
+from rsbench.dataset.layout import stack_file, whole_frames
+from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.shots import Shot
-from rsbench.dataset.verification.content import Content, clean_file
+from rsbench.dataset.verification.content import Content, clean_picture
 from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.errors import RsbenchError
 from rsbench.reading import inside
@@ -45,7 +46,7 @@ def stack_faults(content: Content, missing: Collection[str], stride: int = 1) ->
             ):
                 yield finding(file, f"differs from {twin.shot.image}, which has the same pose")
         if np.any(wrong):
-            what = f"{np.sum(wrong)} images differ in their own row from {clean_file(sequence, shot)}"
+            what = f"{np.sum(wrong)} images differ in their own row from {clean_picture(sequence, shot)}"
             yield finding(f"gs_stack/{shot.side}_{shot.frame}", what, rows_of(wrong))
 
 

@@ -14,7 +14,8 @@ from rsbench import __version__
 from rsbench.cards import list_cards, load_card, parse_card
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.files import read_json, sha256
-from rsbench.dataset.sequence import FORMAT, RELATIVE_FILES, UNITS, Sequence, files_of, sequence_manifest
+from rsbench.dataset.layout import RELATIVE_FILES, files_of
+from rsbench.dataset.sequence import FORMAT, UNITS, Sequence, sequence_manifest
 from rsbench.dataset.verification.findings import finding
 from rsbench.errors import RsbenchError
 from rsbench.reading import NAME, inside
@@ -208,6 +209,7 @@ def sequence_faults(sequence: Sequence, name: str, listing: Listing) -> Iterator
         shutter=sequence.shutter,
         motion=sequence.motion,
         frame_period_s=sequence.frame_period_s,
+        frames=sequence.frames,
     )
     for key, value in expected.items():
         if not _equal(manifest.get(key), value):
@@ -226,7 +228,7 @@ def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: Seque
     """sequence.json against what the card would make, as far as that is known without building the scene."""
     made = manifest.get("made_by")
     same_version = isinstance(made, dict) and made.get("rsbench") == __version__
-    planned = dict.fromkeys(("sensor", "channels", "imu", "twins")) | card.manifest_of(sequence)
+    planned = dict.fromkeys(("sensor", "channels", "imu", "twins", "frames")) | card.manifest_of(sequence)
     planned["seed"] = card.seed_of(sequence)
     start = None if sequence.start is None else asdict(sequence.start)
     scene: dict[str, Any] = {"viewpoint": sequence.viewpoint, "start": start}

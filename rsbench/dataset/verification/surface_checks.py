@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
+from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.projection import back_project
-from rsbench.core.rig import VIEWS
+from rsbench.core.rig import FRAMES, SIDES
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channel_truth import Rays, SeenSurfaces, surface_truth
 from rsbench.dataset.channels import INSTANCE_TABLE, surface_file
@@ -29,26 +30,36 @@ _SURFACE, _FEW_OTHERS = 5e-5, 0.02
 _FEW_AGAIN, _LEAST = 5e-3, 8
 
 
-def surface_faults(sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str]) -> Iterator[str]:
-    """What normals and instances show that the surfaces of the depth maps are not, but for files ``told``."""
+def surface_faults(
+    sequence: Sequence,
+    maps: Mapping[Shot, DepthMap],
+    told: Collection[str],
+    times: tuple[int, ...] = FRAMES,
+    new: tuple[int, ...] = FRAMES,
+) -> Iterator[str]:
+    """What normals and instances show that the surfaces of the depth maps are not, but for files ``told``.
+
+    Of frames at these ``times``, and of pairs of them with one that is ``new``.
+    """
     instances: dict[Shot, NDArray[np.uint16]] = {}
-    for side, frame in VIEWS:
+    for side, frame in product(SIDES, times):
         shot = Shot("rs", side, frame)
         if shot not in maps or shot.depth in told:
             continue
         try:
             file = surface_file("normals", side, frame)
-            if "normals" in sequence.channels and file not in told:
+            if "normals" in sequence.channels and file not in told and frame in new:
                 yield from _normal_faults(sequence, maps[shot], file, sequence.normals(side, frame))
             file = surface_file("instances", side, frame)
             if "instances" in sequence.channels and not {file, INSTANCE_TABLE} & set(told):
                 instances[shot] = sequence.instances(side, frame)
-                yield from _number_faults(maps[shot], file, instances[shot], len(sequence.instance_table()))
+                if frame in new:
+                    yield from _number_faults(maps[shot], file, instances[shot], len(sequence.instance_table()))
         except RsbenchError as error:
             yield str(error)
     for shot in instances:
-        for partner in (shot.other_side, shot.other_frame):
-            if partner in instances:
+        for partner in shot.partners():
+            if partner in instances and {shot.frame, partner.frame} & {*new}:
                 yield from _likeness_faults(sequence, maps, instances, shot, partner)
 
 

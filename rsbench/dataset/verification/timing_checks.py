@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rsbench.core.rig import FRAMES, SIDES, Side
+from rsbench.core.rig import Side, views_of
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.timing import COLUMNS, MANIFEST, table_file, timing_manifest, timing_table
 from rsbench.dataset.verification.findings import finding, rows_of
@@ -25,18 +26,17 @@ def timing_faults(sequence: Sequence, told: Collection[str]) -> Iterator[str]:
             yield from _manifest_faults(sequence)
     except RsbenchError as error:
         yield str(error)
-    for side in SIDES:
-        for frame in FRAMES:
-            try:
-                if table_file(side, frame) not in told:
-                    yield from _table_faults(sequence, side, frame, told)
-            except RsbenchError as error:
-                yield str(error)
+    for side, frame in views_of(sequence.frames):
+        try:
+            if table_file(side, frame) not in told:
+                yield from _table_faults(sequence, side, frame, told)
+        except RsbenchError as error:
+            yield str(error)
 
 
 def _manifest_faults(sequence: Sequence) -> Iterator[str]:
     stored = sequence.timing()
-    expected = timing_manifest(sequence.shutter, sequence.frame_period_s, sequence.sensor)
+    expected = timing_manifest(sequence.shutter, sequence.frame_period_s, sequence.sensor, sequence.frames)
     for key, value in expected.items():
         own = stored.get(key)
         if not isinstance(value, dict) or not isinstance(own, dict):
@@ -51,12 +51,13 @@ def _manifest_faults(sequence: Sequence) -> Iterator[str]:
 def _table_faults(sequence: Sequence, side: Side, frame: int, told: Collection[str]) -> Iterator[str]:
     file, poses = table_file(side, frame), f"poses/{side}_{frame}.csv"
     stored = sequence.row_times_ns(side, frame)
-    expected = timing_table(sequence.shutter, sequence.frame_period_s, sequence.sensor, side, frame)
+    expected = _table(sequence, side, frame)
     for name, own, made in zip(COLUMNS.split(","), stored.T, expected.T, strict=True):
         off = own - made
         if np.any(np.abs(off) > _NEAR_NS):
-            other = timing_table(sequence.shutter, sequence.frame_period_s, sequence.sensor, side, 1 - frame)
-            cause = f"looks like those of frame {1 - frame}" if np.array_equal(stored, other) else ""
+            times = range(sequence.frames)
+            like = [each for each in times if np.array_equal(stored, _table(sequence, side, each))]
+            cause = f"looks like those of frame {like[0]}" if like else ""
             what = f"{name} differs from what sequence.json makes, by up to {np.max(np.abs(off))} ns"
             yield finding(file, what, rows_of(np.abs(off) > _NEAR_NS), cause)
             return
@@ -67,3 +68,7 @@ def _table_faults(sequence: Sequence, side: Side, frame: int, told: Collection[s
             yield finding(
                 file, f"time_ns differs from {poses}, by up to {np.max(off):.3g} ns", rows_of(off > _NEAR_NS)
             )
+
+
+def _table(sequence: Sequence, side: Side, frame: int) -> NDArray[np.int64]:
+    return timing_table(sequence.shutter, sequence.frame_period_s, sequence.sensor, side, frame)

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.projection import RSProjection, project_at, rs_project
-from rsbench.core.rig import View
+from rsbench.core.rig import FRAMES, View
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channel_truth import Rays
 from rsbench.dataset.channels import TRACKS, PixelClass
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.shots import Shot
-from rsbench.dataset.tracks import TRACK_VIEWS, Tracks, look_for, points_at
+from rsbench.dataset.tracks import Tracks, look_for, points_at, track_views
 from rsbench.dataset.verification.findings import finding
 from rsbench.dataset.verification.landing import BoolArray, DepthMap
 from rsbench.errors import RsbenchError
@@ -29,8 +29,13 @@ _NEARLY_ALL = 0.8
 _FEW_AGAIN, _LEAST = 5e-3, 4
 
 
-def track_faults(sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str]) -> Iterator[str]:
-    """What the tracks show that depth maps and motion cannot have made, but for files ``told``."""
+def track_faults(
+    sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str], times: tuple[int, ...] = FRAMES
+) -> Iterator[str]:
+    """What the tracks show in frames at these times that depth maps and motion cannot have made.
+
+    But for files ``told``.
+    """
     if "tracks" not in sequence.channels or TRACKS in told:
         return
     try:
@@ -40,7 +45,9 @@ def track_faults(sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collec
         return
     if len(tracks.points) == 0 and any(np.any(each.depth) for each in maps.values()):
         yield finding(TRACKS, "has no points")
-    for k, view in enumerate(TRACK_VIEWS):
+    for k, view in enumerate(track_views(sequence.frames)):
+        if view[1] not in times:
+            continue
         shot, file = Shot("rs", *view), f"{TRACKS}: {view[0]}_{view[1]}"
         found = rs_project(sequence.rig, sequence.shutter, sequence.motion, *view, tracks.points)
         yield from _pixel_faults(sequence, tracks, k, found, file)
@@ -57,7 +64,7 @@ def _source_faults(sequence: Sequence, tracks: Tracks, k: int, depth: DepthMap, 
     if np.any(outside):
         yield finding(file, f"{np.sum(outside)} points were drawn from no pixel of it")
         return
-    X = points_at(sequence, TRACK_VIEWS[k], pixels, depth.depth)
+    X = points_at(sequence, depth.shot[1:3], pixels, depth.depth)
     off = np.linalg.norm(points - X, axis=1) / np.maximum(np.linalg.norm(X, axis=1), 1e-9)
     if np.any(off > _SAME):
         ratio = float(np.median(np.linalg.norm(points, axis=1) / np.maximum(np.linalg.norm(X, axis=1), 1e-9)))
@@ -69,7 +76,8 @@ def _source_faults(sequence: Sequence, tracks: Tracks, k: int, depth: DepthMap, 
 
 def _pixel_faults(sequence: Sequence, tracks: Tracks, k: int, found: RSProjection, file: str) -> Iterator[str]:
     """Known where and only where a row sees the point; and where that row sees it."""
-    pixels, tau, classes, view = tracks.pixels[:, k], tracks.tau[:, k], tracks.classes[:, k], TRACK_VIEWS[k]
+    pixels, tau, classes = tracks.pixels[:, k], tracks.tau[:, k], tracks.classes[:, k]
+    view = track_views(sequence.frames)[k]
     known, own = np.isin(classes, (PixelClass.VISIBLE, PixelClass.OCCLUDED)), tracks.sources == k
     seen = np.isfinite(found.tau)
     wrong = (known != np.all(np.isfinite(pixels), axis=1)) | (known != (seen | own)) | (known != np.isfinite(tau))
@@ -124,7 +132,8 @@ def tracks_again(sequence: Sequence, rays: Rays, told: Collection[str]) -> Itera
         tracks = sequence.tracks()
     except RsbenchError:  # told already
         return
-    wrong: list[BoolArray] = [_unlike(sequence, tracks, k, view, rays) for k, view in enumerate(TRACK_VIEWS)]
+    views = enumerate(track_views(sequence.frames))
+    wrong: list[BoolArray] = [_unlike(sequence, tracks, k, view, rays) for k, view in views]
     share = float(np.mean(wrong)) if len(tracks.points) else 0.0
     bad = np.sum(wrong) > max(_FEW_AGAIN * np.size(wrong), _LEAST)
     what = f"{100 * share:.2g} % of {np.size(wrong)} classes differ from what rays say"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from itertools import product
 
 import numpy as np
 
-from rsbench.core.rig import VIEWS
+from rsbench.core.rig import SIDES
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.shots import Shot
-from rsbench.dataset.verification.content import Content, clean_file, read_shot, spare_pixels
+from rsbench.dataset.verification.content import Content, clean_picture, read_shot, spare_pixels
 from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.dataset.verification.landing import DEPTH_TOLERANCE, BoolArray, land
 
@@ -20,11 +21,11 @@ _MOST_WRONG = 0.1
 """Share of them: what is thinner than a pixel, and edges that are nearly flat."""
 
 
-def read_twins(sequence: Sequence, missing: Collection[str] = ()) -> Content:
+def read_twins(sequence: Sequence, missing: Collection[str], times: tuple[int, ...]) -> Content:
     """As ``content.read_content``, of the twins at other rows than the first."""
-    content = Content(sequence)
+    content = Content(sequence, times=times)
     for row in sequence.twins:
-        for side, frame in VIEWS:
+        for side, frame in product(SIDES, times):
             read_shot(content, Shot("gs", side, frame, row), missing)
     return content
 
@@ -33,7 +34,7 @@ def other_twin_faults(content: Content, twins: Content, stride: int = 1) -> Iter
     """A twin shares a row with its rolling-shutter frame, bit for bit; it sees the surfaces that this one sees."""
     sequence = content.sequence
     for row in sequence.twins:
-        for side, frame in VIEWS:
+        for side, frame in product(SIDES, content.times):
             twin, source = Shot("gs", side, frame, row), Shot("rs", side, frame)
             yield from _shared_line_faults(content, twins, source, twin)
             if source in content.maps and twin in twins.maps:
@@ -50,7 +51,7 @@ def _shared_line_faults(content: Content, twins: Content, source: Shot, twin: Sh
         )
         unlike = np.any(own != other, axis=-1)
         if np.sum(unlike) > spare_pixels(axis, unlike.size):
-            of = clean_file(content.sequence, source)
+            of = clean_picture(content.sequence, source)
             yield finding(twin.image, f"{words} {of}: {np.sum(unlike)} pixels at the same pose")
     if source in content.maps and twin in twins.maps:
         own, other = (np.take(each.depth, line, axis) for each in (twins.maps[twin], content.maps[source]))
@@ -75,4 +76,5 @@ def _depth_faults(content: Content, twins: Content, source: Shot, twin: Shot, st
 
 def with_twins(content: Content, twins: Content) -> Content:
     """Both, for checks of channels and of rows rendered again."""
-    return Content(content.sequence, content.maps | twins.maps, content.pictures | twins.pictures)
+    maps, pictures = content.maps | twins.maps, content.pictures | twins.pictures
+    return Content(content.sequence, maps, pictures, times=content.times)
