@@ -25,7 +25,7 @@ from rsbench.dataset.channels import Channel
 from rsbench.dataset.files import read_png
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import Sequence, read_sequence
-from rsbench.dataset.verification import verify_dataset
+from rsbench.dataset.verification import content, verify_dataset
 from rsbench.dataset.verification.poses import pose_faults
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
@@ -97,13 +97,20 @@ def test_depth_carries_every_surface_to_where_the_other_camera_sees_it(made: dic
     ],
 )
 def test_another_lens_or_scan_than_the_images_have_is_found(
-    made: dict[str, Path], tmp_path: Path, name: str, table: str, key: str, value: object
+    made: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    table: str,
+    key: str,
+    value: object,
 ) -> None:
+    monkeypatch.setattr(content, "likely_cause", lambda *given: "")  # its search takes nine tenths of the time
     shutil.copytree(made[name], tmp_path / name)
     path = tmp_path / name / "room-twist" / "sequence.json"
-    content = json.loads(path.read_text(encoding="utf-8"))
-    (content[table] if table else content)[key] = value
-    path.write_text(json.dumps(content), encoding="utf-8")
+    manifest = json.loads(path.read_text(encoding="utf-8"))
+    (manifest[table] if table else manifest)[key] = value
+    path.write_text(json.dumps(manifest), encoding="utf-8")
     faults = [fault for report in verify_dataset(tmp_path / name, 4, rerender="no") for fault in report.faults]
     # Beside the hashes, the card and the poses say it.
     assert any(key in fault for fault in faults) or any("looks" in fault or "differ" in fault for fault in faults)
