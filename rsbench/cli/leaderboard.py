@@ -35,9 +35,9 @@ More: [bold]rsbench docs submit[/bold] and [bold]rsbench docs protocols[/bold]""
 
 board_app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", epilog=EPILOG)
 
-_Track = Annotated[str, typer.Argument(help="points, pose (given matches) or pose-own (matches of your own).")]
+_Track = Annotated[str, typer.Argument(help="points, pose (given matches), pose-own (own matches) or readout.")]
 _Data = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="Dataset of the tracks pose and pose-own (a dataset.json).")
+    Path | None, typer.Option(metavar="DIR", help="Dataset (a dataset.json) of all tracks but points.")
 ]
 _Secret = Annotated[
     Path | None, typer.Option("--seed-file", metavar="FILE", help="Text from which a secret test split is drawn.")
@@ -290,18 +290,17 @@ def _show(
 
 
 def _cells(line: Standing) -> dict[str, str]:
-    from rsbench.benchmark.leaderboard.protocols import PRIMARY
     from rsbench.benchmark.statistics import in_words
 
-    rank = line.rank
-    cells = {
-        "method": line.scored.header.method,
-        "rank": "oracle" if rank is None else f"{rank.place} [{rank.low}, {rank.high}] of {line.peers}",
-    }
-    cells["AUC@5"] = in_words(*line.means[PRIMARY])
-    names = {"flip": "flips", "failure": "failed"}
-    cells |= {title: f"{100.0 * line.means[name][0]:.1f} %" for name, title in names.items()}
-    return cells | {title: _number(line.medians[f"{title}_deg"]) for title in ("e_R", "e_T")}
+    primary = line.protocol.primary
+    cells = {"method": line.scored.header.method, "rank": line.rank_words}
+    cells[primary.title] = in_words(*line.means[primary.key])
+    for score in line.protocol.scores:
+        if score.key in ("flip", "failure"):
+            cells[score.title] = f"{100.0 * line.means[score.key][0]:.1f} %"
+        elif score.key in ("e_R_deg", "e_T_deg", "e_readout"):
+            cells[score.title.removesuffix(" (deg)")] = _number(line.medians[score.key])
+    return cells
 
 
 def _number(value: float) -> str:

@@ -15,30 +15,16 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rsbench.benchmark.leaderboard.board import about_split, entries_of, place, splits_of
-from rsbench.benchmark.leaderboard.protocols import KNOWLEDGE, PRIMARY, protocol_of_id
+from rsbench.benchmark.leaderboard.protocols import KNOWLEDGE, Protocol, protocol_of_id
 from rsbench.benchmark.leaderboard.standings import Standing, standings, table
 from rsbench.benchmark.statistics import in_words
 from rsbench.dataset.files import write_bytes
 from rsbench.report.board_figures import bar, curves
 
-_SHARES = {
-    "auc_5": ("AUC@5", "down", "area under the curve of max(e_R, e_T) to 5 deg; decides the rank"),
-    "auc_1": ("AUC@1", "down", "the same to 1 deg"),
-    "auc_10": ("AUC@10", "down", "the same to 10 deg"),
-    "within": ("success", "down", "share with e_R below 1 deg and e_T below 5 deg"),
-    "flip": ("flips", "up", "share with e_T above 90 deg"),
-    "failure": ("failed", "up", "share without a motion"),
-}
-_MEDIANS = {
-    "e_R_deg": ("e_R (deg)", "median angle of the rotation"),
-    "e_T_deg": ("e_T (deg)", "median angle of the translation"),
-    "e_row_deg": ("e_row (deg)", "median of the largest angle of any row's pose"),
-    "e_s": ("e_s", "median |log| of the length; of those that claim metres"),
-    "metres": ("metres", "median distance of d from the truth; of those that claim metres"),
-    "seconds": ("s", "median time of a problem, as stated"),
-}
 _ABOUT = ("version", "description", "authors", "paper", "code", "licence", "hardware", "tuned_on", "motion_model")
 _WORST = 10
+_BRIEF = 2
+"""Medians of the tables that show few numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,17 +92,23 @@ def _section(each: _Table) -> dict[str, Any]:
         "given": protocol.given,
         "files": [f"{each.id}.{suffix}" for suffix in ("csv", "md", "tex")],
         "knowledge": [name for name in KNOWLEDGE if name in used],
-        "columns": _columns(),
+        "columns": _columns(protocol),
         "rows": [_row(each, line) for line in each.lines],
         "figures": _figures(each, each.lines),
     }
 
 
 def _named(each: _Table) -> dict[str, str]:
-    return {"title": protocol_of_id(each.protocol).title, "protocol": each.protocol, "split": each.split}
+    protocol = protocol_of_id(each.protocol)
+    return {
+        "title": protocol.title,
+        "protocol": each.protocol,
+        "split": each.split,
+        "primary": protocol.primary.title,
+    }
 
 
-def _columns() -> list[dict[str, Any]]:
+def _columns(protocol: Protocol) -> list[dict[str, Any]]:
     def column(key: str, title: str, first: str, hint: str, *, text: bool = False) -> dict[str, Any]:
         return {"key": key, "title": title, "first": first, "hint": hint, "text": text}
 
@@ -124,22 +116,21 @@ def _columns() -> list[dict[str, Any]]:
         column("method", "method", "up", "name of the entry", text=True),
         column("uses", "uses", "up", "what it works on", text=True),
         column("rank", "rank", "up", "among those that use no more, with its interval"),
-        *(column(key, title, first, hint) for key, (title, first, hint) in _SHARES.items()),
-        *(column(key, title, "up", hint) for key, (title, hint) in _MEDIANS.items()),
+        *(column(s.key, s.title, "down" if s.better == "higher" else "up", s.hint) for s in protocol.scores),
         column("ties", "ties", "up", "entries that the data do not tell from it", text=True),
         column("tuned_on", "tuned on", "up", "data by which its parameters were chosen", text=True),
     ]
 
 
 def _row(each: _Table, line: Standing) -> dict[str, Any]:
-    header, rank = line.scored.header, line.rank
-    words = "oracle" if rank is None else f"{rank.place} [{rank.low}, {rank.high}] of {line.peers}"
-    cells: list[dict[str, Any]] = [{"value": "" if rank is None else rank.place, "text": words, "bar": None}]
-    for key in _SHARES:
-        drawn = bar(*line.means[key]) if key == PRIMARY else None
-        cells.append({"value": _value(line.means[key][0]), "text": in_words(*line.means[key]), "bar": drawn})
-    for key in _MEDIANS:
-        value = line.medians[key]
+    header, rank, primary = line.scored.header, line.rank, line.protocol.primary.key
+    cells: list[dict[str, Any]] = [
+        {"value": "" if rank is None else rank.place, "text": line.rank_words, "bar": None}
+    ]
+    for key, triple in line.means.items():
+        drawn = bar(*triple) if key == primary else None
+        cells.append({"value": _value(triple[0]), "text": in_words(*triple), "bar": drawn})
+    for value in line.medians.values():
         cells.append({"value": _value(value), "text": "–" if np.isnan(value) else f"{value:.3g}", "bar": None})
     return {
         "method": header.method,
@@ -165,12 +156,12 @@ def _figures(each: _Table, lines: Sequence[Standing]) -> list[dict[str, Any]]:
         seen[line.uses] = seen.get(line.uses, 0) + 1
         places.append((line.rank is None, seen[line.uses]))
     chosen = [lines[k] for k in sorted(range(len(lines)), key=lambda k: places[k])]
-    found = []
+    found, primary = [], protocol_of_id(each.protocol).primary.key
     for name in each.facts.columns:
         numbers = each.facts[name].reindex(chosen[0].scored.scores["problem"])
         if not pd.api.types.is_numeric_dtype(numbers) or not np.all(np.isfinite(numbers)):
             continue
-        scores = {line.scored.header.method: line.scored.scores[PRIMARY].to_numpy() for line in chosen}
+        scores = {line.scored.header.method: line.scored.scores[primary].to_numpy() for line in chosen}
         drawn = curves(numbers, scores)
         if drawn is not None:
             found.append({"title": str(name), "svg": drawn})
@@ -183,13 +174,14 @@ def _figures(each: _Table, lines: Sequence[Standing]) -> list[dict[str, Any]]:
 def _entry(each: _Table, line: Standing) -> dict[str, Any]:
     header, scores = line.scored.header, line.scored.scores
     said = asdict(header)
-    tables = [_worst(each, scores)]
+    protocol = line.protocol
+    tables = [_worst(each, scores, protocol)]
     if scores["scene"].nunique() < len(scores):
-        tables.insert(0, _by("scene", scores["scene"], scores))
+        tables.insert(0, _by("scene", scores["scene"], scores, protocol))
     for name in each.facts.columns:
         kinds = each.facts[name].reindex(scores["problem"])
         if not pd.api.types.is_numeric_dtype(kinds):
-            tables.append(_by(str(name), pd.Series(kinds.to_numpy()).astype(str), scores))
+            tables.append(_by(str(name), pd.Series(kinds.to_numpy()).astype(str), scores, protocol))
     return {
         "header": header,
         "split": _named(each),
@@ -200,31 +192,36 @@ def _entry(each: _Table, line: Standing) -> dict[str, Any]:
     }
 
 
-def _by(name: str, kinds: pd.Series, scores: pd.DataFrame) -> dict[str, Any]:
+def _by(name: str, kinds: pd.Series, scores: pd.DataFrame, protocol: Protocol) -> dict[str, Any]:
     rows = []
     for kind, part in scores.groupby(kinds.to_numpy()):
-        medians = (part[key].median() for key in ("e_R_deg", "e_T_deg"))
-        numbers = [f"{part[PRIMARY].mean():.3f}", *(f"{x:.3g}" for x in medians)]
+        medians = (part[key].median() for key in protocol.of_kind("median")[:_BRIEF])
+        numbers = [f"{part[protocol.primary.key].mean():.3f}", *(f"{x:.3g}" for x in medians)]
         rows.append([str(kind), len(part), *numbers, int(part["failure"].sum())])
     return {
         "title": f"By {name}",
-        "columns": [name, "problems", "AUC@5", "e_R (deg)", "e_T (deg)", "failed"],
+        "columns": [name, "problems", protocol.primary.title, *_medians(protocol), "failed"],
         "rows": rows,
     }
 
 
-def _worst(each: _Table, scores: pd.DataFrame) -> dict[str, Any]:
-    worst = scores.sort_values(["error_deg", "problem"], ascending=[False, True]).head(_WORST)
+def _medians(protocol: Protocol) -> list[str]:
+    """Titles of the most telling ones."""
+    return [score.title for score in protocol.scores if score.kind == "median"][:_BRIEF]
+
+
+def _worst(each: _Table, scores: pd.DataFrame, protocol: Protocol) -> dict[str, Any]:
+    worst = scores.sort_values([protocol.error, "problem"], ascending=[False, True]).head(_WORST)
     names = [str(name) for name in each.facts.columns]
     rows = []
     for case in worst.to_dict("records"):
-        numbers = [f"{case[key]:.3g}" for key in ("error_deg", "e_R_deg", "e_T_deg")]
+        numbers = [f"{case[key]:.3g}" for key in protocol.of_kind("median")[:_BRIEF]]
         known = [each.facts[name].get(case["problem"], "") for name in names]
         words = [f"{value:.3g}" if isinstance(value, float) else str(value) for value in known]
         rows.append([str(case["problem"]), *numbers, *words])
     return {
         "title": "Worst problems",
-        "columns": ["problem", "error (deg)", "e_R (deg)", "e_T (deg)", *names],
+        "columns": ["problem", *_medians(protocol), *names],
         "rows": rows,
     }
 
@@ -238,16 +235,12 @@ def as_csv(lines: Sequence[Standing]) -> str:
 
 
 def _brief(lines: Sequence[Standing]) -> list[list[str]]:
-    rows = [["method", "uses", "rank", "AUC@5", "flips", "failed", "e_R (deg)", "e_T (deg)"]]
+    protocol = lines[0].protocol
+    rows = [["method", "uses", "rank", protocol.primary.title, "failed", *_medians(protocol)]]
     for line in lines:
-        rank = (
-            "oracle"
-            if line.rank is None
-            else f"{line.rank.place} [{line.rank.low}, {line.rank.high}] of {line.peers}"
-        )
-        shares = [in_words(*line.means[key]) for key in ("auc_5", "flip", "failure")]
-        medians = [f"{line.medians[key]:.3g}" for key in ("e_R_deg", "e_T_deg")]
-        rows.append([line.scored.header.method, line.uses, rank, *shares, *medians])
+        shares = [in_words(*line.means[key]) for key in (protocol.primary.key, "failure")]
+        medians = [f"{line.medians[key]:.3g}" for key in protocol.of_kind("median")[:_BRIEF]]
+        rows.append([line.scored.header.method, line.uses, line.rank_words, *shares, *medians])
     return rows
 
 

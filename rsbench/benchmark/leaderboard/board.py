@@ -23,7 +23,7 @@ import pandas as pd
 
 from rsbench.benchmark.leaderboard.exporting import split_record
 from rsbench.benchmark.leaderboard.marking import mark
-from rsbench.benchmark.leaderboard.protocols import AUC_DEG, PROTOCOLS
+from rsbench.benchmark.leaderboard.protocols import PROTOCOLS, protocol_of_id
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import Header, Submission, read_submission
 from rsbench.cards import parse_card
@@ -37,20 +37,6 @@ RUN = "rsbench leaderboard run"
 """Entries that were made by it may be made again; what people handed in is not replaced in silence."""
 FILES = ("predictions.jsonl", "scores.csv", "entry.json")
 """Of an entry; the last one says of the others what they are."""
-NUMBERS = (
-    "e_R_deg",
-    "e_T_deg",
-    "e_s",
-    "metres",
-    "e_row_deg",
-    "error_deg",
-    *(f"auc_{limit}" for limit in AUC_DEG),
-    "flip",
-    "failure",
-    "nees",
-    "seconds",
-)
-"""Columns of scores.csv that hold numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,9 +239,10 @@ def _read_entry(folder: Path) -> Scored:
     named = (record.header.protocol, record.header.split, record.header.method)
     if named != (folder.parents[2].name, folder.parents[1].name, folder.name):
         raise RsbenchError(f"{path}: header: names {'/'.join(named)}, which is not where it lies")
-    columns = ("problem", "scene", "success")
-    scores = read_table(folder / FILES[1], columns, NUMBERS, dtype={"problem": str, "scene": str})
-    shares = scores[[*(f"auc_{limit}" for limit in AUC_DEG), "flip", "failure"]].to_numpy()
+    columns, protocol = ("problem", "scene", "success"), protocol_of_id(record.header.protocol)
+    numbers = (*(score.key for score in protocol.scores), protocol.error)
+    scores = read_table(folder / FILES[1], columns, numbers, dtype={"problem": str, "scene": str})
+    shares = scores[list(protocol.of_kind("share"))].to_numpy()
     if scores["problem"].duplicated().any() or not np.all((shares >= 0.0) & (shares <= 1.0)):
         raise RsbenchError(f"{folder / FILES[1]}: is damaged; rsbench leaderboard rescore makes it again")
     return Scored(folder=folder, header=record.header, predictions_sha256=record.predictions_sha256, scores=scores)

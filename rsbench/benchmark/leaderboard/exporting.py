@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.benchmark.leaderboard.protocols import Protocol
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import truth_text
 from rsbench.dataset.files import save_arrays, write_bytes, write_json
@@ -32,14 +33,15 @@ def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:
     """
     given = list(problems)
     out.mkdir(parents=True, exist_ok=True)
-    records = [problem_record(problem) for problem in given]
+    columns = rig_columns(split.protocol)
+    records = [_record(problem, split.protocol) for problem in given]
     write_bytes(out / "problems.jsonl", "".join(json.dumps(each) + "\n" for each in records).encode())
-    write_bytes(out / "problems.csv", _csv(("name", *RIG), ((p.name, *_rig(p)) for p in given)))
-    for key, columns in COLUMNS.items():
+    write_bytes(out / "problems.csv", _csv(("name", *columns), ((p.name, *_rig(p, columns)) for p in given)))
+    for key, names in COLUMNS.items():
         rows = [(p.name, *row) for p in given for row in getattr(p.correspondences, key).tolist()]
         if rows:
-            write_bytes(out / f"{key}.csv", _csv(("name", *columns.split(", ")), rows))
-    save_arrays(out / "problems.npz", _arrays(given))
+            write_bytes(out / f"{key}.csv", _csv(("name", *names.split(", ")), rows))
+    save_arrays(out / "problems.npz", _arrays(given, columns))
     if split.public:
         write_bytes(out / "truth.jsonl", truth_text(split).encode())
     write_json(out / "split.json", split_record(split))
@@ -57,10 +59,21 @@ def split_record(split: Split) -> dict[str, Any]:
     }
 
 
-def _rig(problem: Problem) -> tuple[float, ...]:
-    camera = problem.rig.camera
-    values = (getattr(camera, key) for key in RIG[:6])
-    return (*values, problem.rig.baseline, problem.shutter.readout_ratio)
+def rig_columns(protocol: Protocol) -> tuple[str, ...]:
+    """Those of ``RIG`` that a protocol gives."""
+    return RIG[:-1] if protocol.asks == "readout" else RIG
+
+
+def _record(problem: Problem, protocol: Protocol) -> dict[str, Any]:
+    record = problem_record(problem)
+    if protocol.asks == "readout":
+        del record["readout_ratio"]
+    return record
+
+
+def _rig(problem: Problem, columns: Sequence[str]) -> tuple[float, ...]:
+    values = (getattr(problem.rig.camera, key) for key in RIG[:6])
+    return (*values, problem.rig.baseline, problem.shutter.readout_ratio)[: len(columns)]
 
 
 def _csv(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
@@ -72,11 +85,11 @@ def _csv(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
     return text.getvalue().encode()
 
 
-def _arrays(problems: list[Problem]) -> dict[str, NDArray[Any]]:
-    """``names`` (n,), ``rig`` (n, 8) as ``RIG``; sets (m, 4 or 8), ``<set>_problem`` (m,): whose each row is."""
+def _arrays(problems: list[Problem], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """``names`` (n,), ``rig`` (n, k), the columns; sets (m, 4 or 8), ``<set>_problem`` (m,): whose each row is."""
     arrays: dict[str, NDArray[Any]] = {
         "names": np.array([problem.name for problem in problems]),
-        "rig": np.array([_rig(problem) for problem in problems]),
+        "rig": np.array([_rig(problem, columns) for problem in problems]),
     }
     for key in COLUMNS:
         sets = [getattr(problem.correspondences, key) for problem in problems]

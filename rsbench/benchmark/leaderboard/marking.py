@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.leaderboard.protocols import AUC_DEG, FLIP_DEG
+from rsbench.benchmark.leaderboard.protocols import AUC_DEG, AUC_READOUT, FLIP_DEG, SUCCESS_DEG
 from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.submissions import Answer, Submission
 from rsbench.benchmark.scoring import answered, pose_errors
@@ -22,16 +22,40 @@ from rsbench.motions import make_motion
 
 _TIMES = 33
 """Row times, from the first row of frame 0 to the last of frame 1, at which poses are compared."""
+_WORST_READOUT = 1.0
+"""Error of a failure: between the two ends of what a ratio can be."""
 Row = dict[str, Any]
 
 
 def mark(submission: Submission, split: Split) -> pd.DataFrame:
     """One row for each problem, in the order of the split; the columns are those of docs/score-files.md."""
-    model = submission.header.motion_model
-    return pd.DataFrame([_row(truth, submission.answers.get(truth.name), model) for truth in split.truths])
+    model, found = submission.header.motion_model, submission.answers
+    if split.protocol.asks == "readout":
+        return pd.DataFrame([_readout_row(truth, found.get(truth.name)) for truth in split.truths])
+    return pd.DataFrame([_motion_row(truth, found.get(truth.name), model) for truth in split.truths])
 
 
-def _row(truth: Truth, answer: Answer | None, model: str) -> Row:
+def _readout_row(truth: Truth, answer: Answer | None) -> Row:
+    ratio = None if answer is None or not answer.success else answer.readout_ratio
+    error = _WORST_READOUT if ratio is None else abs(ratio - truth.shutter.readout_ratio)
+    return {
+        **_named(truth, ratio is not None),
+        "e_readout": error,
+        **{name: max(0.0, 1.0 - error / limit) for name, limit in AUC_READOUT.items()},
+        **_last(ratio is not None, answer),
+    }
+
+
+def _named(truth: Truth, success: bool) -> Row:
+    return {"problem": truth.name, "scene": truth.scene, "success": success}
+
+
+def _last(success: bool, answer: Answer | None) -> Row:
+    seconds = math.nan if answer is None or answer.seconds is None else answer.seconds
+    return {"failure": float(not success), "seconds": seconds}
+
+
+def _motion_row(truth: Truth, answer: Answer | None, model: str) -> Row:
     w, d = _vectors(answer)
     success = answer is not None and bool(answered(w, d, answer.success))
     point = "body" if answer is None else answer.reference_point
@@ -49,18 +73,16 @@ def _row(truth: Truth, answer: Answer | None, model: str) -> Row:
     found = {name: float(value) for name, value in errors.items()}
     worst = float(np.fmax(found["e_R_deg"], found["e_T_deg"]))
     return {
-        "problem": truth.name,
-        "scene": truth.scene,
-        "success": success,
+        **_named(truth, success),
         **found,
         "metres": _metres(d, truth, point) if success and metric else math.nan if success else math.inf,
         "e_row_deg": _row_angle(w, d, truth, model) if success else 180.0,
         "error_deg": worst,
         **{f"auc_{limit}": max(0.0, 1.0 - worst / limit) for limit in AUC_DEG},
+        "within": float(found["e_R_deg"] < SUCCESS_DEG[0] and not found["e_T_deg"] >= SUCCESS_DEG[1]),
         "flip": float(success and found["e_T_deg"] > FLIP_DEG),
-        "failure": float(not success),
         "nees": _nees(answer, w, d, truth) if answer is not None and success and metric else math.nan,
-        "seconds": math.nan if answer is None or answer.seconds is None else answer.seconds,
+        **_last(success, answer),
     }
 
 

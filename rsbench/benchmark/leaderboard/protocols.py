@@ -1,4 +1,4 @@
-"""The protocols of the leaderboard: what a method is given, what it may use, and what is asked; docs/protocols.md.
+"""The protocols of the leaderboard: what a method is given, what it may use, what is asked; docs/protocols.md.
 
 A protocol never changes: what would change scores is a protocol with another number.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Literal
 
 from rsbench.cards import choices
 from rsbench.errors import RsbenchError
@@ -24,10 +25,67 @@ KNOWLEDGE = {
 ORACLE = "truth"
 AUC_DEG = (1, 5, 10)
 """Thresholds of the areas under the curve of max(e_R, e_T)."""
-PRIMARY = "auc_5"
-"""The score by which methods are ranked."""
+AUC_READOUT = {"auc_r10": 0.1, "auc_r02": 0.02}
+"""The same of the error of a readout ratio, by the name of the column."""
 FLIP_DEG = 90.0
 """A direction that is wrong by more is the opposite one."""
+SUCCESS_DEG = (1.0, 5.0)
+"""A success errs by less in rotation and direction, as in the sweeps of simulated points."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score:
+    """A column of scores.csv that tables show."""
+
+    key: str
+    title: str
+    hint: str
+    """What it is, in a line."""
+    kind: Literal["share", "median"]
+    """A share lies in [0, 1]: its mean over scenes has an interval. Of others the median over problems is told."""
+    better: Literal["lower", "higher"] = "lower"
+
+
+_FAILED = Score(key="failure", title="failed", hint="share of problems without an answer", kind="share")
+_SECONDS = Score(key="seconds", title="s", hint="median time of a problem, as stated", kind="median")
+_MOTION = (
+    *(
+        Score(
+            key=f"auc_{limit}",
+            title=f"AUC@{limit}",
+            hint=f"area under the curve of max(e_R, e_T) to {limit} deg",
+            kind="share",
+            better="higher",
+        )
+        for limit in (5, 1, 10)
+    ),
+    Score(
+        key="within", title="success", hint="share with e_R < 1 deg and e_T < 5 deg", kind="share", better="higher"
+    ),
+    Score(key="flip", title="flips", hint="share with e_T above 90 deg", kind="share"),
+    _FAILED,
+    Score(key="e_R_deg", title="e_R (deg)", hint="median angle of the rotation", kind="median"),
+    Score(key="e_T_deg", title="e_T (deg)", hint="median angle of the translation", kind="median"),
+    Score(key="e_row_deg", title="e_row (deg)", hint="median of the largest angle of a row's pose", kind="median"),
+    Score(key="e_s", title="e_s", hint="median |log| of the length, where metres are claimed", kind="median"),
+    Score(key="metres", title="metres", hint="median distance of d from the truth, where claimed", kind="median"),
+    _SECONDS,
+)
+_READOUT = (
+    *(
+        Score(
+            key=key,
+            title=f"AUC@{limit:g}",
+            hint=f"area under the curve of the error of the readout ratio to {limit:g}",
+            kind="share",
+            better="higher",
+        )
+        for key, limit in AUC_READOUT.items()
+    ),
+    _FAILED,
+    Score(key="e_readout", title="error", hint="median error of the readout ratio", kind="median"),
+    _SECONDS,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +101,27 @@ class Protocol:
     """What of ``KNOWLEDGE`` it gives."""
     given: str
     """The inputs, in words."""
+    asks: Literal["motion", "readout"] = "motion"
+    """What an answer is."""
+
+    @property
+    def scores(self) -> tuple[Score, ...]:
+        """Of its tables; methods are ranked by the first."""
+        return _MOTION if self.asks == "motion" else _READOUT
+
+    @property
+    def primary(self) -> Score:
+        """By which methods are ranked: the higher the better."""
+        return self.scores[0]
+
+    @property
+    def error(self) -> str:
+        """The column of scores.csv that decides about the primary score."""
+        return "error_deg" if self.asks == "motion" else "e_readout"
+
+    def of_kind(self, kind: Literal["share", "median"]) -> tuple[str, ...]:
+        """Keys of the scores of a kind."""
+        return tuple(score.key for score in self.scores if score.kind == kind)
 
     def check_uses(self, uses: Collection[str]) -> None:
         """Raises ValueError when a method uses what does not exist, or what this protocol does not give."""
@@ -80,6 +159,14 @@ PROTOCOLS = {
             title="Motion from rendered frames",
             allowed=("left", "right", "links", "readout", "images"),
             given="the four rolling-shutter frames",
+        ),
+        Protocol(
+            track="readout",
+            id="readout-1",
+            title="Readout ratio from given matches of rendered frames",
+            allowed=("left", "right", "links"),
+            given="matches of the frames by rsbench's SIFT, without the readout ratio",
+            asks="readout",
         ),
     )
 }

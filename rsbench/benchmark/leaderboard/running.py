@@ -8,7 +8,8 @@ other packages run in processes of their own with a limit of time; what they do 
 from __future__ import annotations
 
 import hashlib
-import sys
+import json
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
@@ -17,21 +18,26 @@ from typing import Any, NamedTuple
 
 from rsbench.benchmark.images.store import identity_of, read_record
 from rsbench.benchmark.leaderboard.exporting import write_inputs
-from rsbench.benchmark.leaderboard.protocols import Protocol
+from rsbench.benchmark.leaderboard.protocols import PROTOCOLS, Protocol, protocol_of_id
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import submission_text
 from rsbench.benchmark.provenance import numeric_version, processor
 from rsbench.benchmark.simulated.trials import Information, enter
+from rsbench.core.joining import join_stereo
 from rsbench.dataset.files import sha256, write_bytes, write_json
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.answer import Extra, solve_problem
+from rsbench.pipeline.frame_motion import check_readout
 from rsbench.pipeline.isolated_jobs import finished_jobs
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
-from rsbench.pipeline.problem import Problem, read_problems
+from rsbench.pipeline.problem import Problem, parse_problem
+from rsbench.pipeline.readout import estimate_readout_ratio
 from rsbench.pipeline.robust_motion import RobustOptions
+from rsbench.reading import parse_json, read_json, read_text
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.solvers.refined import RefinedSolver
 
 _EXTRAS: tuple[Extra, ...] = ("covariance",)
 CHUNK = 10
@@ -66,9 +72,10 @@ class _Job(NamedTuple):
         return f"{self.card}, problems {self.first} to {self.first + CHUNK - 1}"
 
 
-def uses_of(entry: SolverEntry) -> tuple[str, ...]:
-    """What a solver uses, by what it declares."""
-    return _USES[enter(entry).information] + (("readout",) if entry.solver.spec.shutter == "rolling" else ())
+def uses_of(entry: SolverEntry, protocol: Protocol = PROTOCOLS["points"]) -> tuple[str, ...]:
+    """What a solver uses, by what it declares; what is asked is not used."""
+    rolling = entry.solver.spec.shutter == "rolling" and protocol.asks == "motion"
+    return _USES[enter(entry).information] + (("readout",) if rolling else ())
 
 
 def prepare_inputs(split: Split, problems: Callable[[], Iterator[Problem]], folder: Path) -> None:
@@ -122,8 +129,11 @@ def steps_of(cards: Sequence[str], split: Split) -> int:
 
 
 def _check_uses(protocol: Protocol, entry: SolverEntry) -> None:
+    refined = isinstance(entry.solver, RefinedSolver) and entry.solver.spec.shutter == "rolling"
+    if protocol.asks == "readout" and not refined:
+        raise RsbenchError(f"solver {entry.name!r}: finds no readout ratio; rs-stereo-refined and its variants do")
     try:
-        protocol.check_uses(uses_of(entry))
+        protocol.check_uses(uses_of(entry, protocol))
     except ValueError as error:
         raise RsbenchError(f"solver {entry.name!r}: {error}") from error
 
@@ -146,7 +156,7 @@ def _joined(entry: SolverEntry, split: Split, work: Path, identity: str) -> Path
         "protocol": split.protocol.id,
         "split": split.name,
         "method": entry.name,
-        "uses": uses_of(entry),
+        "uses": uses_of(entry, split.protocol),
         "description": entry.description[:300],
         "paper": spec.reference[:300],
         "code": "rsbench" if entry.built_in else "",
@@ -169,12 +179,14 @@ def _serve(inputs: Path, time_limit_s: float | None) -> Callable[[_Job], None]:
     use_one_thread()
     warm_up()
     runner = SolverRunner(time_limit_s=time_limit_s, single_thread=True)  # as long as this process
-    problems = [_good(each) for each in read_problems(inputs / "problems.jsonl", sys.stdin)]
+    protocol = protocol_of_id(str(read_json(inputs / "split.json").get("protocol")))
+    answer = _answer if protocol.asks == "motion" else _readout
+    problems = read_inputs(inputs, protocol)
 
     def run(job: _Job) -> None:
         try:
             entry = load_solver_entry(job.card)
-            answers = [_answer(problem, entry, runner) for problem in problems[job.first : job.first + CHUNK]]
+            answers = [answer(problem, entry, runner) for problem in problems[job.first : job.first + CHUNK]]
         except RsbenchError as error:
             raise EntryFailure(str(error)) from error
         job.path.parent.mkdir(parents=True, exist_ok=True)
@@ -183,16 +195,45 @@ def _serve(inputs: Path, time_limit_s: float | None) -> Callable[[_Job], None]:
     return run
 
 
-def _good(problem: Problem | RsbenchError) -> Problem:
-    if isinstance(problem, RsbenchError):
-        raise EntryFailure(str(problem))
-    return problem
+def read_inputs(inputs: Path, protocol: Protocol) -> list[Problem]:
+    """The exported problems; where the readout ratio is not given, it is 0.
+
+    Raises:
+        RsbenchError: they are not there, or damaged.
+    """
+    path = inputs / "problems.jsonl"
+    unknown = {"readout_ratio": 0.0} if protocol.asks == "readout" else {}
+    found = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        where = f"{path}:{number}"
+        text = json.dumps(parse_json(line, where) | unknown) if unknown else line
+        found.append(parse_problem(text, where))
+    return found
+
+
+def _seed(problem: Problem, entry: SolverEntry) -> int:
+    """Samples are drawn by the names of problem and solver: they do not depend on the order or on the workers."""
+    text = f"leaderboard {problem.name} {entry.name}"
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+
+
+def _readout(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
+    """The readout ratio that explains the matches best; it needs no ``runner``: the solver is one of ours."""
+    solver = entry.solver
+    assert isinstance(solver, RefinedSolver)
+    matches, start = join_stereo(problem.correspondences).correspondences, time.perf_counter()
+    found = estimate_readout_ratio(matches, problem.rig, solver, RobustOptions(), _seed(problem, entry))
+    seconds = round(time.perf_counter() - start, 6)
+    try:
+        if found is None:
+            raise RsbenchError("no motion explains the matches at any readout ratio")
+        check_readout(found)
+    except RsbenchError as error:
+        return {"name": problem.name, "success": False, "reason": str(error)[:300], "seconds": seconds}
+    return {"name": problem.name, "readout_ratio": min(found.readout_ratio, 1.0), "seconds": seconds}
 
 
 def _answer(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
-    """Samples are drawn by the names of problem and solver: they do not depend on the order or on the workers."""
-    text = f"leaderboard {problem.name} {entry.name}"
-    seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
-    found = solve_problem(problem, entry, RobustOptions(), runner, seed, extras=_EXTRAS)
+    found = solve_problem(problem, entry, RobustOptions(), runner, _seed(problem, entry), extras=_EXTRAS)
     kept = {key: found[key] for key in _KEPT}
     return {**kept, "seconds": round(found["seconds"], 6), "reason": str(found["reason"])[:300]}

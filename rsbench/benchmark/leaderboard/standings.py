@@ -9,18 +9,11 @@ import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.leaderboard.board import Scored
-from rsbench.benchmark.leaderboard.protocols import AUC_DEG, KNOWLEDGE, ORACLE, PRIMARY
+from rsbench.benchmark.leaderboard.protocols import KNOWLEDGE, ORACLE, Protocol, protocol_of_id
 from rsbench.benchmark.leaderboard.ranking import Rank, better, mean_interval, ranks, scene_means, ties
 from rsbench.benchmark.statistics import share_interval
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
-
-SUCCESS_DEG = (1.0, 5.0)
-"""A success errs by less in rotation and direction, as in the sweeps of simulated points."""
-MEANS = (*(f"auc_{limit}" for limit in AUC_DEG), "within", "flip", "failure")
-"""Columns that are means over scenes, with an interval each."""
-MEDIANS = ("e_R_deg", "e_T_deg", "e_row_deg", "e_s", "metres", "seconds")
-"""Columns that are medians over problems; nothing where an entry gives none."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,9 +28,21 @@ class Standing:
     ties: tuple[str, ...]
     """Of those, the ones that the data do not tell from it."""
     means: dict[str, tuple[float, float, float]]
-    """Of ``MEANS``: the mean, and the ends of its interval."""
+    """Of the shares of its protocol: the mean over scenes, and the ends of its interval."""
     medians: dict[str, float]
-    """Of ``MEDIANS``."""
+    """Of the other scores: over problems; NaN where the entry gives none."""
+
+    @property
+    def protocol(self) -> Protocol:
+        """Of the table that it stands in."""
+        return protocol_of_id(self.scored.header.protocol)
+
+    @property
+    def rank_words(self) -> str:
+        """Such as ``2 [1, 4] of 9``."""
+        if self.rank is None:
+            return "oracle"
+        return f"{self.rank.place} [{self.rank.low}, {self.rank.high}] of {self.peers}"
 
     @property
     def uses(self) -> str:
@@ -69,7 +74,8 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
     uses = [frozenset(each.header.uses) for each in ranked]
     found: list[Standing] = []
     if ranked:
-        means = scene_means(np.stack([each.scores[PRIMARY].to_numpy() for each in ranked]), scenes)
+        primary = protocol_of_id(ranked[0].header.protocol).primary.key
+        means = scene_means(np.stack([each.scores[primary].to_numpy() for each in ranked]), scenes)
         beats = better(means)
         for i, rank in enumerate(ranks(means.mean(axis=1), beats, uses)):
             peers = [j for j in range(len(ranked)) if uses[j] <= uses[i]]
@@ -82,23 +88,21 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
 
 def _order(standing: Standing) -> tuple[int, str, float, str]:
     header = standing.scored.header
-    return len(set(header.uses)), standing.uses, -standing.means[PRIMARY][0], header.method
+    score = standing.means[standing.protocol.primary.key][0]
+    return len(set(header.uses)), standing.uses, -score, header.method
 
 
 def _standing(
     scored: Scored, scenes: Sequence[str], rank: Rank | None, peers: int, tied: tuple[str, ...]
 ) -> Standing:
-    scores = scored.scores
-    within = (scores["e_R_deg"] < SUCCESS_DEG[0]) & ~(scores["e_T_deg"] >= SUCCESS_DEG[1])
-    columns = {name: scores[name].to_numpy() for name in MEANS if name != "within"}
-    columns["within"] = within.to_numpy(dtype=np.float64)
+    scores, protocol = scored.scores, protocol_of_id(scored.header.protocol)
     return Standing(
         scored=scored,
         rank=rank,
         peers=peers,
         ties=tied,
-        means={name: _interval(columns[name], scenes) for name in MEANS},
-        medians={name: _median(scores[name].to_numpy()) for name in MEDIANS},
+        means={name: _interval(scores[name].to_numpy(), scenes) for name in protocol.of_kind("share")},
+        medians={name: _median(scores[name].to_numpy()) for name in protocol.of_kind("median")},
     )
 
 

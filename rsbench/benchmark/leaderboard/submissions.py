@@ -81,19 +81,42 @@ class Answer:
     metric: bool = False
     reference_point: Literal["body", "left"] = "body"
     direction_known: bool = True
+    readout_ratio: float | None = None
+    """Where that is asked, instead of a motion."""
     covariance: tuple[tuple[float, ...], ...] | None = None
     seconds: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("w", "d"):
-            if self.success and getattr(self, name) is None:
-                raise ValueError(f"{name}: a success needs three numbers; a failure says success = false")
+        ratio = self.readout_ratio
+        if ratio is not None and not 0.0 <= ratio <= 1.0:
+            raise ValueError(f"readout_ratio = {ratio}: must lie in [0, 1]: readout time / frame period")
         if self.seconds is not None and self.seconds < 0.0:
             raise ValueError(f"seconds = {self.seconds}: must not be negative")
         if self.covariance is not None and (
             len(self.covariance) != 6 or any(len(row) != 6 for row in self.covariance)
         ):
             raise ValueError("covariance: must be 6 x 6 numbers, of w and d")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Motion(Answer):
+    """An answer where a motion is asked."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("w", "d"):
+            if self.success and getattr(self, name) is None:
+                raise ValueError(f"{name}: a success needs three numbers; a failure says success = false")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Readout(Answer):
+    """An answer where the readout ratio is asked."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.success and self.readout_ratio is None:
+            raise ValueError("readout_ratio: a success needs it; a failure says success = false")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -215,7 +238,10 @@ def _answer(text: str, where: str, split: Split) -> Answer:
     if isinstance(name, str) and name not in split.by_name:
         near = choices(name, split.by_name).partition("; there are")[0]
         raise RsbenchError(f"{where}: name = {json.dumps(name[:100])}: is no problem of {split.name}{near}")
-    return parse_card(Answer, data, where)
+    return parse_card(_KINDS[split.protocol.asks], data, where)
+
+
+_KINDS: dict[str, type[Answer]] = {"motion": _Motion, "readout": _Readout}
 
 
 # What may be meant
@@ -225,14 +251,14 @@ def _notes(submission: Submission, split: Split, path: Path) -> Iterator[str]:
     missing = [truth.name for truth in split.truths if truth.name not in submission.answers]
     if missing:
         yield f"{path}: no answer for {len(missing)} of {_few(missing, len(split.truths))}: they count as failures"
-    answers = [answer for answer in submission.answers.values() if answer.success]
+    answers = [answer for answer in submission.answers.values() if answer.success and answer.w is not None]
     turns = [answer.name for answer in answers if np.linalg.norm(_of(answer.w)) > np.pi]
     if turns:
         yield (
             f"{path}: norm(w) is more than half a turn in {len(turns)} of {_few(turns, len(answers))}: w is in "
             "rad, not in degrees"
         )
-    if split.public:
+    if split.public and split.protocol.asks == "motion":
         mistaken = _mistaken(answers, split)
         if mistaken:
             words, count = mistaken
@@ -278,9 +304,10 @@ def template_text(split: Split, method: str = "my-method") -> str:
         **{key: "" for key in ("version", "authors", "paper", "code", "licence", "hardware", "tuned_on")},
     }
     first, *rest = (truth.name for truth in split.truths)
-    motion = {"name": first, "w": [0.01, -0.02, 0.005], "d": [0.1, 0.0, 0.2], "metric": False}
+    motion: dict[str, Any] = {"w": [0.01, -0.02, 0.005], "d": [0.1, 0.0, 0.2], "metric": False}
+    answer = {**motion, "reference_point": "left"} if split.protocol.asks == "motion" else {"readout_ratio": 0.5}
     failures = [{"name": name, "success": False, "reason": "not tried"} for name in rest]
-    return submission_text(header, iter([{**motion, "reference_point": "left"}, *failures]))
+    return submission_text(header, iter([{"name": first, **answer}, *failures]))
 
 
 def truth_text(split: Split) -> str:
@@ -290,9 +317,12 @@ def truth_text(split: Split) -> str:
         "split": split.name,
         "method": "truth",
         "uses": ["truth"],
-        "description": "The true motion",
+        "description": "The truth itself",
     }
-    answers = (
+    if split.protocol.asks == "readout":
+        ratios = ({"name": t.name, "readout_ratio": t.shutter.readout_ratio} for t in split.truths)
+        return submission_text(header, ratios)
+    motions = (
         {"name": t.name, "w": t.motion.w.tolist(), "d": t.motion.d.tolist(), "metric": True} for t in split.truths
     )
-    return submission_text(header, answers)
+    return submission_text(header, motions)

@@ -7,6 +7,7 @@ import json
 import random
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,9 @@ from rsbench.benchmark.leaderboard.submissions import read_submission
 from rsbench.core.projection import rs_project
 from rsbench.dataset.files import load_arrays
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import Problem, read_problems
+from rsbench.report.board_page import build_site
 from rsbench.solvers.engine.registry import load_solver_entry
 
 ROOT = Path(__file__).parents[3]
@@ -170,6 +173,46 @@ def test_scores_that_were_changed_are_named(tmp_path: Path) -> None:
     forged.to_csv(path, index=False)
     assert rescore(board, SPLIT) == {"a": ["auc_5"]}
     assert rescore(board, SPLIT) == {}
+
+
+def test_readout_ratios_are_asked(smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The ratio is not told, one that is off by 0.03 scores 0.7, and small frames are failures by value."""
+    monkeypatch.setattr(running, "finished_jobs", _here)
+    split = dataset_split(PROTOCOLS["readout"], smoke_dataset)
+    where = ("--data", smoke_dataset, "--board", tmp_path / "board")
+    assert run_here("leaderboard", "export", "readout", *where[:2], "--out", tmp_path / "in").returncode == 0
+    assert "0.8" not in (tmp_path / "in" / "problems.csv").read_text("utf-8")
+    assert "readout_ratio" not in (tmp_path / "in" / "problems.jsonl").read_text("utf-8")
+    assert load_arrays(tmp_path / "in" / "problems.npz")["rig"].shape == (2, 7)
+    head, *answers = truth_lines(split)
+    off = [{**head, "method": "off", "uses": ["left"]}, *({**a, "readout_ratio": 0.77} for a in answers)]
+    for lines in ([head, *answers], off):
+        assert run_here("leaderboard", "submit", write(tmp_path / "x.jsonl", lines), *where).returncode == 0
+    assert run_here("leaderboard", "run", "readout", *where, "--entry", "rs-stereo-refined").returncode == 0
+    refused = run_here("leaderboard", "run", "readout", *where, "--entry", "gs-8pt")
+    assert_refused(refused, "gs-8pt", "finds no readout ratio")
+    percent = [head, *({**a, "readout_ratio": 80} for a in answers)]
+    checked = run_here("leaderboard", "check", write(tmp_path / "x.jsonl", percent), *where[:2])
+    assert checked.returncode == 2 and "readout_ratio = 80.0: must lie in [0, 1]" in checked.stderr
+    found = {each.header.method: each.scores for each in entries_of(tmp_path / "board", "readout-1", split.name)}
+    np.testing.assert_allclose(found["off"]["auc_r10"], 0.7, atol=1e-6)
+    assert np.all(found["truth"]["auc_r02"] == 1.0) and np.all(found["off"]["auc_r02"] == 0.0)
+    assert not found["rs-stereo-refined"]["success"].any()  # frames of 128 x 96 px do not determine it
+    assert np.all(found["rs-stereo-refined"]["e_readout"] == 1.0)
+    build_site(tmp_path / "board", tmp_path / "site")
+    assert "AUC@0.1" in (tmp_path / "site" / "index.html").read_text("utf-8")
+
+
+def test_our_solver_finds_the_ratio_that_it_is_not_told() -> None:
+    """Of the public problems the two with the fastest turn whose noise is below 0.2 px."""
+    clear = [t for t in points_split(PROTOCOLS["points"]).truths if float(t.facts["noise_px"]) < 0.2]
+    entry = load_solver_entry("rs-stereo-refined")
+    for truth in sorted(clear, key=lambda t: -float(t.facts["rotation_deg"]))[:2]:
+        problem = simulated_problem(1, int(truth.name[1:]))
+        blind = replace(problem, shutter=problem.shutter.with_ratio(0.0))
+        with SolverRunner() as runner:
+            answer = running._readout(blind, entry, runner)
+        assert abs(answer["readout_ratio"] - truth.shutter.readout_ratio) < 0.05
 
 
 def test_what_is_no_board_stays_as_it_is(tmp_path: Path) -> None:
