@@ -36,6 +36,8 @@ _REWEIGHTINGS = (5, 5)
 _LEAST_IN_FRONT = 0.75
 _AS_GOOD, _APART = 3.0, 25.0
 """Two motions fit alike within so many standard deviations, and are two beyond so many squared ones."""
+_NOISIER = 10.0
+"""Times the noise, with which a motion does not explain what another one does."""
 _NEARLY_PLANAR = 0.15
 """Share of the flow that a homography leaves, at most, for its motions to be tried; 0.2 and more off a plane."""
 _LEAST_NOISE_PX = 0.01
@@ -285,8 +287,12 @@ def _finite(packed: Packed, thetas: Iterable[FloatArray]) -> list[MotionEstimate
 def _as_good(packed: Packed, best: Minimum, other: Minimum) -> bool:
     """Whether the pairs do not prefer one of two motions: each sees another component of the noise of a pair.
 
-    Q. Vuong, Likelihood ratio tests for model selection and non-nested hypotheses, Econometrica 1989.
+    Q. Vuong, Likelihood ratio tests for model selection and non-nested hypotheses, Econometrica 1989. His test
+    says nothing where few pairs have nearly all of the excess; what takes much more noise is not as good.
     """
+    least = max(packed.noise_variance(best.cost), _LEAST_NOISE_PX**2)
+    if packed.noise_variance(other.cost) > _NOISIER**2 * least:
+        return False
     excess = packed.pair_costs(other.theta) - packed.pair_costs(best.theta)
     return float(np.sum(excess)) <= _AS_GOOD * float(np.std(excess)) * np.sqrt(len(excess))
 
