@@ -9,6 +9,7 @@ An entry is written under another name and renamed, so that it is there whole or
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import shutil
@@ -25,7 +26,7 @@ from rsbench.benchmark.leaderboard.exporting import split_record
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS, protocol_of_id
 from rsbench.benchmark.leaderboard.splits import Split
-from rsbench.benchmark.leaderboard.submissions import Header, Submission, read_submission
+from rsbench.benchmark.leaderboard.submissions import SUBMISSION_BYTES, Header, Submission, read_submission
 from rsbench.cards import parse_card
 from rsbench.dataset.files import read_table, write_bytes, write_json, write_table
 from rsbench.dataset.workplace import WORK, workplace
@@ -229,6 +230,17 @@ def _folders(folder: Path) -> Iterator[Path]:
 
 
 def _read_entry(folder: Path) -> Scored:
+    record = _read_record(folder)
+    return Scored(
+        folder=folder,
+        header=record.header,
+        predictions_sha256=record.predictions_sha256,
+        scores=_read_scores(folder, record.header.protocol),
+    )
+
+
+def _read_record(folder: Path) -> Recorded:
+    """What an entry says of itself, which must be true of where it lies and of its predictions."""
     for name in FILES:
         if (folder / name).is_symlink() or not (folder / name).is_file():
             raise RsbenchError(
@@ -239,13 +251,21 @@ def _read_entry(folder: Path) -> Scored:
     named = (record.header.protocol, record.header.split, record.header.method)
     if named != (folder.parents[2].name, folder.parents[1].name, folder.name):
         raise RsbenchError(f"{path}: header: names {'/'.join(named)}, which is not where it lies")
-    columns, protocol = ("problem", "scene", "success"), protocol_of_id(record.header.protocol)
+    if hashlib.sha256(read_bytes(folder / FILES[0], SUBMISSION_BYTES)).hexdigest() != record.predictions_sha256:
+        raise RsbenchError(
+            f"{folder / FILES[0]}: has changed since it was scored; remove the entry, and submit it again"
+        )
+    return record
+
+
+def _read_scores(folder: Path, protocol_id: str) -> pd.DataFrame:
+    columns, protocol = ("problem", "scene", "success"), protocol_of_id(protocol_id)
     numbers = (*(score.key for score in protocol.scores), protocol.error)
     scores = read_table(folder / FILES[1], columns, numbers, dtype={"problem": str, "scene": str})
     shares = scores[list(protocol.of_kind("share"))].to_numpy()
     if scores["problem"].duplicated().any() or not np.all((shares >= 0.0) & (shares <= 1.0)):
         raise RsbenchError(f"{folder / FILES[1]}: is damaged; rsbench leaderboard rescore makes it again")
-    return Scored(folder=folder, header=record.header, predictions_sha256=record.predictions_sha256, scores=scores)
+    return scores
 
 
 # Merging, and scoring again
@@ -287,18 +307,23 @@ def rescore(board: Path, split: Split) -> dict[str, list[str]]:
     """Score the stored predictions of a split again; no method runs.
 
     Returns:
-        For each entry whose scores were others, the columns that changed.
+        For each entry whose scores were others, the columns that changed; all of them where there was no table.
+
+    Raises:
+        RsbenchError: stored predictions are at fault, or not of the entry that they lie in.
     """
     changed: dict[str, list[str]] = {}
     with workplace(board) as hidden:
-        for scored in entries_of(board, split.protocol.id, split.name):
-            path = scored.folder / FILES[0]
+        for folder in _folders(place(board, split.protocol.id, split.name) / "entries"):
+            record, path, old = _read_record(folder), folder / FILES[0], pd.DataFrame()
+            with contextlib.suppress(RsbenchError):
+                old = _read_scores(folder, split.protocol.id)
             submission, data = read_submission(path, split), read_bytes(path)
-            made = read_json(scored.folder / FILES[2]).get("made", {})
-            new = hidden / WORK / scored.header.method
-            _put(new, scored.folder, _contents(submission, data, split, made))
-            now = _read_entry(scored.folder).scores
-            columns = [str(name) for name in now if not now[name].equals(scored.scores.get(name, pd.Series()))]
-            if columns:
-                changed[scored.header.method] = columns
+            if submission.header != record.header:
+                raise RsbenchError(f"{path}: its header is not that of {FILES[2]}; submit it again")
+            made = read_json(folder / FILES[2]).get("made", {})
+            _put(hidden / WORK / folder.name, folder, _contents(submission, data, split, made))
+            now = _read_entry(folder).scores
+            if columns := [str(name) for name in now if not now[name].equals(old.get(name, pd.Series()))]:
+                changed[folder.name] = columns
     return changed

@@ -173,6 +173,15 @@ def test_scores_that_were_changed_are_named(tmp_path: Path) -> None:
     forged.to_csv(path, index=False)
     assert rescore(board, SPLIT) == {"a": ["auc_5"]}
     assert rescore(board, SPLIT) == {}
+    path.write_text("problem\n", "utf-8")
+    with pytest.raises(RsbenchError, match="lacks the column"):
+        entries_of(board, "points-1", SPLIT.name)
+    assert "auc_5" in rescore(board, SPLIT)["a"]
+    assert rescore(board, SPLIT) == {}
+    predictions = scored.folder / "predictions.jsonl"
+    predictions.write_text(predictions.read_text("utf-8").replace("[", "[ "), "utf-8")
+    with pytest.raises(RsbenchError, match="has changed since it was scored"):
+        rescore(board, SPLIT)
 
 
 def test_readout_ratios_are_asked(smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
