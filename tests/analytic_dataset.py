@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +13,12 @@ from rsbench.cards import load_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses
-from rsbench.core.rig import FRAMES, SIDES, StereoRig
+from rsbench.core.rig import StereoRig, views_of
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.files import sha256, write_depth, write_json, write_png, write_poses
-from rsbench.dataset.layout import RELATIVE_FILES
+from rsbench.dataset.layout import relative_files
 from rsbench.dataset.sequence import UNITS, sequence_manifest
 from rsbench.renderers.options import RendererOptions
 
@@ -47,14 +46,16 @@ def plane_colours(camera: PinholeCamera, poses: Pose, depth: NDArray[np.float32]
     return np.round(128 + 50 * np.sin(X @ waves.T)).astype(np.uint8)
 
 
-def _card(rig: StereoRig, shutter: RollingShutter, motion: Motion) -> DatasetCard:
+def _card(rig: StereoRig, shutter: RollingShutter, motion: Motion, frames: int) -> DatasetCard:
     return DatasetCard(
         name="planes",
         camera=CameraCard(width=rig.camera.width, height=rig.camera.height, focal=rig.camera.fx),
         baseline=rig.baseline,
         readout_ratio=shutter.readout_ratio,
+        frames=frames,
         motion=MotionCard(
             model=motion.name,
+            parameters=motion.parameters,
             rotation_deg=float(np.rad2deg(np.linalg.norm(motion.w))),
             rotation_axis=tuple(motion.w.tolist()),
             translation=float(np.linalg.norm(motion.d)),
@@ -65,14 +66,20 @@ def _card(rig: StereoRig, shutter: RollingShutter, motion: Motion) -> DatasetCar
 
 
 def write_analytic_dataset(
-    out: Path, rig: StereoRig, shutter: RollingShutter, motion: Motion, *, true_motion: Motion | None = None
+    out: Path,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    *,
+    true_motion: Motion | None = None,
+    frames: int = 2,
 ) -> None:
     """Write a dataset of format 1; ``true_motion`` makes depth and images, ``motion`` is what the rest says."""
-    folder = out / "planes"
-    for name in RELATIVE_FILES:
+    folder, files = out / "planes", relative_files(frames)
+    for name in files:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
     camera = rig.camera
-    for side, frame in product(SIDES, FRAMES):
+    for side, frame in views_of(frames):
         stated = row_poses(rig, shutter, motion, side, frame)
         write_poses(
             folder / f"poses/{side}_{frame}.csv", shutter.row_time(np.arange(shutter.height), frame), stated
@@ -85,16 +92,18 @@ def write_analytic_dataset(
             depth = plane_depth(camera, poses)
             write_png(folder / f"{kind}/{side}_{frame}.png", plane_colours(camera, poses, depth))
             write_depth(folder / f"{kind}_depth/{side}_{frame}.exr", depth)
-    manifest = sequence_manifest(name="planes", rig=rig, shutter=shutter, motion=motion, frame_period_s=0.1)
+    manifest = sequence_manifest(
+        name="planes", rig=rig, shutter=shutter, motion=motion, frame_period_s=0.1, frames=frames
+    )
     manifest |= {
         "scene": {"name": "planes", "sha256": "", "viewpoint": "default", "eye": [0, 0, 0], "target": [0, 1, 0]},
         "renderer": asdict(load_card(RendererOptions, "renderers", "default")),
         "seed": 0,
         "made_by": dict.fromkeys(("rsbench", "mitsuba", "drjit", "variant"), rsbench.__version__),
-        "files": {name: sha256(folder / name) for name in RELATIVE_FILES},
+        "files": {name: sha256(folder / name) for name in files},
     }
     write_json(folder / "sequence.json", manifest)
-    names = ["sequence.json", *RELATIVE_FILES]
+    names = ["sequence.json", *files]
     write_json(
         out / "dataset.json",
         {
@@ -104,7 +113,7 @@ def write_analytic_dataset(
             "rsbench": rsbench.__version__,
             "mitsuba": "none",
             "units": UNITS,
-            "card": asdict(_card(rig, shutter, motion)),
+            "card": asdict(_card(rig, shutter, motion, frames)),
             "sequences": ["planes"],
             "files": {
                 f"planes/{name}": {"sha256": sha256(folder / name), "size": (folder / name).stat().st_size}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +17,7 @@ _TRIED_PIXELS = 20_000
 _AGREE, _LEAST = 0.8, 50
 """Share of the comparable pixels that agree where both maps are at their places, and how many there must be."""
 _NEAR = 4
-"""Frames before and after with which a frame is compared, and at whose places it is looked for first."""
+"""Frames before and after with which a frame is compared, the nearest first."""
 _FARTHEST = 32
 
 
@@ -30,21 +30,23 @@ def misplaced_frames(sequence: Sequence, apart: Collection[Times]) -> list[str]:
     suspects = sorted({frame for times in apart for frame in times})
     lost = [frame for frame in suspects if not any(maps.agree(frame, frame, other) for other in maps.near(frame))]
     sound = [frame for frame in range(sequence.frames) if frame not in lost]
-    return [fault for frame in lost for fault in _finding(maps, frame, sound or maps.near(frame))]
+    found = {frame: _time_of(maps, frame, sound or maps.near(frame)) for frame in lost}
+    return [
+        _finding(frame, time) for frame, time in found.items() if time is not None or (sound and maps.seen(frame))
+    ]
 
 
-def _finding(maps: _Maps, frame: int, others: list[int]) -> Iterator[str]:
-    """Of a frame that agrees with none: at which time it does; nothing where it cannot be compared."""
+def _time_of(maps: _Maps, frame: int, others: list[int]) -> int | None:
+    """The time at which a frame that agrees with none at its own does."""
     beside = sorted(others, key=lambda other: abs(other - frame))[: 2 * _NEAR]
     times = sorted(range(maps.sequence.frames), key=lambda other: abs(other - frame))[1 : _FARTHEST + 1]
-    file = Shot("rs", "left", frame).depth
-    for time in times:
-        if any(maps.agree(frame, time, other) for other in beside if other != frame and other != time):
-            what = f"all pictures of frame {frame} disagree with those of other times, and not with each other"
-            yield finding(file, what, cause=f"looks like frame {time}")
-            return
-    if len(others) < maps.sequence.frames - 1 or any(maps.comparable(frame, other) for other in beside):
-        yield finding(file, f"frame {frame} agrees with no other time, though its pictures agree with each other")
+    pairs = ((time, other) for time in times for other in beside if other not in (frame, time))
+    return next((time for time, other in pairs if maps.agree(frame, time, other)), None)
+
+
+def _finding(frame: int, time: int | None) -> str:
+    what = f"all pictures of frame {frame} disagree with those of other times, and not with each other"
+    return finding(Shot("rs", "left", frame).depth, what, cause="" if time is None else f"looks like frame {time}")
 
 
 class _Maps:
@@ -65,8 +67,9 @@ class _Maps:
         share, count = self._share(frame, time, other)
         return count >= _LEAST and share > _AGREE
 
-    def comparable(self, frame: int, other: int) -> bool:
-        return self._share(frame, frame, other)[1] >= _LEAST
+    def seen(self, frame: int) -> bool:
+        """Whether another one near it sees what it sees."""
+        return any(self._share(frame, frame, other)[1] >= _LEAST for other in self.near(frame))
 
     def _share(self, frame: int, time: int, other: int) -> tuple[float, int]:
         key = frame, time, other
