@@ -18,7 +18,7 @@ from rsbench import arguments
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.projection import RSProjection, rs_project
-from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
+from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 
 if TYPE_CHECKING:
@@ -46,14 +46,14 @@ def project(
 ) -> RSProjection:
     """Pixels at which a moving rolling-shutter camera sees world points (..., 3), metres.
 
-    Exact: the row that sees a point is solved for, to 1e-9 px. ``frame`` is 0 or 1.
+    Exact: the row that sees a point is solved for, to 1e-9 px. ``frame`` counts from 0.
 
     Returns:
         ``pixels`` (..., 2), ``depth`` (...) z in the camera of that row, ``tau`` (...) its time, ``status`` (...):
         0 seen, 1 never seen, 2 seen twice (the first is given), 3 not converged. NaN where nothing was seen.
     """
     arguments.check_one_of("side", side, SIDES)
-    arguments.check_one_of("frame", frame, FRAMES)
+    arguments.check_whole("frame", frame, 0)
     arguments.check_rows(rig, shutter)
     return rs_project(rig, shutter, motion, side, frame, arguments.world_points(points))
 
