@@ -66,6 +66,21 @@ def _check_outputs(out: Path, names: tuple[str, ...]) -> dict[str, Any]:
     return record
 
 
+def test_a_rendered_sequence_is_footage_that_knows_its_rig(tmp_path: Path, castle: Sequence, rig: Path) -> None:
+    result = correct(castle.folder, "--out", tmp_path / "out")
+    assert result.returncode == 0, result.stderr
+    record = _check_outputs(
+        tmp_path / "out", tuple(f"{side}_00000{k}" for side in ("left", "right") for k in (0, 1))
+    )
+    assert [frame["number"] for frame in record["frames"]] == [0, 1] and not record["readout_ratio_estimated"]
+    assert record["readout_ratio"] == castle.shutter.readout_ratio and record["baseline"] == castle.rig.baseline
+    others = {("--rig", rig): "knows its frames and rig", ("--left", castle.folder): "leave the others out"}
+    for more, words in others.items():
+        assert_refused(correct(castle.folder, *more, "--out", tmp_path / "other"), words)
+    words = "is a dataset; give one of its sequences: castle, room-twist"
+    assert_refused(correct(castle.folder.parent, "--out", tmp_path / "other"), words)
+
+
 def test_four_frames(tmp_path: Path, castle: Sequence, frames: list[Path], rig: Path) -> None:
     out = tmp_path / "out"
     result = correct(*frames, "--rig", rig, "--out", out, "--target", "middle")

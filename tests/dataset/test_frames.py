@@ -13,6 +13,8 @@ import pytest
 from analytic_dataset import PLANES, write_analytic_dataset
 from attack.planting import rehash
 
+from rsbench.benchmark.images.evaluation import open_evaluation
+from rsbench.benchmark.images.plan import EvaluationOptions
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import AcceleratedMotion, LaterMotion, LinearMotion, Motion, TwistMotion
 from rsbench.core.projection import back_project
@@ -265,6 +267,17 @@ def test_what_does_not_fit_many_frames_is_refused() -> None:
     assert short is not None
     with pytest.raises(ValueError, match=r"lasts 2 frame periods; 4 frames need 3\.5"):
         card(frames=4, motion=replace(short, parameters=given)).expanded()
+
+
+def test_an_evaluation_is_of_all_pairs_and_only_takes_their_sequence(sound: Path, tmp_path: Path) -> None:
+    every = {"planes.0", "planes.1", "planes.2"}
+    for only, chosen in (((), every), (("planes",), every), (("planes.1",), {"planes.1"})):
+        options = EvaluationOptions(solvers=("gs-8pt",), only=only)
+        evaluation = open_evaluation(sound, tmp_path / "out", options)
+        assert {sequence.name for sequence in evaluation.sequences} == every
+        assert evaluation.plan.sequence_names == chosen
+    with pytest.raises(RsbenchError, match=r"--only planes\.3: is neither a sequence nor a solver"):
+        open_evaluation(sound, tmp_path / "out", EvaluationOptions(solvers=("gs-8pt",), only=("planes.3",)))
 
 
 def test_two_things_of_one_name_are_refused(sound: Path, tmp_path: Path) -> None:
