@@ -228,7 +228,7 @@ FEW_ROWS = rsbench.RollingShutter(height=9, readout_ratio=0.8)
     [
         (lambda: rsbench.project(np.zeros((4, 2)), RIG, SHUTTER, MOTION), "points: must have shape"),
         (lambda: rsbench.project([1, 2, 3], RIG, SHUTTER, MOTION, "middle"), "side = 'middle': must be"),  # type: ignore[arg-type]
-        (lambda: rsbench.project([1, 2, 3], RIG, SHUTTER, MOTION, "left", -1), "frame = -1: must be a whole number"),
+        (lambda: rsbench.project([1, 2, 3], RIG, SHUTTER, MOTION, "left", -1), "frame = -1: must be a whole"),
         (lambda: rsbench.simulate(RIG, FEW_ROWS, MOTION), "shutter.height = 9: must be .* 900 rows"),
         (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, noise_px=-1), "noise_px = -1: must be a number at"),
         (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, pairs=-1), "pairs = -1: must be a whole number"),
