@@ -209,6 +209,8 @@ def about_split(folder: Path) -> About:
         RsbenchError: it is not there, or damaged.
     """
     path = folder / "split.json"
+    if path.is_symlink() or not path.is_file():
+        raise RsbenchError(f"{path}: must be a file of its own; submit an entry again, which makes it")
     return parse_card(About, read_json(path), str(path), extra="ignore")
 
 

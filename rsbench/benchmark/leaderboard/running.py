@@ -34,7 +34,7 @@ from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_t
 from rsbench.pipeline.problem import Problem, parse_problem
 from rsbench.pipeline.readout import estimate_readout_ratio
 from rsbench.pipeline.robust_motion import RobustOptions
-from rsbench.reading import parse_json, read_json, read_text
+from rsbench.reading import check_name, parse_json, read_json, read_text
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 from rsbench.solvers.engine.warm_up import warm_up
 from rsbench.solvers.refined import RefinedSolver
@@ -133,6 +133,7 @@ def _check_uses(protocol: Protocol, entry: SolverEntry) -> None:
     if protocol.asks == "readout" and not refined:
         raise RsbenchError(f"solver {entry.name!r}: finds no readout ratio; rs-stereo-refined and its variants do")
     try:
+        check_name(entry.name)
         protocol.check_uses(uses_of(entry, protocol))
     except ValueError as error:
         raise RsbenchError(f"solver {entry.name!r}: {error}") from error

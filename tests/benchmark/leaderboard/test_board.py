@@ -243,6 +243,12 @@ def test_a_strangers_board_leads_nowhere(tmp_path: Path) -> None:
     scored.folder.rename(scored.folder.with_name("b"))
     with pytest.raises(RsbenchError):
         merge(theirs, tmp_path / "mine")
+    other = tmp_path / "other"
+    about = add(other, tmp_path / "x.jsonl", SPLIT, {}).folder.parents[1] / "split.json"
+    about.unlink()
+    about.symlink_to(secret)
+    with pytest.raises(RsbenchError, match=r"split\.json: must be a file of its own"):
+        merge(other, tmp_path / "mine")
     assert not list((tmp_path / "mine").rglob("predictions.jsonl"))
 
 
@@ -362,6 +368,13 @@ def _here(serve: Any, jobs: Any, workers: int, environment: object, *arguments: 
     """``finished_jobs`` without a child."""
     run = serve(*arguments)
     yield from ((job, run(job)) for job in jobs)
+
+
+def test_cards_that_cannot_be_entries_are_refused_before_they_run(tmp_path: Path) -> None:
+    card = tmp_path / "my card.toml"
+    card.write_text('class = "rsbench.solvers.eight_point:EightPointSolver"\n', "utf-8")
+    with pytest.raises(RsbenchError, match=r"solver 'my card': name = 'my card': must be a folder's name"):
+        run_cards([str(card)], SPLIT, tmp_path / "in", tmp_path / "work")
 
 
 def test_runs_are_the_same_however_they_are_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
