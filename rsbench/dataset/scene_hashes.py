@@ -23,6 +23,9 @@ def scene_hash(scene: Scene) -> str:
     """Hash of all that is rendered of a scene: geometry, materials and light."""
     digest = hashlib.sha256()
     digest.update(repr(scene.light).encode())
+    if scene.light.environment is not None:
+        digest.update(scene.light.environment.radiance.tobytes())
+        digest.update(scene.light.environment.frame_from_map.tobytes())
     for mesh in scene.meshes:
         digest.update(f"{mesh.name}/{mesh.material.name}/{mesh.material.colour}".encode())
         for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.normals, mesh.material.texture):
@@ -66,6 +69,6 @@ def scene_key(name: str) -> str | None:
     """Equal keys are equal scenes on one machine; None when files or other packages' code decide too."""
     card, builder = read_scene_card(card_path("scenes", name))
     key = built_key(builder, card.seed)
-    if key is None:
+    if key is None or card.light.environment:
         return None
     return hashlib.sha256(json.dumps([key, asdict(card)], sort_keys=True).encode()).hexdigest()

@@ -35,6 +35,8 @@ def sunsky_radiance(scene: MitsubaScene, ray: Any, active: Any = True, ways: Seq
     sun = sky.sun_radiance * dr.select(lit, dr.select(hidden, 0, facing), 0)
     if ways:
         ambient = _seen_sky(scene, hit, normal, ways, on_surface)
+    elif sky.mapped:
+        ambient = sky.on_open_surface(normal)
     else:
         ambient = sky.overhead * dr.fma(dr.dot(normal, sky.up), 0.4, 0.6)
     return dr.select(on_surface, albedo * (sun + ambient), sky.seen_along(ray.d))

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from rsbench.errors import RsbenchError
 from rsbench.renderers.backend import start_backend
-from rsbench.scenes.model import Light, Material, Scene, SceneMesh
+from rsbench.scenes.environment import irradiance_map
+from rsbench.scenes.model import Environment, Light, Material, Scene, SceneMesh
 
 _SKY_ROWS = 64  # of the sky map that `path` samples; the sky is linear in the sine of the elevation
 
@@ -37,7 +38,9 @@ class MitsubaScene:
         # `path` picks one emitter at random for each shadow ray: black ones would only add noise.
         if any(scene.light.sun_irradiance):
             content["sun"] = _sun(scene.light)
-        if any((*scene.light.sky_zenith, *scene.light.sky_horizon)):
+        if scene.light.environment is not None:
+            content["sky"] = _mapped(scene.light.environment.radiance, scene.light.environment)
+        elif any((*scene.light.sky_zenith, *scene.light.sky_horizon)):
             content["sky"] = _sky(scene.light)
         materials: dict[int, Any] = {}
         drawn = [mesh for mesh in scene.meshes if mesh.faces.size]
@@ -50,7 +53,7 @@ class MitsubaScene:
             content[f"mesh{number:05d}"] = _mesh(mesh, materials[key])
         # Merging shapes of equal material, the default, depends on the order of a parallel loader.
         self.scene = mi.load_dict(content, optimize=False)
-        self.sky = Sky(scene.light)
+        self.sky = Sky(scene.light, self.scene.environment())
         gc.collect()  # `mi.traverse` leaves cyclic garbage that holds its shape, and so the textures
 
     def __del__(self) -> None:
@@ -71,7 +74,8 @@ def give_back_memory() -> None:
 class Sky:
     """Sun and sky in the form that the kernels read: data, so another sun compiles nothing."""
 
-    def __init__(self, light: Light) -> None:
+    def __init__(self, light: Light, emitter: Any) -> None:
+        """``emitter``: Mitsuba's of the sky, asked where the light has an environment map."""
         import drjit as dr
         import mitsuba as mi
 
@@ -84,25 +88,43 @@ class Sky:
         self.horizon = mi.Color3f(*opaque(light.sky_horizon))
         self.zenith = mi.Color3f(*opaque(light.sky_zenith))
         self.overhead = mi.Color3f(*opaque(mean_sky(light)))
+        self.mapped = light.environment is not None
+        if light.environment is not None:
+            open_ = irradiance_map(light.environment.radiance)
+            self._around, self._open = emitter, mi.load_dict(_mapped(open_, light.environment))
 
     def seen_along(self, direction: Any) -> Any:
         """Radiance of the sky along unit directions: the horizon's colour below, towards the zenith's above."""
         import drjit as dr
 
+        if self.mapped:
+            return _looked_up(self._around, direction)
         return self.horizon + (self.zenith - self.horizon) * dr.maximum(dr.dot(direction, self.up), 0)
 
     def on_open_surface(self, normal: Any) -> Any:
-        """Radiance of a white diffuse surface with unit normals from all of the sky, and the horizon below it.
+        """Radiance of a white diffuse surface with unit normals from all of the sky, and what lies below it.
 
         The integral of max(n.w, 0) max(up.w, 0) over all directions w is 2 / 3 (sin a + (pi - a) cos a), with a
         between n and up: Cho and Saul, Kernel methods for deep learning, NIPS 2009, in three dimensions.
         """
         import drjit as dr
 
+        if self.mapped:
+            return _looked_up(self._open, normal)
         level = dr.clip(dr.dot(normal, self.up), -1, 1)
         angle = dr.acos(level)
         share = (dr.sqrt(1 - level * level) + (dr.pi - angle) * level) * (2 / (3 * dr.pi))
         return self.horizon + (self.zenith - self.horizon) * share
+
+
+def _looked_up(emitter: Any, direction: Any) -> Any:
+    """Radiance of an environment map along unit directions, as ``path`` has it."""
+    import drjit as dr
+    import mitsuba as mi
+
+    ray = dr.zeros(mi.SurfaceInteraction3f)
+    ray.wi = -direction
+    return mi.Color3f(emitter.eval(ray))
 
 
 def mean_sky(light: Light) -> NDArray[np.float64]:
@@ -147,6 +169,19 @@ def _sky(light: Light) -> dict[str, Any]:
     colours = (horizon + (zenith - horizon) * height).astype(np.float32)
     bitmap = mi.Bitmap(np.repeat(colours[:, None], 2 * _SKY_ROWS, axis=1).copy())
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(pose.tolist())}
+
+
+def _mapped(radiance: NDArray[np.float32], environment: Environment) -> dict[str, Any]:
+    """Mitsuba's environment map, whose middle looks along its z, with -x at its right and y at its pole."""
+    import mitsuba as mi
+
+    pose = np.eye(4)
+    pose[:3, :3] = environment.frame_from_map @ np.diag([-1.0, -1.0, 1.0])
+    return {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(radiance.copy()),
+        "to_world": mi.ScalarTransform4f(pose.tolist()),
+    }
 
 
 def _loaded(material: Material) -> Any:

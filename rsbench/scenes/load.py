@@ -12,6 +12,7 @@ from rsbench.cards import card_path, parse_card, read_toml
 from rsbench.errors import RsbenchError
 from rsbench.imports import blaming
 from rsbench.plugins import Kind, NoOptions, load_class, make_component
+from rsbench.scenes.environment import lit_by, read_environment
 from rsbench.scenes.kept import built_key, keep, kept_meshes
 from rsbench.scenes.model import Light, Scene, SceneBuilder, SceneMesh, Viewpoint
 
@@ -29,6 +30,10 @@ class LightCard:
     sun_irradiance: Rgb = (2.6, 2.4, 2.1)
     sky_zenith: Rgb = (0.25, 0.45, 0.85)
     sky_horizon: Rgb = (0.75, 0.85, 0.95)
+    environment: str = ""
+    """Lat-long .hdr or .exr file, relative to the card: sun and sky of the card only say how bright it is."""
+    environment_turn_deg: float = 0.0
+    """Anticlockwise from above; at 0 the middle of the map looks along +y."""
 
     def __post_init__(self) -> None:
         if not 0 < self.sun_elevation_deg <= 90:
@@ -115,7 +120,11 @@ def load_scene(name_or_path: str | Path) -> Scene:
         with blaming(f"{path}: builder = {card.builder!r}", "failed"):
             meshes = tuple(builder.build(card.seed, path.parent))
     _check_meshes(meshes, f"{path}: builder = {card.builder!r}")
-    return Scene(name=card.name, meshes=meshes, light=card.light.light(), viewpoints=card.viewpoints)
+    light = card.light.light()
+    if card.light.environment:
+        found = read_environment(path.parent / card.light.environment)
+        light = lit_by(light, found, card.light.environment_turn_deg)
+    return Scene(name=card.name, meshes=meshes, light=light, viewpoints=card.viewpoints)
 
 
 def _built(builder: SceneBuilder, seed: int, folder: Path) -> tuple[SceneMesh, ...]:

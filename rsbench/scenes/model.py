@@ -51,6 +51,17 @@ class SceneMesh:
     """(n, 3) unit shading normals; absent = flat shading."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Environment:
+    """Light from all directions, instead of a two-colour sky."""
+
+    radiance: NDArray[np.float32]
+    """(H + 1, 2 H, 3) linear RGB: columns go around as in a picture of all that is, rows from zenith to nadir, the
+    first and the last being these."""
+    frame_from_map: FloatArray
+    """(3, 3) rotation from the map's axes: x right, y down, z forward to the middle of the map."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Light:
     """A directional sun and a two-colour sky, linear RGB."""
@@ -62,6 +73,8 @@ class Light:
     sky_horizon: tuple[float, float, float] = (0.75, 0.85, 0.95)
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Unit vector to the zenith, in the frame of the scene."""
+    environment: Environment | None = field(default=None, repr=False)
+    """Instead of the sky, where there is one; the sun is not in it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,8 +160,10 @@ class Scene:
             )
             for mesh in self.meshes
         )
+        own = self.light.environment
         light = replace(
             self.light,
+            environment=None if own is None else replace(own, frame_from_map=rotation @ own.frame_from_map),
             sun_direction=tuple(rotation @ np.asarray(self.light.sun_direction)),
             up=tuple(rotation @ np.asarray(self.light.up)),
         )

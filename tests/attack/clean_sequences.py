@@ -42,6 +42,7 @@ MOST_DRAWS = 50
 RENDERERS = {
     "one": 'integrator = "sunsky"\nsamples = 1\n',
     "four": 'integrator = "sunsky"\nsamples = 4\n',
+    "hidden": 'integrator = "sunsky"\nsamples = 4\nsky_rays = 2\n',
     "sixteen": 'integrator = "sunsky"\nsamples = 16\nexposure = 1.6\n',
     "traced": 'integrator = "path"\nsamples = 4\nmax_depth = 3\n',
 }
