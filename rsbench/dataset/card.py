@@ -20,7 +20,9 @@ from rsbench.dataset.imu import Imu
 from rsbench.dataset.layout import MOST_FRAMES, MOST_TWINS
 from rsbench.dataset.matches import Matching
 from rsbench.dataset.motion_card import MotionCard as MotionCard
+from rsbench.dataset.movers import MovingCard, check_moving, drawn
 from rsbench.dataset.sequence import sequence_manifest
+from rsbench.dataset.shots import GivenGeometry
 from rsbench.dataset.trajectory import TrajectoryCard, parts_along
 from rsbench.errors import RsbenchError
 from rsbench.imports import search
@@ -64,6 +66,8 @@ class SequenceCard:
     """Baseline and translation are multiplied by it: for what is larger or nearer than other scenes."""
     seed: int | None = None
     """Replaces the dataset's seed."""
+    moving: tuple[MovingCard, ...] = ()
+    """Objects that move by themselves."""
     start: Start | None = None
     """Of the body at time 0, where that is not at the viewpoint: made from a trajectory."""
 
@@ -83,6 +87,7 @@ class Variation:
     readout_ratio: float | None = None
     frame_period_s: float | None = None
     sensor: Sensor | None = None
+    moving: tuple[MovingCard, ...] | None = None
 
     def of(self, sequence: SequenceCard) -> SequenceCard:
         """A sequence with it."""
@@ -133,6 +138,7 @@ class DatasetCard(Scanning):
         for sequence in self.sequence:
             self.rig_of(sequence)
             self._check_times(sequence)
+            check_moving(sequence.moving, self.channels, self.frames)
         if len(set(self.channels)) < len(self.channels):
             raise ValueError(f"channels = {list(self.channels)}: must differ from each other")
         check_channels(self.channels, self.camera.lens is not None, self.plain)
@@ -201,6 +207,11 @@ class DatasetCard(Scanning):
     def motion_of(self, sequence: SequenceCard) -> Motion:
         return self._motion_card(sequence).motion()
 
+    def geometry_of(self, sequence: SequenceCard) -> GivenGeometry:
+        rig, shutter = self.rig_of(sequence), self.shutter_for(sequence)
+        things = tuple(each.thing for each in sequence.moving)
+        return GivenGeometry(rig, shutter, self.motion_of(sequence), self.frames, things)
+
     def _motion_card(self, sequence: SequenceCard) -> MotionCard:
         card = sequence.motion or self.motion
         if card is None:
@@ -227,6 +238,7 @@ class DatasetCard(Scanning):
             motion=self.motion_of(sequence),
             frame_period_s=self.period_of(sequence),
             frames=self.frames,
+            moves=bool(sequence.moving),
         )
         own = self.sensor_of(sequence)
         sensor = {} if own is None else {"sensor": own.record}
@@ -234,7 +246,8 @@ class DatasetCard(Scanning):
         imu = {"imu": asdict(self.imu or Imu())} if "imu" in self.channels else {}
         matches = {"matches": asdict(self.matches or Matching())} if "matches" in self.channels else {}
         twins = {"twins": list(rows)} if (rows := self.twins_of(sequence)) else {}
-        return {**manifest, **sensor, **channels, **imu, **matches, **twins}
+        moving = {"moving": [each.record for each in sequence.moving]} if sequence.moving else {}
+        return {**manifest, **sensor, **channels, **imu, **matches, **twins, **moving}
 
     def only(self, names: list[str]) -> DatasetCard:
         """The same card with some of its sequences.
@@ -304,7 +317,9 @@ class DatasetCard(Scanning):
             for _, variation in values:
                 varied = variation.of(varied)
             moved = (label for label, variation in values if variation.motion is not None)
-            made.append(self._scaled(self._drawn(varied, "-".join((sequence.name, *moved, *ending)))))
+            named = "-".join((sequence.name, *moved, *ending))
+            things = drawn(varied.moving, self.seed_of(varied), named)
+            made.append(self._scaled(self._drawn(replace(varied, moving=things), named)))
         return made
 
     def _drawn(self, sequence: SequenceCard, name: str) -> SequenceCard:
@@ -326,7 +341,8 @@ class DatasetCard(Scanning):
         if motion is not None and motion.translation is not None:
             motion = replace(motion, translation=motion.translation * sequence.scale)
         baseline = self.rig_of(sequence).baseline * sequence.scale
-        return replace(sequence, motion=motion, baseline=baseline, scale=1.0)
+        moving = tuple(each.scaled(sequence.scale) for each in sequence.moving)
+        return replace(sequence, motion=motion, baseline=baseline, moving=moving, scale=1.0)
 
     def _followed(self, sequence: SequenceCard, card: TrajectoryCard, folder: Path) -> list[SequenceCard]:
         """One sequence for each so many frames on a trajectory."""

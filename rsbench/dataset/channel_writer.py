@@ -22,6 +22,7 @@ from rsbench.dataset.channels import (
     surface_file,
 )
 from rsbench.dataset.files import write_exr, write_png, write_png16
+from rsbench.dataset.movers import numbers_of
 from rsbench.dataset.shots import Geometry, Shot
 from rsbench.renderers.render import Frame
 
@@ -54,7 +55,7 @@ def write_channels(
         write_exr(folder / radiance_file(shot.side, shot.frame), bright, half=True)
     if not set(names) & {*PAIR_CHANNELS, "normals", "instances"}:
         return
-    seen = SeenSurfaces(geometry, shot, rendered.depth)
+    seen = SeenSurfaces(geometry, shot, rendered.depth, numbers=numbers_of(rendered.labels))
     for layer in pair_layers(names, twins, geometry.frames):
         if shot[1:3] not in layer.views(geometry.frames):
             continue

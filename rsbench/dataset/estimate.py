@@ -76,10 +76,12 @@ def _of_scene(
     places = len({place_of(sequence) for sequence in sequences})
     kinds: dict[str, list[SequenceCard]] = {}
     for sequence in sequences:
-        kinds.setdefault(repr(card.sensor_of(sequence)), []).append(sequence)
+        kinds.setdefault(repr((card.sensor_of(sequence), len(sequence.moving))), []).append(sequence)
     tried: list[Estimate] = []
     for kind, alike in kinds.items():
-        tried.append(_of_kind(card, alike, options, rendered, warm=kind in warm))
+        same = alike[0].moving == sequences[0].moving
+        shown = rendered if same else MitsubaScene(seen_scene(scene, alike[0]))
+        tried.append(_of_kind(card, alike, options, shown, warm=kind in warm))
         warm.add(kind)
     total = _sum(tried)
     return replace(total, seconds=total.seconds + built - start + places * (loaded - built))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench import __version__
 from rsbench.cards import card_path, load_card
+from rsbench.core.moving import poses_of
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.se3 import Pose
@@ -30,7 +31,7 @@ from rsbench.dataset.manifest import Files, write_manifest
 from rsbench.dataset.matches import Matching
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence_channels import write_sequence_channels
-from rsbench.dataset.shots import GivenGeometry, Shot
+from rsbench.dataset.shots import Geometry, Shot
 from rsbench.dataset.stage import Build, Built, Stage
 from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, remove, strangers, workplace
 from rsbench.errors import RsbenchError
@@ -41,6 +42,7 @@ from rsbench.scenes.load import SceneCard, load_scene, read_scene_card
 from rsbench.vision.feature_matcher import load_features
 
 if TYPE_CHECKING:
+    from rsbench.renderers.render import Frame, OnGlobalFrame
     from rsbench.renderers.scene import MitsubaScene
 
 Progress = Callable[[str], None]
@@ -137,6 +139,11 @@ def _plan(card: DatasetCard, sequence: SequenceCard, options: RendererOptions, s
     if sequence.viewpoint not in scene.viewpoints:
         names = ", ".join(scene.viewpoints)
         raise RsbenchError(f"scene {sequence.scene}: no viewpoint {sequence.viewpoint!r}; there are: {names}")
+    if sequence.moving and (options.integrator != "sunsky" or options.sky_rays):
+        raise RsbenchError(
+            f"sequence {sequence.name}: moving objects are not for the integrator {options.integrator!r} of the "
+            f"renderer {card.renderer} with sky_rays = {options.sky_rays}: take 'sunsky' without sky_rays"
+        )
     viewpoint = scene.viewpoints[sequence.viewpoint]
     start = {} if sequence.start is None else {"start": _listed(asdict(sequence.start))}
     return card.manifest_of(sequence) | {
@@ -172,7 +179,7 @@ def _complete(
             f"{folder}: holds no sequence.json, so rsbench did not make it; move it away or choose another --out"
         )
     manifest = read_json(folder / "sequence.json")
-    expected = dict.fromkeys(("sensor", "channels", "imu", "matches", "twins", "frames"))
+    expected = dict.fromkeys(("sensor", "channels", "imu", "matches", "twins", "frames", "moving"))
     expected |= _of_scene(plan, scene_hashes.of(sequence.scene))
     other = [key for key, value in expected.items() if manifest.get(key) != value]
     if other:
@@ -276,9 +283,7 @@ def _render_sequence(
 
     backend = start_backend()
     mitsuba_scene, digest = stage.set_for(sequence)
-    if words := obstacle(
-        mitsuba_scene, card.rig_of(sequence), card.shutter_for(sequence), card.motion_of(sequence), card.frames
-    ):
+    if words := obstacle(mitsuba_scene, *card.geometry_of(sequence)):
         raise RsbenchError(f"sequence {sequence.name}: {words}; choose another motion, viewpoint or baseline")
     partial = out / HIDDEN / WORK / sequence.name
     remove(partial)  # of a worker that was killed
@@ -318,23 +323,18 @@ def render_camera(
     What a sensor does is done to the rolling-shutter frame alone; its clean twin is kept.
     """
     from rsbench.renderers.image import to_srgb8
-    from rsbench.renderers.render import render
     from rsbench.renderers.segments import SceneRays
     from rsbench.renderers.sensed import sensed_rows
 
-    rig, shutter, sensor = card.rig_of(sequence), card.shutter_for(sequence), card.sensor_of(sequence)
+    geometry, sensor = card.geometry_of(sequence), card.sensor_of(sequence)
+    rig, shutter, motion, _, things = geometry
     options = replace(options, seed=image_seed(card.seed_of(sequence), sequence.name, side, frame))
-    poses = row_poses(rig, shutter, card.motion_of(sequence), side, frame)
+    poses, twins = row_poses(rig, shutter, motion, side, frame), card.twins_of(sequence)
     write_poses(folder / "poses" / f"{side}_{frame}.csv", shutter.line_times(frame, side), poses)
-    columns, twins = shutter.axis(side) == 0, card.twins_of(sequence)
     keep = _stack_writer(folder / "gs_stack" / f"{side}_{frame}", options) if options.full_frames else None
     for shot in (Shot("rs", side, frame), *(Shot("gs", side, frame, row) for row in (0, *twins))):
-        kind, line = shot.shutter, abs(shutter.first_line(side) - shot.row)
-        one = Pose(np.broadcast_to(poses.R[line], poses.R.shape), np.broadcast_to(poses.t[line], poses.t.shape))
-        # A global-shutter frame needs no stitching: all its rows have one pose.
-        chosen, pose = (options, poses) if kind == "rs" else (replace(options, method="single-pass"), one)
-        on_gs_frame = keep if kind == "rs" else None
-        rendered = render(scene, rig.camera, *pose, chosen, columns=columns, on_gs_frame=on_gs_frame)
+        kind = shot.shutter
+        rendered = render_shot(scene, geometry, shot, poses, options, keep if kind == "rs" else None)
         if not np.any(rendered.depth):
             raise RsbenchError(
                 f"sequence {sequence.name}: {side}_{frame} shows no surface at all: change the viewpoint "
@@ -343,15 +343,39 @@ def render_camera(
         clean = clean_file(side, frame) if kind == "rs" and sensor else shot.image
         write_png(folder / clean, to_srgb8(rendered.image, options.exposure))
         write_depth(folder / shot.depth, rendered.depth)
+        if things:
+            write_png(folder / shot.labels, rendered.labels)
         if kind == "rs" and sensor:
-            period, motion = card.period_of(sequence), card.motion_of(sequence)
-            seen = sensed_rows(scene, rig, shutter, motion, sensor.of(side, frame), period, side, frame, options)
+            own, period = sensor.of(side, frame), card.period_of(sequence)
+            seen = sensed_rows(scene, rig, shutter, motion, own, period, side, frame, options, objects=things)
             write_png(folder / shot.image, seen)
         if kind == "rs":
-            geometry = GivenGeometry(rig, shutter, card.motion_of(sequence), card.frames)
-            write_channels(folder, card.channels, geometry, shot, rendered, SceneRays(scene), twins)
+            write_channels(folder, card.channels, geometry, shot, rendered, SceneRays(scene, things), twins)
         if shot.row == 0:
             yield
+
+
+def render_shot(
+    scene: MitsubaScene,
+    geometry: Geometry,
+    shot: Shot,
+    poses: Pose,
+    options: RendererOptions,
+    on_gs_frame: OnGlobalFrame | None = None,
+    rows: list[int] | None = None,
+) -> Frame:
+    """A shot of a sequence; ``poses`` are those of the lines of its rolling-shutter frame."""
+    from rsbench.renderers.render import render
+
+    shutter = geometry.shutter
+    tau, columns = shutter.line_times(shot.frame, shot.side), shutter.axis(shot.side) == 0
+    if shot.shutter == "gs":
+        line = abs(shutter.first_line(shot.side) - shot.row)
+        poses = Pose(np.broadcast_to(poses.R[line], poses.R.shape), np.broadcast_to(poses.t[line], poses.t.shape))
+        # No stitching: all rows have one pose, and one time.
+        tau, options = np.full(tau.shape, tau[line]), replace(options, method="single-pass")
+    more: Any = {"objects": poses_of(geometry.objects, tau), "columns": columns, "on_gs_frame": on_gs_frame}
+    return render(scene, geometry.rig.camera, *poses, options, rows=rows, **more)
 
 
 def _stack_writer(folder: Path, options: RendererOptions) -> Callable[[int, NDArray[np.float32]], None]:

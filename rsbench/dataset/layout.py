@@ -20,7 +20,7 @@ _KINDS = (("rs", "png"), ("rs_depth", "exr"), ("gs", "png"), ("gs_depth", "exr")
 _VIEW = re.compile(r"(left|right)_(0|[1-9][0-9]*)(?=[./])")
 _STACK = re.compile(r"gs_stack/left_0/[0-9]{4,}\.png")
 _MATCHES = re.compile(r"matches/(0|[1-9][0-9]*)\.npz")
-_TWIN = re.compile(r"gs_twin(|_depth|_flow|_flow_mask)/[0-9]{4,}/left_0\.(png|exr)")
+_TWIN = re.compile(r"gs_twin(|_depth|_flow|_flow_mask|_moving)/[0-9]{4,}/left_0\.(png|exr)")
 
 
 def relative_files(frames: int) -> tuple[str, ...]:
@@ -49,6 +49,11 @@ def picture_file(shutter: Shutter, side: str, frame: int, row: int = 0, depth: b
     return f"{folder}{f'/{row:04d}' if row else ''}/{side}_{frame}.{'exr' if depth else 'png'}"
 
 
+def moving_file(shutter: Shutter, side: str, frame: int, row: int = 0) -> str:
+    """Labels of what moves in a picture, where anything does; ``row`` as of ``picture_file``."""
+    return f"gs_twin_moving/{row:04d}/{side}_{frame}.png" if row else f"{shutter}_moving/{side}_{frame}.png"
+
+
 def frames_of(manifest: Mapping[str, Any]) -> int:
     """How many frames each camera has, by a sequence.json; two where it does not say."""
     frames = manifest.get("frames")
@@ -71,7 +76,10 @@ def files_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
     stacks = tuple(stack_file(*view, row) for view in views for row in range(whole_frames(manifest)))
     pictures = [("gs", *view, row, depth) for row in rows for depth in (False, True) for view in views]
     twins = tuple(picture_file(*each) for each in pictures)  # type: ignore[arg-type]
-    return relative_files(frames) + clean + stacks + twins + channel_files(channels_of(manifest), rows, frames)
+    labelled = [("rs", *view, 0) for view in views] + [("gs", *view, row) for row in (0, *rows) for view in views]
+    labels = tuple(moving_file(*each) for each in labelled if manifest.get("moving"))  # type: ignore[arg-type]
+    own = relative_files(frames) + clean + stacks + twins + labels
+    return own + channel_files(channels_of(manifest), rows, frames)
 
 
 def stack_file(side: Side, frame: int, row: int) -> str:
@@ -98,5 +106,10 @@ def channels_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
 
 _KNOWN = {"sequence.json"} | {
     _VIEW.sub("left_0", name)
-    for name in (*relative_files(1), clean_file("left", 0), *channel_files(CHANNELS, frames=len(FRAMES) + 1))
+    for name in (
+        *relative_files(1),
+        clean_file("left", 0),
+        *(moving_file(shutter, "left", 0) for shutter in SHUTTERS),
+        *channel_files(CHANNELS, frames=len(FRAMES) + 1),
+    )
 }

@@ -15,25 +15,28 @@ from numpy.typing import NDArray
 from rsbench.cards import parse_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LaterMotion, Motion
+from rsbench.core.moving import MovingObject
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig, views_of
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channel_reader import ChannelReader
 from rsbench.dataset.channels import check_channels
-from rsbench.dataset.files import read_depth, read_json, read_png, read_poses
+from rsbench.dataset.files import read_depth, read_grey_png, read_json, read_png, read_poses
 from rsbench.dataset.imu import Imu
-from rsbench.dataset.layout import MOST_FRAMES, MOST_TWINS, Shutter, clean_file, picture_file
+from rsbench.dataset.layout import MOST_FRAMES, MOST_TWINS, Shutter, clean_file, moving_file, picture_file
 from rsbench.dataset.matches import Matching
+from rsbench.dataset.movers import MovingManifest, check_moving, numbers_of
 from rsbench.errors import RsbenchError
 from rsbench.motions import motion_record, read_motion
 from rsbench.reading import check_name, check_size, inside
 from rsbench.renderers.electrons import Sensor, check_brightness
 
 FORMAT = 1
-CONVENTIONS, WITH_LENS, OF_FRAMES = 1, 2, 3
+CONVENTIONS, WITH_LENS, OF_FRAMES, WITH_MOVING = 1, 2, 3, 4
 """Of pixels and times. Those of a lens, another scan or a late right camera are others, and so are those of more
-than two frames: earlier versions of rsbench, that would take them for ideal or for two, refuse to read them."""
+than two frames, and of objects that move, whatever the cameras: earlier versions of rsbench, that would take them
+for ideal, for two or for still, refuse to read them."""
 UNITS = {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = no surface"}
 """What dataset.json tells people who find the folder."""
 
@@ -42,8 +45,10 @@ Vector = tuple[float, float, float]
 M = TypeVar("M")
 
 
-def conventions_of(camera: PinholeCamera, plain: bool, frames: int) -> int:
-    """The conventions of such cameras; ``plain``: both read rows from the top at once."""
+def conventions_of(camera: PinholeCamera, plain: bool, frames: int, moves: bool = False) -> int:
+    """The conventions of such cameras; ``plain``: both read rows from the top at once; ``moves``: objects do."""
+    if moves:
+        return WITH_MOVING
     if frames > len(FRAMES):
         return OF_FRAMES
     return CONVENTIONS if plain and camera.lens is None else WITH_LENS
@@ -79,6 +84,7 @@ class SequenceManifest(Scanning):
     matches: Matching | None = None
     twins: tuple[int, ...] = ()
     channels: tuple[str, ...] = ()
+    moving: tuple[MovingManifest, ...] = ()
     files: dict[str, str] = field(default_factory=dict)
     """sha256 by the path below the sequence's folder."""
 
@@ -86,13 +92,16 @@ class SequenceManifest(Scanning):
         check_name(self.name)
         if not len(FRAMES) <= self.frames <= MOST_FRAMES:
             raise ValueError(f"frames = {self.frames}: must lie in [{len(FRAMES)}, {MOST_FRAMES}]")
-        if self.conventions != (needed := conventions_of(self.camera, self.plain, self.frames)):
+        moves = bool(self.moving)
+        if self.conventions != (needed := conventions_of(self.camera, self.plain, self.frames, moves)):
             raise ValueError(
                 f"conventions = {self.conventions}: {needed} is needed; this version reads {CONVENTIONS}, and "
-                f"{WITH_LENS} with a lens, another scan or a late camera, {OF_FRAMES} with more than two frames"
+                f"{WITH_LENS} with a lens, another scan or a late camera, {OF_FRAMES} with more than two frames, "
+                f"{WITH_MOVING} with moving objects"
             )
         check_size("camera", (self.camera.width, self.camera.height))
         check_channels(self.channels, self.camera.lens is not None, self.plain)
+        check_moving(self.moving, self.channels, self.frames)
         lines = self.camera.height if self.scan in ("top", "bottom") else self.camera.width
         if (
             list(self.twins) != sorted({row for row in self.twins if 0 < row < lines})
@@ -158,6 +167,10 @@ class Sequence(ChannelReader):
     """How many each camera has."""
     first: int = 0
     """Of a pair: frame 0 of it is this one of the folder."""
+    moving: tuple[MovingManifest, ...] = ()
+    """Objects that move by themselves, numbered from 1."""
+    objects: tuple[MovingObject, ...] = ()
+    """How they do."""
     manifest: dict[str, Any]
     """Content of sequence.json."""
 
@@ -226,6 +239,17 @@ class Sequence(ChannelReader):
         file = picture_file(shutter, side, frame + self.first, row, depth=True)
         return read_depth(inside(self.folder, file), self._size)
 
+    def labels(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.uint8]:
+        """(H, W) what moves at each pixel of a picture: the number of an object, 0 = none, and 128 more where an
+        object hides the sun from what is seen; all 0 where none moves. ``row`` as of ``image``."""
+        if not self.moving:
+            return np.zeros(self._size[::-1], dtype=np.uint8)
+        path = inside(self.folder, moving_file(shutter, side, frame + self.first, row))
+        labels = read_grey_png(path, self._size)
+        if np.max(numbers_of(labels)) > len(self.moving):
+            raise RsbenchError(f"{path}: holds object {np.max(numbers_of(labels))}: there are {len(self.moving)}")
+        return labels
+
     def poses(self, side: Side, frame: int) -> tuple[FloatArray, Pose]:
         """Row times (H,) and ``cam_from_world`` (H, 3, 3), (H, 3) as stored; of columns, where those are read."""
         path = inside(self.folder, f"poses/{side}_{frame + self.first}.csv")
@@ -246,6 +270,7 @@ def sequence_manifest(
     motion: Motion,
     frame_period_s: float,
     frames: int = len(FRAMES),
+    moves: bool = False,
 ) -> dict[str, Any]:
     """The geometric part of sequence.json, with units in the names where they are not metres and radians."""
     camera = rig.camera
@@ -255,7 +280,7 @@ def sequence_manifest(
     count = {"frames": frames} if frames > len(FRAMES) else {}
     return {
         "format": FORMAT,
-        "conventions": conventions_of(camera, shutter.plain, frames),
+        "conventions": conventions_of(camera, shutter.plain, frames, moves),
         "name": name,
         "camera": {field: getattr(camera, field) for field in fields} | lens,
         "baseline": rig.baseline,
@@ -294,6 +319,8 @@ def read_sequence(folder: Path) -> Sequence:
             twins=manifest.twins,
             frames=manifest.frames,
             channels=manifest.channels,
+            moving=manifest.moving,
+            objects=tuple(each.thing for each in manifest.moving),
             manifest=content,
         )
     except (ValueError, RsbenchError) as error:

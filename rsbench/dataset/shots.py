@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rsbench.core.motion import Motion
+from rsbench.core.moving import MovingObject, RelativeMotion
 from rsbench.core.projection import back_project, rs_project_near
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.layout import SHUTTERS, Shutter, picture_file
+from rsbench.dataset.layout import SHUTTERS, Shutter, moving_file, picture_file
 
 _NEAREST = 32
 FAR = 1e7
@@ -33,6 +34,8 @@ class Geometry(Protocol):
     def motion(self) -> Motion: ...
     @property
     def frames(self) -> int: ...
+    @property
+    def objects(self) -> tuple[MovingObject, ...]: ...
 
 
 class GivenGeometry(NamedTuple):
@@ -42,6 +45,14 @@ class GivenGeometry(NamedTuple):
     shutter: RollingShutter
     motion: Motion
     frames: int = len(FRAMES)
+    objects: tuple[MovingObject, ...] = ()
+    """Those that move by themselves, in the order of their numbers from 1."""
+
+
+def seen_from(geometry: Geometry, number: int) -> GivenGeometry:
+    """How the rig moves seen from an object, in whose frame the object's points stand still; 0: from the world."""
+    motion = RelativeMotion(geometry.motion, geometry.objects[number - 1]) if number else geometry.motion
+    return GivenGeometry(geometry.rig, geometry.shutter, motion, geometry.frames)
 
 
 class Shot(NamedTuple):
@@ -61,6 +72,11 @@ class Shot(NamedTuple):
     @property
     def depth(self) -> str:
         return picture_file(*self, depth=True)
+
+    @property
+    def labels(self) -> str:
+        """Of what moves by itself, where anything does."""
+        return moving_file(*self)
 
     @property
     def other_shutter(self) -> Shot:
@@ -144,6 +160,14 @@ def seen_by(geometry: Geometry, shot: Shot, X: FloatArray, rows: ArrayLike) -> S
     pixels[outside] = np.nan
     tau = np.broadcast_to(_time(geometry, shot), outside.shape)
     return Seen(pixels, np.where(outside, np.nan, x_in_cam[..., 2]), np.where(outside, np.nan, tau))
+
+
+def times_at(geometry: Geometry, shot: Shot, pixels: FloatArray) -> FloatArray:
+    """Times (...) at which a shot sees pixels (..., 2), frame periods; the frame's own for NaN."""
+    if shot.shutter == "gs":
+        return np.broadcast_to(_time(geometry, shot), pixels.shape[:-1])
+    tau = geometry.shutter.pixel_time(pixels, shot.frame, shot.side)
+    return np.where(np.isnan(tau), float(shot.frame), tau)
 
 
 def _time(geometry: Geometry, shot: Shot) -> FloatArray:

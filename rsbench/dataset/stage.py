@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rsbench.dataset.card import SequenceCard
+from rsbench.scenes.bodies import with_moving
 from rsbench.scenes.model import Scene
 
 if TYPE_CHECKING:
@@ -45,9 +46,10 @@ class Stage:
 
 def place_of(sequence: SequenceCard) -> tuple[object, ...]:
     """What decides from where a sequence sees its scene."""
-    return sequence.scene, sequence.viewpoint, sequence.start
+    return sequence.scene, sequence.viewpoint, sequence.start, sequence.moving
 
 
 def seen_scene(scene: Scene, sequence: SequenceCard) -> Scene:
-    """A scene in the frame of the body at time 0 of a sequence."""
-    return scene.seen_from(scene.viewpoints[sequence.viewpoint], sequence.start)
+    """A scene in the frame of the body at time 0 of a sequence, with its objects that move."""
+    seen = scene.seen_from(scene.viewpoints[sequence.viewpoint], sequence.start)
+    return with_moving(seen, sequence.moving) if sequence.moving else seen

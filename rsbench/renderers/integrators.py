@@ -6,10 +6,13 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
+from rsbench.renderers.carried import Placed, first_surface, hidden
 from rsbench.renderers.scene import MitsubaScene
 
 
-def sunsky_radiance(scene: MitsubaScene, ray: Any, active: Any = True, ways: Sequence[Any] = ()) -> Any:
+def sunsky_radiance(
+    scene: MitsubaScene, ray: Any, active: Any = True, ways: Sequence[Any] = (), objects: Sequence[Placed] = ()
+) -> Any:
     """Radiance (RGB) along unit rays: a sun with hard shadows and a hemisphere sky on diffuse surfaces.
 
     L = albedo (E_sun / pi max(n.s, 0) visible + S (0.6 + 0.4 n.up)), with S the cosine-weighted mean of the sky,
@@ -22,7 +25,7 @@ def sunsky_radiance(scene: MitsubaScene, ray: Any, active: Any = True, ways: Seq
 
     sky = scene.sky
     flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
-    hit = scene.scene.ray_intersect(ray, ray_flags=flags, coherent=True, active=active)
+    hit = first_surface(scene, ray, flags, active, objects)
     on_surface = hit.is_valid() & active
     if not dr.is_jit_v(on_surface) and not on_surface:
         return sky.seen_along(ray.d)
@@ -31,8 +34,8 @@ def sunsky_radiance(scene: MitsubaScene, ray: Any, active: Any = True, ways: Seq
     normal = dr.select(dr.dot(normal, ray.d) > 0, -normal, normal)
     facing = dr.maximum(dr.dot(normal, sky.sun_direction), 0)
     lit = on_surface & (facing > 0)
-    hidden = scene.scene.ray_test(hit.spawn_ray(sky.sun_direction), coherent=True, active=lit)
-    sun = sky.sun_radiance * dr.select(lit, dr.select(hidden, 0, facing), 0)
+    dark = hidden(scene, hit.spawn_ray(sky.sun_direction), lit, objects)
+    sun = sky.sun_radiance * dr.select(lit, dr.select(dark, 0, facing), 0)
     if ways:
         ambient = _seen_sky(scene, hit, normal, ways, on_surface)
     elif sky.mapped:
@@ -59,8 +62,8 @@ def _seen_sky(scene: MitsubaScene, hit: Any, normal: Any, ways: Sequence[Any], a
     for way in ways:
         direction = dr.normalize(normal + _WITHIN * way)
         light = scene.sky.seen_along(direction)
-        hidden = scene.scene.ray_test(hit.spawn_ray(direction), active=active)
-        seen += dr.select(hidden, 0, light)
+        dark = scene.scene.ray_test(hit.spawn_ray(direction), active=active)
+        seen += dr.select(dark, 0, light)
         whole += light
     return scene.sky.on_open_surface(normal) * dr.select(whole > 0, seen / whole, 0)
 

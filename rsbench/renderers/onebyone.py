@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.renderers.carried import Placed, depth_and_label, placed
 from rsbench.renderers.exposure import instant_of
 from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
 from rsbench.renderers.options import RendererOptions
@@ -22,17 +23,25 @@ from rsbench.renderers.subpixel import sky_ways, subpixel_grid
 Float32Array = NDArray[np.float32]
 
 
-def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]) -> Float32Array:
-    """Depth z (rows, width) along the rays through pixel centres, metres; 0 = no surface."""
+def depth_rows(
+    scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]
+) -> tuple[Float32Array, NDArray[np.uint8]]:
+    """Depth z (rows, width) along the rays through pixel centres, metres, 0 = no surface; and ``Frame.labels``."""
     import mitsuba as mi
 
     result = np.zeros((len(rows), camera.width), dtype=np.float32)
+    labels = np.zeros(result.shape, dtype=np.uint8)
     for place, row in enumerate(rows):
         for column in range(camera.width):
-            ray = mi.Ray3f(*sensor.row_ray(float(column), float(row), column if sensor.columns else row))
-            hit = scene.scene.ray_intersect_preliminary(ray)
-            result[place, column] = hit.t if hit.is_valid() else 0.0
-    return result
+            pose = column if sensor.columns else row
+            ray = mi.Ray3f(*sensor.row_ray(float(column), float(row), pose))
+            if scene.objects:
+                found = depth_and_label(scene, ray, True, placed(scene, sensor, pose))
+                result[place, column], labels[place, column] = found
+            else:
+                hit = scene.scene.ray_intersect_preliminary(ray)
+                result[place, column] = hit.t if hit.is_valid() else 0.0
+    return result, labels
 
 
 def radiance_rows(
@@ -51,19 +60,27 @@ def radiance_rows(
                     instant = instant_of(options.seed, pixel, number, options.samples, sensor.instants)
                     pose += sensor.lines * int(instant)
                 origin, direction = sensor.row_ray(column + dx, row + dy, pose)
-                total += np.asarray(trace(scene, origin, direction, options, pixel, number), dtype=np.float32)
+                objects = placed(scene, sensor, pose)
+                light = trace(scene, origin, direction, options, pixel, number, objects)
+                total += np.asarray(light, dtype=np.float32)
             result[place, column] = total / np.float32(options.samples)
     return result
 
 
 def _sunsky(
-    scene: MitsubaScene, origin: Any, direction: Any, options: RendererOptions, pixel: int, sample: int
+    scene: MitsubaScene,
+    origin: Any,
+    direction: Any,
+    options: RendererOptions,
+    pixel: int,
+    sample: int,
+    objects: list[Placed],
 ) -> Any:
     import drjit as dr
     import mitsuba as mi
 
     ways = [mi.Vector3f(*way) for way in _ways(options.samples, options.sky_rays)[sample]]
-    return sunsky_radiance(scene, mi.Ray3f(origin, dr.normalize(direction)), ways=ways)
+    return sunsky_radiance(scene, mi.Ray3f(origin, dr.normalize(direction)), ways=ways, objects=objects)
 
 
 @cache
@@ -72,7 +89,13 @@ def _ways(samples: int, rays: int) -> Any:
 
 
 def _path(
-    scene: MitsubaScene, origin: Any, direction: Any, options: RendererOptions, pixel: int, sample: int
+    scene: MitsubaScene,
+    origin: Any,
+    direction: Any,
+    options: RendererOptions,
+    pixel: int,
+    sample: int,
+    objects: list[Placed],
 ) -> Any:
     import drjit as dr
     import mitsuba as mi

@@ -10,17 +10,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
+from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.renderers.sensor import make_sensor, pose_table
+from rsbench.renderers.sensor import make_sensor, object_tables, pose_table
 
 Float32Array = NDArray[np.float32]
 OnGlobalFrame = Callable[[int, Float32Array], None]
@@ -34,6 +35,18 @@ class Frame:
     """(rows, width, 3) linear RGB radiance."""
     depth: Float32Array
     """(rows, width) z in the camera of the row, metres, at pixel centres; 0 = no surface."""
+    labels: NDArray[np.uint8]
+    """(rows, width) number of the object that moves and is seen there, 0 = none; see ``carried.SHADED``."""
+
+
+class Poses(NamedTuple):
+    """Of the camera and of the objects of a scene that move."""
+
+    R: FloatArray
+    """([instants,] lines, 3, 3) ``cam_from_world``."""
+    t: FloatArray
+    objects: Pose | None = None
+    """(objects, [instants,] lines, ...) ``world_from_object``."""
 
 
 def render(
@@ -44,6 +57,8 @@ def render(
     options: RendererOptions | None = None,
     *,
     exposed: Pose | None = None,
+    objects: Pose | None = None,
+    exposed_objects: Pose | None = None,
     rows: Sequence[int] | None = None,
     columns: bool = False,
     on_gs_frame: OnGlobalFrame | None = None,
@@ -58,6 +73,8 @@ def render(
         options: a renderer card; the default one when absent.
         exposed: poses (instants, height) of each row while it collects light, see ``exposure``; the image is their
             mean, the depth that of the row poses. The number of instants is a multiple of ``options.samples``.
+        objects: poses (objects, height) of the scene's objects that move, ``world_from_object``, at row times.
+        exposed_objects: (objects, instants, height) likewise at those of ``exposed``.
         rows: render only these rows of the full frame, with the bits that they have in it.
         columns: every column has its own pose instead: ``rotations`` and ``translations`` have as many.
         on_gs_frame: ``stitched`` with ``full_frames`` calls it with each row and its global-shutter image
@@ -70,8 +87,10 @@ def render(
     if on_gs_frame is not None and not (options.method == "stitched" and options.full_frames):
         raise RsbenchError("on_gs_frame needs renderer method = 'stitched' and full_frames = true")
     chosen = _checked_rows(rows, camera.height)
-    row_poses = Pose(np.asarray(rotations, dtype=np.float64), np.asarray(translations, dtype=np.float64))
-    image_poses = row_poses if exposed is None else exposed
+    row_poses = Poses(np.asarray(rotations, np.float64), np.asarray(translations, np.float64), objects)
+    image_poses = row_poses if exposed is None else Poses(*exposed, exposed_objects)
+    for poses in (row_poses, image_poses):
+        _check_objects(scene, poses.objects, options)
     if exposed is not None and len(exposed.R) % options.samples:
         raise RsbenchError(f"{len(exposed.R)} instants: a multiple of the {options.samples} samples is needed")
     if options.method == "single-pass":
@@ -96,30 +115,32 @@ def render_global(
     if R.shape != (3, 3) or t.shape != (3,):
         raise RsbenchError(f"camera pose has shapes {R.shape} and {t.shape}: (3, 3) and (3,) are needed")
     rows = range(camera.height)
-    poses = Pose(np.broadcast_to(R, (camera.height, 3, 3)), np.broadcast_to(t, (camera.height, 3)))
+    poses = Poses(np.broadcast_to(R, (camera.height, 3, 3)), np.broadcast_to(t, (camera.height, 3)))
+    _check_objects(scene, None, options)
     return _single_pass(scene, camera, poses, poses, options, rows)
 
 
 def _single_pass(
     scene: MitsubaScene,
     camera: PinholeCamera,
-    row_poses: Pose,
-    image_poses: Pose,
+    row_poses: Poses,
+    image_poses: Poses,
     options: RendererOptions,
     rows: Sequence[int],
     columns: bool = False,
 ) -> Frame:
     tracer = _tracer()
-    image = tracer.radiance_rows(scene, make_sensor(camera, *image_poses, columns), camera, rows, options)
-    depth = tracer.depth_rows(scene, make_sensor(camera, *row_poses, columns), camera, rows)
-    return Frame(image=image, depth=depth)
+    image_sensor, row_sensor = (make_sensor(camera, *each, columns=columns) for each in (image_poses, row_poses))
+    image = tracer.radiance_rows(scene, image_sensor, camera, rows, options)
+    depth, labels = tracer.depth_rows(scene, row_sensor, camera, rows)
+    return Frame(image=image, depth=depth, labels=labels)
 
 
 def _stitched(
     scene: MitsubaScene,
     camera: PinholeCamera,
-    row_poses: Pose,
-    image_poses: Pose,
+    row_poses: Poses,
+    image_poses: Poses,
     options: RendererOptions,
     rows: Sequence[int],
     columns: bool,
@@ -131,24 +152,38 @@ def _stitched(
     a packet, hence their rounding: they have the bits of the whole image. Of columns, all rows are traced.
     """
     tracer = _tracer()
-    sensors = [make_sensor(camera, *poses, columns) for poses in (image_poses, row_poses)]
-    tables = [pose_table(camera, *poses, columns) for poses in (image_poses, row_poses)]
+    sensors = [make_sensor(camera, *poses, columns=columns) for poses in (image_poses, row_poses)]
+    tables = [
+        [pose_table(camera, each.R, each.t, columns), *object_tables(camera, each.objects, columns)]
+        for each in (image_poses, row_poses)
+    ]
     image = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
     depth = np.zeros((len(rows), camera.width), dtype=np.float32)
+    labels = np.zeros(depth.shape, dtype=np.uint8)
     for place, line in enumerate(range(camera.width) if columns else rows):
-        for sensor, table in zip(sensors, tables, strict=True):
-            sensor.set_poses(np.repeat(table[..., line : line + 1, :], table.shape[-2], axis=-2), columns)
+        for sensor, own in zip(sensors, tables, strict=True):
+            one, *others = (np.repeat(each[..., line : line + 1, :], each.shape[-2], axis=-2) for each in own)
+            sensor.set_poses(one, columns)
+            sensor.set_objects(others)
         traced = rows if columns else range(camera.height) if options.full_frames else [line]
         gs_image = tracer.radiance_rows(scene, sensors[0], camera, traced, options)
-        gs_depth = tracer.depth_rows(scene, sensors[1], camera, traced)
-        if columns:
-            image[:, line], depth[:, line] = gs_image[:, line], gs_depth[:, line]
-        else:
-            kept = line if options.full_frames else 0
-            image[place], depth[place] = gs_image[kept], gs_depth[kept]
+        gs_depth, gs_labels = tracer.depth_rows(scene, sensors[1], camera, traced)
+        kept = line if options.full_frames else 0
+        to, of = (np.s_[:, line], np.s_[:, line]) if columns else (np.s_[place], np.s_[kept])
+        image[to], depth[to], labels[to] = gs_image[of], gs_depth[of], gs_labels[of]
         if on_gs_frame is not None:
             on_gs_frame(line, gs_image)
-    return Frame(image=image, depth=depth)
+    return Frame(image=image, depth=depth, labels=labels)
+
+
+def _check_objects(scene: MitsubaScene, objects: Pose | None, options: RendererOptions) -> None:
+    given = 0 if objects is None else len(objects.R)
+    if given != len(scene.objects):
+        raise RsbenchError(f"poses of {given} objects that move: scene {scene.name!r} has {len(scene.objects)}")
+    if given and options.integrator != "sunsky":
+        raise RsbenchError(
+            f"renderer integrator = {options.integrator!r}: takes no objects that move; take 'sunsky'"
+        )
 
 
 def _checked_rows(rows: Sequence[int] | None, height: int) -> Sequence[int]:

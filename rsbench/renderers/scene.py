@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import sys
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -15,6 +16,7 @@ from rsbench.renderers.backend import start_backend
 from rsbench.scenes.environment import irradiance_map
 from rsbench.scenes.model import Environment, Light, Material, Scene, SceneMesh
 
+_SLACK = 1e-3
 _SKY_ROWS = 64  # of the sky map that `path` samples; the sky is linear in the sine of the elevation
 
 
@@ -34,7 +36,9 @@ class MitsubaScene:
 
         self.name = scene.name
         self.light = scene.light
+        drawn = [mesh for mesh in scene.meshes if mesh.faces.size]
         content: dict[str, Any] = {"type": "scene"}
+        moved: list[dict[str, Any]] = [{"type": "scene"} for _ in range(max((m.mover for m in drawn), default=0))]
         # `path` picks one emitter at random for each shadow ray: black ones would only add noise.
         if any(scene.light.sun_irradiance):
             content["sun"] = _sun(scene.light)
@@ -43,16 +47,19 @@ class MitsubaScene:
         elif any((*scene.light.sky_zenith, *scene.light.sky_horizon)):
             content["sky"] = _sky(scene.light)
         materials: dict[int, Any] = {}
-        drawn = [mesh for mesh in scene.meshes if mesh.faces.size]
         self.instances = [{"name": mesh.name, "material": mesh.material.name} for mesh in drawn]
         """Of the meshes with faces; the shapes of the renderer are called mesh00000 and so on."""
         for number, mesh in enumerate(drawn):
             key = id(mesh.material)
             if key not in materials:
                 materials[key] = _loaded(mesh.material)
-            content[f"mesh{number:05d}"] = _mesh(mesh, materials[key])
+            of = moved[mesh.mover - 1] if mesh.mover else content
+            of[f"mesh{number:05d}"] = _mesh(mesh, materials[key])
         # Merging shapes of equal material, the default, depends on the order of a parallel loader.
         self.scene = mi.load_dict(content, optimize=False)
+        self.objects = [mi.load_dict(each, optimize=False) for each in moved]
+        """Scenes of the objects that move, each in the world as it is at time 0."""
+        self.balls = [_ball([m.vertices for m in drawn if m.mover == k + 1]) for k in range(len(moved))]
         self.sky = Sky(scene.light, self.scene.environment())
         gc.collect()  # `mi.traverse` leaves cyclic garbage that holds its shape, and so the textures
 
@@ -147,6 +154,18 @@ def _unit(vector: Any, field: str) -> NDArray[np.float64]:
     if not (np.isfinite(norm) and norm > 0.0):
         raise RsbenchError(f"light {field} = {tuple(vector.tolist())}: a direction is needed")
     return vector / norm
+
+
+def _ball(vertices: Sequence[NDArray[np.float64]]) -> tuple[Any, Any]:
+    """Centre, and square of the radius, of a ball around vertices (n, 3); no smaller by rounding."""
+    import drjit as dr
+    import mitsuba as mi
+
+    every = np.concatenate(vertices)
+    centre = 0.5 * (every.min(axis=0) + every.max(axis=0))
+    square = float(np.max(np.sum((every - centre) ** 2, axis=1)))
+    values = [dr.opaque(mi.Float, float(value)) for value in (*centre, (1.0 + _SLACK) * square + _SLACK)]
+    return mi.Point3f(*values[:3]), values[3]
 
 
 def _sun(light: Light) -> dict[str, Any]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core.moving import MovingObject
+from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.renderers.sensor import LEAST_COMPONENT
@@ -31,46 +34,93 @@ class SceneRays:
     """Rays through a scene; eyes and points (n, 3) are in its frame, metres."""
 
     scene: MitsubaScene
+    objects: Sequence[MovingObject] = ()
+    """Those of the scene that move; without them, only what stands still is there."""
 
-    def blocked(self, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
-        """Whether (n,) a surface stands before the points."""
-        found = []
-        for ray in _rays(eyes, points):
-            ray.maxt = REACH
-            found.append(np.atleast_1d(np.array(self.scene.scene.ray_test(ray), dtype=np.bool_)))
-        return np.concatenate(found)
+    def blocked(self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None) -> NDArray[np.bool_]:
+        """Whether (n,) a surface stands before the points, at times (n,): where objects move, these are needed."""
+        found = blocked(self.scene.scene, eyes, points)
+        for scene, each in zip(self.scene.objects, self._objects(tau), strict=False):
+            left = np.flatnonzero(~found)
+            own = inverse(each.world_from_object(_at(tau, left)))
+            found[left] = blocked(scene, transform(own, eyes[left]), transform(own, points[left]))
+        return found
 
     def share(self, eyes: FloatArray, points: FloatArray) -> FloatArray:
-        """Share (n,) of the way to the points, or beyond them, at which the first surface is met; inf: at none."""
+        """Share (n,) of the way to the points, or beyond them, at which the first surface is met; inf: at none.
+
+        Of what stands still.
+        """
         hits = [self.scene.scene.ray_intersect_preliminary(ray, coherent=True) for ray in _rays(eyes, points)]
         met = np.concatenate([np.atleast_1d(np.array(hit.t, dtype=np.float64)) for hit in hits])
         return np.where(np.isfinite(met), met, np.inf)
 
-    def surfaces(self, eyes: FloatArray, points: FloatArray) -> Surfaces:
-        """What is met on the way to the points and beyond."""
-        import mitsuba as mi
+    def surfaces(self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None) -> Surfaces:
+        """What is met on the way to the points and beyond; ``tau`` as of ``blocked``."""
+        met = _met(self.scene.scene, eyes, points)
+        for scene, each in zip(self.scene.objects, self._objects(tau), strict=False):
+            pose = each.world_from_object(_at(tau, slice(None)))
+            own = inverse(pose)
+            other = _met(scene, transform(own, eyes), transform(own, points))
+            nearer = other.distance < met.distance
+            turned = (pose.R @ other.normals[..., None])[..., 0].astype(np.float32)
+            met.normals[nearer], met.instances[nearer] = turned[nearer], other.instances[nearer]
+            met.distance[nearer] = other.distance[nearer]
+        return Surfaces(met.normals, met.instances)
 
-        normals, instances = [], []
-        for ray in _rays(eyes, points):
-            hit = self.scene.scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True)
-            normal, way = (np.array(each, dtype=np.float32).reshape(3, -1) for each in (hit.n, ray.d))
-            normal *= np.where(np.sum(normal * way, axis=0) > 0, np.float32(-1.0), np.float32(1.0))
-            numbers = self._numbers(hit)
-            normal[:, numbers == 0] = 0.0
-            normals.append(normal.T + np.float32(0.0))  # no -0
-            instances.append(numbers)
-        return Surfaces(np.concatenate(normals), np.concatenate(instances))
+    def _objects(self, tau: FloatArray | None) -> Sequence[MovingObject]:
+        if self.objects and tau is None:
+            raise ValueError("objects move: rays need times")
+        return self.objects
 
-    def _numbers(self, hit: Any) -> NDArray[np.uint16]:
-        import drjit as dr
-        import mitsuba as mi
 
-        if not _wide():
-            return np.array([_number(hit.shape) if hit.is_valid() else 0], dtype=np.uint16)
-        keys = np.array(dr.reinterpret_array(mi.UInt32, self.scene.scene.shapes_dr()))
-        table = np.zeros(np.max(keys) + 1, dtype=np.uint16)
-        table[keys] = [_number(shape) for shape in self.scene.scene.shapes()]
-        return table[np.array(dr.reinterpret_array(mi.UInt32, hit.shape))]
+class _Met(NamedTuple):
+    normals: NDArray[np.float32]
+    instances: NDArray[np.uint16]
+    distance: NDArray[np.float32]
+    """(n,) in units of the way to the points."""
+
+
+def _at(tau: FloatArray | None, chosen: Any) -> FloatArray:
+    return np.asarray(tau)[chosen]
+
+
+def blocked(scene: Any, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
+    """See ``SceneRays.blocked``, of one scene of Mitsuba."""
+    found = [np.zeros(0, dtype=np.bool_)]
+    for ray in _rays(eyes, points):
+        ray.maxt = REACH
+        found.append(np.atleast_1d(np.array(scene.ray_test(ray), dtype=np.bool_)))
+    return np.concatenate(found)
+
+
+def _met(scene: Any, eyes: FloatArray, points: FloatArray) -> _Met:
+    """See ``SceneRays.surfaces``, of one scene of Mitsuba."""
+    import mitsuba as mi
+
+    found = []
+    for ray in _rays(eyes, points):
+        hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True)
+        normal, way = (np.array(each, dtype=np.float32).reshape(3, -1) for each in (hit.n, ray.d))
+        normal *= np.where(np.sum(normal * way, axis=0) > 0, np.float32(-1.0), np.float32(1.0))
+        numbers = _numbers(scene, hit)
+        normal[:, numbers == 0] = 0.0
+        found.append(
+            (normal.T + np.float32(0.0), numbers, np.atleast_1d(np.array(hit.t, dtype=np.float32)))
+        )  # no -0
+    return _Met(*(np.concatenate(each) for each in zip(*found, strict=True)))
+
+
+def _numbers(scene: Any, hit: Any) -> NDArray[np.uint16]:
+    import drjit as dr
+    import mitsuba as mi
+
+    if not _wide():
+        return np.array([_number(hit.shape) if hit.is_valid() else 0], dtype=np.uint16)
+    keys = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
+    table = np.zeros(np.max(keys) + 1, dtype=np.uint16)
+    table[keys] = [_number(shape) for shape in scene.shapes()]
+    return table[np.array(dr.reinterpret_array(mi.UInt32, hit.shape))]
 
 
 def _number(shape: Any) -> int:

@@ -6,6 +6,7 @@ renderers call its ``row_ray`` directly. Poses and intrinsics are data of the co
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.se3 import Pose, inverse
 from rsbench.errors import RsbenchError
 from rsbench.renderers.lens_rays import lens_rays
 
@@ -53,11 +55,17 @@ def pose_table(
 
 
 def make_sensor(
-    camera: PinholeCamera, rotations: ArrayLike, translations: ArrayLike, columns: bool = False
+    camera: PinholeCamera,
+    rotations: ArrayLike,
+    translations: ArrayLike,
+    objects: Pose | None = None,
+    *,
+    columns: bool = False,
 ) -> Any:
     """A Mitsuba sensor ``rs_pinhole`` with a box filter, of ``camera``'s size, at these row poses.
 
-    Args and errors: see ``pose_table``. Poses that are equal in all rows make a global shutter.
+    Args and errors: see ``pose_table``. Poses that are equal in all rows make a global shutter. ``objects`` are
+    those of objects that move, ``world_from_object``, with one more leading axis.
     """
     import mitsuba as mi
 
@@ -73,7 +81,18 @@ def make_sensor(
     sensor = mi.load_dict({"type": PLUGIN, "film": film, "sampler": {"type": "independent"}})
     sensor.set_intrinsics(camera)
     sensor.set_poses(pose_table(camera, rotations, translations, columns), columns)
+    sensor.set_objects(object_tables(camera, objects, columns))
     return sensor
+
+
+def object_tables(camera: PinholeCamera, objects: Pose | None, columns: bool) -> list[NDArray[np.float32]]:
+    """A table of each object as ``pose_table`` makes it: ``R`` row-major and ``t`` of ``world_from_object``."""
+    if objects is None:
+        return []
+    tables = pose_table(camera, *inverse(objects), columns)
+    if tables.ndim < 3:
+        raise RsbenchError(f"poses of objects have shape {objects.R.shape}: the first axis holds the objects")
+    return list(tables)
 
 
 def _coordinates(sensor: Any, x: Any, y: Any, active: Any, pixel: Any) -> tuple[Any, Any]:
@@ -85,6 +104,24 @@ def _coordinates(sensor: Any, x: Any, y: Any, active: Any, pixel: Any) -> tuple[
         return u, v
     fx, fy, cx, cy = sensor.intrinsics
     return (x - cx) / fx, (y - cy) / fy
+
+
+def _held(table: NDArray[np.float32]) -> Any:
+    """A table as ``entries`` reads it."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return mi.Float(table.ravel()) if dr.is_jit_v(mi.Float) else table.ravel().tolist()
+
+
+def entries(poses: Any, row: Any, active: Any) -> list[Any]:
+    """The 12 values of the pose of each lane's row."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if not dr.is_jit_v(mi.Float):
+        return list(poses[12 * int(row) : 12 * int(row) + 12])
+    return [dr.gather(mi.Float, poses, row * 12 + k, active) for k in range(12)]
 
 
 @cache
@@ -101,6 +138,8 @@ def sensor_class() -> Any:
             self.intrinsics = [mi.Float(1.0), mi.Float(1.0), mi.Float(0.0), mi.Float(0.0)]
             self.lens: Any = None
             self.poses: Any = None
+            self.objects: list[Any] = []
+            """Poses of each object that moves, as many as those of the camera."""
             self.columns = False
             """Whether poses are those of columns."""
             self.lines = 0
@@ -119,7 +158,11 @@ def sensor_class() -> Any:
             """Table (lines, 12) or (instants, lines, 12) of ``pose_table``."""
             self.columns, self.lines = columns, table.shape[-2]
             self.instants = table.shape[0] if table.ndim == 3 else 1
-            self.poses = table.ravel().tolist() if scalar else mi.Float(table.ravel())
+            self.poses = _held(table)
+
+        def set_objects(self, tables: Sequence[NDArray[np.float32]]) -> None:
+            """See ``object_tables``."""
+            self.objects = list(map(_held, tables))
 
         def row_ray(self, x: Any, y: Any, row: Any, active: Any = True, pixel: Any = None) -> tuple[Any, Any]:
             """World origin and direction of the ray through pixel coordinates (x, y), at the pose of ``row``.
@@ -129,15 +172,14 @@ def sensor_class() -> Any:
             units of it is the depth z.
             """
             u, v = _coordinates(self, x, y, active, pixel)
-            p = [self._entry(row, k, active) for k in range(12)]
+            p = entries(self.poses, row, active)
             direction = [dr.fma(p[3 * i], u, dr.fma(p[3 * i + 1], v, p[3 * i + 2])) for i in range(3)]
             level = [dr.select(dr.abs(value) < LEAST_COMPONENT, 0.0, value) for value in direction]
             return mi.Point3f(p[9], p[10], p[11]), mi.Vector3f(*level)
 
-        def _entry(self, row: Any, k: int, active: Any) -> Any:
-            if scalar:
-                return self.poses[12 * int(row) + k]
-            return dr.gather(mi.Float, self.poses, row * 12 + k, active)
+        def object_pose(self, number: int, row: Any, active: Any) -> list[Any]:
+            """The 12 values of the pose of an object, counted from 0."""
+            return entries(self.objects[number], row, active)
 
         def sample_ray(self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True) -> Any:
             """Mitsuba's interface: film position in [0, 1]^2, whose pixel coordinate is half a pixel less."""

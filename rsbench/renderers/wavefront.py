@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.renderers.carried import depth_and_label, placed
 from rsbench.renderers.exposure import instant_of
 from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
 from rsbench.renderers.options import RendererOptions
@@ -80,23 +81,32 @@ def _bands(rows: Sequence[int], width: int) -> Iterator[Sequence[int]]:
         yield rows[start : start + step]
 
 
-def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]) -> Float32Array:
-    """Depth z (rows, width) along the rays through pixel centres, metres; 0 = no surface."""
+def depth_rows(
+    scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]
+) -> tuple[Float32Array, NDArray[np.uint8]]:
+    """Depth z (rows, width) along the rays through pixel centres, metres, 0 = no surface; and ``Frame.labels``."""
     import drjit as dr
     import mitsuba as mi
 
     result = np.zeros((len(rows), camera.width), dtype=np.float32)
+    labels = np.zeros(result.shape, dtype=np.uint8)
     done = 0
     for band in _bands(rows, camera.width):
         lanes = _Lanes.of(band, camera.width)
         ray = mi.Ray3f(
             *sensor.row_ray(mi.Float(lanes.column), mi.Float(lanes.row), lanes.line(sensor), lanes.active)
         )
-        hit = scene.scene.ray_intersect_preliminary(ray, coherent=True, active=lanes.active)
-        depth = dr.select(hit.is_valid(), hit.t, 0)
-        result[done : done + len(band)] = lanes.image([depth], camera.width)[0, :, :, 0]
+        here = slice(done, done + len(band))
+        if scene.objects:
+            objects = placed(scene, sensor, lanes.line(sensor), lanes.active)
+            found = lanes.image([*depth_and_label(scene, ray, lanes.active, objects)], camera.width)
+            result[here], labels[here] = found[0, :, :, 0], found[0, :, :, 1].astype(np.uint8)
+        else:
+            hit = scene.scene.ray_intersect_preliminary(ray, coherent=True, active=lanes.active)
+            depth = dr.select(hit.is_valid(), hit.t, 0)
+            result[here] = lanes.image([depth], camera.width)[0, :, :, 0]
         done += len(band)
-    return result
+    return result, labels
 
 
 def radiance_rows(
@@ -138,6 +148,7 @@ def _sunsky_band(
     table = mi.Float(sky_ways(options.samples, rays).ravel()) if rays else None
     x, y = mi.Float(lanes.column), mi.Float(lanes.row)
     pixel = None if sensor.lens is None else sensor.lens.pixel(x, y, lanes.active)
+    still = placed(scene, sensor, lanes.line(sensor), lanes.active) if sensor.instants == 1 else None
 
     def add_sample(k: Any, total: Any) -> tuple[Any, Any]:
         dx, dy = dr.gather(mi.Float, grid, 2 * k), dr.gather(mi.Float, grid, 2 * k + 1)
@@ -145,7 +156,8 @@ def _sunsky_band(
         origin, direction = sensor.row_ray(x + dx, y + dy, pose, lanes.active, pixel)
         ray = mi.Ray3f(origin, dr.normalize(direction))
         ways = [_entry(table, k * rays + j) for j in range(rays)]
-        return k + 1, total + sunsky_radiance(scene, ray, lanes.active, ways)
+        objects = placed(scene, sensor, pose, lanes.active) if still is None else still
+        return k + 1, total + sunsky_radiance(scene, ray, lanes.active, ways, objects)
 
     _, total = dr.while_loop(
         state=(dr.zeros(mi.UInt32, dr.width(lanes.row)), dr.zeros(mi.Color3f, dr.width(lanes.row))),

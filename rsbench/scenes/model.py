@@ -49,6 +49,8 @@ class SceneMesh:
     """(n, 2) texture coordinates, v up; one unit is one repeat of the texture."""
     normals: FloatArray | None = None
     """(n, 3) unit shading normals; absent = flat shading."""
+    mover: int = 0
+    """Number from 1 of the object that it belongs to, which moves by itself; 0: it stands still."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

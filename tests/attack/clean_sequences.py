@@ -28,6 +28,7 @@ from rsbench.core.shutter import Scan, Scanning
 from rsbench.dataset import generation
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.channels import CHANNELS, Channel, check_channels
+from rsbench.dataset.movers import TAKEN, MovingCard
 from rsbench.dataset.verification import rerender, verify_dataset
 from rsbench.errors import RsbenchError
 from rsbench.renderers.electrons import Mosaic, Sensor
@@ -67,7 +68,7 @@ def _card(rng: np.random.Generator, number: int, scene: str, folder: Path, seque
     path = Path(scene) if scene.endswith(".toml") else list_cards("scenes")[scene]
     viewpoint = str(rng.choice(list(read_scene_card(path)[0].viewpoints)))
     camera, scanning, period = _camera(rng), _scanning(rng), float(rng.uniform(0.01, 0.2))
-    return DatasetCard(
+    card = DatasetCard(
         name=f"random-{number}",
         camera=camera,
         baseline=float(rng.uniform(0.05, 0.6)),
@@ -86,7 +87,30 @@ def _card(rng: np.random.Generator, number: int, scene: str, folder: Path, seque
             SequenceCard(name=f"s{k}", scene=scene, viewpoint=viewpoint, motion=_motion(rng))
             for k in range(sequences)
         ),
-    ).expanded()
+    )
+    return _with_moving(card, number).expanded()
+
+
+def _with_moving(card: DatasetCard, number: int) -> DatasetCard:
+    """Every fourth card with one to three boxes that move, before the rig; drawn by themselves."""
+    if number % 4 != 2:
+        return card
+    rng = np.random.default_rng([card.seed, number])
+    sequences = tuple(replace(each, moving=_boxes(rng)) for each in card.sequence)
+    return replace(card, sequence=sequences, channels=tuple(each for each in card.channels if each in TAKEN))
+
+
+def _boxes(rng: np.random.Generator) -> tuple[MovingCard, ...]:
+    return tuple(
+        MovingCard(
+            box=tuple(rng.uniform(0.1, 0.8, 3).tolist()),
+            position=tuple((rng.uniform(-0.4, 0.4, 3) * (1, 1, 0) * depth + (0, 0, depth)).tolist()),
+            attitude_deg=tuple(rng.uniform(-90, 90, 3).tolist()),
+            texture_seed=int(rng.integers(1000)),
+            motion=_motion(rng),
+        )
+        for depth in rng.uniform(1.5, 5.0, rng.integers(1, 4))
+    )
 
 
 def _camera(rng: np.random.Generator) -> CameraCard:
@@ -180,7 +204,8 @@ def _generated(card: DatasetCard, out: Path) -> int:
             generation.generate_dataset(card, out)
         except RsbenchError as error:
             blocked = re.match(
-                r"sequence (\S+): (the \S+ camera goes through a surface|\S+ shows no surface)", str(error)
+                r"sequence (\S+): (the \S+ camera (goes through a surface|and moving)|\S+ shows no surface)",
+                str(error),
             )
             if not blocked:
                 raise
@@ -200,6 +225,7 @@ def _words(card: DatasetCard) -> str:
     words += [] if card.plain else [f"{card.scan}/{card.right_scan}/{card.right_delay:.2f}"]
     words += [f"exposure {card.sensor.exposure_s:.3f}"] if card.sensor else []
     words += ["twins"] if card.twins else []
+    words += ["moving"] if card.sequence[0].moving else []
     return ", ".join([*words, *card.channels])
 
 
@@ -211,7 +237,7 @@ def false_alarms(count: int, folder: Path, seed: int = 0) -> Iterator[tuple[str,
 
     def once(seen: Scene) -> scene.MitsubaScene:
         """The renderer's scene, which takes seconds; the light in the frame of the view tells views apart."""
-        key = seen.name, seen.light
+        key = seen.name, seen.light, *((m.name, m.mover, m.vertices.tobytes()) for m in seen.meshes if m.mover)
         if key not in kept:
             kept.clear()
             kept[key] = made(seen)

@@ -19,7 +19,7 @@ def keep_frames(folder: Path) -> None:
 
     def keep(scene: Any, camera: Any, rotations: Any, translations: Any, options: Any, **more: Any) -> Any:
         frame = rendered(scene, camera, rotations, translations, options, **more)
-        np.savez(_path(folder, camera, rotations, translations, options), image=frame.image, depth=frame.depth)
+        np.savez(_path(folder, camera, rotations, translations, options), **vars(frame))
         (folder / "variant").write_text(backend.start_backend().variant)
         return frame
 
@@ -35,7 +35,7 @@ def show_frames(folder: Path) -> None:
 
     def show(_: Any, camera: Any, rotations: Any, translations: Any, options: Any, **more: Any) -> Any:
         with np.load(_path(folder, camera, rotations, translations, options)) as kept:
-            return render.Frame(image=kept["image"], depth=kept["depth"])
+            return render.Frame(**kept)
 
     started = backend.Backend(variant=(folder / "variant").read_text())
     backend.start_backend = lambda *_: started

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,15 @@ from rsbench.core.rig import FRAMES
 from rsbench.dataset.channel_truth import Rays, SeenSurfaces, pair_truth, target_of
 from rsbench.dataset.channel_writer import pair_values
 from rsbench.dataset.channels import STEP_PX, Layer, PixelClass, pair_layers
+from rsbench.dataset.movers import numbers_of
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.shots import FAR, Shot
 from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.dataset.verification.landing import BoolArray, DepthMap, land
 from rsbench.errors import RsbenchError
+
+if TYPE_CHECKING:
+    from rsbench.renderers.render import Frame
 
 Float32Array = NDArray[np.float32]
 _SAME_PX = 1.5 * STEP_PX
@@ -96,7 +100,7 @@ def _stored(sequence: Sequence, layer: Layer, shot: Shot) -> _Stored:
 
 
 def channels_again(
-    sequence: Sequence, shot: Shot, rows: list[int], depth: Float32Array, rays: Rays, told: Collection[str]
+    sequence: Sequence, shot: Shot, rows: list[int], frame: Frame, rays: Rays, told: Collection[str]
 ) -> Iterator[tuple[str, str, bool]]:
     """Rows of the channels of a frame made again: of each file its name, its fault or "", and whether all is same.
 
@@ -104,7 +108,7 @@ def channels_again(
         sequence: holds them.
         shot: the frame; of a global shutter there are none.
         rows: of the frame.
-        depth: (rows, W) rendered again.
+        frame: these rows rendered again.
         rays: through the scene.
         told: files that are not looked at.
     """
@@ -117,7 +121,8 @@ def channels_again(
             values, classes = (each[rows] for each in _stored(sequence, layer, shot))
         except RsbenchError:  # told already
             continue
-        truth = pair_truth(SeenSurfaces(sequence, shot, depth, rows), target_of(layer, shot, frames), rays.blocked)
+        seen = SeenSurfaces(sequence, shot, frame.depth, rows, numbers_of(frame.labels))
+        truth = pair_truth(seen, target_of(layer, shot, frames), rays.blocked)
         made = pair_values(layer.channel, shot, truth.offset)
         far = np.any(~((np.abs(values - made) <= _SAME_PX) | (np.isnan(values) & np.isnan(made))), axis=-1)
         unlike = classes != truth.classes

@@ -19,7 +19,7 @@ from rsbench.dataset.verification.depth_causes import likely_cause
 from rsbench.dataset.verification.findings import DepthAgreement, finding, rows_of
 from rsbench.dataset.verification.image_causes import Elsewhere as Elsewhere
 from rsbench.dataset.verification.image_causes import likeness_faults
-from rsbench.dataset.verification.landing import DepthMap, Shot, land
+from rsbench.dataset.verification.landing import DepthMap, Shot, in_one_light, land
 from rsbench.dataset.verification.png import png_fault
 from rsbench.dataset.verification.rough import roughly_alike
 from rsbench.errors import RsbenchError
@@ -64,8 +64,9 @@ def read_shot(content: Content, shot: Shot, missing: Collection[str]) -> None:
     noisy = isinstance(renderer, dict) and renderer.get("integrator") == "path"
     size = sequence.rig.camera.width, sequence.rig.camera.height
     try:
-        if shot.depth not in missing:
-            content.maps[shot] = DepthMap(shot, sequence.depth(*shot), sequence.rig.camera)
+        if not {shot.depth, *([shot.labels] if sequence.moving else [])} & set(missing):
+            labels = sequence.labels(*shot) if sequence.moving else None
+            content.maps[shot] = DepthMap(shot, sequence.depth(*shot), sequence.rig.camera, labels)
     except RsbenchError as error:
         content.faults.append(str(error))
     file = clean_picture(sequence, shot)
@@ -171,9 +172,10 @@ class Comparison:
             agreement = depth.compare(self.verdicts[source], self.verdicts[target], landing)
             self.agreements.append((source, target, agreement))
             if {source, target} <= pictures.keys():
+                lit = in_one_light(self.content.sequence, maps[source], maps[target], landing, self.stride)
                 self.likenesses.append(
                     image_checks.compare(
-                        pictures[source], pictures[target], maps[source], landing, self.votes[source], self.stride
+                        pictures[source], pictures[target], maps[source], lit, self.votes[source], self.stride
                     )
                 )
             yield agreement

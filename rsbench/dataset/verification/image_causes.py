@@ -19,7 +19,7 @@ from rsbench.dataset.verification.image_checks import (
     noise_of,
     show,
 )
-from rsbench.dataset.verification.landing import BoolArray, DepthMap, Shot, land
+from rsbench.dataset.verification.landing import BoolArray, DepthMap, Shot, in_one_light, land
 
 Elsewhere = Callable[[Shot], Iterable[tuple[str, NDArray[np.uint8]]]]
 """Names and images of other sequences that may have been exchanged with a shot's."""
@@ -77,6 +77,7 @@ def _cause(
     height, width = image.shape[:2]
     stride = max(1, int(np.sqrt(height * width / _TRIED_PIXELS)))
     landing = land(sequence, maps[shot], maps[partner], stride)
+    landing = in_one_light(sequence, maps[shot], maps[partner], landing, stride)
     y, x, shown = show(maps[shot], pictures[partner], landing, stride)
     if len(y) == 0:
         return ""

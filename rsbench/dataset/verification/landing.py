@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.so3 import FloatArray
+from rsbench.dataset.movers import numbers_of
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.shots import FAR, PAIRS, SHOTS, Shot, points_of, seen_by
+from rsbench.dataset.shots import FAR, PAIRS, SHOTS, Geometry, Seen, Shot, points_of, seen_by, seen_from
 
 __all__ = [
     "DEPTH_TOLERANCE",
@@ -46,6 +48,8 @@ class DepthMap:
     depth: NDArray[np.float32]
     """(H, W) metres, 0 = no surface."""
     camera: PinholeCamera
+    labels: NDArray[np.uint8] | None = None
+    """(H, W) what moves there, see ``Sequence.labels``; None where nothing does."""
 
     @cached_property
     def inverse(self) -> FloatArray:
@@ -159,12 +163,50 @@ def land(sequence: Sequence, source: DepthMap, target: DepthMap, stride: int = 1
     for first in range(0, len(grid), step):
         rows = slice(first, first + step)
         sky = depth[rows] == 0
-        X = points_of(sequence, source.shot, grid[rows], np.where(sky, FAR, depth[rows]))
-        guess = grid[rows][..., sequence.shutter.axis(target.shot.side)]
-        seen, z, _ = seen_by(sequence, target.shot, X, guess)
-        pixels[rows] = seen
-        relative[rows] = relative_depth(target, seen, z, sky)
+        numbers = None if source.labels is None else numbers_of(source.labels[::stride, ::stride][rows])
+        seen = seen_with(sequence, source.shot, target.shot, grid[rows], np.where(sky, FAR, depth[rows]), numbers)
+        pixels[rows] = seen.pixels
+        relative[rows] = relative_depth(target, seen.pixels, seen.depth, sky)
     return Landing(pixels, relative)
+
+
+def seen_with(
+    geometry: Geometry,
+    source: Shot,
+    target: Shot,
+    pixels: FloatArray,
+    depth: FloatArray,
+    numbers: NDArray[np.uint8] | None,
+) -> Seen:
+    """Where a target sees what a source sees at pixels (..., 2) with depth (...).
+
+    ``numbers`` (...) of the objects that are seen, and move in between; 0 and None of what stands still.
+    """
+
+    def of(number: int, chosen: Any) -> Seen:
+        own = seen_from(geometry, number)
+        X = points_of(own, source, pixels[chosen], depth[chosen])
+        return seen_by(own, target, X, pixels[chosen][..., own.shutter.axis(target.side)])
+
+    seen = of(0, ...)
+    for number in () if numbers is None else np.unique(numbers[numbers > 0]):
+        chosen = numbers == number
+        for whole, part in zip(seen[:2], of(int(number), chosen)[:2], strict=True):
+            whole[chosen] = part
+    return seen
+
+
+def in_one_light(sequence: Sequence, source: DepthMap, target: DepthMap, landing: Landing, stride: int) -> Landing:
+    """The same without what colours do not tell: what turns, or is shaded by what moves, at another time."""
+    one_time = source.shot.side != target.shot.side and sequence.shutter.plain and source.camera.lens is None
+    if source.labels is None or target.labels is None or one_time:
+        return landing
+    own = cv2.dilate(source.labels, np.ones((3, 3), np.uint8))[::stride, ::stride] > 0
+    other = cv2.dilate(target.labels, np.ones((5, 5), np.uint8)) > 0
+    x, y = np.rint(np.nan_to_num(landing.pixels)).astype(np.int64).reshape(-1, 2).T
+    height, width = other.shape
+    there = other[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].reshape(own.shape)
+    return landing._replace(relative=np.where(own | there, np.float32(np.nan), landing.relative))
 
 
 def relative_depth(target: DepthMap, pixels: FloatArray, z: FloatArray, sky: BoolArray) -> FloatArray:

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from rsbench import __version__
 from rsbench.cards import list_cards, parse_card
+from rsbench.core.moving import poses_of
 from rsbench.core.projection import row_poses
 from rsbench.dataset.channels import AFFINE, TRACKS, matches_file
-from rsbench.dataset.generation import image_seed
+from rsbench.dataset.generation import image_seed, render_shot
 from rsbench.dataset.layout import whole_frames
 from rsbench.dataset.scene_hashes import scene_hash
 from rsbench.dataset.sequence import Sequence
@@ -37,6 +38,7 @@ from rsbench.dataset.verification.surface_checks import surfaces_again
 from rsbench.dataset.verification.track_checks import tracks_again
 from rsbench.errors import RsbenchError
 from rsbench.renderers.options import RendererOptions
+from rsbench.scenes.bodies import with_moving
 from rsbench.scenes.load import load_scene, read_scene_card
 from rsbench.scenes.model import Start
 
@@ -62,6 +64,8 @@ _OTHER_CODES, _FAR_CODES = 0.05, 0.005
 sample across an edge now and then."""
 _NEAR = 2.0
 _OTHER_DEPTH = 0.005
+_OTHER_LABELS, _FEW_LABELS = 1e-3, 8
+"""Share and number of labels that rounding on another processor may change, at edges."""
 
 
 @dataclass(eq=False)
@@ -76,7 +80,7 @@ class Again:
     def is_right(self, content: Content, shot: Shot) -> bool:
         """Whether a depth map is what its scene looks like, at every pixel: that takes but one ray for each."""
         with contextlib.suppress(RsbenchError):  # told by ``check``
-            stored, (_, rendered) = content.maps[shot].depth, self._depth(content, shot)
+            stored, rendered = content.maps[shot].depth, self._whole(content, shot)[1].depth
             return bool(np.all(np.abs(stored - rendered) <= _SAME_DEPTH * np.maximum(stored, rendered)))
         return False
 
@@ -89,11 +93,11 @@ class Again:
         with contextlib.suppress(RsbenchError):
             for shot in [each for each in shots_of(content.times) if each.shutter == "rs"]:
                 if any(f"/{shot.side}_{shot.frame}." in file for file in accused):
-                    scene, depth = self._depth(content, shot)
+                    scene, frame = self._whole(content, shot)
                     for made in (channels_again, surfaces_again):
-                        checks = made(sequence, shot, rows, depth, SceneRays(scene), ())
+                        checks = made(sequence, shot, rows, frame, SceneRays(scene, sequence.objects), ())
                         same |= {file for file, _, alike in checks if alike}
-            scene, _ = self.scene(_table(sequence.manifest, "scene"))
+            scene, _ = self.scene(sequence)
             for file, again in ((TRACKS, tracks_again), (AFFINE, affine_again)):
                 if file in accused:
                     same |= {name for name, _, alike in again(sequence, SceneRays(scene), ()) if alike}
@@ -103,18 +107,19 @@ class Again:
                     same |= {name for name, _, alike in checks if alike}
         return same & set(accused)
 
-    def _depth(self, content: Content, shot: Shot) -> tuple[MitsubaScene, NDArray[np.float32]]:
-        """The scene of a sequence, and a whole depth map of it."""
+    def _whole(self, content: Content, shot: Shot) -> tuple[MitsubaScene, Frame]:
+        """The scene of a sequence, and a whole frame of it, of one sample."""
         manifest = content.sequence.manifest
         options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
-        scene, _ = self.scene(_table(manifest, "scene"))
+        scene, _ = self.scene(content.sequence)
         quick = replace(options, samples=1, integrator="sunsky")
-        return scene, _render(content, scene, quick, shot, list(range(content.sequence.rig.camera.height))).depth
+        return scene, _render(content, scene, quick, shot, list(range(content.sequence.rig.camera.height)))
 
-    def scene(self, record: Mapping[str, Any]) -> tuple[MitsubaScene, str]:
+    def scene(self, sequence: Sequence) -> tuple[MitsubaScene, str]:
         """The scene of a sequence in the renderer, and its hash."""
         from rsbench.renderers.scene import MitsubaScene
 
+        record = _table(sequence.manifest, "scene")
         name, viewpoint = record.get("name"), record.get("viewpoint")
         cards = {read_scene_card(path)[0].name: path for path in self.scene_cards}
         path = cards.get(str(name), list_cards("scenes").get(str(name)))
@@ -129,15 +134,13 @@ class Again:
         start = (
             parse_card(Start, _table(record, "start"), "sequence.json: scene.start") if "start" in record else None
         )
-        wanted = (path, path.stat().st_mtime_ns, viewpoint, start)
+        wanted = (path, path.stat().st_mtime_ns, viewpoint, start, sequence.moving)
         if self._built is None or self._built[0] != wanted:
             self._built = None  # a scene takes hundreds of MB: not two at a time
             scene = load_scene(path)
-            self._built = (
-                wanted,
-                scene_hash(scene),
-                MitsubaScene(scene.seen_from(scene.viewpoints[viewpoint], start)),
-            )
+            seen = scene.seen_from(scene.viewpoints[viewpoint], start)
+            seen = with_moving(seen, sequence.moving) if sequence.moving else seen
+            self._built = (wanted, scene_hash(scene), MitsubaScene(seen))
         return self._built[2], self._built[1]
 
 
@@ -160,7 +163,7 @@ class Redone:
             self._options = parse_card(
                 RendererOptions, _table(sequence.manifest, "renderer"), "sequence.json: renderer"
             )
-            self._scene, self._digest = again.scene(_table(sequence.manifest, "scene"))
+            self._scene, self._digest = again.scene(sequence)
         except RsbenchError as error:
             self._refusal = f"no row rendered again: {error}"
             return
@@ -247,13 +250,14 @@ def _checks(
         frame = _render(content, scene, options, shot, rows)
         if shot in content.maps:
             yield _depth_check(content.maps[shot], frame.depth, rows)
+            yield from _label_checks(content.maps[shot], frame.labels, rows)
         if shot in content.pictures:
             noisy = options.integrator == "path" and elsewhere
             rendered = to_srgb8(frame.image, options.exposure)
             file = clean_picture(content.sequence, shot)
             yield _image_check(file, content.pictures[shot], rendered, rows, noisy)
         for made in (channels_again, surfaces_again):
-            again = made(content.sequence, shot, rows, frame.depth, SceneRays(scene), told)
+            again = made(content.sequence, shot, rows, frame, SceneRays(scene, content.sequence.objects), told)
             yield from (_Check(*check) for check in again)
         if shot.shutter == "rs":
             yield from _frame_checks(content, scene, options, shot, rows, told)
@@ -277,7 +281,15 @@ def _frame_checks(
             sensor = sequence.sensor.of(shot.side, shot.frame)
             some = rows[::_COMPRESSED] if sensor.jpeg_quality and len(rows) < sequence.shutter.height else rows
             sensed = sensed_rows(
-                scene, *geometry, sensor, sequence.frame_period_s, shot.side, shot.frame, chosen, some
+                scene,
+                *geometry,
+                sensor,
+                sequence.frame_period_s,
+                shot.side,
+                shot.frame,
+                chosen,
+                some,
+                sequence.objects,
             )
             yield _image_check(shot.image, seen, sensed, some, elsewhere)
     with contextlib.suppress(RsbenchError):
@@ -297,8 +309,10 @@ def _stack_check(
     R, t = (
         each.copy() for each in row_poses(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame)
     )
-    R[rows], t[rows] = R[of], t[of]
-    rendered = to_srgb8(render(scene, sequence.rig.camera, R, t, chosen, rows=rows).image, chosen.exposure)
+    tau = sequence.shutter.line_times(shot.frame, shot.side).copy()
+    R[rows], t[rows], tau[rows] = R[of], t[of], tau[of]
+    frame = render(scene, sequence.rig.camera, R, t, chosen, objects=poses_of(sequence.objects, tau), rows=rows)
+    rendered = to_srgb8(frame.image, chosen.exposure)
     noisy = chosen.integrator == "path" and not _made_here(content)
     return _image_check(f"gs_stack/{shot.side}_{shot.frame}", seen, rendered, rows, noisy)
 
@@ -320,15 +334,19 @@ def _of_image(content: Content, options: RendererOptions, shot: Shot) -> Rendere
 
 def _render(content: Content, scene: MitsubaScene, options: RendererOptions, shot: Shot, rows: list[int]) -> Frame:
     """Rows of a shot, with the bits that they have in the whole image."""
-    from rsbench.renderers.render import render
+    sequence = content.sequence
+    poses = row_poses(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame)
+    return render_shot(scene, sequence, shot, poses, _of_image(content, options, shot), rows=rows)
 
-    sequence, chosen = content.sequence, _of_image(content, options, shot)
-    R, t = row_poses(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame)
-    if shot.shutter == "gs":
-        line = abs(sequence.shutter.first_line(shot.side) - shot.row)
-        R, t = np.broadcast_to(R[line], R.shape), np.broadcast_to(t[line], t.shape)
-    columns = sequence.shutter.axis(shot.side) == 0
-    return render(scene, sequence.rig.camera, R, t, chosen, rows=rows, columns=columns)
+
+def _label_checks(stored: DepthMap, rendered: NDArray[np.uint8], rows: list[int]) -> Iterator[_Check]:
+    if stored.labels is None:
+        return
+    wrong, file = stored.labels[rows] != rendered, stored.shot.labels
+    what = f"{100 * np.mean(wrong):.2g} % of {wrong.size} labels differ from what is rendered again"
+    in_rows = np.isin(np.arange(len(stored.labels)), np.asarray(rows)[np.any(wrong, axis=1)])
+    bad = np.sum(wrong) > max(_OTHER_LABELS * wrong.size, _FEW_LABELS)
+    yield _Check(file, finding(file, what, rows_of(in_rows)) if bad else "", not np.any(wrong))
 
 
 def _depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]) -> _Check:

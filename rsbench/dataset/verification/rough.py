@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.shots import Geometry, Shot, points_of, seen_by
-from rsbench.dataset.verification.landing import DepthMap
+from rsbench.dataset.movers import numbers_of
+from rsbench.dataset.shots import Geometry, Shot
+from rsbench.dataset.verification.landing import DepthMap, seen_with
 
 _NEAR = 5e-3
 """Relative difference of two depths that may be of one thin thing."""
@@ -37,9 +38,9 @@ def roughly_alike(geometry: Geometry, maps: Mapping[Shot, DepthMap], shot: Shot)
 def _alike(geometry: Geometry, source: DepthMap, target: DepthMap) -> bool:
     stride = max(1, int(np.sqrt(source.depth.size / _TRIED_PIXELS)))
     grid, depth = source.camera.pixel_grid()[::stride, ::stride], source.depth[::stride, ::stride]
+    numbers = None if source.labels is None else numbers_of(source.labels[::stride, ::stride][depth > 0])
     pixels, z = grid[depth > 0], depth[depth > 0].astype(np.float64)
-    X = points_of(geometry, source.shot, pixels, z)
-    seen = seen_by(geometry, target.shot, X, pixels[:, geometry.shutter.axis(target.shot.side)])
+    seen = seen_with(geometry, source.shot, target.shot, pixels, z, numbers)
     inside = np.isfinite(seen.depth)
     middle = np.rint(seen.pixels[inside]).astype(np.int64)
     shares = [

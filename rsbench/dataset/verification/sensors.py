@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from rsbench.core.projection import back_project, project_at
 from rsbench.core.so3 import FloatArray
+from rsbench.dataset.movers import SHADED, numbers_of
 from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.shots import seen_from
 from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.dataset.verification.image_checks import Picture
-from rsbench.dataset.verification.landing import FAR, DepthMap, Shot
+from rsbench.dataset.verification.landing import FAR, BoolArray, DepthMap, Shot
 from rsbench.dataset.verification.png import png_fault
 from rsbench.dataset.verification.processing_checks import processing_fault
 from rsbench.errors import RsbenchError
@@ -35,6 +37,7 @@ _JPEG_REACH = 17
 """Pixels over which JPEG spreads what it leaves out: a block of colours of half the resolution, and one more."""
 _MOST_BIAS = 0.75
 """Of the mean, in sigma: where the twin is uneven by less than one sigma, its middle is off by half at most."""
+_FARTHER = 3
 _UNCLIPPED = (0.03, 0.75)
 _WHITE = 255.0
 
@@ -54,7 +57,8 @@ def sensor_faults(
                 seen = sequence.image(*shot[:3])
                 own, spacing = sensor.of(shot.side, shot.frame), _spacing(sequence)
                 window = _window(sequence, own, maps[shot], spacing)
-                fault = _fault(own, seen, pictures[shot], window, spacing)
+                changing = _changing(sequence, own, maps[shot], spacing)
+                fault = _fault(own, seen, pictures[shot], window, spacing, changing)
         except RsbenchError as error:
             fault = str(error)
         if fault:
@@ -68,24 +72,45 @@ def _spacing(sequence: Sequence) -> float:
     return float(samples**-0.5) if isinstance(samples, int) and samples > 0 else 1.0
 
 
-def _window(sequence: Sequence, sensor: Sensor, depth_map: DepthMap, spacing: float) -> tuple[int, int]:
-    """How far (x, y) a surface may be, in whole pixels, from where the row's time sees it, while it is exposed."""
-    if not sensor.exposure_s:
-        return 0, 0
-    shot = depth_map.shot
+def _changing(sequence: Sequence, sensor: Sensor, depth_map: DepthMap, spacing: float) -> BoolArray:
+    """(H, W) where an object that moves, or its shadow, may be seen while the row is exposed: no window holds."""
+    labels, found = depth_map.labels, np.zeros(depth_map.depth.shape, dtype=np.bool_)
+    if labels is None or not sensor.exposure_s:
+        return found
+    numbers = range(1, len(sequence.moving) + 1)
+    windows = [_window(sequence, sensor, depth_map, spacing, number) for number in numbers]
+    # A shadow goes about as far as what throws it; where the sun is low, or the ground is near, farther.
+    farthest = tuple(_FARTHER * np.max(windows, axis=0))
+    masks = [numbers_of(labels) == number for number in numbers]
+    beside = int(sensor.mosaic != "none") + (_JPEG_REACH if sensor.jpeg_quality else 0)
+    for own, (x, y) in zip((*masks, labels >= SHADED), (*windows, farthest), strict=True):
+        around = np.ones((2 * (y + beside) + 1, 2 * (x + beside) + 1), np.uint8)
+        found |= cv2.dilate(own.astype(np.uint8), around) > 0
+    return found
+
+
+def _window(
+    sequence: Sequence, sensor: Sensor, depth_map: DepthMap, spacing: float, number: int = 0
+) -> tuple[int, int]:
+    """How far (x, y) a surface may be, in whole pixels, from where the row's time sees it, while it is exposed.
+
+    Of the surfaces of an object, by its ``number``, or of what stands still.
+    """
+    shot, labels = depth_map.shot, depth_map.labels
     grid = sequence.rig.camera.pixel_grid()[::4, ::4]
-    depth = depth_map.depth[::4, ::4].astype(np.float64)
-    depth = np.where(depth > 0, depth, FAR)
-    geometry = sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame
-    X = back_project(*geometry, grid, depth)
+    own = np.ones(grid.shape[:2], np.bool_) if labels is None else numbers_of(labels[::4, ::4]) == number
+    if not (sensor.exposure_s and np.any(own)):
+        return 0, 0
+    depth, grid = depth_map.depth[::4, ::4][own].astype(np.float64), grid[own]
+    rig, shutter, motion = seen_from(sequence, number)[:3]
+    X = back_project(rig, shutter, motion, shot.side, shot.frame, grid, np.where(depth > 0, depth, FAR))
     half = 0.5 * sensor.exposure_s / sequence.frame_period_s
-    tau = sequence.shutter.pixel_time(grid, shot.frame, shot.side)
+    tau = shutter.pixel_time(grid, shot.frame, shot.side)
     moved = [
-        np.abs(project_at(sequence.rig, sequence.motion, shot.side, tau + sign * half, X)[..., :2] - grid)
-        for sign in (-1.0, 1.0)
+        np.abs(project_at(rig, motion, shot.side, tau + sign * half, X)[..., :2] - grid) for sign in (-1.0, 1.0)
     ]
     # One more: a pixel is an area, and thin near things lie between the points looked at; and between samples.
-    x, y = np.ceil(np.nanmax(np.stack(moved), axis=(0, 1, 2))).astype(int) + 1 + int(spacing)
+    x, y = np.ceil(np.nanmax(np.stack(moved), axis=(0, 1))).astype(int) + 1 + int(spacing)
     return int(x), int(y)
 
 
@@ -95,13 +120,18 @@ def _fault(
     picture: Picture,
     window: tuple[int, int],
     spacing: float = 0.5,
+    changing: BoolArray | None = None,
 ) -> str | None:
-    """What is wrong with an image of ``picture``'s shot; ``window`` is how far (x, y) its blur may reach, px."""
+    """What is wrong with an image of ``picture``'s shot; ``window`` is how far (x, y) its blur may reach, px.
+
+    ``changing`` (H, W) where it may reach farther.
+    """
     bounds = _Bounds.of(sensor, image, picture, window, spacing)
+    told = np.ones((*image.shape[:2], 1), np.bool_) if changing is None else ~changing[..., None]
     return (
-        _beyond(bounds, image, picture.shot, spacing)
+        _beyond(bounds, image, picture.shot, spacing, told)
         or processing_fault(image, sensor, picture.shot.image)
-        or _noise_fault(bounds, sensor, image, picture)
+        or _noise_fault(bounds, sensor, image, picture, told)
     )
 
 
@@ -150,9 +180,9 @@ class _Bounds:
         return cls(low, high, own, rounded, _BEYOND_SIGMA * np.sqrt(unsure), inner)
 
 
-def _beyond(bounds: _Bounds, image: NDArray[np.uint8], shot: Shot, spacing: float) -> str | None:
+def _beyond(bounds: _Bounds, image: NDArray[np.uint8], shot: Shot, spacing: float, told: BoolArray) -> str | None:
     seen, inner = linear_of_codes(image), bounds.inner
-    beyond = (seen < np.minimum(bounds.low, 1.0) - bounds.slack) | (seen > bounds.high + bounds.slack)
+    beyond = told & ((seen < np.minimum(bounds.low, 1.0) - bounds.slack) | (seen > bounds.high + bounds.slack))
     if not beyond[inner].size:
         return None
     many, rows = float(np.mean(beyond[inner])), np.zeros(len(image), dtype=np.bool_)
@@ -163,12 +193,15 @@ def _beyond(bounds: _Bounds, image: NDArray[np.uint8], shot: Shot, spacing: floa
     return finding(shot.image, what, rows_of(rows))
 
 
-def _noise_fault(bounds: _Bounds, sensor: Sensor, image: NDArray[np.uint8], picture: Picture) -> str | None:
+def _noise_fault(
+    bounds: _Bounds, sensor: Sensor, image: NDArray[np.uint8], picture: Picture, told: BoolArray
+) -> str | None:
     """Light and noise where the twin is smooth. Rounding is no noise: without any beside it, equal values are
     rounded alike."""
     low, high, shot = bounds.low, bounds.high, picture.shot
     sigma = np.sqrt(bounds.own + bounds.rounded)
-    smooth = (high - low < sigma) & (low > _UNCLIPPED[0]) & (high < _UNCLIPPED[1]) & (bounds.own > bounds.rounded)
+    smooth = told & (high - low < sigma) & (low > _UNCLIPPED[0]) & (high < _UNCLIPPED[1])
+    smooth &= bounds.own > bounds.rounded
     if sensor.mosaic != "none":
         inside = np.zeros_like(smooth)
         inside[bounds.inner] = True

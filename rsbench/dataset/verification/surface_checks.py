@@ -4,21 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.projection import back_project
 from rsbench.core.rig import FRAMES, SIDES
+from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channel_truth import Rays, SeenSurfaces, surface_truth
 from rsbench.dataset.channels import INSTANCE_TABLE, surface_file
+from rsbench.dataset.movers import numbers_of
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.shots import Shot
+from rsbench.dataset.shots import Shot, points_of, seen_from, times_at
 from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.dataset.verification.landing import BoolArray, DepthMap, land
 from rsbench.errors import RsbenchError
+
+if TYPE_CHECKING:
+    from rsbench.renderers.render import Frame
 
 _UNIT = 1e-5
 """Of a length: the rounding of float32."""
@@ -72,10 +76,9 @@ def _normal_faults(
     if np.sum(wrong) > _LEAST:
         yield finding(file, f"{np.sum(wrong)} normals are not of length 1, or 0 without a surface", _rows(wrong))
         return
-    geometry = sequence.rig, sequence.shutter, sequence.motion, depth_map.shot.side, depth_map.shot.frame
-    grid, z = sequence.rig.camera.pixel_grid(), np.where(solid, depth_map.depth, 1.0).astype(np.float64)
-    X = back_project(*geometry, grid, z)
-    away = solid & (np.sum((X - back_project(*geometry, grid, z * 0)) * normals, axis=-1) > 0)
+    z = np.where(solid, depth_map.depth, 1.0).astype(np.float64)
+    X, ways, normals = _resting(sequence, depth_map, z, normals)
+    away = solid & (np.sum(ways * normals, axis=-1) > 0)
     if np.sum(away) > _LEAST:
         yield finding(file, f"{np.sum(away)} normals point away from the camera", _rows(away))
     bent = np.zeros(solid.shape, dtype=np.bool_)
@@ -87,6 +90,29 @@ def _normal_faults(
         share = f"{100 * np.sum(bent & flat) / np.sum(flat):.2g} % of the flat pixels"
         what = f"{share} have a normal that is not upright on the surface of {depth_map.shot.depth}"
         yield finding(file, what, _rows(bent & flat))
+
+
+def _resting(
+    sequence: Sequence, depth_map: DepthMap, z: FloatArray, normals: NDArray[np.float32]
+) -> tuple[FloatArray, FloatArray, NDArray[np.float32]]:
+    """Points, rays to them and normals, (H, W, 3) each, in the world; of what moves, in its own frame, where it
+    rests: the normals of a frame are those of the times of its rows."""
+    shot, grid, labels = depth_map.shot, sequence.rig.camera.pixel_grid(), depth_map.labels
+
+    def of(number: int, chosen: Any) -> tuple[FloatArray, FloatArray]:
+        pixels, depth = grid[chosen], z[chosen]
+        own = seen_from(sequence, number)
+        points = points_of(own, shot, pixels, depth)
+        return points, points - points_of(own, shot, pixels, depth * 0)
+
+    X, ways = of(0, ...)
+    for number, thing in enumerate(sequence.objects, start=1):
+        chosen = np.zeros(z.shape, np.bool_) if labels is None else numbers_of(labels) == number
+        X[chosen], ways[chosen] = of(number, chosen)
+        turned = inverse(thing.world_from_object(times_at(sequence, shot, grid[chosen]))).R
+        normals = normals.copy()
+        normals[chosen] = (turned @ normals[chosen][..., None])[..., 0]
+    return X, ways, normals
 
 
 def _number_faults(depth_map: DepthMap, file: str, numbers: NDArray[np.uint16], count: int) -> Iterator[str]:
@@ -128,11 +154,12 @@ def _likeness_faults(
 
 
 def surfaces_again(
-    sequence: Sequence, shot: Shot, rows: list[int], depth: NDArray[np.float32], rays: Rays, told: Collection[str]
+    sequence: Sequence, shot: Shot, rows: list[int], frame: Frame, rays: Rays, told: Collection[str]
 ) -> Iterator[tuple[str, str, bool]]:
     """As ``channel_checks.channels_again``, of normals and instances."""
     names = [name for name in ("normals", "instances") if shot.shutter == "rs" and name in sequence.channels]
-    truth = surface_truth(SeenSurfaces(sequence, shot, depth, rows), rays) if names else None
+    seen = SeenSurfaces(sequence, shot, frame.depth, rows, numbers_of(frame.labels))
+    truth = surface_truth(seen, rays) if names else None
     for name in names:
         file = surface_file("normals" if name == "normals" else "instances", shot.side, shot.frame)
         if truth is None or file in told:
@@ -142,7 +169,7 @@ def surfaces_again(
         except RsbenchError:  # told already
             continue
         made: FloatArray = getattr(truth, name)
-        off = np.abs(stored.astype(np.float64) - made).reshape(*depth.shape, -1).max(axis=-1)
+        off = np.abs(stored.astype(np.float64) - made).reshape(*frame.depth.shape, -1).max(axis=-1)
         wrong: BoolArray = ~(off <= _UNIT)
         in_rows = np.isin(np.arange(sequence.shutter.height), np.asarray(rows)[np.any(wrong, axis=1)])
         bad = np.sum(wrong) > max(_FEW_AGAIN * wrong.size, _LEAST)

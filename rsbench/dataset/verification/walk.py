@@ -17,6 +17,7 @@ from rsbench.dataset.verification.findings import DepthAgreement, Progress, find
 from rsbench.dataset.verification.hdr_checks import hdr_faults
 from rsbench.dataset.verification.match_checks import match_faults, matched_again
 from rsbench.dataset.verification.misplaced import misplaced_frames
+from rsbench.dataset.verification.moving_checks import label_faults
 from rsbench.dataset.verification.rerender import Again, Redone
 from rsbench.dataset.verification.sensors import sensor_faults
 from rsbench.dataset.verification.stacks import stack_faults
@@ -62,9 +63,10 @@ class Walk:
         for times in pairwise(range(self.sequence.frames)):
             fresh = read_content(self.sequence, self.missing, times if times[0] == 0 else times[1:])
             content = content.followed_by(fresh, self.told)
+            twins = read_twins(self.sequence, self.missing, fresh.times)
+            self.faults += label_faults(content, fresh, twins)
             self._of_frames(fresh)
             self._of_pairs(content, step)
-            twins = read_twins(self.sequence, self.missing, fresh.times)
             self.faults += [*twins.faults, *other_twin_faults(fresh, twins, self.stride)]
             self._of_channels(with_twins(content, twins), fresh)
             if redone is not None:

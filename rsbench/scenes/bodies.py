@@ -1,0 +1,99 @@
+"""Objects of a scene that move by themselves: one of its meshes, or a textured box that is put into it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.cards import choices
+from rsbench.core import so3
+from rsbench.errors import RsbenchError
+from rsbench.scenes.model import Material, Scene, SceneMesh
+from rsbench.scenes.textures import fractal_noise, to_bytes
+
+MOST_MOVING = 64
+"""Objects of a sequence."""
+_PIXELS = 256
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body:
+    """A rigid thing that moves."""
+
+    position: Vector
+    """About which it turns, the middle of a box: in the world frame at time 0 (x right, y down, z forward), m."""
+    instance: str = ""
+    """Name of a mesh of the scene: that mesh."""
+    box: Vector | None = None
+    """Or the edges along x, y, z of a box, metres."""
+    attitude_deg: Vector = (0.0, 0.0, 0.0)
+    """Rotation vector by which the box is turned at time 0."""
+    texture_seed: int = 0
+    """Of the texture of the box."""
+
+    def __post_init__(self) -> None:
+        if bool(self.instance) == (self.box is not None):
+            raise ValueError("moving: either 'instance' or 'box' is needed")
+        if not np.all(np.isfinite([self.position, self.box or self.position, self.attitude_deg])):
+            raise ValueError("moving: position, box and attitude_deg must be finite numbers")
+        if self.box is not None and not min(self.box) > 0.0:
+            raise ValueError(f"moving: box = {list(self.box)}: edges must be positive")
+        if self.box is None and any(self.attitude_deg):
+            raise ValueError("moving: attitude_deg is of a box; a mesh stays as the scene has it")
+        if self.texture_seed < 0:
+            raise ValueError(f"moving: texture_seed = {self.texture_seed}: must not be negative")
+
+
+def with_moving(scene: Scene, bodies: Sequence[Body]) -> Scene:
+    """A scene in the world frame at time 0 whose meshes know to which body they belong.
+
+    Raises:
+        RsbenchError: a mesh that the scene does not have, or that moves twice.
+    """
+    meshes = list(scene.meshes)
+    for number, body in enumerate(bodies, start=1):
+        if body.box is not None:
+            meshes.append(_box(body, body.box, number))
+            continue
+        own = [place for place, mesh in enumerate(meshes) if mesh.name == body.instance and mesh.faces.size]
+        if not own:
+            names = choices(body.instance, {mesh.name for mesh in scene.meshes if mesh.faces.size})
+            raise RsbenchError(f"moving: scene {scene.name!r} has no mesh {body.instance!r}{names}")
+        for place in own:
+            if meshes[place].mover:
+                raise RsbenchError(f"moving: instance {body.instance!r} moves twice")
+            meshes[place] = replace(meshes[place], mover=number)
+    return replace(scene, meshes=tuple(meshes))
+
+
+def _box(body: Body, edges: Vector, number: int) -> SceneMesh:
+    """Six sides, each with a part of one texture of its own; the longest edge is half a repeat."""
+    corners, uv, faces = [], [], []
+    for side, (axis, sign) in enumerate((axis, sign) for axis in range(3) for sign in (-1.0, 1.0)):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        for along, up in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+            corner = np.zeros(3)
+            corner[[axis, u, v]] = sign, along, up
+            corners.append(0.5 * corner * edges)
+            uv.append(0.25 * np.array([along * edges[u], up * edges[v]]) / max(edges) + [0.37 * side, 0.61 * side])
+        faces += [[4 * side, 4 * side + 1, 4 * side + 2], [4 * side, 4 * side + 2, 4 * side + 3]]
+    turned = np.array(corners) @ so3.exp(np.deg2rad(body.attitude_deg)).T
+    name = f"moving_{number}"
+    return SceneMesh(
+        name=name,
+        vertices=turned + body.position,
+        faces=np.array(faces, dtype=np.int32),
+        material=Material(name=name, texture=_texture(body.texture_seed)),
+        uv=np.array(uv),
+        mover=number,
+    )
+
+
+def _texture(seed: int) -> NDArray[np.uint8]:
+    rng, shape = np.random.default_rng([seed, 1919]), (_PIXELS, _PIXELS)
+    tone, hue, blue = (fractal_noise(rng, shape, (8, 8), 5, 0.8) for _ in range(3))
+    return to_bytes(np.stack([0.5 + 0.4 * tone, 0.45 + 0.35 * tone + 0.12 * hue, 0.35 + 0.3 * tone + 0.12 * blue]))

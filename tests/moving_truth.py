@@ -1,0 +1,109 @@
+"""What ``traced_truth`` is, where things move: triangles in float64 at each ray's own time, rows by bisection."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from traced_truth import Array, first_hit, look, rays
+
+from rsbench.dataset.channels import PairChannel, PixelClass
+from rsbench.dataset.sequence import Sequence as Recorded
+
+
+class Thing(NamedTuple):
+    """Triangles (m, 3, 3) at time 0, and how they turn about a pivot and are shifted in one frame period."""
+
+    triangles: Array
+    pivot: Array
+    w: Array
+    d: Array
+
+    def moved(self, X: Array, tau: Array) -> Array:
+        """Points (n, 3) of time 0 at times (n,)."""
+        return (
+            Rotation.from_rotvec(tau[:, None] * self.w).apply(X - self.pivot) + self.pivot + tau[:, None] * self.d
+        )
+
+    def back(self, X: Array, tau: Array) -> Array:
+        turn = Rotation.from_rotvec(tau[:, None] * self.w).inv()
+        return np.asarray(turn.apply(X - self.pivot - tau[:, None] * self.d) + self.pivot)
+
+
+class World(NamedTuple):
+    """What stands still, and what moves."""
+
+    still: Array
+    things: Sequence[Thing]
+
+    def hit(self, origins: Array, ways: Array, tau: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Parameter (n,) of the first triangle along rays at times (n,), and the number of its thing; 0: still."""
+        nearest = first_hit(self.still, origins, ways)
+        owner = np.zeros(len(nearest), dtype=np.int64)
+        for number, thing in enumerate(self.things, start=1):
+            start = thing.back(origins, tau)
+            own = first_hit(thing.triangles, start, thing.back(origins + ways, tau) - start)
+            owner[own < nearest] = number
+            nearest = np.minimum(nearest, own)
+        return nearest, owner
+
+    def carried(self, X: Array, owner: NDArray[np.int64], tau: Array, to: Array) -> Array:
+        """Points (n, 3) at times ``tau`` (n,), at times ``to``."""
+        result = X.copy()
+        for number, thing in enumerate(self.things, start=1):
+            own = owner == number
+            result[own] = thing.moved(thing.back(X[own], tau[own]), to[own])
+        return result
+
+
+def row_times(sequence: Recorded, frame: int, y: Array) -> Array:
+    return np.asarray(frame + sequence.shutter.readout_ratio / sequence.shutter.height * y)
+
+
+def truth(
+    sequence: Recorded, world: World, channel: PairChannel, side: str, frame: int, row: int = 0
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """As ``traced_truth.truth``, of all pixels; and the thing (n,) that each sees."""
+    width, height = sequence.rig.camera.width, sequence.rig.camera.height
+    y, x = (each.ravel().astype(float) for each in np.mgrid[:height, :width])
+    pixels, start = np.column_stack([x, y]), row_times(sequence, frame, y)
+    origins, ways = rays(sequence, side, start, pixels)
+    depth, owner = world.hit(origins, ways, start)
+    sky = np.isinf(depth)
+    X = origins + ways * np.where(sky, 1e8, depth)[:, None]
+    to, there = frame, side
+    if channel == "disparity":
+        there, tau = ("right" if side == "left" else "left"), start
+    elif channel == "flow":
+        to = 1 - frame
+        low, high = np.full(len(X), -0.5), np.full(len(X), height - 0.5)
+
+        def below(at: Array) -> Array:
+            time = row_times(sequence, to, at)
+            return look(sequence, side, time, world.carried(X, owner, start, time))[:, 1] - at
+
+        crosses = (below(low) >= 0) & (below(high) <= 0)
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            right = below(middle) >= 0
+            low, high = np.where(right, middle, low), np.where(right, high, middle)
+        tau = np.where(crosses, row_times(sequence, to, low), np.nan)
+    else:
+        tau = np.full(len(X), row_times(sequence, frame, np.array(float(row))))
+    lost = np.isnan(tau)
+    tau = np.where(lost, 0.0, tau)
+    arrived = world.carried(X, owner, start, tau)
+    landed = look(sequence, there, tau, arrived)
+    with np.errstate(invalid="ignore"):
+        inside = ~lost & np.all((landed >= -0.5) & (landed <= [width - 0.5, height - 0.5]), axis=1)
+    eyes, _ = rays(sequence, there, tau, pixels)
+    hidden = world.hit(eyes, arrived - eyes, tau)[0] < 1 - 1e-6  # as in ``traced_truth``
+    classes = np.where(
+        sky,
+        np.where(hidden, PixelClass.SKY_OCCLUDED, PixelClass.SKY),
+        np.where(hidden, PixelClass.OCCLUDED, PixelClass.VISIBLE),
+    )
+    return landed - pixels, np.where(inside, classes, PixelClass.OUT_OF_VIEW), owner
