@@ -46,7 +46,7 @@ def with_lens(matches: Correspondences, camera: PinholeCamera) -> Correspondence
     sets = {}
     for name in _SETS:
         rows = getattr(matches, name)
-        ends = camera.lens_pixels(rows.reshape(len(rows), -1, 2))
+        ends = camera.lens_pixels(rows.reshape(len(rows), rows.shape[1] // 2, 2))
         sets[name] = ends[np.all(camera.contains(ends), axis=1)].reshape(-1, rows.shape[1])
     return replace(matches, **sets)
 

@@ -12,6 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+
 from attack.mutations import mutated, mutated_npz, mutated_png
 from attack.tiny import ROOT, to_toml
 
@@ -107,6 +110,7 @@ def _datasets(inputs: Path, folder: Path) -> Iterator[Loader]:
     from rsbench.dataset.files import load_arrays, load_matches, read_depth, read_png, read_poses
     from rsbench.dataset.sequence import read_dataset, read_sequence
     from rsbench.pipeline.footage import read_frame
+    from rsbench.scenes.environment import read_environment
 
     data = folder / "data"
     shutil.copytree(inputs / "data", data)
@@ -125,11 +129,25 @@ def _datasets(inputs: Path, folder: Path) -> Iterator[Loader]:
     yield Loader(name="frame", path=files / "frame.png", seeds=pngs, load=read_frame, change=mutated_png)
     depths = tuple((one / f"{kind}_depth" / "left_0.exr").read_bytes() for kind in ("rs", "gs"))
     yield Loader(name="EXR", path=files / "depth.exr", seeds=depths, load=read_depth)
+    for suffix in (".hdr", ".exr"):
+        path = files / f"sky{suffix}"
+        yield Loader(name=f"environment {suffix}", path=path, seeds=(_sky(path),), load=read_environment)
     matches = _matches()
     yield Loader(
         name="matches", path=files / "matches.npz", seeds=(matches,), load=load_matches, change=mutated_npz
     )
     yield Loader(name="arrays", path=files / "arrays.npz", seeds=(matches,), load=load_arrays, change=mutated_npz)
+
+
+def _sky(path: Path) -> bytes:
+    """A small environment map."""
+    from rsbench.dataset.files import write_exr
+
+    light = np.random.default_rng(2).random((8, 16, 3), dtype=np.float32)
+    if path.suffix == ".exr":
+        write_exr(path, {name: light[..., k].copy() for k, name in enumerate("RGB")})
+        return path.read_bytes()
+    return bytes(cv2.imencode(".hdr", light)[1])
 
 
 def _inside(sequences: list[Any], folder: Path) -> None:

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.lens import Lens
 from rsbench.core.projection import back_project, project_at, row_poses, rs_project_near
 from rsbench.core.shutter import Scanning
@@ -24,7 +25,7 @@ from rsbench.vision.quality import psnr
 from rsbench.vision.stereo_depth import seen_by_other
 from rsbench.vision.stereo_matcher import load_matcher
 from rsbench.vision.timed_depth import timed_depth
-from rsbench.vision.undistortion import sensor_disparities
+from rsbench.vision.undistortion import sensor_disparities, with_lens
 
 GEOMETRY_PX = 0.01
 BARREL = Lens(model="brown-conrady", k1=-0.22, k2=0.05, p1=0.002, p2=-0.001)
@@ -201,3 +202,9 @@ def test_disparities_lie_on_the_pixels_of_the_sensor(scene: Any, u8: Build, lens
         assert np.mean(np.isfinite(error)) > 0.9
         assert np.nanmedian(error) < 0.05
         assert np.nanquantile(error, 0.95) < 0.5
+
+
+def test_no_match_is_none_behind_a_lens_too() -> None:
+    camera = replace(PinholeCamera.centred(64, 48, 60.0), lens=Lens(model="brown-conrady", k1=-0.1))
+    found = with_lens(Correspondences(left=np.full((1, 4), 30.0)), camera)
+    assert found.left.shape == (1, 4) and found.right.shape == (0, 4) and found.tracks.shape == (0, 8)
