@@ -225,7 +225,8 @@ def flowing(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in channel_files(["flow"], (), COUNT):
         (whole.folder / name).parent.mkdir(exist_ok=True)
     for view in views_of(COUNT):
-        seen = Frame(image=np.zeros((54, 64, 3), np.float32), depth=whole.depth("rs", *view))
+        image, labels = np.zeros((54, 64, 3), np.float32), np.zeros((54, 64), np.uint8)
+        seen = Frame(image=image, depth=whole.depth("rs", *view), labels=labels)
         write_channels(whole.folder, ["flow"], whole, Shot("rs", *view), seen, Open())
     own = json.loads((whole.folder / "sequence.json").read_text()) | {"channels": ["flow"]}
     own["files"] |= dict.fromkeys(channel_files(["flow"], (), COUNT), "")
@@ -240,10 +241,10 @@ def flowing(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Open:
     """Rays that meet nothing."""
 
-    def blocked(self, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
+    def blocked(self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None) -> NDArray[np.bool_]:
         return np.zeros(len(points), dtype=np.bool_)
 
-    def surfaces(self, eyes: FloatArray, points: FloatArray) -> Surfaces:
+    def surfaces(self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None) -> Surfaces:
         raise NotImplementedError
 
 
