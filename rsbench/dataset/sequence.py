@@ -210,16 +210,6 @@ class Sequence(ChannelReader):
         ends = tuple(f"{side}_{frame + self.first}" for side, frame in views_of(self.frames))
         return sorted(path for name in folders for path in (self.folder / name).iterdir() if path.stem in ends)
 
-    @property
-    def uncorrectable(self) -> str:
-        """Why stereo matchers and correctors do not take such cameras; empty when they do."""
-        if not self.shutter.rows_together:
-            return (
-                "depth and correction take cameras that read each row at once, from the top or the bottom, and no "
-                "other scan yet"
-            )
-        return ""
-
     def image(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.uint8]:
         """(H, W, 3) sRGB; ``gs`` is the global-shutter image at the pose of a row: 0, or one of ``twins``."""
         return read_png(inside(self.folder, picture_file(shutter, side, frame + self.first, row)), self._size)

@@ -18,7 +18,7 @@ from rsbench.core.rig import FRAMES, SIDES, VIEWS, StereoRig, View
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_depth import Images, Pairs, complete_depth, frame_pairs, timed_pairs
+from rsbench.pipeline.frame_depth import Images, Pairs, complete_depth, frame_pairs, moving_pairs, timed_pairs
 from rsbench.pipeline.frame_motion import FoundMotion, match_frames, solve_frames, solve_shutter
 from rsbench.pipeline.readout import ReadoutEstimate
 from rsbench.vision.corrector import CorrectionProblem, find_corrected
@@ -128,15 +128,15 @@ def check_cameras(
     """Whether these cameras can be corrected with these options.
 
     Raises:
-        RsbenchError: depth is to be found where a pair is of two times; or a readout ratio is to be found, or an
-            offset given, of cameras with a lens or another scan.
+        RsbenchError: depth is to be found where a pair is of two times, and no motion; or a readout ratio is to
+            be found, or an offset given, of cameras with a lens or another scan.
     """
-    lens = rig.camera.lens
-    if not (depth_is_known or scanning.rows_together) and "depth" in options.corrector.component.spec.needs:
+    lens, needs = rig.camera.lens, options.corrector.component.spec.needs
+    if not (depth_is_known or scanning.rows_together) and "depth" in needs and "motion" not in needs:
         raise RsbenchError(
             f"scan = {scanning.scan!r}, right_scan = {scanning.right_scan!r}, "
-            f"right_delay = {scanning.right_delay}: depth is found where both cameras read each row at once, "
-            "from the top or the bottom; no other yet"
+            f"right_delay = {scanning.right_delay}: depth is found with the motion between the times of both "
+            f"cameras, for which corrector {options.corrector.name!r} does not ask"
         )
     if lens is None and scanning.plain:
         return
@@ -187,7 +187,11 @@ def find_depth(
     disparity_offset: float = 0.0,
 ) -> Pairs:
     """The frames with their depth: from the other camera unless ``pairs`` has it, then from the motion."""
-    if pairs is None:
+    if pairs is None and not shutter.rows_together:
+        if motion is None:
+            raise ValueError("the motion must be known where depth is found of cameras that read rows apart")
+        pairs = moving_pairs(images, rig, shutter, motion, options)
+    elif pairs is None:
         pairs = frame_pairs(images, rig, options, disparity_offset)
     if not all(pair.timed for pair in pairs):
         if motion is None:

@@ -15,6 +15,7 @@ from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.vision.motion_sweep import depth_from_motion
+from rsbench.vision.moving_stereo import moving_disparities
 from rsbench.vision.sky import sky_mask
 from rsbench.vision.stereo_depth import fill_holes
 from rsbench.vision.timed_depth import timed_depth
@@ -90,6 +91,21 @@ def depth_of_pair(
         filled = fill_holes(disparity)
         guess[side] = np.where(np.isnan(disparity), _depth(filled, rig), np.float32(0.0))
     return FramePair(images=images, depth=depth, guess=guess, timed=rig.camera.lens is None)
+
+
+def moving_pairs(
+    images: Images, rig: StereoRig, shutter: RollingShutter, motion: Motion, options: CorrectionOptions
+) -> Pairs:
+    """``frame_pairs`` of cameras that do not read their rows together, by a known motion."""
+
+    def pair(frame: int) -> FramePair:
+        left, right = images["left", frame], images["right", frame]
+        levels = dict(zip(SIDES, eight_bit([left, right]), strict=True))
+        both = moving_disparities(options.matcher, levels, rig, shutter, motion, frame)
+        return replace(depth_of_pair(left, right, both, rig, find_sky=options.find_sky), timed=True)
+
+    first, second = (pair(frame) for frame in FRAMES)
+    return first, second
 
 
 def frame_pairs(

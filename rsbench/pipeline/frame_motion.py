@@ -23,6 +23,7 @@ from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.registry import SolverEntry
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.vision.feature_matcher import find_correspondences
+from rsbench.vision.features import SiftMatcher
 from rsbench.vision.undistortion import undistorted, with_lens
 
 _FEWEST_MATCHES = 12
@@ -75,15 +76,20 @@ def find_matches_of_rig(
     """``find_matches`` of cameras as they are, in pixels of their images.
 
     Matchers see images without distortion. Where the cameras do not read rows together, a left-right match is of
-    two times, and its ends of two rows: only matches over time are kept.
+    two times, and its ends of two rows: rsbench's own matcher looks for it anywhere, and of others, which may look
+    along the row, only matches over time are kept.
 
     Raises:
         RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
     """
     camera = rig.camera
     images = {view: undistorted(image, camera) for view, image in images.items()}
+    component = options.features.component
+    if not scanning.rows_together and isinstance(component, SiftMatcher):
+        apart = replace(options.features, component=replace(component, row_tolerance=None))
+        options = replace(options, features=apart)
     matches = with_lens(find_matches(images, options), camera)
-    if scanning.rows_together:
+    if scanning.rows_together or isinstance(component, SiftMatcher):
         return matches
     return Correspondences(left=matches.left, right=matches.right)
 

@@ -17,7 +17,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.frame_depth import eight_bit
-from rsbench.vision.features import Gate, MatchOptions, detect, match
+from rsbench.vision.features import ROW_TOLERANCE_PX, Gate, MatchOptions, detect, match
 from rsbench.vision.undistortion import undistorted
 
 _FEWEST = 30
@@ -104,7 +104,7 @@ def check_rig(left: NDArray[np.generic], right: NDArray[np.generic], rig: Stereo
     shown = np.logical_and.reduce([camera.contains(camera.lens_pixels(end)) for end in ends])
     if np.count_nonzero(shown) < _FEWEST:
         return
-    judge_stereo(np.concatenate(ends, axis=1)[shown], rig, options.row_tolerance)
+    judge_stereo(np.concatenate(ends, axis=1)[shown], rig, ROW_TOLERANCE_PX)
 
 
 def judge_stereo(stereo: FloatArray, rig: StereoRig, row_tolerance: float) -> None:

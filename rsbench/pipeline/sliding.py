@@ -162,7 +162,7 @@ def _windows(
     number = -1
     for number, images in enumerate(_window_images(left, right)):
         pairs = None
-        if "depth" in needs:
+        if "depth" in needs and shutter.rows_together:
             first = second or frame_pair(images["left", 0], images["right", 0], rig, options, offset)
             second = frame_pair(images["left", 1], images["right", 1], rig, options, offset)
             pairs = first, second
@@ -200,7 +200,7 @@ def _moment(
     window, place = places[0]
     motion = None if window.found is None else window.found.motion
     pairs = window.pairs
-    if pairs is not None:
+    if "depth" in options.corrector.component.spec.needs:
         pairs = find_depth(window.images, rig, shutter, motion, options, pairs)
     views = tuple((side, place) for side in SIDES)
     offset = 0.0 if window.found is None else window.found.disparity_offset

@@ -29,6 +29,7 @@ from rsbench.vision.side_by_side import side_by_side
 
 Indices = NDArray[np.int64]
 _MOST_FEATURES = 100_000
+ROW_TOLERANCE_PX = 1.5
 _DETECTION_BYTES = 300.0
 """Per pixel: the pyramids of twice the size, float32, and of their differences."""
 _RANGES = {
@@ -57,8 +58,9 @@ class MatchOptions:
     """Largest distance of a match; the ratio says nothing where there is only one candidate."""
     search_radius: float | None = None
     """Temporal matches move by at most this many px in x and in y; None searches the whole image."""
-    row_tolerance: float = 1.5
-    """Left-right matches differ by at most this many rows: both cameras read a row at the same time."""
+    row_tolerance: float | None = ROW_TOLERANCE_PX
+    """Left-right matches differ by at most this many rows: both cameras read a row at the same time. None: they do
+    not, and a partner may lie anywhere."""
     max_disparity: float | None = None
     """Largest disparity of left-right matches, px; None is the image width."""
     drop_contradicted: bool = True
@@ -153,7 +155,9 @@ def match_stereo_frames(
     anywhere = Gate(dx=(-reach, reach), dy=(-reach, reach))
     disparity = float(left_0.shape[1]) if options.max_disparity is None else options.max_disparity
     tolerance = options.row_tolerance
-    beside = Gate(dx=(-disparity, -np.finfo(np.float64).tiny), dy=(-tolerance, tolerance))
+    beside = anywhere
+    if tolerance is not None:
+        beside = Gate(dx=(-disparity, -np.finfo(np.float64).tiny), dy=(-tolerance, tolerance))
     # OpenCV, the BLAS and the compiled loop let go of the GIL.
     pixels = left_0.shape[0] * left_0.shape[1]
     l0, r0, l1, r1 = side_by_side(lambda image: detect(image, options), images.values(), pixels, _DETECTION_BYTES)

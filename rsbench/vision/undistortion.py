@@ -65,18 +65,22 @@ def sensor_disparities(
     camera = rig.camera
     if camera.lens is None:
         return find_disparities(entry, left, right, rig)
-    ideal = camera.ideal_pixels(camera.pixel_grid())
-    wide = _around(camera.ideal, ideal)
+    ideal, wide = camera.ideal_pixels(camera.pixel_grid()), widened(camera)
     places = camera.project(wide.unproject(wide.pixel_grid()))
     inside: F32 = np.where(camera.contains(places)[..., None], places, np.nan).astype(np.float32)
     levels = [resample(image, inside) for image in (left, right)]
     both = find_disparities(entry, levels[0], levels[1], replace(rig, camera=wide))
     shift = np.array([wide.cx - camera.cx, wide.cy - camera.cy])
     first, second = (
-        _with_partner(_sampled(found, ideal + shift), ideal, camera, 1.0 if side == "left" else -1.0)
+        _with_partner(between_pixels(found, ideal + shift), ideal, camera, 1.0 if side == "left" else -1.0)
         for side, found in zip(SIDES, both, strict=True)
     )
     return first, second
+
+
+def widened(camera: PinholeCamera) -> PinholeCamera:
+    """The camera without its lens, with an image that holds all that this one shows; the camera without a lens."""
+    return camera if camera.lens is None else _around(camera.ideal, camera.ideal_pixels(camera.pixel_grid()))
 
 
 def _around(ideal: PinholeCamera, pixels: FloatArray) -> PinholeCamera:
@@ -89,8 +93,8 @@ def _around(ideal: PinholeCamera, pixels: FloatArray) -> PinholeCamera:
     return replace(ideal, width=width, height=height, cx=ideal.cx + low[0], cy=ideal.cy + low[1])
 
 
-def _sampled(disparity: F32, places: FloatArray) -> F32:
-    """Disparity (H, W) at places (h, w, 2), px: between its pixels on one surface, else that of the nearest."""
+def between_pixels(disparity: F32, places: FloatArray) -> F32:
+    """Disparity (H, W), px, at places (h, w, 2): between its pixels on one surface, else that of the nearest."""
     height, width = disparity.shape
     x, y = np.moveaxis(np.clip(np.floor(places).astype(np.int64), 0, [width - 2, height - 2]), -1, 0)
     s, t = places[..., 0] - x, places[..., 1] - y

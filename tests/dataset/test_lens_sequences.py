@@ -124,16 +124,20 @@ def test_versions_that_know_no_lens_refuse_the_sequence(made: dict[str, Path]) -
         assert manifest["conventions"] == 2, "version 1 is read by those who would take the lens for none"
 
 
-def test_the_whole_way_through_a_lens(made: dict[str, Path], tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", CARDS)
+def test_the_whole_way(made: dict[str, Path], tmp_path: Path, name: str) -> None:
+    """A late camera, and opposite columns through a fisheye, find depth with the motion that they estimate."""
     options = EvaluationOptions(solvers=("rs-stereo-refined-twist",), correction_solver="rs-stereo-refined-twist")
-    open_evaluation(made["barrel"], tmp_path, options).run("test", lambda word: None)
+    open_evaluation(made[name], tmp_path, options).run("test", lambda word: None)
     (pose,) = read_scores(tmp_path, "pose").to_dict("records")
-    # A motion of 2 degrees; a tenth of a pixel of these images of 128 x 96 is 0.05 degrees.
-    assert pose["success"] and pose["e_R_deg"] < 0.2, pose
+    # A motion of 2 degrees; a tenth of a pixel of these images of 128 x 96 is 0.05 degrees. Without left-right
+    # matches of two times the late camera's would be known to 1.2, opposite columns' to 1.9 degrees.
+    assert pose["success"] and pose["e_R_deg"] < 0.4, pose
     assert len(read_scores(tmp_path, "failures")) == 0
-    depth = read_scores(tmp_path, "depth")
-    seen = depth[depth["pixels"] == "visible"]
-    assert np.all(seen["success"]) and seen["bad_1px"].median() < 0.15 and seen["coverage"].median() > 0.7
+    if name == "barrel":
+        depth = read_scores(tmp_path, "depth")
+        seen = depth[depth["pixels"] == "visible"]
+        assert np.all(seen["success"]) and seen["bad_1px"].median() < 0.15 and seen["coverage"].median() > 0.7
     scores = read_scores(tmp_path, "correction")
     images = scores[scores["pixels"] == "visible"].groupby(["solver", "matcher"])["psnr"].mean()
     # The twin has the same lens: nothing but the resampling of these small images is between them.
@@ -175,7 +179,6 @@ def test_correct_takes_frames_with_distortion(made: dict[str, Path], tmp_path: P
     ("old", "new", "said"),
     [
         ("readout_ratio = 0.8", "", "readout_ratio: must be given with camera.lens = 'brown-conrady'"),
-        ("[camera]", "right_delay = 0.1\n[camera]", "right_delay = 0.1: depth is found where both cameras read"),
         ("[camera]", "disparity_offset = 1.0\n[camera]", "disparity_offset = 1.0: must be 0 with camera.lens"),
         ("k1 = -0.22", "k1 = -0.9", "rig.toml: camera lens: the brown-conrady"),
     ],
@@ -188,21 +191,13 @@ def test_correct_refuses_by_name(made: dict[str, Path], tmp_path: Path, old: str
     assert not (tmp_path / "out").exists()
 
 
-def test_a_late_camera_has_no_depth_and_says_why(made: dict[str, Path], tmp_path: Path) -> None:
-    options = EvaluationOptions(solvers=("rs-stereo-refined-twist",), correction_solver="rs-stereo-refined-twist")
-    open_evaluation(made["late"], tmp_path, options).run("test", lambda word: None)
-    (failure,) = read_scores(tmp_path, "failures").to_dict("records")
-    assert failure["kind"] == "correction" and "read each row at once" in failure["reason"]
-
-
 @pytest.mark.parametrize("name", CARDS)
 def test_matches_in_the_images_fit_the_true_motion_at_their_own_times(made: dict[str, Path], name: str) -> None:
     sequence = read_sequence(made[name] / "room-twist")
     images = {view: sequence.image("rs", *view) for view in VIEWS}
     rig, shutter, motion = sequence.rig, sequence.shutter, sequence.motion
     matches = find_matches_of_rig(images, rig, shutter.scanning, CorrectionOptions())
-    assert len(matches.left) > 40 and (len(matches.tracks) > 10) == (name == "barrel")
-
+    assert len(matches.left) > 40 and len(matches.tracks) > 10
     errors = [rs_sampson_error(rig, shutter, motion, side, getattr(matches, side)) for side in SIDES]
     # SIFT errs by some tenths of a pixel here. The image moves by few pixels, so this shows that matches are where
     # they should be; that times are, exact matches show (test_timed_tracks.py).

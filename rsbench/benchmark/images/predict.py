@@ -80,8 +80,9 @@ class Bench:
             if entry.name in self.plan.solver_names:
                 self.move(entry)
                 step(f"{self.sequence.name}: {entry.name}")
-        if self.plan.corrects and not self.sequence.uncorrectable:
-            self._find_depth()
+        if self.plan.corrects:
+            if self.sequence.shutter.rows_together:  # else the depth depends on the motion
+                self._find_depth()
             step(f"{self.sequence.name}: depth")
             for recipe in Recipe(chain=self.plan.chain).variants():
                 self._correct(recipe)
@@ -215,14 +216,17 @@ class Bench:
         if recipe.names["solver"] != NONE:
             motion = self.sequence.motion if recipe.true_motion else read_motion(self.places, recipe.chain.solver)
         if recipe.names["matcher"] != NONE:
-            pairs = true_pairs(self.sequence, self.images) if recipe.true_depth else self._stored_pairs(recipe)
+            pairs = true_pairs(self.sequence, self.images) if recipe.true_depth else self._pairs(recipe)
         if isinstance(motion, str):
             return f"no motion: {motion}"
         if isinstance(pairs, str):
             return f"no depth: {pairs}"
         return Given(motion=motion, pairs=pairs)
 
-    def _stored_pairs(self, recipe: Recipe) -> Pairs | str:
+    def _pairs(self, recipe: Recipe) -> Pairs | str | None:
+        """Those of the matcher; None where they are found with the motion, for rows are not read together."""
+        if not self.sequence.shutter.rows_together:
+            return None
         artefact = self.places.depth(recipe.chain.matcher)
         record = artefact.record()
         if record is None or not record["success"]:

@@ -160,8 +160,6 @@ class Scorer:
             yield keys | self._metrics(case, DepthCase)
 
     def _score_correction(self) -> None:
-        if self.plan.corrects and self.sequence.uncorrectable:
-            self._fail("correction", self.plan.chain.corrector.name, self.sequence.uncorrectable)
         recipes = list(stored_corrections(self.places))
         if recipes:
             for view in VIEWS:
