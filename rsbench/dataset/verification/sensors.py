@@ -32,7 +32,8 @@ is for four samples, and grows with the distance between them."""
 _LEAST_VALUES, _VARIANCE_RANGE = 1000, (0.85, 1.2)
 """The variance of 1000 values is known to 4.5 %; five times that, and what a smooth surface changes in a blur."""
 _COMPRESSED_RANGE, _BLOCKS_ALIKE = (0.5, 2.0), 10
-"""Of a compressed image over that of the clean twin after the same; its noise is that of blocks, not of values."""
+"""Of a compressed image over that of the clean twin after the same; its noise is that of blocks, not of values:
+both numbers are chosen, not measured."""
 _JPEG_REACH = 17
 """Pixels over which JPEG spreads what it leaves out: a block of colours of half the resolution, and one more."""
 _MOST_BIAS = 0.75
