@@ -119,7 +119,7 @@ def hidden(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]
     """Whether anything lies on the rays."""
     found = scene.scene.ray_test(ray, coherent=True, active=active)
     for each in objects:
-        found = found | each.meets(ray, active & ~found)
+        found = found | each.meets(ray, active & _not(found))
     return found
 
 
@@ -133,9 +133,15 @@ def depth_and_label(scene: MitsubaScene, ray: Any, active: Any, objects: Sequenc
     seen, shaded = hit.is_valid() & active, active & False
     to_sun = hit.spawn_ray(scene.sky.sun_direction)
     for each in objects:
-        shaded = shaded | each.meets(to_sun, seen & ~shaded)
+        shaded = shaded | each.meets(to_sun, seen & _not(shaded))
     label = dr.select(seen, nearest.label, 0)
     return dr.select(seen, hit.t, 0), dr.select(shaded, label + SHADED, label)
+
+
+def _not(value: Any) -> Any:
+    import drjit as dr
+
+    return ~value if dr.is_jit_v(value) else not value
 
 
 def _either(first: Any, own: Any, other: Any) -> Any:

@@ -97,7 +97,13 @@ def _with_moving(card: DatasetCard, number: int) -> DatasetCard:
         return card
     rng = np.random.default_rng([card.seed, number])
     sequences = tuple(replace(each, moving=_boxes(rng)) for each in card.sequence)
-    return replace(card, sequence=sequences, channels=tuple(each for each in card.channels if each in TAKEN))
+    renderer = card.renderer.replace("hidden.toml", "four.toml")  # whose rays to the sky know nothing of them
+    return replace(
+        card,
+        renderer=renderer,
+        sequence=sequences,
+        channels=tuple(each for each in card.channels if each in TAKEN),
+    )
 
 
 def _boxes(rng: np.random.Generator) -> tuple[MovingCard, ...]:
