@@ -32,12 +32,11 @@ def seen(rig: StereoRig, shutter: RollingShutter, side: Side) -> tuple[NDArray[n
     if shutter.axis(side) == 1:
         depth = plane_depth(rig.camera, poses)
         return plane_colours(rig.camera, poses, depth), depth
-    image, depth = np.zeros((120, 160, 3), dtype=np.uint8), np.zeros((120, 160), dtype=np.float32)
-    for x in range(160):
-        same = Pose(np.repeat(poses.R[x : x + 1], 120, axis=0), np.repeat(poses.t[x : x + 1], 120, axis=0))
-        whole = plane_depth(rig.camera, same)
-        image[:, x], depth[:, x] = plane_colours(rig.camera, same, whole)[:, x], whole[:, x]
-    return image, depth
+    # Columns are the rows of a camera whose axes x and y are exchanged; the lens is alike in all directions.
+    camera = replace(rig.camera, width=120, height=160, cx=rig.camera.cy, cy=rig.camera.cx)
+    turned = Pose(poses.R[:, [1, 0, 2]], poses.t[:, [1, 0, 2]])
+    depth = plane_depth(camera, turned)
+    return np.swapaxes(plane_colours(camera, turned, depth), 0, 1).copy(), depth.T.copy()
 
 
 @pytest.mark.parametrize(
