@@ -20,15 +20,16 @@ SUITABLE := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
 demo: $(STAMP)
 	@$(BIN)/rsbench demo
 
-# Types are checked while the kernels are compiled; then two processes share the tests, the long ones first.
+# Types are checked while the kernels are compiled and the first tests run, two processes, the long ones first.
 test: $(STAMP)
 	@echo "== format"; $(BIN)/ruff format --check .
 	@echo "== lint";   $(BIN)/ruff check .
 	@echo "== layers"; $(BIN)/lint-imports
-	@echo "== types, and compiling"; \
-	$(BIN)/python -c '$(COMPILE)' & compiled=$$!; \
-	$(BIN)/mypy; types=$$?; wait $$compiled && exit $$types
-	@echo "== tests"; OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --no-loadscope-reorder
+	@echo "== types, beside compiling and the tests"; \
+	$(BIN)/mypy & types=$$!; \
+	$(BIN)/python -c '$(COMPILE)' || { kill $$types; exit 1; }; \
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --no-loadscope-reorder; tests=$$?; \
+	wait $$types || { echo "types: failed, see above" >&2; exit 1; }; exit $$tests
 
 attack: $(STAMP)
 	@PYTHONPATH=tests $(BIN)/python -m attack --write docs/reliability.md

@@ -37,7 +37,11 @@ def stage(root: Path, cases: Collection[str]) -> Iterator[Arena]:
     checkout = make_checkout(root / "checkout")
     sys.path.insert(0, str(checkout))
     os.environ["PYTHONPATH"] = str(checkout)
+    import rsbench
     from attack.arena import Arena
+
+    if not Path(rsbench.__file__).is_relative_to(checkout):
+        raise RuntimeError(f"{rsbench.__file__} was imported, which has not the tiny cards")
 
     arena = Arena(root / "arena")
     write_inputs(arena.inputs)

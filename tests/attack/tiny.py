@@ -10,14 +10,14 @@ import re
 import shutil
 import tomllib
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from small_scenes import SCENE, write_box_scene
 
-from rsbench.cards import CardKind
-
 ROOT = Path(__file__).parents[2]
-KINDS = get_args(CardKind)
+LINKED = ("rsbench", "docs", "examples")
+KINDS = sorted({path.parent.name for path in ROOT.glob("*/*.toml")} - set(LINKED))
+"""Of cards, by their folders: whoever imports rsbench here attacks it with the cards of the whole checkout."""
 CAMERA = {"width": 96, "height": 64, "focal": 80.0}
 RIG = "baseline = 0.3\nreadout_ratio = 0.8\n[camera]\nfx = 80.0\nfy = 80.0\ncx = 47.5\ncy = 31.5\n"
 SOLVERS = ("gs-8pt", "rs-stereo-linear", "rs-stereo-refined", "rs-stereo")
@@ -27,7 +27,7 @@ def make_checkout(folder: Path) -> Path:
     """A checkout of few solvers, one textured box for a scene, frames of 96 x 64, sweeps of two trials."""
     folder.mkdir(parents=True)
     shutil.copyfile(ROOT / "pyproject.toml", folder / "pyproject.toml")
-    for name in ("rsbench", "docs", "examples"):
+    for name in LINKED:
         (folder / name).symlink_to(ROOT / name)
     for kind in KINDS:
         shutil.copytree(ROOT / kind, folder / kind)
