@@ -28,7 +28,7 @@ Row = dict[str, Any]
 
 
 def mark(submission: Submission, split: Split) -> pd.DataFrame:
-    """One row for each problem, in the order of the split; the columns are those of docs/score-files.md."""
+    """One row for each problem, in the order of the split; the columns are those of docs/submit.md."""
     model, found = submission.header.motion_model, submission.answers
     if split.protocol.asks == "readout":
         return pd.DataFrame([_readout_row(truth, found.get(truth.name)) for truth in split.truths])
