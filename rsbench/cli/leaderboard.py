@@ -58,11 +58,12 @@ def export(
     secret: _Hidden = False,
 ) -> None:
     """Write the inputs of a track for any language; of a public split the truth too."""
-    from rsbench.benchmark.leaderboard.exporting import write_inputs
+    from rsbench.benchmark.leaderboard.exporting import check_place, write_inputs
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.workplace import workplace
 
     split = _split(track, data, seed_file, secret)
+    check_place(split, out)
     with workplace(out), progress_bar(f"exporting {split.name}", len(split.truths)) as advance:
         if data is not None and "images" in split.protocol.allowed:
             from rsbench.benchmark.leaderboard.frames import write_frames
@@ -135,7 +136,7 @@ def run(
 ) -> None:
     """Run solvers of cards on a track, keep what they predict, and score it. An interrupted run goes on there."""
     from rsbench.benchmark.leaderboard.board import RUN, add, made_by
-    from rsbench.benchmark.leaderboard.running import prepare_inputs, run_cards, steps_of
+    from rsbench.benchmark.leaderboard.running import load_entries, prepare_inputs, run_cards, steps_of
     from rsbench.benchmark.provenance import provenance
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.workplace import workplace
@@ -143,6 +144,7 @@ def run(
     split = _split(track, data, seed_file, secret)
     if "images" in split.protocol.allowed:
         raise RsbenchError(f"track {track!r}: solvers of cards take given matches; run them on the track 'pose'")
+    load_entries(entry, split.protocol)  # before anything is written
     with workplace(board) as hidden, progress_bar(f"running {split.name}", steps_of(entry, split)) as advance:
         place = hidden / "runs" / split.protocol.id / split.name
         place.mkdir(parents=True, exist_ok=True)

@@ -121,7 +121,7 @@ def _take(out: Path, hidden: Path) -> int:
             gone = isinstance(error, FileNotFoundError | FileExistsError) and not hidden.is_file()
             if gone and tries > 1:  # its last owner removed it meanwhile
                 continue
-            raise RsbenchError(f"{out}: cannot be written: {error.strerror}; choose another --out") from error
+            raise RsbenchError(f"{out}: cannot be written: {error.strerror}; choose another folder") from error
         try:
             _claim(out, descriptor)
             if _is_at(hidden / _LOCK, descriptor):
@@ -130,13 +130,13 @@ def _take(out: Path, hidden: Path) -> int:
             os.close(descriptor)
             raise
         os.close(descriptor)
-    raise RsbenchError(f"{out}: other commands come and go there; choose another --out")
+    raise RsbenchError(f"{out}: other commands come and go there; choose another folder")
 
 
 def _refuse_foreign(hidden: Path) -> None:
     names = {path.name for path in hidden.iterdir()}
     if hidden.is_symlink() or (names and _LOCK not in names):
-        raise RsbenchError(f"{hidden}: is not a folder that rsbench made; move it away or choose another --out")
+        raise RsbenchError(f"{hidden}: is not a folder that rsbench made; move it away or choose another folder")
 
 
 def _claim(out: Path, descriptor: int) -> None:
@@ -149,7 +149,7 @@ def _claim(out: Path, descriptor: int) -> None:
         who = f"process {owner.get('pid', '?')} on {owner.get('host', 'this machine')}"
         raise RsbenchError(
             f"{out}: {who} is at work there since {owner.get('since', 'just now')}{seen} "
-            f"({owner.get('command', 'rsbench')}); wait for it, or choose another --out"
+            f"({owner.get('command', 'rsbench')}); wait for it, or choose another folder"
         )
     record = {
         "pid": os.getpid(),

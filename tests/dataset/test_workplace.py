@@ -53,7 +53,7 @@ def test_a_second_command_is_told_who_is_there(tmp_path: Path) -> None:
         pass
     message = str(caught.value)
     assert f"process {os.getpid()} on {platform.node()} is at work there since 20" in message
-    assert "\n" not in message and "choose another --out" in message
+    assert "\n" not in message and "choose another folder" in message
     with workplace(tmp_path):
         pass
 

@@ -315,6 +315,7 @@ def rescore(board: Path, split: Split) -> dict[str, list[str]]:
         RsbenchError: stored predictions are at fault, or not of the entry that they lie in.
     """
     changed: dict[str, list[str]] = {}
+    _check_board(board)
     with workplace(board) as hidden:
         for folder in _folders(place(board, split.protocol.id, split.name) / "entries"):
             record, path, old = _read_record(folder), folder / FILES[0], pd.DataFrame()

@@ -15,14 +15,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.benchmark.images.store import read_record
 from rsbench.benchmark.leaderboard.protocols import Protocol
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import truth_text
 from rsbench.dataset.files import save_arrays, write_bytes, write_json
+from rsbench.dataset.workplace import HIDDEN, named
+from rsbench.errors import RsbenchError
 from rsbench.pipeline.problem import COLUMNS, Problem, problem_record
 
 RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "readout_ratio")
 """Columns of problems.csv after the name."""
+
+
+def check_place(split: Split, out: Path) -> None:
+    """Raises RsbenchError when a folder holds anything but inputs of this split, or a truth that is secret now."""
+    others = [path.name for path in out.iterdir() if path.name != HIDDEN] if out.is_dir() else []
+    record = (read_record(out / "split.json") or {}) if others else split_record(split)
+    told = not split.public and "truth.jsonl" in others
+    if record.get("fingerprint") != split.fingerprint or told:
+        raise RsbenchError(
+            f"{out}: holds {named(sorted(others))}, not the inputs of {split.name} alone; choose another folder"
+        )
 
 
 def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:

@@ -20,7 +20,7 @@ from rsbench.benchmark.images.store import identity_of, read_record
 from rsbench.benchmark.leaderboard.exporting import write_inputs
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS, Protocol, protocol_of_id
 from rsbench.benchmark.leaderboard.splits import Split
-from rsbench.benchmark.leaderboard.submissions import submission_text
+from rsbench.benchmark.leaderboard.submissions import LARGEST, submission_text
 from rsbench.benchmark.provenance import numeric_version, processor
 from rsbench.benchmark.simulated.trials import Information, enter
 from rsbench.core.joining import join_stereo
@@ -78,6 +78,18 @@ def uses_of(entry: SolverEntry, protocol: Protocol = PROTOCOLS["points"]) -> tup
     return _USES[enter(entry).information] + (("readout",) if rolling else ())
 
 
+def load_entries(cards: Sequence[str], protocol: Protocol) -> dict[str, SolverEntry]:
+    """Solvers by their cards.
+
+    Raises:
+        RsbenchError: no such solver, or it uses what the protocol does not give.
+    """
+    entries = {card: load_solver_entry(card) for card in cards}
+    for entry in entries.values():
+        _check_uses(protocol, entry)
+    return entries
+
+
 def prepare_inputs(split: Split, problems: Callable[[], Iterator[Problem]], folder: Path) -> None:
     """Export a split into a folder, unless it holds that already."""
     stored = read_record(folder / "split.json")
@@ -101,9 +113,7 @@ def run_cards(
         RsbenchError: no such solver; it uses what the protocol does not give; processes died twice over the same
             problems: what is done is kept.
     """
-    entries = {card: load_solver_entry(card) for card in cards}
-    for entry in entries.values():
-        _check_uses(split.protocol, entry)
+    entries = load_entries(cards, split.protocol)
     data, count = sha256(inputs / "problems.jsonl"), len(split.truths)
     jobs, identities = [], {}
     for card, entry in entries.items():
@@ -237,4 +247,6 @@ def _readout(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict
 def _answer(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
     found = solve_problem(problem, entry, RobustOptions(), runner, _seed(problem, entry), extras=_EXTRAS)
     kept = {key: found[key] for key in _KEPT}
+    if found["success"] and max(map(abs, (*found["w"], *found["d"]))) > LARGEST:
+        return {"name": problem.name, "success": False, "reason": f"w or d goes beyond {LARGEST:g}"}
     return {**kept, "seconds": round(found["seconds"], 6), "reason": str(found["reason"])[:300]}

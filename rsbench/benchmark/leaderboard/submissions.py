@@ -24,6 +24,8 @@ from rsbench.reading import MB, check_name, parse_json, read_text
 
 SUBMISSION_BYTES = 16 * MB
 """Of a file of motions: 20 kB for each of 800 problems."""
+LARGEST = 1e9
+"""Number of w and d: larger ones are no motions, and their squares overflow."""
 _LINE_CHARACTERS = 1 << 16
 _TEXT_CHARACTERS = 300
 _MOST_FAULTS = 50
@@ -88,6 +90,9 @@ class Answer:
 
     def __post_init__(self) -> None:
         ratio = self.readout_ratio
+        for name in ("w", "d"):
+            if np.any(np.abs(_of(getattr(self, name) or (0.0, 0.0, 0.0))) > LARGEST):
+                raise ValueError(f"{name}: numbers must lie within {LARGEST:g} of 0")
         if ratio is not None and not 0.0 <= ratio <= 1.0:
             raise ValueError(f"readout_ratio = {ratio}: must lie in [0, 1]: readout time / frame period")
         if self.seconds is not None and self.seconds < 0.0:

@@ -270,6 +270,13 @@ def _here(serve: Any, jobs: Any, workers: int, environment: object, *arguments: 
     yield from ((job, run(job)) for job in jobs)
 
 
+def test_what_is_not_there_leaves_no_folder(tmp_path: Path) -> None:
+    board = tmp_path / "board"
+    assert_refused(run_here("leaderboard", "run", "points", "--entry", "nobody", "--board", board), "'nobody'")
+    assert_refused(run_here("leaderboard", "rescore", "points", "--board", board), "is no board")
+    assert not board.exists()
+
+
 def test_cards_that_cannot_be_entries_are_refused_before_they_run(tmp_path: Path) -> None:
     card = tmp_path / "my card.toml"
     card.write_text('class = "rsbench.solvers.eight_point:EightPointSolver"\n', "utf-8")

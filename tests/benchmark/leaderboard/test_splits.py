@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from commands import run_here
 from leaderboards import small_split
 
-from rsbench.benchmark.leaderboard.exporting import write_inputs
+from rsbench.benchmark.leaderboard.exporting import check_place, write_inputs
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.oracles import bound_text
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
@@ -118,3 +119,18 @@ def test_a_secret_dataset_is_exported_without_its_truth(smoke_dataset: Path, tmp
     assert len(files) == 3 and split.fingerprint.encode() in told
     for truth in split.truths:
         assert all(repr(float(x)).encode() not in told for x in (*truth.motion.w, *truth.motion.d))
+
+
+def test_inputs_are_written_beside_nothing_else(tmp_path: Path) -> None:
+    """Neither over files of somebody, nor beside another split's, nor beside a truth that is secret now."""
+    split = small_split(3)
+    check_place(split, tmp_path / "new")
+    (tmp_path / "tracks.csv").write_text("mine")
+    with pytest.raises(RsbenchError, match=r"holds tracks\.csv, not the inputs of"):
+        check_place(split, tmp_path)
+    out = tmp_path / "out"
+    write_inputs(split, iter([simulated_problem(1, number) for number in range(3)]), out)
+    check_place(split, out)
+    for other in (small_split(4), replace(split, public=False)):
+        with pytest.raises(RsbenchError, match="choose another folder"):
+            check_place(other, out)

@@ -66,6 +66,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "no problem": (_text([HEAD, {"w": [0, 0, 0], "d": [0, 0, 1]}]), ":2: 'name' is required"),
     "number for a problem": (_text(_changed(name=7)), ":2: name = 7"),
     "the same problem twice": (_text([*TRUTH, FIRST]), ":14: name = 'p000': is that of line 2 too"),
+    "what overflows": (_text(_changed(d=[0.0, 1e300, 0.0])), ":2: d: numbers must lie within 1e+09 of 0"),
     "NaN": (_text(_changed(w=[float("nan"), 0.0, 0.0])), ":2: w.0 = nan: numbers must be finite"),
     "infinity": (_text(_changed(d=[0.0, float("inf"), 0.0])), ":2: d.1 = inf"),
     "beyond infinity": (_text(TRUTH[:1]) + '{"name": "p000", "w": [0, 0, 1e999], "d": [0, 0, 1]}\n', "w.2 = inf"),
