@@ -310,4 +310,7 @@ def _number(value: float) -> str:
 
 
 def register(app: typer.Typer) -> None:
+    from rsbench.cli.leaderboard_smoke import smoke
+
+    board_app.command()(smoke)
     app.add_typer(board_app, name="leaderboard", help="Tracks, entries, ranks with intervals; for any language.")

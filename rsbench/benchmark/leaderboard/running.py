@@ -160,10 +160,10 @@ def _identity(entry: SolverEntry, split: Split, data: str) -> str:
     )
 
 
-def _joined(entry: SolverEntry, split: Split, work: Path, identity: str) -> Path:
-    """The chunks of a solver as one submission."""
+def header_of(entry: SolverEntry, split: Split) -> dict[str, Any]:
+    """The first line of a solver's submission."""
     spec = entry.solver.spec
-    header: dict[str, Any] = {
+    return {
         "protocol": split.protocol.id,
         "split": split.name,
         "method": entry.name,
@@ -174,12 +174,16 @@ def _joined(entry: SolverEntry, split: Split, work: Path, identity: str) -> Path
         "hardware": f"{processor()}, 1 thread"[:300],
         "motion_model": spec.motion_model if spec.motion_model in ("linear", "twist") else "linear",
     }
+
+
+def _joined(entry: SolverEntry, split: Split, work: Path, identity: str) -> Path:
+    """The chunks of a solver as one submission."""
     answers: list[dict[str, Any]] = []
     for first in range(0, len(split.truths), CHUNK):
         record = read_record(work / entry.name / f"{identity[:16]}-{first:05d}.json") or {}
         answers += record.get("answers", [])
     path = work / entry.name / "predictions.jsonl"
-    write_bytes(path, submission_text(header, iter(answers)).encode())
+    write_bytes(path, submission_text(header_of(entry, split), iter(answers)).encode())
     return path
 
 
@@ -191,7 +195,7 @@ def _serve(inputs: Path, time_limit_s: float | None) -> Callable[[_Job], None]:
     warm_up()
     runner = SolverRunner(time_limit_s=time_limit_s, single_thread=True)  # as long as this process
     protocol = protocol_of_id(str(read_json(inputs / "split.json").get("protocol")))
-    answer = _answer if protocol.asks == "motion" else _readout
+    answer = answer_problem if protocol.asks == "motion" else _readout
     problems = read_inputs(inputs, protocol)
 
     def run(job: _Job) -> None:
@@ -244,7 +248,8 @@ def _readout(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict
     return {"name": problem.name, "readout_ratio": min(found.readout_ratio, 1.0), "seconds": seconds}
 
 
-def _answer(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
+def answer_problem(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
+    """What a solver says of a problem, as a line of a submission."""
     found = solve_problem(problem, entry, RobustOptions(), runner, _seed(problem, entry), extras=_EXTRAS)
     kept = {key: found[key] for key in _KEPT}
     if found["success"] and max(map(abs, (*found["w"], *found["d"]))) > LARGEST:
