@@ -18,7 +18,9 @@ def smoke(
     ),
     entry: Annotated[
         list[str] | None,
-        typer.Option(help="Only this solver; repeatable. Default: all of ours.", autocompletion=complete("solvers")),
+        typer.Option(
+            help="Only this solver; repeatable. Default: all of ours.", autocompletion=complete("solvers")
+        ),
     ] = None,
     problems: Annotated[int | None, typer.Option(min=1, help="Only the first ones; default: 6.")] = None,
     write: Annotated[bool, typer.Option("--write", help="Store the scores instead of comparing.")] = False,
