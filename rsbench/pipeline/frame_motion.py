@@ -182,10 +182,14 @@ def find_readout(
 def referee(entry: SolverEntry) -> tuple[str, RefinedSolver]:
     """The solver that finds an unknown readout ratio and the direction of time, with its name.
 
-    The chosen one when it is a refined one, else rs-stereo-refined. Both need residuals that hold for any readout
-    ratio, and a fit as good as the matches allow: a solver that is off by pixels would blame the shutter.
+    The chosen one when it is a refined one of both cameras, else rs-stereo-refined. Both need residuals that hold
+    for any readout ratio, and a fit as good as the matches allow: a solver that is off by pixels would blame the
+    shutter.
     """
-    return (entry.name, entry.solver) if isinstance(entry.solver, RefinedSolver) else (_REFEREE, RefinedSolver())
+    solver = entry.solver
+    if isinstance(solver, RefinedSolver) and not solver.one_camera:
+        return entry.name, solver
+    return _REFEREE, RefinedSolver()
 
 
 def solve_frames(

@@ -163,9 +163,10 @@ def check_asked(asked: str, entry: SolverEntry) -> None:
     if asked not in known:
         raise RsbenchError(f"--motion-model {asked}: {asked!r} is unknown{choices(asked, known)}")
     solver = entry.solver
-    if not isinstance(solver, RefinedSolver) or solver.shutter != "rolling":
+    if not isinstance(solver, RefinedSolver) or solver.shutter != "rolling" or solver.one_camera:
         spec = solver.spec
         known_to = f"solver {entry.name!r} knows only {spec.motion_model} motion and a {spec.shutter} shutter"
+        known_to += "" if spec.metric else ", without a length"
         raise RsbenchError(f"--motion-model {asked}: {known_to}; take rs-stereo")
 
 

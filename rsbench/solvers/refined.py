@@ -11,7 +11,7 @@ import numpy as np
 
 from rsbench.arguments import check_whole
 from rsbench.core import so3
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -63,6 +63,8 @@ class RefinedSolver(Solver):
     """Off: tracks count as unlinked left and right matches, for a fair comparison with solvers of pairs."""
     use_pairs: bool = True
     """Off: only tracks, of which there must be three."""
+    one_camera: bool = False
+    """Only the left camera's matches over time, and its own motion: d has no length."""
     shutter: Literal["rolling", "global"] = "rolling"
     """Global: the same solver without readout, to see what the rolling shutter costs."""
     iterations: int = 60
@@ -79,6 +81,8 @@ class RefinedSolver(Solver):
         load_kernel(self.motion_model, self.motion_parameters)
         if not (self.use_tracks or self.use_pairs):
             raise ValueError("use_tracks and use_pairs cannot both be off")
+        if self.one_camera and not self.use_pairs:
+            raise ValueError("one_camera: uses pairs, so use_pairs cannot be off")
         check_whole("iterations", self.iterations, 1, 10_000)
 
     @property
@@ -90,15 +94,17 @@ class RefinedSolver(Solver):
     @property
     def spec(self) -> SolverSpec:
         minimum: dict[MatchSet, int] = {"left": 7, "right": 7} if self.use_pairs else {"tracks": 3}
+        if self.one_camera:
+            minimum = {"left": 8}
         return SolverSpec(
             needs=frozenset(minimum),
             minimum=minimum,
-            metric=True,
+            metric=not self.one_camera,
             motion_model=self.motion_model,
             motion_parameters=self.motion_parameters,
             shutter=self.shutter,
             cameras="any",
-            reference_point="body",
+            reference_point="left" if self.one_camera else "body",
             reference="rsbench; maximum likelihood of Wang, Fan, Dai, eq. 1-6 without linearisation",
             assumes="constant velocity of the chosen motion model, Gaussian noise, no outliers",
         )
@@ -109,6 +115,8 @@ class RefinedSolver(Solver):
             shutter = shutter.at_once()
         if not self.use_pairs:
             correspondences = Correspondences(tracks=correspondences.tracks)
+        if self.one_camera:
+            correspondences, rig = Correspondences(left=temporal_pairs(correspondences, "left")), rig.about("left")
         linked = self.use_tracks and len(correspondences.tracks) >= 3
         return pack(
             correspondences,
@@ -140,6 +148,8 @@ class RefinedSolver(Solver):
 
     def sample_sizes(self, correspondences: Correspondences) -> dict[MatchSet, int]:
         """Three tracks, else five matches of the camera that has more of them."""
+        if self.one_camera:
+            return {"left": 5}
         if not self.use_pairs or (self.use_tracks and len(correspondences.tracks) >= 3):
             return {"tracks": 3}
         return {"left": 5} if len(correspondences.left) >= len(correspondences.right) else {"right": 5}
@@ -151,7 +161,7 @@ class RefinedSolver(Solver):
     def propose_all(
         self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
     ) -> Iterable[list[MotionEstimate]]:
-        size = len(samples[0].tracks)
+        size = 0 if self.one_camera else len(samples[0].tracks)
         if not self.use_pairs or (self.use_tracks and size >= 3):
             together = Correspondences(tracks=np.concatenate([sample.tracks for sample in samples]))
             packed = self.packed(together, rig, shutter)
@@ -255,11 +265,14 @@ class RefinedSolver(Solver):
         if covariance is not None:
             J = packed.motion_jacobian(best.theta)
             covariance = J @ covariance @ J.T
+        if packed.one_camera:
+            d, covariance = _of_unit_length(d, covariance)
         scale_sigma, direction_sigma = _translation_sigmas(d, covariance)
         at_limit = float(np.linalg.norm(best.theta[3:])) >= 0.999 * self.max_translation_m
         # Tracks measure d in metres, however short it is; pairs only the direction of d well.
         linked = len(packed.tracks) > 0
-        metric = linked or (scale_sigma <= self.max_scale_sigma and not at_limit)
+        known = scale_sigma <= self.max_scale_sigma and not at_limit and not packed.one_camera
+        metric = linked or known
         # Without parallax, noise looks like translation, but half of the points come out behind the cameras.
         in_front = linked or packed.in_front(best.theta) >= _LEAST_IN_FRONT * len(packed.pairs)
         direction_known = in_front and direction_sigma <= self.max_direction_sigma and not rival
@@ -275,7 +288,7 @@ class RefinedSolver(Solver):
             direction_known=direction_known,
             reason="; ".join(reasons),
             covariance=covariance,
-            noise_px=float(np.sqrt(variance)) if packed.constraints > 6 else None,
+            noise_px=float(np.sqrt(variance)) if packed.constraints > packed.parameters else None,
         )
 
 
@@ -308,13 +321,21 @@ def rotation_sigma(H: FloatArray, variance: float) -> float:
     return float(np.sqrt(variance / least)) if least > 1e-12 * float(np.trace(H[:3, :3])) else np.inf
 
 
+def _of_unit_length(d: FloatArray, covariance: FloatArray | None) -> tuple[FloatArray, FloatArray | None]:
+    """The direction of d, and the covariance (6, 6) of the rotation and of it."""
+    length = max(float(np.linalg.norm(d)), 1e-300)
+    u, P = d / length, np.eye(6)
+    P[3:, 3:] = (np.eye(3) - np.outer(u, u)) / length
+    return u, None if covariance is None else P @ covariance @ P.T
+
+
 def _translation_sigmas(d: FloatArray, covariance: FloatArray | None) -> tuple[float, float]:
     """Relative standard deviation of the length of d, and of its direction in radians."""
     length = float(np.linalg.norm(d))
     if covariance is None or length == 0.0:
         return np.inf, np.inf
     C = covariance[3:, 3:]
-    along = float(d @ C @ d) / length**2
+    along = max(float(d @ C @ d), 0.0) / length**2
     return float(np.sqrt(along)) / length, float(np.sqrt(max(np.trace(C) - along, 0.0))) / length
 
 
@@ -327,7 +348,7 @@ def linear_starts(packed: Packed, families: tuple[int, ...], rig: StereoRig) -> 
         solution = solve_reduced(pairs, unknowns, 3)
         if not isinstance(solution, str):
             motions.append(solution)
-    left = pairs[pairs[:, 6] > 0]
+    left = pairs[pairs[:, 6] >= 0.0]
     if len(left) >= 8:
         ones = np.ones((len(left), 1))
         x0, x1 = np.hstack([left[:, :2], ones]), np.hstack([left[:, 2:4], ones])

@@ -139,7 +139,8 @@ def steps_of(cards: Sequence[str], split: Split) -> int:
 
 
 def _check_uses(protocol: Protocol, entry: SolverEntry) -> None:
-    refined = isinstance(entry.solver, RefinedSolver) and entry.solver.spec.shutter == "rolling"
+    solver = entry.solver
+    refined = isinstance(solver, RefinedSolver) and solver.spec.shutter == "rolling" and not solver.one_camera
     if protocol.asks == "readout" and not refined:
         raise RsbenchError(f"solver {entry.name!r}: finds no readout ratio; rs-stereo-refined and its variants do")
     try:

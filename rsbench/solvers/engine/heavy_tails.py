@@ -74,7 +74,7 @@ class HeavyTailed(Packed):
         weights = self.weights(each.squares)
         gradient = weights @ each.gradients
         H = np.tensordot(np.maximum(self.slopes(each.squares), _LEAST_SLOPE * weights), each.hessians, 1)
-        return self.scale**2 * float(np.sum(costs)), gradient, H
+        return self.scale**2 * float(np.sum(costs)), gradient, self.held(theta, H)
 
     def pair_costs(self, theta: FloatArray) -> FloatArray:
         """Twice what each of the pairs (n,) adds to the cost, px^2."""
@@ -98,10 +98,10 @@ class HeavyTailed(Packed):
         weights = self.weights(each.squares)
         bend = 2.0 * weights / (self.nu * self.scale**2 + each.squares)
         A = np.tensordot(weights, each.hessians, 1) - (bend[:, None] * each.gradients).T @ each.gradients
-        inverse = inverse_definite(A)
+        inverse = inverse_definite(self.held(theta, A))
         if inverse is None:
             return None
-        kept = 1.0 - np.minimum(_leverages(each, weights), 0.5)
+        kept = 1.0 - np.minimum(_leverages(self, theta, each, weights), 0.5)
         shares = (weights / kept)[:, None] * each.gradients @ inverse
         return np.asarray(shares.T @ shares)
 
@@ -123,7 +123,7 @@ def heavy_tailed(packed: Packed, theta: FloatArray, scale: float) -> HeavyTailed
     near = means <= (_REACH * scale) ** 2
     tailed = HeavyTailed(**vars(packed.only(near)), nu=nu, scale=scale, trust=np.ones(np.count_nonzero(near)))
     each = Each(*(part[near] for part in each))
-    return replace(tailed, trust=_bounded(each, tailed.weights(each.squares)))
+    return replace(tailed, trust=_bounded(tailed, theta, each, tailed.weights(each.squares)))
 
 
 def _distribution(squares: FloatArray, p: FloatArray, scale: float) -> tuple[float, float]:
@@ -160,20 +160,20 @@ def _likelihood(squares: FloatArray, p: FloatArray, nu: float, scale: float) -> 
     return float(np.sum(norm - 0.5 * (nu + p) * np.log1p(squares / (nu * scale**2))))
 
 
-def _leverages(each: Each, weights: FloatArray) -> FloatArray:
-    """(n,) traces of H^-1 H_i: each one's share of the sum H of the H_i; 6 in sum."""
-    inverse = inverse_definite(np.tensordot(weights, each.hessians, 1))
+def _leverages(packed: Packed, theta: FloatArray, each: Each, weights: FloatArray) -> FloatArray:
+    """(n,) traces of H^-1 H_i: each one's share of the sum H of the H_i; in sum 6, or 5 of one camera."""
+    inverse = inverse_definite(packed.held(theta, np.tensordot(weights, each.hessians, 1)))
     if inverse is None:
         return np.zeros(len(weights))
     return weights * (each.hessians.reshape(-1, _PARAMETERS**2) @ inverse.ravel())
 
 
-def _bounded(each: Each, weights: FloatArray) -> FloatArray:
+def _bounded(packed: Packed, theta: FloatArray, each: Each, weights: FloatArray) -> FloatArray:
     """Factors (n,) up to 1 that bring every leverage to 0.2, or to three times the mean where data are few."""
     bound = min(max(_SAFE_LEVERAGE, _TIMES_THE_MEAN * _PARAMETERS / max(len(weights), 1)), 0.9)
     factors = np.ones(len(weights))
     for _ in range(_LEVERAGE_STEPS):
-        share = np.minimum(_leverages(each, factors * weights), 0.999)
+        share = np.minimum(_leverages(packed, theta, each, factors * weights), 0.999)
         high = share > bound
         if not np.any(high):
             break

@@ -41,14 +41,36 @@ class Packed:
         """Number of scalar equations that depend on the motion."""
         return len(self.pairs) + (3 if self.tracks.ndim == 2 else 5) * len(self.tracks)
 
+    @property
+    def one_camera(self) -> bool:
+        """Whether all are pairs of a camera that stands in the body's origin: they do not feel the length of v."""
+        return len(self.tracks) == 0 and not np.any(self.pairs[:, 6])
+
+    @property
+    def parameters(self) -> int:
+        """Number of unknowns of the motion that the measurements feel."""
+        return 5 if self.one_camera else 6
+
+    def held(self, theta: FloatArray, H: FloatArray) -> FloatArray:
+        """H (6, 6), made definite along the length of v where nothing is felt there, which changes no step else.
+
+        For kernels whose T is proportional to v, as of all motion models here.
+        """
+        length = float(np.linalg.norm(theta[3:]))
+        if not self.one_camera or length == 0.0:
+            return H
+        out, u = H.copy(), theta[3:] / length
+        out[3:, 3:] += np.trace(H[3:, 3:]) * np.outer(u, u)
+        return out
+
     def pair_counts(self) -> dict[Side, int]:
         """Pairs of either camera."""
-        left = int(np.count_nonzero(self.pairs[:, 6] > 0.0))
+        left = int(np.count_nonzero(self.pairs[:, 6] >= 0.0))
         return {"left": left, "right": len(self.pairs) - left}
 
     def larger_side(self) -> FloatArray:
         """The pairs (n, 7) of the camera that has more of them."""
-        left = self.pairs[:, 6] > 0.0
+        left = self.pairs[:, 6] >= 0.0
         return self.pairs[left if 2 * np.count_nonzero(left) >= len(left) else ~left]
 
     def subset(self, most: int) -> Packed:
@@ -83,7 +105,7 @@ class Packed:
         H, gradient = np.zeros((6, 6)), np.zeros(6)
         pair_terms(theta, self.kernel, self.pairs, self.focal, self.h, residuals, H, gradient, True)
         track_terms(theta, self.kernel, self.tracks, self.focal, self.h, self.baseline, squares, H, gradient, True)
-        return 0.5 * float(residuals @ residuals + np.sum(squares)), gradient, H
+        return 0.5 * float(residuals @ residuals + np.sum(squares)), gradient, self.held(theta, H)
 
     def pair_residuals(self, theta: FloatArray) -> FloatArray:
         """Sampson errors (n,) of the pairs, px."""
@@ -116,13 +138,15 @@ class Packed:
 
     def noise_variance(self, cost: float) -> float:
         """Variance (px^2) of a coordinate that the residuals show; 0 without more equations than unknowns."""
-        freedom = self.constraints - 6
+        freedom = self.constraints - self.parameters
         return 2.0 * cost / freedom if freedom > 0 else 0.0
 
     def covariance(self, theta: FloatArray, cost: float, H: FloatArray) -> FloatArray | None:
         """Covariance (6, 6) of theta at the minimum; None when it does not exist."""
         inverse = inverse_definite(H)
-        return None if inverse is None or self.constraints <= 6 else self.noise_variance(cost) * inverse
+        return (
+            None if inverse is None or self.constraints <= self.parameters else self.noise_variance(cost) * inverse
+        )
 
     def in_front(self, theta: FloatArray) -> int:
         """Number of pairs whose point lies in front of both cameras."""
