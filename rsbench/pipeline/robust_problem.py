@@ -16,6 +16,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.robust.ransac import IntArray
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.kernel_type import load_kernel
 from rsbench.solvers.engine.packed import Packed, pack, pack_pairs
 
 SIGMAS = 2.5
@@ -120,10 +121,14 @@ class RobustProblem:
             yield found
 
     def residuals(self, model: MotionEstimate) -> FloatArray:
-        theta = self.packed.theta(model.w, model.d)
-        squares = self.packed.track_squares(theta)
+        packed = self.packed
+        if model.motion_parameters:
+            own = {**self.spec.motion_parameters, **model.motion_parameters}
+            packed = replace(packed, kernel=load_kernel(self.spec.motion_model, own))
+        theta = packed.theta(model.w, model.d)
+        squares = packed.track_squares(theta)
         squares = np.where(squares >= 0.0, squares, np.inf)  # a point next to a camera's plane overflows
-        return np.concatenate([self.packed.pair_residuals(theta), np.sqrt(squares) * _track_scale()])
+        return np.concatenate([packed.pair_residuals(theta), np.sqrt(squares) * _track_scale()])
 
     @property
     def shortage(self) -> str:

@@ -49,6 +49,8 @@ class MotionEstimate:
     """
     noise_px: float | None = None
     """Standard deviation of one pixel coordinate that the residuals show."""
+    motion_parameters: Mapping[str, float] = field(default_factory=dict)
+    """Those of the motion model's own parameters that the solver has found; the others are those of its spec."""
 
     def __post_init__(self) -> None:
         for name in ("w", "d"):

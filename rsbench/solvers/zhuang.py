@@ -1,0 +1,311 @@
+"""The differential solvers of one rolling-shutter camera.
+
+B. Zhuang, L.-F. Cheong, G. H. Lee, Rolling-Shutter-Aware Differential SfM and Image Rectification, ICCV 2017.
+
+A camera whose points move by ``dX/dtau = w x X + v`` shows, to first order in the motion, the flow
+
+    u = beta P(x) (w x x + v / Z),   P(x) = [I | -x] (2, 3),   x the ray of frame 0,
+
+of which ``v . (x x u) + beta x^T s x = 0`` with ``s = (v w^T + w v^T) / 2 - (v . w) I`` is free of the depth: the
+differential epipolar constraint (Y. Ma, J. Kosecka, S. Sastry, IJCV 2000), linear in v and s. beta is the time
+that the flow took, in frame periods: tau1 - tau0 at constant velocity, and at constant acceleration k
+
+    beta = (alpha + k alpha_k) 2 / (2 + k),   alpha = tau1 - tau0,   alpha_k = (tau1^2 - tau0^2) / 2.
+
+Then Z(k) = Z0 + k Z1 annihilates (v (2 + k) / 2, s), so that k is a generalised eigenvalue of nine matches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, final
+
+import numpy as np
+import scipy
+
+from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences, temporal_pairs
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.engine.linear_systems import ROUNDING, rotation_from_essential
+
+_SLOWEST, _FASTEST = -0.49, 3.0
+"""Accelerations k that are looked for: beyond the first the camera would turn back before the last row."""
+_GRID = 29
+_K_STEPS = 8
+_SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+class Flow(NamedTuple):
+    """Flows (n, ...) of one camera."""
+
+    x: FloatArray
+    """(n, 3) rays of frame 0, z = 1."""
+    u: FloatArray
+    """(n, 3) what they move by, third 0."""
+    alpha: FloatArray
+    """(n,) frame periods that they took."""
+    alpha_k: FloatArray
+    """(n,) half the difference of the squared times."""
+    focal: FloatArray
+    """(2,) px."""
+
+    @classmethod
+    def of(cls, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter) -> Flow:
+        matches = temporal_pairs(correspondences, "left")
+        x, y = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
+        tau0 = shutter.pixel_time(matches[:, :2], 0, "left")
+        tau1 = shutter.pixel_time(matches[:, 2:], 1, "left")
+        focal = np.array([rig.camera.fx, rig.camera.fy])
+        return cls(x, y - x, tau1 - tau0, 0.5 * (tau1**2 - tau0**2), focal)
+
+    def beta(self, k: float) -> FloatArray:
+        """(n,) share of the motion of one frame period that each flow shows."""
+        return np.asarray((self.alpha + k * self.alpha_k) * (2.0 / (2.0 + k)))
+
+    def system(self) -> tuple[FloatArray, FloatArray]:
+        """Z0 and Z1 (n, 9): columns of v and of the six entries of s."""
+        x = self.x
+        quadratic = [x[:, i] * x[:, j] * (1.0 if i == j else 2.0) for i, j in _SYMMETRIC]
+        q, c = np.stack(quadratic, axis=-1), np.cross(x, self.u)
+        return np.hstack([c, self.alpha[:, None] * q]), np.hstack([0.0 * c, self.alpha_k[:, None] * q])
+
+
+class Velocity(NamedTuple):
+    """w and v (3,), v of length 1, and k."""
+
+    w: FloatArray
+    v: FloatArray
+    k: float
+
+
+def null_vectors(Z: FloatArray) -> FloatArray:
+    """(..., 9) null vectors of systems (..., n, 9), n >= 8, in unit columns; NaN where there are more."""
+    norms = np.linalg.norm(Z, axis=-2, keepdims=True)
+    good = np.all(norms[..., 0, :] > ROUNDING * np.max(norms, axis=-1), axis=-1)
+    Z = np.where(good[..., None, None], Z, 1.0) / np.where(good[..., None, None], norms, 1.0)
+    _, s, Vt = np.linalg.svd(Z, full_matrices=Z.shape[-2] < 9)
+    good &= s[..., 7] > ROUNDING * s[..., 0]
+    return np.where(good[..., None], Vt[..., -1, :] / np.where(good[..., None], norms[..., 0, :], 1.0), np.nan)
+
+
+def accelerations(Z0: FloatArray, Z1: FloatArray) -> list[float]:
+    """Values of k at which Z0 + k Z1 (n, 9) has a null vector; of more than nine rows, nearly."""
+    if len(Z0) > 9:
+        return _fitting_accelerations(Z0, Z1)
+    # v occurs without k: what is orthogonal to its columns leaves a square pencil of s.
+    across = np.linalg.svd(Z0[:, :3])[0][:, 3:]
+    P, P_k = across.T @ Z0[:, 3:], across.T @ Z1[:, 3:]
+    values: Any = scipy.linalg.eig(P, -P_k, right=False)
+    real = values[np.isfinite(values) & (np.abs(values.imag) <= 1e-9 * (1.0 + np.abs(values.real)))].real
+    return [float(k) for k in sorted(real, key=abs) if _SLOWEST < k < _FASTEST]
+
+
+def _fitting_accelerations(Z0: FloatArray, Z1: FloatArray) -> list[float]:
+    """The k of the least smallest singular value, from a grid and then by turns for the null vector and for k."""
+    norms = np.maximum(np.linalg.norm(Z0, axis=0), 1e-300)
+    Z0, Z1, grid = Z0 / norms, Z1 / norms, np.linspace(_SLOWEST, _FASTEST, _GRID)
+    M00, M01, M11 = Z0.T @ Z0, Z0.T @ Z1, Z1.T @ Z1
+    M = M00 + grid[:, None, None] * (M01 + M01.T) + grid[:, None, None] ** 2 * M11
+    size = np.trace(M, axis1=1, axis2=2)
+    k = float(grid[np.argmin(np.linalg.eigvalsh(M)[:, 0] / size)])
+    for _ in range(_K_STEPS):
+        # Gauss and Newton's step: the other singular vectors take up what they can of the change with k.
+        U, s, Vt = np.linalg.svd(Z0 + k * Z1, full_matrices=False)
+        change = Z1 @ Vt[-1]
+        left = change - U[:, :-1] @ (U[:, :-1].T @ change)
+        k -= float(s[-1] * (U[:, -1] @ change)) / max(float(left @ left), 1e-300)
+        k = float(np.clip(k, _SLOWEST, _FASTEST))
+    return [k]
+
+
+def velocity_of(flow: Flow, e: FloatArray, k: float) -> Velocity | str:
+    """Velocity of a null vector (9,), its sign by the points in front; or why there is none."""
+    if not np.all(np.isfinite(e)):
+        return "the linear system has more than one solution: degenerate motion or scene"
+    v, s = e[:3] * (2.0 / (2.0 + k)), np.zeros((3, 3))
+    if not np.linalg.norm(v) > ROUNDING * np.linalg.norm(e):
+        return "no translation: its direction and the rotation are not separable"
+    for value, (i, j) in zip(e[3:], _SYMMETRIC, strict=True):
+        s[i, j] = s[j, i] = value
+    w = rotation_from_essential(s, v, symmetric=True)
+    if not np.linalg.norm(w) < np.pi / 2:
+        return "no small rotation fits"
+    return _in_front(flow, Velocity(w, v / np.linalg.norm(v), k))
+
+
+def _fields(flow: Flow, found: Velocity) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The flow without the rotation's, that of a translation at unit depth, and the rotation's (n, 2), px."""
+    x = flow.x
+
+    def seen(rate: FloatArray) -> FloatArray:
+        return flow.focal * (rate[:, :2] - x[:, :2] * rate[:, 2:])
+
+    turned = seen(np.cross(found.w, x))
+    return flow.focal * flow.u[:, :2] - flow.beta(found.k)[:, None] * turned, seen(found.v[None]), turned
+
+
+def _in_front(flow: Flow, found: Velocity) -> Velocity:
+    rest, moved, _ = _fields(flow, found)
+    votes = np.sum(np.sign(np.sum(rest * moved, axis=1) * flow.beta(found.k)))
+    return found if votes >= 0 else found._replace(v=-found.v)
+
+
+def reprojection(flow: Flow, found: Velocity) -> tuple[FloatArray, FloatArray]:
+    """Errors (n,), px, of flows whose depths are the best for each, and their derivatives (n, 7) by w, v and k."""
+    rest, moved, turned = _fields(flow, found)
+    length = np.maximum(np.linalg.norm(moved, axis=1), 1e-300)[:, None]
+    along = moved / length
+    across = np.stack([along[:, 1], -along[:, 0]], axis=-1)
+    residuals = np.sum(rest * across, axis=1)
+    rate = np.zeros((len(flow.x), 2, 3))  # of P(x) V in px by V
+    rate[:, 0, 0], rate[:, 1, 1], rate[:, :, 2] = flow.focal[0], flow.focal[1], -flow.focal * flow.x[:, :2]
+    J = np.zeros((len(flow.x), 7))
+    sideways = np.einsum("ni,nij->nj", across, rate)
+    J[:, :3] = -flow.beta(found.k)[:, None] * np.cross(flow.x, sideways)
+    J[:, 3:6] = -(np.sum(rest * along, axis=1) / length[:, 0])[:, None] * sideways
+    scale = 2.0 / (2.0 + found.k)
+    by_k = scale * flow.alpha_k - flow.beta(found.k) / (2.0 + found.k)
+    J[:, 6] = -by_k * np.sum(turned * across, axis=1)
+    return residuals, J
+
+
+def refine(flow: Flow, start: Velocity, accelerated: bool) -> Velocity:
+    """Least squares of ``reprojection``, the paper's second stage; the start where the descent leaves it."""
+    columns = 7 if accelerated else 6
+
+    def velocity(p: FloatArray) -> Velocity:
+        return Velocity(p[:3], p[3:6] / np.linalg.norm(p[3:6]), float(p[6]) if accelerated else start.k)
+
+    def jacobian(p: FloatArray) -> FloatArray:
+        found = velocity(p)
+        J = reprojection(flow, found)[1][:, :columns]
+        J[:, 3:6] = (J[:, 3:6] - np.outer(J[:, 3:6] @ found.v, found.v)) / np.linalg.norm(p[3:6])
+        return J
+
+    p = np.concatenate([start.w, start.v, [start.k]])[:columns]
+    if len(flow.x) < columns:
+        return start
+
+    def residuals(p: FloatArray) -> FloatArray:
+        return reprojection(flow, velocity(p))[0]
+
+    end = scipy.optimize.least_squares(residuals, p, jacobian, method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    if not (np.all(np.isfinite(end.x)) and (not accelerated or _SLOWEST <= end.x[6] <= _FASTEST)):
+        return start
+    return _in_front(flow, velocity(end.x))
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class ZhuangSolver(Solver):
+    """Flow of the left camera as its velocity: eight matches at constant velocity, nine at constant acceleration.
+
+    The flow of a whole frame period counts as instantaneous: the rotation is off by the square of the motion, the
+    direction of translation by its first power. w and s are read from the null vector by least squares, which on
+    exact flows is what Ma's decomposition gives.
+    """
+
+    acceleration: Literal["none", "constant"] = "none"
+    """Whether k is 0 or found."""
+    refinement: Literal["none", "reprojection"] = "reprojection"
+    """Of the linear solution on more than a minimal sample: the paper's error of the flow, over all depths too."""
+
+    @property
+    def spec(self) -> SolverSpec:
+        return SolverSpec(
+            needs=frozenset({"left"}),
+            minimum={"left": self._least},
+            metric=False,
+            motion_model="twist" if self._least == 8 else "accelerated",
+            shutter="rolling",
+            cameras="any",
+            reference_point="left",
+            reference="Zhuang, Cheong, Lee: Rolling-Shutter-Aware Differential SfM, ICCV 2017",
+            assumes="small motion; a scene that is not planar; translation; "
+            + ("constant velocity" if self._least == 8 else "constant acceleration along the path"),
+        )
+
+    @property
+    def _least(self) -> int:
+        return 8 if self.acceleration == "none" else 9
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        flow = Flow.of(correspondences, rig, shutter)
+        short = self.spec.shortage({"left": len(flow.x)})
+        if short is not None:
+            return short
+        found, reason = self._linear(flow)
+        if not found:
+            return MotionEstimate.failed(reason)
+        if self.refinement == "reprojection":
+            found = [refine(flow, start, self._least == 9) for start in found]
+        return self._reported(min(found, key=lambda each: float(np.sum(reprojection(flow, each)[0] ** 2))))
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        found, reason = self._linear(Flow.of(sample, rig, shutter))
+        return [self._reported(each) for each in found] or [MotionEstimate.failed(reason)]
+
+    def propose_all(
+        self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
+    ) -> Iterable[list[MotionEstimate]]:
+        if self._least == 9:
+            return (self.propose(sample, rig, shutter) for sample in samples)
+        flows = [Flow.of(sample, rig, shutter) for sample in samples]
+        vectors = null_vectors(np.stack([flow.system()[0] for flow in flows]))
+        found = (velocity_of(flow, e, 0.0) for flow, e in zip(flows, vectors, strict=True))
+        return ([self._reported(each)] for each in found)
+
+    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
+        return {"left": self._least}
+
+    def improve(
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        quick: bool = False,
+    ) -> MotionEstimate:
+        if self.refinement == "none":
+            return self.estimate(correspondences, rig, shutter)
+        flow = Flow.of(correspondences, rig, shutter)
+        v: FloatArray = motion.d
+        if self._least == 8:
+            v = np.linalg.solve(so3.left_jacobian(motion.w), v).astype(np.float64)
+        length = float(np.linalg.norm(v))
+        if length == 0.0:
+            return self.estimate(correspondences, rig, shutter)
+        k = float(motion.motion_parameters.get("acceleration", 0.0))
+        return self._reported(refine(flow, Velocity(motion.w, v / length, k), self._least == 9))
+
+    def _linear(self, flow: Flow) -> tuple[list[Velocity], str]:
+        """Solutions of the linear system, and why there is none."""
+        Z0, Z1 = flow.system()
+        if not (np.all(np.isfinite(Z0)) and np.all(np.isfinite(Z1))):
+            return [], "matches too far away to compute with"
+        values = [0.0] if self._least == 8 else accelerations(Z0, Z1)
+        found = [velocity_of(flow, null_vectors(Z0 + k * Z1), k) for k in values]
+        good = [each for each in found if not isinstance(each, str)]
+        told = [each for each in found if isinstance(each, str)]
+        return good, told[0] if told else "no acceleration between -0.5 and 3 fits"
+
+    def _reported(self, found: Velocity | str) -> MotionEstimate:
+        if isinstance(found, str):
+            return MotionEstimate.failed(found)
+        constant = self._least == 8
+        d = so3.left_jacobian(found.w) @ found.v if constant else found.v
+        if not np.all(np.isfinite([*found.w, *d])):
+            return MotionEstimate.failed("no finite motion fits")
+        return MotionEstimate(
+            w=found.w,
+            d=d / np.linalg.norm(d),
+            success=True,
+            reason="the length of d is not determined by one camera",
+            motion_parameters={} if constant else {"acceleration": found.k},
+        )

@@ -1,0 +1,119 @@
+"""The differential solvers: exact on instantaneous flow, of the order of their truncation on finite motions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.metrics import rotation_error, translation_error, translation_of_offset
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.motions import make_motion
+from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.zhuang import Flow, Velocity, ZhuangSolver, accelerations, reprojection
+
+CAMERA = PinholeCamera.centred(900, 900, 810.0)
+LEFT = StereoRig(camera=CAMERA, baseline=0.6).about("left")
+SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
+W, V = np.array([0.012, -0.02, 0.016]), np.array([0.2, -0.12, 0.18])
+UNIT = V / np.linalg.norm(V)
+SOLVERS = {
+    (kind, how): ZhuangSolver(acceleration=kind, refinement=how)
+    for kind in ("none", "constant")
+    for how in ("none", "reprojection")
+}
+
+
+def instantaneous(count: int, k: float, seed: int = 0) -> Correspondences:
+    """Flow that is exactly ``beta P(x) (w x x + v / Z)``: what the method assumes, and no rigid motion."""
+    rng = np.random.default_rng(seed)
+    pixels = rng.uniform(100.0, 800.0, (count, 2))
+    x, depth = CAMERA.unproject(pixels), rng.uniform(2.0, 10.0, count)
+    rate = np.cross(W, x) + V / depth[:, None]
+    flow = 810.0 * (rate[:, :2] - x[:, :2] * rate[:, 2:])
+    ends = pixels.copy()
+    for _ in range(100):  # the share of the motion depends on the row of the end
+        tau0, tau1 = SHUTTER.row_time(pixels[:, 1], 0), SHUTTER.row_time(ends[:, 1], 1)
+        beta = (tau1 - tau0 + 0.5 * k * (tau1**2 - tau0**2)) * 2.0 / (2.0 + k)
+        ends = pixels + beta[:, None] * flow
+    return Correspondences(left=np.hstack([pixels, ends]))
+
+
+@pytest.mark.parametrize("kind", ["none", "constant"])
+@pytest.mark.parametrize("how", ["none", "reprojection"])
+@pytest.mark.parametrize("count", [0, 50])
+def test_instantaneous_flow_gives_the_exact_velocity(kind: str, how: str, count: int) -> None:
+    solver, k = SOLVERS[kind, how], 0.4 if kind == "constant" else 0.0
+    matches = instantaneous(count or solver.spec.minimum["left"], k)
+    found = solver.estimate(matches, LEFT, SHUTTER) if count else None
+    candidates = [found] if found is not None else solver.propose(matches, LEFT, SHUTTER)
+    w = min((each.w for each in candidates), key=lambda w: float(np.linalg.norm(w - W)))
+    # Eight matches amplify the rounding of 1e-16 by up to 1e6 (see ROUNDING in linear_systems).
+    np.testing.assert_allclose(w, W, atol=1e-8)
+    if found is not None and kind == "constant":
+        assert found.motion_parameters["acceleration"] == pytest.approx(k, abs=1e-6)
+        np.testing.assert_allclose(found.d, UNIT, atol=1e-8)
+
+
+def test_nine_matches_have_the_true_acceleration_among_the_eigenvalues() -> None:
+    """The sign of k = -eig is that of a determinant which vanishes, not that of the public code."""
+    flow = Flow.of(instantaneous(9, 0.4), LEFT, SHUTTER)
+    Z0, Z1 = flow.system()
+    found = accelerations(Z0, Z1)
+    assert min(abs(k - 0.4) for k in found) < 1e-6
+    for k in found:
+        Z = Z0 + k * Z1
+        s = np.linalg.svd(Z / np.linalg.norm(Z, axis=0), compute_uv=False)
+        assert s[-1] < 1e-10 * s[0]
+
+
+def errors(solver: ZhuangSolver, size: float) -> FloatArray:
+    """Medians of rotation and direction (rad) on exact matches of finite motions, ten scenes."""
+    found = []
+    for seed in range(10):
+        motion = make_motion(solver.spec.motion_model, size * W, size * V, solver.spec.motion_parameters)
+        options, rng = SimulationOptions(pairs=60), np.random.default_rng(seed)
+        c = simulate(LEFT, SHUTTER, motion, options, rng).correspondences
+        estimate = solver.estimate(Correspondences(left=c.left), LEFT, SHUTTER)
+        found.append([float(rotation_error(estimate.w, motion.w)), float(translation_error(estimate.d, motion.d))])
+    return np.median(found, axis=0)
+
+
+@pytest.mark.parametrize("kind", ["none", "constant"])
+@pytest.mark.parametrize("how", ["none", "reprojection"])
+def test_half_the_motion_has_a_quarter_of_the_rotation_s_and_half_of_the_direction_s_error(
+    kind: str, how: str
+) -> None:
+    """Flow of finite motion is its velocity plus terms of second order."""
+    half, quarter = (errors(SOLVERS[kind, how], size) for size in (0.5, 0.25))
+    np.testing.assert_allclose(half / quarter, [4.0, 2.0], rtol=0.25)
+
+
+def test_derivatives_are_those_of_finite_differences() -> None:
+    flow = Flow.of(instantaneous(20, 0.1), LEFT, SHUTTER)
+    p = np.concatenate([W + 0.01, UNIT, [0.3]])
+
+    def at(p: FloatArray) -> FloatArray:
+        return reprojection(flow, Velocity(p[:3], p[3:6], float(p[6])))[0]
+
+    steps = 1e-6 * np.eye(7)
+    numeric = np.stack([(at(p + s) - at(p - s)) / 2e-6 for s in steps], axis=-1)
+    np.testing.assert_allclose(reprojection(flow, Velocity(p[:3], p[3:6], 0.3))[1], numeric, rtol=1e-5, atol=1e-5)
+
+
+def test_the_robust_loop_judges_matches_by_the_acceleration_that_was_found() -> None:
+    """With that of the spec, 0.2, half of these matches would be outliers."""
+    rig, solver = LEFT.about("middle"), SOLVERS["constant", "reprojection"]
+    motion = make_motion("accelerated", 0.5 * W, 0.5 * V, {"acceleration": 1.5})
+    options = SimulationOptions(pairs=150, noise_px=0.1, outlier_ratio=0.2)
+    s = simulate(rig, SHUTTER, motion, options, np.random.default_rng(3))
+    found = estimate_motion(s.correspondences, rig, SHUTTER, solver, RobustOptions(), np.random.default_rng(0))
+    assert found.estimate.motion_parameters["acceleration"] == pytest.approx(1.5, abs=0.5)
+    assert np.mean(found.inliers["left"]) > 0.7
+    d = translation_of_offset(motion.w, motion.d, rig.offset("left"))
+    assert np.degrees(rotation_error(found.estimate.w, motion.w)) < 0.1
+    assert np.degrees(translation_error(found.estimate.d, d)) < 3.0
