@@ -1,23 +1,90 @@
-"""Drawings of the leaderboard as SVG: intervals in a table, and scores against what the problems are."""
+"""Drawings of the leaderboard as SVG: intervals in a table, errors against what problems are, calibration."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from markupsafe import Markup, escape
+from numpy.typing import NDArray
 
+from rsbench.benchmark.leaderboard.calibration import LEVELS, Triple
+from rsbench.benchmark.statistics import Interval, median_interval, typical_interval
 from rsbench.core.so3 import FloatArray
 
 _BAR = 90
-_WIDTH, _HEIGHT = 330, 210
-_LEFT, _BOTTOM, _TOP, _RIGHT = 36, 24, 8, 18
+_WIDTH, _HEIGHT = 300, 190
+_LEFT, _BOTTOM, _TOP, _RIGHT = 44, 24, 8, 12
 _BINS = 5
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8a6d00", "#56b4e9")
-"""Okabe and Ito's, which people with any colour vision tell apart; dashes and marks differ too."""
+_APART = 2.5
+"""Px between the intervals of two lines at one place."""
+_SEED = 0
 _DASHES = ("", "6 3", "2 2", "8 3 2 3", "1 3", "10 4")
-MOST_LINES = len(_COLOURS)
+_MARKS = (
+    "M-3 0a3 3 0 1 0 6 0a3 3 0 1 0 -6 0",
+    "M-3 -3h6v6h-6z",
+    "M0 -4L4 3H-4z",
+    "M0 -4L4 0L0 4L-4 0z",
+    "M0 4L4 -3H-4z",
+    "M-3 -3L3 3M-3 3L3 -3",
+)
+"""Colours of board.css.j2 are told apart by people with any colour vision; marks and dashes differ too."""
+MOST_LINES = len(_MARKS)
+_NOTHING = 1e-6
+"""The truth errs by less, and is not drawn: it would stretch the axis."""
+
+
+class ErrorLine(NamedTuple):
+    """Errors of an entry."""
+
+    name: str
+    errors: FloatArray
+    """(n,) in the order of the problems."""
+    grey: bool
+    """Of an oracle."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Curve:
+    name: str
+    style: str
+    dash: str
+    mark: str
+    at: FloatArray
+    """Medians (parts,)."""
+    ends: FloatArray
+    """Of their intervals (parts, 2); infinite where the values bound nothing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Axis:
+    """Scores to px, from the top."""
+
+    low: float
+    high: float
+    logarithmic: bool
+
+    def down(self, value: float) -> float:
+        low, high, at = (self._place(x) for x in (self.low, self.high, min(max(value, self.low), self.high)))
+        return _TOP + (high - at) / (high - low) * (_HEIGHT - _TOP - _BOTTOM)
+
+    def _place(self, value: float) -> float:
+        return math.log10(value) if self.logarithmic else value
+
+    def ticks(self) -> list[float]:
+        if not self.logarithmic:
+            return [float(x) for x in np.linspace(self.low, self.high, 5)]
+        decades = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
+        for steps in ((1, 2, 5), (1, 3), (1,)):
+            found = [k * 10.0**e for e in decades for k in steps if self.low <= k * 10.0**e <= self.high]
+            if len(found) <= 6:
+                break
+        return found
 
 
 def bar(value: float, low: float, high: float) -> Markup:
@@ -30,70 +97,187 @@ def bar(value: float, low: float, high: float) -> Markup:
     )
 
 
-def curves(facts: pd.Series, scores: Mapping[str, FloatArray]) -> Markup | None:
-    """Mean scores in parts of the problems, by a number that they have: its values where few, else fifths.
+# Curves
+
+
+def legend(lines: Sequence[ErrorLine]) -> Markup:
+    """Which mark is whose."""
+    items = []
+    for line, (style, dash, mark) in zip(lines, _styles(lines), strict=True):
+        drawn = f'<path d="M0 7h34" {_stroke(style, dash)}/>{_mark(17.0, 7.0, style, mark)}'
+        items.append(f'<li><svg width="34" height="14" aria-hidden="true">{drawn}</svg> {escape(line.name)}</li>')
+    return Markup('<ul class="legend">' + "".join(items) + "</ul>")
+
+
+def drawable(lines: Sequence[ErrorLine]) -> list[ErrorLine]:
+    """The first ``MOST_LINES`` entries, and oracles that err."""
+    ranked = [line for line in lines if not line.grey][:MOST_LINES]
+    return ranked + [line for line in lines if line.grey and np.median(line.errors) > _NOTHING]
+
+
+def curves(facts: pd.Series, lines: Sequence[ErrorLine], scenes: Sequence[str]) -> Markup | None:
+    """Median errors with their intervals in parts of the problems: by words, by few values, else by fifths.
 
     Args:
-        facts: (n,) numbers of the problems.
-        scores: (n,) in [0, 1], by the name of the entry; the first ``MOST_LINES`` are drawn.
+        facts: (n,) numbers or words of the problems.
+        lines: what ``drawable`` gives.
+        scenes: (n,) of the problems: their intervals keep those of a scene together.
 
     Returns:
         None where the problems have fewer than two values.
     """
+    parts = _parts(facts)
+    if parts is None or not lines:
+        return None
+    part, labels = parts
+    clusters = np.asarray(scenes) if len(set(scenes)) < len(scenes) else None
+    drawn = []
+    for line, (style, dash, mark) in zip(lines, _styles(lines), strict=True):
+        found = [_typical(line.errors, part == k, clusters) for k in range(len(labels))]
+        at, ends = np.array([each[0] for each in found]), np.array([each[1:] for each in found])
+        drawn.append(_Curve(name=line.name, style=style, dash=dash, mark=mark, at=at, ends=ends))
+    return _drawn(labels, drawn)
+
+
+def _parts(facts: pd.Series) -> tuple[NDArray[np.intp], Sequence[float | str]] | None:
+    """The part of each problem, and what the parts are called: words, or medians."""
+    if not pd.api.types.is_numeric_dtype(facts):
+        words, part = np.unique(facts.astype(str).to_numpy(), return_inverse=True)
+        return None if len(words) < 2 else (part, [str(word) for word in words])
     values = facts.to_numpy(dtype=np.float64)
     different = np.unique(values)
-    if len(different) < 2:
+    if len(different) < 2 or not np.all(np.isfinite(values)):
         return None
     if len(different) <= _BINS:
-        part = np.searchsorted(different, values)
+        return np.searchsorted(different, values), different.tolist()
+    inner = np.quantile(values, np.linspace(0.0, 1.0, _BINS + 1)[1:-1])
+    _, part = np.unique(np.searchsorted(inner, values, side="right"), return_inverse=True)
+    return part, [float(np.median(values[part == k])) for k in range(part.max() + 1)]
+
+
+def _typical(errors: FloatArray, where: NDArray[np.bool_], clusters: NDArray[np.str_] | None) -> Triple:
+    inside = np.sort(errors[where])
+    if clusters is None or len(set(clusters[where])) < 2:  # problems of one scene are drawn independently
+        low, high = (inside[int(k)] if np.isfinite(k) else k for k in _bracket(len(inside)))
     else:
-        inner = np.quantile(values, np.linspace(0.0, 1.0, _BINS + 1)[1:-1])
-        part = np.searchsorted(inner, values, side="right")
-    used = np.unique(part)
-    centres = np.array([np.median(values[part == k]) for k in used])
-    lines = {
-        name: np.array([np.mean(each[part == k]) for k in used])
-        for name, each in list(scores.items())[:MOST_LINES]
-    }
-    return _drawn(centres, lines)
+        low, high = typical_interval(errors[where], _SEED, clusters[where].tolist())
+    return float(np.median(inside)), float(low), float(high)
 
 
-def _drawn(x: FloatArray, lines: Mapping[str, FloatArray]) -> Markup:
-    logarithmic = x[0] > 0.0 and x[-1] > 8.0 * x[0]
-    place = np.log(x) if logarithmic else x
-    across = _LEFT + (_WIDTH - _LEFT - _RIGHT) * (place - place[0]) / max(place[-1] - place[0], 1e-12)
-    height = _HEIGHT + 14 * len(lines)
-    words = "; ".join(f"{name}: {', '.join(f'{y:.2f}' for y in ys)}" for name, ys in lines.items())
-    at = ", ".join(f"{each:.3g}" for each in x)
+@lru_cache
+def _bracket(n: int) -> Interval:
+    """Ranks, from 0, of the ends of the exact interval of a median; infinite where there is none."""
+    return median_interval(np.arange(n))
+
+
+def _styles(lines: Sequence[ErrorLine]) -> list[tuple[str, str, str]]:
+    """Colour, dash and mark of each."""
+    coloured = iter([(f"var(--c{k})", _DASHES[k], _MARKS[k]) for k in range(MOST_LINES)])
+    return [("var(--grey)", "", "") if line.grey else next(coloured) for line in lines]
+
+
+def _drawn(labels: Sequence[float | str], drawn: Sequence[_Curve]) -> Markup:
+    across, axis = _across(labels), _axis(drawn)
+    words = "; ".join(f"{each.name}: {', '.join(f'{y:.3g}' for y in each.at)}" for each in drawn)
+    at = ", ".join(_word(each) for each in labels)
     parts = [
-        f'<svg width="{_WIDTH}" height="{height}" role="img" aria-label="{escape(f"at {at}: {words}")}">',
-        *_axes(x, across),
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" height="{_HEIGHT}" role="img" '
+        f'aria-label="{escape(f"median errors at {at}: {words}")}">',
+        *_frame(labels, across, axis),
     ]
-    for k, (name, ys) in enumerate(lines.items()):
-        points = [(float(a), _down(float(y))) for a, y in zip(across, ys, strict=True)]
-        path = " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
-        stroke = f'stroke="{_COLOURS[k]}" stroke-width="2" stroke-dasharray="{_DASHES[k]}" fill="none"'
-        parts.append(f'<polyline points="{path}" {stroke}/>')
-        parts += [f'<circle cx="{a:.1f}" cy="{b:.1f}" r="2.5" fill="{_COLOURS[k]}"/>' for a, b in points]
-        y = _HEIGHT + 10 + 14 * k
-        parts.append(
-            f'<path d="M{_LEFT} {y - 4}h30" {stroke}/><text x="{_LEFT + 36}" y="{y}">{escape(name)}</text>'
+    for k, each in enumerate(drawn):
+        shift = _APART * (k - 0.5 * (len(drawn) - 1))
+        places = [(float(a) + shift, axis.down(float(y))) for a, y in zip(across, each.at, strict=True)]
+        if not isinstance(labels[0], str):
+            path = "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in places)
+            parts.append(f'<path d="{path}" {_stroke(each.style, each.dash)}/>')
+        bars = "".join(
+            f"M{a:.1f} {axis.down(high):.1f}V{axis.down(low):.1f}"
+            for (a, _), (low, high) in zip(places, each.ends, strict=True)
+            if np.isfinite(low) and np.isfinite(high)
         )
+        parts.append(f'<path d="{bars}" style="stroke:{each.style}" fill="none"/>')
+        parts += [_mark(a, b, each.style, each.mark) for a, b in places]
     return Markup("".join(parts) + "</svg>")
 
 
-def _down(score: float) -> float:
-    return _TOP + (1.0 - score) * (_HEIGHT - _TOP - _BOTTOM)
+def _across(labels: Sequence[float | str]) -> FloatArray:
+    """Places of the parts, px."""
+    words = isinstance(labels[0], str)
+    inset = 0.5 * (_WIDTH - _LEFT - _RIGHT) / len(labels) if words else 12.0
+    x = np.array([k if isinstance(label, str) else label for k, label in enumerate(labels)], dtype=np.float64)
+    if not words and x[0] > 0.0 and x[-1] > 5.0 * x[0]:
+        x = np.log(x)
+    return _LEFT + inset + (_WIDTH - _LEFT - _RIGHT - 2.0 * inset) * (x - x[0]) / (x[-1] - x[0])
 
 
-def _axes(x: FloatArray, across: FloatArray) -> Sequence[str]:
+def _axis(drawn: Sequence[_Curve]) -> _Axis:
+    """Of all medians and what of their intervals is finite; logarithmic where nothing is 0."""
+    every = np.concatenate([np.concatenate([each.at, each.ends.ravel()]) for each in drawn])
+    known = every[np.isfinite(every)]
+    low, high = float(np.min(known)), float(np.max(known))
+    if low <= 0.0 or high < 3.0 * low:
+        return _Axis(low=0.0, high=max(high, 1e-9), logarithmic=False)
+    return _Axis(low=low / 1.1, high=high * 1.1, logarithmic=True)
+
+
+def _frame(labels: Sequence[float | str], across: FloatArray, axis: _Axis) -> list[str]:
     marks = [
-        f'<path d="M{_LEFT} {_down(y):.1f}H{_WIDTH - _RIGHT}" stroke="currentColor" stroke-opacity=".2"/>'
-        f'<text x="{_LEFT - 6}" y="{_down(y) + 4:.1f}" text-anchor="end">{y:g}</text>'
-        for y in (0.0, 0.25, 0.5, 0.75, 1.0)
+        f'<path d="M{_LEFT} {axis.down(y):.1f}H{_WIDTH - _RIGHT}" stroke="currentColor" stroke-opacity=".2"/>'
+        f'<text x="{_LEFT - 5}" y="{axis.down(y) + 4:.1f}" text-anchor="end">{y:.3g}</text>'
+        for y in axis.ticks()
     ]
-    ticks = [
-        f'<text x="{float(a):.1f}" y="{_HEIGHT - 8}" text-anchor="middle">{float(value):.3g}</text>'
-        for a, value in zip(across, x, strict=True)
+    last = -math.inf
+    for a, label in zip(across, labels, strict=True):
+        word = _word(label)
+        if a - last >= 6.0 * len(word) + 4.0:  # room for it
+            last = float(a)
+            marks.append(f'<text x="{a:.1f}" y="{_HEIGHT - 7}" text-anchor="middle">{escape(word)}</text>')
+    return marks
+
+
+def _word(label: float | str) -> str:
+    return label if isinstance(label, str) else f"{label:.2g}" if abs(label) < 100.0 else f"{label:.0f}"
+
+
+def _stroke(style: str, dash: str) -> str:
+    return f'style="stroke:{style}" stroke-width="1.6" stroke-dasharray="{dash}" fill="none"'
+
+
+def _mark(a: float, b: float, style: str, mark: str) -> str:
+    if not mark:
+        return ""
+    return f'<path transform="translate({a:.1f} {b:.1f})" d="{mark}" style="stroke:{style};fill:{style}"/>'
+
+
+# Calibration
+
+
+def reliability(covers: Sequence[Triple]) -> Markup:
+    """Shares of truths within the ellipsoids of the levels, against those that should be."""
+    side, width = 150.0, 190
+
+    def place(x: float, y: float) -> str:
+        return f"{34.0 + side * x:.1f} {8.0 + side * (1.0 - y):.1f}"
+
+    words = "; ".join(f"{100 * at:.0f} %: {100 * x[0]:.0f} %" for at, x in zip(LEVELS, covers, strict=True))
+    parts = [
+        f'<svg width="{width}" height="{width - 4}" role="img" '
+        f'aria-label="{escape(f"levels and shares: {words}")}">',
+        f'<path d="M{place(0, 0)}L{place(1, 1)}" stroke="currentColor" stroke-opacity=".4" fill="none"/>',
     ]
-    return marks + ticks
+    for level in (0.0, 0.5, 0.9, 1.0):
+        parts.append(
+            f'<path d="M{place(level, 0)}L{place(level, 1)}M{place(0, level)}L{place(1, level)}" '
+            'stroke="currentColor" stroke-opacity=".15"/>'
+        )
+        if level != 0.9:
+            parts.append(f'<text x="28" y="{12.0 + side * (1.0 - level):.0f}" text-anchor="end">{level:g}</text>')
+            parts.append(f'<text x="{34.0 + side * level:.0f}" y="176" text-anchor="middle">{level:g}</text>')
+    for level, (share, low, high) in zip(LEVELS, covers, strict=True):
+        parts.append(
+            f'<path d="M{place(level, max(low, 0.0))}L{place(level, min(high, 1.0))}" stroke="currentColor"/>'
+        )
+        x, y = place(level, share).split()
+        parts.append(f'<circle cx="{x}" cy="{y}" r="3" fill="currentColor"/>')
+    return Markup("".join(parts) + "</svg>")

@@ -6,17 +6,19 @@ import csv
 import json
 import re
 import shutil
+import statistics
 import subprocess
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from leaderboards import Line, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard.board import add
-from rsbench.report.board_figures import curves
+from rsbench.report.board_figures import ErrorLine, curves, drawable
 from rsbench.report.board_page import build_site
 
 SPLIT = small_split(30)
@@ -103,12 +105,25 @@ def test_tables_for_papers_hold_the_same_lines(site: Path) -> None:
     assert len(rows) == 5 and len({row.count("&") for row in rows}) == 1
 
 
-def test_curves_are_means_of_parts() -> None:
-    import pandas as pd
-
-    drawn = curves(pd.Series([1.0, 1.0, 2.0]), {"<a>": np.array([0.0, 0.5, 1.0])})
-    assert drawn is not None and "at 1, 2: &lt;a&gt;: 0.25, 1.00" in drawn
-    assert curves(pd.Series([1.0, 1.0]), {"a": np.zeros(2)}) is None
+def test_curves_are_medians_of_parts() -> None:
+    rng = np.random.default_rng(0)
+    facts, errors = pd.Series(np.repeat([1.0, 2.0, 4.0], 20)), rng.lognormal(size=60)
+    lines = drawable(
+        [ErrorLine("<a>", errors, False), ErrorLine("truth", 0.0 * errors, True), ErrorLine("bound", errors, True)]
+    )
+    assert [line.name for line in lines] == ["<a>", "bound"]  # the truth does not err
+    scenes = [str(k) for k in range(60)]
+    drawn = curves(facts, lines, scenes)
+    medians = ", ".join(f"{statistics.median(errors[20 * k : 20 * k + 20]):.3g}" for k in range(3))
+    assert drawn is not None and f"at 1, 2, 4: &lt;a&gt;: {medians}; bound" in drawn
+    # Each interval is drawn from its upper to its lower end: the 6th and the 15th of 20 values (binomial table).
+    axis = re.findall(r'<path d="((?:M[\d.]+ [\d.]+V[\d.]+)+)"', drawn)
+    places = np.array(re.findall(r"M[\d.]+ ([\d.]+)V([\d.]+)", axis[0]), dtype=float)
+    ends = np.log10([[part[14], part[5]] for part in np.sort(errors.reshape(3, 20), axis=1)])
+    slope = np.diff(places.ravel()) / np.diff(ends.ravel())
+    np.testing.assert_allclose(slope, slope[0], rtol=0.02)  # places are rounded to 0.1 px
+    assert curves(pd.Series(["box", "plane"] * 30), lines, scenes) is not None
+    assert curves(pd.Series(np.ones(60)), lines, scenes) is None
 
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

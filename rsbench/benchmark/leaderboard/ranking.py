@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from rsbench.benchmark.statistics import COVERAGE, Interval
+from rsbench.benchmark.statistics import COVERAGE, Interval, share_interval
 from rsbench.core.so3 import FloatArray
 
 _ROUNDING = 1e-12
@@ -48,6 +48,18 @@ def mean_interval(means: FloatArray) -> Interval:
     half = float(student.ppf(0.5 + 0.5 * COVERAGE, k - 1) * np.std(means, ddof=1) / np.sqrt(k))
     middle = float(np.mean(means))
     return Interval(middle - half, middle + half)
+
+
+def score_interval(values: FloatArray, scenes: Sequence[str]) -> tuple[float, float, float]:
+    """The mean over scenes of values (n,) in [0, 1], and the ends of its interval.
+
+    Nothing lies outside [0, 1]; of yes or no of problems that are independent the interval is exact.
+    """
+    means = scene_means(values, scenes)
+    if len(means) == len(values) and np.all((values == 0.0) | (values == 1.0)):
+        return float(np.mean(means)), *share_interval(int(np.sum(values)), len(values))
+    low, high = mean_interval(means)
+    return float(np.mean(means)), max(low, 0.0), min(high, 1.0)
 
 
 def better(means: FloatArray) -> NDArray[np.bool_]:

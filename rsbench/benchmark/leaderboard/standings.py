@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.leaderboard.board import Scored
+from rsbench.benchmark.leaderboard.calibration import Calibration, calibration, named_numbers
 from rsbench.benchmark.leaderboard.protocols import KNOWLEDGE, ORACLE, Protocol, protocol_of_id
-from rsbench.benchmark.leaderboard.ranking import Rank, better, mean_interval, ranks, scene_means, ties
-from rsbench.benchmark.statistics import share_interval
+from rsbench.benchmark.leaderboard.ranking import Rank, better, ranks, scene_means, score_interval, ties
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 
@@ -31,6 +31,8 @@ class Standing:
     """Of the shares of its protocol: the mean over scenes, and the ends of its interval."""
     medians: dict[str, float]
     """Of the other scores: over problems; NaN where the entry gives none."""
+    calibration: Calibration | None
+    """Of the covariances that it states."""
 
     @property
     def protocol(self) -> Protocol:
@@ -101,18 +103,10 @@ def _standing(
         rank=rank,
         peers=peers,
         ties=tied,
-        means={name: _interval(scores[name].to_numpy(), scenes) for name in protocol.of_kind("share")},
+        means={name: score_interval(scores[name].to_numpy(), scenes) for name in protocol.of_kind("share")},
         medians={name: _median(scores[name].to_numpy()) for name in protocol.of_kind("median")},
+        calibration=calibration(scores),
     )
-
-
-def _interval(values: FloatArray, scenes: Sequence[str]) -> tuple[float, float, float]:
-    """Nothing lies outside [0, 1]; of yes or no of problems that are independent the interval is exact."""
-    means = scene_means(values, scenes)
-    if len(means) == len(values) and np.all((values == 0.0) | (values == 1.0)):
-        return float(np.mean(means)), *share_interval(int(np.sum(values)), len(values))
-    low, high = mean_interval(means)
-    return float(np.mean(means)), max(low, 0.0), min(high, 1.0)
 
 
 def _median(values: FloatArray) -> float:
@@ -128,8 +122,17 @@ def table(lines: Sequence[Standing]) -> pd.DataFrame:
         header = line.scored.header
         row: dict[str, object] = {"method": header.method, "uses": line.uses, "peers": line.peers or None}
         row |= dict(zip(("rank", "rank_low", "rank_high"), line.rank or (None, None, None), strict=True))
-        for name, (value, low, high) in line.means.items():
-            row |= {name: value, f"{name}_low": low, f"{name}_high": high}
-        rows.append(row | line.medians | {"ties": " ".join(line.ties)})
+        row |= _ends(line.means) | line.medians
+        if "nees" in line.scored.scores:
+            row |= _ends(named_numbers(line.calibration))
+        rows.append(row | {"ties": " ".join(line.ties)})
     integers = ["peers", "rank", "rank_low", "rank_high"]
     return pd.DataFrame(rows).astype(dict.fromkeys(integers, "Int64")) if rows else pd.DataFrame()
+
+
+def _ends(triples: Mapping[str, tuple[float, float, float]]) -> dict[str, object]:
+    return {
+        f"{name}{end}": number
+        for name, triple in triples.items()
+        for end, number in zip(("", "_low", "_high"), triple, strict=True)
+    }

@@ -1,0 +1,125 @@
+"""A split of a board as the pages see it: its lines, and what is known of its problems."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rsbench.benchmark.leaderboard.board import about_split, entries_of, place
+from rsbench.benchmark.leaderboard.protocols import Protocol, protocol_of_id
+from rsbench.benchmark.leaderboard.standings import Standing, standings
+from rsbench.report.board_figures import ErrorLine, curves, drawable, legend
+
+_ERRORS = {
+    "error_deg": "max(e_R, e_T) in degrees",
+    "e_readout": "error of the readout ratio",
+    "bad_1": "bad@1",
+    "error": "1 - SSIM",
+}
+"""What figures call the column of scores.csv that they draw."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Board:
+    """A split with its lines, and what is told of its problems."""
+
+    protocol: Protocol
+    split: str
+    fingerprint: str
+    lines: list[Standing]
+    facts: pd.DataFrame
+    """By the name of the problem; without columns where they are secret."""
+
+    @property
+    def id(self) -> str:
+        """Of its part of the index, of its files, and of the folder of its pages."""
+        return f"{self.protocol.id}--{self.split}"
+
+    @cached_property
+    def problems(self) -> list[str]:
+        """Names, in the order of scores."""
+        return [str(name) for name in self.lines[0].scored.scores["problem"]]
+
+    @cached_property
+    def scenes(self) -> list[str]:
+        """Of the problems."""
+        return [str(name) for name in self.lines[0].scored.scores["scene"]]
+
+    @property
+    def several(self) -> bool:
+        """Whether scenes have several problems."""
+        return len(set(self.scenes)) < len(self.scenes)
+
+    @property
+    def pages(self) -> bool:
+        """Whether its problems have pages: simulated ones, of which nothing is to be seen, have a row."""
+        return self.protocol.track != "points"
+
+    def page_of(self, problem: str) -> str:
+        """Where a problem is told, from the folder of the index."""
+        return f"{self.id}/problem/{problem}.html" if self.pages else f"{self.named['problems']}#{problem}"
+
+    @property
+    def named(self) -> dict[str, str]:
+        """Words of its own, for all pages."""
+        return {
+            "id": self.id,
+            "title": self.protocol.title,
+            "protocol": self.protocol.id,
+            "split": self.split,
+            "primary": self.protocol.primary.title,
+            "error": self.error,
+            "problems": f"{self.id}--problems.html",
+        }
+
+    @property
+    def error(self) -> str:
+        """What figures draw."""
+        return _ERRORS.get(self.protocol.error, self.protocol.error)
+
+    def known(self) -> list[tuple[str, pd.Series]]:
+        """What is known of the problems, in their order: numbers and words, each with its name, and the scene."""
+        found = [(str(name), self.facts[name].reindex(self.problems)) for name in self.facts.columns]
+        return [*found, ("scene", pd.Series(self.scenes))] if self.several else found
+
+    def figures(self, lines: Sequence[Standing]) -> dict[str, Any]:
+        """Errors of some of its lines against what is known of the problems."""
+        shown = drawable([self._line(line) for line in lines])
+        drawn = [(fact_title(name), curves(values, shown, self.scenes)) for name, values in self.known()]
+        return {
+            "legend": legend(shown),
+            "drawn": [{"title": title, "svg": svg} for title, svg in drawn if svg is not None],
+        }
+
+    def _line(self, line: Standing) -> ErrorLine:
+        errors = line.scored.scores[self.protocol.error].to_numpy(dtype=np.float64)
+        return ErrorLine(line.scored.header.method, errors, line.rank is None)
+
+
+def read_split(board: Path, protocol: str, split: str) -> Board:
+    """A split of a board; without lines where it has no entries.
+
+    Raises:
+        RsbenchError: an entry or what is said of the split is damaged.
+    """
+    about = about_split(place(board, protocol, split))
+    return Board(
+        protocol=protocol_of_id(protocol),
+        split=split,
+        fingerprint=about.fingerprint,
+        lines=standings(entries_of(board, protocol, split)),
+        facts=pd.DataFrame.from_dict(about.facts, orient="index"),
+    )
+
+
+def fact_title(name: str) -> str:
+    """``rotation_deg`` as people write it."""
+    found = re.fullmatch(r"(\w+)_(deg|m|px)", name)
+    return (f"{found[1]} ({found[2]})" if found else name).replace("_", " ")

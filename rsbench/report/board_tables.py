@@ -1,0 +1,46 @@
+"""Each table of the leaderboard as CSV, Markdown and LaTeX."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rsbench.benchmark.leaderboard.protocols import Protocol
+from rsbench.benchmark.leaderboard.standings import Standing, table
+from rsbench.benchmark.statistics import in_words
+
+BRIEF = 2
+"""Medians of the tables that show few numbers."""
+
+
+def as_csv(lines: Sequence[Standing]) -> str:
+    """All numbers of a table, with all their digits; no cell begins as a formula does, since names do not."""
+    return table(lines).to_csv(index=False, lineterminator="\n")
+
+
+def as_markdown(lines: Sequence[Standing]) -> str:
+    """The most telling columns; names of methods hold nothing that Markdown reads, but underscores."""
+    head, *rows = ["| " + " | ".join(row) + " |" for row in _brief(lines)]
+    return "\n".join([head, "|" + "---|" * len(_brief(lines)[0]), *rows]).replace("_", r"\_") + "\n"
+
+
+def as_latex(lines: Sequence[Standing]) -> str:
+    """The same as a tabular with the rules of booktabs."""
+    head, *rows = [" & ".join(row).replace("_", r"\_") + r" \\" for row in _brief(lines)]
+    width = len(_brief(lines)[0])
+    begin, end = rf"\begin{{tabular}}{{ll{'r' * (width - 2)}}}", r"\end{tabular}"
+    return "\n".join([begin, r"\toprule", head, r"\midrule", *rows, r"\bottomrule", end, ""])
+
+
+def brief_medians(protocol: Protocol) -> list[str]:
+    """Titles of the most telling ones."""
+    return [score.title for score in protocol.scores if score.kind == "median"][:BRIEF]
+
+
+def _brief(lines: Sequence[Standing]) -> list[list[str]]:
+    protocol = lines[0].protocol
+    rows = [["method", "uses", "rank", protocol.primary.title, "failed", *brief_medians(protocol)]]
+    for line in lines:
+        shares = [in_words(*line.means[key]) for key in (protocol.primary.key, "failure")]
+        medians = [f"{line.medians[key]:.3g}" for key in protocol.of_kind("median")[:BRIEF]]
+        rows.append([line.scored.header.method, line.uses, line.rank_words, *shares, *medians])
+    return rows
