@@ -37,7 +37,7 @@ def test_wrong_covariances_are_told_wrong(factor: float) -> None:
     assert found.spread[0] == pytest.approx(factor**2, rel=0.15)
     assert found.mean == pytest.approx(factor**2, rel=0.1)  # 500 values: standard deviation 2.6 %
     for level, (share, low, high) in zip(LEVELS, found.covers, strict=True):
-        expected = chi2.cdf(chi2.ppf(level, 6) / factor**2)
+        expected = chi2.cdf(chi2.ppf(level, 6) / factor**2, 6)
         assert low < expected < high and (share > level) == (factor < 1.0)
 
 
