@@ -73,7 +73,7 @@ def _of_scene(
     built = time.monotonic()
     rendered = MitsubaScene(seen_scene(scene, sequences[0]))
     loaded = time.monotonic()
-    places = len({place_of(sequence) for sequence in sequences})
+    places = len({repr(place_of(sequence)) for sequence in sequences})
     kinds: dict[str, list[SequenceCard]] = {}
     for sequence in sequences:
         kinds.setdefault(repr((card.sensor_of(sequence), len(sequence.moving))), []).append(sequence)
