@@ -129,7 +129,7 @@ class DatasetCard(Scanning):
     """When given, every sequence is made once per seed under the name NAME-SEED; random axes change with it."""
     grid: dict[str, dict[str, Variation]] = field(default_factory=dict)
     """Axes of named values: every sequence is made once per combination, under the name NAME-VALUE-VALUE."""
-    sequence: tuple[SequenceCard, ...] = field(default=())
+    sequence: tuple[SequenceCard, ...] = ()
 
     def __post_init__(self) -> None:
         check_size("camera", (self.camera.width, self.camera.height))
@@ -250,11 +250,7 @@ class DatasetCard(Scanning):
         return {**manifest, **sensor, **channels, **imu, **matches, **twins, **moving}
 
     def only(self, names: list[str]) -> DatasetCard:
-        """The same card with some of its sequences.
-
-        Raises:
-            RsbenchError: a name that the card does not have.
-        """
+        """The same card with some of its sequences; RsbenchError for a name that it does not have."""
         known = {sequence.name: sequence for sequence in self.sequence}
         for name in names:
             if name not in known:
@@ -368,17 +364,21 @@ def load_dataset_card(
         trajectory: file along which the rig moves, in place of the card's motions.
         seeds: in place of the card's.
 
-    Raises:
-        RsbenchError: as ``rsbench.cards.load_card``, or the file of a trajectory is wrong.
+    Raises RsbenchError as ``rsbench.cards.load_card``, or where the file of a trajectory is wrong.
     """
     path = card_path("datasets", name_or_path)
-    search(path)
-    card = parse_card(DatasetCard, _with_shutters(read_toml(path), str(path)), str(path))
+    card = read_dataset_card(path)
     try:
         card = card if trajectory is None else card.along(trajectory)
         return (replace(card, seeds=seeds) if seeds else card).expanded(path.parent)
     except ValueError as error:
         raise RsbenchError(f"{path}: {error}") from error
+
+
+def read_dataset_card(path: Path) -> DatasetCard:
+    """A dataset card as it stands in its file, nothing drawn; raises as ``load_dataset_card``."""
+    search(path)
+    return parse_card(DatasetCard, _with_shutters(read_toml(path), str(path)), str(path))
 
 
 def _with_shutters(card: dict[str, Any], where: str) -> dict[str, Any]:

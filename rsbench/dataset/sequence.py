@@ -290,8 +290,12 @@ def read_sequence(folder: Path) -> Sequence:
         RsbenchError: no sequence.json, a format of another version, a field that is missing or wrong, or a name
             that is not the folder's.
     """
-    path = inside(folder, "sequence.json")
-    content = read_json(path)
+    return sequence_of(read_json(path := inside(folder, "sequence.json")), path)
+
+
+def sequence_of(content: dict[str, Any], path: Path) -> Sequence:
+    """The sequence of which a sequence.json holds this; the rest as of ``read_sequence``. Opens no file."""
+    folder = path.parent
     manifest = _parsed(SequenceManifest, content, path)
     if manifest.name != (is_named := os.path.basename(os.path.abspath(folder))):
         raise RsbenchError(f"{path}: name = {manifest.name!r}: must be the name of its folder, {is_named!r}")

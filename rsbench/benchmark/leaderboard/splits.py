@@ -229,11 +229,12 @@ def dataset_split(protocol: Protocol, folder: Path, *, public: bool = True) -> S
         check_name(name)
     except ValueError as error:
         raise RsbenchError(f"{folder / 'dataset.json'}: {error}") from error
-    truths = tuple(_rendered(sequence) for sequence in read_pairs(folder))
+    truths = tuple(truth_of(sequence) for sequence in read_pairs(folder))
     return Split(protocol=protocol, label=name, public=public, truths=truths)
 
 
-def _rendered(sequence: Sequence) -> Truth:
+def truth_of(sequence: Sequence) -> Truth:
+    """Of two frames."""
     scene = sequence.manifest.get("scene")
     named = scene.get("name") if isinstance(scene, dict) else None
     facts = {

@@ -1,0 +1,191 @@
+"""Test splits of rendered frames from a secret text: a public part without truth, and the truth from the text again.
+
+Announced are a hash of the text, the fingerprint of the split, and a hash of all files of the keeper's dataset. So
+whoever is told the text afterwards can see that it is the announced one, that it makes the same motions, and, by
+rendering again, the same frames and depth.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from rsbench.benchmark.leaderboard.exporting import check_place, write_inputs
+from rsbench.benchmark.leaderboard.frames import bare_problems, matched_problems, write_frames
+from rsbench.benchmark.leaderboard.protocols import Protocol
+from rsbench.benchmark.leaderboard.splits import Split, dataset_split, truth_of
+from rsbench.cards import card_path, parse_card
+from rsbench.dataset.card import DatasetCard
+from rsbench.dataset.files import sha256, write_json
+from rsbench.dataset.generation import generate_dataset
+from rsbench.dataset.secret import Secret, secret_card, write_scenes
+from rsbench.dataset.sequence import Sequence, read_dataset_manifest, sequence_of
+from rsbench.dataset.workplace import HIDDEN, files_below, workplace
+from rsbench.errors import RsbenchError
+from rsbench.reading import read_json
+
+ANNOUNCEMENT = "announcement.json"
+SCENES, DATA = "scenes", "data"
+"""Of the keeper's folder."""
+FORMAT = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Announcement:
+    """What is told of a secret split before anybody hands in."""
+
+    format: int
+    card: str
+    """Name of the dataset card, and the hash of its file."""
+    card_sha256: str
+    protocol: str
+    split: str
+    fingerprint: str
+    commitment: str
+    """Hash of the secret text."""
+    truth: str
+    """Hash of the names and hashes of all files of the keeper's dataset."""
+    made_by: dict[str, str]
+    """Versions that rendered it: others may round otherwise."""
+    files: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the public files."""
+
+
+def secret_of(protocol: Protocol, text: Secret) -> Secret:
+    """What a split is drawn from. Inputs of other tracks tell the readout ratio, which one track asks for: that has
+    another split."""
+    return Secret(text.digest("track", protocol.track).hex()) if protocol.asks == "readout" else text
+
+
+def drawn_split(protocol: Protocol, card: str, text: Secret) -> Split:
+    """The split that ``publish`` makes, from the text alone; nothing is rendered.
+
+    Raises:
+        RsbenchError: as ``secret_card``; or the protocol asks for what only rendering tells.
+    """
+    if protocol.asks not in ("motion", "readout"):
+        raise RsbenchError(f"track {protocol.track!r}: its truth is rendered; name the keeper's folder with --keep")
+    drawn = secret_card(card, secret_of(protocol, text))
+    pairs = [pair for each in _sequences(drawn) for pair in each.pairs()]
+    return Split(protocol=protocol, label=drawn.name, public=False, truths=tuple(map(truth_of, pairs)))
+
+
+def _sequences(card: DatasetCard) -> list[Sequence]:
+    """As they would be read, had they been rendered."""
+    manifests = [card.manifest_of(each) | {"scene": {"name": each.scene}} for each in card.sequence]
+    return [sequence_of(json.loads(json.dumps(each)), Path(each["name"], "sequence.json")) for each in manifests]
+
+
+def publish(
+    protocol: Protocol,
+    card: str,
+    text: Secret,
+    keep: Path,
+    out: Path,
+    *,
+    workers: int = 1,
+    progress: Callable[[str], None] | None = None,
+) -> Announcement:
+    """Render a secret split into the keeper's folder, and write its inputs and the announcement into another.
+
+    Where ``out`` holds an announcement already, what is made must be what was announced, to the last byte: that is
+    the proof.
+
+    Args:
+        protocol: of a track of frames.
+        card: name or path of a dataset card.
+        text: the secret.
+        keep: gets the scene cards and the dataset, which ``verify`` checks; an interrupted run resumes there.
+        out: gets what everybody may see.
+        workers: processes.
+        progress: as of ``generate_dataset``.
+
+    Raises:
+        RsbenchError: the card has no secret part; a folder holds something else; what was announced is another split.
+    """
+    secret, data = secret_of(protocol, text), keep / DATA
+    drawn = secret_card(card, secret, keep / SCENES)
+    write_scenes(card, secret, keep / SCENES)
+    generate_dataset(drawn, data, workers=workers, progress=progress)
+    split = dataset_split(protocol, data, public=False)
+    made = _announcement(split, card, text, data)
+    announced = read_announcement(out) if (out / ANNOUNCEMENT).exists() else None
+    if announced is not None:
+        _check_same(announced, made, "card_sha256", "commitment", "fingerprint", "truth")
+    check_place(split, out)
+    with workplace(out):
+        images = "images" in protocol.allowed
+        if images:
+            write_frames(data, out)
+        write_inputs(split, bare_problems(data) if images else matched_problems(data), out)
+        names = [name for name in files_below(out) if name != ANNOUNCEMENT and not name.startswith(HIDDEN)]
+        made = replace(made, files={name: sha256(out / name) for name in sorted(names)})
+        if announced is None:
+            write_json(out / ANNOUNCEMENT, vars(made))
+        else:
+            _check_same(announced, made, "files")
+    return made
+
+
+def _announcement(split: Split, card: str, text: Secret, data: Path) -> Announcement:
+    """All but the public files."""
+    first, path = read_dataset_manifest(data).sequences[0], card_path("datasets", card)
+    return Announcement(
+        format=FORMAT,
+        card=path.stem,
+        card_sha256=sha256(path),
+        protocol=split.protocol.id,
+        split=split.name,
+        fingerprint=split.fingerprint,
+        commitment=text.commitment,
+        truth=truth_hash(data),
+        made_by=read_json(data / first / "sequence.json")["made_by"],
+    )
+
+
+def truth_hash(data: Path) -> str:
+    """SHA-256 of the names and hashes of all files of a dataset, which do not depend on where it lies."""
+    listed = {name: file.sha256 for name, file in read_dataset_manifest(data).files.items()}
+    return hashlib.sha256(json.dumps(listed, sort_keys=True).encode()).hexdigest()
+
+
+def read_announcement(folder: Path) -> Announcement:
+    """Of a public part.
+
+    Raises:
+        RsbenchError: it is not there, or damaged.
+    """
+    path = folder / ANNOUNCEMENT
+    if not path.is_file():
+        raise RsbenchError(f"{folder}: has no {ANNOUNCEMENT}: give the folder that rsbench leaderboard publish wrote")
+    found = parse_card(Announcement, read_json(path), str(path), extra="ignore")
+    if found.format != FORMAT:
+        raise RsbenchError(f"{path}: format = {found.format}: this version reads {FORMAT}")
+    return found
+
+
+def announced_split(announced: Announcement, protocol: Protocol, card: str, text: Secret, keep: Path | None) -> Split:
+    """The truth of an announced split: drawn again, or that of the keeper's folder.
+
+    Raises:
+        RsbenchError: the text, the split or the keeper's files are not the announced ones.
+    """
+    if text.commitment != announced.commitment:
+        raise RsbenchError("--seed-file: its text is not the announced one; take the file that publish was given")
+    split = drawn_split(protocol, card, text) if keep is None else dataset_split(protocol, keep / DATA, public=False)
+    found = replace(announced, fingerprint=split.fingerprint)
+    _check_same(announced, found if keep is None else replace(found, truth=truth_hash(keep / DATA)), "truth", "fingerprint")
+    return split
+
+
+def _check_same(announced: Announcement, found: Announcement, *names: str) -> None:
+    """Raises RsbenchError where what was found is not what was announced."""
+    for name in names:
+        if getattr(announced, name) != getattr(found, name):
+            raise RsbenchError(
+                f"{ANNOUNCEMENT}: {name}: what is here is not what was announced: another text, card or dataset, or "
+                f"other versions than {announced.made_by}"
+            )

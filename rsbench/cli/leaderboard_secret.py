@@ -1,0 +1,73 @@
+"""``rsbench leaderboard publish`` and ``score``: test splits of frames that nobody can foresee."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rsbench.cli.kinds import complete
+from rsbench.errors import RsbenchError
+
+_Seed = Annotated[
+    Path, typer.Option("--seed-file", metavar="FILE", help="Secret text, 16 characters or more, drawn at random.")
+]
+_Card = Annotated[
+    str, typer.Option(metavar="CARD", help="Dataset card of the split.", autocompletion=complete("datasets"))
+]
+
+
+def publish(
+    track: Annotated[str, typer.Argument(help="A track of frames, such as pose or pose-own.")],
+    seed_file: _Seed,
+    keep: Annotated[Path, typer.Option(metavar="DIR", help="The keeper's folder: scenes and truth, not to be shown.")],
+    out: Annotated[Path, typer.Option(help="Folder of what everybody may see.")],
+    card: _Card = "standard",
+    workers: Annotated[int, typer.Option(min=1, help="Processes; each renders whole sequences.")] = 1,
+) -> None:
+    """Render a secret test split and write its inputs without the truth. Again over them: proves that they are so."""
+    from rsbench.benchmark.leaderboard import publishing
+    from rsbench.benchmark.leaderboard.protocols import protocol_of_track
+    from rsbench.cli.console import progress_bar
+    from rsbench.dataset.generation import steps_of
+    from rsbench.dataset.secret import read_secret, secret_card
+
+    protocol, text = protocol_of_track(track), read_secret(seed_file)
+    for hidden in (keep, seed_file):
+        if hidden.resolve().is_relative_to(out.resolve()):
+            raise RsbenchError(f"{hidden}: lies in {out}, which everybody may see; take another place")
+    drawn = secret_card(card, text)
+    with progress_bar(f"rendering {drawn.name}", steps_of(drawn) * len(drawn.sequence)) as advance:
+        made = publishing.publish(protocol, card, text, keep, out, workers=workers, progress=advance)
+    typer.echo(f"{made.protocol}, split {made.split}, {len(drawn.sequence)} sequences: {out}")
+    for name in ("commitment", "fingerprint", "truth"):
+        typer.echo(f"{name}: {getattr(made, name)}")
+
+
+def score(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Predictions: JSON lines.")],
+    seed_file: _Seed,
+    published: Annotated[Path, typer.Option(metavar="DIR", help="Folder that publish wrote for everybody.")],
+    board: Annotated[Path, typer.Option(help="Folder of the board.")],
+    card: Annotated[str | None, typer.Option(metavar="CARD", help="Where its card is not rsbench's own.")] = None,
+    keep: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="The keeper's folder, where the truth is depth or frames.")
+    ] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
+) -> None:
+    """Draw the truth of a secret split again from its text, see that it is the announced one, and score with it."""
+    from rsbench.benchmark.leaderboard.board import add
+    from rsbench.benchmark.leaderboard.protocols import protocol_of_id
+    from rsbench.benchmark.leaderboard.publishing import announced_split, read_announcement
+    from rsbench.benchmark.leaderboard.submissions import check_submission
+    from rsbench.benchmark.provenance import provenance
+    from rsbench.dataset.secret import read_secret
+
+    announced = read_announcement(published)
+    protocol, text = protocol_of_id(announced.protocol), read_secret(seed_file)
+    split = announced_split(announced, protocol, card or announced.card, text, keep)
+    for note in check_submission(file, split).notes:
+        typer.echo(f"note: {note}", err=True)
+    scored = add(board, file, split, provenance("rsbench leaderboard score"), replace=replace)
+    typer.echo(f"entry: {scored.folder}")
