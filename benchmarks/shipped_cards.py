@@ -1,8 +1,8 @@
 """Whether ``verify`` passes on what the shipped cards make: sequences of each are rendered and verified.
 
 Of a card with a grid those are taken in which every scene meets every value of every axis, and every two values of
-different axes each other; ``--whole`` takes all. ``--data`` names a folder in which datasets lie already, under the
-names of their cards: they are verified whole, and nothing is written there. Exits with 1 after any finding.
+different axes each other; ``--whole`` takes all. ``--data`` names a folder in which datasets lie already, under
+the names of their cards: they are verified whole, and nothing is written there. Exits with 1 after any finding.
 
     python benchmarks/shipped_cards.py                          all cards
     python benchmarks/shipped_cards.py standard --whole --width 320
@@ -30,7 +30,9 @@ T = TypeVar("T")
 Labels = tuple[str, ...]
 
 ROOT = Path(__file__).resolve().parent.parent
-HEADER = "| card | width, px | sequences | of | findings | CPU-s to make | to verify |\n|---|---|---|---|---|---|---|"
+HEADER = (
+    "| card | width, px | sequences | of | findings | CPU-s to make | to verify |\n|---|---|---|---|---|---|---|"
+)
 
 
 def say(text: str) -> None:
@@ -72,9 +74,7 @@ def share(labels: dict[str, tuple[Labels, str]]) -> list[str]:
 def resized(card: DatasetCard, width: int) -> DatasetCard:
     """The same card with smaller pictures of the same field of view."""
     by = width / card.camera.width
-    camera = replace(
-        card.camera, width=width, height=round(card.camera.height * by), focal=card.camera.focal * by
-    )
+    camera = replace(card.camera, width=width, height=round(card.camera.height * by), focal=card.camera.focal * by)
     return replace(card, camera=camera)
 
 
@@ -118,7 +118,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--whole", action="store_true", help="all sequences of each card")
     parser.add_argument("--width", type=int, help="of the pictures, px (default: the card's)")
     parser.add_argument("--data", type=Path, help="folder of datasets that were made before")
-    parser.add_argument("--out", type=Path, help="folder for what is made, and removed again (default: a temporary one)")
+    parser.add_argument(
+        "--out", type=Path, help="folder for what is made, and removed again (default: a temporary one)"
+    )
     chosen = parser.parse_args(arguments)
     start_backend()
     set_threads(1)  # so that its seconds are those of one CPU

@@ -310,7 +310,9 @@ def _number(value: float) -> str:
 
 
 def register(app: typer.Typer) -> None:
+    from rsbench.cli.leaderboard_secret import publish, score
     from rsbench.cli.leaderboard_smoke import smoke
 
-    board_app.command()(smoke)
+    for command in (smoke, publish, score):
+        board_app.command()(command)
     app.add_typer(board_app, name="leaderboard", help="Tracks, entries, ranks with intervals; for any language.")

@@ -21,12 +21,14 @@ _Card = Annotated[
 def publish(
     track: Annotated[str, typer.Argument(help="A track of frames, such as pose or pose-own.")],
     seed_file: _Seed,
-    keep: Annotated[Path, typer.Option(metavar="DIR", help="The keeper's folder: scenes and truth, not to be shown.")],
+    keep: Annotated[
+        Path, typer.Option(metavar="DIR", help="The keeper's folder: scenes and truth, not to be shown.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder of what everybody may see.")],
     card: _Card = "standard",
     workers: Annotated[int, typer.Option(min=1, help="Processes; each renders whole sequences.")] = 1,
 ) -> None:
-    """Render a secret test split and write its inputs without the truth. Again over them: proves that they are so."""
+    """Render a secret test split, and write its inputs without truth. Run again, it proves what was announced."""
     from rsbench.benchmark.leaderboard import publishing
     from rsbench.benchmark.leaderboard.protocols import protocol_of_track
     from rsbench.cli.console import progress_bar
@@ -56,7 +58,7 @@ def score(
     ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
 ) -> None:
-    """Draw the truth of a secret split again from its text, see that it is the announced one, and score with it."""
+    """Draw the truth of a secret split from its text again, see that it is the announced one, and score."""
     from rsbench.benchmark.leaderboard.board import add
     from rsbench.benchmark.leaderboard.protocols import protocol_of_id
     from rsbench.benchmark.leaderboard.publishing import announced_split, read_announcement

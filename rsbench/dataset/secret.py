@@ -1,8 +1,8 @@
-"""Datasets that nobody can foresee: of a card, with scenes, motions, noise, order and names drawn from a secret text.
+"""Datasets that nobody can foresee: of a card, with scenes, motions, noise, order and names from a secret text.
 
 Whoever has the text draws the same card again. What is drawn for one purpose tells nothing of what is drawn for
-another, nor of the text: all are hashes of it, each with a word of its own before it. A text is announced by such a
-hash too, which is not the seed of anything.
+another, nor of the text: all are hashes of it, each with a word of its own before it. A text is announced by such
+a hash too, which is not the seed of anything.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rsbench.scenes.load import read_scene_card
 SHORTEST = 16
 """Characters of a secret: shorter ones could be tried."""
 _LEAST = 0.7
-"""Of the card's rotation and translation, of which a secret share is taken: sizes of a card are known to all."""
+"""Of the card's rotation, translation and readout ratio a secret share is taken: what a card says, all know."""
 _BITS = 62
 """Of seeds, which TOML and others hold as 64 bits with a sign."""
 _SEED = re.compile(r"^seed *=.*\n", re.MULTILINE)
@@ -69,10 +69,10 @@ def read_secret(path: Path) -> Secret:
 
 
 def secret_card(name_or_path: str, secret: Secret, scenes: Path | None = None) -> DatasetCard:
-    """A card of which every sequence has a motion, a scene's seed and noise of its own, and a name without meaning.
+    """A card of which every sequence has a motion and noise of its own, and a name without meaning.
 
     Each combination of the card's sequences, grid and seeds is there, in a secret order. Sequences do not share a
-    motion, as they do in the card, and their rotation and translation are 0.7 to 1 times the card's.
+    motion, as they do in the card; rotation, translation and readout ratio are 0.7 to 1 times the card's.
 
     Args:
         name_or_path: of a card whose motions are random.
@@ -109,7 +109,9 @@ def write_scenes(name_or_path: str, secret: Secret, folder: Path) -> list[Path]:
     written = []
     for path in sorted(cards, key=lambda card: card.stem):
         if not read_scene_card(path)[1].closed:
-            raise RsbenchError(f"scene {path.stem}: is not built from a seed, so it cannot be hidden; take another")
+            raise RsbenchError(
+                f"scene {path.stem}: is not built from a seed, so it cannot be hidden; take another"
+            )
         text = _SEED.sub("", read_text(path), count=1)
         folder.mkdir(parents=True, exist_ok=True)
         written.append(folder / f"{path.stem}.toml")
@@ -140,17 +142,23 @@ def _motion(single: DatasetCard) -> MotionCard | None:
 
 
 def _drawn(single: DatasetCard, secret: Secret) -> SequenceCard:
-    """The one sequence of a card, all random parts drawn and its sizes made secret; ValueError for what is not random."""
+    """The one sequence of a card, drawn, of secret size; ValueError for what is not random."""
     stated = _motion(single)
     (sequence,) = single.expanded().sequence
     if stated is None or (stated.rotation_axis, stated.translation_axis) != ("random", "random"):
-        raise ValueError(f"{single.sequence[0].name}: motion: a secret split needs both axes to be \"random\"")
+        raise ValueError(f'{single.sequence[0].name}: motion: a secret split needs both axes to be "random"')
     if sequence.moving:
         raise ValueError(f"{single.sequence[0].name}: moving: the card tells where its objects are; take others")
     motion = sequence.motion or stated
     assert motion.rotation_deg is not None and motion.translation is not None
-    less = {
-        name: value * (_LEAST + (1.0 - _LEAST) * secret.share(name, sequence.name))
-        for name, value in (("rotation_deg", motion.rotation_deg), ("translation", motion.translation))
-    }
-    return replace(sequence, motion=replace(motion, **less))  # type: ignore[arg-type]
+    ratio = single.readout_ratio if sequence.readout_ratio is None else sequence.readout_ratio
+
+    def less(name: str, value: float) -> float:
+        return value * (_LEAST + (1.0 - _LEAST) * secret.share(name, sequence.name))
+
+    rotation, translation = less("rotation", motion.rotation_deg), less("translation", motion.translation)
+    return replace(
+        sequence,
+        motion=replace(motion, rotation_deg=rotation, translation=translation),
+        readout_ratio=less("readout", ratio),
+    )

@@ -1,4 +1,4 @@
-"""Test splits of rendered frames from a secret text: a public part without truth, and the truth from the text again.
+"""Test splits of rendered frames from a secret text: a part for everybody, and the truth from the text again.
 
 Announced are a hash of the text, the fingerprint of the split, and a hash of all files of the keeper's dataset. So
 whoever is told the text afterwards can see that it is the announced one, that it makes the same motions, and, by
@@ -55,7 +55,7 @@ class Announcement:
 
 
 def secret_of(protocol: Protocol, text: Secret) -> Secret:
-    """What a split is drawn from. Inputs of other tracks tell the readout ratio, which one track asks for: that has
+    """What a split is drawn from. One track asks for the readout ratio, which the inputs of others tell: it has
     another split."""
     return Secret(text.digest("track", protocol.track).hex()) if protocol.asks == "readout" else text
 
@@ -67,7 +67,9 @@ def drawn_split(protocol: Protocol, card: str, text: Secret) -> Split:
         RsbenchError: as ``secret_card``; or the protocol asks for what only rendering tells.
     """
     if protocol.asks not in ("motion", "readout"):
-        raise RsbenchError(f"track {protocol.track!r}: its truth is rendered; name the keeper's folder with --keep")
+        raise RsbenchError(
+            f"track {protocol.track!r}: its truth is rendered; name the keeper's folder with --keep"
+        )
     drawn = secret_card(card, secret_of(protocol, text))
     pairs = [pair for each in _sequences(drawn) for pair in each.pairs()]
     return Split(protocol=protocol, label=drawn.name, public=False, truths=tuple(map(truth_of, pairs)))
@@ -104,7 +106,7 @@ def publish(
         progress: as of ``generate_dataset``.
 
     Raises:
-        RsbenchError: the card has no secret part; a folder holds something else; what was announced is another split.
+        RsbenchError: a card that hides nothing; a folder with something else; another split was announced.
     """
     secret, data = secret_of(protocol, text), keep / DATA
     drawn = secret_card(card, secret, keep / SCENES)
@@ -160,14 +162,18 @@ def read_announcement(folder: Path) -> Announcement:
     """
     path = folder / ANNOUNCEMENT
     if not path.is_file():
-        raise RsbenchError(f"{folder}: has no {ANNOUNCEMENT}: give the folder that rsbench leaderboard publish wrote")
+        raise RsbenchError(
+            f"{folder}: has no {ANNOUNCEMENT}: give the folder that rsbench leaderboard publish wrote"
+        )
     found = parse_card(Announcement, read_json(path), str(path), extra="ignore")
     if found.format != FORMAT:
         raise RsbenchError(f"{path}: format = {found.format}: this version reads {FORMAT}")
     return found
 
 
-def announced_split(announced: Announcement, protocol: Protocol, card: str, text: Secret, keep: Path | None) -> Split:
+def announced_split(
+    announced: Announcement, protocol: Protocol, card: str, text: Secret, keep: Path | None
+) -> Split:
     """The truth of an announced split: drawn again, or that of the keeper's folder.
 
     Raises:
@@ -175,9 +181,13 @@ def announced_split(announced: Announcement, protocol: Protocol, card: str, text
     """
     if text.commitment != announced.commitment:
         raise RsbenchError("--seed-file: its text is not the announced one; take the file that publish was given")
-    split = drawn_split(protocol, card, text) if keep is None else dataset_split(protocol, keep / DATA, public=False)
+    split = (
+        drawn_split(protocol, card, text) if keep is None else dataset_split(protocol, keep / DATA, public=False)
+    )
     found = replace(announced, fingerprint=split.fingerprint)
-    _check_same(announced, found if keep is None else replace(found, truth=truth_hash(keep / DATA)), "truth", "fingerprint")
+    _check_same(
+        announced, found if keep is None else replace(found, truth=truth_hash(keep / DATA)), "truth", "fingerprint"
+    )
     return split
 
 
@@ -186,6 +196,6 @@ def _check_same(announced: Announcement, found: Announcement, *names: str) -> No
     for name in names:
         if getattr(announced, name) != getattr(found, name):
             raise RsbenchError(
-                f"{ANNOUNCEMENT}: {name}: what is here is not what was announced: another text, card or dataset, or "
-                f"other versions than {announced.made_by}"
+                f"{ANNOUNCEMENT}: {name}: what is here is not what was announced: another text, card or dataset, "
+                f"or other versions than {announced.made_by}"
             )
