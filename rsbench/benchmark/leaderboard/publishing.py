@@ -26,6 +26,7 @@ from rsbench.dataset.sequence import Sequence, read_dataset_manifest, sequence_o
 from rsbench.dataset.workplace import HIDDEN, files_below, workplace
 from rsbench.errors import RsbenchError
 from rsbench.reading import read_json
+from rsbench.scenes.load import read_scene_card
 
 ANNOUNCEMENT = "announcement.json"
 SCENES, DATA = "scenes", "data"
@@ -77,7 +78,9 @@ def drawn_split(protocol: Protocol, card: str, text: Secret) -> Split:
 
 def _sequences(card: DatasetCard) -> list[Sequence]:
     """As they would be read, had they been rendered."""
-    manifests = [card.manifest_of(each) | {"scene": {"name": each.scene}} for each in card.sequence]
+    names = {each.scene for each in card.sequence}
+    scenes = {name: read_scene_card(card_path("scenes", name))[0].name for name in names}
+    manifests = [card.manifest_of(each) | {"scene": {"name": scenes[each.scene]}} for each in card.sequence]
     return [sequence_of(json.loads(json.dumps(each)), Path(each["name"], "sequence.json")) for each in manifests]
 
 
