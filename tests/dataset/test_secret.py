@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,11 @@ from rsbench.errors import RsbenchError
 from rsbench.scenes.load import load_scene, read_scene_card
 
 TEXT = "f3b1 a secret that nobody guesses"
+MOVING = """[[sequence.moving]]
+box = [1, 1, 1]
+position = [0, 0, 9]
+motion = { rotation_deg = 1, rotation_axis = "random", translation = 0.1, translation_axis = "random" }
+"""
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +73,7 @@ def test_names_and_order_tell_nothing(drawn: DatasetCard) -> None:
     assert [each.name for each in drawn.sequence] == [f"s{number:03d}" for number in range(216)]
     scenes = [each.scene for each in drawn.sequence]
     # Of 215 neighbours one in nine is of one scene by chance: 24, with a deviation of 5.
-    assert sum(one == other for one, other in zip(scenes, scenes[1:], strict=False)) < 24 + 5 * 5
+    assert sum(one == other for one, other in pairwise(scenes)) < 24 + 5 * 5
 
 
 def test_what_is_announced_is_no_seed(drawn: DatasetCard, tmp_path: Path) -> None:
@@ -95,7 +101,9 @@ def test_a_scene_of_a_secret_seed_can_be_built(tmp_path: Path) -> None:
     """Its seed is within what builders, TOML and the cache of scenes take."""
     path = next(each for each in write_scenes("standard", Secret(TEXT), tmp_path) if each.stem == "corridor")
     own, open_one = load_scene(path), load_scene("corridor")
-    textures = [[m.material.texture for m in each.meshes if m.material.texture is not None] for each in (own, open_one)]
+    textures = [
+        [m.material.texture for m in each.meshes if m.material.texture is not None] for each in (own, open_one)
+    ]
     assert len(textures[0]) and not all(map(np.array_equal, *textures))
 
 
@@ -104,10 +112,9 @@ def test_a_scene_of_a_secret_seed_can_be_built(tmp_path: Path) -> None:
     [
         ('rotation_axis = "random"', "rotation_axis = [1, 0, 0]"),
         ('translation_axis = "random"', "translation_axis = [1, 0, 0]"),
-        ('scene = "poles"', 'scene = "poles"\n[[sequence.moving]]\nbox = [1, 1, 1]\nposition = [0, 0, 9]\n'
-         'motion = { rotation_deg = 1, rotation_axis = "random", translation = 0.1, translation_axis = "random" }'),
+        ('scene = "poles"', f'scene = "poles"\n{MOVING}'),
     ],
-)  # fmt: skip
+)
 def test_a_card_that_tells_what_is_to_be_hidden_is_refused(change: str, words: str, tmp_path: Path) -> None:
     text = Path("datasets/poles.toml").read_text()
     assert change in text

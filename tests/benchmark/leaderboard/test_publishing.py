@@ -207,7 +207,9 @@ def test_commands_score_by_the_text_and_keep_the_truth_apart(place: Path, card: 
     given = ("--seed-file", place / "seed", "--published", place / "out", "--board", place / "board")
     done = run_here("leaderboard", "score", place / "mine.jsonl", *given, "--card", card)
     assert done.returncode == 0, done.stderr
-    assert (place / "board/pose-own-1" / read_announcement(place / "out").split / "entries/mine/scores.csv").is_file()
+    assert (
+        place / "board/pose-own-1" / read_announcement(place / "out").split / "entries/mine/scores.csv"
+    ).is_file()
     inside = ("--seed-file", place / "seed", "--keep", place / "out/keep", "--out", place / "out")
     refused = run_here("leaderboard", "publish", "pose-own", *inside, "--card", card)
     assert refused.returncode == 2 and "which everybody may see; take another place" in refused.stderr
