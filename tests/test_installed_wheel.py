@@ -98,7 +98,7 @@ def test_the_readme_runs_as_printed(installed: Path, tmp_path: Path, smoke_datas
     )
     shorter = {
         "rsbench verify": " --rerender no",
-        "rsbench evaluate": " --solver gs-8pt",
+        "rsbench evaluate": " --solver gs-8pt --only castle",
         "rsbench simulate": " --trials 2 --solver gs-8pt --workers 1",
     }
     commands = _printed_commands()

@@ -39,13 +39,14 @@ def _descend(
     out: FloatArray,
 ) -> None:
     size = samples.shape[1]
+    want = size > 0  # a literal True would compile all of track_terms once more
     squares = np.zeros(size)
     H, gradient, theta, step = np.zeros((6, 6)), np.zeros(6), np.zeros(6), np.zeros(6)
     trial_H, trial_gradient = np.zeros((6, 6)), np.zeros(6)
     for s in range(len(samples)):
         chosen = tracks[samples[s]]
         theta[:], H[:], gradient[:], damping = 0.0, 0.0, 0.0, _DAMPING
-        track_terms(theta, kernel, chosen, focal, h, baseline, squares, H, gradient, True)
+        track_terms(theta, kernel, chosen, focal, h, baseline, squares, H, gradient, want)
         cost = squares.sum()
         for _ in range(iterations):
             if not damped_step(H, gradient, damping, step):
@@ -53,14 +54,16 @@ def _descend(
                 break
             trial = theta + step
             trial_H[:], trial_gradient[:] = 0.0, 0.0
-            track_terms(trial, kernel, chosen, focal, h, baseline, squares, trial_H, trial_gradient, True)
+            track_terms(trial, kernel, chosen, focal, h, baseline, squares, trial_H, trial_gradient, want)
             if squares.sum() <= cost:
                 cost = squares.sum()
-                theta[:], H[:], gradient[:] = trial, trial_H, trial_gradient
+                theta, H, trial_H, gradient, trial_gradient = trial, trial_H, H, trial_gradient, gradient
                 damping *= 0.1
             else:
                 damping *= 10.0
-        out[s] = theta
+        # Copying by elements, and swapping above: the error of a copy between slices takes a second to compile.
+        for k in range(6):
+            out[s, k] = theta[k]
 
 
 @compiled

@@ -142,7 +142,9 @@ class TwistKernel(MotionKernel):
     ) -> None:
         a = tau1 - tau0
         twist_by_w(a, times(a, (theta[0], theta[1], theta[2])), (theta[3], theta[4], theta[5]), T_w)
-        T_v[:] = A
+        for i in range(3):
+            for j in range(3):
+                T_v[i, j] = A[i, j]
 
     def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
         return np.concatenate([w, np.linalg.solve(so3.left_jacobian(w), d)])
