@@ -237,7 +237,12 @@ def _frame(labels: Sequence[float | str], across: FloatArray, axis: _Axis) -> li
 
 
 def _word(label: float | str) -> str:
-    return label if isinstance(label, str) else f"{label:.2g}" if abs(label) < 100.0 else f"{label:.0f}"
+    return label if isinstance(label, str) else short(label)
+
+
+def short(value: float) -> str:
+    """With two digits, or none behind the point."""
+    return f"{value:.2g}" if abs(value) < 100.0 else f"{value:.0f}"
 
 
 def _stroke(style: str, dash: str) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rsbench.benchmark.leaderboard.standings import Standing
+from rsbench.report.board_figures import short
 from rsbench.report.board_splits import Board, fact_title
 
 _SHADES = 5
@@ -25,7 +26,7 @@ def matrix_context(each: Board) -> dict[str, Any]:
             "page": each.page_of(problem) if each.pages else "",
             "facts": [_fact(each, name, problem) for name in names],
             "cells": [
-                {"value": repr(float(x)), "text": "failed" if lost else f"{x:.2g}", "shade": int(shade)}
+                {"value": repr(float(x)), "text": "failed" if lost else short(x), "shade": int(shade)}
                 for x, lost, shade in zip(errors[:, k], failed[:, k], shades[:, k], strict=True)
             ],
         }
