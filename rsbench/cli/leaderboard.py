@@ -194,11 +194,17 @@ def oracles(track: _Track, board: _Board, data: _Data = None, seed_file: _Secret
 
 
 @board_app.command()
-def build(board: _Board, out: Annotated[Path, typer.Option(help="Folder of the site.")]) -> None:
+def build(
+    board: _Board,
+    out: Annotated[Path, typer.Option(help="Folder of the site.")],
+    data: Annotated[
+        list[Path] | None, typer.Option(metavar="DIR", help="Dataset whose pictures to show; repeatable.")
+    ] = None,
+) -> None:
     """Write the board as a static site, with each table as CSV, Markdown and LaTeX."""
     from rsbench.report.board_page import build_site
 
-    typer.echo(f"page: {build_site(board, out)}")
+    typer.echo(f"page: {build_site(board, out, data or ())}")
 
 
 @board_app.command()

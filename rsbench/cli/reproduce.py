@@ -23,6 +23,8 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench reproduce fig4 --out results --data data         [dim](renders 63 sequences first: 20 minutes)[/dim]
 
+  rsbench reproduce leaderboard --out results --data data  [dim](our solvers on points: 25 minutes of a core)[/dim]
+
   rsbench reproduce everything                             [dim](hours; goes on where it stopped)[/dim]"""
 
 
@@ -39,6 +41,7 @@ class Target(StrEnum):
     correction = "correction"
     sgm = "sgm"
     real = "real"
+    leaderboard = "leaderboard"
     everything = "everything"
 
 
@@ -62,6 +65,7 @@ def reproduce(
             "fig4: its Figure 4 in every scene, for three motions. correction: baselines, ours and oracles on "
             "mild, moderate, aggressive and poles. sgm: stereo matching when the cameras' rows are not in step. "
             "real: the default pipeline on a real camera's frames, beside an ideal one's. "
+            "leaderboard: our solvers on the public split of points, its site, and the scores of the smoke run. "
             "everything: all of these, one after the other, with the time that each took."
         ),
     ],
@@ -99,6 +103,8 @@ def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds
             _correction(out, data, workers)
         elif target is Target.real:
             _real(out, data, seeds, width)
+        elif target is Target.leaderboard:
+            _leaderboard(out, data, workers)
         elif target in (Target.fig4, Target.sgm):
             _depth(target, out, data)
         else:
@@ -109,6 +115,12 @@ def _correction(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.cli.reproduce_correction import correction
 
     correction(out, data, workers)
+
+
+def _leaderboard(out: Path, data: Path, workers: int | None) -> None:
+    from rsbench.cli.reproduce_leaderboard import leaderboard
+
+    leaderboard(out, data, workers)
 
 
 def _real(out: Path, data: Path, seeds: int, width: int | None) -> None:

@@ -13,6 +13,7 @@ from rsbench.benchmark.leaderboard.ranking import score_interval
 from rsbench.benchmark.leaderboard.standings import Standing
 from rsbench.benchmark.statistics import in_words
 from rsbench.report.board_figures import reliability
+from rsbench.report.board_pictures import Album
 from rsbench.report.board_splits import Board, fact_title
 from rsbench.report.board_tables import BRIEF, brief_medians
 
@@ -20,7 +21,7 @@ _ABOUT = ("version", "description", "authors", "paper", "code", "licence", "hard
 _WORST = 10
 
 
-def entry_context(each: Board, line: Standing) -> dict[str, Any]:
+def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
     """Of the template board_entry.html.j2."""
     header = line.scored.header
     said = asdict(header)
@@ -31,7 +32,7 @@ def entry_context(each: Board, line: Standing) -> dict[str, Any]:
         "scores": _scores(line),
         "ties": ", ".join(line.ties),
         "tables": [_by(each, line, name, kinds) for name, kinds in each.known() if _words(kinds)],
-        "worst": _worst(each, line),
+        "worst": _worst(each, line, album),
         "figures_found": each.figures([line, *_best_peer(each, line), *_oracles(each, line)]),
         "calibration": _calibration(line),
     }
@@ -78,7 +79,7 @@ def _by(each: Board, line: Standing, name: str, kinds: pd.Series) -> dict[str, A
     }
 
 
-def _worst(each: Board, line: Standing) -> dict[str, Any]:
+def _worst(each: Board, line: Standing, album: Album) -> dict[str, Any]:
     protocol = each.protocol
     worst = line.scored.scores.sort_values([protocol.error, "problem"], ascending=[False, True]).head(_WORST)
     names = [str(name) for name in each.facts.columns]
@@ -88,7 +89,15 @@ def _worst(each: Board, line: Standing) -> dict[str, Any]:
         known = [each.facts[name].get(case["problem"], "") for name in names]
         words = [f"{value:.3g}" if isinstance(value, float) else str(value) for value in known]
         problem = str(case["problem"])
-        rows.append({"name": problem, "page": f"../{each.page_of(problem)}", "cells": [*numbers, *words]})
+        thumb = album.thumb(problem)
+        rows.append(
+            {
+                "name": problem,
+                "page": f"../{each.page_of(problem)}",
+                "thumb": thumb and f"../{thumb}",
+                "cells": [*numbers, *words],
+            }
+        )
     return {"columns": [*brief_medians(protocol), *map(fact_title, names)], "rows": rows}
 
 

@@ -20,16 +20,20 @@ from rsbench.benchmark.statistics import in_words
 from rsbench.dataset.files import write_bytes
 from rsbench.report.board_entry import entry_context
 from rsbench.report.board_figures import bar
+from rsbench.report.board_pictures import Album
 from rsbench.report.board_problems import matrix_context, problem_contexts
 from rsbench.report.board_splits import Board, read_split
 from rsbench.report.board_tables import as_csv, as_latex, as_markdown
 
 
-def build_site(board: Path, out: Path) -> Path:
+def build_site(board: Path, out: Path, data: Sequence[Path] = ()) -> Path:
     """Write the site of a board into a folder; returns its first page.
 
+    Args:
+        data: datasets, of which pages of their problems show pictures.
+
     Raises:
-        RsbenchError: it is no board, an entry is damaged, or the folder cannot be written.
+        RsbenchError: it is no board, an entry or a dataset is damaged, or the folder cannot be written.
     """
     environment = Environment(
         loader=PackageLoader("rsbench.report"),
@@ -53,10 +57,11 @@ def build_site(board: Path, out: Path) -> Path:
             ("tex", as_latex(each.lines)),
         ):
             write_bytes(out / f"{each.id}.{suffix}", text.encode())
+        album = Album(each, out, data)
         for line in each.lines:
-            write(f"{each.id}/{line.scored.header.method}.html", "board_entry", entry_context(each, line))
-        write(f"{each.id}--problems.html", "board_problems", matrix_context(each))
-        for name, context in problem_contexts(each):
+            write(f"{each.id}/{line.scored.header.method}.html", "board_entry", entry_context(each, line, album))
+        write(f"{each.id}--problems.html", "board_problems", matrix_context(each, album))
+        for name, context in problem_contexts(each, album):
             write(f"{each.id}/problem/{name}.html", "board_problem", context)
     write("index.html", "board", {"splits": [_section(each) for each in boards]})
     return out / "index.html"

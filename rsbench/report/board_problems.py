@@ -9,12 +9,13 @@ import numpy as np
 
 from rsbench.benchmark.leaderboard.standings import Standing
 from rsbench.report.board_figures import short
+from rsbench.report.board_pictures import Album
 from rsbench.report.board_splits import Board, fact_title
 
 _SHADES = 5
 
 
-def matrix_context(each: Board) -> dict[str, Any]:
+def matrix_context(each: Board, album: Album) -> dict[str, Any]:
     """Of the template board_problems.html.j2: a row for each problem, a column for each entry."""
     errors = np.stack([line.scored.scores[each.protocol.error].to_numpy(dtype=np.float64) for line in each.lines])
     failed = np.stack([line.scored.scores["failure"].to_numpy() > 0.0 for line in each.lines])
@@ -24,6 +25,7 @@ def matrix_context(each: Board) -> dict[str, Any]:
         {
             "name": problem,
             "page": each.page_of(problem) if each.pages else "",
+            "thumb": album.thumb(problem),
             "facts": [_fact(each, name, problem) for name in names],
             "cells": [
                 {"value": repr(float(x)), "text": "failed" if lost else short(x), "shade": int(shade)}
@@ -53,7 +55,7 @@ def _fact(each: Board, name: str, problem: str) -> dict[str, str]:
     return {"value": repr(float(value)), "text": f"{value:.3g}"}
 
 
-def problem_contexts(each: Board) -> Iterator[tuple[str, dict[str, Any]]]:
+def problem_contexts(each: Board, album: Album) -> Iterator[tuple[str, dict[str, Any]]]:
     """Names of rendered sequences, and for each the context of the template board_problem.html.j2."""
     if not each.pages:
         return
@@ -69,6 +71,8 @@ def problem_contexts(each: Board) -> Iterator[tuple[str, dict[str, Any]]]:
                 "facts": [(fact_title(str(n)), _fact(each, str(n), problem)["text"]) for n in each.facts.columns],
                 "columns": [{"title": score.title, "hint": score.hint} for score in each.protocol.scores],
                 "rows": [_row(each, line, k) for line in each.lines],
+                "place": f"../pictures/{problem}",
+                "pictures": album.frames(problem),
             },
         )
 
