@@ -18,7 +18,7 @@ from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.files import sha256, write_depth, write_json, write_png, write_poses
-from rsbench.dataset.layout import relative_files
+from rsbench.dataset.layout import Shutter, picture_file, relative_files
 from rsbench.dataset.sequence import UNITS, sequence_manifest
 from rsbench.renderers.options import RendererOptions
 
@@ -73,9 +73,17 @@ def write_analytic_dataset(
     *,
     true_motion: Motion | None = None,
     frames: int = 2,
+    twins: tuple[int, ...] = (),
 ) -> None:
-    """Write a dataset of format 1; ``true_motion`` makes depth and images, ``motion`` is what the rest says."""
-    folder, files = out / "planes", relative_files(frames)
+    """Write a dataset of format 1; ``true_motion`` makes depth and images, ``motion`` is what the rest says.
+
+    ``twins``: rows of global-shutter twins beside that of row 0.
+    """
+    folder = out / "planes"
+    files = [
+        *relative_files(frames),
+        *(picture_file("gs", *v, row, d) for v in views_of(frames) for row in twins for d in (False, True)),
+    ]
     for name in files:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
     camera = rig.camera
@@ -85,16 +93,17 @@ def write_analytic_dataset(
             folder / f"poses/{side}_{frame}.csv", shutter.row_time(np.arange(shutter.height), frame), stated
         )
         rolling = row_poses(rig, shutter, true_motion or motion, side, frame)
-        first = Pose(
-            np.broadcast_to(rolling.R[0], rolling.R.shape), np.broadcast_to(rolling.t[0], rolling.t.shape)
-        )
-        for kind, poses in (("rs", rolling), ("gs", first)):
+        pictures: list[tuple[Shutter, int]] = [("rs", 0), *(("gs", row) for row in (0, *twins))]
+        for kind, row in pictures:
+            still = Pose(*(np.broadcast_to(part[row], part.shape) for part in rolling))
+            poses = rolling if kind == "rs" else still
             depth = plane_depth(camera, poses)
-            write_png(folder / f"{kind}/{side}_{frame}.png", plane_colours(camera, poses, depth))
-            write_depth(folder / f"{kind}_depth/{side}_{frame}.exr", depth)
+            write_png(folder / picture_file(kind, side, frame, row), plane_colours(camera, poses, depth))
+            write_depth(folder / picture_file(kind, side, frame, row, depth=True), depth)
     manifest = sequence_manifest(
         name="planes", rig=rig, shutter=shutter, motion=motion, frame_period_s=0.1, frames=frames
     )
+    manifest |= {"twins": list(twins)} if twins else {}
     manifest |= {
         "scene": {"name": "planes", "sha256": "", "viewpoint": "default", "eye": [0, 0, 0], "target": [0, 1, 0]},
         "renderer": asdict(load_card(RendererOptions, "renderers", "default")),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rsbench.cli.kinds import complete
+from rsbench.cli.leaderboard_tracks import Data, Hidden, Secret, Track, problems_of, split_of, write_frames_of
 from rsbench.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -35,59 +36,71 @@ More: [bold]rsbench docs submit[/bold] and [bold]rsbench docs protocols[/bold]""
 
 board_app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", epilog=EPILOG)
 
-_Track = Annotated[str, typer.Argument(help="points, pose (given matches), pose-own (own matches) or readout.")]
-_Data = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="Dataset (a dataset.json) of all tracks but points.")
-]
-_Secret = Annotated[
-    Path | None, typer.Option("--seed-file", metavar="FILE", help="Text from which a secret test split is drawn.")
-]
-_Hidden = Annotated[
-    bool, typer.Option("--secret", help="The dataset's truth is not to be told: not exported, not used by check.")
-]
 _Board = Annotated[Path, typer.Option(help="Folder of the board.")]
-_File = Annotated[Path, typer.Argument(metavar="FILE", help="Predictions: JSON lines.")]
+_File = Annotated[
+    Path,
+    typer.Argument(metavar="FILE", help="Predictions: JSON lines; the folder 'pictures' beside it is read too."),
+]
 
 
 @board_app.command()
 def export(
-    track: _Track,
+    track: Track,
     out: Annotated[Path, typer.Option(help="Folder for the inputs.")],
-    data: _Data = None,
-    seed_file: _Secret = None,
-    secret: _Hidden = False,
+    data: Data = None,
+    seed_file: Secret = None,
+    secret: Hidden = False,
 ) -> None:
     """Write the inputs of a track for any language; of a public split the truth too."""
     from rsbench.benchmark.leaderboard.exporting import check_place, write_inputs
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.workplace import workplace
 
-    split = _split(track, data, seed_file, secret)
+    split = split_of(track, data, seed_file, secret)
     check_place(split, out)
     with workplace(out), progress_bar(f"exporting {split.name}", len(split.truths)) as advance:
         if data is not None and "images" in split.protocol.allowed:
-            from rsbench.benchmark.leaderboard.frames import write_frames
-
-            write_frames(data, out)
-        write_inputs(split, _counted(_problems(split, data, seed_file), advance), out)
+            write_frames_of(split, data, out)
+        write_inputs(split, _counted(problems_of(split, data, seed_file), advance), out)
     typer.echo(f"{split.protocol.id}, split {split.name}, {len(split.truths)} problems: {out}")
     typer.echo(f"fingerprint: {split.fingerprint}")
 
 
 @board_app.command()
-def template(track: _Track, data: _Data = None, seed_file: _Secret = None) -> None:
+def template(
+    track: Track,
+    data: Data = None,
+    seed_file: Secret = None,
+    out: Annotated[Path | None, typer.Option(help="New folder for it; needed where pictures are asked.")] = None,
+) -> None:
     """Print a file of predictions that is in order: fill in your own."""
+    from rsbench.benchmark.leaderboard.picture_oracles import write_template
     from rsbench.benchmark.leaderboard.submissions import template_text
+    from rsbench.dataset.files import write_bytes
 
-    typer.echo(template_text(_split(track, data, seed_file)), nl=False)
+    split = split_of(track, data, seed_file)
+    if out is None:
+        if split.protocol.pictures:
+            raise RsbenchError(f"--out: the track {track!r} asks for pictures; name a new folder for the example")
+        typer.echo(template_text(split), nl=False)
+        return
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise RsbenchError(f"--out {out}: is there already; choose a new folder")
+    out.mkdir(parents=True, exist_ok=True)
+    if split.protocol.pictures:
+        path = write_template(split, out)
+    else:
+        path = out / "predictions.jsonl"
+        write_bytes(path, template_text(split).encode())
+    typer.echo(str(path))
 
 
 @board_app.command()
-def check(file: _File, data: _Data = None, seed_file: _Secret = None, secret: _Hidden = False) -> None:
+def check(file: _File, data: Data = None, seed_file: Secret = None, secret: Hidden = False) -> None:
     """Say all that is wrong with a file of predictions. Exit code 2: it cannot be scored; 1: it can, but look."""
     from rsbench.benchmark.leaderboard.submissions import check_submission
 
-    found = check_submission(file, _split(_track_of(file), data, seed_file, secret))
+    found = check_submission(file, split_of(_track_of(file), data, seed_file, secret))
     for fault in found.faults:
         typer.echo(f"fault: {' '.join(fault.split())}", err=True)
     for note in found.notes:
@@ -101,9 +114,9 @@ def check(file: _File, data: _Data = None, seed_file: _Secret = None, secret: _H
 def submit(
     file: _File,
     board: _Board,
-    data: _Data = None,
-    seed_file: _Secret = None,
-    secret: _Hidden = False,
+    data: Data = None,
+    seed_file: Secret = None,
+    secret: Hidden = False,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
 ) -> None:
     """Score a file of predictions and add it to a board."""
@@ -111,7 +124,7 @@ def submit(
     from rsbench.benchmark.leaderboard.submissions import check_submission
     from rsbench.benchmark.provenance import provenance
 
-    split = _split(_track_of(file), data, seed_file, secret)
+    split = split_of(_track_of(file), data, seed_file, secret)
     for note in check_submission(file, split).notes:
         typer.echo(f"note: {note}", err=True)
     scored = add(board, file, split, provenance("rsbench leaderboard submit"), replace=replace)
@@ -120,38 +133,32 @@ def submit(
 
 @board_app.command()
 def run(
-    track: _Track,
+    track: Track,
     entry: Annotated[
         list[str],
-        typer.Option(help="Solver to run, a name or a card; repeatable.", autocompletion=complete("solvers")),
+        typer.Option(
+            help="Solver, stereo matcher (depth) or corrector (correction), a name or a card; repeatable.",
+            autocompletion=complete("solvers"),
+        ),
     ],
     board: _Board,
-    data: _Data = None,
-    seed_file: _Secret = None,
-    secret: _Hidden = False,
+    data: Data = None,
+    seed_file: Secret = None,
+    secret: Hidden = False,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     time_limit: Annotated[
         float | None, typer.Option(min=0.001, help="Seconds per problem for solvers of other packages.")
     ] = None,
 ) -> None:
-    """Run solvers of cards on a track, keep what they predict, and score it. An interrupted run goes on there."""
+    """Run cards on a track, keep what they predict, and score it. An interrupted run goes on there."""
     from rsbench.benchmark.leaderboard.board import RUN, add, made_by
-    from rsbench.benchmark.leaderboard.running import load_entries, prepare_inputs, run_cards, steps_of
     from rsbench.benchmark.provenance import provenance
-    from rsbench.cli.console import progress_bar
-    from rsbench.dataset.workplace import workplace
 
-    split = _split(track, data, seed_file, secret)
-    if "images" in split.protocol.allowed:
+    split = split_of(track, data, seed_file, secret)
+    if track == "pose-own":
         raise RsbenchError(f"track {track!r}: solvers of cards take given matches; run them on the track 'pose'")
-    load_entries(entry, split.protocol)  # before anything is written
-    with workplace(board) as hidden, progress_bar(f"running {split.name}", steps_of(entry, split)) as advance:
-        place = hidden / "runs" / split.protocol.id / split.name
-        place.mkdir(parents=True, exist_ok=True)
-        prepare_inputs(split, lambda: _problems(split, data, seed_file), place / "inputs")
-        files = run_cards(
-            entry, split, place / "inputs", place, workers=workers, time_limit_s=time_limit, step=advance
-        )
+    _load_cards(entry, split)  # before anything is written
+    files = _predict(entry, split, board, data, seed_file, workers, time_limit)
     for file in files:
         add(board, file, split, provenance(RUN), replace=made_by(board, split, file.parent.name) == RUN)
     _show(board, split.protocol.id, split.name, None)
@@ -177,19 +184,28 @@ def show(
 
 
 @board_app.command()
-def oracles(track: _Track, board: _Board, data: _Data = None, seed_file: _Secret = None) -> None:
-    """Add the truth and, on the track points, what the Cramer-Rao bound allows, as rows without a rank."""
-    from rsbench.benchmark.leaderboard.board import add_texts
+def oracles(track: Track, board: _Board, data: Data = None, seed_file: Secret = None) -> None:
+    """Add the truth and others that know it, as rows without a rank; to correction, frames as they are too."""
+    import tempfile
+
+    from rsbench.benchmark.leaderboard.board import add, add_texts
     from rsbench.benchmark.leaderboard.oracles import bound_text
+    from rsbench.benchmark.leaderboard.picture_oracles import write_oracles
     from rsbench.benchmark.leaderboard.splits import seed_of
     from rsbench.benchmark.leaderboard.submissions import truth_text
     from rsbench.benchmark.provenance import provenance
 
-    split = _split(track, data, seed_file)
+    split = split_of(track, data, seed_file)
     if not split.public:
         raise RsbenchError(f"split {split.name}: its truth is secret, and would be told as an entry of the board")
-    texts = [truth_text(split), *([bound_text(split, seed_of(None))] if data is None else [])]
-    add_texts(board, texts, split, provenance("rsbench leaderboard oracles"))
+    made = provenance("rsbench leaderboard oracles")
+    if split.protocol.pictures:
+        with tempfile.TemporaryDirectory() as folder:
+            for path in write_oracles(split, Path(folder)):
+                add(board, path, split, made, replace=True)
+    else:
+        texts = [truth_text(split), *([bound_text(split, seed_of(None))] if data is None else [])]
+        add_texts(board, texts, split, made)
     _show(board, split.protocol.id, split.name, "truth")
 
 
@@ -219,46 +235,57 @@ def merge(
 
 
 @board_app.command()
-def rescore(track: _Track, board: _Board, data: _Data = None, seed_file: _Secret = None) -> None:
+def rescore(track: Track, board: _Board, data: Data = None, seed_file: Secret = None) -> None:
     """Score the stored predictions again and say which scores changed; runs no method."""
     from rsbench.benchmark.leaderboard.board import rescore
 
-    changed = rescore(board, _split(track, data, seed_file))
+    changed = rescore(board, split_of(track, data, seed_file))
     for method, columns in changed.items():
         typer.echo(f"{method}: other scores: {', '.join(columns)}")
     if changed:
         raise typer.Exit(1)
 
 
-def _split(track: str, data: Path | None, seed_file: Path | None, secret: bool = False) -> Split:
-    from rsbench.benchmark.leaderboard.protocols import protocol_of_track
-    from rsbench.benchmark.leaderboard.splits import dataset_split, points_split
+def _predict(
+    entry: list[str],
+    split: Split,
+    board: Path,
+    data: Path | None,
+    seed_file: Path | None,
+    workers: int,
+    time_limit: float | None,
+) -> list[Path]:
+    """Files of predictions of cards, in the hidden folder of the board."""
+    from rsbench.benchmark.leaderboard.picture_running import run_picture_cards
+    from rsbench.benchmark.leaderboard.running import prepare_inputs, run_cards, steps_of
+    from rsbench.cli.console import progress_bar
+    from rsbench.dataset.workplace import workplace
 
-    protocol = protocol_of_track(track)
-    if track == "points":
-        if data is not None:
-            raise RsbenchError(f"--data {data}: the problems of points are simulated; leave it out")
-        if secret and seed_file is None:
-            raise RsbenchError("--secret: of the track 'points' a --seed-file makes a secret split; leave it out")
-        return points_split(protocol, seed_file)
-    if data is None:
-        raise RsbenchError(
-            f"--data: the track {track!r} needs the folder of a dataset; make one with rsbench generate"
+    steps = len(split.truths) if split.protocol.pictures else steps_of(entry, split)
+    with workplace(board) as hidden, progress_bar(f"running {split.name}", steps) as advance:
+        place = hidden / "runs" / split.protocol.id / split.name
+        place.mkdir(parents=True, exist_ok=True)
+        prepare_inputs(
+            split,
+            lambda: problems_of(split, data, seed_file),
+            place / "inputs",
+            lambda folder: write_frames_of(split, data, folder) if data and split.protocol.pictures else None,
         )
-    if seed_file is not None:
-        raise RsbenchError(f"--seed-file {seed_file}: a dataset has its own seed; leave it out, and say --secret")
-    return dataset_split(protocol, data, public=not secret)
+        if split.protocol.pictures:
+            files = run_picture_cards(entry, split, place / "inputs", place, workers=workers, step=advance)
+        else:
+            files = run_cards(
+                entry, split, place / "inputs", place, workers=workers, time_limit_s=time_limit, step=advance
+            )
+    return files
 
 
-def _problems(split: Split, data: Path | None, secret: Path | None) -> Iterator[Problem]:
-    from rsbench.benchmark.leaderboard.splits import seed_of, simulated_problem
+def _load_cards(cards: list[str], split: Split) -> None:
+    """Raises RsbenchError when one of them is wrong, or is none of the track's kind."""
+    from rsbench.benchmark.leaderboard.picture_running import load_chains
+    from rsbench.benchmark.leaderboard.running import load_entries
 
-    if data is None:
-        seed = seed_of(secret)
-        return (simulated_problem(seed, number) for number in range(len(split.truths)))
-    from rsbench.benchmark.leaderboard.frames import bare_problems, matched_problems
-
-    return bare_problems(data) if "images" in split.protocol.allowed else matched_problems(data)
+    (load_chains if split.protocol.pictures else load_entries)(cards, split.protocol)
 
 
 def _counted(problems: Iterator[Problem], advance: object) -> Iterator[Problem]:
@@ -306,7 +333,7 @@ def _cells(line: Standing) -> dict[str, str]:
     for score in line.protocol.scores:
         if score.key in ("flip", "failure"):
             cells[score.title] = f"{100.0 * line.means[score.key][0]:.1f} %"
-        elif score.key in ("e_R_deg", "e_T_deg", "e_readout"):
+        elif score.key in ("e_R_deg", "e_T_deg", "e_readout", "abs_rel", "psnr", "epe_px"):
             cells[score.title.removesuffix(" (deg)")] = _number(line.medians[score.key])
     return cells
 

@@ -24,9 +24,11 @@ from rsbench.benchmark.scoring import answered, score
 from rsbench.core.rig import VIEWS, Side, View
 from rsbench.dataset.corrected_frames import read_origin
 from rsbench.dataset.files import read_png
+from rsbench.dataset.sequence import Sequence
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import Pairs
 from rsbench.vision.corrector import load_corrector
 from rsbench.vision.fusion import Origin
 from rsbench.vision.stereo_depth import seen_by_other
@@ -203,11 +205,25 @@ class Scorer:
 
     @cached_property
     def _visible(self) -> dict[View, NDArray[np.bool_]]:
-        """Pixels of the corrected frame whose place the rolling-shutter frame saw, by true depth and motion."""
         images = {view: self.sequence.image("rs", *view) for view in VIEWS}
-        given = Given(motion=self.sequence.motion, pairs=true_pairs(self.sequence, images))
-        options = CorrectionOptions(corrector=load_corrector("single-view"), depth_from_motion=False)
-        ratio = self.sequence.shutter.readout_ratio
-        scanning = self.sequence.shutter.scanning
-        found = correct_four(images, self.sequence.rig, ratio, options, given=given, scanning=scanning)
-        return {view: fused.origin == Origin.HERE for view, fused in found.frames.items()}
+        return visible_pixels(self.sequence, true_pairs(self.sequence, images), VIEWS)
+
+
+def visible_pixels(
+    sequence: Sequence, pairs: Pairs, views: tuple[View, ...], target_row: float = 0.0
+) -> dict[View, NDArray[np.bool_]]:
+    """Pixels (H, W) of corrected frames whose place the rolling-shutter frame saw, by true depth and motion.
+
+    Args:
+        pairs: the frames with their true depth.
+        views: the frames that are wanted.
+        target_row: at whose time.
+    """
+    images = {(side, frame): pairs[frame].images[side] for side, frame in VIEWS}
+    given = Given(motion=sequence.motion, pairs=pairs)
+    options = CorrectionOptions(
+        corrector=load_corrector("single-view"), depth_from_motion=False, target_row=target_row
+    )
+    ratio, scanning = sequence.shutter.readout_ratio, sequence.shutter.scanning
+    found = correct_four(images, sequence.rig, ratio, options, given=given, views=views, scanning=scanning)
+    return {view: fused.origin == Origin.HERE for view, fused in found.frames.items()}

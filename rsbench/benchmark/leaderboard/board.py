@@ -3,6 +3,7 @@
     board.json                                    the format
     <protocol>/<split>/split.json                 which split it is; facts of its problems where those are public
     <protocol>/<split>/entries/<method>/predictions.jsonl, scores.csv, entry.json
+    <protocol>/<split>/entries/<method>/pictures/<problem>/NAME   depth maps or corrected frames, where asked
 
 An entry is written under another name and renamed, so that it is there whole or not at all.
 """
@@ -10,23 +11,26 @@ An entry is written under another name and renamed, so that it is there whole or
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import os
-import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from rsbench.benchmark.leaderboard.answers import Header
 from rsbench.benchmark.leaderboard.exporting import split_record
 from rsbench.benchmark.leaderboard.marking import mark
+from rsbench.benchmark.leaderboard.picture_files import FOLDER as PICTURES
+from rsbench.benchmark.leaderboard.picture_files import copy_pictures, find_picture, picture_bytes
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS, protocol_of_id
 from rsbench.benchmark.leaderboard.splits import Split
-from rsbench.benchmark.leaderboard.submissions import SUBMISSION_BYTES, Header, Submission, read_submission
+from rsbench.benchmark.leaderboard.submissions import SUBMISSION_BYTES, Submission, read_submission
 from rsbench.cards import parse_card
 from rsbench.dataset.files import read_table, write_bytes, write_json, write_table
 from rsbench.dataset.workplace import WORK, workplace
@@ -49,6 +53,8 @@ class Recorded:
     predictions_sha256: str
     fingerprint: str
     """Of the split."""
+    pictures: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of each, by its path below ``pictures``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +77,8 @@ class Scored:
     predictions_sha256: str
     scores: pd.DataFrame
     """One row for each problem, see ``marking.mark``."""
+    pictures: dict[str, str]
+    """SHA-256 of each, by its path below the folder ``pictures`` of the entry."""
 
 
 def add(board: Path, predictions: Path, split: Split, made: dict[str, Any], *, replace: bool = False) -> Scored:
@@ -88,10 +96,13 @@ def add(board: Path, predictions: Path, split: Split, made: dict[str, Any], *, r
     with workplace(board) as hidden:
         _open(board)
         folder = place(board, split.protocol.id, split.name) / "entries" / submission.header.method
+        new = hidden / WORK / "entry"
+        kept = copy_pictures(submission.pictures, _pictures_of(submission, split), new / PICTURES)
         if not replace:
-            _refuse_another(folder, hashlib.sha256(data).hexdigest())
+            _refuse_another(folder, hashlib.sha256(data).hexdigest(), kept)
         _write_split(board, split)
-        _put(hidden / WORK / "entry", folder, _contents(submission, data, split, made))
+        submission = dataclasses.replace(submission, pictures=new / PICTURES)
+        _put(new, folder, _contents(submission, data, split, made, kept))
     return _read_entry(folder)
 
 
@@ -113,14 +124,25 @@ def made_by(board: Path, split: Split, method: str) -> str:
     return str(made.get("command", "")) if isinstance(made, dict) else ""
 
 
+def _pictures_of(submission: Submission, split: Split) -> Iterator[str]:
+    """Paths below ``pictures`` of all that the answers hold."""
+    for truth in split.truths:
+        answer = submission.answers.get(truth.name)
+        if truth.pictures is not None and answer is not None and answer.success:
+            for asked in truth.pictures.asked:
+                found = find_picture(submission.pictures, truth.name, asked, split.protocol.asks)
+                yield f"{truth.name}/{found.name}"
+
+
 def _contents(
-    submission: Submission, data: bytes, split: Split, made: dict[str, Any]
+    submission: Submission, data: bytes, split: Split, made: dict[str, Any], pictures: dict[str, str]
 ) -> tuple[bytes, pd.DataFrame, dict[str, Any]]:
-    record = {
+    record: dict[str, Any] = {
         "format": FORMAT,
         "header": asdict(submission.header),
         "predictions_sha256": hashlib.sha256(data).hexdigest(),
         "fingerprint": split.fingerprint,
+        **({"pictures": pictures} if pictures else {}),
         "made": made,
     }
     return data, mark(submission, split), record
@@ -129,7 +151,7 @@ def _contents(
 def _put(new: Path, folder: Path, contents: tuple[bytes, pd.DataFrame, dict[str, Any]]) -> None:
     """Write an entry aside, and rename it to its place."""
     data, scores, record = contents
-    new.mkdir(parents=True)
+    new.mkdir(parents=True, exist_ok=True)
     write_bytes(new / FILES[0], data)
     write_table(new / FILES[1], scores)
     write_json(new / FILES[2], record)
@@ -178,8 +200,11 @@ def _write_split(board: Path, split: Split) -> None:
     write_json(path, {**split_record(split), "facts": facts})
 
 
-def _refuse_another(folder: Path, sha256: str) -> None:
-    if folder.is_dir() and read_json(folder / FILES[2]).get("predictions_sha256") != sha256:
+def _refuse_another(folder: Path, sha256: str, pictures: dict[str, str]) -> None:
+    if not folder.is_dir():
+        return
+    there = read_json(folder / FILES[2])
+    if (there.get("predictions_sha256"), there.get("pictures", {})) != (sha256, pictures):
         raise RsbenchError(
             f"{folder}: is an entry of that name with other predictions; rename the method, or replace the entry "
             "with --replace"
@@ -238,6 +263,7 @@ def _read_entry(folder: Path) -> Scored:
         header=record.header,
         predictions_sha256=record.predictions_sha256,
         scores=_read_scores(folder, record.header.protocol),
+        pictures=record.pictures,
     )
 
 
@@ -291,11 +317,11 @@ def merge(other: Path, board: Path) -> list[str]:
     with workplace(board) as hidden:
         _open(board)
         for scored, folder in theirs:
-            _refuse_another(folder, scored.predictions_sha256)
+            _refuse_another(folder, scored.predictions_sha256, scored.pictures)
         for number, (scored, folder) in enumerate(theirs):
             if not folder.exists():
                 new = hidden / WORK / str(number)
-                shutil.copytree(scored.folder, new, ignore=lambda _, names: [n for n in names if n not in FILES])
+                _copy(scored, new)
                 about = folder.parents[1] / "split.json"
                 if not about.exists():
                     about.parent.mkdir(parents=True, exist_ok=True)
@@ -303,6 +329,23 @@ def merge(other: Path, board: Path) -> list[str]:
                 _move(new, folder)
                 copied.append("/".join(folder.parts[-4:-2]) + f"/{folder.name}")
     return copied
+
+
+def _copy(scored: Scored, new: Path) -> None:
+    """An entry of another board, and nothing else that lies in its folder."""
+    new.mkdir(parents=True)
+    for name in FILES:
+        write_bytes(new / name, read_bytes(scored.folder / name))
+    copied = copy_pictures(scored.folder / PICTURES, scored.pictures, new / PICTURES)
+    _check_pictures(scored.folder / PICTURES, scored.pictures, copied)
+
+
+def _check_pictures(folder: Path, pictures: dict[str, str], found: dict[str, str]) -> None:
+    for name, digest in pictures.items():
+        if found[name] != digest:
+            raise RsbenchError(
+                f"{folder / name}: has changed since it was scored; remove the entry, and submit it again"
+            )
 
 
 def rescore(board: Path, split: Split) -> dict[str, list[str]]:
@@ -316,16 +359,20 @@ def rescore(board: Path, split: Split) -> dict[str, list[str]]:
     """
     changed: dict[str, list[str]] = {}
     _check_board(board)
-    with workplace(board) as hidden:
+    with workplace(board):
         for folder in _folders(place(board, split.protocol.id, split.name) / "entries"):
             record, path, old = _read_record(folder), folder / FILES[0], pd.DataFrame()
             with contextlib.suppress(RsbenchError):
                 old = _read_scores(folder, split.protocol.id)
-            submission, data = read_submission(path, split), read_bytes(path)
+            stored = {
+                name: hashlib.sha256(picture_bytes(folder / PICTURES, name)).hexdigest()
+                for name in record.pictures
+            }
+            _check_pictures(folder / PICTURES, record.pictures, stored)
+            submission = read_submission(path, split)
             if submission.header != record.header:
                 raise RsbenchError(f"{path}: its header is not that of {FILES[2]}; submit it again")
-            made = read_json(folder / FILES[2]).get("made", {})
-            _put(hidden / WORK / folder.name, folder, _contents(submission, data, split, made))
+            write_table(folder / FILES[1], mark(submission, split))
             now = _read_entry(folder).scores
             if columns := [str(name) for name in now if not now[name].equals(old.get(name, pd.Series()))]:
                 changed[folder.name] = columns

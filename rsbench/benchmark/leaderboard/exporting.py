@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.benchmark.images.store import read_record
+from rsbench.benchmark.leaderboard.picture_oracles import write_truth
 from rsbench.benchmark.leaderboard.protocols import Protocol
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import truth_text
+from rsbench.benchmark.leaderboard.true_pictures import VIEW
 from rsbench.dataset.files import save_arrays, write_bytes, write_json
 from rsbench.dataset.workplace import HIDDEN, named
 from rsbench.errors import RsbenchError
@@ -56,7 +58,11 @@ def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:
         if rows:
             write_bytes(out / f"{key}.csv", _csv(("name", *names.split(", ")), rows))
     save_arrays(out / "problems.npz", _arrays(given, columns))
-    if split.public:
+    if split.protocol.asks == "frames":
+        write_bytes(out / "pictures.csv", _csv(("name", "picture", "row", "time"), _asked(split)))
+    if split.public and split.protocol.pictures:
+        write_truth(split, out, "truth.jsonl")
+    elif split.public:
         write_bytes(out / "truth.jsonl", truth_text(split).encode())
     write_json(out / "split.json", split_record(split))
 
@@ -88,6 +94,13 @@ def _record(problem: Problem, protocol: Protocol) -> dict[str, Any]:
 def _rig(problem: Problem, columns: Sequence[str]) -> tuple[float, ...]:
     values = (getattr(problem.rig.camera, key) for key in RIG[:6])
     return (*values, problem.rig.baseline, problem.shutter.readout_ratio)[: len(columns)]
+
+
+def _asked(split: Split) -> Iterator[tuple[str, str, int, float]]:
+    """Each picture that is asked, with the row at whose time, and that time."""
+    for truth in split.truths:
+        for each in truth.pictures.asked if truth.pictures else ():
+            yield truth.name, each.stem, each.row, float(truth.shutter.time_after(each.row, VIEW[1], VIEW[0]))
 
 
 def _csv(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:

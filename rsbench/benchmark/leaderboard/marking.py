@@ -11,9 +11,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.leaderboard.protocols import AUC_DEG, AUC_READOUT, FLIP_DEG, SUCCESS_DEG
+from rsbench.benchmark.leaderboard.answers import Answer
+from rsbench.benchmark.leaderboard.picture_marking import depth_scores, frame_scores
+from rsbench.benchmark.leaderboard.picture_files import read_answer_depth, read_answer_frame
+from rsbench.benchmark.leaderboard.protocols import (
+    AUC_DEG,
+    AUC_READOUT,
+    FLIP_DEG,
+    SUCCESS_DEG,
+    protocol_of_id,
+)
 from rsbench.benchmark.leaderboard.splits import Split, Truth
-from rsbench.benchmark.leaderboard.submissions import Answer, Submission
+from rsbench.benchmark.leaderboard.submissions import Submission
 from rsbench.benchmark.scoring import answered, pose_errors
 from rsbench.core import so3
 from rsbench.core.metrics import translation_of_offset
@@ -28,11 +37,32 @@ Row = dict[str, Any]
 
 
 def mark(submission: Submission, split: Split) -> pd.DataFrame:
-    """One row for each problem, in the order of the split; the columns are those of docs/submit.md."""
+    """One row for each problem, in the order of the split; the columns are those of docs/submit.md.
+
+    Raises:
+        RsbenchError: a picture is at fault, or the truth has changed since the split was read.
+    """
     model, found = submission.header.motion_model, submission.answers
+    if split.protocol.pictures:
+        return pd.DataFrame([_picture_row(truth, submission) for truth in split.truths])
     if split.protocol.asks == "readout":
         return pd.DataFrame([_readout_row(truth, found.get(truth.name)) for truth in split.truths])
     return pd.DataFrame([_motion_row(truth, found.get(truth.name), model) for truth in split.truths])
+
+
+def _picture_row(truth: Truth, submission: Submission) -> Row:
+    """Of pictures, which are read here, one problem at a time."""
+    answer, pictures, folder = submission.answers.get(truth.name), truth.pictures, submission.pictures
+    assert pictures is not None
+    success = answer is not None and answer.success
+    pictures.check()
+    if protocol_of_id(submission.header.protocol).asks == "depth":
+        depth = read_answer_depth(folder, truth, submission.header.png_unit_m) if success else None
+        scores = depth_scores(pictures, depth)
+    else:
+        frames = [read_answer_frame(folder, truth, each) for each in pictures.asked] if success else None
+        scores = frame_scores(pictures, frames)
+    return {**_named(truth, success), **scores, **_last(success, answer)}
 
 
 def _readout_row(truth: Truth, answer: Answer | None) -> Row:

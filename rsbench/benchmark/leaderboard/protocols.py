@@ -18,6 +18,8 @@ KNOWLEDGE = {
     "links": "which matches of the two cameras are of one point",
     "readout": "the readout ratio",
     "images": "the images, and with them matches of its own",
+    "stereo": "images of the other camera",
+    "time": "images of the other time",
     "gyro": "the angular rates of a gyroscope",
     "truth": "the truth: an oracle, which has no rank",
 }
@@ -31,6 +33,8 @@ FLIP_DEG = 90.0
 """A direction that is wrong by more is the opposite one."""
 SUCCESS_DEG = (1.0, 5.0)
 """A success errs by less in rotation and direction, as in the sweeps of simulated points."""
+Asks = Literal["motion", "readout", "depth", "frames"]
+Kind = Literal["share", "median"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,9 +45,14 @@ class Score:
     title: str
     hint: str
     """What it is, in a line."""
-    kind: Literal["share", "median"]
+    kind: Kind
     """A share lies in [0, 1]: its mean over scenes has an interval. Of others the median over problems is told."""
     better: Literal["lower", "higher"] = "lower"
+
+    @property
+    def sign(self) -> float:
+        """What makes more of it better."""
+        return 1.0 if self.better == "higher" else -1.0
 
 
 _FAILED = Score(key="failure", title="failed", hint="share of problems without an answer", kind="share")
@@ -86,11 +95,82 @@ _READOUT = (
     Score(key="e_readout", title="error", hint="median error of the readout ratio", kind="median"),
     _SECONDS,
 )
+_DEPTH = (
+    Score(
+        key="bad_1",
+        title="bad@1",
+        hint="share of surface wrong by over 1 px of disparity or unknown",
+        kind="share",
+    ),
+    *(
+        Score(key=f"bad_{limit}", title=f"bad@{limit}", hint=f"the same beyond {limit} px", kind="share")
+        for limit in (2, 3)
+    ),
+    Score(key="bad_1_visible", title="bad@1 visible", hint="bad@1 of what the right camera sees", kind="share"),
+    Score(key="bad_1_occluded", title="bad@1 occluded", hint="bad@1 of what it does not see", kind="share"),
+    Score(key="coverage", title="known", hint="share of surface with a depth", kind="share", better="higher"),
+    Score(key="on_sky", title="on sky", hint="share of pixels without a surface that have a depth", kind="share"),
+    _FAILED,
+    Score(key="abs_rel", title="AbsRel", hint="median of the mean relative error, where known", kind="median"),
+    Score(
+        key="rmse_m", title="RMSE (m)", hint="median of the root mean squared error, where known", kind="median"
+    ),
+    *(
+        Score(key=f"{key}_{part}", title=f"{title} {part}", hint=f"{title} of the {part} part", kind="median")
+        for part in ("visible", "occluded")
+        for key, title in (("abs_rel", "AbsRel"), ("rmse_m", "RMSE"))
+    ),
+    _SECONDS,
+)
+_FRAMES = (
+    Score(key="ssim", title="SSIM", hint="of the common pixels, at least 0", kind="share", better="higher"),
+    Score(key="ssim_covered", title="SSIM covered", hint="of what it drew itself", kind="share", better="higher"),
+    Score(key="ssim_all", title="SSIM all", hint="of the whole image", kind="share", better="higher"),
+    Score(key="coverage", title="drawn", hint="share of the common pixels drawn", kind="share", better="higher"),
+    _FAILED,
+    Score(key="psnr", title="PSNR (dB)", hint="median, of the common pixels", kind="median", better="higher"),
+    *(
+        Score(key=f"psnr_{part}", title=f"PSNR {part}", hint=words, kind="median", better="higher")
+        for part, words in (
+            ("covered", "of what it drew itself"),
+            ("all", "of the whole image"),
+            ("first", "of the first row's time, common pixels"),
+            ("middle", "of the middle row's time, common pixels"),
+        )
+    ),
+    *(
+        Score(key=f"flip_{part}", title=f"FLIP {part}", hint=f"median, of {words}", kind="median")
+        for part, words in (("common", "the common pixels"), ("covered", "what it drew"), ("all", "all pixels"))
+    ),
+    Score(key="epe_px", title="EPE (px)", hint="median flow to the truth, common and drawn pixels", kind="median"),
+    Score(
+        key="ssim_deepunroll",
+        title="SSIM DeepUnrollNet",
+        hint="of the whole image as DeepUnrollNet, RSSR, CVR and QRSC compute it",
+        kind="median",
+        better="higher",
+    ),
+    Score(
+        key="ssim_uniform",
+        title="SSIM uniform",
+        hint="of the whole image with scikit-image's default window",
+        kind="median",
+        better="higher",
+    ),
+    _SECONDS,
+)
+_SCORES: dict[Asks, tuple[Score, ...]] = {
+    "motion": _MOTION,
+    "readout": _READOUT,
+    "depth": _DEPTH,
+    "frames": _FRAMES,
+}
+_ERRORS: dict[Asks, str] = {"motion": "error_deg", "readout": "e_readout", "depth": "bad_1", "frames": "error"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol:
-    """One way of asking for motions."""
+    """One way of asking for motions, or for pictures."""
 
     track: str
     """Name on the command line."""
@@ -101,25 +181,30 @@ class Protocol:
     """What of ``KNOWLEDGE`` it gives."""
     given: str
     """The inputs, in words."""
-    asks: Literal["motion", "readout"] = "motion"
+    asks: Asks = "motion"
     """What an answer is."""
+
+    @property
+    def pictures(self) -> bool:
+        """Whether an answer is made of pictures beside the file of answers."""
+        return self.asks in ("depth", "frames")
 
     @property
     def scores(self) -> tuple[Score, ...]:
         """Of its tables; methods are ranked by the first."""
-        return _MOTION if self.asks == "motion" else _READOUT
+        return _SCORES[self.asks]
 
     @property
     def primary(self) -> Score:
-        """By which methods are ranked: the higher the better."""
+        """By which methods are ranked."""
         return self.scores[0]
 
     @property
     def error(self) -> str:
         """The column of scores.csv that decides about the primary score."""
-        return "error_deg" if self.asks == "motion" else "e_readout"
+        return _ERRORS[self.asks]
 
-    def of_kind(self, kind: Literal["share", "median"]) -> tuple[str, ...]:
+    def of_kind(self, kind: Kind) -> tuple[str, ...]:
         """Keys of the scores of a kind."""
         return tuple(score.key for score in self.scores if score.kind == kind)
 
@@ -167,6 +252,22 @@ PROTOCOLS = {
             allowed=("left", "right", "links"),
             given="matches of the frames by rsbench's SIFT, without the readout ratio",
             asks="readout",
+        ),
+        Protocol(
+            track="depth",
+            id="depth-1",
+            title="Depth of rolling-shutter frames",
+            allowed=("readout", "images", "stereo", "time"),
+            given="the four rolling-shutter frames",
+            asks="depth",
+        ),
+        Protocol(
+            track="correction",
+            id="correction-1",
+            title="Corrected frames",
+            allowed=("readout", "images", "stereo", "time"),
+            given="the four rolling-shutter frames",
+            asks="frames",
         ),
     )
 }

@@ -12,15 +12,16 @@ import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rsbench.benchmark.images.store import identity_of, read_record
+from rsbench.benchmark.leaderboard.answers import LARGEST
 from rsbench.benchmark.leaderboard.exporting import write_inputs
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS, Protocol, protocol_of_id
 from rsbench.benchmark.leaderboard.splits import Split
-from rsbench.benchmark.leaderboard.submissions import LARGEST, submission_text
+from rsbench.benchmark.leaderboard.submissions import submission_text
 from rsbench.benchmark.provenance import numeric_version, processor
 from rsbench.benchmark.simulated.trials import Information, enter
 from rsbench.core.joining import join_stereo
@@ -90,11 +91,20 @@ def load_entries(cards: Sequence[str], protocol: Protocol) -> dict[str, SolverEn
     return entries
 
 
-def prepare_inputs(split: Split, problems: Callable[[], Iterator[Problem]], folder: Path) -> None:
-    """Export a split into a folder, unless it holds that already."""
+def prepare_inputs(
+    split: Split,
+    problems: Callable[[], Iterator[Problem]],
+    folder: Path,
+    frames: Callable[[Path], None] = lambda folder: None,
+) -> None:
+    """Export a split into a folder, unless it holds that already; the truth stays out of it.
+
+    ``frames`` writes those into a folder.
+    """
     stored = read_record(folder / "split.json")
     if stored is None or stored.get("fingerprint") != split.fingerprint:
-        write_inputs(split, problems(), folder)
+        frames(folder)
+        write_inputs(replace(split, public=False), problems(), folder)
 
 
 def run_cards(

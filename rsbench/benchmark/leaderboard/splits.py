@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 
 from rsbench.benchmark.leaderboard.protocols import Protocol
+from rsbench.benchmark.leaderboard.true_pictures import TruePictures, true_pictures
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.simulation import Simulation, simulate
 from rsbench.benchmark.simulated.sweep_card import Setting
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import Motion
+from rsbench.core.motion import LaterMotion, Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.sequence import Sequence, read_dataset_manifest, read_pairs
@@ -48,6 +49,8 @@ class Truth:
     """Problems of one scene are not independent: intervals count scenes."""
     facts: dict[str, float | str]
     """What scores may be drawn against."""
+    pictures: TruePictures | None = None
+    """Where pictures are asked."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -63,7 +66,7 @@ class Split:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of the protocol, the rigs and the true motions."""
+        """SHA-256 of the protocol, the rigs, the true motions, and what is seen where pictures are asked."""
         content = [self.protocol.id, *(_identity(truth) for truth in self.truths)]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
@@ -79,7 +82,15 @@ class Split:
 
 def _identity(truth: Truth) -> dict[str, Any]:
     problem = Problem(name=truth.name, correspondences=Correspondences(), rig=truth.rig, shutter=truth.shutter)
-    return {**problem_record(problem), "motion": motion_record(truth.motion)}
+    seen = {} if truth.pictures is None else {"files": truth.pictures.files}
+    return {**problem_record(problem), "motion": _motion_identity(truth.motion), **seen}
+
+
+def _motion_identity(motion: Motion) -> dict[str, Any]:
+    """Of a pair of frames in a longer way: the whole way, and where it begins."""
+    if isinstance(motion, LaterMotion):
+        return {"later": motion_record(motion.motion), "start": motion.start}
+    return motion_record(motion)
 
 
 # Simulated points
@@ -222,19 +233,22 @@ def dataset_split(protocol: Protocol, folder: Path, *, public: bool = True) -> S
     """The sequences of a dataset.
 
     Raises:
-        RsbenchError: the dataset cannot be read, or its name cannot be that of a split.
+        RsbenchError: the dataset cannot be read, its name cannot be that of a split, or its cameras are none of
+            which the protocol asks pictures.
     """
     name = read_dataset_manifest(folder).name
     try:
         check_name(name)
     except ValueError as error:
         raise RsbenchError(f"{folder / 'dataset.json'}: {error}") from error
-    truths = tuple(truth_of(sequence) for sequence in read_pairs(folder))
+    pairs = read_pairs(folder)
+    pictures = true_pictures(folder, pairs, protocol) if protocol.pictures else {}
+    truths = tuple(truth_of(sequence, pictures.get(sequence.name)) for sequence in pairs)
     return Split(protocol=protocol, label=name, public=public, truths=truths)
 
 
-def truth_of(sequence: Sequence) -> Truth:
-    """Of two frames."""
+def truth_of(sequence: Sequence, pictures: TruePictures | None = None) -> Truth:
+    """Of two frames, with what is compared where pictures are asked."""
     scene = sequence.manifest.get("scene")
     named = scene.get("name") if isinstance(scene, dict) else None
     facts = {
@@ -248,4 +262,5 @@ def truth_of(sequence: Sequence) -> Truth:
         motion=sequence.motion,
         scene=str(named or sequence.name),
         facts=facts,
+        pictures=pictures,
     )

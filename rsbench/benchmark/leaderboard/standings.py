@@ -76,8 +76,9 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
     uses = [frozenset(each.header.uses) for each in ranked]
     found: list[Standing] = []
     if ranked:
-        primary = protocol_of_id(ranked[0].header.protocol).primary.key
-        means = scene_means(np.stack([each.scores[primary].to_numpy() for each in ranked]), scenes)
+        primary = protocol_of_id(ranked[0].header.protocol).primary
+        values = np.stack([each.scores[primary.key].to_numpy() for each in ranked])
+        means = scene_means(primary.sign * values, scenes)
         beats = better(means)
         for i, rank in enumerate(ranks(means.mean(axis=1), beats, uses)):
             peers = [j for j in range(len(ranked)) if uses[j] <= uses[i]]
@@ -90,7 +91,8 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
 
 def _order(standing: Standing) -> tuple[int, str, float, str]:
     header = standing.scored.header
-    score = standing.means[standing.protocol.primary.key][0]
+    primary = standing.protocol.primary
+    score = primary.sign * standing.means[primary.key][0]
     return len(set(header.uses)), standing.uses, -score, header.method
 
 

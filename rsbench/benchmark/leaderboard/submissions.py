@@ -9,25 +9,25 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from rsbench.benchmark.leaderboard.answers import KINDS, Answer, Header, Vector
+from rsbench.benchmark.leaderboard.picture_checks import check_pictures
+from rsbench.benchmark.leaderboard.picture_files import FOLDER
 from rsbench.benchmark.leaderboard.protocols import protocol_of_id
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.simulated.misreadings import misreading
 from rsbench.cards import choices, parse_card
 from rsbench.errors import RsbenchError
-from rsbench.reading import MB, check_name, parse_json, read_text
+from rsbench.reading import MB, parse_json, read_text
 
 SUBMISSION_BYTES = 16 * MB
 """Of a file of motions: 20 kB for each of 800 problems."""
-LARGEST = 1e9
-"""Number of w and d: larger ones are no motions, and their squares overflow."""
 _LINE_CHARACTERS = 1 << 16
-_TEXT_CHARACTERS = 300
 _MOST_FAULTS = 50
 _OF_SOLVE = (
     *("solver", "d_unit", "d_body", "motion_model", "shutter", "assumes", "inliers", "matches", "stereo_alone"),
@@ -35,93 +35,6 @@ _OF_SOLVE = (
 )
 """Keys that an answer of ``rsbench solve --json`` has beside those that are read."""
 _NAMED = 3
-Vector = tuple[float, float, float]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Header:
-    """The first line: which split it is about, what the method is and what it uses."""
-
-    protocol: str
-    split: str
-    method: str
-    uses: tuple[str, ...]
-    version: str = ""
-    description: str = ""
-    authors: str = ""
-    paper: str = ""
-    code: str = ""
-    licence: str = ""
-    hardware: str = ""
-    tuned_on: str = ""
-    """Data by which its parameters were chosen."""
-    motion_model: Literal["linear", "twist"] = "linear"
-    """That ``w`` and ``d`` are meant in, between the rows."""
-
-    def __post_init__(self) -> None:
-        try:
-            check_name(self.method)
-        except ValueError as error:
-            raise ValueError(str(error).replace("name =", "method =", 1)) from error
-        protocol_of_id(self.protocol).check_uses(self.uses)
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, str) and (len(value) > _TEXT_CHARACTERS or not value.isprintable()):
-                raise ValueError(f"{field.name}: must be one line of at most {_TEXT_CHARACTERS} characters")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Answer:
-    """One motion or failure, as ``rsbench solve --json`` prints it."""
-
-    name: str
-    """Of the problem."""
-    success: bool = True
-    reason: str = ""
-    w: Vector | None = None
-    d: Vector | None = None
-    metric: bool = False
-    reference_point: Literal["body", "left"] = "body"
-    direction_known: bool = True
-    readout_ratio: float | None = None
-    """Where that is asked, instead of a motion."""
-    covariance: tuple[tuple[float, ...], ...] | None = None
-    seconds: float | None = None
-
-    def __post_init__(self) -> None:
-        ratio = self.readout_ratio
-        for name in ("w", "d"):
-            if np.any(np.abs(_of(getattr(self, name) or (0.0, 0.0, 0.0))) > LARGEST):
-                raise ValueError(f"{name}: numbers must lie within {LARGEST:g} of 0")
-        if ratio is not None and not 0.0 <= ratio <= 1.0:
-            raise ValueError(f"readout_ratio = {ratio}: must lie in [0, 1]: readout time / frame period")
-        if self.seconds is not None and self.seconds < 0.0:
-            raise ValueError(f"seconds = {self.seconds}: must not be negative")
-        if self.covariance is not None and (
-            len(self.covariance) != 6 or any(len(row) != 6 for row in self.covariance)
-        ):
-            raise ValueError("covariance: must be 6 x 6 numbers, of w and d")
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Motion(Answer):
-    """An answer where a motion is asked."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("w", "d"):
-            if self.success and getattr(self, name) is None:
-                raise ValueError(f"{name}: a success needs three numbers; a failure says success = false")
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Readout(Answer):
-    """An answer where the readout ratio is asked."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.success and self.readout_ratio is None:
-            raise ValueError("readout_ratio: a success needs it; a failure says success = false")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -131,6 +44,8 @@ class Submission:
     header: Header
     answers: Mapping[str, Answer]
     """By the name of the problem."""
+    pictures: Path
+    """Folder of what answers hold beside the file, where pictures are asked."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -187,8 +102,15 @@ def check_submission(path: Path, split: Split) -> Findings:
         faults.append(str(error))
     if header is None or faults:
         return Findings(submission=None, faults=tuple(faults), notes=())
-    submission = Submission(header=header, answers=answers)
-    return Findings(submission=submission, faults=(), notes=tuple(_notes(submission, split, path)))
+    submission = Submission(header=header, answers=answers, pictures=path.parent / FOLDER)
+    notes = list(_notes(submission, split, path))
+    if split.protocol.pictures:
+        answered = [answer.name for answer in answers.values() if answer.success]
+        found = check_pictures(path.parent / FOLDER, answered, header.png_unit_m, split, _MOST_FAULTS)
+        if found[0]:
+            return Findings(submission=None, faults=tuple(found[0]), notes=())
+        notes += found[1]
+    return Findings(submission=submission, faults=(), notes=tuple(notes))
 
 
 def track_of(path: Path) -> str:
@@ -243,10 +165,7 @@ def _answer(text: str, where: str, split: Split) -> Answer:
     if isinstance(name, str) and name not in split.by_name:
         near = choices(name, split.by_name).partition("; there are")[0]
         raise RsbenchError(f"{where}: name = {json.dumps(name[:100])}: is no problem of {split.name}{near}")
-    return parse_card(_KINDS[split.protocol.asks], data, where)
-
-
-_KINDS: dict[str, type[Answer]] = {"motion": _Motion, "readout": _Readout}
+    return parse_card(KINDS[split.protocol.asks], data, where)
 
 
 # What may be meant
@@ -299,24 +218,28 @@ def submission_text(header: Mapping[str, Any], answers: Iterator[Mapping[str, An
     return "".join(json.dumps(line, allow_nan=False) + "\n" for line in (header, *answers))
 
 
-def template_text(split: Split, method: str = "my-method") -> str:
-    """An example without a fault: one motion, and a failure for every other problem."""
-    header = {
+def template_header(split: Split, method: str = "my-method") -> dict[str, Any]:
+    """All keys of a header, to be filled in."""
+    return {
         "protocol": split.protocol.id,
         "split": split.name,
         "method": method,
         "uses": ["left"],
         **{key: "" for key in ("version", "authors", "paper", "code", "licence", "hardware", "tuned_on")},
     }
+
+
+def template_text(split: Split, method: str = "my-method") -> str:
+    """An example without a fault: one motion, and a failure for every other problem."""
     first, *rest = (truth.name for truth in split.truths)
     motion: dict[str, Any] = {"w": [0.01, -0.02, 0.005], "d": [0.1, 0.0, 0.2], "metric": False}
     answer = {**motion, "reference_point": "left"} if split.protocol.asks == "motion" else {"readout_ratio": 0.5}
     failures = [{"name": name, "success": False, "reason": "not tried"} for name in rest]
-    return submission_text(header, iter([{"name": first, **answer}, *failures]))
+    return submission_text(template_header(split, method), iter([{"name": first, **answer}, *failures]))
 
 
 def truth_text(split: Split) -> str:
-    """The truth as a submission: it scores the best value of everything."""
+    """The truth as a submission, but for its pictures: it scores the best value of everything."""
     header = {
         "protocol": split.protocol.id,
         "split": split.name,
@@ -324,6 +247,8 @@ def truth_text(split: Split) -> str:
         "uses": ["truth"],
         "description": "The truth itself",
     }
+    if split.protocol.pictures:
+        return submission_text(header, ({"name": t.name} for t in split.truths))
     if split.protocol.asks == "readout":
         ratios = ({"name": t.name, "readout_ratio": t.shutter.readout_ratio} for t in split.truths)
         return submission_text(header, ratios)

@@ -1,0 +1,126 @@
+"""What stands in a file of predictions: the header, and answers of the kinds that protocols ask."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import numpy as np
+
+from rsbench.benchmark.leaderboard.protocols import Asks, protocol_of_id
+from rsbench.reading import check_name
+
+LARGEST = 1e9
+"""Number of w and d: larger ones are no motions, and their squares overflow."""
+_TEXT_CHARACTERS = 300
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Header:
+    """The first line: which split it is about, what the method is and what it uses."""
+
+    protocol: str
+    split: str
+    method: str
+    uses: tuple[str, ...]
+    version: str = ""
+    description: str = ""
+    authors: str = ""
+    paper: str = ""
+    code: str = ""
+    licence: str = ""
+    hardware: str = ""
+    tuned_on: str = ""
+    """Data by which its parameters were chosen."""
+    motion_model: Literal["linear", "twist"] = "linear"
+    """That ``w`` and ``d`` are meant in, between the rows."""
+    png_unit_m: float | None = None
+    """Metres of one step of depth maps that are PNG files."""
+
+    def __post_init__(self) -> None:
+        try:
+            check_name(self.method)
+        except ValueError as error:
+            raise ValueError(str(error).replace("name =", "method =", 1)) from error
+        protocol_of_id(self.protocol).check_uses(self.uses)
+        if self.png_unit_m is not None and not 0.0 < self.png_unit_m <= 1.0:
+            raise ValueError(f"png_unit_m = {self.png_unit_m}: must be above 0 and at most 1 m")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, str) and (len(value) > _TEXT_CHARACTERS or not value.isprintable()):
+                raise ValueError(f"{field.name}: must be one line of at most {_TEXT_CHARACTERS} characters")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """One motion or failure, as ``rsbench solve --json`` prints it."""
+
+    name: str
+    """Of the problem."""
+    success: bool = True
+    reason: str = ""
+    w: Vector | None = None
+    d: Vector | None = None
+    metric: bool = False
+    reference_point: Literal["body", "left"] = "body"
+    direction_known: bool = True
+    readout_ratio: float | None = None
+    """Where that is asked, instead of a motion."""
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        ratio = self.readout_ratio
+        for name in ("w", "d"):
+            if np.any(np.abs(np.array(getattr(self, name) or (0.0, 0.0, 0.0))) > LARGEST):
+                raise ValueError(f"{name}: numbers must lie within {LARGEST:g} of 0")
+        if ratio is not None and not 0.0 <= ratio <= 1.0:
+            raise ValueError(f"readout_ratio = {ratio}: must lie in [0, 1]: readout time / frame period")
+        if self.seconds is not None and self.seconds < 0.0:
+            raise ValueError(f"seconds = {self.seconds}: must not be negative")
+        if self.covariance is not None and (
+            len(self.covariance) != 6 or any(len(row) != 6 for row in self.covariance)
+        ):
+            raise ValueError("covariance: must be 6 x 6 numbers, of w and d")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Motion(Answer):
+    """An answer where a motion is asked."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("w", "d"):
+            if self.success and getattr(self, name) is None:
+                raise ValueError(f"{name}: a success needs three numbers; a failure says success = false")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Readout(Answer):
+    """An answer where the readout ratio is asked."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.success and self.readout_ratio is None:
+            raise ValueError("readout_ratio: a success needs it; a failure says success = false")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pictures(Answer):
+    """An answer whose pictures lie beside the file."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("w", "d", "readout_ratio", "covariance"):
+            if getattr(self, name) is not None:
+                raise ValueError(f"{name}: is not asked; an answer is pictures, and its line says the name")
+
+
+KINDS: dict[Asks, type[Answer]] = {
+    "motion": _Motion,
+    "readout": _Readout,
+    "depth": _Pictures,
+    "frames": _Pictures,
+}
+"""What an answer to each question must hold."""

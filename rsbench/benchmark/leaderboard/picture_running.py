@@ -1,0 +1,264 @@
+"""Running cards of stereo matchers and correctors: predictions first, each problem kept as soon as it is made.
+
+A job is one problem, for all cards whose answer is not current: correctors share the motion and the depth, which
+take longer than they do. The seconds of an entry are those that it would have taken alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rsbench.benchmark.images.store import identity_of, read_record
+from rsbench.benchmark.leaderboard.picture_files import FARTHEST, FOLDER, frame_png
+from rsbench.benchmark.leaderboard.protocols import Protocol, protocol_of_id
+from rsbench.benchmark.leaderboard.running import read_inputs
+from rsbench.benchmark.leaderboard.splits import Split, Truth
+from rsbench.benchmark.leaderboard.submissions import submission_text
+from rsbench.benchmark.leaderboard.true_pictures import VIEW, Asked
+from rsbench.benchmark.provenance import numeric_version, processor
+from rsbench.core.rig import SIDES, VIEWS
+from rsbench.dataset.files import read_png, write_bytes, write_depth, write_json
+from rsbench.dataset.workplace import remove
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import Images
+from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.pipeline.isolated_jobs import finished_jobs
+from rsbench.pipeline.isolated_parts import Isolation
+from rsbench.pipeline.isolation import THREAD_VARIABLES, use_one_thread
+from rsbench.pipeline.problem import Problem
+from rsbench.reading import check_name, read_json
+from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.vision.corrector import load_corrector
+from rsbench.vision.fusion import Origin
+from rsbench.vision.stereo_matcher import load_matcher
+from rsbench.vision.undistortion import sensor_disparities
+
+_USES = {"depth": ("images", "stereo"), "frames": ("readout", "images", "stereo", "time")}
+"""What matchers, and correctors with our motion and depth, work on."""
+
+
+class _Job(NamedTuple):
+    problem: str
+    asked: tuple[Asked, ...]
+    cards: tuple[tuple[str, Path, str], ...]
+    """Card, folder of its predictions, identity of the answer."""
+
+    def __str__(self) -> str:
+        return f"problem {self.problem}"
+
+
+def load_chains(cards: Sequence[str], protocol: Protocol) -> dict[str, CorrectionOptions]:
+    """The chain that each card runs in: a matcher, or a corrector with our default solver and matcher.
+
+    Raises:
+        RsbenchError: no such card, or two of one name.
+    """
+    chains: dict[str, CorrectionOptions] = {}
+    names: dict[str, str] = {}
+    for card in dict.fromkeys(cards):
+        if protocol.asks == "depth":
+            chains[card] = CorrectionOptions(matcher=load_matcher(card))
+        else:
+            chains[card] = CorrectionOptions(corrector=load_corrector(card))
+        name = _name(chains[card], protocol)
+        try:
+            check_name(name)
+        except ValueError as error:
+            raise RsbenchError(f"entry {card}: {error}") from error
+        if names.setdefault(name, card) != card:
+            raise RsbenchError(
+                f"--entry {card} and --entry {names[name]}: both have the name {name!r}; rename one"
+            )
+    return chains
+
+
+def _name(chain: CorrectionOptions, protocol: Protocol) -> str:
+    return (chain.matcher if protocol.asks == "depth" else chain.corrector).name
+
+
+def run_picture_cards(
+    cards: Sequence[str],
+    split: Split,
+    inputs: Path,
+    work: Path,
+    *,
+    workers: int = 1,
+    step: Callable[[str], None] = lambda word: None,
+) -> list[Path]:
+    """Run matchers or correctors on exported inputs; returns for each a file of answers, ready to be submitted.
+
+    Raises:
+        RsbenchError: no such card; processes died twice over the same problems: what is done is kept.
+    """
+    chains = load_chains(cards, split.protocol)
+    folders = {card: work / _name(chain, split.protocol) for card, chain in chains.items()}
+    jobs = []
+    for truth in split.truths:
+        due = tuple(
+            (card, folders[card], identity)
+            for card, chain in chains.items()
+            if _answer(folders[card], truth.name, identity := _identity(chain, split, truth)) is None
+        )
+        assert truth.pictures is not None
+        if due:
+            jobs.append(_Job(truth.name, truth.pictures.asked, due))
+        else:
+            step(truth.name)
+    one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
+    with closing(finished_jobs(_serve, jobs, workers, one_thread, inputs)) as found:
+        for job, _ in found:
+            step(job.problem)
+    return [_joined(chain, split, folders[card]) for card, chain in chains.items()]
+
+
+def _identity(chain: CorrectionOptions, split: Split, truth: Truth) -> str:
+    """Of one answer: whatever decides it, and nothing of the other problems."""
+    assert truth.pictures is not None
+    return identity_of(
+        source=numeric_version(),
+        chain=chain.matcher.key if split.protocol.asks == "depth" else chain.key,
+        protocol=split.protocol.id,
+        split=split.fingerprint,
+        problem=truth.name,
+    )
+
+
+def _answer(folder: Path, problem: str, identity: str) -> dict[str, Any] | None:
+    """What was answered, when it is current."""
+    record = read_record(folder / "answers" / f"{problem}.json")
+    if record is None or record.get("identity") != identity or not isinstance(record.get("answer"), dict):
+        return None
+    answer: dict[str, Any] = record["answer"]
+    return answer
+
+
+def _joined(chain: CorrectionOptions, split: Split, folder: Path) -> Path:
+    """The answers of a card as one submission."""
+    depth = split.protocol.asks == "depth"
+    entry = chain.matcher if depth else chain.corrector
+    reference = "" if depth else chain.corrector.component.spec.reference
+    header: dict[str, Any] = {
+        "protocol": split.protocol.id,
+        "split": split.name,
+        "method": entry.name,
+        "uses": _USES[split.protocol.asks],
+        "description": entry.description[:300],
+        "paper": reference[:300],
+        "code": "rsbench" if entry.built_in else "",
+        "hardware": f"{processor()}, 1 thread"[:300],
+    }
+    found = (_answer(folder, truth.name, _identity(chain, split, truth)) for truth in split.truths)
+    path = folder / "predictions.jsonl"
+    write_bytes(path, submission_text(header, (each for each in found if each is not None)).encode())
+    return path
+
+
+# In the child
+
+
+def _serve(inputs: Path) -> Callable[[_Job], None]:
+    use_one_thread()
+    warm_up()
+    protocol = protocol_of_id(str(read_json(inputs / "split.json").get("protocol")))
+    problems = {problem.name: problem for problem in read_inputs(inputs, protocol)}
+    isolation, chains = Isolation(), dict[str, CorrectionOptions]()  # as long as this process
+
+    def run(job: _Job) -> None:
+        problem = problems[job.problem]
+        images = {
+            view: read_png(inputs / "frames" / job.problem / f"{view[0]}_{view[1]}.png", _size(problem))
+            for view in VIEWS
+        }
+        made = _Made(problem, images, job.asked)
+        for card, folder, identity in job.cards:
+            if card not in chains:
+                chains[card] = isolation.chain(load_chains([card], protocol)[card])
+            place, record = folder / FOLDER / job.problem, folder / "answers" / f"{job.problem}.json"
+            remove(record)
+            remove(place)
+            answer = (made.depth if protocol.asks == "depth" else made.frames)(chains[card], place)
+            record.parent.mkdir(parents=True, exist_ok=True)
+            write_json(record, {"identity": identity, "answer": {"name": job.problem, **answer}})
+
+    return run
+
+
+def _size(problem: Problem) -> tuple[int, int]:
+    return problem.rig.camera.width, problem.rig.camera.height
+
+
+class _Made:
+    """The pictures of one problem, and what several correctors share."""
+
+    def __init__(self, problem: Problem, images: Images, asked: tuple[Asked, ...]) -> None:
+        self.problem, self.images, self.asked = problem, images, asked
+        self.given = Given()
+        self.spent: dict[str, float] = {}
+
+    def depth(self, chain: CorrectionOptions, place: Path) -> dict[str, Any]:
+        """Write the depth map; 0 where it is not known."""
+        rig, (side, frame) = self.problem.rig, VIEW
+        start = time.perf_counter()
+        try:
+            pair = [self.images[each, frame] for each in SIDES]
+            disparity = sensor_disparities(chain.matcher, pair[0], pair[1], rig)[SIDES.index(side)]
+        except RsbenchError as error:
+            return {"success": False, "reason": str(error)[:300]}
+        depth = np.nan_to_num(rig.depth(disparity), nan=0.0)
+        seconds = time.perf_counter() - start
+        place.mkdir(parents=True)
+        (each,) = self.asked
+        write_depth(place / f"{each.stem}.exr", np.where(depth > FARTHEST, 0.0, depth).astype(np.float32))
+        return {"seconds": round(seconds, 4)}
+
+    def frames(self, chain: CorrectionOptions, place: Path) -> dict[str, Any]:
+        """Write the corrected frames."""
+        needs, seconds = chain.corrector.component.spec.needs, 0.0
+        rig, shutter = self.problem.rig, self.problem.shutter
+        drawn: dict[str, bytes] = {}
+        try:
+            if "motion" in needs and self.given.matches is None:
+                start = time.perf_counter()
+                matches = find_matches_of_rig(self.images, rig, shutter.scanning, chain)
+                self.given = replace(self.given, matches=matches)
+                self.spent["matching"] = time.perf_counter() - start
+            for each in self.asked:
+                found = correct_four(
+                    self.images,
+                    rig,
+                    shutter.readout_ratio,
+                    replace(chain, target_row=float(each.row)),
+                    given=self.given,
+                    views=(VIEW,),
+                    scanning=shutter.scanning,
+                )
+                self._keep(found)
+                seconds += found.seconds["correction"]
+                fused = found.frames[VIEW]
+                drawn[each.stem] = frame_png(fused.image, fused.origin != Origin.NOBODY)
+        except RsbenchError as error:
+            return {"success": False, "reason": str(error)[:300]}
+        place.mkdir(parents=True)
+        for stem, data in drawn.items():
+            write_bytes(place / f"{stem}.png", data)
+        steps = (("matching", "motion"), "motion" in needs), (("depth",), "depth" in needs)
+        seconds += sum(self.spent.get(name, 0.0) for names, needed in steps if needed for name in names)
+        return {"seconds": round(seconds, 4)}
+
+    def _keep(self, found: CorrectedFrames) -> None:
+        """What need not be found again, and how long it took."""
+        if self.given.motion is None and found.motion is not None:
+            self.spent["motion"] = found.seconds["motion"]
+        if self.given.pairs is None and found.pairs is not None:
+            self.spent["depth"] = found.seconds["depth"]
+        motion, pairs = found.motion or self.given.motion, found.pairs or self.given.pairs
+        self.given = replace(self.given, motion=motion, pairs=pairs)

@@ -1,0 +1,546 @@
+"""The tracks depth and correction: what scores, what is told of slips, and that nothing hostile does any harm."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from analytic_dataset import write_analytic_dataset
+from commands import assert_refused, run_here
+from leaderboards import Line, write
+
+from rsbench.benchmark.leaderboard.board import add, entries_of, merge, rescore
+from rsbench.benchmark.leaderboard.marking import mark
+from rsbench.benchmark.leaderboard.picture_oracles import write_oracles, write_template, write_truth
+from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
+from rsbench.benchmark.leaderboard.splits import Split, dataset_split
+from rsbench.benchmark.leaderboard.standings import standings
+from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.motion import LinearMotion
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.files import read_depth, read_png, write_depth, write_exr, write_png
+from rsbench.errors import RsbenchError
+
+RIG = StereoRig(camera=PinholeCamera.centred(96, 80, 110.0), baseline=0.3)
+SHUTTER = RollingShutter(height=80, readout_ratio=0.9)
+MOTION = LinearMotion(np.array([0.01, 0.02, -0.01]), np.array([0.1, -0.05, 0.08]))
+TRACKS = ("depth", "correction")
+
+
+@pytest.fixture(scope="module")
+def planes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two planes in three frames, which are two problems, with the middle row's truth."""
+    folder = tmp_path_factory.mktemp("planes")
+    write_analytic_dataset(folder, RIG, SHUTTER, MOTION, frames=3, twins=(40,))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def splits(planes: Path) -> dict[str, Split]:
+    return {track: dataset_split(PROTOCOLS[track], planes) for track in TRACKS}
+
+
+def _scores(path: Path, split: Split) -> pd.DataFrame:
+    return mark(read_submission(path, split), split)
+
+
+def _lines(path: Path) -> list[Line]:
+    return [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+
+
+def _pictures(path: Path) -> list[Path]:
+    return sorted(p for p in (path.parent / "pictures").rglob("*") if p.is_file())
+
+
+def _each_depth(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
+    for picture in _pictures(path):
+        write_depth(picture, change(read_depth(picture).astype(np.float64)).astype(np.float32))
+    return path
+
+
+def _each_frame(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
+    for picture in _pictures(path):
+        write_png(picture, np.ascontiguousarray(change(read_png(picture))))
+    return path
+
+
+# Scores
+
+
+@pytest.mark.parametrize("track", TRACKS)
+def test_the_truth_is_best_and_nothing_is_worst(track: str, splits: dict[str, Split], tmp_path: Path) -> None:
+    """No score of any other lies outside; the order of answers does not matter."""
+    split = splits[track]
+    found = {path.parent.name: _scores(path, split) for path in write_oracles(split, tmp_path)}
+    path = tmp_path / "truth" / "predictions.jsonl"
+    head, *answers = _lines(path)
+    write(path, [head, *random.Random(1).sample(answers, len(answers))])
+    pd.testing.assert_frame_equal(_scores(path, split), found["truth"])
+    empty = _scores(write(tmp_path / "empty.jsonl", [head]), split)
+    failed = [{**answer, "success": False} for answer in answers]
+    pd.testing.assert_frame_equal(_scores(write(tmp_path / "failed.jsonl", [head, *failed]), split), empty)
+    for score in split.protocol.scores:
+        best, worst = ((score.sign * found["truth"][score.key]), (score.sign * empty[score.key]))
+        if score.key == "seconds":
+            continue
+        assert np.all(best >= worst)
+        for other in found.values():
+            value = score.sign * other[score.key]
+            assert np.all((value <= best) & (value >= worst)), score.key
+    primary = split.protocol.primary
+    assert np.all(found["truth"][primary.key] == (1.0 if primary.better == "higher" else 0.0))
+    assert found["truth"][split.protocol.error].max() == 0.0 and empty[split.protocol.error].min() == 1.0
+
+
+def test_depth_scores_are_those_of_a_count(splits: dict[str, Split], tmp_path: Path) -> None:
+    """Pixel by pixel, of a map that is off by known disparities and does not know a part."""
+    split = splits["depth"]
+    rng = np.random.default_rng(0)
+    path = write_truth(split, tmp_path)
+    off = rng.choice([0.0, 0.6, 1.4, -2.5, 5.0], (80, 96))
+    known = rng.random((80, 96)) > 0.2
+    product = RIG.camera.fx * RIG.baseline
+    _each_depth(path, lambda z: np.where(known, product / np.maximum(product / z + off, 0.1), 0.0))
+    scores = _scores(path, split)
+    for number, truth in enumerate(split.truths):
+        assert truth.pictures is not None
+        z = truth.pictures.depth().astype(np.float64)
+        estimate = read_depth(_pictures(path)[number]).astype(np.float64)
+        for limit in (1, 2, 3):
+            bad = sum(
+                not known[i, j] or abs(product / estimate[i, j] - product / z[i, j]) > limit
+                for i in range(80)
+                for j in range(96)
+            )
+            assert abs(scores[f"bad_{limit}"][number] - bad / z.size) < 1e-12
+        relative = [abs(estimate[i, j] / z[i, j] - 1.0) for i in range(80) for j in range(96) if known[i, j]]
+        assert abs(scores["abs_rel"][number] - np.mean(relative)) < 1e-12
+        squares = (estimate - z)[known] ** 2
+        assert abs(scores["rmse_m"][number] - np.sqrt(squares.mean())) < 1e-9
+        assert scores["coverage"][number] == known.mean() and scores["on_sky"][number] == 0.0
+        # The classes make up the whole: what the right camera sees, and the rest.
+        seen = truth.pictures.seen_by_both().mean()
+        whole = seen * scores["bad_1_visible"][number] + (1.0 - seen) * scores["bad_1_occluded"][number]
+        assert abs(whole - scores["bad_1"][number]) < 1e-12
+
+
+def test_frame_scores_follow_their_formulas(splits: dict[str, Split], tmp_path: Path) -> None:
+    """Ten steps of grey everywhere, a picture that is moved by two pixels, and one that is half drawn."""
+    split = splits["correction"]
+    brighter = _scores(_each_frame(write_truth(split, tmp_path / "a"), lambda image: image + np.uint8(10)), split)
+    for name in ("psnr", "psnr_all", "psnr_covered", "psnr_first", "psnr_middle"):
+        np.testing.assert_allclose(brighter[name], 20.0 * np.log10(25.5), rtol=1e-9)
+    moved = _scores(
+        _each_frame(write_truth(split, tmp_path / "b"), lambda image: np.roll(image, 2, axis=1)), split
+    )
+    assert np.all(np.abs(moved["epe_px"] - 2.0) < 0.3)  # dense flow is some tenths of a pixel wrong
+    assert np.all(moved["ssim"] < brighter["ssim"])
+    path = write_truth(split, tmp_path / "c")
+    for picture in _pictures(path):
+        image = read_png(picture)
+        alpha = np.zeros(image.shape[:2], np.uint8)
+        alpha[:40] = 255
+        cv2.imwrite(str(picture), np.dstack([image[..., ::-1], alpha]))
+    half = _scores(path, split)
+    assert np.all(half["ssim_covered"] == 1.0) and np.all(np.isinf(half["psnr_covered"]))
+    assert np.all(half["psnr_all"] < 12.0)
+    for truth, share in zip(split.truths, half["coverage"], strict=True):
+        assert truth.pictures is not None
+        masks = [truth.pictures.common(each.row) for each in truth.pictures.asked]
+        assert abs(share - np.mean([mask[:40].sum() / mask.sum() for mask in masks])) < 1e-12
+
+
+def test_the_common_pixels_are_those_that_the_frame_saw(splits: dict[str, Split]) -> None:
+    """By rays: the true point of each pixel of the corrected frame, projected into the rolling-shutter one."""
+    from rsbench.core.projection import rs_project
+
+    truth = splits["correction"].truths[1]
+    assert truth.pictures is not None
+    for each in truth.pictures.asked:
+        sequence = truth.pictures.sequence
+        pose = RIG.cam_from_world(truth.motion, truth.shutter.time_after(each.row, 1, "left"), "left")
+        z = sequence.depth("gs", "left", 1, each.row)[..., None]
+        X = (RIG.camera.unproject(RIG.camera.pixel_grid()) * z - pose.t) @ pose.R
+        seen = rs_project(RIG, truth.shutter, truth.motion, "left", 1, X.reshape(-1, 3)).pixels
+        inside = np.all((seen >= 0.0) & (seen <= [95.0, 79.0]), axis=-1).reshape(80, 96)
+        assert np.mean(inside == truth.pictures.common(each.row)) > 0.97  # but for the rims
+
+
+# What is told
+
+
+DEPTH_SLIPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "millimetres": lambda z: 1000.0 * z,
+    "centimetres": lambda z: 100.0 * z,
+    "disparity in px": lambda z: RIG.camera.fx * RIG.baseline / z,
+    "inverse depth": lambda z: 1.0 / z,
+    "along the ray": lambda z: z * np.linalg.norm(RIG.camera.unproject(RIG.camera.pixel_grid()), axis=-1),
+    "up to a factor": lambda z: 3.7 * z,
+}
+FRAME_SLIPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "red and blue": lambda image: image[..., ::-1],
+    "upside down": lambda image: image[::-1],
+    "mirrored": lambda image: image[:, ::-1],
+    "a row too low": lambda image: np.roll(image, 1, axis=0),
+    "a column too far left": lambda image: np.roll(image, -1, axis=1),
+}
+
+
+@pytest.mark.parametrize("words", [*DEPTH_SLIPS, *FRAME_SLIPS])
+def test_slips_are_told(words: str, splits: dict[str, Split], tmp_path: Path) -> None:
+    """And of a secret truth only what needs no truth."""
+    split = splits["depth" if words in DEPTH_SLIPS else "correction"]
+    path = write_truth(split, tmp_path)
+    if words in DEPTH_SLIPS:
+        _each_depth(path, DEPTH_SLIPS[words])
+    else:
+        _each_frame(path, FRAME_SLIPS[words])
+    (note,) = check_submission(path, split).notes
+    assert words in note
+    blind = check_submission(path, replace(split, public=False)).notes
+    assert len(blind) == (1 if words in ("millimetres", "centimetres") else 0)
+
+
+def test_what_is_nearly_right_is_not_called_a_slip(splits: dict[str, Split], tmp_path: Path) -> None:
+    """Noise of 3 %, a map that is 2 % too large, and frames with noise."""
+    rng = np.random.default_rng(0)
+    path = _each_depth(
+        write_truth(splits["depth"], tmp_path / "a"),
+        lambda z: 1.02 * z * np.exp(0.03 * rng.standard_normal(z.shape)),
+    )
+    assert check_submission(path, splits["depth"]).notes == ()
+    path = _each_frame(
+        write_truth(splits["correction"], tmp_path / "b"),
+        lambda image: np.clip(image + rng.normal(0.0, 12.0, image.shape), 0, 255).astype(np.uint8),
+    )
+    assert check_submission(path, splits["correction"]).notes == ()
+
+
+def test_exchanged_rows_are_told(splits: dict[str, Split], tmp_path: Path) -> None:
+    path = write_truth(splits["correction"], tmp_path)
+    for folder in (tmp_path / "pictures").iterdir():
+        (folder / "left_1_first.png").rename(folder / "x")
+        (folder / "left_1_middle.png").rename(folder / "left_1_first.png")
+        (folder / "x").rename(folder / "left_1_middle.png")
+    notes = check_submission(path, splits["correction"]).notes
+    assert len(notes) == 2 and all("rows are exchanged" in note for note in notes)
+
+
+@pytest.mark.parametrize("track", TRACKS)
+def test_the_template_is_in_order(track: str, splits: dict[str, Split], tmp_path: Path) -> None:
+    assert check_submission(write_template(splits[track], tmp_path), splits[track]).faults == ()
+
+
+def test_depth_of_opencv_alone_is_read(splits: dict[str, Split], tmp_path: Path) -> None:
+    """The lines of the document: half a step of rounding is all that is lost."""
+    split = splits["depth"]
+    path = write_truth(split, tmp_path)
+    for picture in _pictures(path):
+        depth = read_depth(picture)
+        picture.unlink()
+        cv2.imwrite(str(picture.with_suffix(".png")), np.clip(depth / 0.001 + 0.5, 0, 65535).astype(np.uint16))
+    head, *answers = _lines(path)
+    write(path, [head, *answers])
+    assert "png_unit_m" in check_submission(path, split).faults[0]
+    write(path, [{**head, "png_unit_m": 0.001}, *answers])
+    scores = _scores(path, split)
+    assert scores["bad_1"].max() == 0.0 and 0.0 < scores["rmse_m"].max() < 0.0005
+
+
+# Hostile and malformed
+
+
+def _png(width: int, height: int, bits: int, colour: int, body: bytes = b"") -> bytes:
+    chunks = (
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)),
+        (b"IDAT", zlib.compress(body)),
+        (b"IEND", b""),
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    )
+
+
+def _with_hole(value: float) -> Callable[[Path], None]:
+    def damage(picture: Path) -> None:
+        depth = np.full((80, 96), 5.0, dtype=np.float32)
+        depth[3, 4] = value
+        write_depth(picture, depth)
+
+    return damage
+
+
+def _link(picture: Path) -> None:
+    other = picture.parents[3] / "secret"
+    picture.rename(other)
+    picture.symlink_to(other)
+
+
+def _circle(picture: Path) -> None:
+    picture.unlink()
+    picture.symlink_to(picture)
+
+
+def _linked_folder(picture: Path) -> None:
+    other = picture.parents[3] / "secret"
+    picture.parent.rename(other)
+    picture.parent.symlink_to(other)
+
+
+def _pipe(picture: Path) -> None:
+    picture.unlink()
+    os.mkfifo(picture)
+
+
+def _folder(picture: Path) -> None:
+    picture.unlink()
+    picture.mkdir()
+
+
+DEPTH_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "missing": (lambda p: p.unlink(), "left_1.exr: is missing"),
+    "two": (
+        lambda p: p.with_suffix(".png").write_bytes(p.read_bytes()),
+        "2 of left_1.exr and left_1.png are there",
+    ),
+    "another name": (lambda p: p.rename(p.with_name("left_0.exr")), "left_0.exr: is not asked"),
+    "another problem": (lambda p: p.parent.rename(p.parent.with_name("castle")), "castle: is no problem of"),
+    "a file too many": (lambda p: p.with_name("evil.sh").write_text("x"), "evil.sh: is not asked"),
+    "a hidden file": (lambda p: p.with_name(".x").write_text("x"), ".x: is not asked"),
+    "a file among folders": (lambda p: (p.parents[1] / "planes.1x").write_text("x"), "planes.1x: is no problem"),
+    "a link": (_link, "left_1.exr: must be a file of its own, no link"),
+    "a linked folder": (_linked_folder, "planes.0: must be a folder of its own, no link"),
+    "a circle": (_circle, "must be a file of its own, no link"),
+    "a pipe": (_pipe, "must be a file of its own"),
+    "a folder": (_folder, "must be a file of its own"),
+    "1 GB": (lambda p: os.truncate(p, 1 << 30), "bytes: 1073741824 is more than"),
+    "no EXR": (lambda p: p.write_bytes(b"PK\x03\x04" + bytes(100)), "damaged or not an EXR file"),
+    "half a file": (lambda p: os.truncate(p, 500), "left_1.exr: "),
+    "channels of colour": (
+        lambda p: write_exr(p, {c: np.ones((80, 96), np.float32) for c in "RGB"}),
+        "must hold one part of scanlines with one channel, Z, of float32",
+    ),
+    "channel Y": (lambda p: write_exr(p, {"Y": np.ones((80, 96), np.float32)}), "with one channel, Z"),
+    "half floats": (lambda p: write_exr(p, {"Z": np.ones((80, 96), np.float32)}, half=True), "float32 channel Z"),
+    "another size": (
+        lambda p: write_depth(p, np.ones((96, 80), np.float32)),
+        "is 80 x 96 pixels, the camera 96 x 80",
+    ),
+    "NaN": (_with_hole(np.nan), "1 pixels are NaN; unknown depth and sky are 0"),
+    "infinity": (_with_hole(np.inf), "1 pixels are infinite"),
+    "negative": (_with_hole(-1.0), "1 pixels are negative"),
+    "beyond the universe": (_with_hole(1e30), "1 pixels are above 1e+09 m"),
+}
+FRAME_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "a JPEG": (lambda p: p.write_bytes(cv2.imencode(".jpg", np.ones((80, 96, 3)))[1].tobytes()), "is no PNG file"),
+    "16 bits": (
+        lambda p: cv2.imwrite(str(p), np.ones((80, 96, 3), np.uint16)),
+        "is RGB of 16 bits: must be RGB or",
+    ),
+    "grey": (lambda p: cv2.imwrite(str(p), np.ones((80, 96), np.uint8)), "is grey of 8 bits: must be RGB or RGBA"),
+    "a palette": (lambda p: p.write_bytes(_png(96, 80, 8, 3)), "is palette of 8 bits"),
+    "no colour type": (lambda p: p.write_bytes(_png(96, 80, 8, 77)), "is unknown of 8 bits"),
+    "another size": (lambda p: write_png(p, np.zeros((80, 95, 3), np.uint8)), "is 95 x 80 pixels"),
+    "a huge image": (
+        lambda p: p.write_bytes(_png(2**31 - 1, 2**31 - 1, 8, 2)),
+        "is 2147483647 x 2147483647 pixels",
+    ),
+    "no pixels": (lambda p: p.write_bytes(_png(96, 80, 8, 2)), "is a damaged PNG file"),
+    "only a header": (lambda p: p.write_bytes(_png(96, 80, 8, 2)[:30]), "is no PNG file"),
+    "nothing": (lambda p: p.write_bytes(b""), "is no PNG file"),
+    "the middle is missing": (
+        lambda p: p.with_name("left_1_middle.png").unlink(),
+        "left_1_middle.png: is missing",
+    ),
+}
+ANSWER_FAULTS: dict[str, tuple[Callable[[list[Line]], list[Line]], str]] = {
+    "no line": (lambda lines: lines[:-1], "planes.1: has pictures, but no line"),
+    "a failure with pictures": (lambda lines: [*lines[:-1], {**lines[-1], "success": False}], "has pictures, but"),
+    "a motion": (lambda lines: [*lines[:-1], {**lines[-1], "w": [0, 0, 0]}], "w: is not asked"),
+    "path for a problem": (lambda lines: [*lines, {"name": "../truth"}], "is no problem of"),
+    "a unit of kilometres": (
+        lambda lines: [{**lines[0], "png_unit_m": 1000.0}, *lines[1:]],
+        "png_unit_m = 1000.0",
+    ),
+    "matches": (lambda lines: [{**lines[0], "uses": ["left"]}, *lines[1:]], "'left' is not given by depth-1"),
+}
+
+
+def _all(folder: Path) -> dict[str, bytes]:
+    """All files, large ones by their size."""
+    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and not p.is_symlink()]
+    return {
+        str(p): p.read_bytes() if p.stat().st_size < 1 << 24 else str(p.stat().st_size).encode() for p in files
+    }
+
+
+@pytest.mark.parametrize("case", [*DEPTH_FAULTS, *(f"frame: {name}" for name in FRAME_FAULTS)])
+def test_faults_are_lines_and_nothing_is_kept(case: str, splits: dict[str, Split], tmp_path: Path) -> None:
+    name = case.removeprefix("frame: ")
+    split, faults = (splits["depth"], DEPTH_FAULTS) if name == case else (splits["correction"], FRAME_FAULTS)
+    damage, words = faults[name]
+    (tmp_path / "in").mkdir()
+    path = write_truth(split, tmp_path / "in")
+    damage(_pictures(path)[0])
+    before = _all(tmp_path)
+    told = check_submission(path, split).faults
+    assert any(words in fault for fault in told), told
+    assert all("\n" not in fault and len(fault) < 400 + 2 * len(str(path)) for fault in told)
+    with pytest.raises(RsbenchError):
+        add(tmp_path / "board", path, split, {})
+    assert _all(tmp_path) == before and not (tmp_path / "board").exists()
+
+
+@pytest.mark.parametrize("case", ANSWER_FAULTS)
+def test_faults_of_answers_are_lines(case: str, splits: dict[str, Split], tmp_path: Path) -> None:
+    change, words = ANSWER_FAULTS[case]
+    path = write_truth(splits["depth"], tmp_path)
+    (fault,) = check_submission(write(path, change(_lines(path))), splits["depth"]).faults
+    assert words in fault
+
+
+# Boards
+
+
+def _submitted(board: Path, split: Split, folder: Path, method: str, factor: float = 1.0) -> None:
+    path = _each_depth(write_truth(split, folder / method), lambda z: factor * z)
+    head, *answers = _lines(path)
+    add(board, write(path, [{**head, "method": method, "uses": ["images"]}, *answers]), split, {})
+
+
+def test_entries_stand_alone_copies_tie_and_boards_merge(splits: dict[str, Split], tmp_path: Path) -> None:
+    split, board, other = splits["depth"], tmp_path / "board", tmp_path / "other"
+    _submitted(board, split, tmp_path, "a", 1.2)
+    (alone,) = entries_of(board, "depth-1", split.name)
+    _submitted(board, split, tmp_path, "b", 1.01)
+    _submitted(other, split, tmp_path, "copy", 1.2)
+    assert merge(other, board) == [f"depth-1/{split.name}/copy"]
+    found = {line.scored.header.method: line for line in standings(entries_of(board, "depth-1", split.name))}
+    pd.testing.assert_frame_equal(found["a"].scored.scores, alone.scores)
+    assert next(iter(found)) == "b" and found["a"].rank == found["copy"].rank and "copy" in found["a"].ties
+    assert sorted(alone.pictures) == ["planes.0/left_1.exr", "planes.1/left_1.exr"]
+    assert rescore(board, split) == {}
+    with pytest.raises(RsbenchError, match="with other predictions"):
+        _submitted(board, split, tmp_path / "again", "a", 1.3)
+
+
+def test_pictures_that_were_changed_are_named(splits: dict[str, Split], tmp_path: Path) -> None:
+    split, board = splits["depth"], tmp_path / "board"
+    _submitted(board, split, tmp_path, "a", 1.2)
+    (entry,) = entries_of(board, "depth-1", split.name)
+    record = json.loads((entry.folder / "entry.json").read_text("utf-8"))
+    write_depth(entry.folder / "pictures" / "planes.0" / "left_1.exr", np.ones((80, 96), np.float32))
+    for act in (lambda: rescore(board, split), lambda: merge(board, tmp_path / "mine")):
+        with pytest.raises(RsbenchError, match=r"left_1\.exr: has changed since it was scored"):
+            act()
+    secret = tmp_path / "secret"
+    secret.write_text("secret", "utf-8")
+    for name in ("../../../../../secret", "planes.0/../../../../../secret", "/etc/passwd", "planes.0/x\0"):
+        hostile = {**record, "pictures": {name: record["pictures"]["planes.0/left_1.exr"]}}
+        (entry.folder / "entry.json").write_text(json.dumps(hostile), "utf-8")
+        with pytest.raises(RsbenchError, match=r"is no name of a picture|unreadable"):
+            merge(board, tmp_path / "mine")
+    assert not [
+        p for p in (tmp_path / "mine").rglob("*") if p.is_file() and "secret" in p.read_text("utf-8", "ignore")
+    ]
+
+
+def test_another_dataset_is_another_split(planes: Path, splits: dict[str, Split], tmp_path: Path) -> None:
+    """Pictures count: of one motion, with another depth; and a byte that changed since is refused by name."""
+    write_analytic_dataset(
+        tmp_path,
+        RIG,
+        SHUTTER,
+        MOTION,
+        frames=3,
+        twins=(40,),
+        true_motion=LinearMotion(MOTION.w, -MOTION.d),
+    )
+    assert dataset_split(PROTOCOLS["pose"], tmp_path).name == dataset_split(PROTOCOLS["pose"], planes).name
+    split = dataset_split(PROTOCOLS["depth"], tmp_path)
+    assert split.name != splits["depth"].name
+    path = write_truth(split, tmp_path / "truth")
+    true = tmp_path / "planes" / "rs_depth" / "left_2.exr"
+    write_depth(true, 1.01 * read_depth(true))
+    with pytest.raises(RsbenchError, match=r"left_2\.exr: is not the file that dataset\.json names"):
+        _scores(path, split)
+
+
+def test_cameras_of_other_kinds_are_refused(planes: Path, tmp_path: Path) -> None:
+    shutil.copytree(planes, tmp_path / "copy")
+    path = tmp_path / "copy" / "planes" / "sequence.json"
+    path.write_text(json.dumps({**json.loads(path.read_text("utf-8")), "scan": "bottom"}), "utf-8")
+    with pytest.raises(RsbenchError, match="is of cameras without a lens that read rows together"):
+        dataset_split(PROTOCOLS["depth"], tmp_path / "copy")
+
+
+# Runs
+
+
+def _here(serve: Any, jobs: Any, workers: int, environment: object, *arguments: object) -> Any:
+    """``finished_jobs`` without a child."""
+    run = serve(*arguments)
+    yield from ((job, run(job)) for job in jobs)
+
+
+@pytest.mark.parametrize(
+    ("track", "entries"), [("depth", ("sgm", "sgm-plain")), ("correction", ("rotation-only", "fusion"))]
+)
+def test_cards_run_and_go_on(
+    track: str, entries: tuple[str, ...], smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Through the command line; what is lost is made again, to the last digit, and a solver is no matcher."""
+    from rsbench.benchmark.leaderboard import picture_running
+
+    monkeypatch.setattr(picture_running, "finished_jobs", _here)
+    where = ("--data", smoke_dataset, "--board", tmp_path / "board")
+    cards = [word for entry in entries for word in ("--entry", entry)]
+    assert_refused(run_here("leaderboard", "run", track, *where, "--entry", "gs-8pt"), "gs-8pt")
+    ran = run_here("leaderboard", "run", track, *where, *cards)
+    assert ran.returncode == 0, ran.stderr
+    assert run_here("leaderboard", "oracles", track, *where).returncode == 0
+    split = dataset_split(PROTOCOLS[track], smoke_dataset)
+    found = {e.header.method: e for e in entries_of(tmp_path / "board", split.protocol.id, split.name)}
+    assert {*entries, "truth"} < set(found)
+    made = tmp_path / "board" / ".rsbench" / "runs" / split.protocol.id / split.name / entries[0]
+    first = {path.name: path.read_bytes() for path in _pictures(made / "x")}
+    (made / "answers" / "castle.json").unlink()
+    (made / "pictures" / "castle").rename(tmp_path / "lost")
+    assert run_here("leaderboard", "run", track, *where, *cards).returncode == 0
+    assert {path.name: path.read_bytes() for path in _pictures(made / "x")} == first
+    if track == "depth":
+        assert np.all(found["sgm"].scores["bad_1"] < 0.5 * found["constant"].scores["bad_1"])
+    else:
+        psnr = {name: entry.scores["psnr"] for name, entry in found.items()}
+        assert np.all(psnr["fusion"] > psnr["uncorrected"] + 3.0)
+        assert np.all(psnr["fusion-true"] > psnr["rotation-only"])
+
+
+@pytest.mark.parametrize("track", TRACKS)
+def test_inputs_hold_no_secret(track: str, planes: Path, tmp_path: Path) -> None:
+    """Of a public split the truth, which is in order as it stands; of a secret one none of its files."""
+    export = ("leaderboard", "export", track, "--data", planes, "--out")
+    assert run_here(*export, tmp_path / "open").returncode == 0
+    split = dataset_split(PROTOCOLS[track], planes)
+    assert check_submission(tmp_path / "open" / "truth.jsonl", split).faults == ()
+    assert run_here(*export, tmp_path / "closed", "--secret").returncode == 0
+    told = set(_all(tmp_path / "closed").values())
+    for truth in split.truths:
+        assert truth.pictures is not None
+        assert not told & {truth.pictures.path(each).read_bytes() for each in truth.pictures.asked}
+    assert (planes / "planes" / "rs" / "left_2.png").read_bytes() in told
