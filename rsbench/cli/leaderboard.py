@@ -14,6 +14,7 @@ from rsbench.errors import RsbenchError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from rsbench.benchmark.leaderboard.running import Limits
     from rsbench.benchmark.leaderboard.splits import Split
     from rsbench.benchmark.leaderboard.standings import Standing
     from rsbench.pipeline.problem import Problem
@@ -147,18 +148,23 @@ def run(
     secret: Hidden = False,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     time_limit: Annotated[
-        float | None, typer.Option(min=0.001, help="Seconds per problem for solvers of other packages.")
+        float | None, typer.Option(min=0.001, help="Seconds per problem; what takes longer is a failure.")
+    ] = None,
+    memory: Annotated[
+        float | None,
+        typer.Option(min=1.0, metavar="MB", help="What a method's process may use; more is a failure."),
     ] = None,
 ) -> None:
     """Run cards on a track, keep what they predict, and score it. An interrupted run goes on there."""
     from rsbench.benchmark.leaderboard.board import RUN, add, made_by
+    from rsbench.benchmark.leaderboard.running import Limits
     from rsbench.benchmark.provenance import provenance
 
     split = split_of(track, data, seed_file, secret)
     if track == "pose-own":
         raise RsbenchError(f"track {track!r}: solvers of cards take given matches; run them on the track 'pose'")
     _load_cards(entry, split)  # before anything is written
-    files = _predict(entry, split, board, data, seed_file, workers, time_limit)
+    files = _predict(entry, split, board, data, seed_file, workers, Limits(time_limit, memory))
     for file in files:
         add(board, file, split, provenance(RUN), replace=made_by(board, split, file.parent.name) == RUN)
     _show(board, split.protocol.id, split.name, None)
@@ -253,7 +259,7 @@ def _predict(
     data: Path | None,
     seed_file: Path | None,
     workers: int,
-    time_limit: float | None,
+    limits: Limits,
 ) -> list[Path]:
     """Files of predictions of cards, in the hidden folder of the board."""
     from rsbench.benchmark.leaderboard.picture_running import run_picture_cards
@@ -261,7 +267,7 @@ def _predict(
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.workplace import workplace
 
-    steps = len(split.truths) if split.protocol.pictures else steps_of(entry, split)
+    steps = len(split.truths) if split.protocol.pictures else steps_of(entry, split, limits)
     with workplace(board) as hidden, progress_bar(f"running {split.name}", steps) as advance:
         place = hidden / "runs" / split.protocol.id / split.name
         place.mkdir(parents=True, exist_ok=True)
@@ -272,11 +278,11 @@ def _predict(
             lambda folder: write_frames_of(split, data, folder) if data and split.protocol.pictures else None,
         )
         if split.protocol.pictures:
-            files = run_picture_cards(entry, split, place / "inputs", place, workers=workers, step=advance)
-        else:
-            files = run_cards(
-                entry, split, place / "inputs", place, workers=workers, time_limit_s=time_limit, step=advance
+            files = run_picture_cards(
+                entry, split, place / "inputs", place, workers=workers, limits=limits, step=advance
             )
+        else:
+            files = run_cards(entry, split, place / "inputs", place, workers=workers, limits=limits, step=advance)
     return files
 
 

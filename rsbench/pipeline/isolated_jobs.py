@@ -64,17 +64,22 @@ def run_jobs(
     workers: int,
     environment: Mapping[str, str],
     *arguments: object,
+    seconds_of: Callable[[Job], float] | None = None,
+    memory_mb: float | None = None,
 ) -> Generator[tuple[Job, Outcome], None, None]:
     """Jobs with their outcomes, as they become ready.
 
-    A job whose process ended is tried once more, in a fresh one. When the iterator is closed or an exception
-    passes through it, such as Ctrl-C, jobs that wait are dropped and all processes end at once.
+    A job whose process ended is tried once more, in a fresh one; where there are limits, it fails. When the
+    iterator is closed or an exception passes through it, such as Ctrl-C, jobs that wait are dropped and all
+    processes end at once.
 
     Args:
         factory: see ``IsolatedWorker``; what it returns is called with a job.
         jobs: picklable.
         workers: processes.
         environment, arguments: see ``IsolatedWorker``.
+        seconds_of: limit of time of a job, perhaps infinite; without one there is none.
+        memory_mb: of a process; see ``IsolatedWorker``.
 
     Raises:
         RuntimeError: rsbench's own code in a child is at fault.
@@ -86,8 +91,10 @@ def run_jobs(
         waiting.put(job)
 
     def work() -> None:
-        with IsolatedWorker(factory, *arguments, environment=environment, cancel=cancel) as worker:
-            _work(worker, waiting, done)
+        with IsolatedWorker(
+            factory, *arguments, environment=environment, cancel=cancel, memory_mb=memory_mb
+        ) as worker:
+            _work(worker, waiting, done, seconds_of, memory_mb is not None)
 
     crew = [threading.Thread(target=work, daemon=True) for _ in range(min(workers, len(jobs)))]
     try:
@@ -104,7 +111,13 @@ def run_jobs(
             member.join()
 
 
-def _work(worker: IsolatedWorker, waiting: queue.SimpleQueue[Job], done: queue.SimpleQueue[_Done[Job]]) -> None:
+def _work(
+    worker: IsolatedWorker,
+    waiting: queue.SimpleQueue[Job],
+    done: queue.SimpleQueue[_Done[Job]],
+    seconds_of: Callable[[Job], float] | None,
+    limited: bool,
+) -> None:
     """Hand jobs to a process until none waits."""
     while True:
         try:
@@ -112,8 +125,8 @@ def _work(worker: IsolatedWorker, waiting: queue.SimpleQueue[Job], done: queue.S
         except queue.Empty:
             return
         try:
-            outcome = worker.call(job, limit_s=math.inf)
-            if outcome.ended:
+            outcome = worker.call(job, limit_s=math.inf if seconds_of is None else seconds_of(job))
+            if outcome.ended and seconds_of is None and not limited:
                 outcome = worker.call(job, limit_s=math.inf)
         except Cancelled:
             return

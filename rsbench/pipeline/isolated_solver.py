@@ -46,13 +46,21 @@ _MASKS: tuple[MatchSet, ...] = ("left", "right", "tracks")
 class SolverRunner:
     """Runs solvers with a limit of time for those of other packages; use as a context manager."""
 
-    def __init__(self, *, time_limit_s: float | None = None, single_thread: bool = False) -> None:
+    def __init__(
+        self,
+        *,
+        time_limit_s: float | None = None,
+        single_thread: bool = False,
+        memory_mb: float | None = None,
+    ) -> None:
         """
         Args:
             time_limit_s: for one problem, instead of what each solver's card says.
             single_thread: whether children compute with one thread, as results that must not depend on the
                 machine need.
+            memory_mb: what a child may use; see ``IsolatedWorker``.
         """
+        self._memory_mb = memory_mb
         self._time_limit_s, self._single_thread = time_limit_s, single_thread
         self._workers: dict[tuple[str, str], IsolatedWorker] = {}
         self._stack = ExitStack()
@@ -110,6 +118,7 @@ class SolverRunner:
                 self._single_thread,
                 classes=(MotionEstimate, RobustEstimate, MatchCount),
                 environment=dict.fromkeys(THREAD_VARIABLES, "1") if self._single_thread else None,
+                memory_mb=self._memory_mb,
             )
             self._workers[known] = self._stack.enter_context(worker)
         limit_s = entry.options.time_limit_s if self._time_limit_s is None else self._time_limit_s

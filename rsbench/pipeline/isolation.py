@@ -4,8 +4,8 @@ A worker starts its child with the first call and keeps it for the next ones. A 
 limit, or whose child ends, is a failed ``Outcome`` with the reason; the child is killed with all processes of its
 group, and a fresh one serves the next call. What the child prints is captured. The child ends with its parent,
 even if the parent is killed. This is protection against mistakes, not against malice: the code runs as the user,
-a process that leaves the group survives, and memory is not limited (address space, which a system can limit, is
-reserved by compilers and BLAS far beyond what they use).
+and a process that leaves the group survives. Memory is limited where that is asked, by looking ten times a second
+at what the child uses (address space, which a system can limit, is reserved by compilers and BLAS far beyond it).
 """
 
 from __future__ import annotations
@@ -83,6 +83,7 @@ class IsolatedWorker:
         start_limit_s: float = START_LIMIT_S,
         environment: Mapping[str, str] | None = None,
         cancel: threading.Event | None = None,
+        memory_mb: float | None = None,
     ) -> None:
         """
         Args:
@@ -93,7 +94,9 @@ class IsolatedWorker:
             start_limit_s: time for ``factory``.
             environment: variables that the child has besides those of this process.
             cancel: once set, perhaps by another thread, calls end with ``Cancelled``.
+            memory_mb: what the child may use; where the system does not tell what it does, nothing is limited.
         """
+        self._memory_mb = memory_mb
         self._start = (factory, arguments)
         self._classes = {cls.__name__: cls for cls in classes}
         self._start_limit_s = start_limit_s
@@ -137,7 +140,7 @@ class IsolatedWorker:
     def _exchange(self, message: object, limit_s: float) -> Outcome:
         assert self._child is not None
         child = self._child
-        data, reason = child.exchange(bytes(ForkingPickler.dumps(message)), limit_s, self._cancel)
+        data, reason = child.exchange(bytes(ForkingPickler.dumps(message)), limit_s, self._cancel, self._memory_mb)
         value = None
         if data is not None:
             value, reason = self._read(data)
@@ -167,7 +170,7 @@ class _Child:
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         self.overdue = False
-        """Whether an answer has not come in time."""
+        """Whether an answer has not come in time, or took too much memory."""
         self._printed = b""
         self._lifeline: int | None = None
         lifeline_end = -1
@@ -204,7 +207,9 @@ class _Child:
     def output(self) -> str:
         return self._printed.decode("utf-8", errors="replace")
 
-    def exchange(self, request: bytes, limit_s: float, cancel: threading.Event) -> tuple[bytes | None, str]:
+    def exchange(
+        self, request: bytes, limit_s: float, cancel: threading.Event, memory_mb: float | None
+    ) -> tuple[bytes | None, str]:
         """The answer to a request, or None and what became of the process."""
         # A child that does not read must not hold up its parent.
         threading.Thread(target=self._send, args=(request,), daemon=True).start()
@@ -212,6 +217,9 @@ class _Child:
         while (left := end - time.monotonic()) > 0.0:
             if cancel.is_set():
                 raise Cancelled
+            if memory_mb is not None and self._used_mb() > memory_mb:
+                self.overdue = True
+                return None, f"used more than {memory_mb:g} MB of memory"
             ended = self._process.poll() is not None  # its own children may keep the pipe open
             try:
                 answer = self._answers.get(timeout=0.0 if ended else min(left, _POLL_S))
@@ -222,6 +230,15 @@ class _Child:
             return (answer, "") if answer is not None else (None, self._ending())
         self.overdue = True
         return None, f"took longer than {limit_s:g} s"
+
+    def _used_mb(self) -> float:
+        """Memory of the process; 0 where the system does not tell."""
+        try:
+            with open(f"/proc/{self._process.pid}/statm", "rb") as file:
+                pages = int(file.read().split()[1])
+        except (OSError, ValueError, IndexError):
+            return 0.0
+        return pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
 
     def kill(self) -> None:
         """End the process and its group, and wait for that."""

@@ -56,6 +56,22 @@ def test_jobs_that_are_lost_are_named_when_the_others_are_done() -> None:
     assert done == [("true", 0), ("exit 3", 3)]
 
 
+def test_a_job_that_takes_too_much_fails_alone(tmp_path: Path) -> None:
+    """Too long, too much memory, and an end of the process, which is not tried again; then one in order."""
+    note = tmp_path / "tries"
+    long = "__import__('time').sleep(1000)"
+    large = "len(b'x' * (900 << 20)) and __import__('time').sleep(1000)"
+    deadly = f"__import__('os').system('printf x >> {note}; kill -9 $PPID')"
+    limits = {long: 0.3, large: 60.0, deadly: 60.0, "7": 60.0}
+    jobs = run_jobs(functools.partial, list(limits), 1, {}, eval, seconds_of=limits.__getitem__, memory_mb=600.0)
+    found = {job: outcome for job, outcome in jobs}
+    assert found[long].reason == "took longer than 0.3 s"
+    assert found[deadly].reason == "killed by signal 9 (SIGKILL)" and note.read_text() == "x"
+    assert found["7"].value == 7
+    if Path("/proc/self/statm").exists():  # elsewhere memory has no limit
+        assert found[large].reason == "used more than 600 MB of memory"
+
+
 def refuse(job: str) -> None:
     raise EntryFailure(f"{job} is wrong")
 

@@ -4,6 +4,7 @@
     <protocol>/<split>/split.json                 which split it is; facts of its problems where those are public
     <protocol>/<split>/entries/<method>/predictions.jsonl, scores.csv, entry.json
     <protocol>/<split>/entries/<method>/pictures/<problem>/NAME   depth maps or corrected frames, where asked
+    <protocol>/<split>/entries/<method>/matches/NAME              matches of its own, where it has some
 
 An entry is written under another name and renamed, so that it is there whole or not at all.
 """
@@ -26,8 +27,10 @@ import pandas as pd
 from rsbench.benchmark.leaderboard.answers import Header
 from rsbench.benchmark.leaderboard.exporting import split_record
 from rsbench.benchmark.leaderboard.marking import mark
+from rsbench.benchmark.leaderboard.own_matches import FOLDER as MATCHES
+from rsbench.benchmark.leaderboard.own_matches import match_files
 from rsbench.benchmark.leaderboard.picture_files import FOLDER as PICTURES
-from rsbench.benchmark.leaderboard.picture_files import copy_pictures, find_picture, picture_bytes
+from rsbench.benchmark.leaderboard.picture_files import copy_files, file_bytes, find_picture
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS, protocol_of_id
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import SUBMISSION_BYTES, Submission, read_submission
@@ -53,8 +56,8 @@ class Recorded:
     predictions_sha256: str
     fingerprint: str
     """Of the split."""
-    pictures: dict[str, str] = field(default_factory=dict)
-    """SHA-256 of each, by its path below ``pictures``."""
+    files: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the pictures and matches of its answers, by their paths below the entry."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +80,8 @@ class Scored:
     predictions_sha256: str
     scores: pd.DataFrame
     """One row for each problem, see ``marking.mark``."""
-    pictures: dict[str, str]
-    """SHA-256 of each, by its path below the folder ``pictures`` of the entry."""
+    files: dict[str, str]
+    """SHA-256 of its pictures and matches, by paths below ``folder`` such as ``pictures/castle/left_1.exr``."""
 
 
 def add(board: Path, predictions: Path, split: Split, made: dict[str, Any], *, replace: bool = False) -> Scored:
@@ -97,11 +100,11 @@ def add(board: Path, predictions: Path, split: Split, made: dict[str, Any], *, r
         _open(board)
         folder = place(board, split.protocol.id, split.name) / "entries" / submission.header.method
         new = hidden / WORK / "entry"
-        kept = copy_pictures(submission.pictures, _pictures_of(submission, split), new / PICTURES)
+        kept = copy_files(submission.folder, _files_of(submission, split), new)
         if not replace:
             _refuse_another(folder, hashlib.sha256(data).hexdigest(), kept)
         _write_split(board, split)
-        submission = dataclasses.replace(submission, pictures=new / PICTURES)
+        submission = dataclasses.replace(submission, folder=new)
         _put(new, folder, _contents(submission, data, split, made, kept))
     return _read_entry(folder)
 
@@ -124,25 +127,27 @@ def made_by(board: Path, split: Split, method: str) -> str:
     return str(made.get("command", "")) if isinstance(made, dict) else ""
 
 
-def _pictures_of(submission: Submission, split: Split) -> Iterator[str]:
-    """Paths below ``pictures`` of all that the answers hold."""
+def _files_of(submission: Submission, split: Split) -> Iterator[str]:
+    """Paths of all that the answers hold beside their file."""
+    if split.protocol.own_matches:
+        yield from (f"{MATCHES}/{name}" for name in match_files(submission.folder))
     for truth in split.truths:
         answer = submission.answers.get(truth.name)
         if truth.pictures is not None and answer is not None and answer.success:
             for asked in truth.pictures.asked:
-                found = find_picture(submission.pictures, truth.name, asked, split.protocol.asks)
-                yield f"{truth.name}/{found.name}"
+                found = find_picture(submission.folder / PICTURES, truth.name, asked, split.protocol.asks)
+                yield f"{PICTURES}/{truth.name}/{found.name}"
 
 
 def _contents(
-    submission: Submission, data: bytes, split: Split, made: dict[str, Any], pictures: dict[str, str]
+    submission: Submission, data: bytes, split: Split, made: dict[str, Any], files: dict[str, str]
 ) -> tuple[bytes, pd.DataFrame, dict[str, Any]]:
     record: dict[str, Any] = {
         "format": FORMAT,
         "header": asdict(submission.header),
         "predictions_sha256": hashlib.sha256(data).hexdigest(),
         "fingerprint": split.fingerprint,
-        **({"pictures": pictures} if pictures else {}),
+        **({"files": files} if files else {}),
         "made": made,
     }
     return data, mark(submission, split), record
@@ -200,11 +205,11 @@ def _write_split(board: Path, split: Split) -> None:
     write_json(path, {**split_record(split), "facts": facts})
 
 
-def _refuse_another(folder: Path, sha256: str, pictures: dict[str, str]) -> None:
+def _refuse_another(folder: Path, sha256: str, files: dict[str, str]) -> None:
     if not folder.is_dir():
         return
     there = read_json(folder / FILES[2])
-    if (there.get("predictions_sha256"), there.get("pictures", {})) != (sha256, pictures):
+    if (there.get("predictions_sha256"), there.get("files", {})) != (sha256, files):
         raise RsbenchError(
             f"{folder}: is an entry of that name with other predictions; rename the method, or replace the entry "
             "with --replace"
@@ -263,7 +268,7 @@ def _read_entry(folder: Path) -> Scored:
         header=record.header,
         predictions_sha256=record.predictions_sha256,
         scores=_read_scores(folder, record.header.protocol),
-        pictures=record.pictures,
+        files=record.files,
     )
 
 
@@ -317,7 +322,7 @@ def merge(other: Path, board: Path) -> list[str]:
     with workplace(board) as hidden:
         _open(board)
         for scored, folder in theirs:
-            _refuse_another(folder, scored.predictions_sha256, scored.pictures)
+            _refuse_another(folder, scored.predictions_sha256, scored.files)
         for number, (scored, folder) in enumerate(theirs):
             if not folder.exists():
                 new = hidden / WORK / str(number)
@@ -336,12 +341,11 @@ def _copy(scored: Scored, new: Path) -> None:
     new.mkdir(parents=True)
     for name in FILES:
         write_bytes(new / name, read_bytes(scored.folder / name))
-    copied = copy_pictures(scored.folder / PICTURES, scored.pictures, new / PICTURES)
-    _check_pictures(scored.folder / PICTURES, scored.pictures, copied)
+    _check_files(scored.folder, scored.files, copy_files(scored.folder, scored.files, new))
 
 
-def _check_pictures(folder: Path, pictures: dict[str, str], found: dict[str, str]) -> None:
-    for name, digest in pictures.items():
+def _check_files(folder: Path, files: dict[str, str], found: dict[str, str]) -> None:
+    for name, digest in files.items():
         if found[name] != digest:
             raise RsbenchError(
                 f"{folder / name}: has changed since it was scored; remove the entry, and submit it again"
@@ -364,11 +368,8 @@ def rescore(board: Path, split: Split) -> dict[str, list[str]]:
             record, path, old = _read_record(folder), folder / FILES[0], pd.DataFrame()
             with contextlib.suppress(RsbenchError):
                 old = _read_scores(folder, split.protocol.id)
-            stored = {
-                name: hashlib.sha256(picture_bytes(folder / PICTURES, name)).hexdigest()
-                for name in record.pictures
-            }
-            _check_pictures(folder / PICTURES, record.pictures, stored)
+            stored = {name: hashlib.sha256(file_bytes(folder, name)).hexdigest() for name in record.files}
+            _check_files(folder, record.files, stored)
             submission = read_submission(path, split)
             if submission.header != record.header:
                 raise RsbenchError(f"{path}: its header is not that of {FILES[2]}; submit it again")

@@ -12,8 +12,9 @@ import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.leaderboard.answers import Answer
+from rsbench.benchmark.leaderboard.own_matches import match_scores, read_own_matches
+from rsbench.benchmark.leaderboard.picture_files import FOLDER, read_answer_depth, read_answer_frame
 from rsbench.benchmark.leaderboard.picture_marking import depth_scores, frame_scores
-from rsbench.benchmark.leaderboard.picture_files import read_answer_depth, read_answer_frame
 from rsbench.benchmark.leaderboard.protocols import (
     AUC_DEG,
     AUC_READOUT,
@@ -47,12 +48,18 @@ def mark(submission: Submission, split: Split) -> pd.DataFrame:
         return pd.DataFrame([_picture_row(truth, submission) for truth in split.truths])
     if split.protocol.asks == "readout":
         return pd.DataFrame([_readout_row(truth, found.get(truth.name)) for truth in split.truths])
-    return pd.DataFrame([_motion_row(truth, found.get(truth.name), model) for truth in split.truths])
+    rows = [_motion_row(truth, found.get(truth.name), model) for truth in split.truths]
+    if split.protocol.own_matches:
+        own = read_own_matches(submission.folder, split.by_name)
+        for row, truth in zip(rows, split.truths, strict=True):
+            assert truth.sequence is not None
+            row |= match_scores(truth.sequence, None if own is None else own[truth.name])
+    return pd.DataFrame(rows)
 
 
 def _picture_row(truth: Truth, submission: Submission) -> Row:
     """Of pictures, which are read here, one problem at a time."""
-    answer, pictures, folder = submission.answers.get(truth.name), truth.pictures, submission.pictures
+    answer, pictures, folder = submission.answers.get(truth.name), truth.pictures, submission.folder / FOLDER
     assert pictures is not None
     success = answer is not None and answer.success
     pictures.check()

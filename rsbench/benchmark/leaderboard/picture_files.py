@@ -23,7 +23,7 @@ from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.true_pictures import Asked
 from rsbench.dataset.files import read_exr, write_bytes
 from rsbench.errors import RsbenchError
-from rsbench.reading import NAME, PIXELS, read_bytes
+from rsbench.reading import NAME, read_bytes
 
 FOLDER = "pictures"
 """Beside the file of answers."""
@@ -50,45 +50,50 @@ def find_picture(folder: Path, problem: str, asked: Asked, asks: Asks) -> Path:
         names = " and ".join(path.name for path in paths)
         problem_is = f"{len(found)} of {names} are there; keep one" if found else "is missing"
         raise RsbenchError(f"{paths[0]}: {problem_is}; a problem without an answer says success = false")
-    _check_own(folder, found[0])
+    check_own(folder.parent, found[0].relative_to(folder.parent).as_posix())
     return found[0]
 
 
-def _check_own(folder: Path, file: Path) -> None:
-    """Raises RsbenchError unless a picture, its folder and the one above are there, and are no links."""
-    for path in (folder, file.parent, file):
-        kind, is_kind = ("file", stat.S_ISREG) if path == file else ("folder", stat.S_ISDIR)
-        if not os.path.lexists(path) or not is_kind(path.lstat().st_mode):
-            raise RsbenchError(f"{path}: must be a {kind} of its own, no link")
-
-
-def copy_pictures(folder: Path, names: Iterable[str], target: Path) -> dict[str, str]:
-    """Copy pictures from one folder ``pictures`` to another; returns the SHA-256 of each, by its name.
+def copy_files(folder: Path, names: Iterable[str], target: Path) -> dict[str, str]:
+    """Copy what lies beside a file of answers; returns the SHA-256 of each, by its name.
 
     Args:
         folder: where they are.
-        names: such as ``castle/left_1.exr``.
+        names: such as ``pictures/castle/left_1.exr``.
         target: a folder, made if missing.
 
     Raises:
-        RsbenchError: a name leads elsewhere, a picture is missing, a link or too large, or cannot be written.
+        RsbenchError: a name leads elsewhere, a file is missing, a link or too large, or cannot be written.
     """
     copied = {}
     for name in names:
-        data = picture_bytes(folder, name)
+        data = file_bytes(folder, name)
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         write_bytes(target / name, data)
         copied[name] = hashlib.sha256(data).hexdigest()
     return copied
 
 
-def picture_bytes(folder: Path, name: str) -> bytes:
-    """The content of a picture such as ``castle/left_1.exr`` below ``pictures``; errors as ``copy_pictures``."""
-    problem, _, file = name.partition("/")
-    if not (NAME.fullmatch(problem) and NAME.fullmatch(file)):
-        raise RsbenchError(f"{folder}: {name[:100]!r} is no name of a picture")
-    _check_own(folder, folder / name)
-    return read_bytes(folder / name, _BYTES + _BYTES_OF_PIXEL * PIXELS)
+def file_bytes(folder: Path, name: str) -> bytes:
+    """The content of a file such as ``pictures/castle/left_1.exr`` below a folder; errors as ``copy_files``."""
+    parts = name.split("/")
+    if not (2 <= len(parts) <= 3 and all(NAME.fullmatch(part) for part in parts)):
+        raise RsbenchError(f"{folder}: {name[:100]!r} is no name of a file of an answer")
+    check_own(folder, name)
+    return read_bytes(folder / name)
+
+
+def check_own(folder: Path, name: str) -> None:
+    """Raises RsbenchError unless a file, and each folder on the way to it, is there and is no link."""
+    path = folder
+    *folders, file = name.split("/")
+    for part, kind, is_kind in (
+        *((each, "folder", stat.S_ISDIR) for each in folders),
+        (file, "file", stat.S_ISREG),
+    ):
+        path = path / part
+        if not os.path.lexists(path) or not is_kind(path.lstat().st_mode):
+            raise RsbenchError(f"{path}: must be a {kind} of its own, no link")
 
 
 def strange_files(folder: Path, split: Split, answered: Collection[str]) -> Iterator[str]:

@@ -7,8 +7,8 @@ take longer than they do. The seconds of an entry are those that it would have t
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ import numpy as np
 from rsbench.benchmark.images.store import identity_of, read_record
 from rsbench.benchmark.leaderboard.picture_files import FARTHEST, FOLDER, frame_png
 from rsbench.benchmark.leaderboard.protocols import Protocol, protocol_of_id
-from rsbench.benchmark.leaderboard.running import read_inputs
+from rsbench.benchmark.leaderboard.running import Limits, jobs_done, read_inputs
 from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.submissions import submission_text
 from rsbench.benchmark.leaderboard.true_pictures import VIEW, Asked
@@ -31,9 +31,8 @@ from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Images
 from rsbench.pipeline.frame_motion import find_matches_of_rig
-from rsbench.pipeline.isolated_jobs import finished_jobs
 from rsbench.pipeline.isolated_parts import Isolation
-from rsbench.pipeline.isolation import THREAD_VARIABLES, use_one_thread
+from rsbench.pipeline.isolation import use_one_thread
 from rsbench.pipeline.problem import Problem
 from rsbench.reading import check_name, read_json
 from rsbench.solvers.engine.warm_up import warm_up
@@ -92,6 +91,7 @@ def run_picture_cards(
     work: Path,
     *,
     workers: int = 1,
+    limits: Limits = Limits(),  # noqa: B008  it is a constant
     step: Callable[[str], None] = lambda word: None,
 ) -> list[Path]:
     """Run matchers or correctors on exported inputs; returns for each a file of answers, ready to be submitted.
@@ -106,21 +106,35 @@ def run_picture_cards(
         due = tuple(
             (card, folders[card], identity)
             for card, chain in chains.items()
-            if _answer(folders[card], truth.name, identity := _identity(chain, split, truth)) is None
+            if _answer(folders[card], truth.name, identity := _identity(chain, split, truth, limits)) is None
         )
         assert truth.pictures is not None
-        if due:
-            jobs.append(_Job(truth.name, truth.pictures.asked, due))
-        else:
+        parts = [due] if limits == Limits() and due else [(each,) for each in due]
+        jobs += [_Job(truth.name, truth.pictures.asked, part) for part in parts]
+        if not due:
             step(truth.name)
-    one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
-    with closing(finished_jobs(_serve, jobs, workers, one_thread, inputs)) as found:
-        for job, _ in found:
+    left = Counter(job.problem for job in jobs)
+    for job in jobs_done(_serve, jobs, workers, inputs, limits, _fail):
+        left[job.problem] -= 1
+        if left[job.problem] == 0:
             step(job.problem)
-    return [_joined(chain, split, folders[card]) for card, chain in chains.items()]
+    return [_joined(chain, split, folders[card], limits) for card, chain in chains.items()]
 
 
-def _identity(chain: CorrectionOptions, split: Split, truth: Truth) -> str:
+def _fail(job: _Job, reason: str) -> None:
+    """Keep that nothing was answered within the limits."""
+    for _, folder, identity in job.cards:
+        remove(folder / FOLDER / job.problem)
+        _keep(folder, job.problem, identity, {"success": False, "reason": reason})
+
+
+def _keep(folder: Path, problem: str, identity: str, answer: dict[str, Any]) -> None:
+    path = folder / "answers" / f"{problem}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, {"identity": identity, "answer": {"name": problem, **answer}})
+
+
+def _identity(chain: CorrectionOptions, split: Split, truth: Truth, limits: Limits) -> str:
     """Of one answer: whatever decides it, and nothing of the other problems."""
     assert truth.pictures is not None
     return identity_of(
@@ -129,6 +143,7 @@ def _identity(chain: CorrectionOptions, split: Split, truth: Truth) -> str:
         protocol=split.protocol.id,
         split=split.fingerprint,
         problem=truth.name,
+        limits=list(limits),
     )
 
 
@@ -141,7 +156,7 @@ def _answer(folder: Path, problem: str, identity: str) -> dict[str, Any] | None:
     return answer
 
 
-def _joined(chain: CorrectionOptions, split: Split, folder: Path) -> Path:
+def _joined(chain: CorrectionOptions, split: Split, folder: Path, limits: Limits) -> Path:
     """The answers of a card as one submission."""
     depth = split.protocol.asks == "depth"
     entry = chain.matcher if depth else chain.corrector
@@ -156,7 +171,7 @@ def _joined(chain: CorrectionOptions, split: Split, folder: Path) -> Path:
         "code": "rsbench" if entry.built_in else "",
         "hardware": f"{processor()}, 1 thread"[:300],
     }
-    found = (_answer(folder, truth.name, _identity(chain, split, truth)) for truth in split.truths)
+    found = (_answer(folder, truth.name, _identity(chain, split, truth, limits)) for truth in split.truths)
     path = folder / "predictions.jsonl"
     write_bytes(path, submission_text(header, (each for each in found if each is not None)).encode())
     return path
@@ -165,7 +180,7 @@ def _joined(chain: CorrectionOptions, split: Split, folder: Path) -> Path:
 # In the child
 
 
-def _serve(inputs: Path) -> Callable[[_Job], None]:
+def _serve(inputs: Path, limits: Limits) -> Callable[[_Job], None]:
     use_one_thread()
     warm_up()
     protocol = protocol_of_id(str(read_json(inputs / "split.json").get("protocol")))
@@ -182,12 +197,11 @@ def _serve(inputs: Path) -> Callable[[_Job], None]:
         for card, folder, identity in job.cards:
             if card not in chains:
                 chains[card] = isolation.chain(load_chains([card], protocol)[card])
-            place, record = folder / FOLDER / job.problem, folder / "answers" / f"{job.problem}.json"
-            remove(record)
+            place = folder / FOLDER / job.problem
+            remove(folder / "answers" / f"{job.problem}.json")
             remove(place)
             answer = (made.depth if protocol.asks == "depth" else made.frames)(chains[card], place)
-            record.parent.mkdir(parents=True, exist_ok=True)
-            write_json(record, {"identity": identity, "answer": {"name": job.problem, **answer}})
+            _keep(folder, job.problem, identity, answer)
 
     return run
 
@@ -241,7 +255,7 @@ class _Made:
                     views=(VIEW,),
                     scanning=shutter.scanning,
                 )
-                self._keep(found)
+                self._share(found)
                 seconds += found.seconds["correction"]
                 fused = found.frames[VIEW]
                 drawn[each.stem] = frame_png(fused.image, fused.origin != Origin.NOBODY)
@@ -254,7 +268,7 @@ class _Made:
         seconds += sum(self.spent.get(name, 0.0) for names, needed in steps if needed for name in names)
         return {"seconds": round(seconds, 4)}
 
-    def _keep(self, found: CorrectedFrames) -> None:
+    def _share(self, found: CorrectedFrames) -> None:
         """What need not be found again, and how long it took."""
         if self.given.motion is None and found.motion is not None:
             self.spent["motion"] = found.seconds["motion"]

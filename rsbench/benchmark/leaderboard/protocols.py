@@ -159,6 +159,16 @@ _FRAMES = (
     ),
     _SECONDS,
 )
+_MATCHES = (
+    Score(key="matches", title="matches", hint="median number of own matches", kind="median", better="higher"),
+    Score(
+        key="matches_1px",
+        title="right matches",
+        hint="median share of own matches within 1 px of the truth",
+        kind="median",
+        better="higher",
+    ),
+)
 _SCORES: dict[Asks, tuple[Score, ...]] = {
     "motion": _MOTION,
     "readout": _READOUT,
@@ -190,9 +200,14 @@ class Protocol:
         return self.asks in ("depth", "frames")
 
     @property
+    def own_matches(self) -> bool:
+        """Whether matches may be handed in with motions."""
+        return self.asks == "motion" and "images" in self.allowed
+
+    @property
     def scores(self) -> tuple[Score, ...]:
         """Of its tables; methods are ranked by the first."""
-        return _SCORES[self.asks]
+        return _SCORES[self.asks] + (_MATCHES if self.own_matches else ())
 
     @property
     def primary(self) -> Score:

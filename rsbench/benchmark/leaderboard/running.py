@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from rsbench.benchmark.images.store import identity_of, read_record
 from rsbench.benchmark.leaderboard.answers import LARGEST
@@ -29,7 +30,7 @@ from rsbench.dataset.files import sha256, write_bytes, write_json
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.answer import Extra, solve_problem
 from rsbench.pipeline.frame_motion import check_readout
-from rsbench.pipeline.isolated_jobs import finished_jobs
+from rsbench.pipeline.isolated_jobs import finished_jobs, run_jobs
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.pipeline.problem import Problem, parse_problem
@@ -41,6 +42,7 @@ from rsbench.solvers.engine.warm_up import warm_up
 from rsbench.solvers.refined import RefinedSolver
 
 _EXTRAS: tuple[Extra, ...] = ("covariance",)
+Job = TypeVar("Job")
 CHUNK = 10
 """Problems of one job."""
 _USES: dict[Information, tuple[str, ...]] = {
@@ -64,13 +66,26 @@ _KEPT = (
 """Of an answer of ``solve_problem``."""
 
 
+class Limits(NamedTuple):
+    """What a method may take for one problem, in a process that ends when it takes more; None: no limit."""
+
+    seconds: float | None = None
+    memory_mb: float | None = None
+
+    @property
+    def chunk(self) -> int:
+        """Problems of one job: a job that takes too much is the failure of one problem."""
+        return CHUNK if self == Limits() else 1
+
+
 class _Job(NamedTuple):
     card: str
     first: int
+    problems: int
     path: Path
 
     def __str__(self) -> str:
-        return f"{self.card}, problems {self.first} to {self.first + CHUNK - 1}"
+        return f"{self.card}, problems {self.first} to {self.first + self.problems - 1}"
 
 
 def uses_of(entry: SolverEntry, protocol: Protocol = PROTOCOLS["points"]) -> tuple[str, ...]:
@@ -114,7 +129,7 @@ def run_cards(
     work: Path,
     *,
     workers: int = 1,
-    time_limit_s: float | None = None,
+    limits: Limits = Limits(),  # noqa: B008  it is a constant
     step: Callable[[str], None] = lambda word: None,
 ) -> list[Path]:
     """Run solvers on exported inputs; returns for each a file of predictions in ``work``, ready to be submitted.
@@ -127,25 +142,74 @@ def run_cards(
     data, count = sha256(inputs / "problems.jsonl"), len(split.truths)
     jobs, identities = [], {}
     for card, entry in entries.items():
-        identities[card] = _identity(entry, split, data)
-        for first in range(0, count, CHUNK):
-            job = _Job(card, first, work / entry.name / f"{identities[card][:16]}-{first:05d}.json")
-            if read_record(job.path) is None:
-                jobs.append(job)
+        identities[card] = _identity(entry, split, data, limits)
+        for first in range(0, count, limits.chunk):
+            path = work / entry.name / f"{identities[card][:16]}-{first:05d}.json"
+            if read_record(path) is None:
+                jobs.append(_Job(card, first, limits.chunk, path))
             else:
                 step(entry.name)
     if jobs:
         warm_up({entry.solver.spec.motion_model for entry in entries.values()})
+
+    def fail(job: _Job, reason: str) -> None:
+        name = split.truths[job.first].name
+        job.path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(job.path, {"answers": [{"name": name, "success": False, "reason": reason}]})
+
+    def limited(job: _Job) -> bool:
+        return entries[job.card].built_in  # those of others are limited in processes of their own
+
+    for job in jobs_done(_serve, jobs, workers, inputs, limits, fail, limited):
+        step(entries[job.card].name)
+    return [_joined(entry, split, work, identities[card], limits.chunk) for card, entry in entries.items()]
+
+
+def jobs_done(
+    serve: Callable[..., Callable[[Job], None]],
+    jobs: Sequence[Job],
+    workers: int,
+    inputs: Path,
+    limits: Limits,
+    fail: Callable[[Job, str], None],
+    limited: Callable[[Job], bool] = lambda job: True,
+) -> Iterator[Job]:
+    """Jobs as they are done in child processes of one thread.
+
+    Args:
+        serve: see ``IsolatedWorker``; called with ``inputs`` and ``limits``.
+        jobs: what is to be done.
+        workers: processes.
+        inputs: folder of the exported inputs.
+        limits: with some, a job that takes more, or ends its process, is handed to ``fail`` with the reason.
+        fail: keeps that as an answer.
+        limited: whether the limit of time is that of the job.
+
+    Raises:
+        RsbenchError: see ``finished_jobs``; only without limits.
+    """
     one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
-    with closing(finished_jobs(_serve, jobs, workers, one_thread, inputs, time_limit_s)) as found:
-        for job, _ in found:
-            step(entries[job.card].name)
-    return [_joined(entry, split, work, identities[card]) for card, entry in entries.items()]
+    if limits == Limits():
+        with closing(finished_jobs(serve, jobs, workers, one_thread, inputs, limits)) as found:
+            yield from (job for job, _ in found)
+        return
+
+    def seconds_of(job: Job) -> float:
+        return limits.seconds if limits.seconds is not None and limited(job) else math.inf
+
+    outcomes = run_jobs(
+        serve, jobs, workers, one_thread, inputs, limits, seconds_of=seconds_of, memory_mb=limits.memory_mb
+    )
+    with closing(outcomes) as ready:
+        for job, outcome in ready:
+            if not outcome.success:
+                fail(job, outcome.reason[:300])
+            yield job
 
 
-def steps_of(cards: Sequence[str], split: Split) -> int:
+def steps_of(cards: Sequence[str], split: Split, limits: Limits = Limits()) -> int:  # noqa: B008  a constant
     """How often ``run_cards`` reports progress."""
-    return len(cards) * -(-len(split.truths) // CHUNK)
+    return len(cards) * -(-len(split.truths) // limits.chunk)
 
 
 def _check_uses(protocol: Protocol, entry: SolverEntry) -> None:
@@ -160,8 +224,9 @@ def _check_uses(protocol: Protocol, entry: SolverEntry) -> None:
         raise RsbenchError(f"solver {entry.name!r}: {error}") from error
 
 
-def _identity(entry: SolverEntry, split: Split, data: str) -> str:
+def _identity(entry: SolverEntry, split: Split, data: str, limits: Limits) -> str:
     return identity_of(
+        **({} if limits == Limits() else {"limits": list(limits)}),
         source=numeric_version(),
         solver=entry.key,
         options=asdict(entry.options),
@@ -187,10 +252,10 @@ def header_of(entry: SolverEntry, split: Split) -> dict[str, Any]:
     }
 
 
-def _joined(entry: SolverEntry, split: Split, work: Path, identity: str) -> Path:
+def _joined(entry: SolverEntry, split: Split, work: Path, identity: str, chunk: int) -> Path:
     """The chunks of a solver as one submission."""
     answers: list[dict[str, Any]] = []
-    for first in range(0, len(split.truths), CHUNK):
+    for first in range(0, len(split.truths), chunk):
         record = read_record(work / entry.name / f"{identity[:16]}-{first:05d}.json") or {}
         answers += record.get("answers", [])
     path = work / entry.name / "predictions.jsonl"
@@ -201,10 +266,10 @@ def _joined(entry: SolverEntry, split: Split, work: Path, identity: str) -> Path
 # In the child
 
 
-def _serve(inputs: Path, time_limit_s: float | None) -> Callable[[_Job], None]:
+def _serve(inputs: Path, limits: Limits) -> Callable[[_Job], None]:
     use_one_thread()
     warm_up()
-    runner = SolverRunner(time_limit_s=time_limit_s, single_thread=True)  # as long as this process
+    runner = SolverRunner(time_limit_s=limits.seconds, single_thread=True, memory_mb=limits.memory_mb)
     protocol = protocol_of_id(str(read_json(inputs / "split.json").get("protocol")))
     answer = answer_problem if protocol.asks == "motion" else _readout
     problems = read_inputs(inputs, protocol)
@@ -212,7 +277,9 @@ def _serve(inputs: Path, time_limit_s: float | None) -> Callable[[_Job], None]:
     def run(job: _Job) -> None:
         try:
             entry = load_solver_entry(job.card)
-            answers = [answer(problem, entry, runner) for problem in problems[job.first : job.first + CHUNK]]
+            answers = [
+                answer(problem, entry, runner) for problem in problems[job.first : job.first + job.problems]
+            ]
         except RsbenchError as error:
             raise EntryFailure(str(error)) from error
         job.path.parent.mkdir(parents=True, exist_ok=True)

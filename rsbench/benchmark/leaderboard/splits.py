@@ -49,6 +49,8 @@ class Truth:
     """Problems of one scene are not independent: intervals count scenes."""
     facts: dict[str, float | str]
     """What scores may be drawn against."""
+    sequence: Sequence | None = None
+    """Of rendered frames: where their truth lies."""
     pictures: TruePictures | None = None
     """Where pictures are asked."""
 
@@ -262,5 +264,6 @@ def truth_of(sequence: Sequence, pictures: TruePictures | None = None) -> Truth:
         motion=sequence.motion,
         scene=str(named or sequence.name),
         facts=facts,
+        sequence=sequence,
         pictures=pictures,
     )

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from rsbench.benchmark.leaderboard.answers import KINDS, Answer, Header, Vector
+from rsbench.benchmark.leaderboard.own_matches import read_own_matches
 from rsbench.benchmark.leaderboard.picture_checks import check_pictures
 from rsbench.benchmark.leaderboard.picture_files import FOLDER
 from rsbench.benchmark.leaderboard.protocols import protocol_of_id
@@ -44,8 +45,8 @@ class Submission:
     header: Header
     answers: Mapping[str, Answer]
     """By the name of the problem."""
-    pictures: Path
-    """Folder of what answers hold beside the file, where pictures are asked."""
+    folder: Path
+    """Of the file; what answers hold beside it lies there."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,15 +103,25 @@ def check_submission(path: Path, split: Split) -> Findings:
         faults.append(str(error))
     if header is None or faults:
         return Findings(submission=None, faults=tuple(faults), notes=())
-    submission = Submission(header=header, answers=answers, pictures=path.parent / FOLDER)
-    notes = list(_notes(submission, split, path))
+    submission = Submission(header=header, answers=answers, folder=path.parent)
+    beside, hints = _beside(submission, split)
+    if beside:
+        return Findings(submission=None, faults=tuple(beside), notes=())
+    return Findings(submission=submission, faults=(), notes=(*_notes(submission, split, path), *hints))
+
+
+def _beside(submission: Submission, split: Split) -> tuple[list[str], list[str]]:
+    """Faults and notes of the pictures or matches that lie beside a file."""
     if split.protocol.pictures:
-        answered = [answer.name for answer in answers.values() if answer.success]
-        found = check_pictures(path.parent / FOLDER, answered, header.png_unit_m, split, _MOST_FAULTS)
-        if found[0]:
-            return Findings(submission=None, faults=tuple(found[0]), notes=())
-        notes += found[1]
-    return Findings(submission=submission, faults=(), notes=tuple(notes))
+        answered = [answer.name for answer in submission.answers.values() if answer.success]
+        folder, unit = submission.folder / FOLDER, submission.header.png_unit_m
+        return check_pictures(folder, answered, unit, split, _MOST_FAULTS)
+    if split.protocol.own_matches:
+        try:
+            read_own_matches(submission.folder, split.by_name)
+        except RsbenchError as error:
+            return [str(error)], []
+    return [], []
 
 
 def track_of(path: Path) -> str:

@@ -33,6 +33,7 @@ from rsbench.benchmark.leaderboard.submissions import read_submission
 from rsbench.dataset.files import load_arrays
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolation import Outcome
 from rsbench.report.board_page import build_site
 from rsbench.solvers.engine.registry import load_solver_entry
 
@@ -301,6 +302,38 @@ def test_runs_are_the_same_however_they_are_cut(tmp_path: Path, monkeypatch: pyt
     assert again == first and chunks[0].read_bytes() == kept
     scores = mark(read_submission(path, SPLIT), SPLIT)
     assert scores["auc_10"].mean() > 0.3  # the conventions of inputs and answers agree
+
+
+def test_a_problem_that_takes_too_much_is_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It alone, with the reason; and what was done without limits is not taken for it."""
+    split = small_split(3)
+    write_inputs(split, (simulated_problem(1, number) for number in range(3)), tmp_path / "in")
+    limits = running.Limits(seconds=5.0)
+
+    def one_too_long(
+        serve: Any,
+        jobs: Any,
+        workers: int,
+        environment: object,
+        *arguments: object,
+        seconds_of: Any,
+        memory_mb: Any,
+    ) -> Any:
+        run = serve(*arguments)
+        for job in jobs:
+            assert seconds_of(job) == 5.0 and memory_mb is None and job.problems == 1
+            late = job.first == 1
+            value = None if late else run(job)
+            yield job, Outcome(value=value, reason="took longer than 5 s" if late else "", output="")
+
+    monkeypatch.setattr(running, "finished_jobs", _here)
+    monkeypatch.setattr(running, "run_jobs", one_too_long)
+    for chosen in (running.Limits(), limits):
+        (path,) = run_cards(["gs-8pt"], split, tmp_path / "in", tmp_path / "work", limits=chosen)
+        answers = [json.loads(line) for line in path.read_text("utf-8").splitlines()[1:]]
+        assert [answer["name"] for answer in answers] == ["p000", "p001", "p002"]
+        assert ("took longer" in answers[1].get("reason", "")) == (chosen == limits)
+    assert mark(read_submission(path, split), split)["failure"][1] == 1.0
 
 
 def test_frames_with_given_matches(smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,6 +21,7 @@ from analytic_dataset import write_analytic_dataset
 from commands import assert_refused, run_here
 from leaderboards import Line, write
 
+from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.board import add, entries_of, merge, rescore
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.picture_oracles import write_oracles, write_template, write_truth
@@ -433,7 +434,7 @@ def test_entries_stand_alone_copies_tie_and_boards_merge(splits: dict[str, Split
     found = {line.scored.header.method: line for line in standings(entries_of(board, "depth-1", split.name))}
     pd.testing.assert_frame_equal(found["a"].scored.scores, alone.scores)
     assert next(iter(found)) == "b" and found["a"].rank == found["copy"].rank and "copy" in found["a"].ties
-    assert sorted(alone.pictures) == ["planes.0/left_1.exr", "planes.1/left_1.exr"]
+    assert sorted(alone.files) == ["pictures/planes.0/left_1.exr", "pictures/planes.1/left_1.exr"]
     assert rescore(board, split) == {}
     with pytest.raises(RsbenchError, match="with other predictions"):
         _submitted(board, split, tmp_path / "again", "a", 1.3)
@@ -450,10 +451,10 @@ def test_pictures_that_were_changed_are_named(splits: dict[str, Split], tmp_path
             act()
     secret = tmp_path / "secret"
     secret.write_text("secret", "utf-8")
-    for name in ("../../../../../secret", "planes.0/../../../../../secret", "/etc/passwd", "planes.0/x\0"):
-        hostile = {**record, "pictures": {name: record["pictures"]["planes.0/left_1.exr"]}}
+    for name in ("../../../../../secret", "pictures/../../../../../secret", "/etc/passwd", "pictures/x\0", "a"):
+        hostile = {**record, "files": {name: "0" * 64}}
         (entry.folder / "entry.json").write_text(json.dumps(hostile), "utf-8")
-        with pytest.raises(RsbenchError, match=r"is no name of a picture|unreadable"):
+        with pytest.raises(RsbenchError, match="is no name of a file of an answer"):
             merge(board, tmp_path / "mine")
     assert not [
         p for p in (tmp_path / "mine").rglob("*") if p.is_file() and "secret" in p.read_text("utf-8", "ignore")
@@ -505,9 +506,7 @@ def test_cards_run_and_go_on(
     track: str, entries: tuple[str, ...], smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Through the command line; what is lost is made again, to the last digit, and a solver is no matcher."""
-    from rsbench.benchmark.leaderboard import picture_running
-
-    monkeypatch.setattr(picture_running, "finished_jobs", _here)
+    monkeypatch.setattr(running, "finished_jobs", _here)
     where = ("--data", smoke_dataset, "--board", tmp_path / "board")
     cards = [word for entry in entries for word in ("--entry", entry)]
     assert_refused(run_here("leaderboard", "run", track, *where, "--entry", "gs-8pt"), "gs-8pt")

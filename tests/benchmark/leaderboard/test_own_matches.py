@@ -1,0 +1,148 @@
+"""Own matches beside own motions: points of known planes, seen by four frames, and what is wrong with files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from analytic_dataset import PLANES, write_analytic_dataset
+from commands import run_here
+from leaderboards import truth_lines, write
+
+from rsbench.benchmark.leaderboard.board import add, entries_of, merge, rescore
+from rsbench.benchmark.leaderboard.marking import mark
+from rsbench.benchmark.leaderboard.own_matches import match_scores
+from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
+from rsbench.benchmark.leaderboard.splits import Split, dataset_split
+from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.motion import LinearMotion
+from rsbench.core.projection import rs_project
+from rsbench.core.rig import VIEWS, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.pipeline.problem import COLUMNS
+
+RIG = StereoRig(camera=PinholeCamera.centred(96, 80, 110.0), baseline=0.3)
+SHUTTER = RollingShutter(height=80, readout_ratio=0.9)
+MOTION = LinearMotion(np.array([0.01, 0.02, -0.01]), np.array([0.1, -0.05, 0.08]))
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory: pytest.TempPathFactory) -> Split:
+    folder = tmp_path_factory.mktemp("planes")
+    write_analytic_dataset(folder, RIG, SHUTTER, MOTION)
+    return dataset_split(PROTOCOLS["pose-own"], folder)
+
+
+def _tracks() -> np.ndarray:
+    """(n, 8) where four frames see points of the nearer plane; no depth map is used."""
+    rng = np.random.default_rng(0)
+    points = []
+    for number, (normal, offset) in enumerate(PLANES):
+        ahead = rng.uniform([-0.5, -0.4, 1.0], [0.5, 0.4, 1.0], (400, 3))
+        near = [c / (ahead @ n) for n, c in PLANES]
+        other = near[1 - number]
+        here = near[number]
+        # Clearly before the other plane, or the other one is behind the camera.
+        chosen = (here > 0.0) & ((here < 0.8 * other) | (other < 0.0))
+        points.append((ahead * here[:, None])[chosen])
+        assert np.allclose(points[-1] @ normal, offset)
+    seen = [rs_project(RIG, SHUTTER, MOTION, *view, np.concatenate(points)).pixels for view in VIEWS]
+    order = [VIEWS.index(view) for view in (("left", 0), ("right", 0), ("left", 1), ("right", 1))]
+    tracks = np.concatenate([seen[k] for k in order], axis=1)
+    inside = np.all(np.isfinite(tracks), axis=1) & np.all((tracks >= 1.0) & (tracks <= 78.0), axis=1)
+    return tracks[inside]
+
+
+def _handed_in(folder: Path, split: Split, sets: dict[str, np.ndarray]) -> Path:
+    (folder / "matches").mkdir(parents=True)
+    for key, rows in sets.items():
+        table = pd.DataFrame(rows, columns=COLUMNS[key].split(", "))
+        table.insert(0, "name", "planes")
+        table.to_csv(folder / "matches" / f"{key}.csv", index=False)
+    return write(folder / "predictions.jsonl", truth_lines(split))
+
+
+def test_right_matches_are_counted(split: Split, tmp_path: Path) -> None:
+    """Every third second end is 2 px off, and all have noise of a tenth of a pixel."""
+    tracks = _tracks()
+    assert len(tracks) > 100
+    left, stereo = tracks[:, [0, 1, 4, 5]], tracks[:, :4]
+    off = np.zeros_like(left)
+    off[::3, 3] = 2.0
+    noise = 0.1 * np.random.default_rng(1).standard_normal(left.shape)
+    path = _handed_in(tmp_path, split, {"left": left + off + noise, "stereo_0": stereo})
+    (row,) = mark(read_submission(path, split), split).to_dict("records")
+    assert row["matches"] == 2 * len(tracks)
+    assert abs(row["matches_1px"] - (1.0 - len(tracks[::3]) / (2 * len(tracks)))) < 0.02
+    # Tracks are matches of all four pairs, each once, also where they are repeated.
+    (truth,) = split.truths
+    assert truth.sequence is not None
+    found = match_scores(truth.sequence, Correspondences(tracks=tracks, left=left))
+    assert found["matches"] == 4 * len(tracks) and found["matches_1px"] > 0.98
+
+
+def test_motions_without_matches_have_none(split: Split, tmp_path: Path) -> None:
+    (row,) = mark(read_submission(write(tmp_path / "x.jsonl", truth_lines(split)), split), split).to_dict(
+        "records"
+    )
+    assert np.isnan(row["matches"]) and np.isnan(row["matches_1px"]) and row["auc_1"] > 1.0 - 1e-6
+    (truth,) = split.truths
+    assert truth.sequence is not None
+    assert match_scores(truth.sequence, Correspondences()) == {"matches": 0.0, "matches_1px": 0.0}
+
+
+def test_matches_are_kept_with_the_entry(split: Split, tmp_path: Path) -> None:
+    path = _handed_in(tmp_path / "in", split, {"left": _tracks()[:, [0, 1, 4, 5]]})
+    add(tmp_path / "board", path, split, {})
+    assert merge(tmp_path / "board", tmp_path / "other") == [f"pose-own-1/{split.name}/truth"]
+    assert rescore(tmp_path / "other", split) == {}
+    (entry,) = entries_of(tmp_path / "other", "pose-own-1", split.name)
+    assert list(entry.files) == ["matches/left.csv"] and entry.scores["matches_1px"][0] > 0.98
+
+
+FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "another file": (lambda p: (p / "evil.csv").write_text("x"), "evil.csv: is not asked; there are: left.csv"),
+    "a link": (lambda p: (p / "right.csv").symlink_to(p / "left.csv"), "right.csv: must be a file of its own"),
+    "nothing": (lambda p: (p / "left.csv").unlink(), "matches: must be a folder with some of"),
+    "no columns": (lambda p: (p / "left.csv").write_text("name,x\nplanes,1\n"), "lacks the column 'x0'"),
+    "text": (lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\nplanes,1,2,3,a\n"), "must hold numbers"),
+    "NaN": (
+        lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\nplanes,1,2,3,nan\n"),
+        "left.csv:2: must hold",
+    ),
+    "infinity": (lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\nplanes,1,2,3,inf\n"), "finite pixels"),
+    "another problem": (
+        lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\n../x,1,2,3,4\n"),
+        "name = '../x': is no problem",
+    ),
+    "other bytes": (lambda p: (p / "left.csv").write_bytes(b"\xff\xfe\x00"), "not UTF-8"),
+}
+
+
+@pytest.mark.parametrize("case", FAULTS)
+def test_faults_are_lines(case: str, split: Split, tmp_path: Path) -> None:
+    damage, words = FAULTS[case]
+    path = _handed_in(tmp_path, split, {"left": np.ones((3, 4))})
+    damage(tmp_path / "matches")
+    (fault,) = check_submission(path, split).faults
+    assert words in fault and "\n" not in fault
+
+
+def test_given_matches_are_in_the_form_of_own_ones(smoke_dataset: Path, tmp_path: Path) -> None:
+    """What ``export pose`` writes may be handed in as it is: most of rsbench's matches are right."""
+    split = dataset_split(PROTOCOLS["pose-own"], smoke_dataset)
+    out = tmp_path / "inputs"
+    assert run_here("leaderboard", "export", "pose", "--data", smoke_dataset, "--out", out).returncode == 0
+    (tmp_path / "matches").mkdir()
+    for key in COLUMNS:
+        if (out / f"{key}.csv").exists():
+            (out / f"{key}.csv").rename(tmp_path / "matches" / f"{key}.csv")
+    path = write(tmp_path / "predictions.jsonl", truth_lines(split))
+    scores = mark(read_submission(path, split), split)
+    assert np.all(scores["matches"] > 50) and np.all(scores["matches_1px"] > 0.7), json.dumps(scores.to_dict())
