@@ -46,7 +46,7 @@ def plane_colours(camera: PinholeCamera, poses: Pose, depth: NDArray[np.float32]
     return np.round(128 + 50 * np.sin(X @ waves.T)).astype(np.uint8)
 
 
-def _card(rig: StereoRig, shutter: RollingShutter, motion: Motion, frames: int) -> DatasetCard:
+def card_of(rig: StereoRig, shutter: RollingShutter, motion: Motion, frames: int) -> DatasetCard:
     return DatasetCard(
         name="planes",
         camera=CameraCard(width=rig.camera.width, height=rig.camera.height, focal=rig.camera.fx),
@@ -122,7 +122,7 @@ def write_analytic_dataset(
             "rsbench": rsbench.__version__,
             "mitsuba": "none",
             "units": UNITS,
-            "card": asdict(_card(rig, shutter, motion, frames)),
+            "card": asdict(card_of(rig, shutter, motion, frames)),
             "sequences": ["planes"],
             "files": {
                 f"planes/{name}": {"sha256": sha256(folder / name), "size": (folder / name).stat().st_size}

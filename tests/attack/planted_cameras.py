@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import frame_faults
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,6 +55,7 @@ CAMERAS: dict[str, dict[str, Any]] = {
     "opposite": {"right_scan": "bottom"},
     "thin": {"scene": "forest"},
     "processed": {"sensor": CAMERA},
+    "frames": {"frames": 4, "channels": ("timing", "imu", "tracks", "affine", "matches")},
 }
 """What differs from the cameras of datasets/smoke.toml, by name; ``thin`` sees hardly a flat place."""
 
@@ -365,6 +367,16 @@ def _thin_faults() -> Iterator[Fault]:
     yield Fault("frames exchanged", late, ("gs_depth/left_0.exr", "looks like gs_depth/left_1.exr"))
 
 
+def _frame_faults() -> Iterator[Fault]:
+    """In channels of whole sequences, beyond the first two frames."""
+    for name, (plant, words) in frame_faults.FAULTS.items():
+        yield Fault(f"frames: {name}", _in_victim(plant), words)
+
+
+def _in_victim(plant: Plant) -> Plant:
+    return lambda folder: plant(folder / VICTIM)
+
+
 CAMERA_FAULTS: dict[str, tuple[Fault, ...]] = {
     "barrel": tuple(_lens_faults()),
     "fisheye columns": tuple(_column_faults()),
@@ -372,5 +384,6 @@ CAMERA_FAULTS: dict[str, tuple[Fault, ...]] = {
     "opposite": tuple(_opposite_faults()),
     "thin": tuple(_thin_faults()),
     "processed": SENSOR_FAULTS,
+    "frames": tuple(_frame_faults()),
 }
 """Of each of ``CAMERAS``."""
