@@ -125,7 +125,7 @@ FAULTS: dict[str, tuple[Plant, Words]] = {
     ),
     "affine frames exchanged": (
         affine_of("jacobians", swapped),
-        (AFFINE, "left_3", "not those of plane, motion and row times"),
+        (AFFINE, "left_3", "derivatives"),  # there without a pixel, or of another frame
     ),
     "inertial samples a sample late": (
         samples_of(late_by_a_sample),
