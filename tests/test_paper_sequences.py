@@ -77,27 +77,27 @@ def test_correction_loses_little_to_true_motion_and_gains_much_over_none(
 Shot = tuple[renderer_scene.MitsubaScene, PinholeCamera, Pose]
 
 
-@pytest.fixture(scope="module", params=["castle", "room"])
+@pytest.fixture(scope="module", params=[("castle", "sunsky"), ("room", "path")])
 def shot(
     request: pytest.FixtureRequest,
     built_scene: Callable[[str], Scene],
     scenes_once: None,
     give_back: Callable[[], None],
-) -> Shot:
-    """A scene and the rows of its second right frame; of module scope, so that one scene goes before the next."""
+) -> tuple[Shot, str]:
+    """A scene, the rows of its second right frame, an integrator; of module scope: one scene before the next."""
     give_back()
+    name, integrator = request.param
     card = load_dataset_card("paper")
-    (sequence,) = card.only([str(request.param)]).sequence
+    (sequence,) = card.only([name]).sequence
     scene = built_scene(sequence.scene)
     rig = card.rig_of(sequence)
     poses = row_poses(rig, card.shutter_for(sequence), card.motion_of(sequence), "right", 1)
     seen = scene.seen_from(scene.viewpoints[sequence.viewpoint])
-    return renderer_scene.MitsubaScene(seen), rig.camera, poses
+    return (renderer_scene.MitsubaScene(seen), rig.camera, poses), integrator
 
 
-@pytest.mark.parametrize("integrator", ["sunsky", "path"])
-def test_single_pass_equals_stitched_on_the_paper_frame(shot: Shot, integrator: str) -> None:
-    scene, camera, poses = shot
+def test_single_pass_equals_stitched_on_the_paper_frame(shot: tuple[Shot, str]) -> None:
+    (scene, camera, poses), integrator = shot
     preset = "default" if integrator == "sunsky" else "path"
     options = replace(load_card(RendererOptions, "renderers", preset), samples=1 if integrator == "path" else 4)
     rows = np.linspace(0, 899, 20).astype(int).tolist()

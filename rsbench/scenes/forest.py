@@ -133,7 +133,7 @@ def _foreground(rng: np.random.Generator) -> list[Piece]:
         at = np.array([x, y, float(_height(x, y))])
         branches += placed([trunk], (x, y, float(at[2])))
         for level in np.arange(1.0, 3.4, 0.2):
-            start = at + [np.interp(level, path[:, 2], path[:, k]) for k in range(3)]
+            start = at + np.array([np.interp(level, path[:, 2], path[:, k]) for k in range(3)])
             angle, length = rng.uniform(0, 2 * np.pi), float(rng.uniform(0.35, 1.0))
             reach = length * np.array([np.cos(angle), 0.5 * np.sin(angle), rng.uniform(0, 0.6)])
             twig, spots = _branch(rng, start, reach, 0.008, 0 if rng.random() < 0.25 else 28)

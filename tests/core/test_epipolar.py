@@ -137,7 +137,8 @@ def test_a_global_shutter_gives_the_textbook_sampson_error() -> None:
     K = RIG.camera.K
     E = epipolar.rs_essential_matrix(RIG, shutter, MOTIONS[0], "left", 0, 0)
     F = np.linalg.inv(K).T @ E @ np.linalg.inv(K)
-    p0, p1 = (np.concatenate([p, np.ones((len(p), 1))], axis=1) for p in (matches[:, :2], matches[:, 2:]))
+    ones = np.ones((len(matches), 1))
+    p0, p1 = np.hstack([matches[:, :2], ones]), np.hstack([matches[:, 2:], ones])
     lines1, lines0 = p0 @ F.T, p1 @ F  # Hartley & Zisserman eq. 11.9, in pixels
     square = np.sum(lines1[:, :2] ** 2, axis=1) + np.sum(lines0[:, :2] ** 2, axis=1)
     expected = np.sum(p1 * lines1, axis=1) / np.sqrt(square)
