@@ -304,3 +304,13 @@ def test_the_divider_cuts_the_upper_picture(rendered_site: Path, browser: Browse
     sources = browser.run("['over', 'under'].map((n) => document.querySelector(`.compare img.${n}`).alt)")
     assert sources == ["rolling-shutter frame 0", "rolling-shutter frame 1"]
     assert browser.said == []
+
+
+def test_readme_tells_the_bound_of_the_committed_board() -> None:
+    root = Path(__file__).parents[2]
+    (table,) = (root / "results" / "leaderboard" / "site").glob("points-*.md")
+    bound = next(line for line in table.read_text("utf-8").splitlines() if line.startswith("| cramer-rao"))
+    section = (root / "README.md").read_text("utf-8").partition("### Leaderboard")[2].partition("\n### ")[0]
+    assert f"reach an AUC@5 of {bound.split(' | ')[3]}." in " ".join(section.split())
+    rows = [line for line in section.splitlines() if line.startswith("| ")]
+    assert set(rows) <= set(table.read_text("utf-8").splitlines()) and len(rows) > 5
