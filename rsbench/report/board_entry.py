@@ -44,10 +44,9 @@ def _words(kinds: pd.Series) -> bool:
 
 def _best_peer(each: Board, line: Standing) -> list[Standing]:
     """The best of the other entries that use no more, which the figures show beside it."""
-    uses, key = set(line.scored.header.uses), each.protocol.primary.key
-    sign = 1.0 if each.protocol.primary.better == "higher" else -1.0
-    peers = [p for p in each.lines if p.rank and p is not line and set(p.scored.header.uses) <= uses]
-    return sorted(peers, key=lambda p: -sign * p.means[key][0])[:1] if line.rank else []
+    uses = set(line.scored.header.uses)
+    peers = [peer for peer in each.by_score if peer is not line and set(peer.scored.header.uses) <= uses]
+    return peers[:1] if line.rank else []
 
 
 def _oracles(each: Board, line: Standing) -> list[Standing]:

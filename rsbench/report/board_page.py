@@ -20,7 +20,7 @@ from rsbench.benchmark.statistics import in_words
 from rsbench.dataset.files import write_bytes
 from rsbench.report.board_entry import entry_context
 from rsbench.report.board_figures import bar
-from rsbench.report.board_pictures import Album
+from rsbench.report.board_pictures import albums
 from rsbench.report.board_problems import matrix_context, problem_contexts
 from rsbench.report.board_splits import Board, read_split
 from rsbench.report.board_tables import as_csv, as_latex, as_markdown
@@ -50,14 +50,13 @@ def build_site(board: Path, out: Path, data: Sequence[Path] = ()) -> Path:
     boards = [read_split(board, protocol, split) for protocol, split in splits_of(board)]
     boards = [each for each in boards if each.lines]
     out.mkdir(parents=True, exist_ok=True)
-    for each in boards:
+    for each, album in zip(boards, albums(boards, out, data), strict=True):
         for suffix, text in (
             ("csv", as_csv(each.lines)),
             ("md", as_markdown(each.lines)),
             ("tex", as_latex(each.lines)),
         ):
             write_bytes(out / f"{each.id}.{suffix}", text.encode())
-        album = Album(each, out, data)
         for line in each.lines:
             write(f"{each.id}/{line.scored.header.method}.html", "board_entry", entry_context(each, line, album))
         write(f"{each.id}--problems.html", "board_problems", matrix_context(each, album))

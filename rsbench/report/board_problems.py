@@ -72,7 +72,8 @@ def problem_contexts(each: Board, album: Album) -> Iterator[tuple[str, dict[str,
                 "columns": [{"title": score.title, "hint": score.hint} for score in each.protocol.scores],
                 "rows": [_row(each, line, k) for line in each.lines],
                 "place": f"../pictures/{problem}",
-                "pictures": album.frames(problem),
+                "pictures": album.pictures(problem),
+                "errors": album.errors,
             },
         )
 

@@ -89,6 +89,13 @@ class Board:
         found = [(str(name), self.facts[name].reindex(self.problems)) for name in self.facts.columns]
         return [*found, ("scene", pd.Series(self.scenes))] if self.several else found
 
+    @property
+    def by_score(self) -> list[Standing]:
+        """Lines that have a rank, the best first, whatever they use."""
+        primary = self.protocol.primary
+        ranked = [line for line in self.lines if line.rank is not None]
+        return sorted(ranked, key=lambda line: -primary.sign * line.means[primary.key][0])
+
     def figures(self, lines: Sequence[Standing]) -> dict[str, Any]:
         """Errors of some of its lines against what is known of the problems."""
         shown = drawable([self._line(line) for line in lines])

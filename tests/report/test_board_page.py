@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 import statistics
 from collections.abc import Iterator
@@ -19,12 +20,14 @@ from browser import CHROMIUM, Browser, started
 from leaderboards import Line, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard.board import add
+from rsbench.benchmark.leaderboard.picture_oracles import write_truth
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.files import read_depth, read_png, write_depth
 from rsbench.report.board_figures import ErrorLine, curves, drawable
 from rsbench.report.board_page import build_site
 
@@ -244,7 +247,7 @@ def test_pages_have_no_serious_fault_of_accessibility(site: Path, rendered_site:
     """Names of controls, headers of tables, landmarks, contrast: on the screen, in the dark and in print."""
     assert AXE is not None and AXE.submodule_search_locations is not None
     script = (Path(AXE.submodule_search_locations[0]) / "axe.min.js").read_text("utf-8")
-    for number, path in enumerate([*_pages(site), *rendered_site.glob("*/problem/planes.html")]):
+    for number, path in enumerate([*_pages(site), _page_of(rendered_site, "correction")]):
         page.open(path.as_uri())
         page.run(f"{script}\n;0")
         for media, dark in (("", False), ("", True), ("print", True))[: 3 if number == 0 else 1 + number % 2]:
@@ -261,38 +264,77 @@ def test_pages_have_no_serious_fault_of_accessibility(site: Path, rendered_site:
 # Rendered frames
 
 
+HALF = (33, 145, 140)
+"""The middle of viridis, #21918c."""
+
+
 @pytest.fixture(scope="module")
 def rendered_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A board of one sequence whose truth was handed in, with the pictures of its dataset."""
+    """A sequence: its true motion; depth wrong by 1.5 px; frames too bright by 32, an eighth not drawn."""
     folder = tmp_path_factory.mktemp("rendered")
     rig = StereoRig(camera=PinholeCamera.centred(96, 72, 80.0), baseline=0.2)
     motion = LinearMotion(np.array([0.01, -0.02, 0.01]), np.array([0.1, 0.0, 0.2]))
-    write_analytic_dataset(folder / "data", rig, RollingShutter(height=72, readout_ratio=0.8), motion)
-    split = dataset_split(PROTOCOLS["pose"], folder / "data")
-    add(folder / "board", write(folder / "x.jsonl", truth_lines(split)), split, {})
+    shutter = RollingShutter(height=72, readout_ratio=0.8)
+    write_analytic_dataset(folder / "data", rig, shutter, motion, twins=(36,))
+    splits = {track: dataset_split(PROTOCOLS[track], folder / "data") for track in ("pose", "depth", "correction")}
+    add(folder / "board", write(folder / "x.jsonl", truth_lines(splits["pose"])), splits["pose"], {})
+    for track in ("depth", "correction"):
+        path = write_truth(splits[track], folder / track)
+        lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+        for picture in (path.parent / "pictures" / "planes").iterdir():
+            if track == "depth":
+                depth = read_depth(picture).astype(np.float64)
+                write_depth(picture, (16.0 / (16.0 / depth + 1.5)).astype(np.float32))
+            else:
+                alpha = np.full((72, 96, 1), 255, dtype=np.uint8)
+                alpha[:9] = 0
+                shown = np.dstack([read_png(picture)[..., ::-1] + np.uint8(32), alpha])
+                cv2.imwrite(str(picture), shown)
+        add(folder / "board", write(path, named(lines, "slip", ("images",))), splits[track], {})
     build_site(folder / "board", folder / "out", [folder / "data"])
     return folder / "out"
 
 
+def _page_of(site: Path, track: str) -> Path:
+    (page,) = site.glob(f"{track}-1--*/problem/planes.html")
+    return page
+
+
+def _picture(page: Path, title: str) -> np.ndarray:
+    """RGB, of the only picture with that title."""
+    (file,) = re.findall(rf'<img src="([^"]+)" alt="{title}"', page.read_text("utf-8"))
+    read = cv2.imread(str(page.parent / file))
+    assert read is not None
+    return np.asarray(read[..., ::-1], dtype=float)
+
+
 def test_a_sequence_has_its_pictures(rendered_site: Path) -> None:
-    (page,) = rendered_site.glob("*/problem/planes.html")
-    files = re.findall(r'<img src="([^"]+)"', page.read_text("utf-8"))
-    assert len(files) == 2
-    for frame, file in enumerate(files):
-        paths = page.parent / file, rendered_site.parent / f"data/planes/rs/left_{frame}.png"
-        shown, true = (np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=float) for path in paths)
-        assert np.mean(np.abs(shown - true)) < 4.0  # of JPEG; the two frames differ by ten times that
-    (entry,) = rendered_site.glob("*/truth.html")
+    page = _page_of(rendered_site, "pose")
+    true = [read_png(rendered_site.parent / f"data/planes/rs/left_{k}.png").astype(float) for k in (0, 1)]
+    for frame in (0, 1):
+        shown = _picture(page, f"rolling-shutter frame {frame}")
+        own, other = (np.mean(np.abs(shown - each)) for each in (true[frame], true[1 - frame]))
+        assert own < 0.6 * other  # colours of these fine waves are what JPEG keeps least
+    (entry,) = rendered_site.glob("pose-1--*/truth.html")
     thumbs = re.findall(r'<img src="([^"]+)"', entry.read_text("utf-8"))
     assert thumbs and all((entry.parent / file).is_file() for file in thumbs)
     assert sum(path.stat().st_size for path in rendered_site.rglob("*")) < 15e6
 
 
+def test_error_maps_show_what_is_wrong(rendered_site: Path) -> None:
+    """Half of the largest error of each map, so the middle of its colours; JPEG costs some levels."""
+    depth = _picture(_page_of(rendered_site, "depth"), "slip, error")
+    np.testing.assert_allclose(np.median(depth, axis=(0, 1)), HALF, atol=4)
+    for row in ("first", "middle"):
+        frame = _picture(_page_of(rendered_site, "correction"), f"slip, {row} row, error")
+        np.testing.assert_allclose(np.median(frame[16:], axis=(0, 1)), HALF, atol=4)
+        np.testing.assert_allclose(np.median(frame[:6], axis=(0, 1)), (60, 60, 66), atol=4)  # not drawn
+
+
 def test_the_divider_cuts_the_upper_picture(rendered_site: Path, browser: Browser) -> None:
-    (path,) = rendered_site.glob("*/problem/planes.html")
     browser.said.clear()
-    browser.appear()
-    browser.open(path.as_uri())
+    browser.appear(width=375)
+    browser.open(_page_of(rendered_site, "correction").as_uri())
     over = "document.querySelector('.compare img.over')"
     assert browser.run(f"{over}.decode().then(() => {over}.naturalWidth)") == 96
     assert browser.run(f"{over}.style.clipPath") == "inset(0px 50% 0px 0px)"
@@ -303,6 +345,7 @@ def test_the_divider_cuts_the_upper_picture(rendered_site: Path, browser: Browse
     assert browser.run(f"{over}.style.clipPath") == "inset(0px 99% 0px 0px)"
     sources = browser.run("['over', 'under'].map((n) => document.querySelector(`.compare img.${n}`).alt)")
     assert sources == ["rolling-shutter frame 0", "rolling-shutter frame 1"]
+    assert browser.run("document.documentElement.scrollWidth") <= 375
     assert browser.said == []
 
 
