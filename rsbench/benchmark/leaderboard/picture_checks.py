@@ -27,7 +27,7 @@ _FAR_M = 300.0
 
 
 def check_pictures(
-    folder: Path, answered: list[str], png_unit_m: float | None, split: Split, most: int
+    folder: Path, answered: list[str], png_unit_m: float | None, split: Split, most: int, hints: bool
 ) -> tuple[list[str], list[str]]:
     """Faults of the pictures of answers, ``most`` at most, and notes; each picture is read once.
 
@@ -37,28 +37,32 @@ def check_pictures(
         png_unit_m: as of the header.
         split: of the answers; a secret truth is not looked at.
         most: faults that are told.
+        hints: whether notes are wanted, which take longer than reading.
     """
-    faults, hints = list(islice(strange_files(folder, split, answered), most)), Counter[str]()
+    faults, found = list(islice(strange_files(folder, split, answered), most)), Counter[str]()
     for name in answered:
         if len(faults) >= most:
             break
         truth = split.by_name[name]
         try:
-            hints.update(_hints(folder, truth, png_unit_m, split))
+            found.update(_hints(folder, truth, png_unit_m, split, hints))
         except RsbenchError as error:
             faults.append(str(error))
     notes = [
         f"{folder}: {count} of {len(answered)} answers look like something else: {words}"
-        for words, count in hints.items()
+        for words, count in found.items()
         if 2 * count > len(answered)
     ]
     return faults, notes
 
 
-def _hints(folder: Path, truth: Truth, png_unit_m: float | None, split: Split) -> set[str]:
+def _hints(folder: Path, truth: Truth, png_unit_m: float | None, split: Split, wanted: bool) -> set[str]:
+    """Reads the pictures of an answer, which may raise, and says what they look like."""
     assert truth.pictures is not None
     if split.protocol.asks == "depth":
         depth = read_answer_depth(folder, truth, png_unit_m)
+        if not wanted:
+            return set()
         if split.public:
             return set(_depth_readings(depth, truth))
         far = np.any(depth > 0.0) and np.median(depth[depth > 0.0]) > _FAR_M
@@ -66,7 +70,7 @@ def _hints(folder: Path, truth: Truth, png_unit_m: float | None, split: Split) -
     found: set[str] = set()
     for each in truth.pictures.asked:
         image, _ = read_answer_frame(folder, truth, each)
-        if split.public:
+        if wanted and split.public:
             others = {k.stem: truth.pictures.frame(k.row) for k in truth.pictures.asked if k != each}
             found |= set(_frame_readings(image, truth.pictures.frame(each.row), others))
     return found

@@ -67,7 +67,7 @@ def read_submission(path: Path, split: Split) -> Submission:
     Raises:
         RsbenchError: it is at fault; the line says how often.
     """
-    found = check_submission(path, split)
+    found = check_submission(path, split, hints=False)
     if found.submission is None:
         more = len(found.faults) - 1
         rest = f" (and {more} more: rsbench leaderboard check {path})" if more else ""
@@ -75,8 +75,8 @@ def read_submission(path: Path, split: Split) -> Submission:
     return found.submission
 
 
-def check_submission(path: Path, split: Split) -> Findings:
-    """Everything that is wrong with a file of predictions, or looks so."""
+def check_submission(path: Path, split: Split, *, hints: bool = True) -> Findings:
+    """Everything that is wrong with a file of predictions, and where ``hints`` are wanted what looks so."""
     faults: list[str] = []
     header: Header | None = None
     answers: dict[str, Answer] = {}
@@ -104,18 +104,20 @@ def check_submission(path: Path, split: Split) -> Findings:
     if header is None or faults:
         return Findings(submission=None, faults=tuple(faults), notes=())
     submission = Submission(header=header, answers=answers, folder=path.parent)
-    beside, hints = _beside(submission, split)
+    beside, notes = _beside(submission, split, hints)
     if beside:
         return Findings(submission=None, faults=tuple(beside), notes=())
-    return Findings(submission=submission, faults=(), notes=(*_notes(submission, split, path), *hints))
+    if hints:
+        notes = [*_notes(submission, split, path), *notes]
+    return Findings(submission=submission, faults=(), notes=tuple(notes))
 
 
-def _beside(submission: Submission, split: Split) -> tuple[list[str], list[str]]:
+def _beside(submission: Submission, split: Split, hints: bool) -> tuple[list[str], list[str]]:
     """Faults and notes of the pictures or matches that lie beside a file."""
     if split.protocol.pictures:
         answered = [answer.name for answer in submission.answers.values() if answer.success]
         folder, unit = submission.folder / FOLDER, submission.header.png_unit_m
-        return check_pictures(folder, answered, unit, split, _MOST_FAULTS)
+        return check_pictures(folder, answered, unit, split, _MOST_FAULTS, hints)
     if split.protocol.own_matches:
         try:
             read_own_matches(submission.folder, split.by_name)

@@ -530,6 +530,54 @@ def test_cards_run_and_go_on(
         assert np.all(psnr["fusion-true"] > psnr["rotation-only"])
 
 
+MATCHER = """
+from dataclasses import dataclass
+import numpy as np
+from rsbench.vision.stereo_matcher import StereoMatcher
+
+@dataclass(frozen=True)
+class Level(StereoMatcher):
+    px: float = 5.0
+
+    def disparities(self, left, right, rig):
+        if self.px < 0.0:
+            raise ValueError("not today")
+        return (np.full(left.shape[:2], self.px),) * 2
+"""
+
+
+def test_a_method_of_somebody_else_runs_and_fails_alone(
+    planes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two cards beside their own module: one level everywhere, and one that raises."""
+    monkeypatch.setattr(running, "finished_jobs", _here)
+    (tmp_path / "level_matcher.py").write_text(MATCHER, "utf-8")
+    for name, px in (("level", 5.0), ("odd", -1.0)):
+        (tmp_path / f"{name}.toml").write_text(
+            f'class = "level_matcher:Level"\nparameters = {{ px = {px} }}\n', "utf-8"
+        )
+    where = ("--data", planes, "--board", tmp_path / "board")
+    cards = [word for name in ("level", "odd") for word in ("--entry", tmp_path / f"{name}.toml")]
+    ran = run_here("leaderboard", "run", "depth", *where, *cards)
+    assert ran.returncode == 0, ran.stderr
+    split = dataset_split(PROTOCOLS["depth"], planes)
+    found = {e.header.method: e for e in entries_of(tmp_path / "board", "depth-1", split.name)}
+    depth = read_depth(found["level"].folder / "pictures" / "planes.0" / "left_1.exr")
+    np.testing.assert_allclose(depth, RIG.camera.fx * RIG.baseline / 5.0, rtol=1e-6)
+    assert found["level"].header.code == "" and found["level"].header.uses == ("images", "stereo")
+    assert found["odd"].scores["failure"].all() and found["odd"].files == {}
+    answers = _lines(found["odd"].folder / "predictions.jsonl")[1:]
+    assert all("not today" in str(answer["reason"]) for answer in answers)
+    # A damaged picture is one line on the command line too, and the board stays as it is.
+    path = write_truth(split, tmp_path / "mine")
+    _pictures(path)[0].write_bytes(b"no picture")
+    before = _all(tmp_path / "board")
+    assert_refused(run_here("leaderboard", "submit", path, *where), "left_1.exr: damaged or not an EXR file")
+    checked = run_here("leaderboard", "check", path, "--data", planes)
+    assert checked.returncode == 2 and len(checked.stderr.splitlines()) == 1
+    assert _all(tmp_path / "board") == before
+
+
 @pytest.mark.parametrize("track", TRACKS)
 def test_inputs_hold_no_secret(track: str, planes: Path, tmp_path: Path) -> None:
     """Of a public split the truth, which is in order as it stands; of a secret one none of its files."""
