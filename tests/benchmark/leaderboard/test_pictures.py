@@ -10,6 +10,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +87,8 @@ def _each_frame(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
 def test_the_truth_is_best_and_nothing_is_worst(track: str, splits: dict[str, Split], tmp_path: Path) -> None:
     """No score of any other lies outside; the order of answers does not matter."""
     split = splits[track]
-    found = {path.parent.name: _scores(path, split) for path in write_oracles(split, tmp_path)}
+    two = islice(write_oracles(split, tmp_path), 2)  # the third takes seconds, and is scored below
+    found = {path.parent.name: _scores(path, split) for path in two}
     path = tmp_path / "truth" / "predictions.jsonl"
     head, *answers = _lines(path)
     write(path, [head, *random.Random(1).sample(answers, len(answers))])
