@@ -43,10 +43,13 @@ class Correspondences:
     """(n, 4) xl, yl, xr, yr: left to right in frame 1."""
     tracks: FloatArray = field(default_factory=lambda: _none(8))
     """(n, 8) xl0, yl0, xr0, yr0, xl1, yl1, xr1, yr1: one point in all four images."""
+    gyro: FloatArray = field(default_factory=lambda: _none(4))
+    """(n, 4) tau, w: what a gyroscope says of the rotation between the rows, dR/dtau = [w]x R, rad per period."""
 
     def __post_init__(self) -> None:
         for name, columns in _COLUMNS.items():
             object.__setattr__(self, name, _matches(getattr(self, name), name, columns))
+        object.__setattr__(self, "gyro", _matches(self.gyro, "gyro", 4))
 
 
 def _matches(value: ArrayLike, name: str, columns: int) -> FloatArray:
@@ -77,7 +80,7 @@ def without_lens(correspondences: Correspondences, camera: PinholeCamera) -> Cor
         lost = np.flatnonzero(np.any(np.isnan(sets[name]), axis=1))
         if len(lost):
             raise ValueError(f"{name}[{lost[0]}] = {rows[lost[0]].tolist()}: the lens shows no ray at this pixel")
-    return Correspondences(**sets)
+    return Correspondences(**sets, gyro=correspondences.gyro)
 
 
 def track_pairs(tracks: FloatArray, side: Side) -> FloatArray:

@@ -27,6 +27,7 @@ COLUMNS = {
 }
 _CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 _LINES = (".jsonl", ".ndjson")
+_GYRO = "tau, wx, wy, wz"
 SUFFIXES = (".json", *_LINES, ".npz")
 EXAMPLE = shipped_folder("examples", "_docs/examples") / "problem.json"
 """A small problem that every installation has."""
@@ -55,6 +56,7 @@ class _Content(Scanning):
     stereo_0: _Rows = ()
     stereo_1: _Rows = ()
     tracks: _Rows = ()
+    gyro: _Rows = ()
 
 
 def read_problems(source: str | Path, stdin: TextIO) -> Iterator[Problem | RsbenchError]:
@@ -183,7 +185,8 @@ def parse_problem(text: str, where: str, name: str = "") -> Problem:
     _check_sets(data, where)
     for key, columns in COLUMNS.items():
         _check_widths(getattr(content, key), key, columns, where)
-    sets = {key: getattr(content, key) for key in COLUMNS}
+    _check_widths(content.gyro, "gyro", _GYRO, where)
+    sets = {key: getattr(content, key) for key in (*COLUMNS, "gyro")}
     return _problem(
         content.camera,
         content.baseline,
@@ -202,10 +205,10 @@ def _check_sets(data: Mapping[str, Any], where: str) -> None:
 
 
 def _check_widths(rows: _Rows, name: str, columns: str, where: str) -> None:
-    width = columns.count(",") + 1
+    width, unit = columns.count(",") + 1, "" if name == "gyro" else " in pixels"
     for k, row in enumerate(rows):
         if len(row) != width:
-            raise RsbenchError(f"{where}: {name}[{k}] = {list(row)}: must be {width} numbers in pixels: {columns}")
+            raise RsbenchError(f"{where}: {name}[{k}] = {list(row)}: must be {width} numbers{unit}: {columns}")
 
 
 def _problem(

@@ -195,7 +195,7 @@ class RobustProblem:
     def _handed(self, left: FloatArray, right: FloatArray, tracks: FloatArray) -> Correspondences:
         """Matches as the solver wants them: tracks as they are, or as matches that end in left-right matches."""
         if not self._stereo:
-            return Correspondences(left=left, right=right, tracks=tracks)
+            return Correspondences(left=left, right=right, tracks=tracks, gyro=self.given.gyro)
         needs, halves = self.spec.needs, {side: track_pairs(tracks, side) for side in SIDES}
         return Correspondences(
             left=np.concatenate([halves["left"], left]) if "left" in needs else left,
@@ -203,6 +203,7 @@ class RobustProblem:
             stereo_0=tracks[:, :4],
             stereo_1=tracks[:, 4:],
             tracks=tracks if "tracks" in needs else tracks[:0],
+            gyro=self.given.gyro,
         )
 
     def counts(self, inliers: BoolArray) -> dict[MatchSet, MatchCount]:

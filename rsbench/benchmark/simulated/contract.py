@@ -7,14 +7,14 @@ linearised one must come nearer to the truth as the motion becomes smaller.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from rsbench.benchmark.simulated.contract_subject import BrokenContractError, Subject
 from rsbench.benchmark.simulated.misreadings import misreading
-from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, simulate
+from rsbench.benchmark.simulated.simulation import GYRO_RATE, SceneShape, Simulation, SimulationOptions, simulate
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.metrics import rotation_error, scale_error, translation_error, translation_of_offset
@@ -87,7 +87,8 @@ def own_problem(subject: Subject, size: float = 1.0, seed: int = 5, noise_px: fl
         motion = make_motion(subject.spec.motion_model, size * W, size * D, subject.spec.motion_parameters)
     except RsbenchError as error:
         raise BrokenContractError(str(error)) from error
-    options = SimulationOptions(pairs=60, tracks=60, noise_px=noise_px)
+    rate = GYRO_RATE if "gyro" in subject.spec.needs else 0
+    options = SimulationOptions(pairs=60, tracks=60, noise_px=noise_px, gyro_rate=rate)
     return simulate(RIG, shutter, motion, options, np.random.default_rng(seed))
 
 
@@ -96,9 +97,7 @@ def given(subject: Subject, simulation: Simulation) -> Correspondences:
     c = simulation.correspondences
     if "stereo" not in {*subject.spec.needs, *subject.spec.minimum}:
         return c
-    return Correspondences(
-        left=c.left, right=c.right, tracks=c.tracks, stereo_0=c.tracks[:, :4], stereo_1=c.tracks[:, 4:]
-    )
+    return replace(c, stereo_0=c.tracks[:, :4], stereo_1=c.tracks[:, 4:])
 
 
 def true_translation(subject: Subject, simulation: Simulation) -> FloatArray:
@@ -197,9 +196,9 @@ def ignores_the_order(subject: Subject) -> tuple[Verdict, str]:
 
 def mirrors(subject: Subject) -> tuple[Verdict, str]:
     """When x is mirrored, left and right change places, and d_x, w_y and w_z their sign."""
-    if subject.spec.reference_point == "left" and subject.spec.needs != {"left"}:
+    alone = subject.spec.needs - {"gyro"} == {"left"}
+    if subject.spec.reference_point == "left" and not alone:
         return "skipped", "the mirror image of the left camera is the right one"
-    alone = subject.spec.needs == {"left"}
     last = RIG.camera.width - 1
 
     def flipped(matches: FloatArray, order: list[int]) -> FloatArray:
@@ -209,15 +208,16 @@ def mirrors(subject: Subject) -> tuple[Verdict, str]:
 
     def mirrored(c: Correspondences) -> Correspondences:
         same, swap = [0, 1, 2, 3], [2, 3, 0, 1]
-        left, right = flipped(c.left, same), flipped(c.right, same)
+        left, right, gyro = flipped(c.left, same), flipped(c.right, same), c.gyro * [1.0, 1.0, -1.0, -1.0]
         if alone:  # with tracks, whose left halves are then those of the mirrored left camera
-            return Correspondences(left=left, right=right, tracks=flipped(c.tracks, [*range(8)]))
+            return Correspondences(left=left, right=right, tracks=flipped(c.tracks, [*range(8)]), gyro=gyro)
         return Correspondences(
             left=right,
             right=left,
             stereo_0=flipped(c.stereo_0, swap),
             stereo_1=flipped(c.stereo_1, swap),
             tracks=flipped(c.tracks, [2, 3, 0, 1, 6, 7, 4, 5]),
+            gyro=gyro,
         )
 
     return _agree(subject, mirrored, np.array([1, -1, -1]), np.array([-1, 1, 1]), "of the mirrored world")
@@ -264,7 +264,11 @@ def fails_by_value(subject: Subject) -> tuple[Verdict, str]:
     failures = 0
     cases = degenerate_cases()
     for name, (c, shutter) in cases.items():
-        sets = {"": c, "pairs of ": _subset(c, "left", "right"), "tracks of ": _subset(c, "tracks")}
+        sets = {
+            "": c,
+            "pairs of ": _subset(c, "left", "right", "gyro"),
+            "tracks of ": _subset(c, "tracks", "gyro"),
+        }
         for kind, matches in sets.items():
             try:
                 estimate = subject.estimate(matches, RIG, shutter)
@@ -313,7 +317,8 @@ def degenerate_cases() -> dict[str, tuple[Correspondences, RollingShutter]]:
     def seen(
         w: FloatArray, d: FloatArray, shutter: RollingShutter = ROLLING, plane: bool = False
     ) -> Correspondences:
-        options = SimulationOptions(pairs=30, tracks=30, shape="plane" if plane else "box")
+        shape: SceneShape = "plane" if plane else "box"
+        options = SimulationOptions(pairs=30, tracks=30, shape=shape, gyro_rate=GYRO_RATE)
         motion = make_motion("linear", w, d)
         return simulate(RIG, shutter, motion, options, np.random.default_rng(2)).correspondences
 

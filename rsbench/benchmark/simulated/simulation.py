@@ -20,6 +20,8 @@ from rsbench.core.so3 import FloatArray
 from rsbench.motions import make_motion
 
 SceneShape = Literal["box", "plane"]
+GYRO_RATE = 20
+"""Samples of a gyroscope in a frame period, where a solver wants any: 600 Hz at 30 frames a second."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +40,14 @@ class SimulationOptions:
     """Outliers lie uniformly within this distance, per coordinate, of the truth."""
     depth: tuple[float, float] = (2.0, 10.0)
     """Range of depths in frame 0, metres, uniform."""
+    gyro_rate: int = 0
+    """Samples of a gyroscope in a frame period; 0: none."""
+    gyro_noise_deg: float = 0.0
+    """Standard deviation of a sample, degrees per frame period, on each axis."""
+    gyro_bias_deg: float = 0.0
+    """Length of what is added to all samples, in a random direction, degrees per frame period."""
+    gyro_delay: float = 0.0
+    """Frame periods by which the samples say that they are later than they are."""
     shape: SceneShape = "box"
     """Points at random depths, or on one slanted plane in the middle of the range."""
 
@@ -47,6 +57,10 @@ class SimulationOptions:
         check_number("noise_px", self.noise_px, 0.0)
         check_number("outlier_ratio", self.outlier_ratio, 0.0, 1.0)
         check_number("outlier_px", self.outlier_px, 0.0)
+        check_whole("gyro_rate", self.gyro_rate, 0, 100_000)
+        check_number("gyro_noise_deg", self.gyro_noise_deg, 0.0)
+        check_number("gyro_bias_deg", self.gyro_bias_deg, 0.0)
+        check_number("gyro_delay", self.gyro_delay, -10.0, 10.0)
         check_one_of("shape", self.shape, get_args(SceneShape))
         near, far = self.depth
         if not 0.0 < near <= far < np.inf:
@@ -102,6 +116,7 @@ def simulate(
         matches = np.swapaxes(exact, 1, 2).reshape(len(exact), 4 * len(views[name]))
         noisy[name] = matches + options.noise_px * noise.standard_normal(matches.shape)
         outliers[name] = _displace(noisy[name], options, wrong)
+    noisy["gyro"] = _gyro(motion, options, rng.spawn(1)[0])
     return Simulation(
         correspondences=Correspondences(**noisy),
         rig=rig,
@@ -109,6 +124,16 @@ def simulate(
         motion=motion,
         outliers=outliers,
     )
+
+
+def _gyro(motion: Motion, options: SimulationOptions, rng: np.random.Generator) -> FloatArray:
+    """Samples (n, 4) from half a period before frame 0 to half a period after the last row of frame 1."""
+    if options.gyro_rate == 0:
+        return np.zeros((0, 4))
+    tau = -0.5 + np.arange(3 * options.gyro_rate + 1) / options.gyro_rate
+    bias = np.deg2rad(options.gyro_bias_deg) * random_direction(rng)
+    noise = np.deg2rad(options.gyro_noise_deg) * rng.standard_normal((len(tau), 3))
+    return np.column_stack([tau + options.gyro_delay, motion.velocity(tau)[0] + bias + noise])
 
 
 def _displace(matches: FloatArray, options: SimulationOptions, rng: np.random.Generator) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rsbench.arguments import check_whole
-from rsbench.benchmark.simulated.simulation import SceneShape, SimulationOptions, random_direction
+from rsbench.benchmark.simulated.simulation import GYRO_RATE, SceneShape, SimulationOptions, random_direction
 from rsbench.cards import card_path, load_card, parse_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
@@ -29,6 +29,9 @@ Axis = Literal[
     "baseline",
     "points",
     "outlier_ratio",
+    "gyro_noise_deg",
+    "gyro_bias_deg",
+    "gyro_delay",
 ]
 Vector = tuple[float, float, float]
 
@@ -67,6 +70,10 @@ class Setting:
     outlier_px: float = 80.0
     readout_ratio_error: float = 0.0
     """What the solver is told minus what is true."""
+    gyro_noise_deg: float = 0.0
+    gyro_bias_deg: float = 0.0
+    gyro_delay: float = 0.0
+    """Of the gyroscope that solvers are given which need one: as ``SimulationOptions`` has them."""
 
     def __post_init__(self) -> None:
         for name in ("rotation_deg", "translation", "noise_px", "outlier_px"):
@@ -119,11 +126,16 @@ class Setting:
             outlier_px=self.outlier_px,
             depth=self.depth,
             shape=self.shape,
+            gyro_rate=GYRO_RATE,
+            gyro_noise_deg=self.gyro_noise_deg,
+            gyro_bias_deg=self.gyro_bias_deg,
+            gyro_delay=self.gyro_delay,
         )
 
     def exact(self) -> Setting:
         """The setting of the same matches without noise and with the truth for the solver."""
-        return replace(self, noise_px=0.0, readout_ratio_error=0.0)
+        told = replace(self, noise_px=0.0, readout_ratio_error=0.0)
+        return replace(told, gyro_noise_deg=0.0, gyro_bias_deg=0.0, gyro_delay=0.0)
 
     def changed(self, changes: Mapping[str, Any], where: str) -> Setting:
         """The setting with some fields replaced.

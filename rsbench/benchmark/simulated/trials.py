@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -62,7 +62,8 @@ def enter(entry: SolverEntry) -> Entrant:
         return Entrant(entry=entry, information="tracks")
     if "stereo" in needs:
         return Entrant(entry=entry, information="linked pairs")
-    return Entrant(entry=entry, information="left pairs" if needs == {"left"} else "left and right pairs")
+    alone = needs - {"gyro"} == {"left"}
+    return Entrant(entry=entry, information="left pairs" if alone else "left and right pairs")
 
 
 def given_matches(simulation: Simulation, information: Information) -> Correspondences:
@@ -197,6 +198,8 @@ def _timed(
 ) -> tuple[MotionEstimate, float]:
     """An answer and its seconds: of the processor, since solvers have one thread and others shall not count."""
     matches, rig, shutter = given_matches(simulation, e.information), setting.rig(), setting.told_shutter()
+    if "gyro" in e.solver.spec.needs:
+        matches = replace(matches, gyro=simulation.correspondences.gyro)
     if not robust:
         return runner.bare(e.entry, matches, rig, shutter)
     rng = generator(seed, "simulate", "robust", e.name, trial)

@@ -24,7 +24,8 @@ from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 from rsbench.motions import check_parameters
 
-MatchSet = Literal["left", "right", "stereo", "tracks"]
+MatchSet = Literal["left", "right", "stereo", "tracks", "gyro"]
+"""Matches; and samples of a gyroscope, which are given whole and no part of RANSAC's samples."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -148,7 +149,8 @@ class SolverSpec:
         """The failure that too few matches are; None when there are enough."""
         for name, least in self.minimum.items():
             if counts.get(name, 0) < least:
-                return MotionEstimate.failed(f"{counts.get(name, 0)} {name} matches, need {least}")
+                what = "samples of a gyroscope" if name == "gyro" else f"{name} matches"
+                return MotionEstimate.failed(f"{counts.get(name, 0)} {what}, need {least}")
         return None
 
 

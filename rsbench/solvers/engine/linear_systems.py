@@ -12,21 +12,22 @@ ROUNDING = 1e-10
 flattest scenes stay above 1e-7; singular configurations below 1e-14."""
 
 
-def null_vector(A: FloatArray, unit_columns: bool) -> tuple[FloatArray | None, str]:
+def null_vector(A: FloatArray, unit_columns: bool, rounding: float = ROUNDING) -> tuple[FloatArray | None, str]:
     """X (columns,) with A X = 0: the right singular vector of the smallest singular value; or why there is none.
 
     Args:
         A: (equations, columns).
         unit_columns: scale the columns to unit length first, which is another estimator wherever A has noise.
+        rounding: what is rounding, relative to the largest column norm or singular value.
     """
     columns = A.shape[1]
     if len(A) < columns - 1:
         return None, f"{len(A)} equations for {columns} unknowns"
     norms = np.linalg.norm(A, axis=0)
-    if not np.min(norms) > ROUNDING * np.max(norms):
+    if not np.min(norms) > rounding * np.max(norms):
         return None, "an unknown has no influence on any match: the motion or the scene is degenerate"
     _, s, Vt = np.linalg.svd(A / norms, full_matrices=len(A) < columns)
-    if not s[columns - 2] > ROUNDING * s[0]:
+    if not s[columns - 2] > rounding * s[0]:
         return None, "the linear system has more than one solution: degenerate motion, scene or readout ratio"
     if unit_columns:
         return Vt[-1] / norms, ""

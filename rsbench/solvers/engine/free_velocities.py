@@ -1,0 +1,174 @@
+"""Two frames of one rolling-shutter camera, each with a velocity of its own that nothing ties to the other.
+
+Time s is a ray's second coordinate (of rows read from the top at constant speed) less that of a row to start from.
+The camera of frame 0 moves as ``(exp(s w0), s v0)``, that of frame 1 as ``(exp(s w1) R, t + s v1)``, of the camera
+that frame 0 has at s = 0. Between two rows the pose is
+
+    R(s0, s1) = exp(s1 w1) R exp(-s0 w0),   T(s0, s1) = t + s1 v1 - s0 R(s0, s1) v0.
+
+The paper's motion is one of these when s is 0 at the first row; linearisations hold best with 0 in the middle.
+
+Y. Dai, H. Li, L. Kneip, Rolling Shutter Camera Relative Pose: Generalized Epipolar Geometry, CVPR 2016: the linear
+model has w0 = w1 = 0, the uniform one all of it. How long the readout takes matters to neither.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from rsbench.core import so3
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.epipolar import epipolar_gradient, in_front
+from rsbench.core.se3 import Pose
+from rsbench.core.so3 import FloatArray, hat
+
+_FAR_PX = 1e6
+
+
+class FreeMotion(NamedTuple):
+    """R (3, 3) and t, v0, v1, w0, w1 (3,), the velocities by s; all translations have one unknown unit."""
+
+    R: FloatArray
+    t: FloatArray
+    v0: FloatArray
+    v1: FloatArray
+    w0: FloatArray
+    w1: FloatArray
+
+    def between(self, s0: FloatArray, s1: FloatArray) -> Pose:
+        """Pose (..., 3, 3), (..., 3) of row s1 (...) of frame 1 from row s0 (...) of frame 0."""
+        s0, s1 = s0[..., None], s1[..., None]
+        R = so3.exp(s1 * self.w1) @ self.R @ so3.exp(-s0 * self.w0)
+        return Pose(R, self.t + s1 * self.v1 - s0 * (R @ self.v0))
+
+    def moved(self, step: FloatArray) -> FreeMotion:
+        """With a step (..., 18) or, without rotations in the frames, (..., 12)."""
+        step = np.concatenate([step, np.zeros((*step.shape[:-1], 18 - step.shape[-1]))], axis=-1)
+        turn, *rest = np.split(step, 6, axis=-1)
+        return FreeMotion(so3.exp(turn) @ self.R, *(a + b for a, b in zip(self[1:], rest, strict=True)))
+
+    def of_unit_length(self) -> FreeMotion:
+        """With |t| = 1."""
+        length = max(float(np.linalg.norm(self.t)), 1e-300)
+        return self._replace(t=self.t / length, v0=self.v0 / length, v1=self.v1 / length)
+
+    def flipped(self) -> FreeMotion:
+        """All translations the other way: the other sign of the essential matrices."""
+        return self._replace(t=-self.t, v0=-self.v0, v1=-self.v1)
+
+
+class Rows(NamedTuple):
+    """Matches of one camera: rays (n, 3) of frames 0 and 1, z = 1, and their s (n,)."""
+
+    x: FloatArray
+    y: FloatArray
+    s0: FloatArray
+    s1: FloatArray
+    camera: PinholeCamera
+
+    @classmethod
+    def of(cls, matches: FloatArray, camera: PinholeCamera, first: float) -> Rows:
+        """Of matches (n, 4), with s = 0 at the row ``first``."""
+        x, y = camera.unproject(matches[:, :2]), camera.unproject(matches[:, 2:])
+        return cls(x, y, (matches[:, 1] - first) / camera.fy, (matches[:, 3] - first) / camera.fy, camera)
+
+
+def constraint(motion: FreeMotion, rows: Rows) -> tuple[FloatArray, FloatArray]:
+    """y^T [T]x R x (n,) and its derivatives (n, 4) by the pixels: a row that moves is another pose too."""
+    x, y, s0, s1, camera = rows
+    R, T = motion.between(s0, s1)
+    p, Rv0 = (R @ x[:, :, None])[:, :, 0], R @ motion.v0
+    gradient = epipolar_gradient(hat(T) @ R, x, y, camera)
+    spin0 = -(so3.exp(s1[:, None] * motion.w1) @ (motion.R @ motion.w0))  # dR/ds0 = [spin0]x R
+    for column, spin, rate in (
+        (1, spin0, -Rv0 - s0[:, None] * np.cross(spin0, Rv0)),
+        (3, motion.w1, motion.v1 - s0[:, None] * np.cross(motion.w1, Rv0)),
+    ):
+        change = np.cross(rate, p) + np.cross(T, np.cross(spin, p))
+        gradient[:, column] += np.sum(y * change, axis=1) / camera.fy
+    return np.sum(y * np.cross(T, p), axis=1), gradient
+
+
+def sampson(motion: FreeMotion, rows: Rows) -> FloatArray:
+    """Rolling-shutter Sampson errors (n,), px."""
+    value, gradient = constraint(motion, rows)
+    norm = np.linalg.norm(gradient, axis=1)
+    return np.where(norm > 0.0, value / np.where(norm > 0.0, norm, 1.0), 0.0)
+
+
+def sampson_jacobian(motion: FreeMotion, rows: Rows) -> FloatArray:
+    """(n, 18) by ``FreeMotion.moved``, such that J^T times the errors is the gradient of half their squares.
+
+    The constraint's derivative at the corrected measurement, over the norm: see ``engine.kernels``.
+    """
+    value, gradient = constraint(motion, rows)
+    norm = np.maximum(np.linalg.norm(gradient, axis=1), 1e-300)[:, None]
+    step = (value[:, None] / norm**2 * gradient).reshape(-1, 2, 2) / [rows.camera.fx, rows.camera.fy]
+    pad = np.zeros((len(step), 1))
+    x, y = rows.x - np.hstack([step[:, 0], pad]), rows.y - np.hstack([step[:, 1], pad])
+    s0, s1 = (rows.s0 - step[:, 0, 1])[:, None], (rows.s1 - step[:, 1, 1])[:, None]
+    R, T = motion.between(s0[:, 0], s1[:, 0])
+    A, p = so3.exp(s1 * motion.w1), (R @ x[:, :, None])[:, :, 0]
+    n = np.cross(p, y)
+    by_turn = np.cross(p, np.cross(y, T)) - s0 * np.cross(R @ motion.v0, n)  # of R, as [turn]x R
+
+    def back(M: FloatArray, rows_of: FloatArray) -> FloatArray:
+        return np.asarray((np.swapaxes(M, 1, 2) @ rows_of[:, :, None])[:, :, 0])
+
+    by_w0 = back(A @ motion.R @ so3.left_jacobian(-s0 * motion.w0), by_turn)
+    by_w1 = back(so3.left_jacobian(s1 * motion.w1), by_turn)
+    parts = [back(A, by_turn), n, -s0 * back(R, n), s1 * n, -s0 * by_w0, s1 * by_w1]
+    return np.concatenate(parts, axis=1) / norm
+
+
+def refine(start: FreeMotion, rows: Rows, *, turning: bool, most: int = 30) -> FreeMotion:
+    """Least squares of ``sampson``; without ``turning`` the camera keeps its rotation in a frame.
+
+    The start where there are fewer matches than unknowns, or the descent leaves what is finite.
+    """
+    unknowns = 18 if turning else 12
+    if len(rows.x) < unknowns:
+        return start
+    start = start.of_unit_length()
+    if not turning:
+        start = start._replace(w0=np.zeros(3), w1=np.zeros(3))
+
+    def errors(step: FloatArray) -> FloatArray:
+        return np.clip(np.nan_to_num(sampson(start.moved(step), rows), nan=_FAR_PX), -_FAR_PX, _FAR_PX)
+
+    def jacobian(step: FloatArray) -> FloatArray:
+        # The step turns what stands left of the old rotation: by the derivative of its exponential.
+        J = sampson_jacobian(start.moved(step), rows)[:, :unknowns]
+        J[:, :3] = J[:, :3] @ so3.left_jacobian(step[:3])
+        return np.nan_to_num(J, posinf=0.0, neginf=0.0)
+
+    end = scipy.optimize.least_squares(
+        errors, np.zeros(unknowns), jacobian, method="lm", max_nfev=most, xtol=1e-10, ftol=1e-8
+    )
+    found = start.moved(end.x).of_unit_length()
+    return found if all(np.all(np.isfinite(part)) for part in found) else start
+
+
+def signed(motion: FreeMotion, rows: Rows) -> FreeMotion:
+    """The sign of the translations that has more points in front of the cameras."""
+    front, back = (in_front_of_both(each, rows) for each in (motion, motion.flipped()))
+    return motion if front >= back else motion.flipped()
+
+
+def in_front_of_both(motion: FreeMotion, rows: Rows) -> int:
+    """How many points lie in front of both cameras."""
+    return int(np.count_nonzero(in_front(motion.between(rows.s0, rows.s1), rows.x, rows.y)))
+
+
+def from_row(motion: FreeMotion, s: float) -> FreeMotion:
+    """The motion with s = 0 at another row: its pose exactly, its velocities as they are there."""
+    here = np.array(s)
+    turn0, turn1 = so3.exp(s * motion.w0), so3.exp(s * motion.w1)
+    R, t = motion.between(here, here)
+    # Frame 0 began at (turn0, s v0); its camera is the world now.
+    v0 = motion.v0 - np.cross(motion.w0, s * motion.v0)
+    v1 = motion.v1 + np.cross(motion.w1, -s * (turn1 @ motion.R @ turn0.T @ motion.v0))
+    return FreeMotion(R, t, v0, v1, motion.w0, motion.w1)
