@@ -36,6 +36,8 @@ def publish(
     from rsbench.dataset.secret import read_secret, secret_card
 
     protocol, text = protocol_of_track(track), read_secret(seed_file)
+    if track == "points":
+        raise RsbenchError("track 'points': has no frames; export and submit take --seed-file themselves")
     for hidden in (keep, seed_file):
         if hidden.resolve().is_relative_to(out.resolve()):
             raise RsbenchError(f"{hidden}: lies in {out}, which everybody may see; take another place")

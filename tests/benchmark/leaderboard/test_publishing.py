@@ -213,6 +213,9 @@ def test_commands_score_by_the_text_and_keep_the_truth_apart(place: Path, card: 
     inside = ("--seed-file", place / "seed", "--keep", place / "out/keep", "--out", place / "out")
     refused = run_here("leaderboard", "publish", "pose-own", *inside, "--card", card)
     assert refused.returncode == 2 and "which everybody may see; take another place" in refused.stderr
+    apart = ("--seed-file", place / "seed", "--keep", place / "apart", "--out", place / "new")
+    simulated = run_here("leaderboard", "publish", "points", *apart)
+    assert simulated.returncode == 2 and "has no frames" in simulated.stderr
     shutil.rmtree(place / "out")
     lost = run_here("leaderboard", "score", place / "mine.jsonl", *given, "--card", card)
     assert lost.returncode == 2 and "has no announcement.json" in lost.stderr
