@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import os
+import re
 import stat
 import struct
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -30,6 +31,10 @@ FOLDER = "pictures"
 SUFFIXES: Mapping[Asks, tuple[str, ...]] = {"depth": (".exr", ".png"), "frames": (".png",)}
 FARTHEST = 1e9
 """m: no surface is farther."""
+_FILE = re.compile(
+    rf"pictures/{NAME.pattern}/left_1(_first|_middle)?\.(exr|png)|matches/(left|right|stereo_[01]|tracks)\.csv"
+)
+"""Paths of what answers hold, below an entry: nothing else is taken from a board of somebody else."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _COLOURS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 """Colour types of a PNG header."""
@@ -76,8 +81,7 @@ def copy_files(folder: Path, names: Iterable[str], target: Path) -> dict[str, st
 
 def file_bytes(folder: Path, name: str) -> bytes:
     """The content of a file such as ``pictures/castle/left_1.exr`` below a folder; errors as ``copy_files``."""
-    parts = name.split("/")
-    if not (2 <= len(parts) <= 3 and all(NAME.fullmatch(part) for part in parts)):
+    if not _FILE.fullmatch(name):
         raise RsbenchError(f"{folder}: {name[:100]!r} is no name of a file of an answer")
     check_own(folder, name)
     return read_bytes(folder / name)

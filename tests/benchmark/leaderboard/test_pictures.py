@@ -453,7 +453,13 @@ def test_pictures_that_were_changed_are_named(splits: dict[str, Split], tmp_path
             act()
     secret = tmp_path / "secret"
     secret.write_text("secret", "utf-8")
-    for name in ("../../../../../secret", "pictures/../../../../../secret", "/etc/passwd", "pictures/x\0", "a"):
+    for name in (
+        "../../../../../secret",
+        "pictures/../../../../../secret",
+        "/etc/passwd",
+        "pictures/x\0",
+        "pictures/planes.0/left_1.html",
+    ):
         hostile = {**record, "files": {name: "0" * 64}}
         (entry.folder / "entry.json").write_text(json.dumps(hostile), "utf-8")
         with pytest.raises(RsbenchError, match="is no name of a file of an answer"):
