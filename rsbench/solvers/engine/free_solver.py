@@ -16,7 +16,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.free_velocities import FreeMotion, Rows, from_row, refine, signed
 
-_QUICK, _FULL = 8, 60
+_QUICK, _FULL = 8, 40
 
 
 @dataclass(frozen=True, kw_only=True)
