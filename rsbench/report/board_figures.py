@@ -78,7 +78,9 @@ class _Axis:
 
     def ticks(self) -> list[float]:
         if not self.logarithmic:
-            return [float(x) for x in np.linspace(self.low, self.high, 5)]
+            size = 10.0 ** math.floor(math.log10(self.high))
+            step = next(k * size for k in (0.1, 0.2, 0.25, 0.5, 1.0, 2.0) if self.high < 6.0 * k * size)
+            return [float(x) for x in np.arange(0.0, self.high * (1.0 + 1e-9), step)]
         decades = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
         for steps in ((1, 2, 5), (1, 3), (1,)):
             found = [k * 10.0**e for e in decades for k in steps if self.low <= k * 10.0**e <= self.high]

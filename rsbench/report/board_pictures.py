@@ -71,6 +71,11 @@ class Album:
                 self._write(problem, f"{stem}.jpg", data)
         return found
 
+    def compared(self, problem: str) -> tuple[int, int]:
+        """Which pictures stand at the divider first: the frame as it was and the best answer, or two frames."""
+        truth = None if self._split is None else self._split.by_name[problem]
+        return (0, 1) if truth is None or truth.pictures is None else (1, 2 + len(truth.pictures.asked))
+
     def _groups(self, problem: str) -> Iterator[list[Named]]:
         """What stands or falls together: frames with the truth, then each entry, the best first."""
         assert self._split is not None

@@ -73,6 +73,7 @@ def problem_contexts(each: Board, album: Album) -> Iterator[tuple[str, dict[str,
                 "rows": [_row(each, line, k) for line in each.lines],
                 "place": f"../pictures/{problem}",
                 "pictures": album.pictures(problem),
+                "compared": album.compared(problem),
                 "errors": album.errors,
             },
         )
