@@ -93,8 +93,7 @@ def evaluate(
 
 _ON_REQUEST = (
     "rs-stereo",  # another name of rs-stereo-refined: one row of it is enough
-    *("rs-mono-refined", "rs-zhuang-8pt", "rs-zhuang-9pt", "rs-dai-linear", "rs-gyro-5pt"),
-    *("rs-gyro-stereo", "rs-12param"),
+    *("rs-mono-refined", "rs-zhuang-8pt", "rs-zhuang-9pt", "rs-gyro-5pt", "rs-gyro-stereo"),
 )
 """Solvers that run only when they are named: the last ones are not in the published tables yet."""
 

@@ -12,6 +12,8 @@ of degree 1 in each where w0 = w1 = 0 (linear), else 2 (uniform). y^T E x is the
 5 x 5 or 7 x 7 of them without the 2 x 2 products of the highest ones, which do not occur: 21 or 45 coefficients,
 of 20 or 44 matches. Several entries of the E's fall into one coefficient, so that the E's cannot be read off
 alone; R, t and the velocities are those whose coefficients come nearest to the null vector.
+
+No card names it yet: its Sampson descent is stopped before it ends, which would show the method weaker than it is.
 """
 
 from __future__ import annotations

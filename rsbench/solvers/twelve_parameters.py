@@ -2,6 +2,8 @@
 
 The rolling-shutter baselines of D. Barath (Rolling Shutter Made Practical, ECCV 2026), there named after the
 solvers of Dai et al., whose algorithm it is not: ``rsbench.solvers.dai`` is that.
+
+No card names it yet: its Sampson descent is stopped before it ends, which would show the method weaker than it is.
 """
 
 from __future__ import annotations

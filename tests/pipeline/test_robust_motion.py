@@ -124,10 +124,7 @@ def test_every_solver_runs_in_the_loop(name: str) -> None:
     s = simulation(pairs=60, tracks=60, outliers=0.05, noise=1e-3)
     solver = load_solver(name)
     threshold = 0.3 if solver.spec.shutter == "rolling" else 3.0
-    most = (
-        60 if name == "rs-dai-linear" else 300
-    )  # a third of its samples are free of outliers, and each takes 20 ms
-    result = run(s, name, threshold_px=threshold, max_iterations=most)
+    result = run(s, name, threshold_px=threshold, max_iterations=300)
     estimate = result.estimate
     assert estimate.success, estimate.reason
     d = s.motion.d
