@@ -32,7 +32,7 @@ def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
         "scores": _scores(line),
         "ties": ", ".join(line.ties),
         "tables": [_by(each, line, name, kinds) for name, kinds in each.known() if _words(kinds)],
-        "worst": _worst(each, line, album),
+        "worst": None if each.secret else _worst(each, line, album),
         "figures_found": each.figures([line, *_best_peer(each, line), *_oracles(each, line)]),
         "calibration": _calibration(line),
     }

@@ -59,7 +59,8 @@ def build_site(board: Path, out: Path, data: Sequence[Path] = ()) -> Path:
             write_bytes(out / f"{each.id}.{suffix}", text.encode())
         for line in each.lines:
             write(f"{each.id}/{line.scored.header.method}.html", "board_entry", entry_context(each, line, album))
-        write(f"{each.id}--problems.html", "board_problems", matrix_context(each, album))
+        if not each.secret:
+            write(f"{each.id}--problems.html", "board_problems", matrix_context(each, album))
         for name, context in problem_contexts(each, album):
             write(f"{each.id}/problem/{name}.html", "board_problem", context)
     write("index.html", "board", {"splits": [_section(each) for each in boards]})

@@ -42,6 +42,11 @@ class Board:
         """Of its part of the index, of its files, and of the folder of its pages."""
         return f"{self.protocol.id}--{self.split}"
 
+    @property
+    def secret(self) -> bool:
+        """Whether nothing is told of single problems: from a few exact errors of one the truth can be computed."""
+        return self.facts.columns.empty
+
     @cached_property
     def problems(self) -> list[str]:
         """Names, in the order of scores."""
@@ -60,7 +65,7 @@ class Board:
     @property
     def pages(self) -> bool:
         """Whether its problems have pages: simulated ones, of which nothing is to be seen, have a row."""
-        return self.protocol.track != "points"
+        return self.protocol.track != "points" and not self.secret
 
     def page_of(self, problem: str) -> str:
         """Where a problem is told, from the folder of the index."""
@@ -76,7 +81,7 @@ class Board:
             "split": self.split,
             "primary": self.protocol.primary.title,
             "error": self.error,
-            "problems": f"{self.id}--problems.html",
+            "problems": "" if self.secret else f"{self.id}--problems.html",
         }
 
     @property

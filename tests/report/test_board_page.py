@@ -7,6 +7,7 @@ import json
 import re
 import statistics
 from collections.abc import Iterator
+from dataclasses import replace
 from html.parser import HTMLParser
 from importlib.util import find_spec
 from pathlib import Path
@@ -64,6 +65,21 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     add(folder / "board", write(folder / "x.jsonl", truth), SPLIT, {})
     build_site(folder / "board", folder / "out")
     return folder / "out"
+
+
+def test_of_a_secret_split_no_problem_is_told(tmp_path: Path) -> None:
+    """From a few exact errors of one problem its truth could be computed."""
+    split = replace(SPLIT, public=False)
+    truth = truth_lines(split)
+    add(tmp_path / "board", write(tmp_path / "x.jsonl", named(truth, "mine", ("left",))), split, {})
+    page = build_site(tmp_path / "board", tmp_path / "out")
+    pages = list((tmp_path / "out").rglob("*.html"))
+    assert sorted(path.name for path in pages) == ["index.html", "mine.html"] and page in pages
+    names = [each.name for each in split.truths]
+    for path in (tmp_path / "out").rglob("*.*"):
+        text = path.read_text("utf-8")
+        assert "problems.html" not in text and not any(re.search(rf"\b{name}\b", text) for name in names)
+    assert f"{len(names)} problems" in page.read_text("utf-8")
 
 
 class _Cells(HTMLParser):
