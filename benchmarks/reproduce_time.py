@@ -89,16 +89,18 @@ def rendered(folder: Path) -> dict[str, float]:
     """Seconds of one sequence: rendered, drawn in Figure 4, corrected by all methods of the study, matched."""
     data = folder / "data"
     found = {"render": seconds_of(lambda: generate("moderate", data / "moderate", THREE))}
-    nothing = patched(reproduce_correction, _generate=lambda card, data: None)
-    with nothing, patched(reproduce_correction, _FIG4=(("moderate", "-2"),)):
+    with patched(
+        reproduce_correction,
+        _generate=lambda card, data: None,  # it is there
+        _FIG4=(("moderate", "-2"),),
+        STRATA=("moderate",),
+        _SGM=(("moderate", "castle-2"),),
+    ):
         found["panels"] = reproduce(Target.fig4, folder)
-    with nothing, patched(reproduce_correction, STRATA=("moderate",)):
         found["correct"] = reproduce(Target.correction, folder)
+        match = reproduce(Target.sgm, folder)
     assert len(read_dataset(data / "moderate")) == len(THREE)
-    found = {name: seconds / len(THREE) for name, seconds in found.items()}
-    with nothing, patched(reproduce_correction, _SGM=(("moderate", "castle-2"),)):
-        found["match"] = reproduce(Target.sgm, folder)
-    return found
+    return {name: seconds / len(THREE) for name, seconds in found.items()} | {"match": match}
 
 
 def real(folder: Path) -> float:
