@@ -8,9 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.splits import Split, points_split
 from rsbench.benchmark.leaderboard.submissions import truth_text
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.motion import LinearMotion
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
 
 Line = dict[str, Any]
 
@@ -34,3 +40,26 @@ def write(path: Path, lines: Iterable[Mapping[str, Any]]) -> Path:
 def named(lines: list[Line], method: str, uses: tuple[str, ...] = ("left",)) -> list[Line]:
     """The same predictions by another method."""
     return [{**lines[0], "method": method, "uses": uses}, *lines[1:]]
+
+
+_RIG = StereoRig(camera=PinholeCamera.centred(96, 80, 110.0), baseline=0.3)
+_SHUTTER = RollingShutter(height=80, readout_ratio=0.9)
+_MOTION = LinearMotion(np.array([0.01, 0.02, -0.01]), np.array([0.1, -0.05, 0.08]))
+PLANES = _RIG, _SHUTTER, _MOTION
+TRACKS = ("depth", "correction")
+
+
+def lines_of(path: Path) -> list[Line]:
+    return [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+
+
+def pictures_of(path: Path) -> list[Path]:
+    return sorted(p for p in (path.parent / "pictures").rglob("*") if p.is_file())
+
+
+def files_below(folder: Path) -> dict[str, bytes]:
+    """All files, large ones by their size."""
+    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and not p.is_symlink()]
+    return {
+        str(p): p.read_bytes() if p.stat().st_size < 1 << 24 else str(p.stat().st_size).encode() for p in files
+    }

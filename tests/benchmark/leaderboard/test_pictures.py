@@ -1,13 +1,10 @@
-"""The tracks depth and correction: what scores, what is told of slips, and that nothing hostile does any harm."""
+"""The tracks depth and correction: what scores, what is told of slips, boards and runs."""
 
 from __future__ import annotations
 
 import json
-import os
 import random
 import shutil
-import struct
-import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
@@ -20,7 +17,7 @@ import pandas as pd
 import pytest
 from analytic_dataset import write_analytic_dataset
 from commands import assert_refused, run_here
-from leaderboards import Line, write
+from leaderboards import PLANES, TRACKS, files_below, lines_of, pictures_of, write
 
 from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.board import add, entries_of, merge, rescore
@@ -30,52 +27,25 @@ from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.splits import Split, dataset_split
 from rsbench.benchmark.leaderboard.standings import standings
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission
-from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion
-from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
-from rsbench.dataset.files import read_depth, read_png, write_depth, write_exr, write_png
+from rsbench.dataset.files import read_depth, read_png, write_depth, write_png
 from rsbench.errors import RsbenchError
 
-RIG = StereoRig(camera=PinholeCamera.centred(96, 80, 110.0), baseline=0.3)
-SHUTTER = RollingShutter(height=80, readout_ratio=0.9)
-MOTION = LinearMotion(np.array([0.01, 0.02, -0.01]), np.array([0.1, -0.05, 0.08]))
-TRACKS = ("depth", "correction")
-
-
-@pytest.fixture(scope="module")
-def planes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two planes in three frames, which are two problems, with the middle row's truth."""
-    folder = tmp_path_factory.mktemp("planes")
-    write_analytic_dataset(folder, RIG, SHUTTER, MOTION, frames=3, twins=(40,))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def splits(planes: Path) -> dict[str, Split]:
-    return {track: dataset_split(PROTOCOLS[track], planes) for track in TRACKS}
+RIG, SHUTTER, MOTION = PLANES
 
 
 def _scores(path: Path, split: Split) -> pd.DataFrame:
     return mark(read_submission(path, split), split)
 
 
-def _lines(path: Path) -> list[Line]:
-    return [json.loads(line) for line in path.read_text("utf-8").splitlines()]
-
-
-def _pictures(path: Path) -> list[Path]:
-    return sorted(p for p in (path.parent / "pictures").rglob("*") if p.is_file())
-
-
 def _each_depth(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
-    for picture in _pictures(path):
+    for picture in pictures_of(path):
         write_depth(picture, change(read_depth(picture).astype(np.float64)).astype(np.float32))
     return path
 
 
 def _each_frame(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
-    for picture in _pictures(path):
+    for picture in pictures_of(path):
         write_png(picture, np.ascontiguousarray(change(read_png(picture))))
     return path
 
@@ -90,7 +60,7 @@ def test_the_truth_is_best_and_nothing_is_worst(track: str, splits: dict[str, Sp
     two = islice(write_oracles(split, tmp_path), 2)  # the third takes seconds, and is scored below
     found = {path.parent.name: _scores(path, split) for path in two}
     path = tmp_path / "truth" / "predictions.jsonl"
-    head, *answers = _lines(path)
+    head, *answers = lines_of(path)
     write(path, [head, *random.Random(1).sample(answers, len(answers))])
     pd.testing.assert_frame_equal(_scores(path, split), found["truth"])
     empty = _scores(write(tmp_path / "empty.jsonl", [head]), split)
@@ -122,7 +92,7 @@ def test_depth_scores_are_those_of_a_count(splits: dict[str, Split], tmp_path: P
     for number, truth in enumerate(split.truths):
         assert truth.pictures is not None
         z = truth.pictures.depth().astype(np.float64)
-        estimate = read_depth(_pictures(path)[number]).astype(np.float64)
+        estimate = read_depth(pictures_of(path)[number]).astype(np.float64)
         for limit in (1, 2, 3):
             bad = sum(
                 not known[i, j] or abs(product / estimate[i, j] - product / z[i, j]) > limit
@@ -153,7 +123,7 @@ def test_frame_scores_follow_their_formulas(splits: dict[str, Split], tmp_path: 
     assert np.all(np.abs(moved["epe_px"] - 2.0) < 0.3)  # dense flow is some tenths of a pixel wrong
     assert np.all(moved["ssim"] < brighter["ssim"])
     path = write_truth(split, tmp_path / "c")
-    for picture in _pictures(path):
+    for picture in pictures_of(path):
         image = read_png(picture)
         alpha = np.zeros(image.shape[:2], np.uint8)
         alpha[:40] = 255
@@ -252,11 +222,11 @@ def test_depth_of_opencv_alone_is_read(splits: dict[str, Split], tmp_path: Path)
     """The lines of the document: half a step of rounding is all that is lost."""
     split = splits["depth"]
     path = write_truth(split, tmp_path)
-    for picture in _pictures(path):
+    for picture in pictures_of(path):
         depth = read_depth(picture)
         picture.unlink()
         cv2.imwrite(str(picture.with_suffix(".png")), np.clip(depth / 0.001 + 0.5, 0, 65535).astype(np.uint16))
-    head, *answers = _lines(path)
+    head, *answers = lines_of(path)
     write(path, [head, *answers])
     assert "png_unit_m" in check_submission(path, split).faults[0]
     write(path, [{**head, "png_unit_m": 0.001}, *answers])
@@ -264,165 +234,12 @@ def test_depth_of_opencv_alone_is_read(splits: dict[str, Split], tmp_path: Path)
     assert scores["bad_1"].max() == 0.0 and 0.0 < scores["rmse_m"].max() < 0.0005
 
 
-# Hostile and malformed
-
-
-def _png(width: int, height: int, bits: int, colour: int, body: bytes = b"") -> bytes:
-    chunks = (
-        (b"IHDR", struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)),
-        (b"IDAT", zlib.compress(body)),
-        (b"IEND", b""),
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in chunks
-    )
-
-
-def _with_hole(value: float) -> Callable[[Path], None]:
-    def damage(picture: Path) -> None:
-        depth = np.full((80, 96), 5.0, dtype=np.float32)
-        depth[3, 4] = value
-        write_depth(picture, depth)
-
-    return damage
-
-
-def _link(picture: Path) -> None:
-    other = picture.parents[3] / "secret"
-    picture.rename(other)
-    picture.symlink_to(other)
-
-
-def _circle(picture: Path) -> None:
-    picture.unlink()
-    picture.symlink_to(picture)
-
-
-def _linked_folder(picture: Path) -> None:
-    other = picture.parents[3] / "secret"
-    picture.parent.rename(other)
-    picture.parent.symlink_to(other)
-
-
-def _pipe(picture: Path) -> None:
-    picture.unlink()
-    os.mkfifo(picture)
-
-
-def _folder(picture: Path) -> None:
-    picture.unlink()
-    picture.mkdir()
-
-
-DEPTH_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "missing": (lambda p: p.unlink(), "left_1.exr: is missing"),
-    "two": (
-        lambda p: p.with_suffix(".png").write_bytes(p.read_bytes()),
-        "2 of left_1.exr and left_1.png are there",
-    ),
-    "another name": (lambda p: p.rename(p.with_name("left_0.exr")), "left_0.exr: is not asked"),
-    "another problem": (lambda p: p.parent.rename(p.parent.with_name("castle")), "castle: is no problem of"),
-    "a file too many": (lambda p: p.with_name("evil.sh").write_text("x"), "evil.sh: is not asked"),
-    "a hidden file": (lambda p: p.with_name(".x").write_text("x"), ".x: is not asked"),
-    "a file among folders": (lambda p: (p.parents[1] / "planes.1x").write_text("x"), "planes.1x: is no problem"),
-    "a link": (_link, "left_1.exr: must be a file of its own, no link"),
-    "a linked folder": (_linked_folder, "planes.0: must be a folder of its own, no link"),
-    "a circle": (_circle, "must be a file of its own, no link"),
-    "a pipe": (_pipe, "must be a file of its own"),
-    "a folder": (_folder, "must be a file of its own"),
-    "1 GB": (lambda p: os.truncate(p, 1 << 30), "bytes: 1073741824 is more than"),
-    "no EXR": (lambda p: p.write_bytes(b"PK\x03\x04" + bytes(100)), "damaged or not an EXR file"),
-    "half a file": (lambda p: os.truncate(p, 500), "left_1.exr: "),
-    "channels of colour": (
-        lambda p: write_exr(p, {c: np.ones((80, 96), np.float32) for c in "RGB"}),
-        "must hold one part of scanlines with one channel, Z, of float32",
-    ),
-    "channel Y": (lambda p: write_exr(p, {"Y": np.ones((80, 96), np.float32)}), "with one channel, Z"),
-    "half floats": (lambda p: write_exr(p, {"Z": np.ones((80, 96), np.float32)}, half=True), "float32 channel Z"),
-    "another size": (
-        lambda p: write_depth(p, np.ones((96, 80), np.float32)),
-        "is 80 x 96 pixels, the camera 96 x 80",
-    ),
-    "NaN": (_with_hole(np.nan), "1 pixels are NaN; unknown depth and sky are 0"),
-    "infinity": (_with_hole(np.inf), "1 pixels are infinite"),
-    "negative": (_with_hole(-1.0), "1 pixels are negative"),
-    "beyond the universe": (_with_hole(1e30), "1 pixels are above 1e+09 m"),
-}
-FRAME_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "a JPEG": (lambda p: p.write_bytes(cv2.imencode(".jpg", np.ones((80, 96, 3)))[1].tobytes()), "is no PNG file"),
-    "16 bits": (
-        lambda p: cv2.imwrite(str(p), np.ones((80, 96, 3), np.uint16)),
-        "is RGB of 16 bits: must be RGB or",
-    ),
-    "grey": (lambda p: cv2.imwrite(str(p), np.ones((80, 96), np.uint8)), "is grey of 8 bits: must be RGB or RGBA"),
-    "a palette": (lambda p: p.write_bytes(_png(96, 80, 8, 3)), "is palette of 8 bits"),
-    "no colour type": (lambda p: p.write_bytes(_png(96, 80, 8, 77)), "is unknown of 8 bits"),
-    "another size": (lambda p: write_png(p, np.zeros((80, 95, 3), np.uint8)), "is 95 x 80 pixels"),
-    "a huge image": (
-        lambda p: p.write_bytes(_png(2**31 - 1, 2**31 - 1, 8, 2)),
-        "is 2147483647 x 2147483647 pixels",
-    ),
-    "no pixels": (lambda p: p.write_bytes(_png(96, 80, 8, 2)), "is a damaged PNG file"),
-    "only a header": (lambda p: p.write_bytes(_png(96, 80, 8, 2)[:30]), "is no PNG file"),
-    "nothing": (lambda p: p.write_bytes(b""), "is no PNG file"),
-    "the middle is missing": (
-        lambda p: p.with_name("left_1_middle.png").unlink(),
-        "left_1_middle.png: is missing",
-    ),
-}
-ANSWER_FAULTS: dict[str, tuple[Callable[[list[Line]], list[Line]], str]] = {
-    "no line": (lambda lines: lines[:-1], "planes.1: has pictures, but no line"),
-    "a failure with pictures": (lambda lines: [*lines[:-1], {**lines[-1], "success": False}], "has pictures, but"),
-    "a motion": (lambda lines: [*lines[:-1], {**lines[-1], "w": [0, 0, 0]}], "w: is not asked"),
-    "path for a problem": (lambda lines: [*lines, {"name": "../truth"}], "is no problem of"),
-    "a unit of kilometres": (
-        lambda lines: [{**lines[0], "png_unit_m": 1000.0}, *lines[1:]],
-        "png_unit_m = 1000.0",
-    ),
-    "matches": (lambda lines: [{**lines[0], "uses": ["left"]}, *lines[1:]], "'left' is not given by depth-1"),
-}
-
-
-def _all(folder: Path) -> dict[str, bytes]:
-    """All files, large ones by their size."""
-    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and not p.is_symlink()]
-    return {
-        str(p): p.read_bytes() if p.stat().st_size < 1 << 24 else str(p.stat().st_size).encode() for p in files
-    }
-
-
-@pytest.mark.parametrize("case", [*DEPTH_FAULTS, *(f"frame: {name}" for name in FRAME_FAULTS)])
-def test_faults_are_lines_and_nothing_is_kept(case: str, splits: dict[str, Split], tmp_path: Path) -> None:
-    name = case.removeprefix("frame: ")
-    split, faults = (splits["depth"], DEPTH_FAULTS) if name == case else (splits["correction"], FRAME_FAULTS)
-    damage, words = faults[name]
-    (tmp_path / "in").mkdir()
-    path = write_truth(split, tmp_path / "in")
-    damage(_pictures(path)[0])
-    before = _all(tmp_path)
-    told = check_submission(path, split).faults
-    assert any(words in fault for fault in told), told
-    assert all("\n" not in fault and len(fault) < 400 + 2 * len(str(path)) for fault in told)
-    with pytest.raises(RsbenchError):
-        add(tmp_path / "board", path, split, {})
-    assert _all(tmp_path) == before and not (tmp_path / "board").exists()
-
-
-@pytest.mark.parametrize("case", ANSWER_FAULTS)
-def test_faults_of_answers_are_lines(case: str, splits: dict[str, Split], tmp_path: Path) -> None:
-    change, words = ANSWER_FAULTS[case]
-    path = write_truth(splits["depth"], tmp_path)
-    (fault,) = check_submission(write(path, change(_lines(path))), splits["depth"]).faults
-    assert words in fault
-
-
 # Boards
 
 
 def _submitted(board: Path, split: Split, folder: Path, method: str, factor: float = 1.0) -> None:
     path = _each_depth(write_truth(split, folder / method), lambda z: factor * z)
-    head, *answers = _lines(path)
+    head, *answers = lines_of(path)
     add(board, write(path, [{**head, "method": method, "uses": ["images"]}, *answers]), split, {})
 
 
@@ -525,11 +342,11 @@ def test_cards_run_and_go_on(
     found = {e.header.method: e for e in entries_of(tmp_path / "board", split.protocol.id, split.name)}
     assert {*entries, "truth"} < set(found)
     made = tmp_path / "board" / ".rsbench" / "runs" / split.protocol.id / split.name / entries[0]
-    first = {path.name: path.read_bytes() for path in _pictures(made / "x")}
+    first = {path.name: path.read_bytes() for path in pictures_of(made / "x")}
     (made / "answers" / "castle.json").unlink()
     (made / "pictures" / "castle").rename(tmp_path / "lost")
     assert run_here("leaderboard", "run", track, *where, *cards).returncode == 0
-    assert {path.name: path.read_bytes() for path in _pictures(made / "x")} == first
+    assert {path.name: path.read_bytes() for path in pictures_of(made / "x")} == first
     if track == "depth":
         assert np.all(found["sgm"].scores["bad_1"] < 0.5 * found["constant"].scores["bad_1"])
     else:
@@ -574,16 +391,16 @@ def test_a_method_of_somebody_else_runs_and_fails_alone(
     np.testing.assert_allclose(depth, RIG.camera.fx * RIG.baseline / 5.0, rtol=1e-6)
     assert found["level"].header.code == "" and found["level"].header.uses == ("images", "stereo")
     assert found["odd"].scores["failure"].all() and found["odd"].files == {}
-    answers = _lines(found["odd"].folder / "predictions.jsonl")[1:]
+    answers = lines_of(found["odd"].folder / "predictions.jsonl")[1:]
     assert all("not today" in str(answer["reason"]) for answer in answers)
     # A damaged picture is one line on the command line too, and the board stays as it is.
     path = write_truth(split, tmp_path / "mine")
-    _pictures(path)[0].write_bytes(b"no picture")
-    before = _all(tmp_path / "board")
+    pictures_of(path)[0].write_bytes(b"no picture")
+    before = files_below(tmp_path / "board")
     assert_refused(run_here("leaderboard", "submit", path, *where), "left_1.exr: damaged or not an EXR file")
     checked = run_here("leaderboard", "check", path, "--data", planes)
     assert checked.returncode == 2 and len(checked.stderr.splitlines()) == 1
-    assert _all(tmp_path / "board") == before
+    assert files_below(tmp_path / "board") == before
 
 
 @pytest.mark.parametrize("track", TRACKS)
@@ -594,7 +411,7 @@ def test_inputs_hold_no_secret(track: str, planes: Path, tmp_path: Path) -> None
     split = dataset_split(PROTOCOLS[track], planes)
     assert check_submission(tmp_path / "open" / "truth.jsonl", split).faults == ()
     assert run_here(*export, tmp_path / "closed", "--secret").returncode == 0
-    told = set(_all(tmp_path / "closed").values())
+    told = set(files_below(tmp_path / "closed").values())
     for truth in split.truths:
         assert truth.pictures is not None
         assert not told & {truth.pictures.path(each).read_bytes() for each in truth.pictures.asked}
