@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.compiled import compiled
-from rsbench.vision.optics import Flag, Table, line_of, look, see
+from rsbench.vision.optics import Table, line_of, look, see
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -72,7 +72,7 @@ def connect(rho: F32, limit: F64) -> U8:
 
 @compiled(error_model="numpy", inline="always")
 def move(
-    M: F64, b: F64, ideal: Table, lens: Table, columns: Flag, x: int, y: int, rho: float
+    M: F64, b: F64, ideal: Table, lens: Table, columns: bool, x: int, y: int, rho: float
 ) -> tuple[float, float, float]:
     """Target pixel and inverse depth of a source pixel; NaN behind the target camera or where rho is NaN."""
     line = line_of(columns, x, y)
@@ -86,7 +86,7 @@ def move(
 
 
 @compiled(error_model="numpy")
-def move_pixels(rho: F32, M: F64, b: F64, ideal: Table, lens: Table, columns: Flag, moved: F64) -> None:
+def move_pixels(rho: F32, M: F64, b: F64, ideal: Table, lens: Table, columns: bool, moved: F64) -> None:
     """Fill ``moved`` (3, H, W) with target x, y and inverse depth of every source pixel centre."""
     height, width = rho.shape
     for y in range(height):
@@ -94,9 +94,20 @@ def move_pixels(rho: F32, M: F64, b: F64, ideal: Table, lens: Table, columns: Fl
             moved[0, y, x], moved[1, y, x], moved[2, y, x] = move(M, b, ideal, lens, columns, x, y, rho[y, x])
 
 
+@compiled(error_model="numpy", inline="always")
+def _move_row(M: F64, b: F64, ideal: Table, lens: Table, columns: bool, y: int, rho: F32, out: F64) -> None:
+    """``move`` of a row of pixels into ``out`` (W, 3)."""
+    if columns:
+        for x in range(rho.shape[1]):
+            out[x, 0], out[x, 1], out[x, 2] = move(M, b, ideal, lens, True, x, y, rho[y, x])
+    else:  # apart, so that the row's map is loaded once
+        for x in range(rho.shape[1]):
+            out[x, 0], out[x, 1], out[x, 2] = move(M, b, ideal, lens, False, x, y, rho[y, x])
+
+
 @compiled(error_model="numpy")
 def draw_mesh(
-    rho: F32, joined: U8, M: F64, b: F64, ideal: Table, lens: Table, columns: Flag, source_map: F32, buffer: F32
+    rho: F32, joined: U8, M: F64, b: F64, ideal: Table, lens: Table, columns: bool, source_map: F32, buffer: F32
 ) -> None:
     """Draw the triangles of all joined neighbours into ``source_map`` (H, W, 2) and ``buffer`` (H, W).
 
@@ -106,8 +117,7 @@ def draw_mesh(
     rows = np.zeros((2, width, 3))
     for y in range(height):
         upper, lower = rows[(y + 1) & 1], rows[y & 1]
-        for x in range(width):
-            lower[x, 0], lower[x, 1], lower[x, 2] = move(M, b, ideal, lens, columns, x, y, rho[y, x])
+        _move_row(M, b, ideal, lens, columns, y, rho, lower)
         if y == 0:
             continue
         for x in range(width - 1):
@@ -186,7 +196,7 @@ def _quad(
 
 @compiled(error_model="numpy")
 def draw_cells(
-    rho: F32, joined: U8, M: F64, b: F64, ideal: Table, lens: Table, columns: Flag, source_map: F32, buffer: F32
+    rho: F32, joined: U8, M: F64, b: F64, ideal: Table, lens: Table, columns: bool, source_map: F32, buffer: F32
 ) -> None:
     """Draw the cells of pixels that are not joined to four neighbours, behind ``draw_mesh``'s result.
 
@@ -224,7 +234,7 @@ def _cell(
     b: F64,
     ideal: Table,
     lens: Table,
-    columns: Flag,
+    columns: bool,
     source_map: F32,
     buffer: F32,
 ) -> None:
@@ -232,7 +242,7 @@ def _cell(
     height, width = buffer.shape
     ax, ay, az = move(M, b, ideal, lens, columns, x, y, rho[y, x])
     # The next line has another pose, also at the last one, whose next neighbour does not exist. A row's goes on.
-    right = -1 if x + 1 == width and not (columns is None and lens is None) else 1
+    right = -1 if x + 1 == width and (columns or lens is not None) else 1
     bx, by, bz = move(M, b, ideal, lens, columns, x + right, y, rho[y, x] + right * along_x)
     step = 1 if y + 1 < height else -1
     cx, cy, cz = move(M, b, ideal, lens, columns, x, y + step, rho[y, x] + step * along_y)

@@ -24,7 +24,7 @@ from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.correction import Corrected, WarpOptions, inverse_depth, relative_row_maps, warp
 from rsbench.vision.forward_warp import move
-from rsbench.vision.optics import Flag, Table, across_lines, line_of, look, optics_of, see
+from rsbench.vision.optics import Table, across_lines, line_of, look, optics_of, see
 from rsbench.vision.resample import resample
 from rsbench.vision.stereo_depth import known_beside
 
@@ -232,7 +232,7 @@ def _find_in_lines(
     b: FloatArray,
     ideal: Table,
     lens: Table,
-    columns: Flag,
+    columns: bool,
     places: NDArray[np.float32],
     seen_rho: NDArray[np.float32],
 ) -> None:
@@ -299,7 +299,7 @@ def _keep_landing(
     b: FloatArray,
     ideal: Table,
     lens: Table,
-    columns: Flag,
+    columns: bool,
     wanted: NDArray[np.uint8],
     kept: NDArray[np.float32],
 ) -> int:

@@ -25,7 +25,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.correction import inverse_depth
 from rsbench.vision.images import grey_u8
-from rsbench.vision.optics import Flag, Table, across_lines, line_of, look, optics_of, see
+from rsbench.vision.optics import Table, across_lines, line_of, look, optics_of, see
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -55,7 +55,7 @@ class _Geometry(NamedTuple):
     ideal: Table
     """Of ``Optics``, as the next two."""
     lens: Table
-    columns: Flag
+    columns: bool
 
 
 def depth_from_motion(
@@ -148,7 +148,7 @@ def _land(
     B: FloatArray,
     ideal: Table,
     lens: Table,
-    columns: Flag,
+    columns: bool,
 ) -> tuple[float, float, float]:
     """Pixel and depth factor in the other frame's camera of ``line``; NaN behind it."""
     own = line_of(columns, x, y)
@@ -189,7 +189,7 @@ def _fill_costs(
     B: FloatArray,
     ideal: Table,
     lens: Table,
-    columns: Flag,
+    columns: bool,
     rho: float,
     cost: F32,
 ) -> None:
@@ -233,7 +233,7 @@ def _keep_agreeing(
     B: FloatArray,
     ideal: Table,
     lens: Table,
-    columns: Flag,
+    columns: bool,
     tolerance: float,
     depth: F32,
 ) -> None:

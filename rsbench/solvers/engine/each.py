@@ -57,8 +57,9 @@ def _each_pair(
     H: FloatArray,
     gradients: FloatArray,
 ) -> None:
+    want = len(pairs) > 0  # a literal True would compile all of pair_terms once more
     for k in range(len(pairs)):
-        pair_terms(theta, kernel, pairs[k : k + 1], focal, h, residuals[k : k + 1], H[k], gradients[k], True)
+        pair_terms(theta, kernel, pairs[k : k + 1], focal, h, residuals[k : k + 1], H[k], gradients[k], want)
 
 
 @compiled
@@ -73,6 +74,7 @@ def _each_track(
     H: FloatArray,
     gradients: FloatArray,
 ) -> None:
+    want = len(tracks) > 0
     for k in range(len(tracks)):
         track_terms(
             theta,
@@ -84,5 +86,5 @@ def _each_track(
             squares[k : k + 1],
             H[k],
             gradients[k],
-            True,
+            want,
         )

@@ -50,19 +50,17 @@ def timed_track_terms(
     for k in range(len(tracks)):
         squares[k] = BEHIND
         point = _first_point(theta, kernel, tracks[k], baseline, work)
-        if not _linearise(theta, kernel, tracks[k], focal, baseline, point, e, D, W, work, True):
-            continue
         seen = True
-        for _ in range(_POINT_STEPS):
-            if not _fill_inverse(D, N, inverse):
-                seen = False
+        for step in range(_POINT_STEPS + 1):
+            if step > 0:
+                g = (_column(D, 0, e), _column(D, 1, e), _column(D, 2, e))
+                point = plus(point, -1.0, apply(inverse, g))
+            # Weighed where it starts. A literal True would compile _linearise once more.
+            seen = _linearise(theta, kernel, tracks[k], focal, baseline, point, e, D, W, work, step == 0)
+            seen = seen and _fill_inverse(D, N, inverse)
+            if not seen:
                 break
-            g = (_column(D, 0, e), _column(D, 1, e), _column(D, 2, e))
-            point = plus(point, -1.0, apply(inverse, g))
-            if not _linearise(theta, kernel, tracks[k], focal, baseline, point, e, D, W, work, False):
-                seen = False
-                break
-        if not seen or not _fill_inverse(D, N, inverse):
+        if not seen:
             continue
         squares[k] = 0.0
         for i in range(8):
