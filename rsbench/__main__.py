@@ -1,6 +1,7 @@
 """``python -m rsbench`` and the command ``rsbench``."""
 
 import contextlib
+import gc
 import os
 import signal
 import sys
@@ -9,6 +10,7 @@ import sys
 def main() -> None:
     """Run the command line; a signal while it is loaded ends the process in one line, or without one."""
     _open_streams()
+    gc.set_threshold(10_000, 20, 10)  # loading makes many objects and no garbage: looking for it takes a tenth
     heard = [each for each in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(each) != signal.SIG_IGN]
     for number in heard:
         signal.signal(number, signal.SIG_DFL)

@@ -6,7 +6,7 @@ import datetime
 import os
 import platform
 import subprocess
-from functools import partial
+from functools import cache, partial
 from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
@@ -74,6 +74,7 @@ def processor() -> str:
     return next(named, "") or platform.processor() or "unknown"
 
 
+@cache
 def _version(name: str) -> str:
     try:
         return version(name)

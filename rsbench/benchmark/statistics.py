@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import binom, binomtest
+from scipy.special import bdtr, betaincinv  # scipy.stats takes a second to load
 
 from rsbench.benchmark.seeds import generator
 from rsbench.core.so3 import FloatArray
@@ -47,7 +47,7 @@ def median_interval(values: ArrayLike, coverage: float = COVERAGE) -> Interval:
     n = len(ordered)
     # P(x[k] <= median <= x[n+1-k]) = 1 - 2 P(Binomial(n, 1/2) <= k - 1)
     k = 0
-    while k + 1 <= n // 2 and 1.0 - 2.0 * float(binom.cdf(k, n, 0.5)) >= coverage:
+    while k + 1 <= n // 2 and 1.0 - 2.0 * float(bdtr(k, n, 0.5)) >= coverage:
         k += 1
     if k == 0:
         return Interval(-np.inf, np.inf)
@@ -58,8 +58,10 @@ def share_interval(successes: int, trials: int, coverage: float = COVERAGE) -> I
     """Exact (Clopper-Pearson) interval of a share: 300 of 300 is [0.988, 1], not [1, 1]."""
     if trials == 0:
         return Interval(0.0, 1.0)
-    found = binomtest(successes, trials).proportion_ci(coverage, method="exact")
-    return Interval(float(found.low), float(found.high))
+    tail, failures = 0.5 * (1.0 - coverage), trials - successes
+    low = betaincinv(successes, failures + 1, tail) if successes > 0 else 0.0
+    high = betaincinv(successes + 1, failures, 1.0 - tail) if failures > 0 else 1.0
+    return Interval(float(low), float(high))
 
 
 def bootstrap_interval(

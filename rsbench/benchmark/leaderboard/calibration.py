@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from rsbench.benchmark.leaderboard.ranking import score_interval
 from rsbench.benchmark.statistics import median_interval, typical_interval
@@ -46,7 +46,7 @@ def calibration(scores: pd.DataFrame) -> Calibration | None:
     if told.empty:
         return None
     nees, scenes = told["nees"].to_numpy(dtype=np.float64), list(told["scene"])
-    ratio = nees / chi2.ppf(0.5, UNKNOWNS)
+    ratio = nees / _chi_squared(0.5)
     alone = len(set(scenes)) == len(scenes)
     return Calibration(
         stated=len(told),
@@ -59,8 +59,13 @@ def calibration(scores: pd.DataFrame) -> Calibration | None:
     )
 
 
+def _chi_squared(level: float) -> float:
+    """Below which a share ``level`` of a chi-squared variable of ``UNKNOWNS`` degrees of freedom lies."""
+    return 2.0 * float(gammaincinv(0.5 * UNKNOWNS, level))
+
+
 def _inside(nees: FloatArray, level: float) -> FloatArray:
-    return (nees <= chi2.ppf(level, UNKNOWNS)).astype(np.float64)
+    return (nees <= _chi_squared(level)).astype(np.float64)
 
 
 def named_numbers(found: Calibration | None) -> dict[str, Triple]:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtr, stdtrit  # Student's distribution and its inverse
 
 from rsbench.benchmark.statistics import COVERAGE, Interval, share_interval
 from rsbench.core.so3 import FloatArray
@@ -45,7 +45,7 @@ def mean_interval(means: FloatArray) -> Interval:
     k = len(means)
     if k < 2:
         return Interval(-np.inf, np.inf)
-    half = float(student.ppf(0.5 + 0.5 * COVERAGE, k - 1) * np.std(means, ddof=1) / np.sqrt(k))
+    half = float(stdtrit(k - 1, 0.5 + 0.5 * COVERAGE) * np.std(means, ddof=1) / np.sqrt(k))
     middle = float(np.mean(means))
     return Interval(middle - half, middle + half)
 
@@ -83,7 +83,7 @@ def _chances(differences: FloatArray) -> FloatArray:
     if k < 2:
         return np.ones(len(middle))
     spread = np.maximum(np.std(differences, axis=1, ddof=1) / np.sqrt(k), _ROUNDING)
-    return np.where(middle < _ROUNDING, 1.0, 2.0 * student.sf(middle / spread, k - 1))
+    return np.where(middle < _ROUNDING, 1.0, 2.0 * stdtr(k - 1, -middle / spread))
 
 
 def _holm(chances: FloatArray) -> NDArray[np.bool_]:
