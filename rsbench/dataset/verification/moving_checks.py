@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from rsbench.dataset.movers import numbers_of
@@ -82,7 +83,9 @@ def _misplaced(content: Content, own: DepthMap) -> str:
                 moved = replace(own, labels=np.full(own.depth.shape, other, dtype=np.uint8))
                 seen = np.abs(land(sequence, moved, content.maps[partner], stride).relative) <= DEPTH_TOLERANCE
                 elsewhere |= through & seen & (numbers[::stride, ::stride] != other)
-    if np.sum(elsewhere) <= _LEAST:
+    # Along an edge that stands out by a hair, a whole line of pixels may lie by chance where another label takes it.
+    wide = cv2.morphologyEx(elsewhere.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    if np.sum(wide) <= _LEAST:
         return ""
     what = f"{np.sum(elsewhere)} pixels are not where their labels take them, but where another would"
     return finding(shot.labels, what, rows_of(np.repeat(np.any(elsewhere, axis=1), stride)[: len(own.depth)]))
