@@ -83,7 +83,7 @@ def _misplaced(content: Content, own: DepthMap) -> str:
                 moved = replace(own, labels=np.full(own.depth.shape, other, dtype=np.uint8))
                 seen = np.abs(land(sequence, moved, content.maps[partner], stride).relative) <= DEPTH_TOLERANCE
                 elsewhere |= through & seen & (numbers[::stride, ::stride] != other)
-    # Along an edge that stands out by a hair, a whole line of pixels may lie by chance where another label takes it.
+    # Along an edge that stands out by a hair, a line of pixels may lie by chance where another label takes it.
     wide = cv2.morphologyEx(elsewhere.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     if np.sum(wide) <= _LEAST:
         return ""
