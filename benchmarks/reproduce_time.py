@@ -32,7 +32,7 @@ from rsbench.dataset.sequence import read_dataset
 THREE = ["castle-2", "old-town-2", "room-2"]
 TWO_REAL = ["castle-aggressive-2", "room-mild-2"]
 SEEDS = 20
-RENDERED_FIRST, RENDERED_LATER, CORRECTED, PANELS, MATCHED, REAL = 63, 40, 100, 9, 4, 8
+RENDERED_FIRST, RENDERED_LATER, CORRECTED, PANELS, MATCHED, REAL = 63, 40, 100, 9, 4, 64
 """Sequences of fig4: rendered first; that correction renders more; that it corrects; drawn in fig4; of sgm; and
 of each camera of the real study."""
 
