@@ -96,7 +96,10 @@ def run() -> None:
     """Entry point: every error becomes one line on stderr; 2 for a user's, 70 for one that nobody foresaw."""
     try:
         with stoppable():
-            app(prog_name="rsbench")
+            code = app(prog_name="rsbench", standalone_mode=False)
+        sys.exit(code if isinstance(code, int) else 0)
+    except typer.TyperException as error:
+        _wrongly_used(error)
     except RsbenchError as error:
         _fail(str(error), error.exit_code)
     except MemoryError:
@@ -106,6 +109,14 @@ def run() -> None:
         if isinstance(error, OSError) and (place := error.filename or _NAMELESS.get(error.errno or 0)):
             _fail(f"{place}: {error.strerror or error}")
         _fail(faults.describe(error), faults.EXIT_CODE)
+
+
+def _wrongly_used(error: typer.TyperException) -> None:
+    context = getattr(error, "ctx", None)
+    if type(error).__name__ == "NoArgsIsHelpError":  # the help has been printed
+        sys.exit(error.exit_code)
+    remedy = f"; see {context.command_path} --help" if context is not None else ""
+    _fail(error.format_message().rstrip(".") + remedy, error.exit_code)
 
 
 def _fail(message: str, code: int = 2) -> None:

@@ -120,3 +120,19 @@ def test_a_folder_that_cannot_be_written_is_said_before_the_work(
         result = run_here(*command, "--out", out)
         assert_refused(result, "file")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("evaluate", "--out-of"), "No such option: --out-of"),
+        (("generate",), "Missing argument 'card'; see rsbench generate --help"),
+        (("simulate", "noise", "--trials", "x"), "Invalid value for '--trials'"),
+        (("leaderboard", "submit"), "see rsbench leaderboard submit --help"),
+        (("bogus",), "No such command 'bogus'; see rsbench --help"),
+    ],
+)
+def test_wrong_words_are_refused_in_one_line_with_the_help_to_read(words: tuple[str, ...], said: str) -> None:
+    result = run_here(*words)
+    (line,) = result.stderr.splitlines()
+    assert result.returncode == 2 and line.startswith("rsbench: error: ") and said in line
