@@ -111,9 +111,12 @@ class Arena:
         streams = [self.root / "home" / name for name in (".out", ".err")]
         start = time.monotonic()
         sys.stdout.flush()
+        stops = {signal.SIGINT, signal.SIGTERM}
+        signal.pthread_sigmask(signal.SIG_BLOCK, stops)  # until the child is the command
         pid = os.fork()
         if pid == 0:
             _become(list(map(str, arguments)), self, streams, before, environment or {})
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, stops)
         code, peak_mb, hung = _wait(pid, start, stop, limit_s)
         seconds = time.monotonic() - start
         orphans = _bury()
@@ -141,6 +144,9 @@ def _become(
             os.environ.pop(name, None)
             if value is not None:
                 os.environ[name] = value
+        if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # as ``main`` sets it at once
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
         code = command(arguments, before)
         sys.stdout.flush()
         sys.stderr.flush()
