@@ -33,9 +33,15 @@ def smoke(
     from rsbench.benchmark.provenance import provenance
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.files import check_out, write_json, write_table
+    from rsbench.errors import RsbenchError
 
     if write:
         check_out(stored)
+    elif not (stored / FILE).is_file():
+        raise RsbenchError(
+            f"{stored / FILE}: there are no stored scores; a checkout of rsbench has some (--stored names their "
+            "folder), and --write stores those of this code"
+        )
     known = None if write else read_scores(stored)
     cards = entry or own_solvers()
     with progress_bar("smoke", len(cards)) as step:
