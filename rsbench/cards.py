@@ -149,7 +149,7 @@ def check_values(data: Mapping[str, Any], where: str) -> None:
                 f"{where}: {'.'.join(map(str, keys[:3]))}...: nested more than {_DEEPEST} levels deep"
             )
         for key, value in values.items() if isinstance(values, Mapping) else enumerate(values):
-            if isinstance(value, Mapping | list | tuple):
+            if isinstance(value, (Mapping, list, tuple)):
                 todo.append((value, (*keys, key)))
             elif isinstance(value, float) and not math.isfinite(value):
                 field = ".".join(map(str, (*keys, key)))

@@ -55,7 +55,7 @@ def _type_name(annotation: object) -> str:
 def _as_in_a_card(value: object) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: _as_in_a_card(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return [_as_in_a_card(item) for item in value]
     return value if isinstance(value, bool | int | float | str) else "" if value is None else str(value)
 

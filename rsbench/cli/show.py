@@ -68,7 +68,7 @@ def _print(about: dict[str, Any]) -> None:
 def _text(value: object) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{key} = {_text(item)}" for key, item in value.items())
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return ", ".join(_text(item) for item in value)
     return str(value)
 

@@ -45,7 +45,7 @@ def log(pose: Pose) -> FloatArray:
     """Twist (..., 6) of a transform whose rotation is below a half turn."""
     w = so3.log(pose.R)
     v = np.linalg.solve(so3.left_jacobian(w), pose.t[..., None])[..., 0]
-    return np.concatenate([w, v], axis=-1)
+    return np.concatenate([w, v], axis=-1, dtype=np.float64)
 
 
 def adjoint_apply(pose: Pose, xi: FloatArray) -> FloatArray:

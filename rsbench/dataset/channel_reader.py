@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from rsbench.errors import RsbenchError
 from rsbench.reading import inside
 
 
+@dataclass(frozen=True, kw_only=True)
 class ChannelReader:
     """What a ``Sequence`` reads of its channels; each raises RsbenchError where it does not have them."""
 

@@ -165,7 +165,7 @@ class Errors:
                 )
                 slope = (above - below) / (2.0 * step)
                 S += variance * slope[:, :, None] * slope[:, None, :]
-        return np.linalg.inv(np.linalg.cholesky(S))
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(S)), np.float64)
 
     def __call__(self, motion: Motion) -> FloatArray:
         """Errors (n,), px."""
@@ -240,7 +240,8 @@ class ModelFit:
 
     def covariance(self, dispersion: float) -> FloatArray:
         """Of phi; ``dispersion``: see ``dispersion``."""
-        return np.asarray(np.linalg.inv(self.curvature / dispersion + np.diag(self.candidate.precision)))
+        curvature = self.curvature / dispersion + np.diag(self.candidate.precision)
+        return np.asarray(np.linalg.inv(curvature), np.float64)
 
     def log_evidence(self, dispersion: float) -> float:
         """Of the matches under this model, up to a constant that all models share: Laplace's approximation."""
@@ -348,7 +349,7 @@ def _along(by_pose: FloatArray, tau: FloatArray, after: Pose) -> FloatArray:
         whole += power / factorial(k + 1)
         out += (tau ** (k + 1) / factorial(k + 1))[:, None] * (by_pose @ power)
         power = ad @ power
-    return np.asarray(np.linalg.solve(whole.T, out.T).T)
+    return np.asarray(np.linalg.solve(whole.T, out.T).T, np.float64)
 
 
 def dispersion(fit: ModelFit, cell_px: float) -> float:

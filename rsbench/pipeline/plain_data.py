@@ -62,7 +62,7 @@ def _flat(value: object, arrays: list[NDArray[Any]]) -> object:
         value = value.item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if isinstance(value, tuple | list):
+    if isinstance(value, (tuple, list)):
         return {type(value).__name__: [_flat(item, arrays) for item in value]}
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
         return {"dict": {key: _flat(item, arrays) for key, item in value.items()}}

@@ -67,7 +67,7 @@ def row_pattern(stereo: FloatArray, rig: StereoRig) -> RowPattern | None:
     columns = np.stack([np.ones(len(x)), x, y, x * y, camera.fy * y * (xl**2 - xr**2)], axis=1)
     difference = stereo[:, 1] - stereo[:, 3]
     near = np.abs(difference) < _FAR_OFF_PX
-    keep, noise = near, _LEAST_PX
+    keep, noise, fit = near, _LEAST_PX, np.zeros(columns.shape[1])
     for _ in range(_ROUNDS):
         if np.count_nonzero(keep) < _FEWEST:
             return None

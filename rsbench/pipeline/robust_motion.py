@@ -119,7 +119,7 @@ def estimate_motion(
         ideal = without_lens(given, rig.camera)
         refusal = solver.spec.refusal(rig, shutter)
     except ValueError as error:
-        refusal = str(error)
+        return _refused(correspondences, str(error), solver, options)
     if refusal:
         return _refused(correspondences, refusal, solver, options)
     if solver.spec.shutter == "global":
@@ -175,7 +175,7 @@ def _search(
     rng: np.random.Generator,
 ) -> _Found:
     """By RANSAC around the solver."""
-    iterations = 0
+    failed, iterations = None, 0
     for problem, threshold in _attempts(correspondences, rig, shutter, solver, options):
         report = ransac(problem, replace(options, threshold_px=threshold).ransac(), rng)
         iterations += report.iterations
@@ -183,8 +183,10 @@ def _search(
             return _Found(
                 problem, *_conclude(problem, report.model, report.inliers, threshold, options), iterations
             )
-        failed = MotionEstimate.failed(problem.failure(report.reason))
-    return _Found(problem, failed, report.inliers, threshold, iterations)
+        reason = problem.failure(report.reason)
+        failed = _Found(problem, MotionEstimate.failed(reason), report.inliers, threshold, iterations)
+    assert failed is not None, "one attempt is always made"
+    return failed
 
 
 def _own(

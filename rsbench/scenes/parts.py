@@ -104,7 +104,7 @@ def joined(pieces: Sequence[Piece]) -> Piece:
     return Piece(pieces[0].surface, points, uv, normals)
 
 
-def box(surface: str, low: Sequence[float], high: Sequence[float], *, turned: bool = False) -> Piece:
+def box(surface: str, low: ArrayLike, high: ArrayLike, *, turned: bool = False) -> Piece:
     """An axis-aligned box between two corners."""
     corners = np.stack([np.minimum(low, high), np.maximum(low, high)]).astype(np.float64)
     return flat(surface, corners[_BOX, np.arange(3)], turned=turned)
@@ -227,8 +227,8 @@ def grid(surface: str, points: FloatArray, uv: FloatArray, normals: FloatArray |
     """A sheet of points (rows, columns, 3) with uv (rows, columns, 2); its own normals if none are given."""
     if normals is None:
         across, along = np.gradient(points, axis=1), np.gradient(points, axis=0)
-        normals = _cross(across, along)
-        normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+        facing = _cross(across, along)
+        normals = facing / np.linalg.norm(facing, axis=2, keepdims=True)
 
     def cut(values: FloatArray) -> FloatArray:
         a, b, c, d = values[:-1, :-1], values[:-1, 1:], values[1:, 1:], values[1:, :-1]

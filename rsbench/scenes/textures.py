@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Field = NDArray[np.float32]
+Field = NDArray[np.floating]  # float32, which NumPy's annotations of + and * do not tell
 _FINENESS = 4  # steps per pixel of the look-up tables of borders
 
 Colour = tuple[float, float, float]

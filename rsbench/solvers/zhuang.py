@@ -101,7 +101,7 @@ def accelerations(Z0: FloatArray, Z1: FloatArray) -> list[float]:
     P, P_k = across.T @ Z0[:, 3:], across.T @ Z1[:, 3:]
     values: Any = scipy.linalg.eig(P, -P_k, right=False)
     real = values[np.isfinite(values) & (np.abs(values.imag) <= 1e-9 * (1.0 + np.abs(values.real)))].real
-    return [float(k) for k in sorted(real, key=abs) if _SLOWEST < k < _FASTEST]
+    return [k for k in sorted(map(float, real), key=abs) if _SLOWEST < k < _FASTEST]
 
 
 def _fitting_accelerations(Z0: FloatArray, Z1: FloatArray) -> list[float]:

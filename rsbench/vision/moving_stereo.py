@@ -107,9 +107,8 @@ def _of_side(
         rho = _known(_inverse_depth(eyes[side], eyes[other], _pixels(camera, wide, partner), ends))
         if np.mean(gain * np.abs(rho - before) > _STILL_PX) < _SETTLED:
             break
-    places = grid - _across(sign * here)
     known = np.isfinite(here)
-    places = np.where(known[..., None], places, 0.0)
+    places: FloatArray = np.where(known[..., None], grid - _across(sign * here), 0.0)
     moved = (ends - grid).astype(np.float32)
     ends = places + np.stack([between_pixels(moved[..., k], places) for k in (0, 1)], axis=-1)
     rho = _inverse_depth(eyes[side], eyes[other], _pixels(camera, wide, grid), _inside(camera, ends))

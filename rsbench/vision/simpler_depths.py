@@ -37,7 +37,7 @@ def plane_depth(depth: NDArray[Any], camera: PinholeCamera | None = None) -> F32
         return np.full(depth.shape, np.inf, dtype=np.float32)
     A, rho = basis[known], 1.0 / depth[known].astype(np.float64)
     least = 1e-3 * max(float(np.median(rho)), 1e-12)
-    weights = np.ones_like(rho)
+    weights, plane = np.ones_like(rho), np.zeros(3)
     for _ in range(_ROUNDS):
         plane, *_ = np.linalg.lstsq(A * weights[:, None], rho * weights, rcond=None)
         weights = 1.0 / np.sqrt(np.maximum(np.abs(A @ plane - rho), least))

@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -64,13 +64,9 @@ def main() -> int:
     chosen, given = _options(), sys.argv[1:]  # the commands have arguments of their own there
     extent = SAMPLE if chosen.sample else LONG
     if chosen.case:
-        extent = Extent(**{**vars(extent), "cases": tuple(chosen.case)})
-    extent = Extent(
-        **{
-            **vars(extent),
-            **{k: getattr(chosen, k) for k in ("kills", "files", "inputs", "surroundings") if getattr(chosen, k)},
-        }
-    )
+        extent = replace(extent, cases=tuple(chosen.case))
+    asked = {k: getattr(chosen, k) for k in ("kills", "files", "inputs", "surroundings") if getattr(chosen, k)}
+    extent = replace(extent, **asked)
     chosen.keep.mkdir(parents=True, exist_ok=True)
     rows, faults = dict[str, str](), 0
     with tempfile.TemporaryDirectory(prefix="attack-") as root, stage(Path(root), extent.cases) as arena:

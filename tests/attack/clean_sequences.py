@@ -147,7 +147,7 @@ def _scanning(rng: np.random.Generator) -> Scanning:
         return Scanning()
     scan, right = (get_args(Scan)[k] for k in rng.integers(len(get_args(Scan)), size=2))
     delay = float(rng.choice([0.0, rng.uniform(-0.5, 0.5)]))
-    return Scanning(scan=scan, right_scan=rng.choice([None, right]), right_delay=delay)
+    return Scanning(scan=scan, right_scan=right if rng.integers(2) else None, right_delay=delay)
 
 
 def _in_one_direction(scanning: Scanning) -> bool:

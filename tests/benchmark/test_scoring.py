@@ -22,7 +22,8 @@ vectors = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
 
 
 def errors(w: Any = W, d: Any = D, **changes: Any) -> dict[str, FloatArray]:
-    return pose_errors(w, d, **{"true_w": W, "true_d": D, "rig": RIG, **changes})
+    truth: dict[str, Any] = {"true_w": W, "true_d": D, "rig": RIG}
+    return pose_errors(w, d, **truth | changes)
 
 
 def test_the_truth_scores_the_best_value_of_each_error() -> None:

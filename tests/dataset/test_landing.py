@@ -17,9 +17,10 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.files import read_depth, write_depth
 from rsbench.dataset.shots import SHOTS, GivenGeometry
-from rsbench.dataset.verification import landing, structure, verify_sequence
+from rsbench.dataset.verification import landing, verify_sequence
 from rsbench.dataset.verification.landing import DepthMap
 from rsbench.dataset.verification.rough import roughly_alike
+from rsbench.dataset.verification.structure import Listing
 
 LENSES = (
     None,
@@ -68,7 +69,7 @@ def dataset(tmp_path: Path) -> Path:
 
 def test_planes_of_which_no_place_is_flat_are_spoilt(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(landing, "FLATNESS", -1.0)
-    listing = structure.Listing.of(dataset, {"sequences": ["planes"]})
+    listing = Listing.of(dataset, {"sequences": ["planes"]})
     fault = "rs_depth/left_0.exr: all rows: nothing can be compared with another frame"
     assert fault in verify_sequence(listing, "planes").faults
 
@@ -92,6 +93,6 @@ def test_a_map_that_begins_elsewhere_says_where(dataset: Path) -> None:
     path = dataset / "planes/rs_depth/left_0.exr"
     depth, twin = read_depth(path), read_depth(dataset / "planes/gs_depth/left_0.exr")
     write_depth(path, np.concatenate([depth[:-1] * np.float32(1.001), twin[-1:]]))
-    listing = structure.Listing.of(dataset, {"sequences": ["planes"]})
+    listing = Listing.of(dataset, {"sequences": ["planes"]})
     faults = verify_sequence(listing, "planes").faults
     assert any("row 0 differs" in fault and "looks read from the bottom" in fault for fault in faults)

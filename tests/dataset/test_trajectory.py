@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import assert_refused, run_here
+from numpy.typing import ArrayLike
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.core import so3
@@ -27,7 +28,7 @@ RATE, COUNT = 40.0, 41
 """Poses of one second."""
 
 
-def _walk(seconds: FloatArray) -> Pose:
+def _walk(seconds: ArrayLike) -> Pose:
     """Some way in a box of 6 x 10 x 4 m, from its middle, and a look around."""
     s = np.asarray(seconds)
     turn = so3.exp(np.stack([0.1 * np.sin(5 * s), 0.3 * s, 0.05 * np.cos(7 * s)], axis=-1))
@@ -81,7 +82,7 @@ def test_pairs_follow_each_other_as_the_card_says(walk: Path) -> None:
         (starts(), 0.01 + 0.2 * np.arange(5)),
         (starts(step=1, start_s=0.5), 0.51 + 0.1 * np.arange(4)),
     ):
-        np.testing.assert_allclose(found, np.asarray(_walk(np.array(times)).t), rtol=0, atol=1e-5)
+        np.testing.assert_allclose(found, np.asarray(_walk(times).t), rtol=0, atol=1e-5)
     assert len(starts(pairs=2)) == 2
 
 

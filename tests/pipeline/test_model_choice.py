@@ -40,7 +40,8 @@ OWN: dict[str, dict[str, Any]] = {
 
 
 def matches(motion: Motion, seed: int = 0, **options: Any) -> Correspondences:
-    wanted = SimulationOptions(**{"tracks": 60, "noise_px": 0.3, **options})
+    usual: dict[str, Any] = {"tracks": 60, "noise_px": 0.3}
+    wanted = SimulationOptions(**usual | options)
     return simulate(RIG, SHUTTER, motion, wanted, np.random.default_rng(seed)).correspondences
 
 

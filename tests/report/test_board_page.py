@@ -90,8 +90,8 @@ class _Cells(HTMLParser):
         self.keys: list[str] = []
         self.rows: list[tuple[str, list[str]]] = []
 
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        found = {key: value or "" for key, value in attributes}
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        found = {key: value or "" for key, value in attrs}
         if tag == "th" and "data-key" in found:
             self.keys.append(found["data-key"])
         if tag == "tr" and "data-method" in found:

@@ -48,7 +48,7 @@ def test_it_is_at_the_bound_of_one_camera() -> None:
         left = Correspondences(left=exact.correspondences.left)
         F = motion_bound(left, LEFT, SHUTTER, s.motion, noise).information
         estimate = SOLVER.estimate(s.correspondences, RIG, SHUTTER)
-        length = np.linalg.norm(s.motion.d)
+        length = float(np.linalg.norm(s.motion.d))
         error = np.concatenate([estimate.w - s.motion.w, length * estimate.d - s.motion.d])
         distances.append(error @ F @ error)
         assert estimate.covariance is not None

@@ -285,7 +285,8 @@ def test_bad_input(world: Build, wrong: dict[str, Any]) -> None:
 
 
 def test_bad_options_and_times(world: Build) -> None:
-    for options in ({"interpolation": "nearest"}, {"tear_px": 0.0}, {"tear_px": float("nan")}):
+    bad: list[dict[str, Any]] = [{"interpolation": "nearest"}, {"tear_px": 0.0}, {"tear_px": float("nan")}]
+    for options in bad:
         with pytest.raises(ValueError, match="must"):
             WarpOptions(**options)
     scene = world(())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -139,9 +139,10 @@ def test_what_is_not_known_is_not_guessed(world: Build, shapes: Any, field: str)
     ("changes", "word"),
     [({"needs": {"gyro"}}, "'gyro'"), ({"reference": ""}, "reference"), ({"assumes": None}, "assumes")],
 )
-def test_a_spec_is_checked(changes: Mapping[str, Any], word: str) -> None:
+def test_a_spec_is_checked(changes: dict[str, Any], word: str) -> None:
+    spec: dict[str, Any] = {"needs": {"motion"}, "reference": "r", "assumes": "a"}
     with pytest.raises(ValueError, match=word):
-        CorrectorSpec(**{"needs": {"motion"}, "reference": "r", "assumes": "a", **changes})
+        CorrectorSpec(**spec | changes)
 
 
 # What others' correctors may answer. This module is not rsbench's, so they count as such.

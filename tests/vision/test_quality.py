@@ -40,9 +40,9 @@ def test_types_share_one_scale() -> None:
     a, b = ((image * 255).astype(np.uint8) for image in _pair((30, 30, 3)))
     wide = [image.astype(np.uint16) * 257 for image in (a, b)]
     unit = [image / 255.0 for image in (a, b)]
-    for pair in (wide, unit):
-        assert psnr(*pair) == pytest.approx(psnr(a, b), abs=1e-9)
-        assert ssim(*pair) == pytest.approx(ssim(a, b), abs=1e-9)
+    for first, second in (wide, unit):
+        assert psnr(first, second) == pytest.approx(psnr(a, b), abs=1e-9)
+        assert ssim(first, second) == pytest.approx(ssim(a, b), abs=1e-9)
 
 
 def test_identical_images() -> None:

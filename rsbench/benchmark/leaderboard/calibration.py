@@ -48,12 +48,10 @@ def calibration(scores: pd.DataFrame) -> Calibration | None:
     nees, scenes = told["nees"].to_numpy(dtype=np.float64), list(told["scene"])
     ratio = nees / _chi_squared(0.5)
     alone = len(set(scenes)) == len(scenes)
+    low, high = median_interval(ratio) if alone else typical_interval(ratio, _SEED, scenes)
     return Calibration(
         stated=len(told),
-        spread=(
-            float(np.median(ratio)),
-            *(median_interval(ratio) if alone else typical_interval(ratio, _SEED, scenes)),
-        ),
+        spread=(float(np.median(ratio)), low, high),
         covers=tuple(score_interval(_inside(nees, level), scenes) for level in LEVELS),
         mean=float(np.mean(nees)) / UNKNOWNS,
     )

@@ -57,7 +57,8 @@ def score_interval(values: FloatArray, scenes: Sequence[str]) -> tuple[float, fl
     """
     means = scene_means(values, scenes)
     if len(means) == len(values) and np.all((values == 0.0) | (values == 1.0)):
-        return float(np.mean(means)), *share_interval(int(np.sum(values)), len(values))
+        low, high = share_interval(int(np.sum(values)), len(values))
+        return float(np.mean(means)), low, high
     low, high = mean_interval(means)
     return float(np.mean(means)), max(low, 0.0), min(high, 1.0)
 

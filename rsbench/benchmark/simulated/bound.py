@@ -141,7 +141,7 @@ def _marginal_axes(F: FloatArray, target: FloatArray) -> FloatArray:
         return np.full(len(target), np.inf)
     known = ~unknown
     axes = np.linalg.svd(weights[:, known] / np.sqrt(values[known]), compute_uv=False)
-    return np.concatenate([axes, np.zeros(len(target) - len(axes))])
+    return np.concatenate([axes, np.zeros(len(target) - len(axes))], dtype=np.float64)
 
 
 def _pair_information(

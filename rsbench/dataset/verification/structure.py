@@ -266,7 +266,7 @@ def _equal(stored: object, expected: object) -> bool:
         if not isinstance(stored, Mapping) or stored.keys() != expected.keys():
             return False
         return all(_equal(stored[key], value) for key, value in expected.items())
-    if isinstance(expected, list | tuple):
+    if isinstance(expected, (list, tuple)):
         return isinstance(stored, list) and len(stored) == len(expected) and all(map(_equal, stored, expected))
     if isinstance(expected, bool) or isinstance(stored, bool) or not isinstance(expected, int | float):
         return type(stored) is type(expected) and stored == expected

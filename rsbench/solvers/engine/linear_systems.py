@@ -41,7 +41,7 @@ def rotation_from_essential(E: FloatArray, d: FloatArray, symmetric: bool) -> Fl
     if symmetric:
         columns, E = columns + np.swapaxes(columns, 1, 2), E + E.T
     w, *_ = np.linalg.lstsq(columns.reshape(3, 9).T, E.reshape(9), rcond=None)
-    return w
+    return np.asarray(w, np.float64)
 
 
 def scaled_translation(pairs: FloatArray, w: FloatArray, limit: float) -> FloatArray | None:

@@ -147,7 +147,7 @@ class TwistKernel(MotionKernel):
                 T_v[i, j] = A[i, j]
 
     def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
-        return np.concatenate([w, np.linalg.solve(so3.left_jacobian(w), d)])
+        return np.concatenate([w, np.linalg.solve(so3.left_jacobian(w), d)], dtype=np.float64)
 
     def motion(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         return theta[:3], so3.left_jacobian(theta[:3]) @ theta[3:]

@@ -256,7 +256,7 @@ def test_the_reading_bounds_the_noise_that_the_noise_claim_is_judged_by() -> Non
 def test_the_best_reading_is_found_and_the_literal_one_kept() -> None:
     def row(solver: str, statistic: str, held: float, verdict: str, left_open: float = 0.0) -> dict[str, object]:
         where = {"claim": "c", "matches": NINE, "noise": "1e-3 px", "solver": solver, "statistic": statistic}
-        return where | {"held": held, "open": left_open, "verdict": verdict}
+        return {**where, "held": held, "open": left_open, "verdict": verdict}
 
     rows = [
         row("literal", "mean", 0.0, "fails"),
