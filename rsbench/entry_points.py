@@ -38,7 +38,7 @@ def points_of(group: str, folders: tuple[tuple[str, int], ...]) -> Sequence[meta
     try:
         return tuple(metadata.entry_points(group=group))
     except Exception:
-        points, seen = [], set()
+        points, seen = list[metadata.EntryPoint](), set[str]()
         for package in metadata.distributions():
             with contextlib.suppress(Exception):
                 if (name := str(package.metadata["Name"]).lower()) not in seen:

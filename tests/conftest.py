@@ -18,7 +18,7 @@ import pytest
 from rsbench.imports import import_untried
 
 if TYPE_CHECKING:
-    from rsbench.scenes.model import Scene
+    from rsbench.scenes.model import Light, Scene
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Started in the background of a shell without job control: the commands that tests interrupt would inherit it.

@@ -91,7 +91,7 @@ _FORBIDDEN = re.compile(
 
 @in_checkout
 def test_nothing_points_at_one_machine_or_one_package_index() -> None:
-    found = []
+    found: list[str] = []
     for path in _tracked():
         if path == Path(__file__):
             continue

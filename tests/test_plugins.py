@@ -238,7 +238,7 @@ def test_an_edited_module_is_read_again(tmp_path: Path) -> None:
 
 def test_an_edited_helper_is_a_change_of_the_key(tmp_path: Path) -> None:
     uses = MODULE.replace("import sys", "from greeting_words import WORD").replace('"hello "', "WORD")
-    keys, words = set(), []
+    keys, words = set[str](), list[str]()
     for text in ("hi ", "servus "):
         (tmp_path / "greeting_words.py").write_text(f"WORD = {text!r}", "utf-8")
         entry = load_entry(GREETINGS, write(tmp_path, module=uses))

@@ -142,7 +142,7 @@ def named_channels(text: str) -> tuple[Channel, ...]:
     """
     if text in ("all", "none"):
         return CHANNELS if text == "all" else ()
-    found = []
+    found: list[Channel] = []
     for name in text.split(","):
         matching = [channel for channel in CHANNELS if channel == name.strip()]
         if not matching or matching[0] in found:

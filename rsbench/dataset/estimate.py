@@ -95,7 +95,7 @@ def _of_kind(
     with tempfile.TemporaryDirectory(prefix="rsbench-") as temporary:
         for folder in {Path(name).parent for name in own}:
             (Path(temporary) / folder).mkdir(parents=True, exist_ok=True)
-        times, middle = [], (card.frames - 1) // 2
+        times, middle = list[float](), (card.frames - 1) // 2
         for _ in range(1 if warm else 2):
             begun = time.monotonic()
             for _ in render_camera(card, sequences[0], options, scene, SIDES[0], middle, Path(temporary)):

@@ -266,7 +266,7 @@ def sequence_manifest(
     camera = rig.camera
     fields = ("width", "height", "fx", "fy", "cx", "cy")
     readout_s = shutter.readout_ratio * frame_period_s
-    lens = {} if camera.lens is None else {"lens": asdict(camera.lens)}
+    lens: dict[str, Any] = {} if camera.lens is None else {"lens": asdict(camera.lens)}
     count = {"frames": frames} if frames > len(FRAMES) else {}
     return {
         "format": FORMAT,
@@ -280,7 +280,8 @@ def sequence_manifest(
         "row_time_s": readout_s / shutter.lines("left"),
         "motion": motion_record(motion),
         **count,
-    } | ({} if shutter.plain else asdict(shutter.scanning))
+        **({} if shutter.plain else asdict(shutter.scanning)),
+    }
 
 
 def read_sequence(folder: Path) -> Sequence:

@@ -77,7 +77,7 @@ def read_trajectory(path: Path, longest_gap_s: float) -> Trajectory:
     Raises:
         RsbenchError: it cannot be read, or a line is wrong: one line with its number and a remedy.
     """
-    stamps, poses, lines = [], [], []
+    stamps, poses, lines = list[Decimal](), list[FloatArray](), list[int]()
     for number, text in enumerate(read_text(path).splitlines(), start=1):
         words = text.split()
         if words and not words[0].startswith("#"):

@@ -83,7 +83,7 @@ def depth_of_pair(
     images = dict(zip(SIDES, (left, right), strict=True))
     levels = dict(zip(SIDES, eight_bit([left, right]), strict=True))
     disparities = dict(zip(SIDES, both, strict=True))
-    depth, guess = {}, {}
+    depth, guess = dict[Side, NDArray[np.float32]](), dict[Side, NDArray[np.float32]]()
     for side in SIDES:
         sky = sky_mask(levels[side], disparities[side]) if find_sky else np.zeros(left.shape[:2], np.bool_)
         disparity = np.where(sky, np.float32(0.0), disparities[side])

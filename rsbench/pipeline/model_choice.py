@@ -141,7 +141,7 @@ def preferred(probability: dict[str, float]) -> str:
 
 def _fits(errors: Errors, start: Motion, rig: StereoRig) -> tuple[list[ModelFit], float]:
     """Every candidate at the scale of the best one, and the dispersion that the best one leaves."""
-    phi, fits = np.concatenate([start.w, start.d]), []
+    phi, fits = np.concatenate([start.w, start.d]), list[ModelFit]()
     for candidate in CANDIDATES:
         fits.append(fit_model(errors, candidate, np.concatenate([phi, np.zeros(len(candidate.sigma))])))
     evidence = [fit.log_evidence(1.0) for fit in fits]

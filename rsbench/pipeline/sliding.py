@@ -74,7 +74,7 @@ def estimate_sequence_readout(
         RefusedFramesError: the first windows cannot be what they are said to be, or time runs backwards.
         NoMotionError: the windows do not determine the ratio.
     """
-    estimates, refusals = [], _Refusals(left)
+    estimates, refusals = list[ReadoutEstimate](), _Refusals(left)
     for number, images in enumerate(_window_images(left, right)):
         try:
             matches = match_frames(images, rig, options, judge_rig=number < _JUDGED)

@@ -66,7 +66,7 @@ def _scores(line: Standing) -> list[dict[str, str]]:
 
 
 def _by(each: Board, line: Standing, name: str, kinds: pd.Series) -> dict[str, Any]:
-    scores, protocol, rows = line.scored.scores, each.protocol, []
+    scores, protocol, rows = line.scored.scores, each.protocol, list[list[object]]()
     for kind, part in scores.groupby(kinds.astype(str).to_numpy()):
         share = in_words(*score_interval(part[protocol.primary.key].to_numpy(), list(part["scene"])))
         medians = (part[key].median() for key in protocol.of_kind("median")[:BRIEF])

@@ -58,7 +58,7 @@ class Album:
         """Frames, truth and answers, written, with a thumbnail; of the last entries if there is room."""
         if problem not in self._sequences:
             return []
-        left, found = self.allowance, []
+        left, found = self.allowance, list[Shown]()
         for group in self._groups(problem):
             pictures = [
                 (stem, words, encode_jpeg(shrink(image, _LONGEST), _QUALITY)) for stem, words, image in group

@@ -221,7 +221,7 @@ def publish(evaluation: Path, out: Path) -> Path:
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         write_bytes(out / name, (evaluation / name).read_bytes())
     write_overview(out)
-    lines = []
+    lines: list[str] = []
     for table in summary_tables(evaluation):
         lines += [f"## {table.title}", "", table.note, "", markdown_table(table.brief), ""]
     path = out / "summary.md"

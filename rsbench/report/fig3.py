@@ -72,7 +72,7 @@ def draw_fig3(folder: Path) -> list[Path]:
     Equal summaries give equal bytes.
     """
     tables = read_summaries(folder, SWEEPS)
-    paths = []
+    paths: list[Path] = []
     for variant in READINGS:
         for centre in CENTRES:
             paths += _draw(tables, variant, centre, folder / f"fig3-{_ENDINGS[variant]}-{centre}")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rsbench.cards import choices
 from rsbench.core import so3
 from rsbench.errors import RsbenchError
-from rsbench.scenes.model import Material, Scene, SceneMesh
+from rsbench.scenes.model import FloatArray, Material, Scene, SceneMesh
 from rsbench.scenes.textures import fractal_noise, to_bytes
 
 MOST_MOVING = 64
@@ -72,7 +72,7 @@ def with_moving(scene: Scene, bodies: Sequence[Body]) -> Scene:
 
 def _box(body: Body, edges: Vector, number: int) -> SceneMesh:
     """Six sides, each with a part of one texture of its own; the longest edge is half a repeat."""
-    corners, uv, faces = [], [], []
+    corners, uv, faces = list[FloatArray](), list[FloatArray](), list[list[int]]()
     for side, (axis, sign) in enumerate((axis, sign) for axis in range(3) for sign in (-1.0, 1.0)):
         u, v = (axis + 1) % 3, (axis + 2) % 3
         for along, up in ((-1, -1), (1, -1), (1, 1), (-1, 1)):

@@ -195,7 +195,8 @@ def _storey_front(rng: np.random.Generator, style: HouseStyle, storey: int) -> l
     middles = (np.arange(count) - (count - 1) / 2) * (w - 0.6) / count
     wall = style.ground if storey == 0 else style.wall
     door_at = int(rng.integers(count)) if storey == 0 and style.door else -1
-    holes, pieces, openings = [], [], []
+    holes, pieces = list[list[tuple[float, float]]](), list[Piece]()
+    openings: list[tuple[float, float]] = []
     for k, x in enumerate(middles):
         x = float(x)
         if k == door_at:

@@ -112,7 +112,7 @@ def _tree(rng: np.random.Generator, distance: float) -> list[Piece]:
     """A tree with branches as high as one sees from the path; the farther it stands, the larger its leaves."""
     height, radius = float(rng.uniform(9, 14)), float(rng.uniform(0.05, 0.19))
     trunk, path = _trunk(rng, height, radius, "bark", 10)
-    branches, centres = [], []
+    branches, centres = list[Piece](), list[FloatArray]()
     for level in np.arange(float(rng.uniform(1.2, 3.0)), min(height, 2.5 + 0.45 * distance), 0.8):
         start = np.array([np.interp(level, path[:, 2], path[:, k]) for k in range(3)])
         angle, length = rng.uniform(0, 2 * np.pi), float(rng.uniform(0.7, 2.2)) * (1.15 - level / height)
@@ -127,7 +127,7 @@ def _tree(rng: np.random.Generator, distance: float) -> list[Piece]:
 
 def _foreground(rng: np.random.Generator) -> list[Piece]:
     """Thin trunks, and bare or leafy twigs that cross the picture 2.5 to 6 m away."""
-    branches, centres = [], []
+    branches, centres = list[Piece](), list[FloatArray]()
     for x, y, radius in _NEAR:
         trunk, path = _trunk(rng, 7.0, radius, "bark_fine", 16)
         at = np.array([x, y, float(_height(x, y))])

@@ -68,7 +68,7 @@ def curtain_wall(
 
 def _voussoirs(width: float, crown: float) -> list[Piece]:
     """The ring of wedge stones around a round arch in the wall y = 0."""
-    pieces = []
+    pieces: list[Piece] = []
     spring = crown - width / 2
     for a in np.linspace(0, np.pi, 12)[:-1] + np.pi / 22:
         inner, outer = width / 2, width / 2 + 0.34
@@ -146,7 +146,7 @@ def square_tower(
     pieces: list[Piece] = [box(wall, (-half + 0.4, -half + 0.4, height - 0.3), (half - 0.4, half - 0.4, height))]
     section = [(-0.5, 0.0), (0.1, 0.0), (0.1, 2.2), (0.0, 2.0)]
     for heading in (0, 90, 180, 270):
-        holes, face = [], []
+        holes, face = list[list[tuple[float, float]]](), list[Piece]()
         for floor in range(floors):
             z = 1.6 + (height - 3.2) * (floor + 0.35) / floors
             count = 1 if width < 6 else 2

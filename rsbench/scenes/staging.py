@@ -9,7 +9,7 @@ import numpy as np
 
 from rsbench.scenes.model import FloatArray, SceneMesh
 from rsbench.scenes.palette import paint_palette
-from rsbench.scenes.parts import assemble, box, grid
+from rsbench.scenes.parts import Piece, assemble, box, grid
 
 _GROUND, _WALL = "cobbles", "brick"
 _SUNK = 1e-3
@@ -42,7 +42,7 @@ def surroundings(meshes: Sequence[SceneMesh], ground: bool, backdrop: bool, seed
     """Cobbles below a model, and a square of brick walls around it; its box decides their size."""
     low, high = box_of(meshes)
     size, (x, y) = float(np.max(high - low)), (low[:2] + high[:2]) / 2
-    floor, reach, pieces = float(low[2]) - _SUNK * size, _APART * size, []
+    floor, reach, pieces = float(low[2]) - _SUNK * size, _APART * size, list[Piece]()
     if ground:
         steps = np.linspace(-2 * reach, 2 * reach, 33)
         across, along = np.meshgrid(steps, steps)

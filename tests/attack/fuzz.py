@@ -71,7 +71,7 @@ def _messages(
     os.close(writer)
     pending, closed, told = b"", False, True
     while not closed:
-        ready, _, _ = select.select([reader], [], [], HANG_S)
+        ready, _, _ = select.select([reader], (), (), HANG_S)
         if not ready:
             os.kill(pid, signal.SIGKILL)
             yield "hung", f"longer than {HANG_S:g} s"

@@ -38,7 +38,7 @@ def attack(arena: Arena, case: Case, reference: Reference, rng: np.random.Genera
     tally, kills = Tally(), 0
     while kills < count:
         place(arena)
-        before, deaths, whole = arena.outside(arena.work / "out"), [], False
+        before, deaths, whole = arena.outside(arena.work / "out"), list[str](), False
         for _ in range(min(CHAIN, count - kills)):
             death = draw(arena, case, reference, rng)
             ending = arena.run(("--quiet", *case.arguments), before=death.before, stop=death.stop)

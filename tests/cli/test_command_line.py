@@ -133,7 +133,7 @@ def test_problem_that_is_not_json_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("solver", ["rs-stereo-refined", "rs-stereo-linear", "gs-8pt"])
 def test_too_few_matches_is_a_failure_with_a_reason(tmp_path: Path, problem: dict[str, Any], solver: str) -> None:
-    few = {"left": problem["left"][:2], "right": [], "tracks": []}
+    few: dict[str, Any] = {"left": problem["left"][:2], "right": [], "tracks": []}
     result = run_here("solve", write_problem(tmp_path, problem, **few), "--solver", solver, "--json")
     assert result.returncode == 1
     answer = json.loads(result.stdout)
@@ -144,7 +144,7 @@ def test_too_few_matches_is_a_failure_with_a_reason(tmp_path: Path, problem: dic
 
 def test_matches_without_a_motion_are_a_failure(tmp_path: Path, problem: dict[str, Any]) -> None:
     rng = np.random.default_rng(3)
-    noise = {
+    noise: dict[str, Any] = {
         "left": rng.uniform(0, 899, (80, 4)).tolist(),
         "right": rng.uniform(0, 899, (80, 4)).tolist(),
         "tracks": [],

@@ -42,7 +42,7 @@ def _exact_matches(
 
 def _world_constraint(motion: Motion, side: Side, match: FloatArray, shutter: RollingShutter = SHUTTER) -> float:
     """Volume spanned by the two viewing rays and the line between the two centres, all in the world frame."""
-    centres, rays = [], []
+    centres, rays = list[FloatArray](), list[FloatArray]()
     for frame, (x, y) in enumerate(match.reshape(2, 2)):
         tau = frame + shutter.readout_ratio * y / shutter.height
         world_from_cam = inverse(RIG.cam_from_world(motion, tau, side))
@@ -259,7 +259,7 @@ def test_parallel_rays_have_no_depth_and_are_not_in_front() -> None:
 
 def _stereo_matches(motion: Motion, X: FloatArray) -> tuple[list[FloatArray], np.ndarray]:
     """Matches (n, 3) x, y, disparity halfway between the cameras, of both frames, and which points have both."""
-    out, ok = [], np.ones(len(X), dtype=bool)
+    out, ok = list[FloatArray](), np.ones(len(X), dtype=bool)
     for frame in (0, 1):
         left, right = (rs_project(RIG, SHUTTER, motion, side, frame, X) for side in SIDES)
         ok &= (left.status == ProjectionStatus.SEEN) & (right.status == ProjectionStatus.SEEN)

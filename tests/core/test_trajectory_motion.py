@@ -55,7 +55,7 @@ def test_poses_are_hit_at_their_times(seed: int) -> None:
 
 def test_between_poses_the_error_falls_with_the_fourth_power_of_the_step() -> None:
     between = np.linspace(0.0, 1.0, 101)
-    expected, errors = _smooth(between), []
+    expected, errors = _smooth(between), list[list[float]]()
     for step in (0.1, 0.05, 0.025):
         tau = np.arange(-1.0, 2.0 + step, step)
         found = world_from_body(_rows(tau, _smooth(tau)), between)

@@ -135,7 +135,7 @@ def test_every_pixel_lies_where_rays_say(
 ) -> None:
     """The bounds of the issue: 99.9 % of the visible pixels within 0.01 px, and no other class on 99.9 %."""
     seen = np.zeros(len(PixelClass), dtype=int)
-    near, right = [], []
+    near, right = list[NDArray[np.bool_]](), list[NDArray[np.bool_]]()
     for side, frame in VIEWS:
         offset, classes = truth(sequence, partial(first_hit, triangles), channel, side, frame, row)
         if channel == "disparity":
@@ -220,7 +220,7 @@ def test_affine_frames_are_of_the_triangles_that_rays_hit(sequence: Sequence, tr
 def test_matches_are_labelled_as_rays_say(sequence: Sequence, triangles: Array) -> None:
     """Between pixels: depth to the rounding of rays to float32, rows by bisection, what is hidden by rays."""
     matches, hit = sequence.matches(), partial(first_hit, triangles)
-    h, seen = sequence.shutter.readout_ratio / sequence.shutter.height, []
+    h, seen = sequence.shutter.readout_ratio / sequence.shutter.height, list[NDArray[np.int_]]()
     for k, ((side, frame), (other, later)) in enumerate(MATCHED.values()):
         pixels, depth, place, error, classes = matches.of_pair(k)
         origins, ways = rays(sequence, side, frame + h * pixels[:, 0, 1], pixels[:, 0])

@@ -337,7 +337,7 @@ def card(**fields: object) -> DatasetCard:
 
 
 def test_a_card_lets_the_shake_last_as_long_as_its_frames() -> None:
-    two, nine = (card(**fields).expanded() for fields in ({}, {"frames": 9}))
+    two, nine = card().expanded(), card(frames=9).expanded()
     short, long = (each.motion_of(each.sequence[0]) for each in (two, nine))
     assert long.lasts >= 8.5 > short.lasts
     assert "frames" not in two.manifest_of(two.sequence[0])

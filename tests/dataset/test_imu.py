@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,7 +52,13 @@ def folder(tmp_path: Path) -> Path:
     folder = tmp_path / "shaken"
     (folder / "imu").mkdir(parents=True)
     manifest = sequence_manifest(name="shaken", rig=RIG, shutter=SHUTTER, motion=MOTION, frame_period_s=0.1)
-    own = {"scene": SCENE, "sensor": asdict(SENSOR), "channels": ["imu"], "imu": asdict(IMU), "files": {}}
+    own: dict[str, Any] = {
+        "scene": SCENE,
+        "sensor": asdict(SENSOR),
+        "channels": ["imu"],
+        "imu": asdict(IMU),
+        "files": {},
+    }
     write_json(folder / "sequence.json", manifest | own)
     write_imu(folder, IMU, gravity_of(SCENE), drawn("1"))
     return folder

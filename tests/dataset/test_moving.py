@@ -139,7 +139,7 @@ def world(lot: Path, sequence: Sequence) -> World:
 @pytest.mark.parametrize(("channel", "row"), [*((name, 0) for name in PAIR_CHANNELS), ("gs_flow", 24)])
 def test_every_pixel_lies_where_rays_say(sequence: Sequence, world: World, channel: PairChannel, row: int) -> None:
     """99.9 % of the visible pixels within 0.01 px, no other class on 99.9 %; of the objects by themselves too."""
-    near, right, owners = [], [], []
+    near, right, owners = list[NDArray[np.bool_]](), list[NDArray[np.bool_]](), list[NDArray[np.intp]]()
     for side, frame in VIEWS:
         offset, classes, owner = truth(sequence, world, channel, side, frame, row)
         if channel == "disparity":

@@ -198,7 +198,7 @@ def test_stopped_between_the_old_and_the_new_it_goes_on(
     card: DatasetCard, copy: Path, dataset: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (copy / "a/rs/left_0.png").write_bytes(b"damaged")
-    real, calls = os.rename, []
+    real, calls = os.rename, list[Path]()
 
     def second_fails(source: Path, target: Path) -> None:
         calls.append(target)

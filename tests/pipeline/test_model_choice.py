@@ -143,7 +143,7 @@ def test_matches_that_err_together_count_once() -> None:
     truth = make_motion("twist", W, D)
     once = matches(truth, tracks=150)
     again = replace(once, tracks=np.repeat(once.tracks, 4, axis=0))
-    start, gaps, spreads = np.concatenate([W, D]), [], []
+    start, gaps, spreads = np.concatenate([W, D]), list[float](), list[float]()
     for given in (once, again):
         errors = Errors(given, RIG, SHUTTER, truth)
         linear, twist = (fit_model(errors, named(name), start, 0.3) for name in ("linear", "twist"))

@@ -109,7 +109,7 @@ def test_the_descent_is_exact_on_the_paper_s_motion(solver: DaiSolver | TwelvePa
 
 def test_the_twelve_parameters_leave_an_error_of_first_order_in_the_velocities() -> None:
     """The essential matrix of all matches is none of the middle rows', and the correction does not touch it."""
-    solver, errors = TwelveParameterSolver(refinement="none"), []
+    solver, errors = TwelveParameterSolver(refinement="none"), list[float]()
     for share in (1.0, 0.5):
         each = []
         for seed in range(6):

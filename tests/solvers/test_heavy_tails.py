@@ -109,7 +109,7 @@ def test_covariance_holds_whatever_the_errors(kind: str) -> None:
 
     Least squares takes the errors of two cameras, which one track shares, for independent, and misses the band.
     """
-    squares, plain = [], []
+    squares, plain = list[float](), list[float]()
     for seed in range(40):
         c = with_errors(kind, seed)
         found = RefinedSolver().weigh(TRUTH, c, RIG, SHUTTER, 0.3)

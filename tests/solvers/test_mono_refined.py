@@ -42,7 +42,7 @@ def test_exact_matches_give_the_exact_motion_with_a_unit_translation(seed: int) 
 
 def test_it_is_at_the_bound_of_one_camera() -> None:
     """The error, by the information of the same matches, is chi-squared with five degrees of freedom."""
-    noise, distances, stated = 0.3, [], []
+    noise, distances, stated = 0.3, list[float](), list[float]()
     for seed in range(40):
         s, exact = trial(seed, noise), trial(seed, 0.0)
         left = Correspondences(left=exact.correspondences.left)
@@ -50,7 +50,7 @@ def test_it_is_at_the_bound_of_one_camera() -> None:
         estimate = SOLVER.estimate(s.correspondences, RIG, SHUTTER)
         length = float(np.linalg.norm(s.motion.d))
         error = np.concatenate([estimate.w - s.motion.w, length * estimate.d - s.motion.d])
-        distances.append(error @ F @ error)
+        distances.append(float(error @ F @ error))
         assert estimate.covariance is not None
         scale = np.repeat([1.0, length], 3)
         stated.append(np.sum(F * (estimate.covariance * np.outer(scale, scale))))

@@ -220,7 +220,7 @@ def normalised_square(estimate: MotionEstimate, motion: Motion, noise_px: float)
 @pytest.mark.parametrize("sets", ["pairs", "tracks"])
 def test_covariance_predicts_the_errors(sets: str, noise_px: float) -> None:
     """The mean of 150 normalised squared errors lies in the 99 % band of chi-squared with 6 degrees of freedom."""
-    squares, noises = [], []
+    squares, noises = list[float](), list[float]()
     for seed in range(150):
         rng = np.random.default_rng(seed)
         # Rotation about the vertical and the optical axis keeps the length of d observable from pairs.

@@ -71,7 +71,7 @@ def test_track_errors_are_those_of_the_best_point(model: str) -> None:
     for track, square in zip(c.tracks[:10], squares, strict=False):
 
         def reprojection(X: FloatArray, track: FloatArray = track) -> FloatArray:
-            views = []
+            views: list[FloatArray] = []
             for frame in (0, 1):
                 y = track[4 * frame + 1]
                 for _ in range(8):  # the row equation: image points move much slower than the readout

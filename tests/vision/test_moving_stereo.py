@@ -51,7 +51,7 @@ def seen(rig: StereoRig, shutter: RollingShutter, side: Side) -> tuple[NDArray[n
 def test_depth_is_that_of_the_planes(lens: Lens | None, scanning: dict[str, Any]) -> None:
     rig = StereoRig(camera=replace(CAMERA, lens=lens), baseline=0.4)
     shutter = Scanning(**scanning).shutter_of(160, 120, 0.9)
-    images, truth = {}, {}
+    images, truth = dict[Side, NDArray[np.uint8]](), dict[Side, NDArray[np.float32]]()
     for side in SIDES:
         images[side], truth[side] = seen(rig, shutter, side)
     found = moving_disparities(load_matcher("sgm"), images, rig, shutter, MOTION, 0)

@@ -72,7 +72,7 @@ class Evaluation:
     def _score(self, plan: Plan, hashes: FileHashes, step: Step) -> list[str]:
         """Write all tables; what is not current is returned."""
         rows: dict[str, list[Row]] = {table: [] for table in TABLES}
-        stale = []
+        stale: list[str] = []
         for sequence in self.sequences:
             places = Places(sequence, self._folder(sequence), plan.chain, hashes.sha256)
             scorer = Scorer(places, plan)

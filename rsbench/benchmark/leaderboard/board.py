@@ -226,7 +226,7 @@ def splits_of(board: Path) -> list[tuple[str, str]]:
         RsbenchError: it is no board.
     """
     _check_board(board)
-    found = []
+    found: list[tuple[str, str]] = []
     for protocol in (each.id for each in PROTOCOLS.values()):
         found += [(protocol, folder.name) for folder in _folders(board / protocol)]
     return found

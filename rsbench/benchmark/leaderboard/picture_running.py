@@ -101,7 +101,7 @@ def run_picture_cards(
     """
     chains = load_chains(cards, split.protocol)
     folders = {card: work / _name(chain, split.protocol) for card, chain in chains.items()}
-    jobs = []
+    jobs: list[_Job] = []
     for truth in split.truths:
         due = tuple(
             (card, folders[card], identity)

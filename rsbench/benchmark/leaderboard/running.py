@@ -140,7 +140,7 @@ def run_cards(
     """
     entries = load_entries(cards, split.protocol)
     data, count = sha256(inputs / "problems.jsonl"), len(split.truths)
-    jobs, identities = [], {}
+    jobs, identities = list[_Job](), dict[str, str]()
     for card, entry in entries.items():
         identities[card] = _identity(entry, split, data, limits)
         for first in range(0, count, limits.chunk):

@@ -46,7 +46,7 @@ def run_smoke(
         raise RsbenchError(f"--problems {problems}: must lie in [1, {len(split.truths)}]")
     split = replace(split, truths=split.truths[:problems])
     given = [simulated_problem(PUBLIC_SEED, number) for number in range(problems)]
-    runner, tables = SolverRunner(single_thread=True), []
+    runner, tables = SolverRunner(single_thread=True), list[pd.DataFrame]()
     with tempfile.TemporaryDirectory() as folder:
         for entry in load_entries(cards, split.protocol).values():
             answers = (answer_problem(problem, entry, runner) for problem in given)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rsbench.arguments import check_number, check_one_of, check_whole
 from rsbench.core.correspondences import Correspondences
@@ -109,7 +110,7 @@ def simulate(
     scenes, noises, wrongs = rng.spawn(3), rng.spawn(3), rng.spawn(3)
     counts = {"left": options.pairs, "right": options.pairs, "tracks": options.tracks}
     views: dict[str, tuple[Side, ...]] = {"left": ("left",), "right": ("right",), "tracks": ("left", "right")}
-    noisy, outliers = {}, {}
+    noisy, outliers = dict[str, FloatArray](), dict[str, NDArray[np.bool_]]()
     for (name, count), scene, noise, wrong in zip(counts.items(), scenes, noises, wrongs, strict=True):
         exact = _exact(rig, shutter, motion, options, scene, count, views[name])
         # (n, views, frames, 2) -> xl0, yl0, xr0, yr0, xl1, ...

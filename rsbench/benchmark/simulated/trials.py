@@ -105,7 +105,8 @@ def run_trials(
         RsbenchError: no such solver; the motion of the setting leaves too few points in view.
     """
     entrants = [enter(load_solver_entry(name)) for name in solvers]
-    truth, answers, seconds = [], [], []
+    truth, seconds = list[tuple[FloatArray, FloatArray]](), list[list[float]]()
+    answers: list[list[MotionEstimate]] = []
     for trial in range(first, first + count):
         simulation = _simulation(setting, entrants, seed, trial)
         truth.append((simulation.motion.w, simulation.motion.d))

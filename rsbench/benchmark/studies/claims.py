@@ -240,7 +240,7 @@ def judge_claims(
     Raises:
         RsbenchError: a summary lacks a solver or a variant.
     """
-    rows = []
+    rows: list[dict[str, object]] = []
     for claim in CLAIMS:
         for matches in claim.matches:
             if claim.sweep in tables.get(matches, {}):

@@ -342,7 +342,7 @@ def _extra_scores(image: NDArray[Any], truth: NDArray[Any], common: Mask, wanted
 
 
 def _band_rows(attempts: dict[str, Attempt | None]) -> list[Row]:
-    truth, rows = _found(attempts)["truth"], []
+    truth, rows = _found(attempts)["truth"], list[Row]()
     for key, attempt in attempts.items():
         error = np.full(truth.covered.shape, worst_flow(truth.image))
         if attempt is not None:

@@ -35,7 +35,7 @@ def motion_on_images(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
     """Per sequence: both errors of a solver below those of gs-8pt (medians where there are several runs)."""
     runs = table.groupby(["solver", "sequence"], sort=False)[["e_R_deg", "e_T_deg"]]
     errors, told = runs.median(), runs.agg(median_and_quartiles)
-    baseline, found = errors.loc["gs-8pt"], {}
+    baseline, found = errors.loc["gs-8pt"], dict[str, tuple[list[Check], str]]()
     for solver in PUBLISHED:
         own = errors.loc[solver]
         checks = [Check(str(name), bool((own.loc[name] < baseline.loc[name]).all())) for name in own.index]

@@ -242,7 +242,8 @@ def _costs(
     def mean(values: Colours) -> NDArray[np.float64]:
         return np.asarray(np.bincount(bands, weights=values, minlength=count) / size)
 
-    as_is, costs, errors = difference(image[y, x], shown), [], []
+    as_is = difference(image[y, x], shown)
+    costs, errors = list[NDArray[np.float64]](), list[NDArray[np.float64]]()
     for change in CHANGES:
         unlike = difference(change.undone(image, y, x), shown)
         costs.append(mean(unlike))

@@ -30,7 +30,7 @@ def plan(sequence: Sequence) -> Plan:
 def store_truth(places: Places, plan: Plan, **changes: Any) -> None:
     """The truth as the prediction of rs-stereo-refined and of sgm; ``changes`` of the motion's record."""
     motion = places.sequence.motion
-    record = {
+    record: dict[str, Any] = {
         "solver": plan.chain.solver.name,
         "entry": plan.chain.solver.name,
         "seed": 0,

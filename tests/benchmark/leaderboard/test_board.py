@@ -116,10 +116,10 @@ def test_stated_covariances_are_judged(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     half = rng.standard_normal((6, 6)) * 1e-3
     covariance = (half @ half.T).tolist()
-    lines, squares = [TRUTH[0]], []
+    lines, squares = [TRUTH[0]], list[float]()
     for line in TRUTH[1:]:
         error = rng.standard_normal(6) * 1e-3
-        squares.append(error @ np.linalg.solve(half @ half.T, error))
+        squares.append(float(error @ np.linalg.solve(half @ half.T, error)))
         theta = np.array([*line["w"], *line["d"]]) + error
         lines.append({**line, "w": theta[:3].tolist(), "d": theta[3:].tolist(), "covariance": covariance})
     np.testing.assert_allclose(_scores(tmp_path, lines)["nees"], squares, rtol=1e-6)

@@ -70,7 +70,7 @@ def render(card: DatasetCard, out: Path, **options: Any) -> None:
     """As ``generate_dataset``: noise of the seed in the places of pictures, and what a sequence says of itself."""
     made = {}
     for each in card.sequence:
-        folder, files = out / each.name, {}
+        folder, files = out / each.name, dict[str, str]()
         (folder / "rs").mkdir(parents=True, exist_ok=True)
         for side, frame in views_of(2):
             rng = np.random.default_rng(image_seed(card.seed_of(each), each.name, side, frame))
@@ -156,7 +156,7 @@ def test_pictures_hold_pixels_alone(place: Path) -> None:
     """No date, no program, no comment: a header, the pixels and an end."""
     for name, content in public(place):
         if name.endswith(".png"):
-            kinds, at = [], 8
+            kinds, at = list[bytes](), 8
             while at < len(content):
                 length, kind = struct.unpack(">I4s", content[at : at + 8])
                 kinds.append(kind)

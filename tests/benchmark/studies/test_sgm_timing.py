@@ -44,7 +44,7 @@ def test_the_prediction_is_first_order(
     """Halving the motion halves what is predicted and quarters what the prediction misses."""
     y, x = np.mgrid[:50, :60] / 50.0
     depth = z * (1.0 + 0.3 * x + 0.2 * y)
-    missed, predicted = [], []
+    missed, predicted = list[float](), list[float]()
     for size in (0.02, 0.01):
         motion = LinearMotion(size * np.array(w), size * np.array(d))
         shift = predicted_shift(depth, RIG, SHUTTER, motion, timing)
