@@ -26,7 +26,7 @@ test: $(STAMP)
 	@echo "== lint";   $(BIN)/ruff check .
 	@echo "== layers"; $(BIN)/lint-imports
 	@echo "== types, beside compiling and the tests"; \
-	$(BIN)/mypy & types=$$!; \
+	$(BIN)/pyrefly check --progress-bar no --python-interpreter-path $(BIN)/python & types=$$!; \
 	$(BIN)/python -c '$(COMPILE)' || { kill $$types; exit 1; }; \
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --no-loadscope-reorder; tests=$$?; \
 	wait $$types || { echo "types: failed, see above" >&2; exit 1; }; exit $$tests
@@ -61,5 +61,5 @@ lock:
 	  --generate-hashes --no-annotate --no-header --quiet --output-file constraints.txt
 
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache dist build
+	rm -rf $(VENV) .ruff_cache .pytest_cache .hypothesis .import_linter_cache dist build
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -62,7 +62,7 @@ def trial(solver: Solver, seed: int, size: float = 1.0, pairs: int = 100, **opti
     """2 degrees and 0.3 m times ``size``."""
     rng = np.random.default_rng([11, seed])
     motion = random_motion(rng, np.deg2rad(2.0 * size), 0.3 * size, solver.spec.motion_model)
-    chosen = SimulationOptions(pairs=pairs, gyro_rate=GYRO_RATE, **options)  # type: ignore[arg-type]
+    chosen = SimulationOptions(pairs=pairs, gyro_rate=GYRO_RATE, **options)  # pyrefly: ignore[bad-argument-type]
     return simulate(rig_of(solver), SHUTTER, motion, chosen, np.random.default_rng(seed))
 
 

@@ -57,7 +57,7 @@ def make_up(card: Path, out: Path) -> None:
         yield
 
     nothing = SimpleNamespace(viewpoints={"default": None}, seen_from=lambda *place: place)
-    vars(generation)["build_scene"] = lambda name: Built(nothing, "0" * 64)  # type: ignore[arg-type]
+    vars(generation)["build_scene"] = lambda name: Built(nothing, "0" * 64)  # pyrefly: ignore[bad-argument-type]
     vars(generation)["render_camera"] = render
     vars(passage)["obstacle"] = lambda *moving: ""
     vars(scene)["MitsubaScene"] = lambda scene: None
@@ -70,7 +70,7 @@ def resume(card: Path, out: Path, rehash: bool) -> None:
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.stage import Built
 
-    vars(generation)["build_scene"] = lambda name: Built(None, "0" * 64)  # type: ignore[arg-type]
+    vars(generation)["build_scene"] = lambda name: Built(None, "0" * 64)  # pyrefly: ignore[bad-argument-type]
     start, processor = time.perf_counter(), time.process_time()
     assert generation.generate_dataset(load_dataset_card(str(card)), out, rehash=rehash) == []
     seconds, processor = time.perf_counter() - start, time.process_time() - processor

@@ -115,7 +115,7 @@ def parse_card(cls: type[T], data: Mapping[str, Any], where: str, *, extra: Extr
     check_values(data, where)
     try:
         # Strict JSON validation reads arrays as tuples and tables as dataclasses, as TOML means them.
-        card = _adapter(cls, extra).validate_json(json.dumps([data], default=str))  # type: ignore[arg-type]
+        card = _adapter(cls, extra).validate_json(json.dumps([data], default=str))
     except ValidationError as error:
         raise RsbenchError(f"{where}: {_first_problem(cls, error)}") from None
     except RsbenchError as error:
@@ -130,7 +130,7 @@ def _adapter(cls: type, extra: Extra) -> TypeAdapter[Any]:
     pydantic takes no settings for a standard dataclass itself, but hands those of a container down to it.
     """
     config = ConfigDict(extra=extra, strict=True, allow_inf_nan=False)
-    return TypeAdapter(tuple[cls], config=config)  # type: ignore[valid-type]
+    return TypeAdapter(tuple[cls], config=config)
 
 
 def check_values(data: Mapping[str, Any], where: str) -> None:

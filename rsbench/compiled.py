@@ -70,11 +70,11 @@ class _Locator:
         return str(self._line)
 
 
-class _Implementation(CompileResultCacheImpl):  # type: ignore[misc]
+class _Implementation(CompileResultCacheImpl):
     _locator_classes = (_Locator,)
 
 
-class _KernelCache(FunctionCache):  # type: ignore[misc]
+class _KernelCache(FunctionCache):
     """Numba's cache of one function, with one index per signature; a file that cannot be read is made again."""
 
     def __init__(self, py_func: Callable[..., object]) -> None:

@@ -23,7 +23,7 @@ from rsbench.plugins import Kind, NoOptions, list_names, load_class
 MOTIONS: Kind[Motion, NoOptions] = Kind(
     singular="motion model",
     group="rsbench.motions",
-    base=Motion,  # type: ignore[type-abstract]
+    base=Motion,
     options=NoOptions,
     built_in={
         "linear": "rsbench.core.motion:LinearMotion",

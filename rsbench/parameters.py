@@ -71,7 +71,7 @@ def _field_docstrings(cls: type) -> dict[str, str]:
         body = tree.body if isinstance(tree, ast.ClassDef) else []
         for field, text in itertools.pairwise(body):
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and _is_text(text):
-                found[field.target.id] = " ".join(str(text.value.value).split())  # type: ignore[attr-defined]
+                found[field.target.id] = " ".join(str(text.value.value).split())  # pyrefly: ignore[missing-attribute]
     return found
 
 

@@ -260,7 +260,7 @@ def _offered_class(kind: Kind[Component, Any], offer: Offer) -> tuple[type[Compo
 
 def _from_card(kind: Kind[Component, Options], path: Path) -> Entry[Component, Options]:
     data = read_toml(path)
-    known = [*_OWN, *(option.name for option in dataclasses.fields(kind.options))]  # type: ignore[arg-type]
+    known = [*_OWN, *(option.name for option in dataclasses.fields(kind.options))]  # pyrefly: ignore[bad-argument-type]
     for key in data:
         if key not in known:
             raise RsbenchError(f"{path}: unknown key {key!r}{choices(key, known)}")
@@ -298,7 +298,7 @@ def _checked(kind: Kind[Component, Any], cls: object, where: str) -> type[Compon
     if not (isinstance(cls, type) and issubclass(cls, kind.base)) or inspect.isabstract(cls):
         base = f"{kind.base.__module__}.{kind.base.__qualname__}"
         missing = ", ".join(sorted(getattr(cls, "__abstractmethods__", ()))) if isinstance(cls, type) else ""
-        lacks = f"; it lacks {missing}" if missing and issubclass(cls, kind.base) else ""  # type: ignore[arg-type]
+        lacks = f"; it lacks {missing}" if missing and issubclass(cls, kind.base) else ""  # pyrefly: ignore[bad-argument-type]
         raise RsbenchError(
             f"{where}: {cls!r} is not a {kind.singular}: it must be a concrete subclass of {base}{lacks}"
         )

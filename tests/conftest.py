@@ -63,7 +63,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Whole files go to a process, as their fixtures are made once there."""
     from xdist.scheduler import LoadFileScheduling
 
-    class Scheduling(LoadFileScheduling):  # type: ignore[misc]
+    class Scheduling(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
             file = str(super()._split_scope(nodeid))
             return "large scenes" if file.endswith(LARGE_SCENES) else file
@@ -116,7 +116,8 @@ def scenes_once(built_scene: Callable[[str], Scene], give_back: Callable[[], Non
     from rsbench.renderers import scene
     from rsbench.scenes.load import load_scene
 
-    made, kept = scene.MitsubaScene, {}  # type: ignore[var-annotated]
+    made = scene.MitsubaScene
+    kept: dict[tuple[str, Light], scene.MitsubaScene] = {}
 
     def loaded(card: str | Path) -> Scene:
         return (

@@ -231,7 +231,7 @@ def documented_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
     """The files of docs/add-a-solver.md in a folder on the import path."""
     document = ROOT / "docs" / "add-a-solver.md"
     for block in [*_blocks(document, "python"), *_blocks(document, "toml")]:
-        name, content = re.fullmatch(r"# (\S+)\n(.*)", block, flags=re.DOTALL).groups()  # type: ignore[union-attr]
+        name, content = re.fullmatch(r"# (\S+)\n(.*)", block, flags=re.DOTALL).groups()  # pyrefly: ignore[missing-attribute]
         (tmp_path / name).write_text(content, "utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     yield tmp_path

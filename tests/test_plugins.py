@@ -32,7 +32,7 @@ GREETINGS: Kind[Greeting, NoOptions] = Kind(
     singular="greeting",
     cards="matchers",  # any folder will do
     group="rsbench.greetings",
-    base=Greeting,  # type: ignore[type-abstract]
+    base=Greeting,
     options=NoOptions,
     check=_no_shouting,
 )

@@ -85,7 +85,7 @@ def test_public_names_are_documented(name: str) -> None:
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="'rsbench' has no attribute 'solve_everything'"):
-        rsbench.solve_everything  # type: ignore[attr-defined]  # noqa: B018
+        rsbench.solve_everything  # pyrefly: ignore[missing-attribute]  # noqa: B018
 
 
 def test_the_import_brings_nothing_along() -> None:
@@ -98,7 +98,7 @@ def test_the_import_brings_nothing_along() -> None:
     assert [name for name in brought if name.partition(".")[0] not in sys.stdlib_module_names] == ["rsbench"]
 
 
-# One experiment. mypy checks the assert_type lines: the types reach those who import rsbench alone.
+# One experiment. pyrefly checks the assert_type lines: the types reach those who import rsbench alone.
 
 
 def test_points_are_projected() -> None:
@@ -227,18 +227,18 @@ FEW_ROWS = rsbench.RollingShutter(height=9, readout_ratio=0.8)
     ("call", "message"),
     [
         (lambda: rsbench.project(np.zeros((4, 2)), RIG, SHUTTER, MOTION), "points: must have shape"),
-        (lambda: rsbench.project([1, 2, 3], RIG, SHUTTER, MOTION, "middle"), "side = 'middle': must be"),  # type: ignore[arg-type]
+        (lambda: rsbench.project([1, 2, 3], RIG, SHUTTER, MOTION, "middle"), "side = 'middle': must be"),  # pyrefly: ignore[bad-argument-type]
         (lambda: rsbench.project([1, 2, 3], RIG, SHUTTER, MOTION, "left", -1), "frame = -1: must be a whole"),
         (lambda: rsbench.simulate(RIG, FEW_ROWS, MOTION), "shutter.height = 9: must be .* 900 rows"),
         (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, noise_px=-1), "noise_px = -1: must be a number at"),
         (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, pairs=-1), "pairs = -1: must be a whole number"),
         (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, outlier_ratio=2), "outlier_ratio = 2: must be"),
         (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, depth=(9, 2)), r"depth = \(9, 2\): must be two positive"),
-        (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, shape="ball"), "shape = 'ball': must be one of 'box'"),  # type: ignore[arg-type]
+        (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, shape="ball"), "shape = 'ball': must be one of 'box'"),  # pyrefly: ignore[bad-argument-type]
         (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, seed=-1), "seed = -1"),
-        (lambda: rsbench.estimate_motion(np.zeros((9, 4)), RIG, SHUTTER), "correspondences: must be rsbench.C"),  # type: ignore[arg-type]
-        (lambda: rsbench.estimate_motion(EMPTY, RIG, SHUTTER, 3), "solver: must be a name, the path of a card"),  # type: ignore[arg-type]
-        (lambda: rsbench.pose_errors({}, MOTION, RIG), "found: must be what estimate_motion returned"),  # type: ignore[arg-type]
+        (lambda: rsbench.estimate_motion(np.zeros((9, 4)), RIG, SHUTTER), "correspondences: must be rsbench.C"),  # pyrefly: ignore[bad-argument-type]
+        (lambda: rsbench.estimate_motion(EMPTY, RIG, SHUTTER, 3), "solver: must be a name, the path of a card"),  # pyrefly: ignore[bad-argument-type]
+        (lambda: rsbench.pose_errors({}, MOTION, RIG), "found: must be what estimate_motion returned"),  # pyrefly: ignore[bad-argument-type]
         (lambda: rsbench.match([FLAT] * 3), "got 3; four are needed"),
         (lambda: rsbench.match([FLAT.astype(float)] * 4), "image left 0: must be .* got float64"),
         (lambda: rsbench.match([FLAT, FLAT, FLAT, FLAT[:9]]), "image right 1: is .* but image left 0"),
@@ -249,7 +249,7 @@ FEW_ROWS = rsbench.RollingShutter(height=9, readout_ratio=0.8)
         (lambda: rsbench.correct([FLAT] * 4, RIG, 1.5), "readout_ratio = 1.5: must be a number from 0 to 1"),
         (lambda: rsbench.correct([FLAT] * 4, RIG, target_row=900), "target_row = 900: must be .* to 899"),
         (lambda: rsbench.generate("smoke", "unused", workers=0), "workers = 0: must be a whole"),
-        (lambda: rsbench.verify("unused", rerender="some"), "rerender = 'some': must be one of"),  # type: ignore[arg-type]
+        (lambda: rsbench.verify("unused", rerender="some"), "rerender = 'some': must be one of"),  # pyrefly: ignore[bad-argument-type]
         (lambda: rsbench.verify("unused", stride=0), "stride = 0: must be a whole number of at least 1"),
     ],
 )  # fmt: skip

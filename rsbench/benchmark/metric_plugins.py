@@ -149,7 +149,7 @@ MetricEntry = Entry[Metric, RunOptions]
 METRICS: Kind[Metric, RunOptions] = Kind(
     singular="metric",
     cards="metrics",
-    base=Metric,  # type: ignore[type-abstract]
+    base=Metric,
     options=RunOptions,
 )
 

@@ -229,7 +229,7 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
     from rsbench.report.corrected_page import card_of
 
     order = (("left", 0), ("right", 0), ("left", 1), ("right", 1))
-    images = read_four(dict(zip(order, paths, strict=True)))  # type: ignore[arg-type]
+    images = read_four(dict(zip(order, paths, strict=True)))  # pyrefly: ignore[bad-argument-type]
     rig = _sized(card, images["left", 0])
     height = rig.camera.height
     options = replace(options, target_row=_target_row(target, height))

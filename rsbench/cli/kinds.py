@@ -46,7 +46,7 @@ def names_of(kind: str) -> list[str]:
     from rsbench.cards import list_cards
 
     described = component_kind(kind)
-    return plugins.list_names(described) if described is not None else list(list_cards(kind))  # type: ignore[arg-type]
+    return plugins.list_names(described) if described is not None else list(list_cards(kind))  # pyrefly: ignore[bad-argument-type]
 
 
 def complete(kind: str) -> Callable[[str], list[str]]:
@@ -80,7 +80,7 @@ def _quick_names(kind: str) -> list[str]:
 
     from rsbench.cards import CardKind, list_cards
 
-    names = set(list_cards(kind)) if kind in get_args(CardKind) else set()  # type: ignore[arg-type]
+    names = set(list_cards(kind)) if kind in get_args(CardKind) else set()  # pyrefly: ignore[bad-argument-type]
     if kind in COMPONENTS:
         try:
             group = _GROUPS.get(kind, f"rsbench.{kind}")

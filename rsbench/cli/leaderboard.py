@@ -297,7 +297,7 @@ def _load_cards(cards: list[str], split: Split) -> None:
 def _counted(problems: Iterator[Problem], advance: object) -> Iterator[Problem]:
     for problem in problems:
         yield problem
-        advance(problem.name)  # type: ignore[operator]
+        advance(problem.name)  # pyrefly: ignore[not-callable]
 
 
 def _track_of(file: Path) -> str:

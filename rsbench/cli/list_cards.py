@@ -72,7 +72,7 @@ def entries(kind: str) -> list[dict[str, Any]]:
     described = component_kind(kind)
     if described is not None:
         return [_row(described, offer) for offer in plugins.offers(described)]
-    cards = list_cards(kind)  # type: ignore[arg-type]
+    cards = list_cards(kind)  # pyrefly: ignore[bad-argument-type]
     return [_row(None, Offer(name=name, origin="rsbench", path=path)) for name, path in cards.items()]
 
 

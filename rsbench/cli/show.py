@@ -103,7 +103,7 @@ def _about(name: str, kind: str) -> dict[str, Any]:
 
     described = component_kind(kind)
     if described is None:
-        path = card_path(kind, name)  # type: ignore[arg-type]
+        path = card_path(kind, name)  # pyrefly: ignore[bad-argument-type]
         return {"kind": kind, "name": path.stem, "card": path.as_posix(), "content": read_toml(path)}
     if described.cards is None:
         return {"kind": kind, "name": name, **_about_class(described, name)}

@@ -119,7 +119,7 @@ def generate_dataset(
 
 def _repeat(progress: Progress | None, name: str, times: int) -> None:
     for _ in range(times if progress else 0):
-        progress(name)  # type: ignore[misc]
+        progress(name)  # pyrefly: ignore[not-callable]
 
 
 def scene_name(sequence: SequenceCard) -> str:
@@ -198,7 +198,7 @@ def _complete(
         _refuse_strangers(folder, f"{named(damaged)} differs from what was written")
         return None
     own = hashes.of(f"{sequence.name}/sequence.json")
-    return {"sequence.json": own, **files} if own else None  # type: ignore[dict-item]
+    return {"sequence.json": own, **files} if own else None  # pyrefly: ignore[bad-return]
 
 
 def _refuse_strangers(folder: Path, why: str) -> None:

@@ -75,9 +75,9 @@ def files_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
     clean = tuple(clean_file(*view) for view in views if manifest.get("sensor"))
     stacks = tuple(stack_file(*view, row) for view in views for row in range(whole_frames(manifest)))
     pictures = [("gs", *view, row, depth) for row in rows for depth in (False, True) for view in views]
-    twins = tuple(picture_file(*each) for each in pictures)  # type: ignore[arg-type]
+    twins = tuple(picture_file(*each) for each in pictures)  # pyrefly: ignore[bad-argument-type]
     labelled = [("rs", *view, 0) for view in views] + [("gs", *view, row) for row in (0, *rows) for view in views]
-    labels = tuple(moving_file(*each) for each in labelled if manifest.get("moving"))  # type: ignore[arg-type]
+    labels = tuple(moving_file(*each) for each in labelled if manifest.get("moving"))  # pyrefly: ignore[bad-argument-type]
     own = relative_files(frames) + clean + stacks + twins + labels
     return own + channel_files(channels_of(manifest), rows, frames)
 

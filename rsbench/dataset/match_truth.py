@@ -50,7 +50,7 @@ def matcher_record(matching: Matching) -> dict[str, Any]:
     """
     entry = load_features(matching.features)
     component = entry.component
-    parameters = asdict(component) if entry.built_in else entry.parameters  # type: ignore[call-overload]
+    parameters = asdict(component) if entry.built_in else entry.parameters  # pyrefly: ignore[bad-argument-type]
     return {
         **asdict(matching),
         "class": f"{type(component).__module__}:{type(component).__qualname__}",

@@ -75,7 +75,7 @@ class MotionCard:
             if getattr(self, field) == "random"
         }
         parameters = drawn_parameters(self.model, self.parameters, _generator(f"{seed}/{name}/parameters"))
-        return replace(self, parameters=parameters, **axes)  # type: ignore[arg-type]
+        return replace(self, parameters=parameters, **axes)
 
 
 def _generator(text: str) -> np.random.Generator:

@@ -271,7 +271,7 @@ class _Child:
     def _send(self, request: bytes) -> None:
         assert self._process.stdin is not None
         with contextlib.suppress(OSError, ValueError):  # the child is gone, which the reader tells
-            send(self._process.stdin, request)  # type: ignore[arg-type]
+            send(self._process.stdin, request)  # pyrefly: ignore[bad-argument-type]
 
     def _read_answers(self) -> None:
         stream: Any = self._process.stdout
@@ -322,7 +322,7 @@ def serve_parent(lifeline: int) -> NoReturn:
         try:
             value = server(*ForkingPickler.loads(data))
             if server is _start:
-                server, value = value, None  # type: ignore[assignment]
+                server, value = value, None  # pyrefly: ignore[bad-assignment]
             message = ("answer", value, "")
             reply = encode(message)
         except EntryFailure as error:

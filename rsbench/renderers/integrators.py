@@ -93,10 +93,10 @@ def lane_sampler() -> Any:
 def _register_lane_sampler() -> None:
     import mitsuba as mi
 
-    class LaneSampler(mi.Sampler):  # type: ignore[misc,name-defined,unused-ignore]
+    class LaneSampler(mi.Sampler):
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
-            self.rng = mi.PCG32()  # type: ignore[operator,unused-ignore]
+            self.rng = mi.PCG32()
 
         def seed_lanes(self, seed: Any, pixel: Any, sample: Any) -> None:
             """Start the sequences of (pixel, sample) pairs; ``pixel`` is the index in the full frame."""

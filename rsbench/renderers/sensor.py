@@ -132,7 +132,7 @@ def sensor_class() -> Any:
 
     scalar = not dr.is_jit_v(mi.Float)
 
-    class RSPinhole(mi.Sensor):  # type: ignore[misc,name-defined,unused-ignore]
+    class RSPinhole(mi.Sensor):
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
             self.intrinsics = [mi.Float(1.0), mi.Float(1.0), mi.Float(0.0), mi.Float(0.0)]

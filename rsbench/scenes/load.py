@@ -85,7 +85,7 @@ class SceneCard:
 BUILDERS: Kind[SceneBuilder, NoOptions] = Kind(
     singular="scene builder",
     group="rsbench.scenes",
-    base=SceneBuilder,  # type: ignore[type-abstract]
+    base=SceneBuilder,
     options=NoOptions,
     built_in={
         "castle": "rsbench.scenes.castle:CastleBuilder",

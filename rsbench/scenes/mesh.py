@@ -129,7 +129,7 @@ def _check_size(model: Any, path: Path) -> None:
     check_amount(f"mesh file {path}", "triangles", triangles, _TRIANGLES)
 
 
-class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc,unused-ignore]
+class _Neighbours(trimesh.resolvers.FilePathResolver):
     """Files beside the model and below, as UTF-8; remembers what was wrong with them, which trimesh only logs."""
 
     def __init__(self, source: str) -> None:

@@ -127,7 +127,7 @@ def _check_spec(corrector: Corrector) -> None:
 CORRECTORS: Kind[Corrector, RunOptions] = Kind(
     singular="corrector",
     cards="correctors",
-    base=Corrector,  # type: ignore[type-abstract]
+    base=Corrector,
     options=RunOptions,
     check=_check_spec,
 )

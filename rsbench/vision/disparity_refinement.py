@@ -1,4 +1,3 @@
-# mypy: disable-error-code="untyped-decorator"
 """Sub-pixel refinement of a disparity map by least squares on the images.
 
 Semi-global matching interpolates its cost between whole disparities, which biases it by up to a quarter of a pixel

@@ -36,7 +36,7 @@ FeatureEntry = Entry[FeatureMatcher, RunOptions]
 FEATURE_MATCHERS: Kind[FeatureMatcher, RunOptions] = Kind(
     singular="feature matcher",
     cards="features",
-    base=FeatureMatcher,  # type: ignore[type-abstract]
+    base=FeatureMatcher,
     options=RunOptions,
 )
 

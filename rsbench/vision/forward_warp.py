@@ -1,4 +1,3 @@
-# mypy: disable-error-code="untyped-decorator"
 """The compiled loops of z-buffered forward warping: a mesh of pixel centres drawn at the target camera.
 
 Every source pixel centre is moved by its line's map, ``h = M_y (x, y, 1) + rho b_y`` with ``rho = 1 / depth``, to

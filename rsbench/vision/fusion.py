@@ -1,4 +1,3 @@
-# mypy: disable-error-code="untyped-decorator"
 """Filling what a corrected frame did not see: from the other camera, from the other frame, at last by a guess.
 
 A pixel of the target is a hole of the corrected frame for one of three reasons: something hid the place, it lies

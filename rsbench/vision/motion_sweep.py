@@ -1,4 +1,3 @@
-# mypy: disable-error-code="untyped-decorator"
 """Depth of thin and near things from a camera's own known motion: a search along every pixel's epipolar curve.
 
 Dense flow carries a thin post along with what is behind it. Where the motion is known the flow of a pixel has one
@@ -114,7 +113,7 @@ def _search(
     lines, best = (x if maps.columns else y).copy(), np.full(len(y), -1, dtype=np.int32)
     costs = np.full((len(y), 4), np.inf, dtype=np.float32)
     for k in range(count):
-        _fill_costs(y, x, lines, *both, *maps, k * step, cost)  # type: ignore[arg-type]
+        _fill_costs(y, x, lines, *both, *maps, k * step, cost)
         mean = cv2.boxFilter(cost, -1, window, borderType=cv2.BORDER_CONSTANT)[y, x] / weight
         _keep_best(k, mean, best, costs)
     before, least, after = costs[:, 1], costs[:, 0], costs[:, 2]

@@ -1,4 +1,3 @@
-# mypy: disable-error-code="untyped-decorator"
 """Nearest and second-nearest descriptors among candidates in a window, exhaustively and exactly.
 
 SIFT descriptors are whole numbers up to 255 with a squared length below 2**24, so their products are exact in

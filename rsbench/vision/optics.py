@@ -1,4 +1,3 @@
-# mypy: disable-error-code="untyped-decorator"
 """A camera as compiled loops see it: where its pixels look, where it sees a point, and which line reads a pixel.
 
 An ideal camera is the special case: its pixels look where they are, and its loops are compiled without a lens.

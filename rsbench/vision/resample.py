@@ -1,4 +1,3 @@
-# mypy: disable-error-code="untyped-decorator"
 """Sampling an image at sub-pixel positions.
 
 The cubic kernel is Keys' with a = -1/2, the only one of its family that reproduces straight lines and parabolas.

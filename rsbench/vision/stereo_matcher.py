@@ -37,7 +37,7 @@ MatcherEntry = Entry[StereoMatcher, RunOptions]
 STEREO_MATCHERS: Kind[StereoMatcher, RunOptions] = Kind(
     singular="matcher",
     cards="matchers",
-    base=StereoMatcher,  # type: ignore[type-abstract]
+    base=StereoMatcher,
     options=RunOptions,
 )
 

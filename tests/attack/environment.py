@@ -54,7 +54,7 @@ def _close(*numbers: int) -> Callable[[], None]:
 
 
 def _full(number: int) -> Callable[[], None]:
-    return lambda: os.dup2(os.open("/dev/full", os.O_WRONLY), number)  # type: ignore[return-value]
+    return lambda: os.dup2(os.open("/dev/full", os.O_WRONLY), number)  # pyrefly: ignore[bad-return]
 
 
 def _closed_pipe() -> None:

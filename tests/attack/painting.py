@@ -38,9 +38,9 @@ def show_frames(folder: Path) -> None:
             return render.Frame(**kept)
 
     started = backend.Backend(variant=(folder / "variant").read_text())
-    backend.start_backend = lambda *_: started
-    passage.obstacle = lambda *_: ""  # it was looked for when the frames were rendered
-    scene.MitsubaScene = lambda *_: SimpleNamespace()  # type: ignore[assignment,misc]
+    backend.start_backend = lambda *_, **__: started
+    passage.obstacle = lambda *_, **__: ""  # it was looked for when the frames were rendered
+    scene.MitsubaScene = lambda *_: SimpleNamespace()  # pyrefly: ignore[bad-assignment]
     setattr(render, "render", show)  # noqa: B010  an assignment has the wrong type
 
 

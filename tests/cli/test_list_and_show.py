@@ -174,7 +174,7 @@ def test_parameters_have_defaults_values_and_meanings() -> None:
 
 
 def commands() -> list[str]:
-    return sorted(str(each.name or each.callback.__name__).replace("_", "-") for each in app.registered_commands)  # type: ignore[union-attr]
+    return sorted(str(each.name or each.callback.__name__).replace("_", "-") for each in app.registered_commands)  # pyrefly: ignore[missing-attribute]
 
 
 def test_help_is_quick(tmp_path: Path) -> None:

@@ -17,13 +17,13 @@ def test_absent_sets_are_empty_with_their_columns() -> None:
 
 @pytest.mark.parametrize(("name", "columns"), COLUMNS.items())
 def test_lists_become_float64_rows(name: str, columns: int) -> None:
-    rows = getattr(Correspondences(**{name: [list(range(columns))] * 3}), name)  # type: ignore[arg-type]
+    rows = getattr(Correspondences(**{name: [list(range(columns))] * 3}), name)  # pyrefly: ignore[bad-argument-type]
     assert (rows.shape, rows.dtype) == ((3, columns), np.float64)
 
 
 @pytest.mark.parametrize("name", COLUMNS)
 def test_an_empty_list_is_an_empty_set(name: str) -> None:
-    assert getattr(Correspondences(**{name: []}), name).shape == (0, COLUMNS[name])  # type: ignore[arg-type]
+    assert getattr(Correspondences(**{name: []}), name).shape == (0, COLUMNS[name])  # pyrefly: ignore[bad-argument-type]
 
 
 @pytest.mark.parametrize(("name", "columns"), COLUMNS.items())

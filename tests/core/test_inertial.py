@@ -42,12 +42,12 @@ MODELS: dict[str, Callable[[FloatArray, FloatArray], Motion]] = {
 }
 
 
-class _Plain(LinearMotion):  # type: ignore[misc]  # final
+class _Plain(LinearMotion):  # pyrefly: ignore[invalid-inheritance]  # final
     """A model that does not say its accelerations."""
 
     accelerations = Motion.accelerations
 
-    def velocity(self, tau):  # type: ignore[no-untyped-def]
+    def velocity(self, tau):  # pyrefly: ignore[implicit-any-parameter, unannotated-return]
         tau = np.asarray(tau)[..., None]
         return np.sin(3 * tau) * self.w, np.exp(tau) * self.d
 

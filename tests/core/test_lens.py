@@ -56,7 +56,7 @@ def test_a_lens_is_inverted_over_the_whole_image_or_refused(
         radial = {**radial, "p1": p[0], "p2": p[1]}
         del radial["k4"]
     try:
-        camera = replace(PLAIN, fx=focal, fy=focal, lens=Lens(model=model, **radial))  # type: ignore[arg-type]
+        camera = replace(PLAIN, fx=focal, fy=focal, lens=Lens(model=model, **radial))  # pyrefly: ignore[bad-argument-type]
     except ValueError as error:
         assert "folds inside the image" in str(error)
         return
@@ -130,4 +130,4 @@ def test_behind_a_fisheye_there_is_no_pixel() -> None:
 )
 def test_wrong_lenses_are_refused_by_name(values: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Lens(**values)  # type: ignore[arg-type]
+        Lens(**values)  # pyrefly: ignore[bad-argument-type]

@@ -117,7 +117,7 @@ def test_the_given_arrays_are_copied_and_frozen() -> None:
 @pytest.mark.parametrize("bad", [[1.0, 2.0], [1.0, 2.0, np.nan], [[1.0, 2.0, 3.0]], 4.0])
 def test_anything_but_three_finite_numbers_is_refused(bad: object) -> None:
     with pytest.raises(ValueError, match="motion d must be 3 finite numbers"):
-        LinearMotion(np.zeros(3), bad)  # type: ignore[arg-type]
+        LinearMotion(np.zeros(3), bad)  # pyrefly: ignore[bad-argument-type]
 
 
 accelerations = st.floats(-0.45, 3.0)
@@ -249,7 +249,7 @@ def test_explicit_poses_fix_the_motion() -> None:
     given = {"interval": 0.4, "poses": control(3, 8)}
     w, d = SplineMotion.endpoint(given) or (None, None)
     assert w is not None and d is not None
-    motion = SplineMotion(w, d, **given)  # type: ignore[arg-type]
+    motion = SplineMotion(w, d, **given)
     # The poses are seen through the spline, which passes near them, and from its own pose at time 0.
     near = Pose(so3.exp(control(3, 8)[:, :3]), control(3, 8)[:, 3:])
     R, t = motion.body_from_world(0.4 * np.arange(1, 6))
@@ -257,7 +257,7 @@ def test_explicit_poses_fix_the_motion() -> None:
     assert np.max(so3.angle(R @ np.swapaxes(expected.R, -1, -2))) < 0.2
     assert np.max(np.abs(t - expected.t)) < 0.2
     with pytest.raises(ValueError, match="are those of its poses"):
-        SplineMotion(w, 1.1 * d, **given)  # type: ignore[arg-type]
+        SplineMotion(w, 1.1 * d, **given)
 
 
 @pytest.mark.parametrize(
@@ -274,7 +274,7 @@ def test_explicit_poses_fix_the_motion() -> None:
 )
 def test_a_spline_refuses_what_it_cannot_be(parameters: dict[str, object], words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        SplineMotion(np.zeros(3), np.zeros(3), **parameters)  # type: ignore[arg-type]
+        SplineMotion(np.zeros(3), np.zeros(3), **parameters)  # pyrefly: ignore[bad-argument-type]
 
 
 def test_a_spline_of_half_a_turn_is_refused() -> None:

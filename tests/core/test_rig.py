@@ -46,12 +46,12 @@ def test_rotations_are_shared_and_centres_stay_a_baseline_apart() -> None:
 def test_a_rig_about_a_camera_has_that_camera_for_its_body() -> None:
     still = LinearMotion(np.zeros(3), np.zeros(3))
     for origin, centres in (("left", [0.0, 0.2]), ("right", [-0.2, 0.0]), ("middle", [-0.1, 0.1])):
-        rig = RIG.about(origin)  # type: ignore[arg-type]
+        rig = RIG.about(origin)
         found = [inverse(Pose(*rig.cam_from_world(still, 0.0, side))).t[0] for side in SIDES]
         np.testing.assert_allclose(found, centres, atol=1e-15)
     assert RIG.about("left").about("middle") == RIG
     with pytest.raises(ValueError, match="origin"):
-        RIG.about("top")  # type: ignore[arg-type]
+        RIG.about("top")  # pyrefly: ignore[bad-argument-type]
 
 
 def test_depth_and_disparity_of_nothing_are_nan() -> None:

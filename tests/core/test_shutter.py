@@ -92,4 +92,4 @@ def test_rows_from_the_bottom_in_both_cameras_are_read_together() -> None:
 )
 def test_shutters_that_cannot_be_are_refused_by_name(values: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        RollingShutter(**{"height": 10, "readout_ratio": 0.5, **values})  # type: ignore[arg-type]
+        RollingShutter(**{"height": 10, "readout_ratio": 0.5, **values})  # pyrefly: ignore[bad-argument-type]

@@ -116,7 +116,7 @@ STRAIGHT = np.array([[-1.0, 0, 0, 0, 0, 0, 0, 1], [0.5, 1, 0, 0, 0, 0, 0, 1], [2
 )
 def test_poses_that_cannot_be_are_refused(change: object, words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        TrajectoryMotion.endpoint({"poses": change(STRAIGHT)})  # type: ignore[operator]
+        TrajectoryMotion.endpoint({"poses": change(STRAIGHT)})  # pyrefly: ignore[not-callable]
 
 
 def test_another_end_than_that_of_the_poses_is_refused() -> None:

@@ -23,7 +23,7 @@ def _card(**changes: object) -> DatasetCard:
         seeds=(1, 2),
         sequence=(SequenceCard(name="a", scene="castle"), SequenceCard(name="b", scene="room")),
     )
-    return replace(card, **changes)  # type: ignore[arg-type]
+    return replace(card, **changes)  # pyrefly: ignore[bad-argument-type]
 
 
 def test_every_sequence_is_made_once_per_seed() -> None:

@@ -93,7 +93,7 @@ def yard_card(folder: Path, **fields: object) -> DatasetCard:
         renderer="preview",
         sensor=Sensor(exposure_s=0.004, full_well=6000, photon_noise=True, read_noise=2.5),
         sequence=(SequenceCard(name="yard", scene=str(folder / "yard.toml")),),
-        **fields,  # type: ignore[arg-type]
+        **fields,  # pyrefly: ignore[bad-argument-type]
     )
 
 

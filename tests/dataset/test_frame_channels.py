@@ -74,7 +74,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).parent.mkdir(exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(segments, "SceneRays", PlaneRays)
-        write_sequence_channels(folder, card, card.sequence[0], None, own["scene"])  # type: ignore[arg-type]
+        write_sequence_channels(folder, card, card.sequence[0], None, own["scene"])  # pyrefly: ignore[bad-argument-type]
     own |= {key: card.manifest_of(card.sequence[0])[key] for key in ("channels", "imu", "matches")}
     own["files"] |= dict.fromkeys(channel_files(CHANNELS, (), COUNT), "")
     write_json(folder / "sequence.json", own)

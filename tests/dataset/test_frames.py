@@ -333,7 +333,7 @@ def card(**fields: object) -> DatasetCard:
         "motion": motion,
         "sequence": (SequenceCard(name="one", scene="castle"),),
     }
-    return DatasetCard(**own | fields)  # type: ignore[arg-type]
+    return DatasetCard(**own | fields)  # pyrefly: ignore[bad-argument-type]
 
 
 def test_a_card_lets_the_shake_last_as_long_as_its_frames() -> None:

@@ -48,7 +48,7 @@ def _card(name: str) -> DatasetCard:
     smoke = load_dataset_card("smoke")
     lens, scanning = CARDS[name]
     camera = CameraCard(width=128, height=96, focal=110.0, lens=lens)
-    return replace(smoke, camera=camera, sequence=smoke.sequence[1:], **scanning)  # type: ignore[arg-type]
+    return replace(smoke, camera=camera, sequence=smoke.sequence[1:], **scanning)  # pyrefly: ignore[bad-argument-type]
 
 
 @pytest.fixture(scope="module")

@@ -101,7 +101,7 @@ def lot_card(folder: Path, **fields: object) -> DatasetCard:
         "sensor": Sensor(exposure_s=0.02, full_well=6000, photon_noise=True, read_noise=2.5),
         "sequence": (SequenceCard(name="lot", scene=str(folder / "lot.toml"), moving=(CART, BOX)),),
     }
-    return DatasetCard(**(kept | fields)).expanded()  # type: ignore[arg-type]
+    return DatasetCard(**(kept | fields)).expanded()  # pyrefly: ignore[bad-argument-type]
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +189,7 @@ def _check_normals(
     sequence: Sequence, world: World, side: str, frame: int, owner: NDArray[np.int64], tau: Array, ways: Array
 ) -> None:
     """Upright on a triangle of the object where it is then, and towards the camera."""
-    normals = sequence.normals(side, frame).reshape(-1, 3)  # type: ignore[arg-type]
+    normals = sequence.normals(side, frame).reshape(-1, 3)  # pyrefly: ignore[bad-argument-type]
     for number, thing in enumerate(world.things, start=1):
         own = np.flatnonzero(owner == number)
         corners = [

@@ -33,7 +33,7 @@ NEAR_PX = 5e-6
 
 def _geometry(lens: Lens | None, motion: Motion, **scan: object) -> GivenGeometry:
     camera = PinholeCamera(width=64, height=48, fx=60.0, fy=62.0, cx=30.0, cy=25.0, lens=lens)
-    shutter = RollingShutter(height=48, width=64, readout_ratio=0.9, **scan)  # type: ignore[arg-type]
+    shutter = RollingShutter(height=48, width=64, readout_ratio=0.9, **scan)  # pyrefly: ignore[bad-argument-type]
     return GivenGeometry(StereoRig(camera=camera, baseline=0.3), shutter, motion)
 
 
@@ -104,10 +104,10 @@ def test_rows_alone_have_the_bits_that_they_have_among_others() -> None:
     np.testing.assert_array_equal(whole.pixels[1:3], some.pixels)
 
 
-class _Jump(LinearMotion):  # type: ignore[misc]  # final
+class _Jump(LinearMotion):  # pyrefly: ignore[invalid-inheritance]  # final
     """Stands somewhere else from half of the readout on."""
 
-    def body_from_world(self, tau):  # type: ignore[no-untyped-def]
+    def body_from_world(self, tau):  # pyrefly: ignore[implicit-any-parameter, unannotated-return]
         pose = super().body_from_world(tau)
         return pose._replace(t=pose.t + (np.asarray(tau)[..., None] > 0.4) * 0.1)
 

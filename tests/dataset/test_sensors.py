@@ -41,7 +41,7 @@ UNEVEN = replace(NOISY, right_gain=12, right_exposure_s=0.01, brightness=(1.0, 0
 def _card(sensor: Sensor | None, **fields: object) -> DatasetCard:
     smoke = load_dataset_card("smoke")
     camera = CameraCard(width=96, height=72, focal=112.0)
-    return replace(smoke, camera=camera, sequence=smoke.sequence[1:], sensor=sensor, **fields)  # type: ignore[arg-type]
+    return replace(smoke, camera=camera, sequence=smoke.sequence[1:], sensor=sensor, **fields)  # pyrefly: ignore[bad-argument-type]
 
 
 @pytest.fixture(scope="module")

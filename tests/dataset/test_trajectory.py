@@ -74,7 +74,7 @@ def test_every_pose_of_the_file_is_hit_at_its_own_time(tmp_path: Path, walk: Pat
 
 def test_pairs_follow_each_other_as_the_card_says(walk: Path) -> None:
     def starts(**keys: float) -> FloatArray:
-        card = TrajectoryCard(file="walk.txt", absolute=True, **keys)  # type: ignore[arg-type]
+        card = TrajectoryCard(file="walk.txt", absolute=True, **keys)  # pyrefly: ignore[bad-argument-type]
         return np.array([pair.start.position for pair in parts_along(card, walk.parent, 0.1, (-0.1, 1.9), 2)])
 
     # A pair takes 0.2 s, and begins 0.01 s after the first pose, for it is exposed from then on.

@@ -64,7 +64,7 @@ def test_a_body_motion_in_metres_stays_as_it_is() -> None:
 @pytest.mark.parametrize(("spec", "word"), [(LEFT, "left camera"), (BODY, "metres")])
 def test_a_direction_is_refused(spec: object, word: str) -> None:
     answer = MotionEstimate(w=np.zeros(3), d=np.array([0.0, 0.0, 1.0]), success=True, metric=False)
-    found = body_motion(answer, spec, RIG)  # type: ignore[arg-type]
+    found = body_motion(answer, spec, RIG)  # pyrefly: ignore[bad-argument-type]
     assert isinstance(found, str) and word in found
 
 

@@ -216,7 +216,7 @@ def test_problems_are_answered_as_they_come() -> None:
     read = []
 
     class Terminal(io.StringIO):
-        def readline(self, *limit: int) -> str:  # type: ignore[override]
+        def readline(self, *limit: int) -> str:
             read.append(super().readline(*limit))
             return read[-1]
 

@@ -46,7 +46,7 @@ def simulation(
 
 
 def run(s: Simulation, name: str = "rs-stereo-refined", seed: int = 0, **options: float) -> RobustEstimate:
-    robust = RobustOptions(**options)  # type: ignore[arg-type]
+    robust = RobustOptions(**options)  # pyrefly: ignore[bad-argument-type]
     return estimate_motion(
         s.correspondences, s.rig, s.shutter, load_solver(name), robust, np.random.default_rng(seed)
     )
@@ -260,7 +260,7 @@ def test_reported_inliers_are_those_of_the_reported_motion() -> None:
 @pytest.mark.parametrize("bad", [{"threshold_px": 0.0}, {"confidence": 2.0}, {"max_iterations": 0}])
 def test_options_refuse_nonsense(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad)).removesuffix("_px")):
-        RobustOptions(**bad)  # type: ignore[arg-type]
+        RobustOptions(**bad)  # pyrefly: ignore[bad-argument-type]
 
 
 @pytest.mark.parametrize("freedom", [1, 5])

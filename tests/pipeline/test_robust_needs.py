@@ -95,7 +95,7 @@ def simulation(pairs: int, tracks: int, outliers: float = 0.3, seed: int = 1) ->
 
 def run(solver: Solver, c: Correspondences, **keywords: object) -> RobustEstimate:
     options = RobustOptions(max_iterations=200)
-    return estimate_motion(c, RIG, SHUTTER, solver, options, np.random.default_rng(0), **keywords)  # type: ignore[arg-type]
+    return estimate_motion(c, RIG, SHUTTER, solver, options, np.random.default_rng(0), **keywords)  # pyrefly: ignore[bad-argument-type]
 
 
 def pairwise(c: Correspondences, shift: float = 0.0) -> Correspondences:

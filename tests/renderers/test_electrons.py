@@ -106,4 +106,4 @@ def test_the_corners_lose_what_the_card_says() -> None:
 )
 def test_values_out_of_range_are_refused(field: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"sensor {field} = .*: allowed is"):
-        Sensor(**{field: value})  # type: ignore[arg-type]
+        Sensor(**{field: value})  # pyrefly: ignore[bad-argument-type]

@@ -138,7 +138,7 @@ def test_images_are_told_by_what_was_done_to_them(sensor: Sensor, quality: int) 
 
 def test_what_cannot_be_is_refused() -> None:
     with pytest.raises(ValueError, match=r"sensor mosaic = 'RGBG': allowed are none, RGGB"):
-        Sensor(mosaic="RGBG")  # type: ignore[arg-type]
+        Sensor(mosaic="RGBG")  # pyrefly: ignore[bad-argument-type]
     with pytest.raises(ValueError, match=r"sensor jpeg_quality = 101: allowed is 0 to 100"):
         Sensor(jpeg_quality=101)
     with pytest.raises(RsbenchError, match=r"jpeg_quality = 90: .* at most 65500"):

@@ -109,7 +109,7 @@ def test_groups_are_sampled_separately() -> None:
         seen.extend(samples)
         return original(samples)
 
-    estimator.generate = generate  # type: ignore[method-assign]
+    estimator.generate = generate  # pyrefly: ignore[method-assign]
     estimator.num_data, estimator.sample_size = (20, 20, 10), (1, 1, 0)
     ransac(estimator, RansacOptions(threshold=0.03, min_iterations=30), np.random.default_rng(0))
     samples = np.array(seen)
@@ -195,7 +195,7 @@ def test_msac_score_is_bounded_by_the_number_of_data(residuals: list[float], thr
 )
 def test_options_refuse_nonsense(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad)).split("_")[0]):
-        RansacOptions(**{"threshold": 1.0, **bad})  # type: ignore[arg-type]
+        RansacOptions(**{"threshold": 1.0, **bad})  # pyrefly: ignore[bad-argument-type]
 
 
 def test_false_alarms_by_hand() -> None:

@@ -36,7 +36,7 @@ def test_up_axis_and_units(tmp_path: Path, axis: str, where: tuple[float, float,
     textured_quad().export(tmp_path / "quad.glb")
     parameters = f'file = "quad.glb"\nup_axis = "{axis}"\nmetres_per_unit = 0.25'
     (mesh,) = load(tmp_path, parameters).meshes
-    uv_of(mesh, tuple(0.25 * value for value in where))  # type: ignore[arg-type]
+    uv_of(mesh, tuple(0.25 * value for value in where))  # pyrefly: ignore[bad-argument-type]
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     assert sorted(high - low) == pytest.approx([0.0, 0.25, 0.5])
 

@@ -28,7 +28,7 @@ MONO, STEREO = load_solver("rs-gyro-5pt"), load_solver("rs-gyro-stereo")
 def trial(seed: int, *, stereo: bool, **options: float) -> Simulation:
     motion = random_motion(np.random.default_rng(seed), np.radians(3.0), 0.3)
     rig = RIG if stereo else RIG.about("left")
-    chosen = SimulationOptions(**{"pairs": 60, "gyro_rate": 20, **options})  # type: ignore[arg-type]
+    chosen = SimulationOptions(**{"pairs": 60, "gyro_rate": 20, **options})  # pyrefly: ignore[bad-argument-type]
     return simulate(rig, SHUTTER, motion, chosen, np.random.default_rng(seed))
 
 
@@ -54,11 +54,11 @@ def test_rotations_are_those_of_the_motion_that_was_sampled() -> None:
 def test_the_translation_of_exact_data_is_exact_and_metric_on_the_rig(how: str) -> None:
     for seed in range(3):
         s = trial(seed, stereo=False)
-        found = GyroSolver(refinement=how).estimate(s.correspondences, RIG, SHUTTER)  # type: ignore[arg-type]
+        found = GyroSolver(refinement=how).estimate(s.correspondences, RIG, SHUTTER)  # pyrefly: ignore[bad-argument-type]
         assert found.success and not found.metric and rotation_error(found.w, s.motion.w) < 1e-12
         assert translation_error(found.d, s.motion.d) < 1e-8
         s = trial(seed, stereo=True)
-        found = GyroSolver(cameras_used="both", refinement=how).estimate(  # type: ignore[arg-type]
+        found = GyroSolver(cameras_used="both", refinement=how).estimate(  # pyrefly: ignore[bad-argument-type]
             s.correspondences, RIG, SHUTTER
         )
         # The length comes from w x baseline, a hundredth of the flow.

@@ -174,6 +174,7 @@ def test_a_kernel_that_breaks_the_contract_is_refused_when_it_is_made() -> None:
 
     @dataclass(frozen=True)
     class Renamed(CubicKernel):
+        # pyrefly: ignore[bad-override-param-name]
         def move(self, theta: FloatArray, t0: float, t1: float, R: FloatArray, A: FloatArray) -> Moved:
             raise NotImplementedError
 

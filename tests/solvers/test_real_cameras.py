@@ -75,7 +75,7 @@ def test_a_solver_that_says_nothing_takes_ideal_cameras_alone() -> None:
     assert spec.refusal(RIG, SHUTTER) and spec.refusal(ideal, LATE)
     assert not replace(spec, shutter="global").refusal(RIG, LATE)
     with pytest.raises(ValueError, match="cameras = 'all': must be one of ideal, lens, any"):
-        replace(spec, cameras="all")  # type: ignore[arg-type]
+        replace(spec, cameras="all")  # pyrefly: ignore[bad-argument-type]
 
 
 def test_matches_where_a_lens_shows_nothing_are_named() -> None:

@@ -230,7 +230,7 @@ def test_the_key_follows_class_parameters_source_and_what_is_inside(tmp_path: Pa
 )
 def test_a_wrong_declaration_is_refused(field: str, value: object, part: str) -> None:
     with pytest.raises(ValueError, match=part):
-        replace(SPEC, **{field: value})  # type: ignore[arg-type]
+        replace(SPEC, **{field: value})  # pyrefly: ignore[bad-argument-type]
 
 
 def test_a_failure_holds_no_motion() -> None:

@@ -49,7 +49,7 @@ def read_sections() -> dict[str, Section]:
         found[title] = Section(
             module=module,
             source=files[module],
-            entry_points=re.search(r"\[project.entry-points.*?\n(?=\n|$)", points[0] + "\n", re.DOTALL).group(),  # type: ignore[union-attr]
+            entry_points=re.search(r"\[project.entry-points.*?\n(?=\n|$)", points[0] + "\n", re.DOTALL).group(),  # pyrefly: ignore[missing-attribute]
             cards={
                 name: text for name, text in files.items() if name.endswith(".toml") and name != "pyproject.toml"
             },

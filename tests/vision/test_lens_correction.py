@@ -196,7 +196,7 @@ def test_disparities_lie_on_the_pixels_of_the_sensor(scene: Any, u8: Build, lens
     (left, depth), (right, other) = (real.rolling(side, 0) for side in ("left", "right"))
     found = sensor_disparities(load_matcher("sgm"), u8(left), u8(right), real.rig)
     for side, mine, theirs, disparity in (("left", depth, other, found[0]), ("right", other, depth, found[1])):
-        seen: Any = seen_by_other(mine, theirs, real.rig, side)  # type: ignore[arg-type]
+        seen: Any = seen_by_other(mine, theirs, real.rig, side)
         seen &= _smooth(mine.astype(np.float32))
         error = np.abs(disparity - real.rig.disparity(mine))[seen]
         assert np.mean(np.isfinite(error)) > 0.9

@@ -28,7 +28,7 @@ def test_a_thin_post_before_a_wall_gets_its_depth(world: Build, shapes: Any, u8:
     posts = [depth < 4.0 for depth in truth]
     known = [np.where(post, 0.0, depth).astype(np.float32) for post, depth in zip(posts, truth, strict=True)]
     geometry = scene.rig, scene.shutter, scene.motion
-    for frame, found in enumerate(depth_from_motion(tuple(images), tuple(known), *geometry, side)):  # type: ignore[arg-type]
+    for frame, found in enumerate(depth_from_motion(tuple(images), tuple(known), *geometry, side)):  # pyrefly: ignore[bad-argument-type]
         assert not np.any(found[~posts[frame]])
         got = found[posts[frame]]
         assert np.mean(got > 0.0) > 0.7
@@ -41,7 +41,7 @@ def test_what_the_other_frame_does_not_confirm_has_no_depth(world: Build, shapes
     scene = world((shapes[0]((0.0, 0.0, 1.0), 5.0),), d=(0.3, 0.0, 0.0))
     images = tuple(np.random.default_rng(k).integers(0, 255, (160, 200), dtype=np.uint8) for k in (0, 1))
     nothing = (np.zeros((160, 200), np.float32),) * 2
-    found = depth_from_motion(images, nothing, scene.rig, scene.shutter, scene.motion, "left")  # type: ignore[arg-type]
+    found = depth_from_motion(images, nothing, scene.rig, scene.shutter, scene.motion, "left")  # pyrefly: ignore[bad-argument-type]
     assert all(np.mean(depth > 0.0) < 0.02 for depth in found)
 
 

@@ -60,7 +60,7 @@ def test_pixel_centres_return_the_pixels(interpolation: str, dtype: type) -> Non
     at[3, 4] = np.nan
     expected = image.copy()
     expected[3, 4] = 0
-    got = resample(image, at, interpolation)  # type: ignore[arg-type]
+    got = resample(image, at, interpolation)  # pyrefly: ignore[bad-argument-type]
     assert got.dtype == image.dtype
     np.testing.assert_array_equal(got, expected)
 

@@ -162,7 +162,7 @@ def read_headings(out: Path, table: str) -> dict[str, str]:
     path = out / "scores" / "columns.json"
     columns = read_json(path).get(table)
     try:
-        return {str(column["name"]): str(column["heading"]) for column in columns}  # type: ignore[union-attr]
+        return {str(column["name"]): str(column["heading"]) for column in columns}  # pyrefly: ignore[not-iterable]
     except (KeyError, TypeError) as error:
         raise RsbenchError(f"{path}: {table!r} must be a list of columns with name and heading") from error
 

@@ -136,7 +136,7 @@ def _second_differences(values: FloatArray) -> tuple[FloatArray, ...]:
     return np.diff(values, 2, axis=1), np.diff(values, 2, axis=0), np.diff(np.diff(values, axis=0), axis=1)
 
 
-def _window_max(values: NDArray, rows: int, columns: int) -> NDArray:  # type: ignore[type-arg]
+def _window_max(values: NDArray, rows: int, columns: int) -> NDArray:  # pyrefly: ignore[implicit-any-type-argument]
     """Largest value (H - rows + 1, W - columns + 1) of each window."""
     height, width = values.shape
     tall = np.maximum.reduce([values[k : height - rows + 1 + k] for k in range(rows)])

@@ -116,7 +116,7 @@ def load_kernel(motion_name: str, parameters: Mapping[str, Any] | None = None) -
             f"motion model {motion_name!r} has no kernel, so no solver can assume it; these have: {known}"
         )
     motion, kernel = make_motion(motion_name, np.zeros(3), np.zeros(3), parameters), _KERNELS[model]
-    return kernel(**{field.name: float(getattr(motion, field.name)) for field in dataclasses.fields(kernel)})  # type: ignore[arg-type]
+    return kernel(**{field.name: float(getattr(motion, field.name)) for field in dataclasses.fields(kernel)})  # pyrefly: ignore[bad-argument-type]
 
 
 def has_kernel(motion_name: str) -> bool:
@@ -124,12 +124,12 @@ def has_kernel(motion_name: str) -> bool:
     return motion_model(motion_name) in _KERNELS
 
 
-class KernelType(types.Type):  # type: ignore[misc]
+class KernelType(types.Type):
     """Numba's type of a kernel: one per class, whatever the numbers, so that code is compiled once per class."""
 
     def __init__(self, cls: type[MotionKernel]) -> None:
         self.cls = cls
-        self.members = tuple(field.name for field in dataclasses.fields(cls))  # type: ignore[arg-type]
+        self.members = tuple(field.name for field in dataclasses.fields(cls))  # pyrefly: ignore[bad-argument-type]
         super().__init__(name=f"MotionKernel({cls.__module__}.{cls.__qualname__})")
 
     @property
@@ -146,32 +146,32 @@ _kernel_type = functools.cache(KernelType)
 """Asked at every call of a compiled function: making the type anew would cost more than some of the calls."""
 
 
-@typeof_impl.register(MotionKernel)  # type: ignore[untyped-decorator]
+@typeof_impl.register(MotionKernel)
 def _typeof(value: MotionKernel, context: object) -> KernelType:
     return _kernel_type(type(value))
 
 
 @register_model(KernelType)
-class _KernelModel(models.StructModel):  # type: ignore[misc]
+class _KernelModel(models.StructModel):
     def __init__(self, manager: Any, kind: KernelType) -> None:
         # Never empty: an argument without members confuses the calling convention.
         super().__init__(manager, kind, [(name, types.float64) for name in (*kind.members, "_")])
 
 
 @infer_getattr
-class _KernelAttributes(AttributeTemplate):  # type: ignore[misc]
+class _KernelAttributes(AttributeTemplate):
     key = KernelType
 
     def generic_resolve(self, kind: KernelType, name: str) -> Any:
         return types.float64 if name in kind.members else None
 
 
-@lower_getattr_generic(KernelType)  # type: ignore[untyped-decorator]
+@lower_getattr_generic(KernelType)
 def _getattr(context: Any, builder: Any, kind: KernelType, value: Any, name: str) -> Any:
     return getattr(cgutils.create_struct_proxy(kind)(context, builder, value=value), name)
 
 
-@unbox(KernelType)  # type: ignore[untyped-decorator]
+@unbox(KernelType)
 def _unbox(kind: KernelType, value: Any, c: Any) -> NativeValue:
     struct = cgutils.create_struct_proxy(kind)(c.context, c.builder)
     for name in kind.members:

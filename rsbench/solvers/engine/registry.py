@@ -35,7 +35,7 @@ def _check_spec(solver: Solver) -> None:
 SOLVERS: Kind[Solver, SolverOptions] = Kind(
     singular="solver",
     cards="solvers",
-    base=Solver,  # type: ignore[type-abstract]
+    base=Solver,
     options=SolverOptions,
     check=_check_spec,
 )

@@ -141,7 +141,7 @@ def test_no_public_file_holds_a_number_or_name_of_the_truth(place: Path, card: s
     for each in drawn.sequence:
         assert each.motion is not None
         motion = drawn.motion_of(each)
-        numbers += [*motion.w, *motion.d, each.motion.rotation_deg, each.motion.translation]  # type: ignore[list-item]
+        numbers += [*motion.w, *motion.d, each.motion.rotation_deg, each.motion.translation]  # pyrefly: ignore[bad-assignment]
         hidden |= {str(each.seed), f"{each.seed:x}"}
         hidden |= {str(image_seed(drawn.seed_of(each), each.name, *view)) for view in views_of(2)}
     hidden |= {repr(float(number)) for number in numbers}
