@@ -21,6 +21,7 @@ from rsbench.solvers.engine.poselib_adapter import (
     poselib_module,
     rig_extrinsics,
 )
+from rsbench.solvers.engine.stereo_points import stereo_points, with_depth
 
 
 @final
@@ -42,7 +43,7 @@ class PoselibPnpSolver(PoselibSolver):
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        usable = _with_depth(correspondences.tracks)
+        usable = with_depth(correspondences.tracks)
         if len(usable) < self.spec.minimum["tracks"]:
             return MotionEstimate.failed(
                 f"{len(usable)} tracks with positive disparity, need {self.spec.minimum['tracks']}"
@@ -55,7 +56,7 @@ class PoselibPnpSolver(PoselibSolver):
         return {"tracks": 3}
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
-        poselib, tracks = poselib_module(), _with_depth(sample.tracks)
+        poselib, tracks = poselib_module(), with_depth(sample.tracks)
         if poselib is None:
             return [MotionEstimate.failed(MISSING)]
         if len(tracks) < 3:
@@ -63,14 +64,14 @@ class PoselibPnpSolver(PoselibSolver):
         rays = rig.camera.unproject(tracks[:3, 4:6])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         # Points in the body; the left camera of frame 1 sees them at R x + d + offset.
-        poses = poselib.p3p(rays, _points(tracks[:3], rig))
+        poses = poselib.p3p(rays, stereo_points(tracks[:3], rig))
         return [_shifted(pose, rig.offset("left")) for pose in poses if np.all(np.isfinite(pose.t))]
 
     def refined(
         self, poselib: Any, start: Any, correspondences: Correspondences, rig: StereoRig, options: dict[str, Any]
     ) -> Any:
-        tracks = _with_depth(correspondences.tracks)
-        points = _points(tracks, rig)
+        tracks = with_depth(correspondences.tracks)
+        points = stereo_points(tracks, rig)
         pose, _ = poselib.refine_generalized_absolute_pose(
             [tracks[:, 4:6], tracks[:, 6:8]],
             [points, points],
@@ -80,17 +81,6 @@ class PoselibPnpSolver(PoselibSolver):
             options,
         )
         return pose
-
-
-def _with_depth(tracks: FloatArray) -> FloatArray:
-    """Tracks with a positive disparity in frame 0."""
-    return tracks[tracks[:, 0] - tracks[:, 2] > 0.0]
-
-
-def _points(tracks: FloatArray, rig: StereoRig) -> FloatArray:
-    """Points (n, 3) in the body of frame 0."""
-    depth = rig.depth(tracks[:, 0] - tracks[:, 2])
-    return depth[:, None] * rig.camera.unproject(tracks[:, :2]) - rig.offset("left")
 
 
 def _shifted(pose: Any, offset: FloatArray) -> MotionEstimate:

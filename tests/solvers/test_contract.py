@@ -24,6 +24,7 @@ ALLOWED_WARNINGS = {
     # OpenCV draws five of the matches in the order given, and keeps one model.
     ("gs-5pt-opencv", "ignores the order of matches"),
     # The three-point pose is that of the left camera: the right one's noise counts differently.
+    ("gs-p3p", "mirrors with the world"),
     ("gs-stereo-pnp", "mirrors with the world"),
     ("gs-stereo-pnp-scaled", "mirrors with the world"),
 }
