@@ -23,8 +23,11 @@ ALLOWED_WARNINGS = {
     ("rs-stereo-linear", "finds the truth"),
     # OpenCV draws five of the matches in the order given, and keeps one model.
     ("gs-5pt-opencv", "ignores the order of matches"),
-    # The three-point pose is that of the left camera: the right one's noise counts differently.
+    # Points lie on the rays of the left camera: the right one's noise counts differently.
     ("gs-p3p", "mirrors with the world"),
+    ("rs-r6p", "mirrors with the world"),
+    ("rs-r6p-single", "mirrors with the world"),
+    # And their three-point pose is its too.
     ("gs-stereo-pnp", "mirrors with the world"),
     ("gs-stereo-pnp-scaled", "mirrors with the world"),
 }

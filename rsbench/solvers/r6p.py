@@ -1,0 +1,291 @@
+"""Absolute pose of a rolling-shutter frame from six points, on the stereo depth of the frame before.
+
+C. Albl, Z. Kukelova, T. Pajdla, R6P: Rolling Shutter Absolute Camera Pose, CVPR 2015, let the camera turn and move
+at constant velocity while it reads. With s the time since the first row,
+
+    lambda x = (I + s [w']x) R X + C + s t'      (single linearisation)
+    lambda x = (I + s [w']x) (I + [v]x) X + C + s t'      (double linearisation, R near the identity).
+
+Six points give twelve equations. Z. Kukelova, C. Albl, A. Sugimoto, T. Pajdla, Linear Solution to the Minimal
+Absolute Pose Rolling Shutter Problem, ACCV 2018, solve the double linearisation with [w']x [v]x X frozen at the v
+of the step before: a few linear steps. The single one (C. Albl, Z. Kukelova, V. Larsson, T. Pajdla, Rolling
+Shutter Camera Absolute Pose, PAMI 2020, by a Groebner basis) is solved by the same steps here, whose v turns R
+after each: of its solutions the one next to the orientation of frame 0.
+
+The points are from the stereo pair of frame 0, whose rows move too: see ``R6pSolver.frame_0``. All lies in the
+body's axes, so that C is its translation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, final
+
+import numpy as np
+
+from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray, hat
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.engine.stereo_points import stereo_points, with_depth
+
+_LEAST = 6
+_STEPS = 6
+"""Linear ones; of motions of some degrees each gains two digits."""
+_QUICK, _FULL = 4, 20
+_SMALL = 1e-13
+_COLUMNS: dict[Side, slice] = {"left": slice(4, 6), "right": slice(6, 8)}
+_OPEN = "the matches leave the pose and the velocity of frame 1 open"
+
+
+class RowPose(NamedTuple):
+    """The body at frame 1's first row, ``R X + C``, and its velocities, per frame period; batch axes (...)."""
+
+    R: FloatArray
+    """(..., 3, 3)"""
+    C: FloatArray
+    """(..., 3)"""
+    w: FloatArray
+    """(..., 3) rad"""
+    t: FloatArray
+    """(..., 3)"""
+
+    @property
+    def finite(self) -> FloatArray:
+        """(...) bool"""
+        whole = np.concatenate([self.R.reshape(*self.C.shape[:-1], 9), *self[1:]], axis=-1)
+        return np.asarray(np.all(np.isfinite(whole), axis=-1))
+
+
+class Resection(NamedTuple):
+    """Points and what frame 1 shows of them; batch axes (...)."""
+
+    body: FloatArray
+    """(..., n, 3) in the body as it is when frame 0 reads them, metres."""
+    tau0: FloatArray
+    """(..., n) of these rows, 0 where frame 0 is taken as still."""
+    x: FloatArray
+    """(..., c, n, 3) rays of c cameras, z = 1."""
+    s: FloatArray
+    """(..., c, n) frame periods since the first row of frame 1."""
+    offset: FloatArray
+    """(c, 1, 3)"""
+    focal: FloatArray
+    """(2,) px."""
+
+    @classmethod
+    def of(
+        cls, tracks: FloatArray, rig: StereoRig, shutter: RollingShutter, sides: tuple[Side, ...], moved: bool
+    ) -> Resection:
+        """Of tracks (n, 8) with depth."""
+        tau0 = shutter.pixel_time(tracks[:, :2], 0, "left")
+        return cls(
+            stereo_points(tracks, rig),
+            tau0 if moved else 0.0 * tau0,
+            np.stack([rig.camera.unproject(tracks[:, _COLUMNS[side]]) for side in sides]),
+            np.stack([shutter.pixel_time(tracks[:, _COLUMNS[side]], 1, side) - 1.0 for side in sides]),
+            np.stack([rig.offset(side) for side in sides])[:, None],
+            np.array([rig.camera.fx, rig.camera.fy]),
+        )
+
+    def in_samples(self, count: int) -> Resection:
+        """(n,) as (count, n / count)."""
+        c = len(self.x)
+        return self._replace(
+            body=self.body.reshape(count, -1, 3),
+            tau0=self.tau0.reshape(count, -1),
+            x=np.swapaxes(self.x.reshape(c, count, -1, 3), 0, 1),
+            s=np.swapaxes(self.s.reshape(c, count, -1), 0, 1),
+        )
+
+    def points(self, w: FloatArray, d: FloatArray) -> FloatArray:
+        """(..., n, 3) at time 0, of a body that moves with R = exp(tau w), t = tau d; w, d (..., 3)."""
+        tau = self.tau0[..., None]
+        back = so3.exp(-tau * w[..., None, :])
+        return np.asarray((back @ (self.body - tau * d[..., None, :])[..., None])[..., 0])
+
+
+def linear_step(data: Resection, X: FloatArray, v: FloatArray) -> FloatArray:
+    """v, C, w', t' (..., 12) of points X (..., n, 3), with [w']x [v]x X frozen at v (..., 3); NaN where open."""
+    X = X[..., None, :, :]
+    bent = X + np.cross(v[..., None, None, :], X)
+    s = data.s[..., None, None]
+    eye = np.broadcast_to(np.eye(3), (*data.s.shape, 3, 3))
+    columns = np.concatenate([np.broadcast_to(-hat(X), eye.shape), eye, -s * hat(bent), s * eye], axis=-1)
+    rest = X + data.offset
+    # x P_z = P_x and y P_z = P_y, over the depth: errors of rays.
+    A = (columns[..., :2, :] - data.x[..., :2, None] * columns[..., 2:, :]) / X[..., 2:, None]
+    y = (data.x[..., :2] * rest[..., 2:] - rest[..., :2]) / X[..., 2:]
+    batch = data.s.shape[:-2]
+    return _solved(A.reshape(*batch, -1, 12), y.reshape(*batch, -1))
+
+
+def _solved(A: FloatArray, y: FloatArray) -> FloatArray:
+    """Least squares (..., 12), the shortest where velocities are open; NaN where the pose is, too."""
+    if A.shape[-2] == A.shape[-1]:
+        try:
+            return np.asarray(np.linalg.solve(A, y[..., None])[..., 0])
+        except np.linalg.LinAlgError:
+            pass
+    flat = A.reshape(-1, *A.shape[-2:]), y.reshape(-1, y.shape[-1])
+    found = np.full((len(flat[0]), 12), np.nan)
+    for k, (each, right) in enumerate(zip(*flat, strict=True)):
+        if np.all(np.isfinite(each)) and np.all(np.isfinite(right)):
+            z, _, rank, _ = np.linalg.lstsq(each, right, rcond=1e-12)
+            found[k] = z if rank >= _LEAST else np.nan
+    return found.reshape(*A.shape[:-2], 12)
+
+
+def linear_pose(data: Resection, turning: bool) -> RowPose:
+    """The pose that the linear steps end at; NaN where there is none.
+
+    Args:
+        turning: whether v turns R after each step, so that it vanishes: the single linearisation.
+    """
+    batch = data.body.shape[:-2]
+    R: FloatArray = np.broadcast_to(np.eye(3), (*batch, 3, 3))
+    z, v = np.zeros((*batch, 12)), np.zeros((*batch, 3))
+    w, d = v, v
+    for _ in range(_STEPS):
+        X = data.points(w, d)
+        if turning:
+            X = (R[..., None, :, :] @ X[..., None])[..., 0]
+        before, z = z, linear_step(data, X, v)
+        turn, d = z[..., :3], z[..., 3:6]
+        if turning:
+            R = so3.exp(turn) @ R
+            w = so3.log(R)
+        else:
+            v = w = turn
+        if np.all(np.abs(z - before)[..., 3:] < _SMALL):
+            break
+    return RowPose(R if turning else so3.exp(v), d, z[..., 6:9], z[..., 9:])
+
+
+def errors(data: Resection, pose: RowPose, X: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Reprojection errors (m,) in px, infinite behind the cameras, and their derivatives (m, 12).
+
+    The body of row s is ``exp(s w') R X + C + s t'``. Derivatives are by a turn of R from the left, C, w', t'.
+    """
+    s = data.s[..., None, None]
+    turn = so3.exp(s[..., 0] * pose.w)
+    Q = X @ pose.R.T
+    turned = (turn @ Q[..., None])[..., 0]
+    P = turned + pose.C + s[..., 0] * pose.t + data.offset
+    depth = np.where(P[..., 2:] > 0.0, P[..., 2:], np.nan)
+    e = (P[..., :2] / depth - data.x[..., :2]) * data.focal
+    eye = np.broadcast_to(np.eye(3), turn.shape)
+    by_w = -s * (hat(turned) @ so3.left_jacobian(s[..., 0] * pose.w))
+    J = np.concatenate([-(turn @ hat(Q)), eye, by_w, s * eye], axis=-1)
+    J = (J[..., :2, :] - (P[..., :2] / depth)[..., None] * J[..., 2:, :]) * (data.focal / depth)[..., None]
+    return np.nan_to_num(e.reshape(-1), nan=np.inf), J.reshape(-1, 12)
+
+
+def refined(data: Resection, start: RowPose, most: int) -> RowPose:
+    """Least squares of ``errors`` by Gauss-Newton, of points that move with the pose of the step before.
+
+    The start where the descent leaves what is finite or ends no better.
+    """
+    pose, best, lowest = start, start, np.inf
+    for _ in range(most):
+        e, J = errors(data, pose, data.points(so3.log(pose.R), pose.C))
+        cost = float(e @ e)
+        if not (np.isfinite(cost) and np.all(np.isfinite(J)) and cost <= 4.0 * lowest):
+            break
+        if cost < lowest:
+            best, lowest = pose, cost
+        step = -np.linalg.lstsq(J, e, rcond=1e-12)[0]
+        pose = RowPose(so3.exp(step[:3]) @ pose.R, pose.C + step[3:6], pose.w + step[6:9], pose.t + step[9:])
+        if np.all(np.abs(step[:6]) < _SMALL):
+            return pose
+    return best
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class R6pSolver(Solver):
+    """Six points or more: linear steps, then least squares of the reprojection error of exact rotations."""
+
+    linearisation: Literal["double", "single"] = "double"
+    """Whether R is linearised about no rotation, beside the rotation within the frame."""
+    frame_0: Literal["moved", "still"] = "moved"
+    """Whether the points of each row of frame 0 are moved to time 0 with the motion of the step before (constant
+    velocity from frame to frame: it ends where points and pose agree), or taken as they are, as of a known map."""
+    cameras_used: Literal["left", "both"] = "both"
+    """Whose pixels of frame 1 count; minimal samples take the left camera's alone."""
+    refinement: Literal["none", "reprojection"] = "reprojection"
+
+    spec = SolverSpec(
+        needs=frozenset({"tracks"}),
+        minimum={"tracks": _LEAST},
+        metric=True,
+        motion_model="linear",
+        shutter="rolling",
+        reference_point="body",
+        reference="Albl, Kukelova, Pajdla: R6P, CVPR 2015; Kukelova et al., ACCV 2018; Albl et al., PAMI 2020",
+        assumes="constant velocity; depth of frame 0 without noise",
+    )
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        tracks = with_depth(correspondences.tracks)
+        if len(tracks) < _LEAST:
+            return MotionEstimate.failed(f"{len(tracks)} tracks with positive disparity, need {_LEAST}")
+        data = self._data(tracks, rig, shutter)
+        with np.errstate(all="ignore"):
+            pose = linear_pose(data, self.linearisation == "single")
+            if self.refinement == "reprojection" and pose.finite:
+                pose = refined(data, pose, _FULL)
+        return _reported(pose)
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        return next(iter(self.propose_all([sample], rig, shutter)))
+
+    def propose_all(
+        self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
+    ) -> Iterable[list[MotionEstimate]]:
+        tracks = [with_depth(sample.tracks)[:_LEAST] for sample in samples]
+        whole = [each for each in tracks if len(each) == _LEAST]
+        poses: list[RowPose] = []
+        if whole:
+            data = self._data(np.concatenate(whole), rig, shutter, minimal=True).in_samples(len(whole))
+            with np.errstate(all="ignore"):
+                found = linear_pose(data, self.linearisation == "single")
+            poses = [RowPose(*parts) for parts in zip(*found, strict=True)]
+        rest = iter(poses)
+        few = MotionEstimate.failed(f"fewer than {_LEAST} points of a sample have positive disparity")
+        return [[_reported(next(rest)) if len(each) == _LEAST else few] for each in tracks]
+
+    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
+        return {"tracks": _LEAST}
+
+    def improve(
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        quick: bool = False,
+    ) -> MotionEstimate:
+        tracks = with_depth(correspondences.tracks)
+        if self.refinement == "none" or len(tracks) < _LEAST:
+            return self.estimate(correspondences, rig, shutter)
+        start = RowPose(so3.exp(motion.w), motion.d, motion.w, motion.d)
+        with np.errstate(all="ignore"):
+            return _reported(refined(self._data(tracks, rig, shutter), start, _QUICK if quick else _FULL))
+
+    def _data(
+        self, tracks: FloatArray, rig: StereoRig, shutter: RollingShutter, minimal: bool = False
+    ) -> Resection:
+        sides: tuple[Side, ...] = SIDES if self.cameras_used == "both" and not minimal else ("left",)
+        return Resection.of(tracks, rig, shutter, sides, self.frame_0 == "moved")
+
+
+def _reported(pose: RowPose) -> MotionEstimate:
+    if not pose.finite:
+        return MotionEstimate.failed(_OPEN)
+    return MotionEstimate(w=so3.log(pose.R), d=pose.C, success=True, metric=True)
