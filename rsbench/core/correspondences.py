@@ -46,10 +46,14 @@ class Correspondences:
     gyro: FloatArray = field(default_factory=lambda: _none(4))
     """(n, 4) tau, w: what a gyroscope says of the rotation between the rows, dR/dtau = [w]x R, rad per period."""
 
+    gravity: FloatArray = field(default_factory=lambda: _none(4))
+    """(n, 4) tau, g: which way things fall at that time, in the axes of the body as it is then; of any length."""
+
     def __post_init__(self) -> None:
         for name, columns in _COLUMNS.items():
             object.__setattr__(self, name, _matches(getattr(self, name), name, columns))
-        object.__setattr__(self, "gyro", _matches(self.gyro, "gyro", 4))
+        for name in ("gyro", "gravity"):
+            object.__setattr__(self, name, _matches(getattr(self, name), name, 4))
 
 
 def _matches(value: ArrayLike, name: str, columns: int) -> FloatArray:
@@ -80,7 +84,7 @@ def without_lens(correspondences: Correspondences, camera: PinholeCamera) -> Cor
         lost = np.flatnonzero(np.any(np.isnan(sets[name]), axis=1))
         if len(lost):
             raise ValueError(f"{name}[{lost[0]}] = {rows[lost[0]].tolist()}: the lens shows no ray at this pixel")
-    return Correspondences(**sets, gyro=correspondences.gyro)
+    return Correspondences(**sets, gyro=correspondences.gyro, gravity=correspondences.gravity)
 
 
 def track_pairs(tracks: FloatArray, side: Side) -> FloatArray:

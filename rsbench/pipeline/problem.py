@@ -27,7 +27,7 @@ COLUMNS = {
 }
 _CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 _LINES = (".jsonl", ".ndjson")
-_GYRO = "tau, wx, wy, wz"
+_SENSED = {"gyro": "tau, wx, wy, wz", "gravity": "tau, gx, gy, gz"}
 SUFFIXES = (".json", *_LINES, ".npz")
 EXAMPLE = shipped_folder("examples", "_docs/examples") / "problem.json"
 """A small problem that every installation has."""
@@ -57,6 +57,7 @@ class _Content(Scanning):
     stereo_1: _Rows = ()
     tracks: _Rows = ()
     gyro: _Rows = ()
+    gravity: _Rows = ()
 
 
 def read_problems(source: str | Path, stdin: TextIO) -> Iterator[Problem | RsbenchError]:
@@ -183,10 +184,10 @@ def parse_problem(text: str, where: str, name: str = "") -> Problem:
     data = parse_json(text, where)  # reads NaN, which parse_card refuses with the field's name
     content = parse_card(_Content, data, where)
     _check_sets(data, where)
-    for key, columns in COLUMNS.items():
+    given = COLUMNS | _SENSED
+    for key, columns in given.items():
         _check_widths(getattr(content, key), key, columns, where)
-    _check_widths(content.gyro, "gyro", _GYRO, where)
-    sets = {key: getattr(content, key) for key in (*COLUMNS, "gyro")}
+    sets = {key: getattr(content, key) for key in given}
     return _problem(
         content.camera,
         content.baseline,
@@ -205,7 +206,7 @@ def _check_sets(data: Mapping[str, Any], where: str) -> None:
 
 
 def _check_widths(rows: _Rows, name: str, columns: str, where: str) -> None:
-    width, unit = columns.count(",") + 1, "" if name == "gyro" else " in pixels"
+    width, unit = columns.count(",") + 1, "" if name in _SENSED else " in pixels"
     for k, row in enumerate(rows):
         if len(row) != width:
             raise RsbenchError(f"{where}: {name}[{k}] = {list(row)}: must be {width} numbers{unit}: {columns}")

@@ -15,7 +15,7 @@ from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.robust.ransac import IntArray
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.base import SENSORS, MatchSet, MotionEstimate, Solver
 from rsbench.solvers.engine.kernel_type import load_kernel
 from rsbench.solvers.engine.packed import Packed, pack, pack_pairs
 
@@ -195,7 +195,7 @@ class RobustProblem:
     def _handed(self, left: FloatArray, right: FloatArray, tracks: FloatArray) -> Correspondences:
         """Matches as the solver wants them: tracks as they are, or as matches that end in left-right matches."""
         if not self._stereo:
-            return Correspondences(left=left, right=right, tracks=tracks, gyro=self.given.gyro)
+            return Correspondences(left=left, right=right, tracks=tracks, **self._sensed)
         needs, halves = self.spec.needs, {side: track_pairs(tracks, side) for side in SIDES}
         return Correspondences(
             left=np.concatenate([halves["left"], left]) if "left" in needs else left,
@@ -203,8 +203,13 @@ class RobustProblem:
             stereo_0=tracks[:, :4],
             stereo_1=tracks[:, 4:],
             tracks=tracks if "tracks" in needs else tracks[:0],
-            gyro=self.given.gyro,
+            **self._sensed,
         )
+
+    @property
+    def _sensed(self) -> dict[str, FloatArray]:
+        """What other sensors say, which is given whole."""
+        return {name: getattr(self.given, name) for name in SENSORS}
 
     def counts(self, inliers: BoolArray) -> dict[MatchSet, MatchCount]:
         """Inliers and matches of each group of data."""

@@ -40,7 +40,7 @@ def simulation(
     rng = np.random.default_rng(seed)
     motion = random_motion(rng, np.radians(2.0), 0.3)
     options = SimulationOptions(
-        pairs=pairs, tracks=tracks, noise_px=noise, outlier_ratio=outliers, gyro_rate=GYRO_RATE
+        pairs=pairs, tracks=tracks, noise_px=noise, outlier_ratio=outliers, gyro_rate=GYRO_RATE, gravity=True
     )
     return simulate(RIG, SHUTTER, motion, options, rng)
 

@@ -32,7 +32,9 @@ ANGLE = 0.04
 def test_every_shipped_solver_takes_a_lens_or_says_why_not(name: str) -> None:
     rng = np.random.default_rng(3)
     motion = random_motion(rng, ANGLE, 0.2, "linear")
-    s = simulate(RIG, SHUTTER, motion, SimulationOptions(tracks=40, pairs=40, noise_px=0.1, gyro_rate=20), rng)
+    s = simulate(
+        RIG, SHUTTER, motion, SimulationOptions(tracks=40, pairs=40, noise_px=0.1, gyro_rate=20, gravity=True), rng
+    )
     solver = load_solver_entry(name).solver
     options = RobustOptions(max_iterations=20)
     found = estimate_motion(s.correspondences, RIG, SHUTTER, solver, options, np.random.default_rng(0)).estimate

@@ -21,6 +21,7 @@ KNOWLEDGE = {
     "stereo": "images of the other camera",
     "time": "images of the other time",
     "gyro": "the angular rates of a gyroscope",
+    "gravity": "the direction of gravity",
     "truth": "the truth: an oracle, which has no rank",
 }
 """What methods use, in the order of tables."""

@@ -23,7 +23,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 from rsbench.motions import make_motion
-from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.engine.base import SENSORS, MotionEstimate
 from rsbench.solvers.engine.registry import SolverEntry
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
@@ -87,8 +87,8 @@ def own_problem(subject: Subject, size: float = 1.0, seed: int = 5, noise_px: fl
         motion = make_motion(subject.spec.motion_model, size * W, size * D, subject.spec.motion_parameters)
     except RsbenchError as error:
         raise BrokenContractError(str(error)) from error
-    rate = GYRO_RATE if "gyro" in subject.spec.needs else 0
-    options = SimulationOptions(pairs=60, tracks=60, noise_px=noise_px, gyro_rate=rate)
+    rate, upright = GYRO_RATE if "gyro" in subject.spec.needs else 0, "gravity" in subject.spec.needs
+    options = SimulationOptions(pairs=60, tracks=60, noise_px=noise_px, gyro_rate=rate, gravity=upright)
     return simulate(RIG, shutter, motion, options, np.random.default_rng(seed))
 
 
@@ -196,7 +196,7 @@ def ignores_the_order(subject: Subject) -> tuple[Verdict, str]:
 
 def mirrors(subject: Subject) -> tuple[Verdict, str]:
     """When x is mirrored, left and right change places, and d_x, w_y and w_z their sign."""
-    alone = subject.spec.needs - {"gyro"} == {"left"}
+    alone = subject.spec.needs - SENSORS.keys() == {"left"}
     if subject.spec.reference_point == "left" and not alone:
         return "skipped", "the mirror image of the left camera is the right one"
     last = RIG.camera.width - 1
@@ -208,16 +208,17 @@ def mirrors(subject: Subject) -> tuple[Verdict, str]:
 
     def mirrored(c: Correspondences) -> Correspondences:
         same, swap = [0, 1, 2, 3], [2, 3, 0, 1]
-        left, right, gyro = flipped(c.left, same), flipped(c.right, same), c.gyro * [1.0, 1.0, -1.0, -1.0]
+        left, right = flipped(c.left, same), flipped(c.right, same)
+        sensed = {"gyro": c.gyro * [1.0, 1.0, -1.0, -1.0], "gravity": c.gravity * [1.0, -1.0, 1.0, 1.0]}
         if alone:  # with tracks, whose left halves are then those of the mirrored left camera
-            return Correspondences(left=left, right=right, tracks=flipped(c.tracks, [*range(8)]), gyro=gyro)
+            return Correspondences(left=left, right=right, tracks=flipped(c.tracks, [*range(8)]), **sensed)
         return Correspondences(
             left=right,
             right=left,
             stereo_0=flipped(c.stereo_0, swap),
             stereo_1=flipped(c.stereo_1, swap),
             tracks=flipped(c.tracks, [2, 3, 0, 1, 6, 7, 4, 5]),
-            gyro=gyro,
+            **sensed,
         )
 
     return _agree(subject, mirrored, np.array([1, -1, -1]), np.array([-1, 1, 1]), "of the mirrored world")
@@ -266,8 +267,8 @@ def fails_by_value(subject: Subject) -> tuple[Verdict, str]:
     for name, (c, shutter) in cases.items():
         sets = {
             "": c,
-            "pairs of ": _subset(c, "left", "right", "gyro"),
-            "tracks of ": _subset(c, "tracks", "gyro"),
+            "pairs of ": _subset(c, "left", "right", *SENSORS),
+            "tracks of ": _subset(c, "tracks", *SENSORS),
         }
         for kind, matches in sets.items():
             try:
@@ -318,7 +319,7 @@ def degenerate_cases() -> dict[str, tuple[Correspondences, RollingShutter]]:
         w: FloatArray, d: FloatArray, shutter: RollingShutter = ROLLING, plane: bool = False
     ) -> Correspondences:
         shape: SceneShape = "plane" if plane else "box"
-        options = SimulationOptions(pairs=30, tracks=30, shape=shape, gyro_rate=GYRO_RATE)
+        options = SimulationOptions(pairs=30, tracks=30, shape=shape, gyro_rate=GYRO_RATE, gravity=True)
         motion = make_motion("linear", w, d)
         return simulate(RIG, shutter, motion, options, np.random.default_rng(2)).correspondences
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.arguments import check_number, check_one_of, check_whole
+from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.projection import ROW_TOLERANCE_PX, ProjectionStatus, back_project, project_at, rs_project
@@ -23,6 +24,9 @@ from rsbench.motions import make_motion
 SceneShape = Literal["box", "plane"]
 GYRO_RATE = 20
 """Samples of a gyroscope in a frame period, where a solver wants any: 600 Hz at 30 frames a second."""
+
+_DOWN = np.array([0.2, 0.9, -0.3]) / np.sqrt(0.94)
+"""The way things fall, in the axes of the body at time 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +53,10 @@ class SimulationOptions:
     """Length of what is added to all samples, in a random direction, degrees per frame period."""
     gyro_delay: float = 0.0
     """Frame periods by which the samples say that they are later than they are."""
+    gravity: bool = False
+    """Whether the direction of gravity is given, at the start of either frame."""
+    gravity_noise_deg: float = 0.0
+    """Standard deviation of each of its two angles, degrees."""
     shape: SceneShape = "box"
     """Points at random depths, or on one slanted plane in the middle of the range."""
 
@@ -62,6 +70,7 @@ class SimulationOptions:
         check_number("gyro_noise_deg", self.gyro_noise_deg, 0.0)
         check_number("gyro_bias_deg", self.gyro_bias_deg, 0.0)
         check_number("gyro_delay", self.gyro_delay, -10.0, 10.0)
+        check_number("gravity_noise_deg", self.gravity_noise_deg, 0.0)
         check_one_of("shape", self.shape, get_args(SceneShape))
         near, far = self.depth
         if not 0.0 < near <= far < np.inf:
@@ -118,6 +127,7 @@ def simulate(
         noisy[name] = matches + options.noise_px * noise.standard_normal(matches.shape)
         outliers[name] = _displace(noisy[name], options, wrong)
     noisy["gyro"] = _gyro(motion, options, rng.spawn(1)[0])
+    noisy["gravity"] = _gravity(motion, options, rng.spawn(1)[0])
     return Simulation(
         correspondences=Correspondences(**noisy),
         rig=rig,
@@ -135,6 +145,17 @@ def _gyro(motion: Motion, options: SimulationOptions, rng: np.random.Generator) 
     bias = np.deg2rad(options.gyro_bias_deg) * random_direction(rng)
     noise = np.deg2rad(options.gyro_noise_deg) * rng.standard_normal((len(tau), 3))
     return np.column_stack([tau + options.gyro_delay, motion.velocity(tau)[0] + bias + noise])
+
+
+def _gravity(motion: Motion, options: SimulationOptions, rng: np.random.Generator) -> FloatArray:
+    """(2, 4) of a camera that is held at an angle."""
+    if not options.gravity:
+        return np.zeros((0, 4))
+    tau = np.array([0.0, 1.0])
+    down = motion.body_from_world(tau).R @ _DOWN
+    noise = np.deg2rad(options.gravity_noise_deg) * rng.standard_normal((2, 3))
+    across = noise - np.sum(noise * down, axis=1, keepdims=True) * down  # two angles: none about itself
+    return np.column_stack([tau, (so3.exp(across) @ down[..., None])[..., 0]])
 
 
 def _displace(matches: FloatArray, options: SimulationOptions, rng: np.random.Generator) -> np.ndarray:

@@ -32,6 +32,7 @@ Axis = Literal[
     "gyro_noise_deg",
     "gyro_bias_deg",
     "gyro_delay",
+    "gravity_noise_deg",
 ]
 Vector = tuple[float, float, float]
 
@@ -73,7 +74,8 @@ class Setting:
     gyro_noise_deg: float = 0.0
     gyro_bias_deg: float = 0.0
     gyro_delay: float = 0.0
-    """Of the gyroscope that solvers are given which need one: as ``SimulationOptions`` has them."""
+    gravity_noise_deg: float = 0.0
+    """Of the sensors that solvers are given which need them: as ``SimulationOptions`` has them."""
 
     def __post_init__(self) -> None:
         for name in ("rotation_deg", "translation", "noise_px", "outlier_px"):
@@ -130,12 +132,14 @@ class Setting:
             gyro_noise_deg=self.gyro_noise_deg,
             gyro_bias_deg=self.gyro_bias_deg,
             gyro_delay=self.gyro_delay,
+            gravity=True,
+            gravity_noise_deg=self.gravity_noise_deg,
         )
 
     def exact(self) -> Setting:
         """The setting of the same matches without noise and with the truth for the solver."""
         told = replace(self, noise_px=0.0, readout_ratio_error=0.0)
-        return replace(told, gyro_noise_deg=0.0, gyro_bias_deg=0.0, gyro_delay=0.0)
+        return replace(told, gyro_noise_deg=0.0, gyro_bias_deg=0.0, gyro_delay=0.0, gravity_noise_deg=0.0)
 
     def changed(self, changes: Mapping[str, Any], where: str) -> Setting:
         """The setting with some fields replaced.

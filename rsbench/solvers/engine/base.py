@@ -24,8 +24,10 @@ from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 from rsbench.motions import check_parameters
 
-MatchSet = Literal["left", "right", "stereo", "tracks", "gyro"]
-"""Matches; and samples of a gyroscope, which are given whole and no part of RANSAC's samples."""
+MatchSet = Literal["left", "right", "stereo", "tracks", "gyro", "gravity"]
+"""Matches; and samples of other sensors, which are given whole and no part of RANSAC's samples."""
+SENSORS: Mapping[MatchSet, str] = {"gyro": "samples of a gyroscope", "gravity": "directions of gravity"}
+"""What is no set of matches."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -149,8 +151,9 @@ class SolverSpec:
         """The failure that too few matches are; None when there are enough."""
         for name, least in self.minimum.items():
             if counts.get(name, 0) < least:
-                what = "samples of a gyroscope" if name == "gyro" else f"{name} matches"
-                return MotionEstimate.failed(f"{counts.get(name, 0)} {what}, need {least}")
+                return MotionEstimate.failed(
+                    f"{counts.get(name, 0)} {SENSORS.get(name, f'{name} matches')}, need {least}"
+                )
         return None
 
 
