@@ -127,7 +127,7 @@ def _solved(A: FloatArray, y: FloatArray) -> FloatArray:
     """Least squares (..., 12), the shortest where velocities are open; NaN where the pose is, too."""
     if A.shape[-2] == A.shape[-1]:
         try:
-            return np.asarray(np.linalg.solve(A, y[..., None])[..., 0])
+            return np.linalg.solve(A, y[..., None])[..., 0].astype(np.float64)
         except np.linalg.LinAlgError:
             pass
     flat = A.reshape(-1, *A.shape[-2:]), y.reshape(-1, y.shape[-1])

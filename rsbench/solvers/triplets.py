@@ -100,7 +100,7 @@ def _step(A: FloatArray, e: FloatArray) -> FloatArray:
     square = A.shape[-2] == A.shape[-1]
     try:
         left, right = (A, e[..., None]) if square else (At @ A, At @ e[..., None])
-        return -np.asarray(np.linalg.solve(left, right)[..., 0])
+        return -np.linalg.solve(left, right)[..., 0].astype(np.float64)
     except np.linalg.LinAlgError:
         if A.ndim == 2:
             return np.full(6, np.nan)

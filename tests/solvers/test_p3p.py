@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from dataclasses import replace
 
 import cv2
@@ -30,10 +32,10 @@ def trial(seed: int, count: int = 100, noise_px: float = 0.0, outlier_ratio: flo
 
 @pytest.mark.parametrize("cameras", ["left", "both"])
 @pytest.mark.parametrize("count", [4, 100])
-def test_the_pose_of_exact_points_is_exact(cameras: str, count: int) -> None:
+def test_the_pose_of_exact_points_is_exact(cameras: Literal["both", "left"], count: int) -> None:
     for seed in range(5):
         s = trial(seed, count)
-        found = P3pSolver(cameras_used=cameras).estimate(s.correspondences, RIG, GLOBAL)  # type: ignore[arg-type]
+        found = P3pSolver(cameras_used=cameras).estimate(s.correspondences, RIG, GLOBAL)
         assert found.success and found.metric
         # The rows of the simulation are exact to 1e-7 px: 1e-10 of a ray, times what four points amplify.
         np.testing.assert_allclose(found.w, s.motion.w, atol=1e-8)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any, Literal
+
 import numpy as np
 import pytest
 
@@ -46,8 +49,8 @@ def own_model(kind: str, count: int, seed: int) -> Correspondences:
 
 @pytest.mark.parametrize("kind", ["double", "single"])
 @pytest.mark.parametrize("count", [6, 40])
-def test_the_pose_of_its_own_model_is_exact(kind: str, count: int) -> None:
-    solver = R6pSolver(linearisation=kind, frame_0="still", refinement="none")  # type: ignore[arg-type]
+def test_the_pose_of_its_own_model_is_exact(kind: Literal["double", "single"], count: int) -> None:
+    solver = R6pSolver(linearisation=kind, frame_0="still", refinement="none")
     found = []
     for seed in range(10):
         c = own_model(kind, count, seed)
@@ -57,8 +60,8 @@ def test_the_pose_of_its_own_model_is_exact(kind: str, count: int) -> None:
     assert np.max(found) < (1e-5 if count == 6 else 1e-8) and np.median(found) < 1e-9
 
 
-def trial(seed: int, size: float = 1.0, **options: float) -> Simulation:
-    chosen = SimulationOptions(**{"tracks": 40, **options})  # type: ignore[arg-type]
+def trial(seed: int, size: float = 1.0, **options: Any) -> Simulation:
+    chosen = replace(SimulationOptions(tracks=40), **options)
     return simulate(RIG, SHUTTER, LinearMotion(size * W, size * D), chosen, np.random.default_rng(seed))
 
 
@@ -73,10 +76,10 @@ def medians(solver: R6pSolver, size: float) -> FloatArray:
 
 @pytest.mark.parametrize(("kind", "frame_0"), [("double", "moved"), ("single", "moved"), ("double", "still")])
 def test_half_the_motion_has_a_quarter_of_the_rotation_s_and_half_of_the_direction_s_error(
-    kind: str, frame_0: str
+    kind: Literal["double", "single"], frame_0: Literal["moved", "still"]
 ) -> None:
     """What linearisations drop, and what a frame 0 that is taken as still moves, is of second order."""
-    solver = R6pSolver(linearisation=kind, frame_0=frame_0, refinement="none")  # type: ignore[arg-type]
+    solver = R6pSolver(linearisation=kind, frame_0=frame_0, refinement="none")
     np.testing.assert_allclose(medians(solver, 0.5) / medians(solver, 0.25), [4.0, 2.0], rtol=0.25)
 
 

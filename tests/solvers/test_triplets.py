@@ -27,8 +27,8 @@ def trial(seed: int, count: int = 3, noise_px: float = 0.0, outlier_ratio: float
 
 @pytest.mark.parametrize("known", [(0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1)])
 def test_every_kind_of_three_triplets_gives_the_exact_motion(known: tuple[int, int, int]) -> None:
-    sides = ("left", "right", "left")
-    views: list[View] = [(0 if frame else 1, side) for frame, side in zip(known, sides, strict=True)]  # type: ignore[misc]
+    sides: tuple[Side, ...] = ("left", "right", "left")
+    views: list[View] = [(0 if frame else 1, side) for frame, side in zip(known, sides, strict=True)]
     errors = []
     for seed in range(30):
         s = trial(seed)

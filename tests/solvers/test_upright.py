@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,9 +29,9 @@ GLOBAL = RollingShutter(height=900, readout_ratio=0.0)
 NAMES = ("gs-upright-3pt", "gs-upright-4pt")
 
 
-def trial(seed: int, degrees: float = 3.0, **options: float) -> Simulation:
+def trial(seed: int, degrees: float = 3.0, **options: Any) -> Simulation:
     motion = random_motion(np.random.default_rng(seed), np.radians(degrees), 0.3)
-    chosen = SimulationOptions(**{"pairs": 60, "gravity": True, **options})  # type: ignore[arg-type]
+    chosen = replace(SimulationOptions(pairs=60, gravity=True), **options)
     return simulate(RIG, GLOBAL, motion, chosen, np.random.default_rng(seed))
 
 
