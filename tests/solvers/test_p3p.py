@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from dataclasses import replace
+from typing import Literal
 
 import cv2
 import numpy as np

@@ -10,7 +10,7 @@ from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.metrics import rotation_error, translation_error
-from rsbench.core.rig import StereoRig
+from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.triplets import Triplets, TripletSolver, View, newton
