@@ -12,8 +12,6 @@ of degree 1 in each where w0 = w1 = 0 (linear), else 2 (uniform). y^T E x is the
 5 x 5 or 7 x 7 of them without the 2 x 2 products of the highest ones, which do not occur: 21 or 45 coefficients,
 of 20 or 44 matches. Several entries of the E's fall into one coefficient, so that the E's cannot be read off
 alone; R, t and the velocities are those whose coefficients come nearest to the null vector.
-
-No card names it yet: its Sampson descent is stopped before it ends, which would show the method weaker than it is.
 """
 
 from __future__ import annotations
@@ -22,20 +20,20 @@ from dataclasses import dataclass
 from typing import Literal, final
 
 import numpy as np
-import scipy
-from numpy.typing import NDArray
 
-from rsbench.core import so3
-from rsbench.core.so3 import FloatArray, hat
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.free_descent import Normal, chart, descend
 from rsbench.solvers.engine.free_solver import FreeVelocitySolver
-from rsbench.solvers.engine.free_velocities import FreeMotion, Rows, in_front_of_both, signed
+from rsbench.solvers.engine.free_velocities import FreeMotion, Rows
+from rsbench.solvers.engine.generalised_essential import coefficients, places, with_derivatives
 from rsbench.solvers.engine.linear_systems import null_vector
 
 _QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-_ALTERNATIONS = 6
-_STEP, _MOST = 1e-6, 25
+_ALTERNATIONS, _MOST = 4, 30
 _ROUNDING = 1e-14
 """The 45 coefficients of slow motion are separate by 1e-10 of the largest singular value and less."""
+_EXACT = 1e-28
+"""Squared misfit that rounding leaves."""
 
 
 def monomials(x: FloatArray, degree: int) -> FloatArray:
@@ -44,106 +42,62 @@ def monomials(x: FloatArray, degree: int) -> FloatArray:
     return np.stack([*(p * s**i for i in range(degree + 1)), *(s**j for j in range(degree + 2))], axis=-1)
 
 
-def occurring(degree: int) -> NDArray[np.bool_]:
-    """Mask (m, m) of the products of monomials that occur, frame 1 first."""
-    highest = np.zeros(2 * degree + 3, dtype=np.bool_)
-    highest[[degree, 2 * degree + 2]] = True
-    return ~np.outer(highest, highest)
-
-
 def system(rows: Rows, degree: int) -> FloatArray:
     """(n, 21) or (n, 45) of rows whose s = 0 is the principal point's."""
     products = monomials(rows.y, degree)[:, :, None] * monomials(rows.x, degree)[:, None, :]
-    return products[:, occurring(degree)]
-
-
-def _places(power: int, degree: int) -> list[int]:
-    """Monomials of the ray's entries p, s and 1 times s^power."""
-    return [power, degree + 2 + power, degree + 1 + power]
-
-
-def coefficients(motion: FreeMotion, degree: int) -> FloatArray:
-    """The (..., 21) or (..., 45) coefficients of motions."""
-    before = [np.eye(3), hat(motion.w1)][:degree]
-    after = [np.eye(3), -hat(motion.w0)][:degree]
-    t, v0, v1 = hat(motion.t), hat(motion.v0), hat(motion.v1)
-    G = np.zeros((*motion.t.shape[:-1], 2 * degree + 3, 2 * degree + 3))
-    for a, L in enumerate(before):
-        for b, N in enumerate(after):
-            Q = L @ motion.R @ N
-            for power1, power0, E in ((a, b, t @ Q), (a + 1, b, v1 @ Q), (a, b + 1, -Q @ v0)):
-                rows, columns = np.array(_places(power1, degree)), np.array(_places(power0, degree))
-                G[..., rows[:, None], columns] += E
-    return np.asarray(G[..., occurring(degree)])
+    return products[:, places(degree) >= 0]
 
 
 def extract(F: FloatArray, degree: int) -> list[FreeMotion]:
-    """Two motions whose coefficients are near to F, (21,) or (45,) of arbitrary length and sign; the nearer first.
+    """Motions whose coefficients are near to F, (21,) or (45,) of arbitrary length and sign; the nearest first.
 
-    Where all velocities are parallel to t, as in slow motion nearly, frame 1 may be turned by half a turn about
-    it. Least squares over all unknowns, from the best of ``_starts``, and from there turned so.
+    Least squares over all unknowns, from either rotation of an essential matrix. Where all velocities are along t,
+    as in slow motion nearly, the twin of each has nearly the same coefficients.
     """
-    F = F / np.linalg.norm(F)
-
-    def misfit(motion: FreeMotion) -> float:
-        return float(np.linalg.norm(_difference(motion, F, degree)))
-
-    end = _nearest(F, min(_starts(F, degree), key=misfit), degree)
-    twin = _translations(F, so3.exp(np.pi * end.t) @ end.R, degree)
-    return sorted([end, _nearest(F, twin._replace(w0=end.w0, w1=end.w1), degree)], key=misfit)
+    misfit = _Misfit(F / np.linalg.norm(F), degree)
+    ends = [descend(misfit, _start(misfit.F, quarter, degree), _MOST, _EXACT) for quarter in (_QUARTER, _QUARTER.T)]
+    near = [end for end, _ in sorted(ends, key=lambda end: end[1])]
+    return [*near, *(end.twin() for end in near)]
 
 
-def _difference(motion: FreeMotion, F: FloatArray, degree: int) -> FloatArray:
-    """(..., 21) or (..., 45) what unit coefficients have across F."""
-    C = coefficients(motion, degree)
-    C = C / np.maximum(np.linalg.norm(C, axis=-1, keepdims=True), 1e-300)
-    return np.asarray(C - (C @ F)[..., None] * F)
+class _Misfit:
+    """What unit coefficients have across F."""
+
+    def __init__(self, F: FloatArray, degree: int) -> None:
+        self.F, self.degree, self.unknowns = F, degree, 11 if degree == 1 else 17
+
+    def at(self, motion: FreeMotion) -> Normal:
+        C, by = with_derivatives(motion, self.degree)
+        M = chart(motion)[:, : self.unknowns]
+        length = max(float(np.linalg.norm(C)), 1e-300)
+        C, J = C / length, by.T @ M / length
+        J -= np.outer(C, C @ J)
+        J -= np.outer(self.F, self.F @ J)
+        r = C - (C @ self.F) * self.F
+        return Normal(float(r @ r), J.T @ r, J.T @ J, M)
 
 
-def _nearest(F: FloatArray, start: FreeMotion, degree: int) -> FreeMotion:
-    start, unknowns = start.of_unit_length(), 12 if degree == 1 else 18
-
-    def difference(step: FloatArray) -> FloatArray:
-        return _difference(start.moved(step), F, degree)
-
-    def jacobian(step: FloatArray) -> FloatArray:
-        shifts = _STEP * np.eye(unknowns)
-        return (difference(step + shifts) - difference(step - shifts)).T / (2.0 * _STEP)
-
-    end = scipy.optimize.least_squares(
-        difference, np.zeros(unknowns), jacobian, method="lm", xtol=1e-14, ftol=1e-6, max_nfev=_MOST
-    )
-    return start.moved(end.x).of_unit_length()
-
-
-def _starts(F: FloatArray, degree: int) -> list[FreeMotion]:
-    """By turns the translations that fit a rotation best, and the rotation of what they leave of t's matrix.
-
-    From either rotation of an essential matrix.
-    """
-    G = np.zeros((2 * degree + 3, 2 * degree + 3))
-    G[occurring(degree)] = F
-    place = np.ix_(_places(0, degree), _places(0, degree))
-    found = []
-    for quarter in (_QUARTER, _QUARTER.T):
-        E = G[place]
-        for _ in range(_ALTERNATIONS):
-            U, _, Vt = np.linalg.svd(E)
-            R = U @ quarter @ Vt
-            motion = _translations(F, R * np.sign(np.linalg.det(R)), degree)
-            others = np.zeros_like(G)
-            others[occurring(degree)] = coefficients(motion._replace(t=np.zeros(3)), degree)
-            E = (G - others)[place]
-            found.append(motion)
-    return found
+def _start(F: FloatArray, quarter: FloatArray, degree: int) -> FreeMotion:
+    """By turns the translations that fit a rotation best, and the rotation of what they leave of t's matrix."""
+    G, place = np.zeros((2 * degree + 3, 2 * degree + 3)), places(degree)
+    G[place >= 0] = F
+    block = np.ix_([0, degree + 2, degree + 1], [0, degree + 2, degree + 1])
+    E = G[block]
+    for _ in range(_ALTERNATIONS):
+        U, _, Vt = np.linalg.svd(E)
+        R = U @ quarter @ Vt
+        motion = _translations(F, R * np.sign(np.linalg.det(R)), degree)
+        others = np.zeros_like(G)
+        others[place >= 0] = coefficients(motion._replace(t=np.zeros(3)), degree)
+        E = (G - others)[block]
+    return motion
 
 
 def _translations(F: FloatArray, R: FloatArray, degree: int) -> FreeMotion:
-    zero = np.zeros((9, 3))
-    units = np.swapaxes(np.eye(9).reshape(9, 3, 3), 0, 1)
-    basis = coefficients(FreeMotion(R, units[0], units[1], units[2], zero, zero), degree)
+    zero = np.zeros(3)
+    basis = with_derivatives(FreeMotion(R, *np.zeros((5, 3))), degree)[1][3:12]
     found = np.asarray(np.linalg.lstsq(basis.T, F, rcond=None)[0], dtype=np.float64)
-    return FreeMotion(R, found[:3], found[3:6], found[6:], zero[0], zero[0])
+    return FreeMotion(R, found[:3], found[3:6], found[6:], zero, zero)
 
 
 @final
@@ -175,9 +129,12 @@ class DaiSolver(FreeVelocitySolver):
             f"{held}; a constant velocity in each; readout ratio above 0; a scene that is not planar; translation",
         )
 
-    def linear(self, rows: Rows) -> FreeMotion | str:
+    def linear(self, rows: Rows) -> list[FreeMotion] | str:
         degree = 2 if self.turning else 1
         F, reason = null_vector(system(rows, degree), unit_columns=True, rounding=_ROUNDING)
-        if F is None:
-            return reason
-        return max(extract(F, degree), key=lambda end: in_front_of_both(signed(end, rows), rows))
+        return reason if F is None else extract(F, degree)
+
+    def starts(self, rows: Rows) -> list[FreeMotion]:
+        """The linear model's motions: noise spoils 45 coefficients long before it spoils 21."""
+        F, _ = null_vector(system(rows, 1), unit_columns=True) if self.turning else (None, "")
+        return [] if F is None else extract(F, 1)

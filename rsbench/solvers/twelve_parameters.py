@@ -2,8 +2,6 @@
 
 The rolling-shutter baselines of D. Barath (Rolling Shutter Made Practical, ECCV 2026), there named after the
 solvers of Dai et al., whose algorithm it is not: ``rsbench.solvers.dai`` is that.
-
-No card names it yet: its Sampson descent is stopped before it ends, which would show the method weaker than it is.
 """
 
 from __future__ import annotations
@@ -56,10 +54,10 @@ class TwelveParameterSolver(FreeVelocitySolver):
             "slow motion within the frames; readout ratio above 0; a scene that is not planar; translation",
         )
 
-    def linear(self, rows: Rows) -> FreeMotion | str:
+    def linear(self, rows: Rows) -> list[FreeMotion] | str:
         E = eight_point(rows.x, rows.y)
         if E is None:
             return "the matches fit more than one essential matrix: degenerate scene or motion"
         pose, _ = decompose_essential(E, rows.x, rows.y)
         zero = np.zeros(3)
-        return velocities(FreeMotion(pose.R, pose.t, zero, zero, zero, zero), rows)
+        return [velocities(FreeMotion(pose.R, pose.t, zero, zero, zero, zero), rows)]

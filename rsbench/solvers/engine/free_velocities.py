@@ -17,15 +17,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.epipolar import epipolar_gradient, in_front
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray, hat
-
-_FAR_PX = 1e6
+from rsbench.solvers.engine.free_kernels import free_in_front, free_terms
 
 
 class FreeMotion(NamedTuple):
@@ -59,6 +57,14 @@ class FreeMotion(NamedTuple):
         """All translations the other way: the other sign of the essential matrices."""
         return self._replace(t=-self.t, v0=-self.v0, v1=-self.v1)
 
+    def twin(self) -> FreeMotion:
+        """Frame 1 turned by half a turn about t: where all translations are along t, the same constraints."""
+        return self._replace(R=so3.exp(np.pi * self.t / np.linalg.norm(self.t)) @ self.R)
+
+    def at_rest(self) -> FreeMotion:
+        """Without velocities."""
+        return FreeMotion(self.R, self.t, *np.zeros((4, 3)))
+
 
 class Rows(NamedTuple):
     """Matches of one camera: rays (n, 3) of frames 0 and 1, z = 1, and their s (n,)."""
@@ -74,6 +80,10 @@ class Rows(NamedTuple):
         """Of matches (n, 4), with s = 0 at the row ``first``."""
         x, y = camera.unproject(matches[:, :2]), camera.unproject(matches[:, 2:])
         return cls(x, y, (matches[:, 1] - first) / camera.fy, (matches[:, 3] - first) / camera.fy, camera)
+
+    def packed(self) -> FloatArray:
+        """(n, 6) as the kernels take them."""
+        return np.column_stack([self.x[:, :2], self.y[:, :2], self.s0, self.s1])
 
 
 def constraint(motion: FreeMotion, rows: Rows) -> tuple[FloatArray, FloatArray]:
@@ -124,43 +134,38 @@ def sampson_jacobian(motion: FreeMotion, rows: Rows) -> FloatArray:
     return np.concatenate(parts, axis=1) / norm
 
 
-def refine(start: FreeMotion, rows: Rows, *, turning: bool, most: int = 30) -> FreeMotion:
-    """Least squares of ``sampson``; without ``turning`` the camera keeps its rotation in a frame.
+def errors(motion: FreeMotion, rows: Rows) -> tuple[FloatArray, FloatArray]:
+    """``sampson`` (n,) and ``sampson_jacobian`` (n, 18), compiled."""
+    r, J = np.zeros(len(rows.x)), np.zeros((len(rows.x), 18))
+    focal = np.array([rows.camera.fx, rows.camera.fy])
+    free_terms(motion.R, np.stack(motion[1:]), rows.packed(), focal, r, J)
+    return r, J
 
-    The start where there are fewer matches than unknowns, or the descent leaves what is finite.
+
+def squares(motion: FreeMotion, rows: Rows) -> float:
+    """Sum of the squares of ``sampson``, compiled."""
+    r, focal = np.zeros(len(rows.x)), np.array([rows.camera.fx, rows.camera.fy])
+    free_terms(motion.R, np.stack(motion[1:]), rows.packed(), focal, r, np.zeros((0, 18)))
+    total = float(r @ r)
+    return total if np.isfinite(total) else np.inf
+
+
+def signed(motion: FreeMotion, rows: Rows) -> tuple[FreeMotion, int]:
+    """The sign of the translations that has more points in front of both cameras, and how many.
+
+    The length of T over that of t is the least certain of all: estimates of it pass zero in the middle of the
+    image, where then half of the points would vote for either sign of t. T is taken to lie on the side of t.
     """
-    unknowns = 18 if turning else 12
-    if len(rows.x) < unknowns:
-        return start
-    start = start.of_unit_length()
-    if not turning:
-        start = start._replace(w0=np.zeros(3), w1=np.zeros(3))
-
-    def errors(step: FloatArray) -> FloatArray:
-        return np.clip(np.nan_to_num(sampson(start.moved(step), rows), nan=_FAR_PX), -_FAR_PX, _FAR_PX)
-
-    def jacobian(step: FloatArray) -> FloatArray:
-        # The step turns what stands left of the old rotation: by the derivative of its exponential.
-        J = sampson_jacobian(start.moved(step), rows)[:, :unknowns]
-        J[:, :3] = J[:, :3] @ so3.left_jacobian(step[:3])
-        return np.nan_to_num(J, posinf=0.0, neginf=0.0)
-
-    end = scipy.optimize.least_squares(
-        errors, np.zeros(unknowns), jacobian, method="lm", max_nfev=most, xtol=1e-10, ftol=1e-8
+    front, back = (
+        free_in_front(each.R, np.stack(each[1:]), rows.packed()) for each in (motion, motion.flipped())
     )
-    found = start.moved(end.x).of_unit_length()
-    return found if all(np.all(np.isfinite(part)) for part in found) else start
-
-
-def signed(motion: FreeMotion, rows: Rows) -> FreeMotion:
-    """The sign of the translations that has more points in front of the cameras."""
-    front, back = (in_front_of_both(each, rows) for each in (motion, motion.flipped()))
-    return motion if front >= back else motion.flipped()
+    return (motion, front) if front >= back else (motion.flipped(), back)
 
 
 def in_front_of_both(motion: FreeMotion, rows: Rows) -> int:
-    """How many points lie in front of both cameras."""
-    return int(np.count_nonzero(in_front(motion.between(rows.s0, rows.s1), rows.x, rows.y)))
+    """How many points lie in front of both cameras if T lies on the side of t."""
+    R, T = motion.between(rows.s0, rows.s1)
+    return int(np.count_nonzero(in_front(Pose(R, T * np.sign(T @ motion.t)[:, None]), rows.x, rows.y)))
 
 
 def from_row(motion: FreeMotion, s: float) -> FreeMotion:
