@@ -63,7 +63,7 @@ def _row(vectors: FloatArray, k: int) -> Vector:
 
 
 @compiled
-def _exponential(phi: Vector, out: FloatArray) -> None:
+def exponential(phi: Vector, out: FloatArray) -> None:
     a, b, _, _, _ = coefficients(dot(phi, phi))
     fill_rotation(phi, 1.0 - b * dot(phi, phi), a, b, out)
 
@@ -80,8 +80,8 @@ def _between(
 ) -> tuple[Vector, Vector]:
     """T and R(s0, s1) v0; P is filled with R(s0, s1), A0 and A1 with the rotations of the frames."""
     v0, v1 = _row(vectors, 1), _row(vectors, 2)
-    _exponential(times(-s0, _row(vectors, 3)), A0)
-    _exponential(times(s1, _row(vectors, 4)), A1)
+    exponential(times(-s0, _row(vectors, 3)), A0)
+    exponential(times(s1, _row(vectors, 4)), A1)
     for i in range(3):
         B = (
             A1[i, 0] * R[0, 0] + A1[i, 1] * R[1, 0] + A1[i, 2] * R[2, 0],

@@ -20,6 +20,7 @@ from rsbench.solvers.engine.free_descent import refine
 from rsbench.solvers.engine.free_velocities import FreeMotion, Rows, from_row, signed, squares
 
 _QUICK, _FULL = 8, 100
+"""Evaluations of a descent that is one of several or a step of a search, and of one whose end is told."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,27 +74,21 @@ class FreeVelocitySolver(Solver):
     ) -> MotionEstimate:
         matches = temporal_pairs(correspondences, "left")
         found = self._linear(matches, rig)
-        if isinstance(found, str):
+        if self.refinement == "none" or len(matches) < self.least:
+            return _best_of(found, matches, rig)
+        more = self.starts(Rows.of(matches, rig.camera, rig.camera.cy))
+        if isinstance(found, str) and not more:
             return MotionEstimate.failed(found)
-        rows = Rows.of(matches, rig.camera, 0.0)
-        found = [_at_first_row(each, rig.camera) for each in found]
-        if self.refinement == "none":
-            return _reported(found[0], rows)
-        middle = Rows.of(matches, rig.camera, rig.camera.cy)
-        others = _likely(self.starts(middle), middle)
-        found += [_at_first_row(each, rig.camera) for each in others]
+        begun = [_at_first_row(each, rig.camera) for each in [*more, *([] if isinstance(found, str) else found)]]
         # What a linear solution's velocities are worth is seen by the errors that a descent without them ends with.
-        ends = [self._refined(each, rows, _FULL) for each in [found[0], *(each.at_rest() for each in found)]]
+        rows = Rows.of(matches, rig.camera, 0.0)
+        ends = [self._refined(each, rows, _QUICK) for each in [*begun, *(each.at_rest() for each in begun)]]
         best = min(_in_front([end for end, _ in ends], rows), key=lambda k: ends[k][1])
-        return _reported(ends[best][0], rows)
+        return _reported(self._refined(ends[best][0], rows, _FULL)[0], rows)
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
         matches = temporal_pairs(sample, "left")
-        found = self._linear(matches, rig)
-        if isinstance(found, str):
-            return [MotionEstimate.failed(found)]
-        rows = Rows.of(matches, rig.camera, 0.0)
-        return [_reported(_at_first_row(found[0], rig.camera), rows)]
+        return [_best_of(self._linear(matches, rig), matches, rig)]
 
     def improve(
         self,
@@ -106,8 +101,9 @@ class FreeVelocitySolver(Solver):
         if self.refinement == "none":
             return self.estimate(correspondences, rig, shutter)
         rows = Rows.of(temporal_pairs(correspondences, "left"), rig.camera, 0.0)
-        if len(rows.x) < self.least:
-            return MotionEstimate.failed(f"{len(rows.x)} left matches, need {self.least}")
+        least = self.sample_sizes(correspondences)["left"]
+        if len(rows.x) < least:
+            return MotionEstimate.failed(f"{len(rows.x)} left matches, need {least}")
         rate = float(shutter.rate("left")[1]) * rig.camera.fy  # frame periods in a unit of s
         w, d = rate * motion.w, rate * motion.d
         start = FreeMotion(so3.exp(motion.w), np.array(motion.d), d, d, w, w)
@@ -117,13 +113,18 @@ class FreeVelocitySolver(Solver):
         return refine(start, rows, turning=self.turning, most=most)
 
     def _linear(self, matches: FloatArray, rig: StereoRig) -> list[FreeMotion] | str:
-        """The linear solutions that have points in front, the best first, with s = 0 at the principal point's."""
+        """The linear solutions, s = 0 at the principal point: with most points in front first, by their errors."""
         short = self.spec.shortage({"left": len(matches)})
         if short is not None:
             return short.reason
         rows = Rows.of(matches, rig.camera, rig.camera.cy)
         found = self.linear(rows)
-        return found if isinstance(found, str) else _likely(found, rows) or "no finite motion fits"
+        if isinstance(found, str):
+            return found
+        finite = [each.of_unit_length() for each in found if all(np.all(np.isfinite(part)) for part in each)]
+        order = sorted(range(len(finite)), key=lambda k: squares(finite[k], rows))
+        front = set(_in_front(finite, rows))
+        return [finite[k] for k in sorted(order, key=lambda k: k not in front)] or "no finite motion fits"
 
 
 def _in_front(motions: list[FreeMotion], rows: Rows) -> list[int]:
@@ -132,10 +133,11 @@ def _in_front(motions: list[FreeMotion], rows: Rows) -> list[int]:
     return [k for k, front in enumerate(fronts) if 2 * front >= max(fronts)]
 
 
-def _likely(motions: list[FreeMotion], rows: Rows) -> list[FreeMotion]:
-    """Those of which enough points are in front, of the least errors first."""
-    finite = [each.of_unit_length() for each in motions if all(np.all(np.isfinite(part)) for part in each)]
-    return sorted((finite[k] for k in _in_front(finite, rows)), key=lambda each: squares(each, rows))
+def _best_of(found: list[FreeMotion] | str, matches: FloatArray, rig: StereoRig) -> MotionEstimate:
+    """The first of linear solutions, as it is."""
+    if isinstance(found, str):
+        return MotionEstimate.failed(found)
+    return _reported(_at_first_row(found[0], rig.camera), Rows.of(matches, rig.camera, 0.0))
 
 
 def _at_first_row(motion: FreeMotion, camera: PinholeCamera) -> FreeMotion:

@@ -40,26 +40,27 @@ def with_derivatives(motion: FreeMotion, degree: int) -> tuple[FloatArray, Float
     """The (21,) or (45,) coefficients, and what they change by with ``FreeMotion.moved``, (18, 21) or (18, 45)."""
     place = places(degree)
     out, by = np.zeros(np.max(place) + 1), np.zeros((18, np.max(place) + 1))
-    _fill(motion.R, np.stack(motion[1:]), degree, place, out, by)
+    fill_coefficients(motion.R, np.stack(motion[1:]), place, out, by)
     return out, by
 
 
 @compiled
-def _fill(
-    R: FloatArray, vectors: FloatArray, degree: int, place: NDArray[np.int64], out: FloatArray, by: FloatArray
+def fill_coefficients(
+    R: FloatArray, vectors: FloatArray, place: NDArray[np.int64], out: FloatArray, by: FloatArray
 ) -> None:
+    """``with_derivatives`` of a motion, vectors (5, 3) t, v0, v1, w0, w1; into zeros, place is ``places``."""
+    degree = (len(place) - 3) // 2
     t, v0, v1, w0, w1 = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
     Q, zero, unit = np.zeros((2, 2, 3, 3)), np.zeros(3), np.zeros(3)
     _turned(R, w0, w1, 1.0, 1.0, 1.0, degree, Q)
     _form(Q, t, v0, v1, degree, place, out)
     for k in range(3):
-        unit[:] = 0.0
         unit[k] = 1.0
         _form(Q, unit, zero, zero, degree, place, by[3 + k])
         _form(Q, zero, unit, zero, degree, place, by[6 + k])
         _form(Q, zero, zero, unit, degree, place, by[9 + k])
+        unit[k] = 0.0
     for k in range(3):
-        unit[:] = 0.0
         unit[k] = 1.0
         other = np.zeros((3, 3))
         for j in range(3):  # [e_k]x R
@@ -71,6 +72,7 @@ def _fill(
             _form(Q, t, v0, v1, degree, place, by[12 + k])
             _turned(R, w0, unit, 0.0, 0.0, 1.0, degree, Q)
             _form(Q, t, v0, v1, degree, place, by[15 + k])
+        unit[k] = 0.0
 
 
 @compiled
@@ -111,8 +113,7 @@ def _form(
     place: NDArray[np.int64],
     out: FloatArray,
 ) -> None:
-    """Coefficients of [t + s1 v1]x Q - Q [s0 v0]x, filled."""
-    out[:] = 0.0
+    """Coefficients of [t + s1 v1]x Q - Q [s0 v0]x, added."""
     for a in range(degree):
         for b in range(degree):
             for i in range(3):
