@@ -16,41 +16,46 @@ alone; R, t and the velocities are those whose coefficients come nearest to the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import functools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal, final
 
 import numpy as np
 
-from rsbench.core.correspondences import Correspondences
+from rsbench.core import so3
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.eight_point import decompose_essential, eight_point
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate
 from rsbench.solvers.engine.free_descent import nearest
-from rsbench.solvers.engine.free_solver import FreeVelocitySolver
+from rsbench.solvers.engine.free_samples import propose
+from rsbench.solvers.engine.free_solver import FreeVelocitySolver, motion_of, without_velocities
 from rsbench.solvers.engine.free_velocities import FreeMotion, Rows
-from rsbench.solvers.engine.generalised_essential import coefficients, places, with_derivatives
+from rsbench.solvers.engine.generalised_essential import places, with_derivatives
 from rsbench.solvers.engine.linear_systems import null_vector
 
 _QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-_ALTERNATIONS, _MOST = 4, 30
-_SAMPLE = 20
+_ALTERNATIONS, _MOST = 2, 30
+_SAMPLE, _SAMPLE_MOST = 20, (10, 16)
+"""Matches of a sample of the robust search; evaluations of its descents to coefficients and of Sampson errors."""
+_SINGULAR = "the linear system has more than one solution: degenerate motion, scene or readout ratio"
 _ROUNDING = 1e-14
 """The 45 coefficients of slow motion are separate by 1e-10 of the largest singular value and less."""
 
 
 def monomials(x: FloatArray, degree: int) -> FloatArray:
-    """(n, 2 degree + 3) of rays (n, 3)."""
-    p, s = x[:, 0], x[:, 1]
+    """(..., 2 degree + 3) of rays (..., 3)."""
+    p, s = x[..., 0], x[..., 1]
     return np.stack([*(p * s**i for i in range(degree + 1)), *(s**j for j in range(degree + 2))], axis=-1)
 
 
-def system(rows: Rows, degree: int) -> FloatArray:
-    """(n, 21) or (n, 45) of rows whose s = 0 is the principal point's."""
-    products = monomials(rows.y, degree)[:, :, None] * monomials(rows.x, degree)[:, None, :]
-    return products[:, places(degree) >= 0]
+def system(x: FloatArray, y: FloatArray, degree: int) -> FloatArray:
+    """(..., 21) or (..., 45) of rays (..., 3) of frames 0 and 1, z = 1: s = 0 is the principal point's row."""
+    products = monomials(y, degree)[..., :, None] * monomials(x, degree)[..., None, :]
+    return products[..., places(degree) >= 0]
 
 
 def extract(F: FloatArray, degree: int) -> list[FreeMotion]:
@@ -60,41 +65,60 @@ def extract(F: FloatArray, degree: int) -> list[FreeMotion]:
     as in slow motion nearly, the twin of each has nearly the same coefficients.
     """
     F = F / np.linalg.norm(F)
-    ends = [nearest(_start(F, quarter, degree), F, degree, _MOST) for quarter in (_QUARTER, _QUARTER.T)]
-    near = [end for end, _ in sorted(ends, key=lambda end: end[1])]
+    begun = [FreeMotion(R, *vectors) for R, vectors in zip(*_starts(F, degree), strict=True)]
+    near = [end for end, _ in sorted((nearest(each, F, degree, _MOST) for each in begun), key=lambda end: end[1])]
     return [*near, *(end.twin() for end in near)]
 
 
-def without_velocities(rows: Rows) -> FreeMotion | None:
-    """R and t of one essential matrix for all rows, of the eight-point algorithm; None where there are more."""
-    E = eight_point(rows.x, rows.y)
-    if E is None:
-        return None
-    pose, _ = decompose_essential(E, rows.x, rows.y)
-    return FreeMotion(pose.R, pose.t, *np.zeros((4, 3)))
+def _starts(F: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
+    """R (..., 2, 3, 3) and t, v0, v1, 0, 0 (..., 2, 5, 3) of unit coefficients (..., 21 or 45).
 
-
-def _start(F: FloatArray, quarter: FloatArray, degree: int) -> FreeMotion:
-    """By turns the translations that fit a rotation best, and the rotation of what they leave of t's matrix."""
-    G, place = np.zeros((2 * degree + 3, 2 * degree + 3)), places(degree)
-    G[place >= 0] = F
-    block = np.ix_([0, degree + 2, degree + 1], [0, degree + 2, degree + 1])
-    E = G[block]
+    From either rotation of an essential matrix, by turns the translations that fit a rotation best, and the
+    rotation of what they leave of t's matrix.
+    """
+    block = places(degree)[np.ix_([0, degree + 2, degree + 1], [0, degree + 2, degree + 1])]
+    F = F[..., None, :]
+    E = F[..., block]
     for _ in range(_ALTERNATIONS):
         U, _, Vt = np.linalg.svd(E)
-        R = U @ quarter @ Vt
-        motion = _translations(F, R * np.sign(np.linalg.det(R)), degree)
-        others = np.zeros_like(G)
-        others[place >= 0] = coefficients(motion._replace(t=np.zeros(3)), degree)
-        E = (G - others)[block]
-    return motion
+        R = U @ np.stack([_QUARTER, _QUARTER.T]) @ Vt
+        R = R * np.sign(np.linalg.det(R))[..., None, None]
+        basis = np.tensordot(R, _translating(degree), axes=2)
+        found = np.linalg.solve(basis @ np.swapaxes(basis, -1, -2), basis @ F[..., None])[..., 0]
+        E = (F - (found[..., None, 3:] @ basis[..., 3:, :])[..., 0, :])[..., block]
+    vectors = np.zeros((*R.shape[:-2], 5, 3))
+    vectors[..., :3, :] = found.reshape(*found.shape[:-1], 3, 3)
+    return R, vectors
 
 
-def _translations(F: FloatArray, R: FloatArray, degree: int) -> FreeMotion:
-    zero = np.zeros(3)
-    basis = with_derivatives(FreeMotion(R, *np.zeros((5, 3))), degree)[1][3:12]
-    found = np.asarray(np.linalg.lstsq(basis.T, F, rcond=None)[0], dtype=np.float64)
-    return FreeMotion(R, found[:3], found[3:6], found[6:], zero, zero)
+@functools.cache
+def _translating(degree: int) -> FloatArray:
+    """(3, 3, 9, 21 or 45): coefficients by R and by (t, v0, v1), without rotations in the frames."""
+    units = np.eye(9).reshape(3, 3, 3, 3)
+    still = np.zeros((5, 3))
+    return np.array([[with_derivatives(FreeMotion(R, *still), degree)[1][3:12] for R in row] for row in units])
+
+
+def _sampled(matches: FloatArray, camera: PinholeCamera, refined: bool) -> list[MotionEstimate]:
+    """Motions by the linear model of samples (b, n, 4), n >= 20."""
+    x, y = camera.unproject(matches[..., :2]), camera.unproject(matches[..., 2:])
+    A = system(x, y, 1)
+    norms = np.maximum(np.linalg.norm(A, axis=1), 1e-300)
+    good = np.all(np.isfinite(A), axis=(1, 2))
+    _, sizes, Vt = np.linalg.svd(np.where(good[:, None, None], A / norms[:, None], 0.0))
+    good &= sizes[:, 19] > _ROUNDING * sizes[:, 0]
+    F = np.where(good[:, None], Vt[:, -1] / norms, 1.0)
+    F /= np.linalg.norm(F, axis=-1, keepdims=True)
+    data = np.concatenate([x[..., :2], y[..., :2], x[..., 1:2], y[..., 1:2]], axis=-1)
+    most = (_SAMPLE_MOST[0], _SAMPLE_MOST[1] if refined else 0)
+    focal, slowness = np.array([camera.fx, camera.fy]), (camera.height / camera.fy) ** 2 / matches.shape[1]
+    first, place, R, vectors = -camera.cy / camera.fy, places(1), np.zeros((len(F), 3, 3)), np.zeros((len(F), 5, 3))
+    for k, (Rs, begun) in enumerate(zip(*_starts(F, 1), strict=True)):
+        propose(Rs, begun, F[k], place, data[k], focal, first, slowness, most, R[k], vectors[k])
+    return [
+        motion_of(*motion) if usable else MotionEstimate.failed(_SINGULAR)
+        for motion, usable in zip(zip(so3.log(R), vectors[:, 0], strict=True), good, strict=True)
+    ]
 
 
 @final
@@ -128,12 +152,12 @@ class DaiSolver(FreeVelocitySolver):
 
     def linear(self, rows: Rows) -> list[FreeMotion] | str:
         degree = 2 if self.turning else 1
-        F, reason = null_vector(system(rows, degree), unit_columns=True, rounding=_ROUNDING)
+        F, reason = null_vector(system(rows.x, rows.y, degree), unit_columns=True, rounding=_ROUNDING)
         return reason if F is None else extract(F, degree)
 
     def starts(self, rows: Rows) -> list[FreeMotion]:
         """Motions of the smaller models: noise spoils 45 coefficients long before it spoils 21 or 9."""
-        F, _ = null_vector(system(rows, 1), unit_columns=True) if self.turning else (None, "")
+        F, _ = null_vector(system(rows.x, rows.y, 1), unit_columns=True) if self.turning else (None, "")
         still = without_velocities(rows)
         return [*([] if F is None else extract(F, 1)), *([] if still is None else [still])]
 
@@ -141,6 +165,13 @@ class DaiSolver(FreeVelocitySolver):
         return {"left": _SAMPLE}
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        return next(iter(self.propose_all([sample], rig, shutter)))
+
+    def propose_all(
+        self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
+    ) -> Iterable[list[MotionEstimate]]:
         """By the linear model: no 44 matches with noise of 0.3 px give a rotation, and few are free of outliers."""
-        linear = replace(self, model="linear") if self.turning else self
-        return super(DaiSolver, linear).propose(sample, rig, shutter)
+        matches = np.stack([temporal_pairs(sample, "left") for sample in samples])
+        if matches.shape[1] < _SAMPLE:
+            return [[MotionEstimate.failed(f"{matches.shape[1]} left matches, need {_SAMPLE}")] for _ in matches]
+        return [[each] for each in _sampled(matches, rig.camera, self.refinement == "sampson")]

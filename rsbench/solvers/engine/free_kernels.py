@@ -171,3 +171,15 @@ def free_in_front(R: FloatArray, vectors: FloatArray, rows: FloatArray) -> int:
         if pp * yy - py * py > 1e-15 * pp * yy and py * yT > yy * pT and pp * yT > py * pT:
             count += 1
     return count
+
+
+@compiled
+def free_from_row(R: FloatArray, vectors: FloatArray, s: float, out_R: FloatArray, out: FloatArray) -> None:
+    """``free_velocities.from_row``: the motion with s = 0 at another row, filled."""
+    A0, A1 = np.zeros((3, 3)), np.zeros((3, 3))
+    v0, v1, w0, w1 = _row(vectors, 1), _row(vectors, 2), _row(vectors, 3), _row(vectors, 4)
+    t, Rv0 = _between(R, vectors, s, s, A0, A1, out_R)
+    # Frame 0 began at (exp(s w0), s v0); its camera is the world now.
+    v0, v1 = plus(v0, -s, cross(w0, v0)), plus(v1, -s, cross(w1, Rv0))
+    for k in range(3):
+        out[0, k], out[1, k], out[2, k], out[3, k], out[4, k] = t[k], v0[k], v1[k], w0[k], w1[k]

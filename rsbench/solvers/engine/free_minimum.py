@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rsbench.compiled import compiled
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.free_kernels import exponential, free_terms
+from rsbench.solvers.engine.free_kernels import exponential, free_from_row, free_in_front, free_terms
 from rsbench.solvers.engine.generalised_essential import fill_coefficients
 from rsbench.solvers.engine.vectors import Vector, cross, dot, times
 

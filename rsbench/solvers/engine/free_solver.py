@@ -15,10 +15,12 @@ from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.eight_point import eight_point
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.free_descent import refine
 from rsbench.solvers.engine.free_velocities import FreeMotion, Rows, from_row, signed, squares
 
+_QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _QUICK, _FULL = 8, 100
 """Evaluations of a descent that is one of several or a step of a search, and of one whose end is told."""
 
@@ -127,6 +129,17 @@ class FreeVelocitySolver(Solver):
         return [finite[k] for k in sorted(order, key=lambda k: k not in front)] or "no finite motion fits"
 
 
+def without_velocities(rows: Rows) -> FreeMotion | None:
+    """R and t of one essential matrix for all rows, of the eight-point algorithm; None where there are more."""
+    E = eight_point(rows.x, rows.y)
+    if E is None:
+        return None
+    U, _, Vt = np.linalg.svd(E)
+    R = U @ _QUARTER @ Vt
+    motion = FreeMotion(R * np.sign(np.linalg.det(R)), U[:, 2], *np.zeros((4, 3)))
+    return max((signed(each, rows) for each in (motion, motion.twin())), key=lambda found: found[1])[0]
+
+
 def _in_front(motions: list[FreeMotion], rows: Rows) -> list[int]:
     """Which have more than half as many points in front as any has: the twins of right motions have not."""
     fronts = [signed(each, rows)[1] for each in motions]
@@ -146,8 +159,12 @@ def _at_first_row(motion: FreeMotion, camera: PinholeCamera) -> FreeMotion:
 
 def _reported(motion: FreeMotion, rows: Rows) -> MotionEstimate:
     motion, _ = signed(motion.of_unit_length(), rows)
-    w = so3.log(motion.R)
-    if not np.all(np.isfinite([*w, *motion.t])):
+    return motion_of(so3.log(motion.R), motion.t)
+
+
+def motion_of(w: FloatArray, d: FloatArray) -> MotionEstimate:
+    """w and d (3,) as an answer."""
+    if not np.all(np.isfinite([*w, *d])):
         return MotionEstimate.failed("no finite motion fits")
     reason = "the length of d is not determined by one camera"
-    return MotionEstimate(w=w, d=motion.t, success=True, reason=reason)
+    return MotionEstimate(w=w, d=d, success=True, reason=reason)

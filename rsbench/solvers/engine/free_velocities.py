@@ -23,7 +23,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.epipolar import epipolar_gradient, in_front
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray, hat
-from rsbench.solvers.engine.free_kernels import free_in_front, free_terms
+from rsbench.solvers.engine.free_kernels import free_from_row, free_in_front, free_terms
 
 
 class FreeMotion(NamedTuple):
@@ -170,10 +170,6 @@ def in_front_of_both(motion: FreeMotion, rows: Rows) -> int:
 
 def from_row(motion: FreeMotion, s: float) -> FreeMotion:
     """The motion with s = 0 at another row: its pose exactly, its velocities as they are there."""
-    here = np.array(s)
-    turn0, turn1 = so3.exp(s * motion.w0), so3.exp(s * motion.w1)
-    R, t = motion.between(here, here)
-    # Frame 0 began at (turn0, s v0); its camera is the world now.
-    v0 = motion.v0 - np.cross(motion.w0, s * motion.v0)
-    v1 = motion.v1 + np.cross(motion.w1, -s * (turn1 @ motion.R @ turn0.T @ motion.v0))
-    return FreeMotion(R, t, v0, v1, motion.w0, motion.w1)
+    R, vectors = np.zeros((3, 3)), np.zeros((5, 3))
+    free_from_row(motion.R, np.stack(motion[1:]), s, R, vectors)
+    return FreeMotion(R, *vectors)
