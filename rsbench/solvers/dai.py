@@ -32,13 +32,12 @@ from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate
 from rsbench.solvers.engine.free_descent import nearest
 from rsbench.solvers.engine.free_samples import propose
-from rsbench.solvers.engine.free_solver import FreeVelocitySolver, motion_of, without_velocities
+from rsbench.solvers.engine.free_solver import QUARTER, FreeVelocitySolver, motion_of, without_velocities
 from rsbench.solvers.engine.free_velocities import FreeMotion, Rows
 from rsbench.solvers.engine.generalised_essential import places, with_derivatives
 from rsbench.solvers.engine.linear_systems import null_vector
 
-_QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-_ALTERNATIONS, _MOST = 2, 30
+_MOST = 30
 _SAMPLE, _SAMPLE_MOST = 20, (10, 16)
 """Matches of a sample of the robust search; evaluations of its descents to coefficients and of Sampson errors."""
 _SINGULAR = "the linear system has more than one solution: degenerate motion, scene or readout ratio"
@@ -66,29 +65,32 @@ def extract(F: FloatArray, degree: int) -> list[FreeMotion]:
     """
     F = F / np.linalg.norm(F)
     begun = [FreeMotion(R, *vectors) for R, vectors in zip(*_starts(F, degree), strict=True)]
-    near = [end for end, _ in sorted((nearest(each, F, degree, _MOST) for each in begun), key=lambda end: end[1])]
+    ends = [nearest(each, F, degree, _MOST) for each in begun]
+    twin = min(ends, key=lambda end: end[1])[0].twin()
+    t, v0, v1 = _translations(F, twin.R, degree)
+    ends.append(nearest(twin._replace(t=t, v0=v0, v1=v1), F, degree, _MOST))
+    near = [end for end, _ in sorted(ends, key=lambda end: end[1])]
     return [*near, *(end.twin() for end in near)]
 
 
 def _starts(F: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
     """R (..., 2, 3, 3) and t, v0, v1, 0, 0 (..., 2, 5, 3) of unit coefficients (..., 21 or 45).
 
-    From either rotation of an essential matrix, by turns the translations that fit a rotation best, and the
-    rotation of what they leave of t's matrix.
+    Either rotation of t's essential matrix, whose entries the velocities share, with the translations that fit it.
     """
     block = places(degree)[np.ix_([0, degree + 2, degree + 1], [0, degree + 2, degree + 1])]
-    F = F[..., None, :]
-    E = F[..., block]
-    for _ in range(_ALTERNATIONS):
-        U, _, Vt = np.linalg.svd(E)
-        R = U @ np.stack([_QUARTER, _QUARTER.T]) @ Vt
-        R = R * np.sign(np.linalg.det(R))[..., None, None]
-        basis = np.tensordot(R, _translating(degree), axes=2)
-        found = np.linalg.solve(basis @ np.swapaxes(basis, -1, -2), basis @ F[..., None])[..., 0]
-        E = (F - (found[..., None, 3:] @ basis[..., 3:, :])[..., 0, :])[..., block]
-    vectors = np.zeros((*R.shape[:-2], 5, 3))
-    vectors[..., :3, :] = found.reshape(*found.shape[:-1], 3, 3)
-    return R, vectors
+    U, _, Vt = np.linalg.svd(F[..., None, block])
+    R = U @ np.stack([QUARTER, QUARTER.T]) @ Vt
+    R = R * np.sign(np.linalg.det(R))[..., None, None]
+    found = _translations(F[..., None, :], R, degree)
+    return R, np.concatenate([found, np.zeros((*found.shape[:-2], 2, 3))], axis=-2)
+
+
+def _translations(F: FloatArray, R: FloatArray, degree: int) -> FloatArray:
+    """t, v0 and v1 (..., 3, 3) that fit best to coefficients and a rotation (..., 3, 3), without w0 and w1."""
+    basis = np.tensordot(R, _translating(degree), axes=2)
+    found = np.linalg.solve(basis @ np.swapaxes(basis, -1, -2), basis @ F[..., None])
+    return np.asarray(found.reshape(*R.shape[:-2], 3, 3))
 
 
 @functools.cache
@@ -112,7 +114,12 @@ def _sampled(matches: FloatArray, camera: PinholeCamera, refined: bool) -> list[
     data = np.concatenate([x[..., :2], y[..., :2], x[..., 1:2], y[..., 1:2]], axis=-1)
     most = (_SAMPLE_MOST[0], _SAMPLE_MOST[1] if refined else 0)
     focal, slowness = np.array([camera.fx, camera.fy]), (camera.height / camera.fy) ** 2 / matches.shape[1]
-    first, place, R, vectors = -camera.cy / camera.fy, places(1), np.zeros((len(F), 3, 3)), np.zeros((len(F), 5, 3))
+    first, place, R, vectors = (
+        -camera.cy / camera.fy,
+        places(1),
+        np.zeros((len(F), 3, 3)),
+        np.zeros((len(F), 5, 3)),
+    )
     for k, (Rs, begun) in enumerate(zip(*_starts(F, 1), strict=True)):
         propose(Rs, begun, F[k], place, data[k], focal, first, slowness, most, R[k], vectors[k])
     return [

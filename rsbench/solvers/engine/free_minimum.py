@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rsbench.compiled import compiled
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.free_kernels import exponential, free_from_row, free_in_front, free_terms
+from rsbench.solvers.engine.free_kernels import exponential, free_terms
 from rsbench.solvers.engine.generalised_essential import fill_coefficients
 from rsbench.solvers.engine.vectors import Vector, cross, dot, times
 
@@ -210,9 +210,7 @@ def _by_unknowns(J: FloatArray, R: FloatArray, across: tuple[Vector, Vector], ou
 
 
 @compiled
-def _move(
-    R: FloatArray, vectors: FloatArray, step: FloatArray, out_R: FloatArray, out: FloatArray
-) -> None:
+def _move(R: FloatArray, vectors: FloatArray, step: FloatArray, out_R: FloatArray, out: FloatArray) -> None:
     """The motion after a step of the unknowns."""
     across, A = _across(vectors), np.empty((3, 3))
     for k in range(3):

@@ -20,7 +20,7 @@ from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, Solver
 from rsbench.solvers.engine.free_descent import refine
 from rsbench.solvers.engine.free_velocities import FreeMotion, Rows, from_row, signed, squares
 
-_QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _QUICK, _FULL = 8, 100
 """Evaluations of a descent that is one of several or a step of a search, and of one whose end is told."""
 
@@ -135,7 +135,7 @@ def without_velocities(rows: Rows) -> FreeMotion | None:
     if E is None:
         return None
     U, _, Vt = np.linalg.svd(E)
-    R = U @ _QUARTER @ Vt
+    R = U @ QUARTER @ Vt
     motion = FreeMotion(R * np.sign(np.linalg.det(R)), U[:, 2], *np.zeros((4, 3)))
     return max((signed(each, rows) for each in (motion, motion.twin())), key=lambda found: found[1])[0]
 

@@ -156,9 +156,7 @@ def signed(motion: FreeMotion, rows: Rows) -> tuple[FreeMotion, int]:
     The length of T over that of t is the least certain of all: estimates of it pass zero in the middle of the
     image, where then half of the points would vote for either sign of t. T is taken to lie on the side of t.
     """
-    front, back = (
-        free_in_front(each.R, np.stack(each[1:]), rows.packed()) for each in (motion, motion.flipped())
-    )
+    front, back = (free_in_front(each.R, np.stack(each[1:]), rows.packed()) for each in (motion, motion.flipped()))
     return (motion, front) if front >= back else (motion.flipped(), back)
 
 
