@@ -92,6 +92,7 @@ def evaluate(
 
 
 UNPUBLISHED = (
+    *("rs-12param", "rs-dai-linear", "rs-dai-uniform"),
     "gs-p3p",
     "gs-stereo-triplets",
     "gs-upright-3pt",

@@ -177,7 +177,7 @@ class DaiSolver(FreeVelocitySolver):
     def propose_all(
         self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
     ) -> Iterable[list[MotionEstimate]]:
-        """By the linear model: no 44 matches with noise of 0.3 px give a rotation, and few are free of outliers."""
+        """By the linear model: noise of 0.3 px leaves nothing of 44 matches, and few 44 are free of outliers."""
         matches = np.stack([temporal_pairs(sample, "left") for sample in samples])
         if matches.shape[1] < _SAMPLE:
             return [[MotionEstimate.failed(f"{matches.shape[1]} left matches, need {_SAMPLE}")] for _ in matches]

@@ -11,7 +11,6 @@ from typing import final
 
 import numpy as np
 
-from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.free_solver import FreeVelocitySolver, without_velocities
 from rsbench.solvers.engine.free_velocities import FreeMotion, Rows, errors
 
@@ -22,7 +21,7 @@ def velocities(still: FreeMotion, rows: Rows) -> FreeMotion:
     y^T E x is linear in (v0, v1, w0, w1) where these are small. Each row is weighed by its Sampson norm.
     """
     r, J = errors(still, rows)
-    found: FloatArray = np.linalg.lstsq(J[:, 6:], -r, rcond=None)[0]
+    found = np.asarray(np.linalg.lstsq(J[:, 6:], -r, rcond=None)[0], dtype=np.float64)
     return FreeMotion(still.R, still.t, *found.reshape(4, 3))
 
 

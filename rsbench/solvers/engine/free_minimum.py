@@ -42,7 +42,7 @@ def descend(
         rows, focal, slowness: of ``_sampson``, when F is empty.
         F, place: of ``_misfit`` otherwise.
     """
-    trial_R, trial = np.empty((3, 3)), np.empty((5, 3))
+    trial_R, trial = np.zeros((3, 3)), np.zeros((5, 3))
     H, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
     there_H, there_gradient, step = np.zeros((unknowns, unknowns)), np.zeros(unknowns), np.zeros(unknowns)
     _unit_length(vectors)
@@ -125,7 +125,7 @@ def _sampson(
     gradient: FloatArray,
 ) -> float:
     """C (1 + slowness (|v0|^2 + |v1|^2)), C the sum of squared Sampson errors, px^2, of rows (n, 6)."""
-    residuals, J, across, row = np.empty(len(rows)), np.empty((len(rows), 18)), _across(vectors), np.empty(17)
+    residuals, J, across, row = np.zeros(len(rows)), np.zeros((len(rows), 18)), _across(vectors), np.zeros(17)
     free_terms(R, vectors, rows, focal, residuals, J)
     squares, fast = 0.0, 1.0
     for m in range(len(rows)):
@@ -158,8 +158,8 @@ def _misfit(
     gradient: FloatArray,
 ) -> float:
     """Square of what the unit coefficients of a motion have across the unit vector F."""
-    n, across, row = len(F), _across(vectors), np.empty(18)
-    C, by, J = np.zeros(n), np.zeros((18, n)), np.empty((n, 17))
+    n, across, row = len(F), _across(vectors), np.zeros(18)
+    C, by, J = np.zeros(n), np.zeros((18, n)), np.zeros((n, 17))
     fill_coefficients(R, vectors, place, C, by)
     length, along, cost = 1e-300, 0.0, 0.0
     for m in range(n):
@@ -212,7 +212,7 @@ def _by_unknowns(J: FloatArray, R: FloatArray, across: tuple[Vector, Vector], ou
 @compiled
 def _move(R: FloatArray, vectors: FloatArray, step: FloatArray, out_R: FloatArray, out: FloatArray) -> None:
     """The motion after a step of the unknowns."""
-    across, A = _across(vectors), np.empty((3, 3))
+    across, A = _across(vectors), np.zeros((3, 3))
     for k in range(3):
         out[0, k] = vectors[0, k] + step[3] * across[0][k] + step[4] * across[1][k]
     for row, first in ((1, 5), (3, 11)):
@@ -245,7 +245,7 @@ def _unit_length(vectors: FloatArray) -> None:
 def _damped_step(H: FloatArray, gradient: FloatArray, damping: float, step: FloatArray) -> bool:
     """Solve (H + damping diag H) step = -gradient, each unknown in its own unit; False where rounding forbids."""
     n = len(H)
-    unit, L = np.empty(n), np.empty((n, n))
+    unit, L = np.zeros(n), np.zeros((n, n))
     for i in range(n):
         unit[i] = 1.0 / math.sqrt(max(H[i, i], 1e-300))
     for i in range(n):

@@ -36,17 +36,10 @@ def propose(
         slowness: of ``free_minimum``.
         most: evaluations of the descents to F, and of that of the Sampson errors, from no velocities; 0: none.
     """
-    near_R, near = np.empty((4, 3, 3)), np.empty((4, 5, 3))
+    near_R, near = np.zeros((4, 3, 3)), np.zeros((4, 5, 3))
     for k in range(2):
         descend(Rs[k], vectors[k], _UNKNOWNS, most[0], 1e-28, rows[:0], focal, 0.0, F, place)
-        for i in range(3):
-            for j in range(3):
-                near_R[2 * k, i, j], near_R[2 * k + 1, i, j] = Rs[k, i, j], -Rs[k, i, j]
-                for c in range(3):  # the twin: half a turn about t
-                    near_R[2 * k + 1, i, j] += 2.0 * vectors[k, 0, i] * vectors[k, 0, c] * Rs[k, c, j]
-        for i in range(5):
-            for j in range(3):
-                near[2 * k, i, j] = near[2 * k + 1, i, j] = vectors[k, i, j]
+        _with_twin(Rs[k], vectors[k], near_R[2 * k : 2 * k + 2], near[2 * k : 2 * k + 2])
     best = _most_likely(near_R, near, rows, focal)
     free_from_row(near_R[best], near[best], first, R, out)
     moved = rows.copy()
@@ -65,10 +58,24 @@ def propose(
 
 
 @compiled
+def _with_twin(R: FloatArray, vectors: FloatArray, out_R: FloatArray, out: FloatArray) -> None:
+    """A motion and, by half a turn about its t, ``FreeMotion.twin``, filled."""
+    for i in range(3):
+        for j in range(3):
+            out_R[0, i, j], out_R[1, i, j] = R[i, j], -R[i, j]
+            for k in range(3):
+                out_R[1, i, j] += 2.0 * vectors[0, i] * vectors[0, k] * R[k, j]
+    for i in range(5):
+        for j in range(3):
+            out[0, i, j] = vectors[i, j]
+            out[1, i, j] = vectors[i, j]
+
+
+@compiled
 def _most_likely(Rs: FloatArray, vectors: FloatArray, rows: FloatArray, focal: FloatArray) -> int:
     """Which motion has the least errors of those with more than half as many points in front as any has."""
     n = len(Rs)
-    front, r, J = np.zeros(n, dtype=np.int64), np.empty(len(rows)), np.empty((0, 18))
+    front, r, J = np.zeros(n, dtype=np.int64), np.zeros(len(rows)), np.zeros((0, 18))
     for k in range(n):
         front[k] = max(free_in_front(Rs[k], vectors[k], rows), free_in_front(Rs[k], -vectors[k], rows))
     best, least = 0, np.inf

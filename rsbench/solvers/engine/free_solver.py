@@ -20,6 +20,8 @@ from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, Solver
 from rsbench.solvers.engine.free_descent import refine
 from rsbench.solvers.engine.free_velocities import FreeMotion, Rows, from_row, signed, squares
 
+_MOST_TURN = 1.0
+"""Radians in a frame; cameras that spin faster pass every match nearly, and fit what there is."""
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _QUICK, _FULL = 8, 100
 """Evaluations of a descent that is one of several or a step of a search, and of one whose end is told."""
@@ -48,7 +50,7 @@ class FreeVelocitySolver(Solver):
 
     @abstractmethod
     def linear(self, rows: Rows) -> list[FreeMotion] | str:
-        """Motions that rows whose s = 0 is the principal point's may have, or why there is none; signs are open."""
+        """Motions of rows whose s = 0 is the principal point's, their signs open, or why there is none."""
 
     def starts(self, rows: Rows) -> list[FreeMotion]:
         """Other motions to descend from, of the same rows."""
@@ -82,11 +84,12 @@ class FreeVelocitySolver(Solver):
         if isinstance(found, str) and not more:
             return MotionEstimate.failed(found)
         begun = [_at_first_row(each, rig.camera) for each in [*more, *([] if isinstance(found, str) else found)]]
-        # What a linear solution's velocities are worth is seen by the errors that a descent without them ends with.
+        # Noise may have spoiled a linear solution's velocities: each starts a descent with them and one without.
         rows = Rows.of(matches, rig.camera, 0.0)
         ends = [self._refined(each, rows, _QUICK) for each in [*begun, *(each.at_rest() for each in begun)]]
-        best = min(_in_front([end for end, _ in ends], rows), key=lambda k: ends[k][1])
-        return _reported(self._refined(ends[best][0], rows, _FULL)[0], rows)
+        gentle = [end for end in ends if _turn(end[0], rig.camera) < _MOST_TURN] or ends
+        best = min(_in_front([end for end, _ in gentle], rows), key=lambda k: gentle[k][1])
+        return _reported(self._refined(gentle[best][0], rows, _FULL)[0], rows)
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
         matches = temporal_pairs(sample, "left")
@@ -144,6 +147,11 @@ def _in_front(motions: list[FreeMotion], rows: Rows) -> list[int]:
     """Which have more than half as many points in front as any has: the twins of right motions have not."""
     fronts = [signed(each, rows)[1] for each in motions]
     return [k for k, front in enumerate(fronts) if 2 * front >= max(fronts)]
+
+
+def _turn(motion: FreeMotion, camera: PinholeCamera) -> float:
+    """Radians within a frame."""
+    return max(float(np.linalg.norm(w)) for w in (motion.w0, motion.w1)) * camera.height / camera.fy
 
 
 def _best_of(found: list[FreeMotion] | str, matches: FloatArray, rig: StereoRig) -> MotionEstimate:
