@@ -76,16 +76,20 @@ class FreeVelocitySolver(Solver):
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        matches = temporal_pairs(correspondences, "left")
+        return self._estimated(temporal_pairs(correspondences, "left"), rig, [])
+
+    def _estimated(self, matches: FloatArray, rig: StereoRig, near: list[FreeMotion]) -> MotionEstimate:
+        """From the linear solutions, those of smaller models, and motions from the first row that may be near."""
         found = self._linear(matches, rig)
         if self.refinement == "none" or len(matches) < self.least:
             return _best_of(found, matches, rig)
-        more = self.starts(Rows.of(matches, rig.camera, rig.camera.cy))
-        if isinstance(found, str) and not more:
+        middle = self.starts(Rows.of(matches, rig.camera, rig.camera.cy))
+        middle += [] if isinstance(found, str) else found
+        if isinstance(found, str) and not (middle or near):
             return MotionEstimate.failed(found)
-        begun = [_at_first_row(each, rig.camera) for each in [*more, *([] if isinstance(found, str) else found)]]
-        # Noise may have spoiled a linear solution's velocities: each starts a descent with them and one without.
+        begun = [*near, *(_at_first_row(each, rig.camera) for each in middle)]
         rows = Rows.of(matches, rig.camera, 0.0)
+        # Noise may have spoiled a linear solution's velocities: each starts a descent with them and one without.
         ends = [self._refined(each, rows, _QUICK) for each in [*begun, *(each.at_rest() for each in begun)]]
         gentle = [end for end in ends if _turn(end[0], rig.camera) < _MOST_TURN] or ends
         best = min(_in_front([end for end, _ in gentle], rows), key=lambda k: gentle[k][1])
@@ -105,14 +109,17 @@ class FreeVelocitySolver(Solver):
     ) -> MotionEstimate:
         if self.refinement == "none":
             return self.estimate(correspondences, rig, shutter)
-        rows = Rows.of(temporal_pairs(correspondences, "left"), rig.camera, 0.0)
+        matches = temporal_pairs(correspondences, "left")
+        rows = Rows.of(matches, rig.camera, 0.0)
         least = self.sample_sizes(correspondences)["left"]
         if len(rows.x) < least:
             return MotionEstimate.failed(f"{len(rows.x)} left matches, need {least}")
         rate = float(shutter.rate("left")[1]) * rig.camera.fy  # frame periods in a unit of s
         w, d = rate * motion.w, rate * motion.d
         start = FreeMotion(so3.exp(motion.w), np.array(motion.d), d, d, w, w)
-        return _reported(self._refined(start, rows, _QUICK if quick else _FULL)[0], rows)
+        if quick or len(rows.x) < self.least:
+            return _reported(self._refined(start, rows, _QUICK)[0], rows)
+        return self._estimated(matches, rig, [start])
 
     def _refined(self, start: FreeMotion, rows: Rows, most: int) -> tuple[FreeMotion, float]:
         return refine(start, rows, turning=self.turning, most=most)
