@@ -3,7 +3,7 @@
 python benchmarks/monocular.py                       # some minutes on one core
 python benchmarks/monocular.py --trials 100 --solver rs-mono-refined --solver rs-zhuang-8pt
 
-The robust loop has 200 matches and its usual options. Each solver sees exact matches of its own motion model first;
+The robust loop has 200 matches. Each solver sees exact matches of its own motion model first;
 rs-dai-linear those of `linear`, whose rotation within a frame it leaves out: on its own model it is exact, see
 tests/solvers/test_free_velocities.py. "order" is the factor by which the errors fall when the motion is halved;
 below 1e-6 deg they are rounding. The bound is of the same matches and six unknowns, or of a known rotation for the
