@@ -90,7 +90,7 @@ def _translations(F: FloatArray, R: FloatArray, degree: int) -> FloatArray:
     """t, v0 and v1 (..., 3, 3) that fit best to coefficients and a rotation (..., 3, 3), without w0 and w1."""
     basis = np.tensordot(R, _translating(degree), axes=2)
     found = np.linalg.solve(basis @ np.swapaxes(basis, -1, -2), basis @ F[..., None])
-    return np.asarray(found.reshape(*R.shape[:-2], 3, 3))
+    return np.asarray(found.reshape(*R.shape[:-2], 3, 3), dtype=np.float64)
 
 
 @functools.cache
