@@ -76,13 +76,13 @@ def rs_constraint(
     Rt0 = _apply(R, t0)
     T, p = t1 - Rt0, _apply(R, x0)
     (w0, v0), (w1, v1) = motion.velocity(tau0), motion.velocity(tau1)
-    value = np.einsum("...i,...i->...", x1, np.cross(T, p))
+    value = np.einsum("...i,...i->...", x1, so3.cross(T, p))
     gradient = _by_pixels(epipolar_gradient(hat(T) @ R, x0, x1, rig.camera), rig.camera, matches)
     # T = t1 - R t0 with dR/dtau1 = [w1]x R and dR/dtau0 = -R [w0]x.
-    T_rate1, p_rate1 = v1 - np.cross(w1, Rt0), np.cross(w1, p)
-    T_rate0, p_rate0 = _apply(R, np.cross(w0, t0) - v0), -_apply(R, np.cross(w0, x0))
+    T_rate1, p_rate1 = v1 - so3.cross(w1, Rt0), so3.cross(w1, p)
+    T_rate0, p_rate0 = _apply(R, so3.cross(w0, t0) - v0), -_apply(R, so3.cross(w0, x0))
     for columns, T_rate, p_rate in ((slice(0, 2), T_rate0, p_rate0), (slice(2, 4), T_rate1, p_rate1)):
-        rate = np.cross(T_rate, p) + np.cross(T, p_rate)
+        rate = so3.cross(T_rate, p) + so3.cross(T, p_rate)
         gradient[:, columns] += np.sum(x1 * rate, axis=-1)[:, None] * shutter.rate(side)
     return value, gradient
 
@@ -129,7 +129,7 @@ def rs_sampson_jacobian(
     T = tau1[:, None] * motion.d + offset - Rt0
     # dR = [r_j]x R for the columns r_j of a J(a w); dT = -[r_j]x R t0 for w_j and (tau1 - tau0 R) e_j for d_j.
     rotation_rate = np.swapaxes(a[:, None, None] * so3.left_jacobian(a[:, None] * motion.w), -1, -2)
-    T_by_w = -np.cross(rotation_rate, Rt0[:, None])
+    T_by_w = -so3.cross(rotation_rate, Rt0[:, None])
     E_by_w = hat(T_by_w) @ R[:, None] + hat(T)[:, None] @ hat(rotation_rate) @ R[:, None]
     T_by_d = np.swapaxes(tau1[:, None, None] * np.eye(3) - tau0[:, None, None] * R, -1, -2)
     E_by_d = hat(T_by_d) @ R[:, None]

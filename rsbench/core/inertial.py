@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rsbench.core import so3
 from rsbench.core.motion import Motion
 from rsbench.core.so3 import FloatArray
 
@@ -41,7 +42,7 @@ def inertial(motion: Motion, tau: ArrayLike, frame_period_s: float, gravity: Arr
     R, t = motion.body_from_world(tau)
     w, speed = motion.velocity(tau)
     turn_change, speed_change = motion.accelerations(tau)
-    u = speed - np.cross(w, t)
-    u_change = speed_change - np.cross(turn_change, t) - np.cross(w, speed)
-    acceleration = (np.cross(w, u) - u_change) / frame_period_s**2
+    u = speed - so3.cross(w, t)
+    u_change = speed_change - so3.cross(turn_change, t) - so3.cross(w, speed)
+    acceleration = (so3.cross(w, u) - u_change) / frame_period_s**2
     return Inertial(-w / frame_period_s, acceleration - R @ np.asarray(gravity, dtype=np.float64))

@@ -24,7 +24,7 @@ def translation_error(d_est: ArrayLike, d_gt: ArrayLike) -> FloatArray:
     NaN when the true translation is zero (the direction does not exist); pi when only the estimate is zero.
     """
     d_est, d_gt = np.asarray(d_est, dtype=np.float64), np.asarray(d_gt, dtype=np.float64)
-    sine = np.linalg.norm(np.cross(d_est, d_gt), axis=-1)
+    sine = np.linalg.norm(so3.cross(d_est, d_gt), axis=-1)
     cosine = np.sum(d_est * d_gt, axis=-1)
     error = np.arctan2(sine, cosine)
     error = np.where(np.any(d_est != 0.0, axis=-1), error, WORST_ANGLE)

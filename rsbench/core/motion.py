@@ -158,7 +158,7 @@ class TwistMotion(Motion):
 
     def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
         w, speed = self.velocity(tau)
-        return np.zeros(speed.shape), np.cross(w, speed)
+        return np.zeros(speed.shape), so3.cross(w, speed)
 
     def from_time(self, start: float) -> Motion:
         return self  # a screw looks the same from everywhere on it
@@ -248,13 +248,13 @@ class LaterMotion(Motion):
 
     def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
         w, speed = self.motion.velocity(np.asarray(tau) + self.start)
-        return w, speed + np.cross(w, self._beside(tau))
+        return w, speed + so3.cross(w, self._beside(tau))
 
     def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
         later = np.asarray(tau) + self.start
         (w, _), (turn, change) = self.motion.velocity(later), self.motion.accelerations(later)
         beside = self._beside(tau)
-        return turn, change + np.cross(turn, beside) + np.cross(w, np.cross(w, beside))
+        return turn, change + so3.cross(turn, beside) + so3.cross(w, so3.cross(w, beside))
 
     def _beside(self, tau: ArrayLike) -> FloatArray:
         """(..., 3) what the new world's origin adds to the body's translation; it turns with the body."""

@@ -38,7 +38,7 @@ class MovingObject:
         """Of ``world_from_object``, as ``Motion.velocity``."""
         R, _ = self.motion.body_from_world(tau)
         w_rate, t_rate = self.motion.velocity(tau)
-        return w_rate, t_rate - np.cross(w_rate, R @ self.pivot)
+        return w_rate, t_rate - so3.cross(w_rate, R @ self.pivot)
 
 
 def poses_of(objects: Sequence[MovingObject], tau: ArrayLike) -> Pose | None:
@@ -74,4 +74,4 @@ class RelativeMotion(Motion):
         _, place = self.body.world_from_object(tau)
         turned = (R @ own_w[..., None])[..., 0]
         carried = (R @ own_t[..., None])[..., 0]
-        return w_rate + turned, t_rate + np.cross(w_rate, (R @ place[..., None])[..., 0]) + carried
+        return w_rate + turned, t_rate + so3.cross(w_rate, (R @ place[..., None])[..., 0]) + carried

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rsbench.core import so3
 from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.se3 import Pose, transform
@@ -75,7 +76,7 @@ class _RowEquation(NamedTuple):
         rotated = (R @ X[..., None])[..., 0]
         x = rotated + t
         w_rate, t_rate = self.motion.velocity(tau)
-        x_rate = np.cross(w_rate, rotated) + t_rate
+        x_rate = so3.cross(w_rate, rotated) + t_rate
         value = self.rig.camera.project(x)[..., axis] - y
         velocity = self.rig.camera.velocity(x, x_rate)[..., axis]
         return value, self.shutter.rate(self.side)[axis] * velocity - 1.0, x

@@ -52,10 +52,10 @@ def adjoint_apply(pose: Pose, xi: FloatArray) -> FloatArray:
     """Twist (..., 6) of the motion ``xi`` seen after ``pose``: exp(Ad xi) = pose exp(xi) pose^-1."""
     w = (pose.R @ xi[..., :3, None])[..., 0]
     v = (pose.R @ xi[..., 3:, None])[..., 0]
-    return np.concatenate([w, v + np.cross(pose.t, w)], axis=-1)
+    return np.concatenate([w, v + so3.cross(pose.t, w)], axis=-1)
 
 
 def bracket(a: FloatArray, b: FloatArray) -> FloatArray:
     """Twist (..., 6) by which ``b`` changes, per unit of time, where the frame moves by the twist ``a``."""
     w, v = a[..., :3], a[..., 3:]
-    return np.concatenate([np.cross(w, b[..., :3]), np.cross(w, b[..., 3:]) + np.cross(v, b[..., :3])], axis=-1)
+    return np.concatenate([so3.cross(w, b[..., :3]), so3.cross(w, b[..., 3:]) + so3.cross(v, b[..., :3])], axis=-1)

@@ -122,13 +122,13 @@ class SplineMotion(Motion):
     def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
         (_, t), twist, _ = self._spline.at(tau)
         w = twist[..., :3]
-        return w, np.cross(w, t) + twist[..., 3:]
+        return w, so3.cross(w, t) + twist[..., 3:]
 
     def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
         (_, t), twist, change = self._spline.at(tau)
-        w, speed = twist[..., :3], np.cross(twist[..., :3], t) + twist[..., 3:]
+        w, speed = twist[..., :3], so3.cross(twist[..., :3], t) + twist[..., 3:]
         turn = change[..., :3]
-        return turn, np.cross(turn, t) + np.cross(w, speed) + change[..., 3:]
+        return turn, so3.cross(turn, t) + so3.cross(w, speed) + change[..., 3:]
 
     @property
     def parameters(self) -> dict[str, Any]:

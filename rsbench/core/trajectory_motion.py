@@ -70,14 +70,14 @@ class TrajectoryMotion(Motion):
         place, turn, speed, *_ = self._path.at(tau)
         body = inverse(place)
         t = compose(body, self._start).t
-        return -turn, -np.cross(turn, t) - (body.R @ speed[..., None])[..., 0]
+        return -turn, -so3.cross(turn, t) - (body.R @ speed[..., None])[..., 0]
 
     def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
         place, turn, speed, turn_change, speed_change = self._path.at(tau)
         body = inverse(place)
         t, (_, t_rate) = compose(body, self._start).t, self.velocity(tau)
         v, v_change = ((body.R @ each[..., None])[..., 0] for each in (speed, speed_change))
-        return -turn_change, np.cross(turn, v) - v_change - np.cross(turn_change, t) - np.cross(turn, t_rate)
+        return -turn_change, so3.cross(turn, v) - v_change - so3.cross(turn_change, t) - so3.cross(turn, t_rate)
 
     @property
     def lasts(self) -> float:
@@ -136,10 +136,10 @@ class _Path(NamedTuple):
         v, dv, dw = place[..., 3:6], rate[..., 3:6], rate[..., 6:]
         square = np.sum(place[..., 3:] ** 2, axis=-1, keepdims=True)
         # 2 q* q' of a quaternion q, whose length has no part in it.
-        turn = 2.0 * (w[..., None] * dv - dw * v - np.cross(v, dv)) / square
+        turn = 2.0 * (w[..., None] * dv - dw * v - so3.cross(v, dv)) / square
         ddv, ddw = change[..., 3:6], change[..., 6:]
         growth = 2.0 * np.sum(place[..., 3:] * rate[..., 3:], axis=-1, keepdims=True) / square
-        turn_change = 2.0 * (w[..., None] * ddv - ddw * v - np.cross(v, ddv)) / square - still * growth * turn
+        turn_change = 2.0 * (w[..., None] * ddv - ddw * v - so3.cross(v, ddv)) / square - still * growth * turn
         R = so3.from_quaternion(np.stack([w, x, y, z], axis=-1)) @ so3.exp(beyond * turn)
         moved = Pose(R, place[..., :3] + beyond * rate[..., :3])
         return Moving(moved, turn, rate[..., :3], turn_change, change[..., :3])

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from rsbench.core import so3
 from rsbench.core.lens import inverse_2x2
 from rsbench.core.rig import View
 from rsbench.core.se3 import inverse
@@ -97,7 +98,7 @@ def _moves(geometry: Geometry, view: View, tracks: Tracks, k: int, along: FloatA
     R, t = geometry.rig.cam_from_world(geometry.motion, tau, side)
     turned = (R @ tracks.points[..., None])[..., 0]
     w_rate, t_rate = geometry.motion.velocity(tau)
-    velocity = camera.velocity(turned + t, np.cross(w_rate, turned) + t_rate)
+    velocity = camera.velocity(turned + t, so3.cross(w_rate, turned) + t_rate)
     steps = R @ along
     by_plane = np.stack([camera.velocity(turned + t, steps[..., j]) for j in range(2)], axis=-1)
     late = np.eye(2) - velocity[:, :, None] * geometry.shutter.rate(side)
@@ -108,9 +109,9 @@ def _moves(geometry: Geometry, view: View, tracks: Tracks, k: int, along: FloatA
 def _plane_basis(normals: FloatArray) -> FloatArray:
     """(n, 3, 2) two orthonormal vectors on planes with normals (n, 3); any two of a plane without one."""
     least = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
-    first = np.cross(normals, least)
+    first = so3.cross(normals, least)
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    return np.stack([first, np.cross(normals, first)], axis=-1)
+    return np.stack([first, so3.cross(normals, first)], axis=-1)
 
 
 def save_affine(path: Path, affine: AffineFrames) -> None:

@@ -38,7 +38,7 @@ def reduced_blocks(pairs: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
     x, y = np.column_stack([pairs[:, :2], np.ones(n)]), np.column_stack([pairs[:, 2:4], np.ones(n)])
     k1, k3, sb = pairs[:, 4], pairs[:, 5], pairs[:, 6]
     a = k3 - k1
-    c = np.cross(x, y)
+    c = so3.cross(x, y)
     M = y[:, :, None] * x[:, None, :]
     M = M + np.swapaxes(M, 1, 2)
     by_w = (a * sb)[:, None] * np.column_stack([c[:, 2], -c[:, 1]])
@@ -57,7 +57,7 @@ def solve_reduced(pairs: FloatArray, unknowns: int, passes: int) -> tuple[FloatA
     first_E = 3 + (0 if unknowns == 9 else 2)
     w = d = np.zeros(3)
     for _ in range(passes):
-        X, reason = null_vector(np.concatenate([by_d + np.cross(w, shifted), rest], axis=1), unit_columns=True)
+        X, reason = null_vector(np.concatenate([by_d + so3.cross(w, shifted), rest], axis=1), unit_columns=True)
         if X is None:
             return reason
         d = X[:3]
@@ -84,8 +84,8 @@ def length_from_tracks(tracks: FloatArray, packed: Packed, w: FloatArray, u: Flo
     rho = tracks[:, 2] / (packed.focal[0] * packed.baseline)
     tau0, tau1 = tracks[:, 6], tracks[:, 7]
     R = so3.exp((tau1 - tau0)[:, None] * w)
-    turned = np.cross(y, (R @ x[:, :, None])[:, :, 0])
-    moved = rho[:, None] * np.cross(y, tau1[:, None] * u - tau0[:, None] * (R @ u))
+    turned = so3.cross(y, (R @ x[:, :, None])[:, :, 0])
+    moved = rho[:, None] * so3.cross(y, tau1[:, None] * u - tau0[:, None] * (R @ u))
     squares = float(np.sum(moved * moved))
     return -float(np.sum(moved * turned)) / squares if squares > 0.0 else None
 

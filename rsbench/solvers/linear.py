@@ -10,6 +10,7 @@ from typing import Literal, final
 
 import numpy as np
 
+from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -48,7 +49,7 @@ def system_rows(
     k1, k3 = shutter.pixel_time(matches[:, :2], 0, side), shutter.pixel_time(matches[:, 2:], 1, side)
     a = (k3 - k1)[:, None]
     sb = rig.offset(side)[0]
-    c = np.cross(x, y)
+    c = so3.cross(x, y)
     M = y[:, :, None] * x[:, None, :]
     by_d = a * c
     by_w = a * sb * np.stack([c[:, 2], -c[:, 1]], axis=-1)

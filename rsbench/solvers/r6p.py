@@ -111,7 +111,7 @@ class Resection(NamedTuple):
 def linear_step(data: Resection, X: FloatArray, v: FloatArray) -> FloatArray:
     """v, C, w', t' (..., 12) of points X (..., n, 3), with [w']x [v]x X frozen at v (..., 3); NaN where open."""
     X = X[..., None, :, :]
-    bent = X + np.cross(v[..., None, None, :], X)
+    bent = X + so3.cross(v[..., None, None, :], X)
     s = data.s[..., None, None]
     eye = np.broadcast_to(np.eye(3), (*data.s.shape, 3, 3))
     columns = np.concatenate([np.broadcast_to(-hat(X), eye.shape), eye, -s * hat(bent), s * eye], axis=-1)

@@ -58,7 +58,7 @@ class Uprights(NamedTuple):
             if not (len(near) and abs(near[0, 0] - frame) < 0.5 and 0.0 < length < np.inf):
                 return None
             g = near[0, 1:] / length
-            axis = np.cross(g, _DOWN)
+            axis = so3.cross(g, _DOWN)
             sine = float(np.linalg.norm(axis))
             # Where it points up, any horizontal axis is as good.
             axis = axis / sine if sine > 0.0 else np.array([1.0, 0.0, 0.0])
@@ -81,7 +81,7 @@ def best_angle(x: FloatArray, y: FloatArray) -> tuple[float, FloatArray]:
     The turned normal is ``n = a + cos b + sin c``.
     """
     flat, along = x * [1.0, 0.0, 1.0], x * _DOWN
-    parts = np.stack([np.cross(each, y) for each in (along, flat, np.cross(_DOWN, flat))])
+    parts = np.stack([so3.cross(each, y) for each in (along, flat, so3.cross(_DOWN, flat))])
     products = np.einsum("ank,bnl->abkl", parts, parts)
 
     def smallest(angle: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -70,7 +70,7 @@ class Flow(NamedTuple):
         """Z0 and Z1 (n, 9): columns of v and of the six entries of s."""
         x = self.x
         quadratic = [x[:, i] * x[:, j] * (1.0 if i == j else 2.0) for i, j in _SYMMETRIC]
-        q, c = np.stack(quadratic, axis=-1), np.cross(x, self.u)
+        q, c = np.stack(quadratic, axis=-1), so3.cross(x, self.u)
         return np.hstack([c, self.alpha[:, None] * q]), np.hstack([0.0 * c, self.alpha_k[:, None] * q])
 
 
@@ -144,7 +144,7 @@ def _fields(flow: Flow, found: Velocity) -> tuple[FloatArray, FloatArray, FloatA
     def seen(rate: FloatArray) -> FloatArray:
         return flow.focal * (rate[:, :2] - x[:, :2] * rate[:, 2:])
 
-    turned = seen(np.cross(found.w, x))
+    turned = seen(so3.cross(found.w, x))
     return flow.focal * flow.u[:, :2] - flow.beta(found.k)[:, None] * turned, seen(found.v[None]), turned
 
 
@@ -165,7 +165,7 @@ def reprojection(flow: Flow, found: Velocity) -> tuple[FloatArray, FloatArray]:
     rate[:, 0, 0], rate[:, 1, 1], rate[:, :, 2] = flow.focal[0], flow.focal[1], -flow.focal * flow.x[:, :2]
     J = np.zeros((len(flow.x), 7))
     sideways = np.einsum("ni,nij->nj", across, rate)
-    J[:, :3] = -flow.beta(found.k)[:, None] * np.cross(flow.x, sideways)
+    J[:, :3] = -flow.beta(found.k)[:, None] * so3.cross(flow.x, sideways)
     J[:, 3:6] = -(np.sum(rest * along, axis=1) / length[:, 0])[:, None] * sideways
     scale = 2.0 / (2.0 + found.k)
     by_k = scale * flow.alpha_k - flow.beta(found.k) / (2.0 + found.k)

@@ -137,3 +137,12 @@ def test_batch_axes_match_single_calls() -> None:
         singles = (one, so3.log(one), so3.left_jacobian(w[i, j]), so3.angle(one), so3.quaternion(one))
         for batch, single in zip(results, singles, strict=True):
             np.testing.assert_allclose(batch[i, j], single, rtol=0, atol=1e-15)
+
+
+@given(
+    st.integers(0, 2**32 - 1), st.sampled_from([((3,), (3,)), ((5, 3), (3,)), ((4, 1, 3), (2, 3)), ((0, 3), (3,))])
+)
+def test_cross_has_the_bits_of_numpy(seed: int, shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = (rng.normal(size=shape) for shape in shapes)
+    np.testing.assert_array_equal(so3.cross(a, b), np.cross(a, b), strict=True)

@@ -212,7 +212,7 @@ def _projection_jacobian(
     rotated = (R @ points[:, :, None])[:, :, 0]
     x = rotated + t
     w_rate, t_rate = motion.velocity(tau)
-    velocity = np.cross(w_rate, rotated) + t_rate
+    velocity = so3.cross(w_rate, rotated) + t_rate
     columns = []
     for k in range(6):
         shift = _STEP * np.eye(6)[k]

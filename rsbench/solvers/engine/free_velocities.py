@@ -94,12 +94,12 @@ def constraint(motion: FreeMotion, rows: Rows) -> tuple[FloatArray, FloatArray]:
     gradient = epipolar_gradient(hat(T) @ R, x, y, camera)
     spin0 = -(so3.exp(s1[:, None] * motion.w1) @ (motion.R @ motion.w0))  # dR/ds0 = [spin0]x R
     for column, spin, rate in (
-        (1, spin0, -Rv0 - s0[:, None] * np.cross(spin0, Rv0)),
-        (3, motion.w1, motion.v1 - s0[:, None] * np.cross(motion.w1, Rv0)),
+        (1, spin0, -Rv0 - s0[:, None] * so3.cross(spin0, Rv0)),
+        (3, motion.w1, motion.v1 - s0[:, None] * so3.cross(motion.w1, Rv0)),
     ):
-        change = np.cross(rate, p) + np.cross(T, np.cross(spin, p))
+        change = so3.cross(rate, p) + so3.cross(T, so3.cross(spin, p))
         gradient[:, column] += np.sum(y * change, axis=1) / camera.fy
-    return np.sum(y * np.cross(T, p), axis=1), gradient
+    return np.sum(y * so3.cross(T, p), axis=1), gradient
 
 
 def sampson(motion: FreeMotion, rows: Rows) -> FloatArray:
@@ -122,8 +122,8 @@ def sampson_jacobian(motion: FreeMotion, rows: Rows) -> FloatArray:
     s0, s1 = (rows.s0 - step[:, 0, 1])[:, None], (rows.s1 - step[:, 1, 1])[:, None]
     R, T = motion.between(s0[:, 0], s1[:, 0])
     A, p = so3.exp(s1 * motion.w1), (R @ x[:, :, None])[:, :, 0]
-    n = np.cross(p, y)
-    by_turn = np.cross(p, np.cross(y, T)) - s0 * np.cross(R @ motion.v0, n)  # of R, as [turn]x R
+    n = so3.cross(p, y)
+    by_turn = so3.cross(p, so3.cross(y, T)) - s0 * so3.cross(R @ motion.v0, n)  # of R, as [turn]x R
 
     def back(M: FloatArray, rows_of: FloatArray) -> FloatArray:
         return np.asarray((np.swapaxes(M, 1, 2) @ rows_of[:, :, None])[:, :, 0])

@@ -53,7 +53,7 @@ def scaled_translation(pairs: FloatArray, w: FloatArray, limit: float) -> FloatA
     n = len(pairs)
     x, y = np.column_stack([pairs[:, :2], np.ones(n)]), np.column_stack([pairs[:, 2:4], np.ones(n)])
     R = so3.exp((pairs[:, 5] - pairs[:, 4])[:, None] * w)
-    normal = np.cross((R @ x[:, :, None])[:, :, 0], y)
+    normal = so3.cross((R @ x[:, :, None])[:, :, 0], y)
     back = (np.swapaxes(R, 1, 2) @ normal[:, :, None])[:, :, 0]
     m = pairs[:, 5:6] * normal - pairs[:, 4:5] * back
     beta = pairs[:, 6] * (normal[:, 0] - back[:, 0])
