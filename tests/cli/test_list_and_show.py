@@ -232,7 +232,7 @@ def test_colours_are_left_out_where_they_are_not_wanted() -> None:
     for arguments in (("--help",), ("list", "--help"), ("list", "scenes"), ("list", "nothing")):
         result = rsbench(*arguments, NO_COLOR="1", FORCE_COLOR="1")
         assert not colour.search(result.stdout + result.stderr)
-    assert colour.search(rsbench("--help", FORCE_COLOR="1").stdout)
+    assert colour.search(rsbench("--help", FORCE_COLOR="1", TERM="xterm").stdout)
 
 
 @pytest.mark.parametrize(
