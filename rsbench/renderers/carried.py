@@ -35,7 +35,7 @@ class Placed:
         import mitsuba as mi
 
         origin = mi.Point3f(*self._turned(ray.o - mi.Vector3f(*self.pose[9:])))
-        way = mi.Vector3f(*_level(self._turned(ray.d)))
+        way = mi.Vector3f(*level(self._turned(ray.d)))
         centre, square = self.ball
         to = centre - origin
         off = dr.cross(to, way)
@@ -123,8 +123,8 @@ def hidden(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]
     return found
 
 
-def depth_and_label(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]) -> tuple[Any, Any]:
-    """Parameter of the first surface along the rays, 0 where there is none, and its label: see ``SHADED``."""
+def depth_and_label(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]) -> tuple[Any, Any, Any]:
+    """Of the first surface along rays its parameter, 0 where there is none, label (see ``SHADED``) and BSDF."""
     import drjit as dr
     import mitsuba as mi
 
@@ -135,7 +135,7 @@ def depth_and_label(scene: MitsubaScene, ray: Any, active: Any, objects: Sequenc
     for each in objects:
         shaded = shaded | each.meets(to_sun, seen & _not(shaded))
     label = dr.select(seen, nearest.label, 0)
-    return dr.select(seen, hit.t, 0), dr.select(shaded, label + SHADED, label)
+    return dr.select(seen, hit.t, 0), dr.select(shaded, label + SHADED, label), hit.bsdf()
 
 
 def _not(value: Any) -> Any:
@@ -152,7 +152,7 @@ def _either(first: Any, own: Any, other: Any) -> Any:
     return own if first else other
 
 
-def _level(direction: list[Any]) -> list[Any]:
+def level(direction: list[Any]) -> list[Any]:
     """See ``sensor.LEAST_COMPONENT``."""
     import drjit as dr
 

@@ -6,12 +6,18 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
-from rsbench.renderers.carried import Placed, first_surface, hidden
+from rsbench.renderers.carried import Placed, first_surface, hidden, level
+from rsbench.renderers.gloss import Coat, is_glossy
 from rsbench.renderers.scene import MitsubaScene
 
 
 def sunsky_radiance(
-    scene: MitsubaScene, ray: Any, active: Any = True, ways: Sequence[Any] = (), objects: Sequence[Placed] = ()
+    scene: MitsubaScene,
+    ray: Any,
+    active: Any = True,
+    ways: Sequence[Any] = (),
+    objects: Sequence[Placed] = (),
+    facet: Any = None,
 ) -> Any:
     """Radiance (RGB) along unit rays: a sun with hard shadows and a hemisphere sky on diffuse surfaces.
 
@@ -19,6 +25,9 @@ def sunsky_radiance(
     so that level ground in the open has its exact sky irradiance and a wall three fifths of it. It draws no random
     number: the same ray has the same radiance, in every renderer, process and number of threads. With ``ways``,
     points on the unit sphere, the sky's part is that of ``_seen_sky``: all is direct light as ``path`` has it.
+
+    The coat of a glossy surface mirrors the sun, and by ``facet``, a point of the unit square, what the mirrored
+    ray meets: its light without what glossy surfaces there would mirror in turn. Without ``facet``, the sun alone.
     """
     import drjit as dr
     import mitsuba as mi
@@ -42,7 +51,22 @@ def sunsky_radiance(
         ambient = sky.on_open_surface(normal)
     else:
         ambient = sky.overhead * dr.fma(dr.dot(normal, sky.up), 0.4, 0.6)
-    return dr.select(on_surface, albedo * (sun + ambient), sky.seen_along(ray.d))
+    light = dr.select(on_surface, albedo * (sun + ambient), sky.seen_along(ray.d))
+    if not scene.glossy:
+        return light
+
+    def coated(_: Any) -> Any:
+        coat = Coat(hit, normal, ray)
+        direct = dr.select(lit & ~dark if dr.is_jit_v(lit) else lit and not dark, dr.pi * sky.sun_radiance, 0)
+        found = direct * coat.share_towards(sky.sun_direction, lit) + ambient * coat.below(shiny)
+        if facet is None:
+            return found
+        mirrored, share = coat.mirrored(facet, shiny)
+        mirrored.d = mi.Vector3f(*level(list(mirrored.d)))
+        return found + share * sunsky_radiance(scene, mirrored, shiny, ways, objects)
+
+    shiny = is_glossy(hit.bsdf(), on_surface)
+    return dr.if_stmt(args=(light,), cond=shiny, true_fn=coated, false_fn=lambda plain: plain)
 
 
 _WITHIN = 0.9999

@@ -15,33 +15,34 @@ from numpy.typing import NDArray
 from rsbench.core.camera import PinholeCamera
 from rsbench.renderers.carried import Placed, depth_and_label, placed
 from rsbench.renderers.exposure import instant_of
+from rsbench.renderers.gloss import is_glossy
+from rsbench.renderers.hits import Hits
 from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.renderers.subpixel import sky_ways, subpixel_grid
+from rsbench.renderers.subpixel import facet_points, sky_ways, subpixel_grid
 
 Float32Array = NDArray[np.float32]
 
 
-def depth_rows(
-    scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]
-) -> tuple[Float32Array, NDArray[np.uint8]]:
-    """Depth z (rows, width) along the rays through pixel centres, metres, 0 = no surface; and ``Frame.labels``."""
+def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]) -> Hits:
+    """What the rays through pixel centres meet."""
     import mitsuba as mi
 
-    result = np.zeros((len(rows), camera.width), dtype=np.float32)
-    labels = np.zeros(result.shape, dtype=np.uint8)
+    depth, labels, gloss = result = Hits.none(len(rows), camera.width)
     for place, row in enumerate(rows):
         for column in range(camera.width):
             pose = column if sensor.columns else row
             ray = mi.Ray3f(*sensor.row_ray(float(column), float(row), pose))
             if scene.objects:
                 found = depth_and_label(scene, ray, True, placed(scene, sensor, pose))
-                result[place, column], labels[place, column] = found
+                depth[place, column], labels[place, column], bsdf = found
             else:
                 hit = scene.scene.ray_intersect_preliminary(ray)
-                result[place, column] = hit.t if hit.is_valid() else 0.0
-    return result, labels
+                depth[place, column] = hit.t if hit.is_valid() else 0.0
+                bsdf = hit.shape.bsdf() if hit.is_valid() else None
+            gloss[place, column] = bsdf is not None and is_glossy(bsdf, True)
+    return result
 
 
 def radiance_rows(
@@ -80,7 +81,8 @@ def _sunsky(
     import mitsuba as mi
 
     ways = [mi.Vector3f(*way) for way in _ways(options.samples, options.sky_rays)[sample]]
-    return sunsky_radiance(scene, mi.Ray3f(origin, dr.normalize(direction)), ways=ways, objects=objects)
+    facet = mi.Point2f(facet_points(options.samples)[sample].tolist()) if scene.glossy else None
+    return sunsky_radiance(scene, mi.Ray3f(origin, dr.normalize(direction)), True, ways, objects, facet)
 
 
 @cache

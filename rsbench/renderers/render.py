@@ -19,6 +19,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
+from rsbench.renderers.hits import Hits
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.renderers.sensor import make_sensor, object_tables, pose_table
@@ -37,6 +38,8 @@ class Frame:
     """(rows, width) z in the camera of the row, metres, at pixel centres; 0 = no surface."""
     labels: NDArray[np.uint8]
     """(rows, width) number of the object that moves and is seen there, 0 = none; see ``carried.SHADED``."""
+    gloss: NDArray[np.bool_]
+    """(rows, width) whether the surface is glossy that the ray through the pixel's centre meets."""
 
 
 class Poses(NamedTuple):
@@ -132,8 +135,7 @@ def _single_pass(
     tracer = _tracer()
     image_sensor, row_sensor = (make_sensor(camera, *each, columns=columns) for each in (image_poses, row_poses))
     image = tracer.radiance_rows(scene, image_sensor, camera, rows, options)
-    depth, labels = tracer.depth_rows(scene, row_sensor, camera, rows)
-    return Frame(image=image, depth=depth, labels=labels)
+    return Frame(image=image, **tracer.depth_rows(scene, row_sensor, camera, rows)._asdict())
 
 
 def _stitched(
@@ -158,8 +160,7 @@ def _stitched(
         for each in (image_poses, row_poses)
     ]
     image = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
-    depth = np.zeros((len(rows), camera.width), dtype=np.float32)
-    labels = np.zeros(depth.shape, dtype=np.uint8)
+    hits = Hits.none(len(rows), camera.width)
     for place, line in enumerate(range(camera.width) if columns else rows):
         for sensor, own in zip(sensors, tables, strict=True):
             one, *others = (np.repeat(each[..., line : line + 1, :], each.shape[-2], axis=-2) for each in own)
@@ -167,13 +168,14 @@ def _stitched(
             sensor.set_objects(others)
         traced = rows if columns else range(camera.height) if options.full_frames else [line]
         gs_image = tracer.radiance_rows(scene, sensors[0], camera, traced, options)
-        gs_depth, gs_labels = tracer.depth_rows(scene, sensors[1], camera, traced)
+        gs_hits = tracer.depth_rows(scene, sensors[1], camera, traced)
         kept = line if options.full_frames else 0
         to, of = (np.s_[:, line], np.s_[:, line]) if columns else (np.s_[place], np.s_[kept])
-        image[to], depth[to], labels[to] = gs_image[of], gs_depth[of], gs_labels[of]
+        for result, whole in zip((image, *hits), (gs_image, *gs_hits), strict=True):
+            result[to] = whole[of]
         if on_gs_frame is not None:
             on_gs_frame(line, gs_image)
-    return Frame(image=image, depth=depth, labels=labels)
+    return Frame(image=image, **hits._asdict())
 
 
 def _check_objects(scene: MitsubaScene, objects: Pose | None, options: RendererOptions) -> None:

@@ -16,6 +16,8 @@ from rsbench.renderers.backend import start_backend
 from rsbench.scenes.environment import irradiance_map
 from rsbench.scenes.model import Environment, Light, Material, Scene, SceneMesh
 
+COAT_INDEX = 1.5
+"""Refractive index of the clear coat of glossy surfaces: glass, lacquer, and what glTF means."""
 _SLACK = 1e-3
 _SKY_ROWS = 64  # of the sky map that `path` samples; the sky is linear in the sine of the elevation
 
@@ -46,6 +48,8 @@ class MitsubaScene:
             content["sky"] = _mapped(scene.light.environment.radiance, scene.light.environment)
         elif any((*scene.light.sky_zenith, *scene.light.sky_horizon)):
             content["sky"] = _sky(scene.light)
+        self.glossy = scene.glossy
+        """Whether any surface is."""
         materials: dict[int, Any] = {}
         self.instances = [{"name": mesh.name, "material": mesh.material.name} for mesh in drawn]
         """Of the meshes with faces; the shapes of the renderer are called mesh00000 and so on."""
@@ -204,7 +208,7 @@ def _mapped(radiance: NDArray[np.float32], environment: Environment) -> dict[str
 
 
 def _loaded(material: Material) -> Any:
-    """Mitsuba's twosided diffuse BSDF of a material.
+    """Mitsuba's twosided BSDF of a material: diffuse, or diffuse below a clear coat.
 
     Dr.Jit pads a texture to four channels at its first use and only then drops the original; used one by one, the
     textures of a scene take a third less memory at the peak than all at once in the first image.
@@ -217,7 +221,17 @@ def _loaded(material: Material) -> Any:
         reflectance = {"type": "rgb", "value": srgb_to_linear(material.colour).tolist()}
     else:
         reflectance = _texture(material)
-    bsdf = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}})
+    inner: dict[str, Any] = {"type": "diffuse", "reflectance": reflectance}
+    if material.roughness is not None:
+        inner = {
+            "type": "roughplastic",
+            "distribution": "ggx",
+            "alpha": material.roughness**2,
+            "int_ior": COAT_INDEX,
+            "ext_ior": 1.0,
+            "diffuse_reflectance": reflectance,
+        }
+    bsdf = mi.load_dict({"type": "twosided", "bsdf": inner})
     if material.texture is not None and dr.is_jit_v(mi.Float):
         dr.eval(bsdf.eval_diffuse_reflectance(dr.zeros(mi.SurfaceInteraction3f)))
         give_back_memory()

@@ -37,6 +37,14 @@ def sky_ways(samples: int, rays: int) -> NDArray[np.float32]:
     return points.reshape(rays, samples, 3).swapaxes(0, 1)[np.arange(samples) * golden_step(samples) % samples]
 
 
+def facet_points(samples: int) -> NDArray[np.float32]:
+    """Points (samples, 2) in the unit square, one for each sample of a pixel; of a single one the middle.
+
+    Those of the sub-pixel grid, in another order: no side of a pixel has the facets of one side.
+    """
+    return subpixel_grid(samples)[np.arange(samples) * golden_step(samples) % samples] + np.float32(0.5)
+
+
 def golden_step(count: int) -> int:
     """Coprime with ``count`` and near its golden section: neighbours are brought far apart."""
     golden = round(0.618 * count)

@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from rsbench.core.camera import PinholeCamera
 from rsbench.renderers.carried import depth_and_label, placed
 from rsbench.renderers.exposure import instant_of
+from rsbench.renderers.gloss import is_glossy
+from rsbench.renderers.hits import Hits
 from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.renderers.subpixel import sky_ways, subpixel_grid
+from rsbench.renderers.subpixel import facet_points, sky_ways, subpixel_grid
 
 PACKET = 16
 """Lanes that are traced together at most (AVX-512)."""
@@ -81,32 +83,32 @@ def _bands(rows: Sequence[int], width: int) -> Iterator[Sequence[int]]:
         yield rows[start : start + step]
 
 
-def depth_rows(
-    scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]
-) -> tuple[Float32Array, NDArray[np.uint8]]:
-    """Depth z (rows, width) along the rays through pixel centres, metres, 0 = no surface; and ``Frame.labels``."""
+def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]) -> Hits:
+    """What the rays through pixel centres meet."""
     import drjit as dr
     import mitsuba as mi
 
-    result = np.zeros((len(rows), camera.width), dtype=np.float32)
-    labels = np.zeros(result.shape, dtype=np.uint8)
+    result = Hits.none(len(rows), camera.width)
     done = 0
     for band in _bands(rows, camera.width):
         lanes = _Lanes.of(band, camera.width)
         ray = mi.Ray3f(
             *sensor.row_ray(mi.Float(lanes.column), mi.Float(lanes.row), lanes.line(sensor), lanes.active)
         )
-        here = slice(done, done + len(band))
         if scene.objects:
             objects = placed(scene, sensor, lanes.line(sensor), lanes.active)
-            found = lanes.image([*depth_and_label(scene, ray, lanes.active, objects)], camera.width)
-            result[here], labels[here] = found[0, :, :, 0], found[0, :, :, 1].astype(np.uint8)
+            depth, label, bsdf = depth_and_label(scene, ray, lanes.active, objects)
+            found = {"depth": depth, "labels": label}
         else:
             hit = scene.scene.ray_intersect_preliminary(ray, coherent=True, active=lanes.active)
-            depth = dr.select(hit.is_valid(), hit.t, 0)
-            result[here] = lanes.image([depth], camera.width)[0, :, :, 0]
+            found, bsdf = {"depth": dr.select(hit.is_valid(), hit.t, 0)}, hit.shape.bsdf()
+        if scene.glossy:
+            found["gloss"] = dr.select(is_glossy(bsdf, lanes.active), mi.UInt32(1), 0)
+        values = lanes.image([*found.values()], camera.width)[0]
+        for number, name in enumerate(found):
+            getattr(result, name)[done : done + len(band)] = values[..., number]
         done += len(band)
-    return result, labels
+    return result
 
 
 def radiance_rows(
@@ -146,6 +148,7 @@ def _sunsky_band(
     grid = mi.Float(subpixel_grid(options.samples).ravel())
     count, rays = dr.opaque(mi.UInt32, options.samples), options.sky_rays
     table = mi.Float(sky_ways(options.samples, rays).ravel()) if rays else None
+    facets = mi.Float(facet_points(options.samples).ravel()) if scene.glossy else None
     x, y = mi.Float(lanes.column), mi.Float(lanes.row)
     pixel = None if sensor.lens is None else sensor.lens.pixel(x, y, lanes.active)
     still = placed(scene, sensor, lanes.line(sensor), lanes.active) if sensor.instants == 1 else None
@@ -157,7 +160,8 @@ def _sunsky_band(
         ray = mi.Ray3f(origin, dr.normalize(direction))
         ways = [_entry(table, k * rays + j) for j in range(rays)]
         objects = placed(scene, sensor, pose, lanes.active) if still is None else still
-        return k + 1, total + sunsky_radiance(scene, ray, lanes.active, ways, objects)
+        facet = None if facets is None else mi.Point2f(*(dr.gather(mi.Float, facets, 2 * k + j) for j in (0, 1)))
+        return k + 1, total + sunsky_radiance(scene, ray, lanes.active, ways, objects, facet)
 
     _, total = dr.while_loop(
         state=(dr.zeros(mi.UInt32, dr.width(lanes.row)), dr.zeros(mi.Color3f, dr.width(lanes.row))),

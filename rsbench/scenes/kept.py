@@ -123,7 +123,8 @@ def _unpacked(arrays: Any) -> Iterator[SceneMesh]:
     materials = []
     for number, found in enumerate(content["materials"]):
         texture = arrays[f"texture-{number}"] if found["texture"] else None
-        materials.append(Material(name=found["name"], colour=tuple(found["colour"]), texture=texture))
+        parts: dict[str, Any] = {**found, "colour": tuple(found["colour"]), "texture": texture}
+        materials.append(Material(**parts))
     for number, found in enumerate(content["meshes"]):
         own = {name: arrays[f"{name}-{number}"] for name in _ARRAYS if f"{name}-{number}" in arrays}
         yield SceneMesh(name=found["name"], material=materials[found["material"]], **own)

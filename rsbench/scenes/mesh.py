@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ from rsbench.imports import in_words
 from rsbench.reading import FILE_BYTES, check_amount, check_size
 from rsbench.scenes.gltf import TextureTransform
 from rsbench.scenes.mesh_limits import check_mesh_file
-from rsbench.scenes.model import FloatArray, Material, SceneBuilder, SceneMesh
+from rsbench.scenes.model import ROUGHEST, SMOOTHEST, FloatArray, Material, SceneBuilder, SceneMesh
 from rsbench.scenes.staging import box_of, standing, surroundings
 
 # Rows turn file axes into a right-handed frame with z up.
@@ -49,6 +49,8 @@ class MeshBuilder(SceneBuilder):
     shading: Literal["flat", "smooth"] = "flat"
     transparent: Literal["refuse", "opaque"] = "refuse"
     """What becomes of surfaces that the file cuts out or blends by an alpha: only opaque ones can be rendered."""
+    gloss: Literal["none", "file"] = "none"
+    """``file``: surfaces are as glossy as a glTF's roughness says, see ``_roughness``; ``none``: diffuse."""
 
     size: float | None = None
     """Longest side of the model's box, metres, whatever its units are."""
@@ -99,7 +101,13 @@ class MeshBuilder(SceneBuilder):
         angle = np.deg2rad(self.heading_deg)
         heading = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
         axes = self.metres_per_unit * heading @ _Z_UP[self.up_axis]
-        look = _Look(shading=self.shading, transparent=self.transparent, transforms=transforms, materials={})
+        look = _Look(
+            shading=self.shading,
+            transparent=self.transparent,
+            gloss=self.gloss,
+            transforms=transforms,
+            materials={},
+        )
         meshes = []
         for node in sorted(model.graph.nodes_geometry):
             transform, name = model.graph[node]
@@ -117,6 +125,7 @@ class _Look:
 
     shading: str
     transparent: str
+    gloss: str
     transforms: dict[str, TextureTransform]
     materials: dict[int, Material]
     """Made so far, by the identity of what trimesh read."""
@@ -222,7 +231,9 @@ def _scene_mesh(
     uv = getattr(part.visual, "uv", None)
     if id(source) not in look.materials:
         _check_alpha(source, where, look.transparent)
-        look.materials[id(source)] = _material(source, where, list(look.materials.values()))
+        material = _material(source, where, list(look.materials.values()))
+        roughness = _roughness(source, where) if look.gloss == "file" else None
+        look.materials[id(source)] = replace(material, roughness=roughness)
     material = look.materials[id(source)]
     if material.texture is not None and (uv is None or not np.isfinite(uv).all()):
         raise RsbenchError(f"{where} has a texture but no finite texture coordinates")
@@ -270,7 +281,7 @@ def _check_alpha(source: Any, where: str, transparent: str) -> None:
 
 
 def _material(source: Any, where: str, others: list[Material]) -> Material:
-    """Diffuse part of a glTF or MTL material; everything else that a material may say is left out."""
+    """Diffuse part of a glTF or MTL material; all else that it may say is left out, or ``_roughness``."""
     if source is None:
         return Material(name="plain")
     if isinstance(source, trimesh.visual.material.MultiMaterial):
@@ -288,6 +299,31 @@ def _material(source: Any, where: str, others: list[Material]) -> Material:
         r, g, b = (float(value) for value in _to_srgb(linear))
         return Material(name=name, colour=(r, g, b))
     return Material(name=name, texture=_texture(image, linear, where, others))
+
+
+def _roughness(source: Any, where: str) -> float | None:
+    """Of a glTF material, no less than the smoothest; above the roughest, and of other files, None: diffuse.
+
+    Raises:
+        RsbenchError: metal, or a map: a coat has one roughness, and what is below it is diffuse.
+    """
+    if not isinstance(source, trimesh.visual.material.PBRMaterial):
+        return None
+    if source.metallicRoughnessTexture is not None:
+        raise RsbenchError(
+            f'{where} has a map of roughness, and gloss = "file" takes one number for each material: export it '
+            "without, or leave gloss out"
+        )
+    # What a file does not state is 1, by glTF's specification.
+    metal, roughness = (
+        1.0 if each is None else float(each) for each in (source.metallicFactor, source.roughnessFactor)
+    )
+    if metal > 0.0:
+        raise RsbenchError(
+            f'{where} is metal (metallicFactor = {metal:g}), and gloss = "file" takes clear coats on diffuse '
+            "surfaces only: set it to 0, or leave gloss out"
+        )
+    return max(roughness, SMOOTHEST) if roughness <= ROUGHEST else None
 
 
 def _texture(image: Any, factor: FloatArray, where: str, others: list[Material]) -> NDArray[np.uint8]:

@@ -20,19 +20,36 @@ from rsbench.core import so3
 from rsbench.errors import RsbenchError
 
 FloatArray = NDArray[np.float64]
+SMOOTHEST, ROUGHEST = 0.05, 0.5
+"""Of glossy surfaces. A mirror's picture of the sun is a point that no pixel can show; and above a half the model,
+which follows no light from facet to facet, loses more than it mirrors: that is paint, and diffuse."""
 _UNIT = 1e-6
 """Quaternions may be longer or shorter than 1 by this much: rounding in a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """A diffuse surface, visible from both sides."""
+    """A diffuse surface, visible from both sides; glossy where it has a ``roughness``.
+
+    Raises:
+        RsbenchError: ``roughness`` is out of its range.
+    """
 
     name: str
     colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
     """sRGB reflectance in [0, 1]; multiplies nothing when ``texture`` is given."""
     texture: NDArray[np.uint8] | None = None
     """(h, w, 3) sRGB, repeated in both directions; row 0 is the top, uv v points up."""
+    roughness: float | None = None
+    """None: diffuse. Else in [0.05, 0.5], as of glTF: below a clear coat of refractive index 1.5, whose facets are
+    spread by the law of Trowbridge and Reitz (GGX) with alpha = roughness squared."""
+
+    def __post_init__(self) -> None:
+        if self.roughness is not None and not SMOOTHEST <= self.roughness <= ROUGHEST:
+            raise RsbenchError(
+                f"material {self.name!r}: roughness = {self.roughness}: allowed are {SMOOTHEST} to {ROUGHEST}; "
+                "without one it is diffuse"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,6 +166,11 @@ class Scene:
     meshes: tuple[SceneMesh, ...]
     light: Light
     viewpoints: dict[str, Viewpoint] = field(default_factory=dict)
+
+    @property
+    def glossy(self) -> bool:
+        """Whether any surface is."""
+        return any(mesh.material.roughness is not None for mesh in self.meshes if mesh.faces.size)
 
     def seen_from(self, viewpoint: Viewpoint, start: Start | None = None) -> Scene:
         """The same scene in the world frame whose origin and axes are the body at time 0."""

@@ -27,12 +27,18 @@ class Recipe:
     metres: float | None
     """What one repeat of the texture covers; None: the texture fits its part exactly."""
     pixels: int
+    roughness: float | None
+    """Of a glossy surface, as ``Material`` has it."""
 
 
 def _recipe(
-    paint: Callable[..., Bytes], metres: float | None = 8.0, pixels: int = 1024, **settings: Any
+    paint: Callable[..., Bytes],
+    metres: float | None = 8.0,
+    pixels: int = 1024,
+    roughness: float | None = None,
+    **settings: Any,
 ) -> Recipe:
-    return Recipe(partial(paint, **settings), metres, pixels)
+    return Recipe(partial(paint, **settings), metres, pixels, roughness)
 
 
 def paint_palette(names: Iterable[str], seed: int) -> dict[str, Surface]:
@@ -44,7 +50,7 @@ def paint_palette(names: Iterable[str], seed: int) -> dict[str, Surface]:
         rng = np.random.default_rng((seed, zlib.crc32(name.encode())))
         texture = recipe.paint(Painter(rng, noise, recipe.metres or 1.0, recipe.pixels))
         repeat = None if recipe.metres is None else (recipe.metres, recipe.metres)
-        return Surface(Material(name=name, texture=texture), repeat)
+        return Surface(Material(name=name, texture=texture, roughness=recipe.roughness), repeat)
 
     chosen = sorted(set(names))
     with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
@@ -104,6 +110,9 @@ RECIPES: dict[str, Recipe] = {
         s.leaves, 2.0, 512, greens=((0.75, 0.2, 0.25), (0.35, 0.45, 0.2), (0.9, 0.6, 0.5)), size=0.05
     ),
     "glass": _recipe(s.glass, 4.0),
+    "pane": _recipe(
+        s.speckled, 4.0, 512, roughness=0.1, colours=((0.07, 0.08, 0.09), (0.17, 0.16, 0.14)), contrast=0.2
+    ),
     "water": _recipe(s.speckled, 4.0, 512, colours=((0.16, 0.25, 0.27), (0.40, 0.48, 0.48)), contrast=0.3),
     "cloth_0": _recipe(s.cloth, 4.0, stripes=((0.66, 0.16, 0.14), (0.86, 0.80, 0.66)), width=0.28),
     "cloth_1": _recipe(s.cloth, 4.0, stripes=((0.20, 0.36, 0.50), (0.85, 0.82, 0.74)), width=0.24),

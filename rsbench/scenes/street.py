@@ -1,7 +1,7 @@
 """A street canyon: tall facades with rows of equal windows on both sides, shops, balconies, parked cars.
 
-It runs along y from -14 to 62 m, 13 m between the facades; the roadway is z = 0. The default viewpoint
-looks along +y.
+Windows and panes mirror the other side and the sky. It runs along y from -14 to 62 m, 13 m between the facades;
+the roadway is z = 0. The default viewpoint looks along +y.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def _by_surface(pieces: list[Piece]) -> list[Piece]:
 def _window(width: float, height: float) -> list[Piece]:
     """Two sashes behind the wall's front, a surround and a sill, for an opening that stands on z = 0."""
     w, h = width / 2, height
-    pieces = [box("glass", (-w - 0.05, 0.2, -0.05), (w + 0.05, 0.24, h + 0.05))]
+    pieces = [box("pane", (-w - 0.05, 0.2, -0.05), (w + 0.05, 0.24, h + 0.05))]
     pieces += [box("enamel", (x - 0.04, 0.13, -0.02), (x + 0.04, 0.22, h + 0.02)) for x in (-w, 0.0, w)]
     pieces += [box("enamel", (-w, 0.14, z - 0.04), (w, 0.21, z + 0.04)) for z in (0.0, 0.66 * h, h)]
     pieces += [box("stone", (side * (w + 0.16), -0.05, 0.0), (side * (w - 0.01), 0.12, h)) for side in (-1, 1)]
@@ -131,7 +131,7 @@ def _shop(rng: np.random.Generator, width: float) -> list[Piece]:
     bays = max(2, int(width / 3.4))
     step = width / bays
     colour = str(rng.choice(["paint_red", "paint_blue", "paint_sage"]))
-    pieces = [box("glass", (-width / 2 + 0.1, 0.42, 0.5), (width / 2 - 0.1, 0.47, 3.2))]
+    pieces = [box("pane", (-width / 2 + 0.1, 0.42, 0.5), (width / 2 - 0.1, 0.47, 3.2))]
     pieces.append(box("stone", (-width / 2 + 0.1, 0.36, -0.2), (width / 2 - 0.1, 0.6, 0.52), turned=True))
     pieces.append(box(colour, (-width / 2 + 0.02, 0.02, 3.1), (width / 2 - 0.02, 0.6, 3.95), turned=True))
     for k in range(bays + 1):
@@ -196,7 +196,7 @@ def _car(colour: str) -> list[Piece]:
     cabin = [(-1.8, 0.88), (1.15, 0.84), (0.45, 1.38), (-1.3, 1.4)]
     roof = [(-1.25, 1.37), (0.42, 1.36), (0.4, 1.44), (-1.2, 1.45)]
     pieces: list[Piece] = []
-    for surface, outline, width in ((colour, side, 1.75), ("soot", cabin, 1.5), (colour, roof, 1.46)):
+    for surface, outline, width in ((colour, side, 1.75), ("pane", cabin, 1.5), (colour, roof, 1.46)):
         pieces += placed([panel(surface, outline, width)], (0, -width / 2, 0))
     rim = [(0.0, -0.1), (0.31, -0.1), (0.31, 0.1), (0.0, 0.1)]
     for x in (-1.3, 1.3):
