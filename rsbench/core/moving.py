@@ -40,6 +40,11 @@ class MovingObject:
         w_rate, t_rate = self.motion.velocity(tau)
         return w_rate, t_rate - so3.cross(w_rate, R @ self.pivot)
 
+    def from_time(self, start: float, body: Pose) -> MovingObject:
+        """The same seen from a later time, which is its time 0, in the world that is the rig's ``body`` then."""
+        motion = TurnedMotion(self.motion.from_time(start), body.R)
+        return MovingObject(body.R @ self.pivot + body.t, motion)
+
 
 def poses_of(objects: Sequence[MovingObject], tau: ArrayLike) -> Pose | None:
     """``world_from_object`` (objects, ..., 3, 3), (objects, ..., 3) at times (...); None where there are none."""
@@ -47,6 +52,30 @@ def poses_of(objects: Sequence[MovingObject], tau: ArrayLike) -> Pose | None:
         return None
     poses = [each.world_from_object(tau) for each in objects]
     return Pose(np.stack([each.R for each in poses]), np.stack([each.t for each in poses]))
+
+
+@final
+@dataclass(frozen=True, eq=False, init=False)
+class TurnedMotion(Motion):
+    """Another motion told in turned axes: R(tau) and t(tau) become ``A R A^T`` and ``A t``."""
+
+    name: ClassVar[str] = "turned"
+    motion: Motion
+    axes: FloatArray
+    """A (3, 3): turned from the axes of ``motion``."""
+
+    def __init__(self, motion: Motion, axes: FloatArray) -> None:
+        super().__init__(axes @ motion.w, axes @ motion.d)
+        object.__setattr__(self, "motion", motion)
+        object.__setattr__(self, "axes", axes)
+
+    def body_from_world(self, tau: ArrayLike) -> Pose:
+        R, t = self.motion.body_from_world(tau)
+        return Pose(self.axes @ R @ self.axes.T, t @ self.axes.T)
+
+    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        w_rate, t_rate = self.motion.velocity(tau)
+        return w_rate @ self.axes.T, t_rate @ self.axes.T
 
 
 @final

@@ -29,7 +29,7 @@ from rsbench.imports import search
 from rsbench.reading import check_name, check_size
 from rsbench.renderers.electrons import Sensor, check_brightness
 from rsbench.scenes.model import Start
-from rsbench.shutters import with_shutter
+from rsbench.shutters import with_shutters
 
 Twin = Literal["first", "middle", "last"]
 
@@ -138,7 +138,7 @@ class DatasetCard(Scanning):
         for sequence in self.sequence:
             self.rig_of(sequence)
             self._check_times(sequence)
-            check_moving(sequence.moving, self.channels, self.frames)
+            check_moving(sequence.moving, self.channels)
         if len(set(self.channels)) < len(self.channels):
             raise ValueError(f"channels = {list(self.channels)}: must differ from each other")
         check_channels(self.channels, self.camera.lens is not None, self.plain)
@@ -292,15 +292,17 @@ class DatasetCard(Scanning):
         """A card that says all that it will make: one sequence per seed and part of a way, random axes drawn.
 
         Args:
-            folder: of the card, where the file of a trajectory is looked for.
+            folder: of the card, where the files of a trajectory and of moving meshes are looked for.
 
         Raises:
             RsbenchError: the file of a trajectory is wrong.
+            ValueError: a motion is given for a shorter time than the frames take.
         """
         seeds: tuple[int | None, ...] = self.seeds or (None,)
         made = [each for sequence in self.sequence for seed in seeds for each in self._variants(sequence, seed)]
         if self.trajectory is not None:
             made = [each for sequence in made for each in self._followed(sequence, self.trajectory, folder)]
+        made = [replace(each, moving=tuple(thing.found(folder) for thing in each.moving)) for each in made]
         return replace(self, sequence=tuple(made), grid={}, trajectory=None, seeds=())
 
     def _variants(self, sequence: SequenceCard, seed: int | None) -> list[SequenceCard]:
@@ -314,7 +316,8 @@ class DatasetCard(Scanning):
                 varied = variation.of(varied)
             moved = (label for label, variation in values if variation.motion is not None)
             named = "-".join((sequence.name, *moved, *ending))
-            things = drawn(varied.moving, self.seed_of(varied), named)
+            lasting = None if self.frames == len(FRAMES) else self._span(varied)[1]
+            things = drawn(varied.moving, self.seed_of(varied), named, lasting)
             made.append(self._scaled(self._drawn(replace(varied, moving=things), named)))
         return made
 
@@ -378,21 +381,4 @@ def load_dataset_card(
 def read_dataset_card(path: Path) -> DatasetCard:
     """A dataset card as it stands in its file, nothing drawn; raises as ``load_dataset_card``."""
     search(path)
-    return parse_card(DatasetCard, _with_shutters(read_toml(path), str(path)), str(path))
-
-
-def _with_shutters(card: dict[str, Any], where: str) -> dict[str, Any]:
-    """The content of a card in which every ``shutter`` is replaced by what it means; what is wrong stays so."""
-
-    def meant(value: Any) -> Any:
-        return with_shutter(value, where) if isinstance(value, dict) else value
-
-    def values(axis: Any) -> Any:
-        return {key: meant(value) for key, value in axis.items()} if isinstance(axis, dict) else axis
-
-    card = with_shutter(card, where)
-    if isinstance(sequences := card.get("sequence"), list):
-        card["sequence"] = [meant(sequence) for sequence in sequences]
-    if isinstance(grid := card.get("grid"), dict):
-        card["grid"] = {name: values(axis) for name, axis in grid.items()}
-    return card
+    return parse_card(DatasetCard, with_shutters(read_toml(path), str(path)), str(path))

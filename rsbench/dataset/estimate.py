@@ -91,7 +91,8 @@ def _of_kind(
     card: DatasetCard, sequences: list[SequenceCard], options: RendererOptions, scene: MitsubaScene, warm: bool
 ) -> Estimate:
     """Of sequences of one sensor; its first image compiles, which is counted once."""
-    own = files_of(card.manifest_of(sequences[0]))
+    glossy: dict[str, bool] = {"glossy": True} if scene.glossy else {}
+    own = files_of(card.manifest_of(sequences[0]) | glossy)
     with tempfile.TemporaryDirectory(prefix="rsbench-") as temporary:
         for folder in {Path(name).parent for name in own}:
             (Path(temporary) / folder).mkdir(parents=True, exist_ok=True)

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MATCH_SETS = ("left", "right", "stereo_0", "stereo_1", "tracks")
+_SET = 255
+"""In a mask."""
 POSE_COLUMNS = "row,tau,qw,qx,qy,qz,tx,ty,tz"
 
 
@@ -122,6 +124,23 @@ def read_grey_png(path: Path, size: tuple[int, int] | None = None, bits: Literal
     if pixels is None or pixels.dtype != np.dtype(f"uint{bits}") or pixels.ndim != 2:
         raise RsbenchError(f"{path}: must be a grey image of {bits} bits")
     return np.asarray(pixels)
+
+
+def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
+    """Grey PNG of 8 bits: 255 where the mask (H, W) is set, 0 elsewhere."""
+    write_png(path, np.where(mask, np.uint8(_SET), np.uint8(0)))
+
+
+def read_mask(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
+    """Mask (H, W); ``size`` as of ``read_png``.
+
+    Raises:
+        RsbenchError: as of ``read_grey_png``, or values other than 0 and 255.
+    """
+    values = read_grey_png(path, size)
+    if not np.isin(values, (0, _SET)).all():
+        raise RsbenchError(f"{path}: must hold 0 and {_SET} alone")
+    return np.asarray(values > 0)
 
 
 def write_depth(path: Path, depth: NDArray[np.float32]) -> None:

@@ -24,12 +24,12 @@ from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.se3 import Pose
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channel_writer import write_channels
-from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_png, write_poses
+from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_mask, write_png, write_poses
 from rsbench.dataset.hashes import HASHES, FileHashes
 from rsbench.dataset.layout import clean_file, files_of, is_of_sequence
 from rsbench.dataset.manifest import Files, write_manifest
 from rsbench.dataset.matches import Matching
-from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
+from rsbench.dataset.scene_hashes import SceneHashes, hashes_of_meshes, mesh_file_hash, scene_hash
 from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.dataset.shots import Geometry, Shot
 from rsbench.dataset.stage import Build, Built, Stage
@@ -93,7 +93,11 @@ def generate_dataset(
     if "matches" in card.channels:
         load_features((card.matches or Matching()).features)  # before hours of rendering
     scenes = lru_cache(maxsize=None)(_scene_card)
-    plans = {each.name: _plan(card, each, options, scenes(each.scene)) for each in card.sequence}
+    mesh_hash = lru_cache(maxsize=None)(mesh_file_hash)
+    plans = {
+        each.name: _plan(card, each, options, scenes(each.scene)) | hashes_of_meshes(each.moving, mesh_hash)
+        for each in card.sequence
+    }
     with workplace(out) as hidden:
         # Of this run alone, and the last one only: a scene takes hundreds of MB, and its card may change.
         build = lru_cache(maxsize=1)(build_scene)
@@ -163,6 +167,11 @@ def _of_scene(plan: Plan, sha256: str) -> Plan:
     return plan | {"scene": plan["scene"] | {"sha256": sha256}}
 
 
+def _with_gloss(plan: Plan, glossy: bool) -> Plan:
+    """What only the scene says: whether any of its surfaces is glossy."""
+    return plan | {"glossy": True} if glossy else plan
+
+
 def _listed(values: dict[str, Any]) -> dict[str, Any]:
     return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
@@ -179,7 +188,7 @@ def _complete(
             f"{folder}: holds no sequence.json, so rsbench did not make it; move it away or choose another --out"
         )
     manifest = read_json(folder / "sequence.json")
-    expected = dict.fromkeys(("sensor", "channels", "imu", "matches", "twins", "frames", "moving"))
+    expected = dict.fromkeys(("sensor", "channels", "imu", "matches", "twins", "frames", "moving", "meshes"))
     expected |= _of_scene(plan, scene_hashes.of(sequence.scene))
     other = [key for key, value in expected.items() if manifest.get(key) != value]
     if other:
@@ -191,7 +200,7 @@ def _complete(
     files = {name: hashes.of(f"{sequence.name}/{name}") for name in listed if is_of_sequence(name)}
     damaged = [
         name
-        for name in {**dict.fromkeys(files_of(plan)), **listed}
+        for name in {**dict.fromkeys(files_of(_with_gloss(plan, manifest.get("glossy") is True))), **listed}
         if (found := files.get(name)) is None or found.sha256 != listed.get(name)
     ]
     if damaged:
@@ -238,14 +247,11 @@ def _render_all(
         return
     jobs = [(sequence, plans[sequence.name]) for sequence in todo]
     threads = max(1, (os.cpu_count() or 1) // workers)
-    found = finished_jobs(_serve_renders, jobs, workers, {}, card, options, out, threads, name=_job_name)
+    given = card, options, out, threads
+    found = finished_jobs(_serve_renders, jobs, workers, {}, *given, name=lambda job: f"sequence {job[0].name}")
     with closing(found):
         for (sequence, _), _ in found:
             yield sequence.name, steps_of(card)
-
-
-def _job_name(job: tuple[SequenceCard, Plan]) -> str:
-    return f"sequence {job[0].name}"
 
 
 def _serve_renders(
@@ -285,6 +291,7 @@ def _render_sequence(
     mitsuba_scene, digest = stage.set_for(sequence)
     if words := obstacle(mitsuba_scene, *card.geometry_of(sequence)):
         raise RsbenchError(f"sequence {sequence.name}: {words}; choose another motion, viewpoint or baseline")
+    plan = _with_gloss(plan, mitsuba_scene.glossy)
     partial = out / HIDDEN / WORK / sequence.name
     remove(partial)  # of a worker that was killed
     for folder in {Path(name).parent for name in files_of(plan)}:
@@ -345,6 +352,8 @@ def render_camera(
         write_depth(folder / shot.depth, rendered.depth)
         if things:
             write_png(folder / shot.labels, rendered.labels)
+        if scene.glossy:
+            write_mask(folder / shot.gloss, rendered.gloss)
         if kind == "rs" and sensor:
             own, period = sensor.of(side, frame), card.period_of(sequence)
             seen = sensed_rows(scene, rig, shutter, motion, own, period, side, frame, options, objects=things)

@@ -146,6 +146,15 @@ def draw_samples(
     return ImuSamples(stamps_of(imu, times_ns), measured, times_ns, true, bias)
 
 
+def gyro_samples(samples: ImuSamples, frame_period_s: float) -> FloatArray:
+    """(n, 4) tau, w of ``Correspondences.gyro``: what was measured, by the sensor's own clock, wrong as it is.
+
+    The motion carries points into the body, which turns the other way: w is the measured rate's negative.
+    """
+    tau = samples.stamps_ns / (_NS * frame_period_s)
+    return np.column_stack([tau, -frame_period_s * samples.measured[:, :3]])
+
+
 def gravity_of(scene: Mapping[str, Any]) -> FloatArray:
     """(3,) m/s^2 in the world frame, of what sequence.json says of its scene, whose z points up.
 

@@ -20,7 +20,7 @@ _KINDS = (("rs", "png"), ("rs_depth", "exr"), ("gs", "png"), ("gs_depth", "exr")
 _VIEW = re.compile(r"(left|right)_(0|[1-9][0-9]*)(?=[./])")
 _STACK = re.compile(r"gs_stack/left_0/[0-9]{4,}\.png")
 _MATCHES = re.compile(r"matches/(0|[1-9][0-9]*)\.npz")
-_TWIN = re.compile(r"gs_twin(|_depth|_flow|_flow_mask|_moving)/[0-9]{4,}/left_0\.(png|exr)")
+_TWIN = re.compile(r"gs_twin(|_depth|_flow|_flow_mask|_moving|_gloss)/[0-9]{4,}/left_0\.(png|exr)")
 
 
 def relative_files(frames: int) -> tuple[str, ...]:
@@ -51,7 +51,16 @@ def picture_file(shutter: Shutter, side: str, frame: int, row: int = 0, depth: b
 
 def moving_file(shutter: Shutter, side: str, frame: int, row: int = 0) -> str:
     """Labels of what moves in a picture, where anything does; ``row`` as of ``picture_file``."""
-    return f"gs_twin_moving/{row:04d}/{side}_{frame}.png" if row else f"{shutter}_moving/{side}_{frame}.png"
+    return _beside("moving", shutter, side, frame, row)
+
+
+def gloss_file(shutter: Shutter, side: str, frame: int, row: int = 0) -> str:
+    """Where surfaces are glossy in a picture, where any is; ``row`` as of ``picture_file``."""
+    return _beside("gloss", shutter, side, frame, row)
+
+
+def _beside(kind: str, shutter: Shutter, side: str, frame: int, row: int) -> str:
+    return f"gs_twin_{kind}/{row:04d}/{side}_{frame}.png" if row else f"{shutter}_{kind}/{side}_{frame}.png"
 
 
 def frames_of(manifest: Mapping[str, Any]) -> int:
@@ -76,9 +85,10 @@ def files_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
     stacks = tuple(stack_file(*view, row) for view in views for row in range(whole_frames(manifest)))
     pictures = [("gs", *view, row, depth) for row in rows for depth in (False, True) for view in views]
     twins = tuple(picture_file(*each) for each in pictures)  # pyrefly: ignore[bad-argument-type]
-    labelled = [("rs", *view, 0) for view in views] + [("gs", *view, row) for row in (0, *rows) for view in views]
-    labels = tuple(moving_file(*each) for each in labelled if manifest.get("moving"))  # pyrefly: ignore[bad-argument-type]
-    own = relative_files(frames) + clean + stacks + twins + labels
+    every = [("rs", *view, 0) for view in views] + [("gs", *view, row) for row in (0, *rows) for view in views]
+    labels = tuple(moving_file(*each) for each in every if manifest.get("moving"))  # pyrefly: ignore[bad-argument-type]
+    gloss = tuple(gloss_file(*each) for each in every if manifest.get("glossy"))  # pyrefly: ignore[bad-argument-type]
+    own = relative_files(frames) + clean + stacks + twins + labels + gloss
     return own + channel_files(channels_of(manifest), rows, frames)
 
 
@@ -109,7 +119,7 @@ _KNOWN = {"sequence.json"} | {
     for name in (
         *relative_files(1),
         clean_file("left", 0),
-        *(moving_file(shutter, "left", 0) for shutter in SHUTTERS),
+        *(file(shutter, "left", 0) for file in (moving_file, gloss_file) for shutter in SHUTTERS),
         *channel_files(CHANNELS, frames=len(FRAMES) + 1),
     )
 }

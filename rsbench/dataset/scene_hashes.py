@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,10 @@ import numpy as np
 from rsbench.cards import card_path
 from rsbench.dataset.files import read_json, write_json
 from rsbench.errors import RsbenchError
+from rsbench.scenes.bodies import Body, MeshFile
 from rsbench.scenes.kept import built_key
 from rsbench.scenes.load import read_scene_card
-from rsbench.scenes.model import Scene
+from rsbench.scenes.model import Scene, SceneMesh
 
 
 def scene_hash(scene: Scene) -> str:
@@ -26,11 +27,29 @@ def scene_hash(scene: Scene) -> str:
     if scene.light.environment is not None:
         digest.update(scene.light.environment.radiance.tobytes())
         digest.update(scene.light.environment.frame_from_map.tobytes())
-    for mesh in scene.meshes:
-        digest.update(f"{mesh.name}/{mesh.material.name}/{mesh.material.colour}".encode())
-        for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.normals, mesh.material.texture):
-            digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
+    for part in _bytes_of(scene.meshes):
+        digest.update(part)
     return digest.hexdigest()
+
+
+def mesh_file_hash(mesh: MeshFile) -> str:
+    """The same of a mesh file that moves, by itself; RsbenchError where it cannot be read."""
+    return hashlib.sha256(b"".join(_bytes_of(mesh.meshes()))).hexdigest()
+
+
+def hashes_of_meshes(moving: Sequence[Body], mesh_hash: Callable[[MeshFile], str]) -> dict[str, Any]:
+    """What a sequence.json says of the mesh files of its objects: ``meshes``, where there are any."""
+    hashes = {str(number): mesh_hash(each.mesh) for number, each in enumerate(moving, start=1) if each.mesh}
+    return {"meshes": hashes} if hashes else {}
+
+
+def _bytes_of(meshes: Sequence[SceneMesh]) -> Iterator[bytes]:
+    for mesh in meshes:
+        yield f"{mesh.name}/{mesh.material.name}/{mesh.material.colour}".encode()
+        if mesh.material.roughness is not None:
+            yield f"/{mesh.material.roughness}".encode()
+        for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.normals, mesh.material.texture):
+            yield b"-" if array is None else np.ascontiguousarray(array).tobytes()
 
 
 class SceneHashes:

@@ -22,9 +22,17 @@ from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channel_reader import ChannelReader
 from rsbench.dataset.channels import check_channels
-from rsbench.dataset.files import read_depth, read_grey_png, read_json, read_png, read_poses
+from rsbench.dataset.files import read_depth, read_grey_png, read_json, read_mask, read_png, read_poses
 from rsbench.dataset.imu import Imu
-from rsbench.dataset.layout import MOST_FRAMES, MOST_TWINS, Shutter, clean_file, moving_file, picture_file
+from rsbench.dataset.layout import (
+    MOST_FRAMES,
+    MOST_TWINS,
+    Shutter,
+    clean_file,
+    gloss_file,
+    moving_file,
+    picture_file,
+)
 from rsbench.dataset.matches import Matching
 from rsbench.dataset.movers import MovingManifest, check_moving, numbers_of
 from rsbench.errors import RsbenchError
@@ -85,6 +93,7 @@ class SequenceManifest(Scanning):
     twins: tuple[int, ...] = ()
     channels: tuple[str, ...] = ()
     moving: tuple[MovingManifest, ...] = ()
+    glossy: bool = False
     files: dict[str, str] = field(default_factory=dict)
     """sha256 by the path below the sequence's folder."""
 
@@ -101,7 +110,7 @@ class SequenceManifest(Scanning):
             )
         check_size("camera", (self.camera.width, self.camera.height))
         check_channels(self.channels, self.camera.lens is not None, self.plain)
-        check_moving(self.moving, self.channels, self.frames)
+        check_moving(self.moving, self.channels)
         lines = self.camera.height if self.scan in ("top", "bottom") else self.camera.width
         if (
             list(self.twins) != sorted({row for row in self.twins if 0 < row < lines})
@@ -171,6 +180,8 @@ class Sequence(ChannelReader):
     """Objects that move by themselves, numbered from 1."""
     objects: tuple[MovingObject, ...] = ()
     """How they do."""
+    glossy: bool = False
+    """Whether its scene has glossy surfaces, which look otherwise from each place."""
     manifest: dict[str, Any]
     """Content of sequence.json."""
 
@@ -191,9 +202,14 @@ class Sequence(ChannelReader):
                 frames=len(FRAMES),
                 first=first,
                 channels=channels,
+                objects=self._objects_from(first),
             )
             for first in range(self.frames - 1)
         ]
+
+    def _objects_from(self, first: int) -> tuple[MovingObject, ...]:
+        body = self.motion.body_from_world(float(first))
+        return tuple(each.from_time(float(first), body) for each in self.objects)
 
     @property
     def whole(self) -> str:
@@ -239,6 +255,13 @@ class Sequence(ChannelReader):
         if np.max(numbers_of(labels)) > len(self.moving):
             raise RsbenchError(f"{path}: holds object {np.max(numbers_of(labels))}: there are {len(self.moving)}")
         return labels
+
+    def gloss(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.bool_]:
+        """(H, W) whether a pixel's surface is glossy; ``row`` as of ``image``."""
+        if not self.glossy:
+            return np.zeros(self._size[::-1], dtype=np.bool_)
+        path = inside(self.folder, gloss_file(shutter, side, frame + self.first, row))
+        return read_mask(path, self._size)
 
     def poses(self, side: Side, frame: int) -> tuple[FloatArray, Pose]:
         """Row times (H,) and ``cam_from_world`` (H, 3, 3), (H, 3) as stored; of columns, where those are read."""
@@ -316,6 +339,7 @@ def sequence_of(content: dict[str, Any], path: Path) -> Sequence:
             channels=manifest.channels,
             moving=manifest.moving,
             objects=tuple(each.thing for each in manifest.moving),
+            glossy=manifest.glossy,
             manifest=content,
         )
     except (ValueError, RsbenchError) as error:

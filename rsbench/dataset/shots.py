@@ -16,7 +16,7 @@ from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.layout import SHUTTERS, Shutter, moving_file, picture_file
+from rsbench.dataset.layout import SHUTTERS, Shutter, gloss_file, moving_file, picture_file
 
 _NEAREST = 32
 FAR = 1e7
@@ -77,6 +77,11 @@ class Shot(NamedTuple):
     def labels(self) -> str:
         """Of what moves by itself, where anything does."""
         return moving_file(*self)
+
+    @property
+    def gloss(self) -> str:
+        """Of glossy surfaces, where any is."""
+        return gloss_file(*self)
 
     @property
     def other_shutter(self) -> Shot:

@@ -88,6 +88,18 @@ def strangers(folder: Path, ours: Callable[[str], bool]) -> list[str]:
     return sorted(found)
 
 
+def listed(folder: Path, suffix: str = "") -> list[Path]:
+    """What lies in a folder, sorted, of names with this end; nothing where there is no such folder.
+
+    Raises:
+        OSError: the folder cannot be listed; ``Path.glob`` passes over it in silence.
+    """
+    try:
+        return sorted(path for path in folder.iterdir() if path.name.endswith(suffix))
+    except FileNotFoundError:
+        return []
+
+
 def files_below(folder: Path) -> list[str]:
     """Paths of all files below a folder, relative to it, with slashes, sorted.
 

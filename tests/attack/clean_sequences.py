@@ -3,7 +3,7 @@
 Cameras and their lenses, rigs, scans, delays, sensors, channels, motions of every model, renderers, scenes and
 viewpoints are drawn; motions go to 20 degrees and a metre per frame, and one scene has hardly any texture. What
 ``generate`` refuses, such as a way through a wall or into the sky, is drawn again. Small, so that there can be
-many. No surface is glossy: none of rsbench's scenes has one.
+many. Glossy surfaces are those of the street, and of the castle after rain.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import contextlib
 import re
 import shutil
 from collections.abc import Iterator
+from collections.abc import Sequence as SequenceOf
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +22,7 @@ from unittest.mock import patch
 import numpy as np
 from small_scenes import write_box_scene
 
+from attack.wet_castle import WET_CASTLE
 from rsbench.cards import card_path, list_cards
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.lens import Lens
@@ -51,13 +53,17 @@ RENDERERS = {
 DIRECT = [name for name in RENDERERS if name != "traced"]
 
 
-def random_cards(count: int, folder: Path, seed: int) -> Iterator[DatasetCard]:
-    """Cards of ``count`` sequences in all; those of one scene follow each other, as it is built once."""
+def random_cards(count: int, folder: Path, seed: int, chosen: SequenceOf[str] = ()) -> Iterator[DatasetCard]:
+    """Cards of ``count`` sequences in all, of all scenes or those chosen.
+
+    Those of one scene follow each other, as it is built once.
+    """
     rng = np.random.default_rng(seed)
     for name, text in RENDERERS.items():
         (folder / f"{name}.toml").write_text(f'description = "{name}"\n{text}')
     plain = str(write_box_scene(folder, "plain", (2, 2)))
-    scenes = [plain, *(name for name in list_cards("scenes") if name != "mesh")]
+    every = [plain, *(name for name in list_cards("scenes") if name != "mesh"), str(WET_CASTLE)]
+    scenes = [name for name in every if not chosen or Path(name).stem in chosen]
     datasets = -(-count // PER_DATASET)
     for number in range(datasets):
         scene = scenes[number * len(scenes) // datasets]
@@ -92,7 +98,10 @@ def _card(rng: np.random.Generator, number: int, scene: str, folder: Path, seque
 
 
 def _with_moving(card: DatasetCard, number: int) -> DatasetCard:
-    """Every fourth card with one to three boxes that move, before the rig; drawn by themselves."""
+    """Every fourth card with one to three boxes that move, before the rig; drawn by themselves.
+
+    Half of these are of three frames.
+    """
     if number % 4 != 2:
         return card
     rng = np.random.default_rng([card.seed, number])
@@ -101,6 +110,7 @@ def _with_moving(card: DatasetCard, number: int) -> DatasetCard:
     return replace(
         card,
         renderer=renderer,
+        frames=3 if number % 8 == 6 else 2,
         sequence=sequences,
         channels=tuple(each for each in card.channels if each in TAKEN),
     )
@@ -235,7 +245,9 @@ def _words(card: DatasetCard) -> str:
     return ", ".join([*words, *card.channels])
 
 
-def false_alarms(count: int, folder: Path, seed: int = 0) -> Iterator[tuple[str, int, int, list[str]]]:
+def false_alarms(
+    count: int, folder: Path, seed: int = 0, chosen: SequenceOf[str] = ()
+) -> Iterator[tuple[str, int, int, list[str]]]:
     """Of each dataset its name, how many sequences it has, motions that were refused, and what verify found."""
     from rsbench.renderers import scene
 
@@ -259,10 +271,10 @@ def false_alarms(count: int, folder: Path, seed: int = 0) -> Iterator[tuple[str,
         patch.object(rerender, "load_scene", loaded),
         patch.object(scene, "MitsubaScene", once),
     ):
-        for card in random_cards(count, folder, seed):
+        for card in random_cards(count, folder, seed, chosen):
             out = folder / card.name
             refused = _generated(card, out)
-            reports = verify_dataset(out, rerender="auto", scenes=[folder / "plain.toml"])
+            reports = verify_dataset(out, rerender="auto", scenes=[folder / "plain.toml", WET_CASTLE])
             found = [f"{report.name}: {fault}" for report in reports for fault in report.faults]
             yield f"{card.name} ({_words(card)})", len(card.sequence), refused, found
             if not found:

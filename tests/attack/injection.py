@@ -13,7 +13,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-OPERATIONS = ("replace", "rename", "mkdir", "unlink", "remove", "rmdir", "fsync", "link", "truncate", "scandir")
+OPERATIONS = (
+    "replace",
+    "rename",
+    "mkdir",
+    "unlink",
+    "remove",
+    "rmdir",
+    "fsync",
+    "link",
+    "truncate",
+    "scandir",
+    "listdir",
+)
 """Functions of ``os`` that count, beside opening a file by ``open``, ``io.open`` and ``os.open``."""
 How = Literal["before", "after"]
 

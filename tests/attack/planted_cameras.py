@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attack.planted_faults import scene_of_victim, twin_at
+from attack.planted_gloss import GLOSS_FAULTS
 from attack.planted_sensors import CAMERA, SENSOR_FAULTS
 from attack.planting import (
     VICTIM,
@@ -34,6 +35,7 @@ from attack.planting import (
     swapped,
     times,
 )
+from attack.wet_castle import WET_CASTLE
 from rsbench.cards import load_card
 from rsbench.core.lens import Lens
 from rsbench.core.projection import row_poses
@@ -55,6 +57,7 @@ CAMERAS: dict[str, dict[str, Any]] = {
     "opposite": {"right_scan": "bottom"},
     "thin": {"scene": "forest"},
     "processed": {"sensor": CAMERA},
+    "glossy": {"scene": str(WET_CASTLE), "focal": 150.0},
     "frames": {"frames": 4, "channels": ("timing", "imu", "tracks", "affine", "matches")},
 }
 """What differs from the cameras of datasets/smoke.toml, by name; ``thin`` sees hardly a flat place."""
@@ -63,7 +66,7 @@ CAMERAS: dict[str, dict[str, Any]] = {
 def card_of(name: str) -> DatasetCard:
     """The card of a camera, of one sequence."""
     smoke, change = load_dataset_card("smoke"), dict(CAMERAS[name])
-    camera = CameraCard(width=128, height=96, focal=110.0, lens=change.pop("lens", None))
+    camera = CameraCard(width=128, height=96, focal=change.pop("focal", 110.0), lens=change.pop("lens", None))
     sequence = replace(smoke.sequence[0], name=VICTIM, scene=change.pop("scene", VICTIM))
     return replace(smoke, camera=camera, sequence=(sequence,), **change)
 
@@ -384,6 +387,7 @@ CAMERA_FAULTS: dict[str, tuple[Fault, ...]] = {
     "opposite": tuple(_opposite_faults()),
     "thin": tuple(_thin_faults()),
     "processed": SENSOR_FAULTS,
+    "glossy": GLOSS_FAULTS,
     "frames": tuple(_frame_faults()),
 }
 """Of each of ``CAMERAS``."""

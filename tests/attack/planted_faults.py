@@ -47,6 +47,7 @@ from attack.planting import (
     times,
     written,
 )
+from attack.wet_castle import WET_CASTLE
 from rsbench.cards import load_card
 from rsbench.core.motion import TwistMotion
 from rsbench.core.projection import row_poses
@@ -57,7 +58,7 @@ from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene
 
 
-def _depth_faults() -> Iterator[Fault]:
+def depth_faults() -> Iterator[Fault]:
     for shutter, view in (("rs", "left_0"), ("rs", "right_1"), ("gs", "left_1"), ("gs", "right_0")):
         file = f"{shutter}_depth/{view}.exr"
 
@@ -117,10 +118,10 @@ def _depth_faults() -> Iterator[Fault]:
 
 
 @lru_cache(maxsize=1)
-def scene_of_victim() -> Any:
+def scene_of_victim(name: str = VICTIM) -> Any:
     from rsbench.renderers.scene import MitsubaScene
 
-    scene = load_scene(VICTIM)
+    scene = load_scene(name)
     return MitsubaScene(scene.seen_from(scene.viewpoints["default"]))
 
 
@@ -134,7 +135,9 @@ def twin_at(row: int) -> Plant:
         sequence = read_sequence(folder / VICTIM)
         poses = row_poses(sequence.rig, sequence.shutter, sequence.motion, "left", 1)
         options = load_card(RendererOptions, "renderers", "preview")
-        frame = render_global(scene_of_victim(), sequence.rig.camera, poses.R[row], poses.t[row], options)
+        name = sequence.manifest["scene"]["name"]
+        scene = scene_of_victim(str(WET_CASTLE) if name == "wet-castle" else name)
+        frame = render_global(scene, sequence.rig.camera, poses.R[row], poses.t[row], options)
         write_png(sequence.folder / "gs/left_1.png", to_srgb8(frame.image, options.exposure))
         write_depth(sequence.folder / "gs_depth/left_1.exr", frame.depth)
 
@@ -150,7 +153,7 @@ def _every_depth(change: Callable[[Any], Any]) -> Plant:
     return plant
 
 
-def _image_faults() -> Iterator[Fault]:
+def image_faults() -> Iterator[Fault]:
     for shutter, view in (("rs", "right_0"), ("gs", "left_1")):
         file = f"{shutter}/{view}.png"
         for name, change, words in (
@@ -388,8 +391,8 @@ def _own_list_faults() -> Iterator[Fault]:
 
 
 FAULTS = (
-    *_depth_faults(),
-    *_image_faults(),
+    *depth_faults(),
+    *image_faults(),
     *_pose_faults(),
     *_manifest_faults(),
     *_consistent_faults(),

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from attack.wet_castle import WET_CASTLE
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.files import (
@@ -82,7 +83,7 @@ def planted(fault: Fault, sound: Path, out: Path) -> Path:
 def found(fault: Fault, folder: Path) -> tuple[bool, list[str]]:
     """Whether one line of verify's answer has the fault's words; and all lines, but for the other sequence."""
     listing = Listing.of(folder, read_json(folder / "dataset.json"))
-    again = Again("auto") if fault.rendered else None
+    again = Again("auto", [WET_CASTLE]) if fault.rendered else None
     lines = [*dataset_faults(listing), *_of_victim(listing, again)]
     return any(all(word in line for word in fault.words) for line in lines), lines
 

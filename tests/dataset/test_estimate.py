@@ -28,7 +28,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, bool]]:
         Path(folder, "rs", f"{side}_{frame}.png").write_bytes(b"x" * (300 if real else 100))
         yield
 
-    monkeypatch.setattr(estimate, "build_scene", lambda name: Built(SimpleNamespace(), ""))  # pyrefly: ignore[bad-argument-type]
+    monkeypatch.setattr(estimate, "build_scene", lambda name: Built(SimpleNamespace(glossy=False), ""))  # pyrefly: ignore[bad-argument-type]
     monkeypatch.setattr(estimate, "seen_scene", lambda scene, sequence: scene)
     monkeypatch.setattr(estimate, "render_camera", render)
     monkeypatch.setattr(renderer, "MitsubaScene", lambda seen: seen)

@@ -226,7 +226,8 @@ def flowing(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         (whole.folder / name).parent.mkdir(exist_ok=True)
     for view in views_of(COUNT):
         image, labels = np.zeros((54, 64, 3), np.float32), np.zeros((54, 64), np.uint8)
-        seen = Frame(image=image, depth=whole.depth("rs", *view), labels=labels)
+        gloss = np.zeros(labels.shape, np.bool_)
+        seen = Frame(image=image, depth=whole.depth("rs", *view), labels=labels, gloss=gloss)
         write_channels(whole.folder, ["flow"], whole, Shot("rs", *view), seen, Open())
     own = json.loads((whole.folder / "sequence.json").read_text()) | {"channels": ["flow"]}
     own["files"] |= dict.fromkeys(channel_files(["flow"], (), COUNT), "")

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import run_here
+from numpy.typing import NDArray
 
 from rsbench.benchmark.images.evaluation import open_evaluation, read_scores
 from rsbench.benchmark.images.plan import EvaluationOptions
@@ -19,10 +20,10 @@ from rsbench.cards import parse_card
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.lens import Lens
 from rsbench.core.projection import back_project, rs_project_near
-from rsbench.core.rig import FRAMES, SIDES, VIEWS
+from rsbench.core.rig import FRAMES, SIDES, VIEWS, View
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.channels import Channel
-from rsbench.dataset.files import read_png
+from rsbench.dataset.files import read_depth, read_png
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.verification import content, verify_dataset
@@ -173,6 +174,55 @@ def test_correct_takes_frames_with_distortion(made: dict[str, Path], tmp_path: P
     assert np.mean(drawn) > 0.8
     # The twin has the lens, and so has the corrected frame.
     assert psnr(corrected, twin, drawn) > psnr(frame, twin, drawn) + 3.0
+
+
+APART = {
+    "late": 'scan = "bottom"\nright_delay = 0.1\n[camera]\n',
+    "columns": 'scan = "left"\nright_scan = "right"\n[camera]\n'
+    'lens = { model = "kannala-brandt", k1 = -0.03, k2 = 0.01 }\n',
+}
+"""What a rig.toml says of them beside focal length and centre."""
+
+
+def _rig_apart(sequence: Sequence, told: str, path: Path) -> Path:
+    c = sequence.rig.camera
+    given = f"baseline = {sequence.rig.baseline}\nreadout_ratio = {sequence.shutter.readout_ratio}\n"
+    path.write_text(f"{given}{told}fx = {c.fx}\nfy = {c.fy}\ncx = {c.cx}\ncy = {c.cy}\n")
+    return path
+
+
+@pytest.mark.parametrize("name", APART)
+def test_correct_takes_a_rig_of_cameras_apart(made: dict[str, Path], tmp_path: Path, name: str) -> None:
+    """Motion, depth and frames, against those of the dataset; a rig.toml that does not say so corrects worse."""
+    sequence, out = read_sequence(made[name] / "room-twist"), tmp_path / "out"
+    done = _correct(sequence, _rig_apart(sequence, APART[name], tmp_path / "rig.toml"), out)
+    assert done.returncode == 0, done.stderr
+    record = json.loads((out / "motion.json").read_text("utf-8"))
+    # Half a degree is a pixel of this camera, whose images are 128 wide.
+    np.testing.assert_allclose(record["motion"]["w"], sequence.motion.w, rtol=0, atol=np.deg2rad(0.5))
+    np.testing.assert_allclose(record["motion"]["d"], sequence.motion.d, rtol=0, atol=0.03)
+    drawn = {(s, f): read_png(out / f"mask/{s}_{f}.png")[..., 0] == 255 for s, f in VIEWS}
+    for view in VIEWS:
+        depth, true = read_depth(out / "depth/{}_{}.exr".format(*view)), sequence.depth("gs", *view)
+        both = drawn[view] & (depth > 0) & (true > 0)
+        # Half a pixel of some ten of disparity.
+        assert np.mean(drawn[view]) > 0.8 and np.median(np.abs(depth[both] / true[both] - 1.0)) < 0.05
+    before = _psnr({view: sequence.image("rs", *view) for view in VIEWS}, sequence, drawn)
+    after = _psnr(_frames(out), sequence, drawn)
+    assert after > before + 3.0
+    done = _correct(sequence, _rig_apart(sequence, "[camera]\n", tmp_path / "rig.toml"), tmp_path / "plain")
+    assert done.returncode != 0 or _psnr(_frames(tmp_path / "plain"), sequence, drawn) < after - 1.0
+
+
+def _frames(out: Path) -> dict[View, NDArray[np.uint8]]:
+    return {view: read_png(out / "corrected/{}_{}.png".format(*view)) for view in VIEWS}
+
+
+def _psnr(
+    frames: dict[View, NDArray[np.uint8]], sequence: Sequence, drawn: dict[View, NDArray[np.bool_]]
+) -> float:
+    """Mean of the views, of what was drawn, against the global-shutter twins."""
+    return float(np.mean([psnr(frames[view], sequence.image("gs", *view), drawn[view]) for view in VIEWS]))
 
 
 @pytest.mark.parametrize(

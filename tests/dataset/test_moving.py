@@ -316,7 +316,7 @@ def test_what_knows_nothing_of_moving_objects_is_refused(lot: Path, tmp_path: Pa
         seen_scene(load_scene(lot.parent / "lot.toml"), replace(sequence, moving=(CART, CART)))
     content = json.loads(json.dumps(asdict(lot_card(lot.parent))))
     for wrong, words in (
-        ({"box": [1, 1, 1]}, "either 'instance' or 'box'"),
+        ({"box": [1, 1, 1]}, "one of 'instance', 'box' and 'mesh'"),
         ({"instance": "", "box": [1, 0, 1]}, "edges must be positive"),
         ({"attitude_deg": [1, 0, 0]}, "attitude_deg is of a box"),
     ):

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from rsbench.dataset.workplace import HIDDEN, WORK, files_below, remove, strangers, workplace
+from rsbench.dataset.workplace import HIDDEN, WORK, files_below, listed, remove, strangers, workplace
 from rsbench.errors import RsbenchError
 
 HOLDS = """
@@ -165,14 +165,20 @@ def test_strangers_are_all_that_is_not_a_plain_file_of_ours(tmp_path: Path) -> N
 def test_a_folder_that_cannot_be_listed_is_not_taken_for_an_empty_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """``os.walk`` passes over it in silence, and what lies in it would be taken for rsbench's own."""
+    """``os.walk`` and ``Path.glob`` pass over it in silence: scores would be made without what lies in it."""
 
     def broken(path: object) -> None:
         raise OSError(5, "Input/output error", str(path))
 
     (tmp_path / "mine.txt").write_text("mine")
     monkeypatch.setattr(os, "scandir", broken)
+    monkeypatch.setattr(os, "listdir", broken)
     with pytest.raises(OSError, match="Input/output"):
         strangers(tmp_path, lambda path: False)
     with pytest.raises(OSError, match="Input/output"):
         files_below(tmp_path)
+    with pytest.raises(OSError, match="Input/output"):
+        listed(tmp_path, ".txt")
+    monkeypatch.undo()
+    assert listed(tmp_path, ".txt") == [tmp_path / "mine.txt"]
+    assert listed(tmp_path, ".json") == listed(tmp_path / "nothing") == []

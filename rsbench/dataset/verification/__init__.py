@@ -51,7 +51,7 @@ def verify_dataset(
         stride: compare every ``stride``-th pixel in both directions.
         progress: see ``Progress``; there are ``verification_steps`` in all.
         rerender: rows to render again where the scene can be built here.
-        scenes: cards of scenes that are not rsbench's own.
+        scenes: cards of scenes that are not rsbench's own, and mesh files of objects that move.
 
     Returns:
         One report per sequence; before them one named dataset.json where that has faults of its own.
@@ -67,8 +67,14 @@ def verify_dataset(
     listing = structure.Listing.of(folder, manifest)
     faults = tuple(structure.dataset_faults(listing))
     reports = [SequenceReport(name=structure.DATASET, faults=faults)] if faults else []
-    again = None if rerender == "no" else Again(rerender, [card_path("scenes", path) for path in scenes])
+    again = None if rerender == "no" else Again(rerender, *_cards_and_files(scenes))
     return reports + [verify_sequence(listing, name, stride, step, again) for name in listing.names]
+
+
+def _cards_and_files(named: Collection[Path]) -> tuple[list[Path], list[Path]]:
+    """Scene cards, and what is none by its name."""
+    files = [path for path in named if path.suffix not in ("", ".toml")]
+    return [card_path("scenes", path) for path in named if path not in files], files
 
 
 def verification_steps(manifest: Mapping[str, Any]) -> int:

@@ -64,9 +64,11 @@ def read_shot(content: Content, shot: Shot, missing: Collection[str]) -> None:
     noisy = isinstance(renderer, dict) and renderer.get("integrator") == "path"
     size = sequence.rig.camera.width, sequence.rig.camera.height
     try:
-        if not {shot.depth, *([shot.labels] if sequence.moving else [])} & set(missing):
+        beside = [shot.labels] * bool(sequence.moving) + [shot.gloss] * sequence.glossy
+        if not {shot.depth, *beside} & set(missing):
             labels = sequence.labels(*shot) if sequence.moving else None
-            content.maps[shot] = DepthMap(shot, sequence.depth(*shot), sequence.rig.camera, labels)
+            gloss = sequence.gloss(*shot) if sequence.glossy else None
+            content.maps[shot] = DepthMap(shot, sequence.depth(*shot), sequence.rig.camera, labels, gloss)
     except RsbenchError as error:
         content.faults.append(str(error))
     file = clean_picture(sequence, shot)

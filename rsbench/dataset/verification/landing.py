@@ -50,6 +50,8 @@ class DepthMap:
     camera: PinholeCamera
     labels: NDArray[np.uint8] | None = None
     """(H, W) what moves there, see ``Sequence.labels``; None where nothing does."""
+    gloss: BoolArray | None = None
+    """(H, W) whether the surface is glossy; None where none is."""
 
     @cached_property
     def inverse(self) -> FloatArray:
@@ -197,16 +199,28 @@ def seen_with(
 
 
 def in_one_light(sequence: Sequence, source: DepthMap, target: DepthMap, landing: Landing, stride: int) -> Landing:
-    """The same without what colours do not tell: what turns, or is shaded by what moves, at another time."""
+    """The same without what colours do not tell: gloss, and what turns, or is shaded by what moves, at another
+    time."""
     one_time = source.shot.side != target.shot.side and sequence.shutter.plain and source.camera.lens is None
-    if source.labels is None or target.labels is None or one_time:
+    changing = [_changing(each, one_time) for each in (source, target)]
+    if not np.any(changing):
         return landing
-    own = cv2.dilate(source.labels, np.ones((3, 3), np.uint8))[::stride, ::stride] > 0
-    other = cv2.dilate(target.labels, np.ones((5, 5), np.uint8)) > 0
+    own = cv2.dilate(changing[0], np.ones((3, 3), np.uint8))[::stride, ::stride] > 0
+    other = cv2.dilate(changing[1], np.ones((5, 5), np.uint8)) > 0
     x, y = np.rint(np.nan_to_num(landing.pixels)).astype(np.int64).reshape(-1, 2).T
     height, width = other.shape
     there = other[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].reshape(own.shape)
     return landing._replace(relative=np.where(own | there, np.float32(np.nan), landing.relative))
+
+
+def _changing(each: DepthMap, one_time: bool) -> NDArray[np.uint8]:
+    """(H, W) 1 where another picture may see another light on the same surface."""
+    found = np.zeros(each.depth.shape, dtype=np.uint8)
+    if each.labels is not None and not one_time:
+        found[each.labels > 0] = 1
+    if each.gloss is not None:
+        found[each.gloss] = 1
+    return found
 
 
 def relative_depth(target: DepthMap, pixels: FloatArray, z: FloatArray, sky: BoolArray) -> FloatArray:

@@ -22,9 +22,9 @@ def label_faults(content: Content, fresh: Content, twins: Content) -> Iterator[s
     """What labels cannot be. Their maps are taken out of all: they would accuse the depth of others.
 
     Args:
-        content: of two frames, the whole sequence.
-        fresh: what was read of it last.
-        twins: at other rows than the first.
+        content: of two successive frames.
+        fresh: what was read of them last.
+        twins: at other rows than the first, of these last.
     """
     if not content.sequence.moving:
         return
@@ -74,7 +74,8 @@ def _misplaced(content: Content, own: DepthMap) -> str:
     numbers = np.zeros(own.depth.shape, np.uint8) if own.labels is None else numbers_of(own.labels)
     elsewhere = np.zeros(own.depth[::stride, ::stride].shape, dtype=np.bool_)
     # The other camera sees all of them at about the same time, which tells nothing.
-    for partner in (shot.other_shutter._replace(row=0), shot.next_frame(sequence.frames)._replace(row=0)):
+    over_time = shot._replace(frame=shot.frame + 1, row=0), shot.frame_before._replace(row=0)
+    for partner in (shot.other_shutter._replace(row=0), *over_time):
         if partner not in content.maps:
             continue
         with np.errstate(invalid="ignore"):

@@ -33,6 +33,7 @@ from rsbench.dataset.verification.findings import finding, rows_of
 from rsbench.dataset.verification.image_checks import CHANGES, Picture
 from rsbench.dataset.verification.landing import DepthMap
 from rsbench.dataset.verification.match_checks import matches_again
+from rsbench.dataset.verification.mesh_files import with_files
 from rsbench.dataset.verification.stacks import stack_rows
 from rsbench.dataset.verification.surface_checks import surfaces_again
 from rsbench.dataset.verification.track_checks import tracks_again
@@ -75,12 +76,14 @@ class Again:
     mode: Rerender
     scene_cards: Many[Path] = ()
     """Of scenes that are not rsbench's own. What a dataset says of its scene is a name, and never opened."""
+    mesh_files: Many[Path] = ()
+    """Of objects that move, likewise."""
     _built: tuple[tuple[object, ...], str, MitsubaScene] | None = field(default=None, init=False)
 
     def is_right(self, content: Content, shot: Shot) -> bool:
         """Whether a depth map is what its scene looks like, at every pixel: that takes but one ray for each."""
         with contextlib.suppress(RsbenchError):  # told by ``check``
-            stored, rendered = content.maps[shot].depth, self._whole(content, shot)[1].depth
+            stored, rendered = content.maps[shot].depth, self.whole(content, shot)[1].depth
             return bool(np.all(np.abs(stored - rendered) <= _SAME_DEPTH * np.maximum(stored, rendered)))
         return False
 
@@ -93,7 +96,7 @@ class Again:
         with contextlib.suppress(RsbenchError):
             for shot in [each for each in shots_of(content.times) if each.shutter == "rs"]:
                 if any(f"/{shot.side}_{shot.frame}." in file for file in accused):
-                    scene, frame = self._whole(content, shot)
+                    scene, frame = self.whole(content, shot)
                     for made in (channels_again, surfaces_again):
                         checks = made(sequence, shot, rows, frame, SceneRays(scene, sequence.objects), ())
                         same |= {file for file, _, alike in checks if alike}
@@ -107,7 +110,7 @@ class Again:
                     same |= {name for name, _, alike in checks if alike}
         return same & set(accused)
 
-    def _whole(self, content: Content, shot: Shot) -> tuple[MitsubaScene, Frame]:
+    def whole(self, content: Content, shot: Shot) -> tuple[MitsubaScene, Frame]:
         """The scene of a sequence, and a whole frame of it, of one sample."""
         manifest = content.sequence.manifest
         options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
@@ -134,12 +137,13 @@ class Again:
         start = (
             parse_card(Start, _table(record, "start"), "sequence.json: scene.start") if "start" in record else None
         )
-        wanted = (path, path.stat().st_mtime_ns, viewpoint, start, sequence.moving)
+        moving = with_files(sequence, self.mesh_files)
+        wanted = (path, path.stat().st_mtime_ns, viewpoint, start, moving)
         if self._built is None or self._built[0] != wanted:
             self._built = None  # a scene takes hundreds of MB: not two at a time
             scene = load_scene(path)
             seen = scene.seen_from(scene.viewpoints[viewpoint], start)
-            seen = with_moving(seen, sequence.moving) if sequence.moving else seen
+            seen = with_moving(seen, moving) if moving else seen
             self._built = (wanted, scene_hash(scene), MitsubaScene(seen))
         return self._built[2], self._built[1]
 

@@ -74,8 +74,12 @@ def _spacing(sequence: Sequence) -> float:
 
 
 def _changing(sequence: Sequence, sensor: Sensor, depth_map: DepthMap, spacing: float) -> BoolArray:
-    """(H, W) where an object that moves, or its shadow, may be seen while the row is exposed: no window holds."""
-    labels, found = depth_map.labels, np.zeros(depth_map.depth.shape, dtype=np.bool_)
+    """(H, W) where no window holds while the row is exposed: an object that moves, or its shadow, or what a glossy
+    surface mirrors may be seen there."""
+    labels, gloss, found = depth_map.labels, depth_map.gloss, np.zeros(depth_map.depth.shape, dtype=np.bool_)
+    beside = int(sensor.mosaic != "none") + (_JPEG_REACH if sensor.jpeg_quality else 0)
+    if gloss is not None and sensor.exposure_s:
+        found |= _around(gloss, _window(sequence, sensor, depth_map, spacing), beside)
     if labels is None or not sensor.exposure_s:
         return found
     numbers = range(1, len(sequence.moving) + 1)
@@ -83,11 +87,16 @@ def _changing(sequence: Sequence, sensor: Sensor, depth_map: DepthMap, spacing: 
     # A shadow goes about as far as what throws it; where the sun is low, or the ground is near, farther.
     farthest = tuple(_FARTHER * np.max(windows, axis=0))
     masks = [numbers_of(labels) == number for number in numbers]
-    beside = int(sensor.mosaic != "none") + (_JPEG_REACH if sensor.jpeg_quality else 0)
-    for own, (x, y) in zip((*masks, labels >= SHADED), (*windows, farthest), strict=True):
-        around = np.ones((2 * (y + beside) + 1, 2 * (x + beside) + 1), np.uint8)
-        found |= cv2.dilate(own.astype(np.uint8), around) > 0
+    for own, window in zip((*masks, labels >= SHADED), (*windows, farthest), strict=True):
+        found |= _around(own, window, beside)
     return found
+
+
+def _around(own: BoolArray, window: tuple[int, int], beside: int) -> BoolArray:
+    """(H, W) what lies within a window (x, y) of pixels, and some more."""
+    x, y = window
+    around = np.ones((2 * (y + beside) + 1, 2 * (x + beside) + 1), np.uint8)
+    return np.asarray(cv2.dilate(own.astype(np.uint8), around) > 0)
 
 
 def _window(

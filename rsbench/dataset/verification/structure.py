@@ -17,6 +17,7 @@ from rsbench.dataset.files import read_json, sha256
 from rsbench.dataset.layout import RELATIVE_FILES, files_of
 from rsbench.dataset.sequence import FORMAT, UNITS, Sequence, sequence_manifest
 from rsbench.dataset.verification.findings import finding
+from rsbench.dataset.workplace import files_below
 from rsbench.errors import RsbenchError
 from rsbench.reading import NAME, inside
 from rsbench.renderers.options import RendererOptions
@@ -110,8 +111,8 @@ def _listing_faults(listing: Listing) -> Iterator[str]:
     strange = [path for path in files if path.partition("/")[0] not in listing.files or not _stays_inside(path)]
     if strange:
         yield finding(DATASET, f"files lists what belongs to none of its sequences: {_some(strange)}")
-    there = [path for path in folder.rglob("*") if not path.is_dir() and not _hidden(path.relative_to(folder))]
-    extra = sorted({path.relative_to(folder).as_posix() for path in there} - {DATASET, *files})
+    there = {path for path in files_below(folder) if not _hidden(Path(path))}
+    extra = sorted(there - {DATASET, *files})
     if extra:
         yield finding(DATASET, f"lies there but is not listed in files: {_some(extra)}")
 

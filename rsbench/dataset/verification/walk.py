@@ -14,6 +14,7 @@ from rsbench.dataset.verification.channel_checks import channel_faults
 from rsbench.dataset.verification.content import Comparison, Content, Elsewhere, read_content, twin_faults
 from rsbench.dataset.verification.depth import GeometryFault
 from rsbench.dataset.verification.findings import DepthAgreement, Progress, finding
+from rsbench.dataset.verification.gloss_checks import gloss_faults, known_gloss
 from rsbench.dataset.verification.hdr_checks import hdr_faults
 from rsbench.dataset.verification.match_checks import match_faults, matched_again
 from rsbench.dataset.verification.misplaced import misplaced_frames
@@ -62,8 +63,12 @@ class Walk:
         redone = None if self.again is None else Redone(self.again, self.sequence)
         for times in pairwise(range(self.sequence.frames)):
             fresh = read_content(self.sequence, self.missing, times if times[0] == 0 else times[1:])
-            content = content.followed_by(fresh, self.told)
             twins = read_twins(self.sequence, self.missing, fresh.times)
+            known = [known_gloss(each, self.again) for each in (fresh, twins)]
+            self.faults += [fault for faults, _ in known for fault in faults]
+            content = content.followed_by(fresh, self.told)
+            if not all(derived for _, derived in known):
+                self.faults += gloss_faults(content, fresh, twins)
             self.faults += label_faults(content, fresh, twins)
             self._of_frames(fresh)
             self._of_pairs(content, step)

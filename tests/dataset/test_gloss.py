@@ -1,0 +1,164 @@
+"""Sequences of a scene with a glossy surface: masks, and what verify makes of them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from attack.planting import drop, manifest_of, rehash
+from numpy.typing import NDArray
+from PIL import Image
+from small_scenes import SCENE, write_small_card
+from trimesh.visual.material import PBRMaterial
+
+from rsbench.core.rig import SIDES
+from rsbench.dataset.card import DatasetCard, load_dataset_card
+from rsbench.dataset.estimate import estimate_dataset
+from rsbench.dataset.files import read_grey_png, read_json, read_mask, write_mask
+from rsbench.dataset.generation import generate_dataset
+from rsbench.dataset.sequence import read_sequence
+from rsbench.dataset.shots import SHOTS, Shot
+from rsbench.dataset.verification import verify_dataset
+from rsbench.errors import RsbenchError
+
+Mask = NDArray[np.bool_]
+Vector = tuple[float, float, float]
+ONE = Shot("rs", "left", 1)
+
+
+def _box(edges: Vector, at: Vector, material: PBRMaterial) -> trimesh.Trimesh:
+    box = trimesh.creation.box(edges)
+    corners = np.asarray(box.triangles).reshape(-1, 3) + at
+    uv = np.tile([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], (12, 1))
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    return trimesh.Trimesh(vertices=corners, faces=np.arange(36).reshape(12, 3), visual=visual, process=False)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A card of a painted room with a black, glossy panel at an angle to the view."""
+    folder = tmp_path_factory.mktemp("scenes")
+    y, x = np.mgrid[:64, :64]
+    paint = np.stack([x * 5 % 256, y * 3 % 256, (x + 2 * y) % 256], axis=-1).astype(np.uint8)
+    matt = PBRMaterial(name="matt", baseColorTexture=Image.fromarray(paint), metallicFactor=0.0)
+    shiny = PBRMaterial(name="shiny", baseColorFactor=[20, 20, 20, 255], metallicFactor=0.0, roughnessFactor=0.1)
+    panel = _box((1.6, 0.1, 1.6), (0.2, 1.0, 0.0), shiny)
+    panel.apply_transform(trimesh.transformations.rotation_matrix(0.9, (0, 0, 1), (0.2, 1.0, 0.0)))
+    made = trimesh.Scene({"room": _box((6.0, 10.0, 4.0), (0, 0, 0), matt), "panel": panel})
+    made.export(folder / "hall.glb")
+    card = folder / "hall.toml"
+    card.write_text(SCENE.format(name="hall").replace('up_axis = "z"', 'up_axis = "z"\ngloss = "file"'))
+    return card
+
+
+@pytest.fixture(scope="module")
+def card(scene: Path) -> DatasetCard:
+    text = write_small_card(scene.parent, [scene]).read_text()
+    path = scene.parent / "glossy.toml"
+    path.write_text('channels = ["instances"]\ntwins = ["middle"]\n' + text)
+    return load_dataset_card(str(path))
+
+
+@pytest.fixture(scope="module")
+def sound(card: DatasetCard, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("sound") / "data"
+    generate_dataset(card, out)
+    return out
+
+
+def faults_of(folder: Path, scenes: Sequence[Path] = ()) -> list[str]:
+    reports = verify_dataset(folder, rerender="auto" if scenes else "no", scenes=scenes)
+    return [fault for report in reports for fault in report.faults]
+
+
+@pytest.fixture
+def spoilt(sound: Path, tmp_path: Path) -> Callable[[Callable[[Mask], Mask], tuple[Shot, ...]], Path]:
+    """A copy with other masks, and hashes made to fit."""
+
+    def make(change: Callable[[Mask], Mask], shots: tuple[Shot, ...]) -> Path:
+        out = tmp_path / "data"
+        shutil.copytree(sound, out)
+        for shot in shots:
+            path = out / "hall" / shot.gloss
+            write_mask(path, change(read_mask(path)))
+        rehash(out)
+        return out
+
+    return make
+
+
+def test_masks_are_where_the_glossy_instance_is(sound: Path) -> None:
+    sequence = read_sequence(sound / "hall")
+    assert sequence.glossy and read_json(sound / "hall/sequence.json")["glossy"] is True
+    table = json.loads((sound / "hall/instances.json").read_text())
+    text = json.dumps(table)
+    assert "shiny" in text
+    numbers = [k for k, each in enumerate(table["instances"], start=1) if each["material"] == "shiny"]
+    for side in SIDES:
+        own = read_grey_png(sound / f"hall/instances/{side}_1.png", bits=16)
+        gloss = sequence.gloss("rs", side, 1)
+        # Rays of both are rounded otherwise: an edge may fall to either side of a pixel's centre.
+        assert np.mean(gloss != np.isin(own, numbers)) < 1e-3 and 0.05 < np.mean(gloss) < 0.4
+    middle = sequence.gloss("gs", "left", 0, row=32)
+    np.testing.assert_array_equal(middle[32], sequence.gloss("rs", "left", 0)[32])
+
+
+def test_a_sound_sequence_passes(sound: Path, scene: Path) -> None:
+    assert faults_of(sound) == [] and faults_of(sound, [scene]) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "shots", "words"),
+    [
+        (lambda mask: mask & False, (ONE,), (ONE.gloss, "marks other surfaces")),
+        (lambda mask: mask | True, tuple(SHOTS), ("_gloss/", "leaves 0 %")),
+        (lambda mask: mask[:, ::-1], (ONE,), (ONE.gloss, "")),
+    ],
+    ids=["emptied", "of all", "flipped"],
+)
+def test_wrong_masks_are_named_without_the_scene(
+    spoilt: Callable[..., Path], change: Callable[[Mask], Mask], shots: tuple[Shot, ...], words: tuple[str, str]
+) -> None:
+    found = faults_of(spoilt(change, shots))
+    assert any(all(word in fault for word in words) for fault in found), found
+
+
+def test_rays_know_where_it_is_glossy(spoilt: Callable[..., Path], scene: Path) -> None:
+    def band(mask: Mask) -> Mask:
+        mask[20:40] = True
+        return mask
+
+    out = spoilt(band, tuple(SHOTS))
+    assert any(f"{ONE.gloss}: rows 20-39" in fault and "rays meet" in fault for fault in faults_of(out, [scene]))
+    manifest_of("hall/sequence.json", drop("glossy"))(out)
+    rehash(out)
+    found = faults_of(out, [scene])
+    assert any("sequence.json: glossy = false" in fault for fault in found), found
+
+
+def test_resuming_makes_a_lost_mask_again(sound: Path, card: DatasetCard, tmp_path: Path) -> None:
+    out = tmp_path / "data"
+    shutil.copytree(sound, out)
+    assert generate_dataset(card, out) == []
+    kept = (out / "hall" / ONE.gloss).read_bytes()
+    (out / "hall" / ONE.gloss).unlink()
+    assert generate_dataset(card, out) == ["hall"]
+    assert (out / "hall" / ONE.gloss).read_bytes() == kept
+
+
+def test_an_estimate_counts_masks(sound: Path, card: DatasetCard) -> None:
+    files = [path for path in sound.rglob("*") if path.is_file() and ".rsbench" not in path.parts]
+    assert estimate_dataset(card, lambda name: None).files == len(files)
+
+
+def test_a_mask_holds_two_values(sound: Path, tmp_path: Path) -> None:
+    from rsbench.dataset.files import write_png
+
+    write_png(tmp_path / "mask.png", np.arange(12, dtype=np.uint8).reshape(3, 4))
+    with pytest.raises(RsbenchError, match=r"mask.png: must hold 0 and 255 alone"):
+        read_mask(tmp_path / "mask.png")
