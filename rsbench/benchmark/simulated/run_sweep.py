@@ -26,7 +26,7 @@ from rsbench import __version__
 from rsbench.benchmark.simulated.sweep_card import Cell, SweepCard
 from rsbench.benchmark.simulated.trials import Arrays, Entrant, enter, run_bounds, run_trials
 from rsbench.dataset.files import load_arrays, read_json, save_arrays, write_json
-from rsbench.dataset.workplace import remove, workplace
+from rsbench.dataset.workplace import listed, remove, workplace
 from rsbench.errors import RsbenchError
 from rsbench.identity import source_version
 from rsbench.motions import motion_model
@@ -269,8 +269,8 @@ def simulator_version() -> str:
 
 
 def _open_folder(plan: dict[str, Any], out: Path, force: bool) -> None:
-    there = [path for kind in _KINDS for path in (out / kind).glob("*.npz") if _OURS.fullmatch(path.name)]
     links = [out / kind for kind in _KINDS if (out / kind).is_symlink()]
+    there = [path for kind in _KINDS for path in listed(out / kind, ".npz") if _OURS.fullmatch(path.name)]
     if links or (there and not (out / "sweep.json").is_file()):
         raise RsbenchError(
             f"{[*links, *there][0]}: 'rsbench simulate' did not make it; move it away or choose another --out"

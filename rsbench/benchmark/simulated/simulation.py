@@ -92,7 +92,12 @@ class Simulation:
 def random_direction(rng: np.random.Generator) -> FloatArray:
     """Unit vector (3,), uniform on the sphere."""
     v = rng.standard_normal(3)
-    return v / np.linalg.norm(v)
+    return unit(v)
+
+
+def unit(v: FloatArray) -> FloatArray:
+    """A vector (3,) made one long; BLAS, which ``np.linalg.norm`` asks, sums otherwise on other processors."""
+    return v / np.sqrt(np.sum(v * v))
 
 
 def random_motion(rng: np.random.Generator, angle: float, distance: float, model: str = "linear") -> Motion:

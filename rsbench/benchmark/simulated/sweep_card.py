@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rsbench.arguments import check_whole
-from rsbench.benchmark.simulated.simulation import GYRO_RATE, SceneShape, SimulationOptions, random_direction
+from rsbench.benchmark.simulated.simulation import GYRO_RATE, SceneShape, SimulationOptions, random_direction, unit
 from rsbench.cards import card_path, load_card, parse_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
@@ -113,7 +113,7 @@ class Setting:
         axes = []
         for given, drawn in zip((self.rotation_axis, self.translation_axis), random, strict=True):
             axis = drawn if given is None else np.asarray(given, dtype=np.float64)
-            axes.append(axis / np.linalg.norm(axis))
+            axes.append(unit(axis))
         w, d = np.deg2rad(self.rotation_deg) * axes[0], self.translation * axes[1]
         parameters = drawn_parameters(self.motion_model, self.motion_parameters, rng)
         return make_motion(self.motion_model, w, d, parameters)

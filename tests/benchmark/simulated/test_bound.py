@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rsbench.benchmark.simulated.bound import Bound, Views, information, motion_bound
+from rsbench.benchmark.simulated.bound import Bound, Views, motion_bound, root_information
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
@@ -73,7 +73,8 @@ def test_equals_a_numeric_fit_of_motion_and_points(views: tuple[Side, ...]) -> N
         (side, frame, rs_project(RIG, SHUTTER, motion, side, frame, points).pixels[:, 1])
         for side, frame in zip(views, frames, strict=True)
     ]
-    measured = information(RIG, SHUTTER, motion, points, rows)
+    root = root_information(RIG, SHUTTER, motion, points, rows)
+    measured = root.T @ root
     scale = np.sqrt(np.outer(np.diagonal(expected), np.diagonal(expected)))
     np.testing.assert_allclose(measured / scale, expected / scale, atol=1e-5)
 
@@ -137,6 +138,29 @@ def test_says_what_pairs_leave_open(w: FloatArray, d: FloatArray, direction: boo
     assert (pairs.direction_observable, pairs.scale_observable) == (direction, scale)
     four = motion_bound(c, RIG, SHUTTER, motion, 0.5)
     assert four.direction_observable and four.scale_observable and four.scale < 0.01
+
+
+def one_camera(degrees: float) -> tuple[Correspondences, Motion]:
+    motion = LinearMotion(np.radians(degrees) * np.array([0.5, 0.6, -0.62]), D)
+    return Correspondences(left=exact(motion, pairs=100).left), motion
+
+
+def test_what_is_hardly_known_is_no_rounding() -> None:
+    """One camera's scale comes from terms of second order in the rotation: half of it, a quarter is known."""
+    found = [motion_bound(*(c, RIG, SHUTTER, m), 1e-6).scale for c, m in map(one_camera, (0.2, 0.1, 0.05, 0.025))]
+    ratios = np.divide(found[1:], found[:-1])
+    # What is left of the next order halves too; the information had (2e7)^-2 of its largest value here.
+    np.testing.assert_allclose(ratios, 4.0, rtol=0.02)
+    assert abs(ratios[2] - 4.0) < 0.6 * abs(ratios[1] - 4.0) < 0.36 * abs(ratios[0] - 4.0)
+
+
+def test_the_order_of_matches_does_not_matter() -> None:
+    c, motion = one_camera(0.1)
+    shuffled = Correspondences(left=c.left[np.random.default_rng(0).permutation(len(c.left))])
+    one, other = (motion_bound(each, RIG, SHUTTER, motion, 1e-3) for each in (c, shuffled))
+    assert other.scale == pytest.approx(one.scale, rel=1e-6)
+    np.testing.assert_allclose(other.direction_axes, one.direction_axes, rtol=1e-6)
+    np.testing.assert_allclose(other.rotation_axes, one.rotation_axes, rtol=1e-6)
 
 
 def test_no_translation_and_no_matches() -> None:
