@@ -16,13 +16,23 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, StereoRig, View
 from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_depth import Images, Pairs, complete_depth, frame_pairs, moving_pairs, timed_pairs
+from rsbench.pipeline.frame_depth import (
+    Images,
+    Pairs,
+    complete_depth,
+    frame_pairs,
+    motion_pairs,
+    moving_pairs,
+    timed_pairs,
+)
 from rsbench.pipeline.frame_motion import FoundMotion, match_frames, solve_frames, solve_shutter
 from rsbench.pipeline.readout import ReadoutEstimate
 from rsbench.vision.corrector import CorrectionProblem, find_corrected
 from rsbench.vision.fusion import Fused, Origin, inpaint
+from rsbench.vision.stereo_matcher import needs_motion, refuse_motion
 
 Step = Callable[[str], None]
 STEPS = ("matching", "motion", "depth", "correction")
@@ -38,11 +48,13 @@ class Given:
     """Of the body, metres, of any model; the readout ratio must be known then."""
     pairs: Pairs | None = None
     """Frames with their depth; ``depth_from_motion`` still fills what is unknown in it."""
+    gyro: FloatArray | None = None
+    """(n, 4) samples of a gyroscope, as in ``Correspondences``: the one thing that frames do not show."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CorrectedFrames:
-    """The result for four frames; None is what neither was given nor needed."""
+    """The result for four frames; None is what neither was given nor needed. A frame may have failed by value."""
 
     motion: Motion | None
     """Of the body, with which the frames were corrected."""
@@ -103,7 +115,8 @@ def correct_four(
         find_depth(images, rig, shutter, motion, options, given.pairs, offset) if "depth" in needs else given.pairs
     )
     clock("depth")
-    frames = correct_frames(images, pairs, rig, shutter, motion, options, views, offset)
+    known = replace(given, matches=matches, motion=motion, pairs=pairs)
+    frames = correct_known(images, known, rig, shutter, options, views, offset)
     clock("correction")
     return CorrectedFrames(
         motion=motion,
@@ -129,9 +142,12 @@ def check_cameras(
 
     Raises:
         RsbenchError: depth is to be found where a pair is of two times, and no motion; or a readout ratio is to
-            be found, or an offset given, of cameras with a lens or another scan.
+            be found, or an offset given, of cameras with a lens or another scan, or with a matcher that needs
+            the motion.
     """
     lens, needs = rig.camera.lens, options.corrector.component.spec.needs
+    if not depth_is_known and "depth" in needs:
+        _check_matcher(options, readout_ratio, disparity_offset)
     if not (depth_is_known or scanning.rows_together) and "depth" in needs and "motion" not in needs:
         raise RsbenchError(
             f"scan = {scanning.scan!r}, right_scan = {scanning.right_scan!r}, "
@@ -149,6 +165,23 @@ def check_cameras(
         )
 
 
+def _check_matcher(
+    options: CorrectionOptions, readout_ratio: float | None, disparity_offset: float | None
+) -> None:
+    """Raises RsbenchError where the matcher needs a motion and there is none, or only one of a doubtful rig."""
+    if not needs_motion(options.matcher):
+        return
+    if "motion" not in options.corrector.component.spec.needs:
+        refuse_motion(options.matcher, f"corrector {options.corrector.name!r} does not ask for one")
+    if readout_ratio is None:
+        raise RsbenchError(f"readout_ratio: must be given with matcher {options.matcher.name!r}")
+    if disparity_offset:
+        raise RsbenchError(
+            f"disparity_offset = {disparity_offset}: must be 0 with matcher {options.matcher.name!r}; "
+            "calibrate the rig again"
+        )
+
+
 def _solve(
     images: Images,
     rig: StereoRig,
@@ -160,19 +193,25 @@ def _solve(
     disparity_offset: float | None,
 ) -> tuple[Correspondences | None, FoundMotion | None, RollingShutter, ReadoutEstimate | None]:
     """Matches, motion and shutter, as far as they are needed and not given."""
-    wanted = given.motion is None and "motion" in options.corrector.component.spec.needs
-    if readout_ratio is not None and not wanted:
+    needs = options.corrector.component.spec.needs
+    wanted, matched = (
+        given.motion is None and "motion" in needs,
+        given.matches is not None or "matches" not in needs,
+    )
+    if readout_ratio is not None and not wanted and matched:
         clock("matching")
         clock("motion")
         shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
         return given.matches, None, shutter, None
     matches = match_frames(images, rig, options, scanning) if given.matches is None else given.matches
     clock("matching")
-    found = None
+    found, readout = None, None
     if wanted:
         found, shutter, readout = solve_frames(matches, rig, readout_ratio, options, disparity_offset, scanning)
-    else:
+    elif readout_ratio is None:
         shutter, readout = solve_shutter(matches, rig, readout_ratio, options, disparity_offset)
+    else:
+        shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
     clock("motion")
     return matches, found, shutter, readout
 
@@ -186,8 +225,12 @@ def find_depth(
     pairs: Pairs | None = None,
     disparity_offset: float = 0.0,
 ) -> Pairs:
-    """The frames with their depth: from the other camera unless ``pairs`` has it, then from the motion."""
-    if pairs is None and not shutter.rows_together:
+    """The frames with their depth: by the matcher unless ``pairs`` has it, then from the motion."""
+    if pairs is None and needs_motion(options.matcher):
+        if motion is None:
+            raise ValueError(f"the motion must be known where matcher {options.matcher.name!r} finds depth")
+        pairs = motion_pairs(images, rig, shutter, motion, options)
+    elif pairs is None and not shutter.rows_together:
         if motion is None:
             raise ValueError("the motion must be known where depth is found of cameras that read rows apart")
         pairs = moving_pairs(images, rig, shutter, motion, options)
@@ -212,31 +255,54 @@ def correct_frames(
     views: tuple[View, ...] = VIEWS,
     disparity_offset: float = 0.0,
 ) -> dict[View, Fused]:
+    """``correct_known`` of correctors that need no more than a motion and a depth."""
+    given = Given(motion=motion, pairs=pairs)
+    return correct_known(images, given, rig, shutter, options, views, disparity_offset)
+
+
+def correct_known(
+    images: Images,
+    known: Given,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    options: CorrectionOptions,
+    views: tuple[View, ...] = VIEWS,
+    disparity_offset: float = 0.0,
+) -> dict[View, Fused]:
     """Corrected frames of the views asked for, at the time of ``options.target_row``, through the same lens.
 
     A global shutter leaves nothing to correct: at a readout ratio of 0 the frames come back as they are.
 
     Raises:
-        RsbenchError: another package's corrector failed, see ``find_corrected``.
+        RsbenchError: the corrector needs a gyroscope's samples and there are none, or another package's corrector
+            failed, see ``find_corrected``.
     """
+    pairs, needs = known.pairs, options.corrector.component.spec.needs
     if shutter.readout_ratio == 0.0:
         return uncorrected(images, views, pairs)
+    if "gyro" in needs and known.gyro is None:
+        raise RsbenchError(
+            f"corrector {options.corrector.name!r}: needs the samples of a gyroscope, which frames do not show: "
+            "give them as gyro in Python, or evaluate a dataset that has the channel imu"
+        )
     problem = CorrectionProblem(
         images=images,
         rig=rig,
         shutter=shutter,
         target_row=options.target_row,
-        motion=motion,
+        motion=known.motion,
         depth=None if pairs is None else {(s, f): pairs[f].depth[s] for s in SIDES for f in FRAMES},
         guess=None if pairs is None else {(s, f): pairs[f].guess[s] for s in SIDES for f in FRAMES},
         disparity_offset=disparity_offset,
+        matches=known.matches if "matches" in needs else None,
+        gyro=known.gyro if "gyro" in needs else None,
     )
     corrected = find_corrected(options.corrector, problem, views)
     return {view: _finish(fused, options) for view, fused in corrected.items()}
 
 
 def _finish(fused: Fused, options: CorrectionOptions) -> Fused:
-    if not options.inpaint:
+    if not (options.inpaint and fused.success):
         return fused
     return replace(fused, image=inpaint(fused.image, fused.origin == Origin.NOBODY))
 

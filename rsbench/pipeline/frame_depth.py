@@ -18,6 +18,7 @@ from rsbench.vision.motion_sweep import depth_from_motion
 from rsbench.vision.moving_stereo import moving_disparities
 from rsbench.vision.sky import sky_mask
 from rsbench.vision.stereo_depth import fill_holes
+from rsbench.vision.stereo_matcher import MatcherEntry, find_depths
 from rsbench.vision.timed_depth import timed_depth
 from rsbench.vision.undistortion import sensor_disparities
 
@@ -106,6 +107,39 @@ def moving_pairs(
 
     first, second = (pair(frame) for frame in FRAMES)
     return first, second
+
+
+def motion_pairs(
+    images: Images, rig: StereoRig, shutter: RollingShutter, motion: Motion, options: CorrectionOptions
+) -> Pairs:
+    """``frame_pairs`` of a matcher that needs the motion, of any cameras that it takes.
+
+    Raises:
+        RsbenchError: see ``find_depths``.
+    """
+    both = motion_disparities(options.matcher, images, rig, shutter, motion)
+    first, second = (
+        pair_with_motion(images, [both[side, frame] for side in SIDES], frame, rig, find_sky=options.find_sky)
+        for frame in FRAMES
+    )
+    return first, second
+
+
+def motion_disparities(
+    entry: MatcherEntry, images: Images, rig: StereoRig, shutter: RollingShutter, motion: Motion
+) -> dict[View, NDArray[np.float32]]:
+    """Disparity (H, W), ideal px, that depth in each line's own camera means; 0 infinitely far, NaN unknown."""
+    levels = dict(zip(images, eight_bit(list(images.values())), strict=True))
+    found = find_depths(entry, levels, rig, shutter, motion)
+    return {view: rig.disparity(depth).astype(np.float32) for view, depth in found.items()}
+
+
+def pair_with_motion(
+    images: Images, both: Sequence[NDArray[np.float32]], frame: int, rig: StereoRig, *, find_sky: bool
+) -> FramePair:
+    """``depth_of_pair`` of disparities that a motion is in already."""
+    pair = depth_of_pair(images["left", frame], images["right", frame], both, rig, find_sky=find_sky)
+    return replace(pair, timed=True)
 
 
 def frame_pairs(

@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig, View
+from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.isolated_solver import entrys_own
@@ -40,9 +42,13 @@ from rsbench.vision.feature_matcher import (
 from rsbench.vision.fusion import Fused
 from rsbench.vision.stereo_matcher import (
     STEREO_MATCHERS,
+    Cameras,
+    MotionMatcher,
     StereoMatcher,
+    find_depths,
     find_disparities,
     load_matcher,
+    needs_motion,
 )
 
 AnyEntry = TypeVar("AnyEntry", bound=Entry[Any, Any])
@@ -54,15 +60,26 @@ Proxy = Callable[[Any, Caller], Any]
 class Isolation:
     """The children; use as a context manager."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, time_limit_s: float | None = None, memory_mb: float | None = None) -> None:
+        """
+        Args:
+            time_limit_s: for one call, instead of what each entry's card says.
+            memory_mb: what a child may use; see ``IsolatedWorker``.
+        """
+        self._time_limit_s, self._memory_mb = time_limit_s, memory_mb
         self._stack = ExitStack()
 
     def chain(self, options: CorrectionOptions) -> CorrectionOptions:
         """The options with all but the solver isolated, which ``find_motion`` runs apart by itself."""
+        serve, matcher = (
+            (_serve_motion_matcher, _MotionMatcher)
+            if needs_motion(options.matcher)
+            else (_serve_matcher, _Matcher)
+        )
         return replace(
             options,
             features=self.wrap(FEATURE_MATCHERS, options.features, _serve_features, (Correspondences,), _Features),
-            matcher=self.wrap(STEREO_MATCHERS, options.matcher, _serve_matcher, (), _Matcher),
+            matcher=self.wrap(STEREO_MATCHERS, options.matcher, serve, (), matcher),
             corrector=self.wrap(CORRECTORS, options.corrector, _serve_corrector, (Fused,), _Corrector),
         )
 
@@ -86,11 +103,13 @@ class Isolation:
         if entry.built_in:
             return entry
         place = os.fspath(entry.path.resolve()) if entry.path is not None else entry.name
-        worker = self._stack.enter_context(IsolatedWorker(factory, place, classes=classes))
+        child = IsolatedWorker(factory, place, classes=classes, memory_mb=self._memory_mb)
+        worker = self._stack.enter_context(child)
+        limit_s = entry.options.time_limit_s if self._time_limit_s is None else self._time_limit_s
         who = f"{kind.singular} {entry.name!r}"
 
         def call(*arguments: object) -> Any:
-            outcome = worker.call(*arguments, limit_s=entry.options.time_limit_s)
+            outcome = worker.call(*arguments, limit_s=limit_s)
             if not outcome.success:
                 reason = outcome.reason.removeprefix(f"{who}: ")
                 raise RsbenchError(f"{who}: {reason}")
@@ -128,6 +147,22 @@ class _Matcher(StereoMatcher):
 
 
 @dataclass(frozen=True)
+class _MotionMatcher(MotionMatcher):
+    original: MotionMatcher
+    call: Caller
+
+    @property
+    def cameras(self) -> Cameras:
+        return self.original.cameras
+
+    def depths(
+        self, images: Mapping[View, NDArray[np.uint8]], rig: StereoRig, shutter: RollingShutter, motion: Motion
+    ) -> dict[View, NDArray[Any]]:
+        found = self.call(dict(images), rig, shutter, motion)
+        return {view: found[f"{view[0]}_{view[1]}"] for view in images}
+
+
+@dataclass(frozen=True)
 class _Corrector(Corrector):
     original: Corrector
     call: Caller
@@ -162,6 +197,20 @@ def _serve_matcher(place: str) -> Callable[..., object]:
     def answer(left: NDArray[np.uint8], right: NDArray[np.uint8], rig: StereoRig) -> object:
         with entrys_own():
             return find_disparities(entry, left, right, rig)
+
+    return answer
+
+
+def _serve_motion_matcher(place: str) -> Callable[..., object]:
+    with entrys_own():
+        entry = load_matcher(place)
+
+    def answer(
+        images: Mapping[View, NDArray[np.uint8]], rig: StereoRig, shutter: RollingShutter, motion: Motion
+    ) -> object:
+        with entrys_own():
+            found = find_depths(entry, images, rig, shutter, motion)
+        return {f"{side}_{frame}": depth for (side, frame), depth in found.items()}
 
     return answer
 

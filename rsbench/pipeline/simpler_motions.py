@@ -12,6 +12,7 @@ from rsbench.core.motion import LinearMotion, Motion
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.motions import make_motion
 from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.base import MotionEstimate, Solver
 from rsbench.solvers.refined import RefinedSolver
@@ -58,17 +59,18 @@ def solved_alone(
     solver: Solver,
     options: RobustOptions,
     rng: np.random.Generator,
+    model: str = LinearMotion.name,
 ) -> Motion | None:
     """Motion of one camera about its own centre by a solver of the left camera, from its matches over time.
 
-    The translation has length 1; None when the solver finds none. Right matches are handed over as left ones:
-    the cameras are equal.
+    It follows ``model``, with the parameters that the solver found. The translation has length 1; None when the
+    solver finds none. Right matches are handed over as left ones: the cameras are equal.
     """
     pairs = Correspondences(left=temporal_pairs(matches, side))
     estimate = estimate_motion(pairs, rig, shutter, solver, options, rng).estimate
     if not estimate.success or not np.any(estimate.d):
         return None
-    return LinearMotion(estimate.w, _unit(estimate.d))
+    return make_motion(model, estimate.w, _unit(estimate.d), estimate.motion_parameters)
 
 
 def _unit(d: FloatArray) -> FloatArray:

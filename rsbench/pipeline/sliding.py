@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.errors import RsbenchError
-from rsbench.pipeline.chain import check_cameras, correct_frames, find_depth
+from rsbench.pipeline.chain import Given, check_cameras, correct_known, find_depth
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, check_alike
 from rsbench.pipeline.frame_depth import Images, Pairs, frame_pair
@@ -28,6 +29,7 @@ from rsbench.pipeline.frame_motion import (
 from rsbench.pipeline.readout import ReadoutEstimate, combined
 from rsbench.pipeline.rectification import RefusedFramesError
 from rsbench.vision.fusion import Fused
+from rsbench.vision.stereo_matcher import needs_motion
 
 _JUDGED = 3
 """First windows whose rig is looked at; when all of them are refused, so is the sequence."""
@@ -39,9 +41,11 @@ class Window:
 
     images: Images
     pairs: Pairs | None
-    """With depth from the other camera; None when the corrector needs none."""
+    """With depth from the other camera; None when the corrector needs none, or it is found with the motion."""
     found: FoundMotion | None
     reason: str = ""
+    matches: Correspondences | None = None
+    """None when the corrector needs none, or they were refused."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,10 +56,11 @@ class CorrectedMoment:
     images: dict[Side, NDArray[Any]]
     """As they were read."""
     frames: dict[Side, Fused]
-    """Corrected; empty when a motion was needed and not found."""
+    """Corrected; empty when a motion was needed and not found, or the corrector found no correction."""
     found: FoundMotion | None
     reason: str
-    """Why no motion leads from here to the next frame; empty when one does, or when this is the last frame."""
+    """Why no motion leads from here to the next frame, or why there is no correction; empty when neither is so, or
+    when this is the last frame."""
 
 
 def estimate_sequence_readout(
@@ -162,22 +167,23 @@ def _windows(
     number = -1
     for number, images in enumerate(_window_images(left, right)):
         pairs = None
-        if "depth" in needs and shutter.rows_together:
+        if "depth" in needs and shutter.rows_together and not needs_motion(options.matcher):
             first = second or frame_pair(images["left", 0], images["right", 0], rig, options, offset)
             second = frame_pair(images["left", 1], images["right", 1], rig, options, offset)
             pairs = first, second
-        found, reason = None, ""
-        if "motion" in needs:
+        found, reason, matches = None, "", None
+        if needs & {"motion", "matches"}:
             try:
                 judged, scanning = number < _JUDGED, shutter.scanning
                 matches = match_frames(images, rig, options, scanning, judge_rig=judged)
-                found, _, _ = solve_frames(matches, rig, shutter.readout_ratio, options, offset, scanning)
+                if "motion" in needs:
+                    found, _, _ = solve_frames(matches, rig, shutter.readout_ratio, options, offset, scanning)
             except NoMotionError as error:
                 reason = str(error)
             except RefusedFramesError as error:
                 refusals.add(number, error)
                 reason = error.reason
-        yield Window(images=images, pairs=pairs, found=found, reason=reason)
+        yield Window(images=images, pairs=pairs, found=found, reason=reason, matches=matches)
     refusals.end(number + 1)
 
 
@@ -190,21 +196,28 @@ def _moment(
     options: CorrectionOptions,
 ) -> CorrectedMoment:
     """Frame 0 or 1 of the first window; as frame 1 of the second one when only that knows a motion."""
-    here = windows[0]
+    here, needs = windows[0], options.corrector.component.spec.needs
     images = {side: here.images[side, frame] for side in SIDES}
     places = list(zip(windows, (frame, 1), strict=False))
-    if "motion" in options.corrector.component.spec.needs:
+    if "motion" in needs:
         places = [(window, place) for window, place in places if window.found is not None]
+    elif "matches" in needs:
+        places = [(window, place) for window, place in places if window.matches is not None]
     if not places:
         return CorrectedMoment(number=number, images=images, frames={}, found=None, reason=here.reason)
     window, place = places[0]
     motion = None if window.found is None else window.found.motion
     pairs = window.pairs
-    if "depth" in options.corrector.component.spec.needs:
+    if "depth" in needs:
         pairs = find_depth(window.images, rig, shutter, motion, options, pairs)
     views = tuple((side, place) for side in SIDES)
     offset = 0.0 if window.found is None else window.found.disparity_offset
-    fused = correct_frames(window.images, pairs, rig, shutter, motion, options, views, offset)
+    known = Given(matches=window.matches, motion=motion, pairs=pairs)
+    fused = correct_known(window.images, known, rig, shutter, options, views, offset)
+    for (side, _), each in fused.items():
+        if not each.success:
+            why = f"{side}: {each.reason}"
+            return CorrectedMoment(number=number, images=images, frames={}, found=window.found, reason=why)
     frames = {side: fused[side, place] for side in SIDES}
     return CorrectedMoment(
         number=number, images=images, frames=frames, found=window.found, reason=here.reason if frame == 0 else ""

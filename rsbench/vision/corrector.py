@@ -15,15 +15,17 @@ from rsbench import plugins
 from rsbench.arguments import check_plain
 from rsbench.core import projection
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig, View
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 from rsbench.plugins import Entry, Kind, RunOptions
 from rsbench.vision.fusion import Fused, Origin
 
-Knowledge = Literal["motion", "depth"]
+Knowledge = Literal["motion", "depth", "matches", "gyro"]
 Cameras = Literal["ideal", "any"]
 Depths = Mapping[View, NDArray[np.float32]]
 
@@ -33,7 +35,8 @@ class CorrectorSpec:
     """What a corrector declares, checked when it is made. Raises ValueError on what does not exist."""
 
     needs: Set[Knowledge]
-    """What the chain must find for it first; what nobody needs is not looked for."""
+    """What the chain must find for it first; what nobody needs is not looked for. Samples of a gyroscope cannot be
+    found: they are given, or the frames are refused."""
     reference: str
     """Where it was published."""
     assumes: str
@@ -73,6 +76,10 @@ class CorrectionProblem:
     """(H, W) the same, guessed from the neighbours where ``depth`` is unknown; 0 elsewhere."""
     disparity_offset: float = 0.0
     """px by which disparities in the images are too large, half of it in either camera; ``depth`` is without."""
+    matches: Correspondences | None = None
+    """Of the four frames, outliers among them; None when the corrector does not need them."""
+    gyro: FloatArray | None = None
+    """(n, 4) tau, w: samples of a gyroscope, as in ``Correspondences``; None when it does not need them."""
 
     def camera(self, side: Side, reference: Side) -> PinholeCamera:
         """Of one side's images, in pixels in which the images of ``reference`` have the rig's principal point."""
@@ -112,11 +119,16 @@ class Corrector(ABC):
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
         """The corrected frames of the views asked for, with where each pixel comes from.
 
-        Images keep the shape and type of the given ones.
+        Images keep the shape and type of the given ones. A frame that cannot be corrected is ``Fused.failed`` with
+        the reason: a value, never an exception or the frame as it was.
         """
 
 
 CorrectorEntry = Entry[Corrector, RunOptions]
+
+
+class NotCorrectedError(RsbenchError):
+    """The frames are in order, but the corrector found no correction of them; the message says why."""
 
 
 def _check_spec(corrector: Corrector) -> None:
@@ -160,9 +172,22 @@ def find_corrected(entry: CorrectorEntry, problem: CorrectionProblem, views: Seq
     return {view: found[view] for view in views}
 
 
+def demand_corrected(frames: Mapping[View, Fused], corrector: str) -> None:
+    """For whoever can do nothing with a part of the frames.
+
+    Raises:
+        NotCorrectedError: one of them has failed; names the corrector, the first such frame and the reason.
+    """
+    for (side, frame), fused in frames.items():
+        if not fused.success:
+            raise NotCorrectedError(f"{CORRECTORS.singular} {corrector!r}: {side} {frame}: {fused.reason}")
+
+
 def _check(fused: object, image: NDArray[Any], where: str) -> None:
     if not isinstance(fused, Fused):
         raise RsbenchError(f"{where}: must be a Fused, got {type(fused).__name__}")
+    if not isinstance(fused.reason, str):
+        raise RsbenchError(f"{where}: reason must be a text, got {type(fused.reason).__name__}")
     for name, dtype, shape in (
         ("image", image.dtype, image.shape),
         ("origin", np.dtype(np.uint8), image.shape[:2]),

@@ -108,8 +108,7 @@ class RotationCorrector(Corrector):
     )
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
-        far = np.full((problem.rig.camera.height, problem.rig.camera.width), np.inf, dtype=np.float32)
-        return {view: _alone(problem, view, far, self.warp) for view in views}
+        return {view: turned(problem, view, self.warp) for view in views}
 
 
 @final
@@ -133,6 +132,12 @@ class PlaneCorrector(Corrector):
         return {
             view: _alone(problem, view, plane_depth(depth[view], problem.rig.camera), self.warp) for view in views
         }
+
+
+def turned(problem: CorrectionProblem, view: View, options: WarpOptions) -> Fused:
+    """A frame as the rotation of the problem's motion alone moves it: everything is at infinity."""
+    far = np.full((problem.rig.camera.height, problem.rig.camera.width), np.inf, dtype=np.float32)
+    return _alone(problem, view, far, options)
 
 
 def _alone(problem: CorrectionProblem, view: View, depth: F32, options: WarpOptions) -> Fused:

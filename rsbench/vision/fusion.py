@@ -9,7 +9,7 @@ among those that agree in depth the earlier in the list wins.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
@@ -72,12 +72,25 @@ class Fused:
     """(H, W) of ``Origin``."""
     depth: NDArray[np.float32]
     """(H, W) z in the target camera, metres; inf at infinity, NaN where it is unknown or the origin is NOBODY."""
+    reason: str = ""
+    """Why the corrector found no correction of this frame; empty when it did."""
+
+    @property
+    def success(self) -> bool:
+        """Whether there is a corrected frame."""
+        return not self.reason
 
     @classmethod
     def seen(cls, image: NDArray[Any], mask: Mask) -> Fused:
         """A corrected frame (H, W[, C]) drawn from the frame itself where ``mask`` (H, W) is True; no depth."""
         origin = np.where(mask, np.uint8(Origin.HERE), np.uint8(Origin.NOBODY))
         return cls(image=image, origin=origin, depth=np.full(mask.shape, np.nan, dtype=np.float32))
+
+    @classmethod
+    def failed(cls, image: NDArray[Any], reason: str) -> Fused:
+        """No correction of a frame (H, W[, C]), because of ``reason``: a black one that nobody saw."""
+        nothing = cls.seen(np.zeros_like(image), np.zeros(image.shape[:2], dtype=np.bool_))
+        return replace(nothing, reason=reason)
 
     def shares(self) -> dict[str, float]:
         """Share of the pixels of each origin, by its name in lower case."""

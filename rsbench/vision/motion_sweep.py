@@ -10,7 +10,7 @@ truncated difference of grey levels.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,7 +24,8 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.correction import inverse_depth
 from rsbench.vision.images import grey_u8
-from rsbench.vision.optics import Table, across_lines, line_of, look, optics_of, see
+from rsbench.vision.optics import Table, across_lines, line_of
+from rsbench.vision.other_view import Landing, land, landing, parallax_gain
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -38,23 +39,6 @@ _ALIKE = 14.0
 """Largest mean cost in the window of a depth that counts; unlike places cost about 20."""
 _AGREE_PX = 1.5
 """Largest difference of parallax between a pixel and the place where the other frame sees it."""
-
-
-class _Geometry(NamedTuple):
-    """Lines' maps of ideal pixels (x, y, 1) of inverse depth rho to the other frame's: A (G x + rho c) + rho B."""
-
-    G: FloatArray
-    """(lines, 3, 3)."""
-    c: FloatArray
-    """(lines, 3)."""
-    A: FloatArray
-    """(lines, 3, 3) of the other frame's lines."""
-    B: FloatArray
-    """(lines, 3)."""
-    ideal: Table
-    """Of ``Optics``, as the next two."""
-    lens: Table
-    columns: bool
 
 
 def depth_from_motion(
@@ -73,8 +57,9 @@ def depth_from_motion(
     """
     found = np.zeros_like(depths[0]), np.zeros_like(depths[1])
     poses = [row_poses(rig, shutter, motion, side, frame) for frame in (0, 1)]
-    centres = [-np.einsum("nji,nj->ni", pose.R, pose.t) for pose in poses]
-    gain = max(rig.camera.fx, rig.camera.fy) * float(np.linalg.norm(np.mean(centres[1] - centres[0], axis=0)))
+    axes = (shutter.axis(side), shutter.axis(side))
+    maps = [landing(rig.camera, poses[frame], poses[1 - frame], axes) for frame in (0, 1)]
+    gain = parallax_gain(rig.camera, *maps)
     count = int(_REACH * max(depths[0].shape))
     unknown = [depth == 0.0 for depth in depths]
     if gain == 0.0 or not any(np.any(mask) for mask in unknown):
@@ -82,13 +67,7 @@ def depth_from_motion(
     greys = [grey_u8(image) for image in images]
     censuses = [_census(grey) for grey in greys]
     rhos = [inverse_depth(depth) for depth in depths]
-    maps = []
-    K, optics = rig.camera.ideal.K, optics_of(rig.camera, shutter.axis(side) == 0)
-    inverse_K = np.linalg.inv(K)
     for frame in (0, 1):
-        here, there = poses[frame], poses[1 - frame]
-        back = np.swapaxes(here.R, -1, -2)
-        maps.append(_Geometry(back @ inverse_K, centres[frame], K @ there.R, there.t @ K.T, *optics))
         y, x = (places.astype(np.int32) for places in np.nonzero(unknown[frame]))
         both = (greys[frame], greys[1 - frame], censuses[frame], censuses[1 - frame])
         rhos[frame][y, x] = _search(y, x, both, maps[frame], count, 1.0 / gain)
@@ -101,7 +80,7 @@ def _search(
     y: NDArray[np.int32],
     x: NDArray[np.int32],
     both: tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint32], NDArray[np.uint32]],
-    maps: _Geometry,
+    maps: Landing,
     count: int,
     step: float,
 ) -> F32:
@@ -136,34 +115,6 @@ def _census(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
 
 
 @compiled(error_model="numpy", inline="always")
-def _land(
-    x: int,
-    y: int,
-    rho: float,
-    line: int,
-    G: FloatArray,
-    c: FloatArray,
-    A: FloatArray,
-    B: FloatArray,
-    ideal: Table,
-    lens: Table,
-    columns: bool,
-) -> tuple[float, float, float]:
-    """Pixel and depth factor in the other frame's camera of ``line``; NaN behind it."""
-    own = line_of(columns, x, y)
-    gx, gy = look(ideal, x, y)
-    p = G[own, 0, 0] * gx + G[own, 0, 1] * gy + G[own, 0, 2] + rho * c[own, 0]
-    q = G[own, 1, 0] * gx + G[own, 1, 1] * gy + G[own, 1, 2] + rho * c[own, 1]
-    r = G[own, 2, 0] * gx + G[own, 2, 1] * gy + G[own, 2, 2] + rho * c[own, 2]
-    z = A[line, 2, 0] * p + A[line, 2, 1] * q + A[line, 2, 2] * r + rho * B[line, 2]
-    s = 1.0 / z if z > 0.0 else np.nan
-    u = (A[line, 0, 0] * p + A[line, 0, 1] * q + A[line, 0, 2] * r + rho * B[line, 0]) * s
-    v = (A[line, 1, 0] * p + A[line, 1, 1] * q + A[line, 1, 2] * r + rho * B[line, 1]) * s
-    u, v = see(lens, u, v)
-    return u, v, s
-
-
-@compiled(error_model="numpy", inline="always")
 def _ones(bits: np.uint32) -> float:
     """Number of bits that are 1 (Warren, "Hacker's delight", 2002)."""
     n = np.int64(bits)
@@ -189,6 +140,7 @@ def _fill_costs(
     ideal: Table,
     lens: Table,
     columns: bool,
+    there: bool,
     rho: float,
     cost: F32,
 ) -> None:
@@ -197,8 +149,8 @@ def _fill_costs(
     count = len(A)
     for i in range(len(y)):
         # One step along the curve changes the line by one at most: its pose is that of the last landing.
-        u, v, _ = _land(x[i], y[i], rho, lines[i], G, c, A, B, ideal, lens, columns)
-        along = across_lines(columns, u, v)
+        u, v, _ = land(x[i], y[i], rho, lines[i], G, c, A, B, ideal, lens, columns)
+        along = across_lines(there, u, v)
         if -count < along < 2 * count:
             lines[i] = min(max(int(along + 0.5), 0), count - 1)
         value = _NOWHERE
@@ -233,6 +185,7 @@ def _keep_agreeing(
     ideal: Table,
     lens: Table,
     columns: bool,
+    there: bool,
     tolerance: float,
     depth: F32,
 ) -> None:
@@ -245,8 +198,8 @@ def _keep_agreeing(
                 continue
             line, u, v, s = line_of(columns, x, y), np.nan, np.nan, np.nan
             for _ in range(6):
-                u, v, s = _land(x, y, rho[y, x], line, G, c, A, B, ideal, lens, columns)
-                along = across_lines(columns, u, v)
+                u, v, s = land(x, y, rho[y, x], line, G, c, A, B, ideal, lens, columns)
+                along = across_lines(there, u, v)
                 if not -lines < along < 2 * lines:
                     break
                 line = min(max(int(along + 0.5), 0), lines - 1)

@@ -1,21 +1,28 @@
-"""The contract of stereo matchers, dense disparity of a rectified pair, and how they are found by name."""
+"""The contracts of stereo matchers, and how they are found by name.
+
+Those of a rectified pair give its disparity; those that need a motion give the depth of four images.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench import plugins
-from rsbench.arguments import check_ideal
-from rsbench.core.rig import SIDES, StereoRig
+from rsbench.arguments import check_ideal, check_plain
+from rsbench.core.motion import Motion
+from rsbench.core.rig import SIDES, StereoRig, View
+from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
 from rsbench.plugins import Entry, Kind, RunOptions
 
 F32 = NDArray[np.float32]
+Cameras = Literal["ideal", "any"]
 
 
 class StereoMatcher(ABC):
@@ -31,6 +38,36 @@ class StereoMatcher(ABC):
         rectified in a rolling-shutter pair too, for both cameras read a row at the same time. ``rig`` gives focal
         length and baseline to a matcher that limits its search.
         """
+
+
+class MotionMatcher(StereoMatcher):
+    """Dense depth of all four images of two frames, by a motion that is known; a frozen dataclass likewise."""
+
+    @property
+    def cameras(self) -> Cameras:
+        """``ideal``: without a lens, rows read from the top by both at once; others are refused. ``any``."""
+        return "ideal"
+
+    @abstractmethod
+    def depths(
+        self,
+        images: Mapping[View, NDArray[np.uint8]],
+        rig: StereoRig,
+        shutter: RollingShutter,
+        motion: Motion,
+    ) -> Mapping[View, NDArray[Any]]:
+        """Depth (H, W), metres, of the pixels of each of the images, in the camera of the pixel's own line.
+
+        Images (H, W) or (H, W, 3) RGB by side and frame; NaN is unknown, inf infinitely far. ``motion`` is the
+        body's over one frame period, in metres.
+        """
+
+    @final
+    def disparities(
+        self, left: NDArray[np.uint8], right: NDArray[np.uint8], rig: StereoRig
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Nothing: one pair has no motion."""
+        raise NotImplementedError("needs four images and a motion")
 
 
 MatcherEntry = Entry[StereoMatcher, RunOptions]
@@ -61,6 +98,7 @@ def find_disparities(
     """
     where = f"{STEREO_MATCHERS.singular} {entry.name!r}"
     check_ideal(rig, where)
+    refuse_motion(entry, "one pair of images has none")
     with plugins.blame(STEREO_MATCHERS, entry):
         answer = entry.component.disparities(left, right, rig)
     if not isinstance(answer, tuple) or len(answer) != len(SIDES):
@@ -72,16 +110,65 @@ def find_disparities(
     return first, second
 
 
-def _checked(disparity: object, size: tuple[int, ...], where: str) -> F32:
-    if not isinstance(disparity, np.ndarray) or not np.issubdtype(disparity.dtype, np.floating):
-        kind = disparity.dtype if isinstance(disparity, np.ndarray) else type(disparity).__name__
+def needs_motion(entry: MatcherEntry) -> bool:
+    """Whether depth is found with a motion: ``find_depths`` asks such a matcher, ``find_disparities`` others."""
+    return isinstance(entry.component, MotionMatcher)
+
+
+def refuse_motion(entry: MatcherEntry, why: str) -> None:
+    """Raises RsbenchError for a matcher that needs a motion where none is known; ``why`` says why not."""
+    if needs_motion(entry):
+        raise RsbenchError(
+            f"{STEREO_MATCHERS.singular} {entry.name!r}: needs the rig's motion, and {why}; "
+            "take another, such as sgm"
+        )
+
+
+def find_depths(
+    entry: MatcherEntry,
+    images: Mapping[View, NDArray[np.uint8]],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+) -> dict[View, F32]:
+    """What a matcher that needs a motion makes of four images, checked: float32 (H, W) metres, inf or NaN.
+
+    Raises:
+        RsbenchError: it takes no such cameras, or another package's matcher raised or answered something else.
+    """
+    where, matcher = f"{STEREO_MATCHERS.singular} {entry.name!r}", entry.component
+    assert isinstance(matcher, MotionMatcher)
+    if matcher.cameras == "ideal":
+        check_plain(rig, shutter, where)
+    with plugins.blame(STEREO_MATCHERS, entry):
+        answer = matcher.depths(images, rig, shutter, motion)
+    if not isinstance(answer, Mapping) or set(answer) != set(images):
+        raise RsbenchError(f"{where}: must return the depth of each image, by {', '.join(map(str, images))}")
+    return {view: _checked_depth(answer[view], images[view].shape[:2], f"{where}: {view}") for view in images}
+
+
+def _checked_depth(depth: object, size: tuple[int, ...], where: str) -> F32:
+    found = _floating(depth, size, where)
+    if np.any(found <= 0.0):  # NaN is unknown
+        raise RsbenchError(f"{where}: depth must be above 0 or NaN, got {np.nanmin(found)}")
+    return found
+
+
+def _floating(values: object, size: tuple[int, ...], where: str) -> F32:
+    if not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
+        kind = values.dtype if isinstance(values, np.ndarray) else type(values).__name__
         raise RsbenchError(f"{where}: must be an array of floating point numbers, got {kind}")
-    if disparity.shape != size:
-        raise RsbenchError(f"{where}: must have the image's shape {size}, got {disparity.shape}")
-    infinite = np.isinf(disparity)
+    if values.shape != size:
+        raise RsbenchError(f"{where}: must have the image's shape {size}, got {values.shape}")
+    return np.asarray(values, dtype=np.float32)
+
+
+def _checked(disparity: object, size: tuple[int, ...], where: str) -> F32:
+    found = _floating(disparity, size, where)
+    infinite = np.isinf(found)
     if np.any(infinite):
         raise RsbenchError(f"{where}: {np.count_nonzero(infinite)} values are infinite; NaN is unknown")
-    known = disparity[~np.isnan(disparity)]
+    known = found[~np.isnan(found)]
     if known.size and np.median(known) < 0.0:
         raise RsbenchError(f"{where}: is mostly below 0, such as {known.min()}; disparity is x_left - x_right")
-    return np.asarray(disparity, dtype=np.float32)
+    return found

@@ -13,22 +13,32 @@ import pytest
 from rsbench.cards import list_cards
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import VIEWS, StereoRig
+from rsbench.core.shutter import RollingShutter
 from rsbench.errors import RsbenchError
 from rsbench.plugins import Entry, RunOptions
 from rsbench.vision.feature_matcher import FeatureMatcher, find_correspondences, load_features
 from rsbench.vision.features import MatchOptions, SiftMatcher
+from rsbench.vision.plane_sweep import SweepMatcher
 from rsbench.vision.stereo_depth import SgmMatcher, SgmOptions
-from rsbench.vision.stereo_matcher import StereoMatcher, find_disparities, load_matcher
+from rsbench.vision.stereo_matcher import (
+    MotionMatcher,
+    StereoMatcher,
+    find_depths,
+    find_disparities,
+    load_matcher,
+)
 
 RIG = StereoRig(camera=PinholeCamera.centred(40, 30, 50.0), baseline=0.2)
+SHUTTER, MOTION = RollingShutter(height=30, readout_ratio=0.5), LinearMotion(np.zeros(3), np.ones(3))
 IMAGES = {view: np.zeros((30, 40), np.uint8) for view in VIEWS}
 
 
 @pytest.mark.parametrize("name", list_cards("matchers"))
 def test_matcher_cards_load(name: str) -> None:
     entry = load_matcher(name)
-    assert isinstance(entry.component, SgmMatcher) and entry.description
+    assert isinstance(entry.component, (SgmMatcher, SweepMatcher)) and entry.description
 
 
 @pytest.mark.parametrize("name", list_cards("features"))
@@ -101,6 +111,16 @@ class Says(StereoMatcher):
 
 
 @dataclass(frozen=True)
+class SaysDepth(MotionMatcher):
+    answer: Any
+
+    def depths(self, images: Any, rig: StereoRig, shutter: Any, motion: Any) -> Any:
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+
+@dataclass(frozen=True)
 class Finds(FeatureMatcher):
     answer: Any
 
@@ -123,6 +143,41 @@ def test_good_disparities_pass_as_float32() -> None:
     both = find_disparities(entry_of(Says((left, right))), IMAGES["left", 0], IMAGES["right", 0], RIG)
     assert [disparity.dtype for disparity in both] == [np.float32, np.float32]
     np.testing.assert_array_equal(both, (left, right))
+
+
+def test_a_matcher_that_needs_a_motion_is_refused_where_there_is_none() -> None:
+    with pytest.raises(RsbenchError, match=r"^matcher 'mine': needs the rig's motion, and .*such as sgm$"):
+        find_disparities(entry_of(SaysDepth({})), IMAGES["left", 0], IMAGES["right", 0], RIG)
+
+
+def test_good_depths_pass_as_float32() -> None:
+    answer = dict.fromkeys(VIEWS, flat(3.0)) | {("left", 1): flat(float("nan")), ("right", 1): flat(float("inf"))}
+    depths = find_depths(entry_of(SaysDepth(answer)), IMAGES, RIG, SHUTTER, MOTION)
+    assert {depth.dtype for depth in depths.values()} == {np.dtype(np.float32)}
+    np.testing.assert_array_equal(list(depths.values()), list(answer.values()))
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        ([flat(1.0)], ("depth of each image",)),
+        ({("left", 0): flat(1.0)}, ("depth of each image", "right")),
+        (dict.fromkeys(VIEWS, flat(0.0)), ("above 0 or NaN", "0.0")),
+        (dict.fromkeys(VIEWS, flat(1.0, shape=(40, 30))), ("(30, 40)", "(40, 30)")),
+        (dict.fromkeys(VIEWS, flat(1, np.int64)), ("int64",)),
+        (KeyError("weights"), ("failed: KeyError", "weights")),
+    ],
+)
+def test_wrong_depths_are_refused_in_one_line(answer: Any, words: tuple[str, ...]) -> None:
+    with pytest.raises(RsbenchError) as caught:
+        find_depths(entry_of(SaysDepth(answer)), IMAGES, RIG, SHUTTER, MOTION)
+    assert all(word in str(caught.value) for word in ("mine", *words)) and "\n" not in str(caught.value)
+
+
+def test_cameras_that_a_matcher_does_not_take_are_refused() -> None:
+    late = RollingShutter(height=30, readout_ratio=0.5, right_delay=0.1)
+    with pytest.raises(RsbenchError, match=r"right_delay = 0\.1: matcher 'mine' takes rows"):
+        find_depths(entry_of(SaysDepth({})), IMAGES, RIG, late, MOTION)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property, partial
@@ -16,13 +17,14 @@ from rsbench.benchmark.provenance import numeric_version
 from rsbench.cards import choices, list_cards
 from rsbench.dataset.files import sha256
 from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.workplace import listed
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.plugins import Entry, Kind
 from rsbench.solvers.engine.registry import SOLVERS, SolverEntry, load_solver_entry
 from rsbench.vision.corrector import CORRECTORS, load_corrector
 from rsbench.vision.feature_matcher import load_features
-from rsbench.vision.stereo_matcher import STEREO_MATCHERS, MatcherEntry, load_matcher
+from rsbench.vision.stereo_matcher import STEREO_MATCHERS, MatcherEntry, load_matcher, needs_motion
 
 Component = TypeVar("Component")
 HashOf = Callable[[Path], str]
@@ -217,13 +219,15 @@ class Places:
             f"motion/{solver.name}" if seed == 0 else f"{_SEEDS}/{seed}/{solver.name}",
             matches=self.matches().identity,
             solver=solver.key,
-            options=asdict(solver.options),
+            options=solver.options.deciding,
             robust=asdict(self.chain.robust),
             seed=self.chain.seed,
         )
 
     def depth(self, matcher: MatcherEntry) -> Artefact:
-        return self._artefact(f"depth/{matcher.name}", data=self.data, matcher=matcher.key)
+        """By the motion of the solver of ``chain`` where the matcher needs one."""
+        motion = {"motion": self.motion(self.chain.solver).identity} if needs_motion(matcher) else {}
+        return self._artefact(f"depth/{matcher.name}", data=self.data, matcher=matcher.key, **motion)
 
     def corrected(self, recipe: Recipe) -> Artefact:
         chain, needs = recipe.chain, recipe.chain.corrector.component.spec.needs
@@ -235,6 +239,7 @@ class Places:
             corrector=chain.corrector.key,
             motion=motion if "motion" in needs else None,
             depth=depth if "depth" in needs else None,
+            matches=self.matches().identity if "matches" in needs else None,
             target_row=chain.target_row,
             steps=[chain.depth_from_motion, chain.find_sky, chain.inpaint],
         )
@@ -256,7 +261,8 @@ def stored_motions(places: Places, plan: Plan) -> Iterator[Stored]:
     """Of every solver and seed, planned or not."""
     chosen = {solver.name: solver for solver in plan.solvers}
     again = cache(partial(_again, partial(_named, load_solver_entry)))
-    numbers = sorted(int(path.name) for path in (places.folder / _SEEDS).glob("[1-9]*"))
+    names = [path.name for path in listed(places.folder / _SEEDS)]
+    numbers = sorted(int(name) for name in names if re.fullmatch("[1-9][0-9]*", name))
     for seed, kind in [(0, "motion"), *((k, f"{_SEEDS}/{k}") for k in numbers)]:
         for name, record in records_below(places.folder, kind):
             entry = chosen.get(name) or again(record.get("entry"))

@@ -32,11 +32,19 @@ from rsbench.dataset.files import (
     sha256,
     write_png,
 )
+from rsbench.dataset.imu import gyro_samples
 from rsbench.dataset.sequence import Sequence
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.chain import Given, correct_four
-from rsbench.pipeline.frame_depth import Images, Pairs, depth_of_pair, known_depth
+from rsbench.pipeline.frame_depth import (
+    Images,
+    Pairs,
+    depth_of_pair,
+    known_depth,
+    motion_disparities,
+    pair_with_motion,
+)
 from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.robust_motion import RobustEstimate
@@ -44,7 +52,7 @@ from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.registry import SOLVERS, SolverEntry
 from rsbench.solvers.engine.warm_up import warm_up
 from rsbench.vision.corrector import CORRECTORS
-from rsbench.vision.stereo_matcher import STEREO_MATCHERS
+from rsbench.vision.stereo_matcher import STEREO_MATCHERS, MatcherEntry, needs_motion
 from rsbench.vision.timed_depth import timed_depth
 from rsbench.vision.undistortion import sensor_disparities
 
@@ -81,7 +89,8 @@ class Bench:
                 self.move(entry)
                 step(f"{self.sequence.name}: {entry.name}")
         if self.plan.corrects:
-            if self.sequence.shutter.rows_together:  # else the depth depends on the motion
+            # Of other cameras a pair has no disparity of one time.
+            if self.sequence.shutter.rows_together or needs_motion(self.plan.chain.matcher):
                 self._find_depth()
             step(f"{self.sequence.name}: depth")
             for recipe in Recipe(chain=self.plan.chain).variants():
@@ -163,24 +172,37 @@ class Bench:
         if self.stands(artefact):
             return
         artefact.start()
-        images, start = self.images, time.perf_counter()
-        found: dict[str, NDArray[np.float32]] = {}
+        start = time.perf_counter()
         record = {
             "matcher": entry.name,
             "entry": reference_of(STEREO_MATCHERS, entry),
+            "timed": needs_motion(entry),
             "success": True,
             "reason": "",
         }
         try:
-            for frame in FRAMES:
-                both = sensor_disparities(entry, images["left", frame], images["right", frame], self.sequence.rig)
-                found[f"left_{frame}"], found[f"right_{frame}"] = both
+            found = self._disparities(entry)
         except RsbenchError as error:
             artefact.finish(record | {"success": False, "reason": str(error)})
             return
         seconds = time.perf_counter() - start
         save_arrays(artefact.file(".npz"), found)
         artefact.finish(record, seconds)
+
+    def _disparities(self, entry: MatcherEntry) -> dict[str, NDArray[np.float32]]:
+        """Of each view by its name; a matcher that needs a motion gets the estimated one."""
+        images, sequence = self.images, self.sequence
+        found: dict[View, NDArray[np.float32]] = {}
+        if needs_motion(entry):
+            motion = read_motion(self.places, self.plan.chain.solver)
+            if isinstance(motion, str):
+                raise RsbenchError(f"no motion: {motion}")
+            found = motion_disparities(entry, images, sequence.rig, sequence.shutter, motion)
+        else:
+            for frame in FRAMES:
+                both = sensor_disparities(entry, images["left", frame], images["right", frame], sequence.rig)
+                found |= {("left", frame): both[0], ("right", frame): both[1]}
+        return {f"{side}_{frame}": disparity for (side, frame), disparity in found.items()}
 
     # Correction
 
@@ -204,6 +226,7 @@ class Bench:
             artefact.finish(record | {"success": False, "reason": str(error)})
             return
         seconds = time.perf_counter() - start
+        record["failures"] = {f"{s}_{f}": fused.reason for (s, f), fused in frames.items() if not fused.success}
         for (side, frame), fused in frames.items():
             write_png(artefact.file(f"-{side}_{frame}.png"), fused.image)
             write_origin(artefact.file(f"-{side}_{frame}-origin.png"), fused.origin)
@@ -221,17 +244,37 @@ class Bench:
             return f"no motion: {motion}"
         if isinstance(pairs, str):
             return f"no depth: {pairs}"
-        return Given(motion=motion, pairs=pairs)
+        needs = recipe.chain.corrector.component.spec.needs
+        matches = self._matches if "matches" in needs else None
+        if isinstance(matches, str):
+            return f"no matches: {matches}"
+        gyro = None
+        if "gyro" in needs and "imu" in self.sequence.channels:
+            gyro = gyro_samples(self.sequence.inertial(), self.sequence.frame_period_s)
+        return Given(matches=matches, motion=motion, pairs=pairs, gyro=gyro)
 
     def _pairs(self, recipe: Recipe) -> Pairs | str | None:
-        """Those of the matcher; None where they are found with the motion, for rows are not read together."""
-        if not self.sequence.shutter.rows_together:
+        """Those of the matcher; None where they are found with the motion that the recipe has."""
+        moved = needs_motion(recipe.chain.matcher)
+        if recipe.true_motion if moved else not self.sequence.shutter.rows_together:
             return None
         artefact = self.places.depth(recipe.chain.matcher)
         record = artefact.record()
         if record is None or not record["success"]:
             return str(record["reason"]) if record else "not made"
         stored = load_disparities(artefact.file(".npz"), self.sequence.rig)
+        if moved:
+            first, second = (
+                pair_with_motion(
+                    self.images,
+                    [stored[f"{side}_{frame}"] for side in SIDES],
+                    frame,
+                    self.sequence.rig,
+                    find_sky=recipe.chain.find_sky,
+                )
+                for frame in FRAMES
+            )
+            return first, second
         first, second = (
             depth_of_pair(
                 self.images["left", frame],
@@ -310,14 +353,17 @@ def true_pairs(sequence: Sequence, images: Images) -> Pairs:
     return known_depth(images, {view: np.where(z > 0, z, np.float32(np.inf)) for view, z in truth.items()})
 
 
-def depth_of(disparity: NDArray[np.float32], sequence: Sequence, side: Side, frame: int) -> NDArray[np.float32]:
+def depth_of(
+    disparity: NDArray[np.float32], sequence: Sequence, side: Side, frame: int, *, timed: bool = False
+) -> NDArray[np.float32]:
     """Depth (H, W), metres, 0 where the disparity is not known: the depth convention of the dataset.
 
-    With a lens the true motion says where the rig was at both ends of a disparity: a matcher is scored, no motion.
+    ``timed``: a motion is in the disparities already. Else, with a lens, the true motion says where the rig was at
+    both ends of a disparity: a matcher is scored, no motion.
     """
     rig = sequence.rig
     depth = np.nan_to_num(rig.depth(disparity), nan=0.0).astype(np.float32)
-    if rig.camera.lens is None:
+    if timed or rig.camera.lens is None:
         return depth
     found = timed_depth(depth, rig, sequence.shutter, sequence.motion, side, frame)
     return np.where(np.isfinite(found), found, np.float32(0.0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from rsbench.cards import parse_card
@@ -52,6 +52,7 @@ class _Motion(_Record):
 class _Depth(_Record):
     matcher: str
     entry: str
+    timed: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +61,8 @@ class _Correction(_Record):
     solver: str
     matcher: str
     entries: dict[str, str]
+    failures: dict[str, str] = field(default_factory=dict)
+    """By views such as ``left_0`` that the corrector gave up, why."""
 
 
 _KINDS: dict[str, type[_Record]] = {

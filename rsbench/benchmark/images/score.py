@@ -145,9 +145,9 @@ class Scorer:
                 self._fail("matcher", record["matcher"], record["reason"])
             for view in VIEWS:
                 disparity = None if stored is None else stored[f"{view[0]}_{view[1]}"]
-                self._add("depth", self._depth_rows(record["matcher"], view, disparity))
+                self._add("depth", self._depth_rows(record, view, disparity))
 
-    def _depth_rows(self, matcher: str, view: View, disparity: NDArray[np.float32] | None) -> Iterator[Row]:
+    def _depth_rows(self, record: Row, view: View, disparity: NDArray[np.float32] | None) -> Iterator[Row]:
         side, frame = view
         rig, truth = self.sequence.rig, self.sequence.depth("rs", side, frame)
         other: Side = "right" if side == "left" else "left"
@@ -155,10 +155,10 @@ class Scorer:
         for name, part in (("all", np.ones_like(seen)), ("visible", seen), ("occluded", ~seen)):
             case = None
             if disparity is not None:
-                case = DepthCase(
-                    depth=depth_of(disparity, self.sequence, *view), truth=truth, pixels=part, rig=rig
-                )
-            keys = {"matcher": matcher, "side": side, "frame": frame, "pixels": name, "success": case is not None}
+                depth = depth_of(disparity, self.sequence, *view, timed=record["timed"])
+                case = DepthCase(depth=depth, truth=truth, pixels=part, rig=rig)
+            keys: Row = {"matcher": record["matcher"], "side": side, "frame": frame, "pixels": name}
+            keys["success"] = case is not None
             yield keys | self._metrics(case, DepthCase)
 
     def _score_correction(self) -> None:
@@ -177,12 +177,15 @@ class Scorer:
                 continue
             if not record["success"]:
                 self._fail("correction", "+".join(names.values()), record["reason"])
+            lost = record.get("failures", {})
+            for view, reason in lost.items():
+                self._fail("correction", "+".join(names.values()), f"{view}: {reason}")
             artefact = self.places.corrected(recipe)
             size = self.sequence.rig.camera.width, self.sequence.rig.camera.height
             for view in VIEWS:
                 image = drawn = None
-                if record["success"]:
-                    end = f"-{view[0]}_{view[1]}"
+                end = f"-{view[0]}_{view[1]}"
+                if record["success"] and end[1:] not in lost:
                     image = read_png(artefact.file(f"{end}.png"), size)
                     drawn = read_origin(artefact.file(f"{end}-origin.png"), size) != Origin.NOBODY
                 self._add("correction", self._image_rows(names, view, image, drawn))

@@ -16,6 +16,7 @@ from typing import Any
 
 from rsbench.benchmark.images.records import is_whole
 from rsbench.dataset.files import read_json, write_json
+from rsbench.dataset.workplace import listed
 from rsbench.errors import RsbenchError
 
 SECONDS = "seconds.json"
@@ -78,7 +79,7 @@ def read_record(path: Path) -> dict[str, Any] | None:
 
 def records_below(folder: Path, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:
     """Names and whole records of all artefacts of a kind, such as ``motion``, in the order of their names."""
-    for path in sorted((folder / kind).glob("*.json")):
+    for path in listed(folder / kind, ".json"):
         record = read_record(path)
         if record is not None and is_whole(kind, record):
             yield path.stem, record

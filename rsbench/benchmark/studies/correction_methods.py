@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 
@@ -70,3 +71,30 @@ METHODS = (
     Method(key="true-depth", title="our motion, true depth", kind="oracle", knows="true depth"),
     Method(key="truth", title="true motion, true depth", kind="oracle", knows="true motion and depth"),
 )
+UNPUBLISHED = (
+    Method(
+        key="gyroscope",
+        title="rotation only, measured",
+        kind="baseline",
+        knows="what the gyroscope of the channel `imu` measured, with its noise, bias and clock; no depth",
+    ),
+    Method(
+        key="zhuang",
+        title="monocular, Zhuang et al.",
+        kind="baseline",
+        knows="one camera, two frames: its motion by `rs-zhuang-8pt`, depth from dense flow in the same unit",
+    ),
+    Method(key="lao-lines", title="lines, Lao et al.", kind="baseline", knows="one image: curves that were lines"),
+    Method(
+        key="purkait-manhattan",
+        title="Manhattan, Purkait et al.",
+        kind="baseline",
+        knows="one image: lines along three orthogonal directions",
+    ),
+)
+"""Methods that are in no published table yet: a study has them when it is asked for them."""
+
+
+def methods_among(keys: Collection[str]) -> list[Method]:
+    """The methods of these keys, in the order of tables."""
+    return [method for method in (*METHODS, *UNPUBLISHED) if method.key in keys]

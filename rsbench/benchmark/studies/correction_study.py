@@ -4,7 +4,8 @@ A method is a depth, a motion and a corrector of the chain that users have. Thos
 frame did not see from the other frames; what remains is invented (inpainted), so that every method gives a whole
 picture, which 'all' scores. 'Covered' scores the pixels that every method of a view draws from the frame itself:
 nothing there is filled or invented. A method that finds no motion has failed: it scores the worst values, and
-takes no pixels from the others.
+takes no pixels from the others. Nor do methods that are in no published table, which are compared when they are
+asked for: what they do not cover is invented.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from numpy.typing import NDArray
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.standard_metrics import Flip, Psnr, Ssim
-from rsbench.benchmark.studies.correction_methods import METHODS
+from rsbench.benchmark.studies.asked_rotations import asked_rotation
+from rsbench.benchmark.studies.correction_methods import METHODS, UNPUBLISHED
 from rsbench.benchmark.studies.kept_rows import KeptRows, Row, Rows
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, VIEWS, Side, View
@@ -34,16 +36,16 @@ from rsbench.pipeline.frame_depth import Pairs, frame_pairs, known_depth
 from rsbench.pipeline.frame_motion import FoundMotion, NoMotionError, find_matches, find_motion
 from rsbench.pipeline.isolated_jobs import finished_jobs
 from rsbench.pipeline.isolation import EntryFailure
+from rsbench.pipeline.one_camera import ZhuangCorrector, depth_alone
 from rsbench.pipeline.readout import select
 from rsbench.pipeline.simpler_motions import global_shutter_motion, monocular_motion, solved_alone
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 from rsbench.vision.correction import correction_flow
 from rsbench.vision.corrector import load_corrector
-from rsbench.vision.flow import dense_flow
 from rsbench.vision.fusion import Fused, Origin
 from rsbench.vision.legacy_quality import flip, ssim_deepunroll, ssim_uniform
 from rsbench.vision.quality import psnr, ssim_within
-from rsbench.vision.simpler_depths import monocular_depth, plane_depth
+from rsbench.vision.simpler_depths import plane_depth
 
 Mask = NDArray[np.bool_]
 Depth = NDArray[np.float32]
@@ -76,12 +78,13 @@ def study_dataset(
     solver: str = "rs-stereo-refined",
     workers: int | None = 1,
     kept: Path | None = None,
+    others: tuple[str, ...] = (),
 ) -> Rows:
     """Scores of every method on every view, errors by row band, and the motion errors, of all sequences.
 
     ``solver`` names the solver of "our" motion, whose model the corrections take. ``step`` is called with the name
     of each sequence done; ``workers`` processes share them, one per core for None. A folder ``kept`` holds what is
-    done of a run that is cut off.
+    done of a run that is cut off. ``others`` are keys of ``UNPUBLISHED`` methods to have too.
 
     Raises:
         RsbenchError: the dataset cannot be read, or there is no such solver.
@@ -89,13 +92,15 @@ def study_dataset(
     """
     sequences = read_dataset(dataset)
     found: dict[str, Rows] = {}
-    store = None if kept is None else KeptRows(folder=kept, dataset=dataset, seed=seed, solver=solver)
+    store = (
+        None if kept is None else KeptRows(folder=kept, dataset=dataset, seed=seed, solver=solver, others=others)
+    )
     if store is not None:
         found = {one.name: rows for one in sequences if (rows := store.read(one.name)) is not None}
     for name in found:
         step(name)
     missing = [sequence for sequence in sequences if sequence.name not in found]
-    with closing(_studied(missing, dataset, seed, solver, workers)) as outcomes:
+    with closing(_studied(missing, dataset, seed, solver, workers, others)) as outcomes:
         for name, rows in outcomes:
             found[name] = rows
             if store is not None:
@@ -108,37 +113,44 @@ def study_dataset(
 
 
 def _studied(
-    sequences: list[Sequence], dataset: Path, seed: int, solver: str, workers: int | None
+    sequences: list[Sequence],
+    dataset: Path,
+    seed: int,
+    solver: str,
+    workers: int | None,
+    others: tuple[str, ...],
 ) -> Generator[tuple[str, Rows], None, None]:
     """Names of sequences with their rows, as they become ready."""
     if workers == 1:
         for sequence in sequences:
-            yield sequence.name, study_sequence(sequence, seed, solver)
+            yield sequence.name, study_sequence(sequence, seed, solver, others)
     else:
         names, count = [sequence.name for sequence in sequences], workers or os.cpu_count() or 1
-        yield from finished_jobs(_serve, names, count, {}, dataset, seed, solver)
+        yield from finished_jobs(_serve, names, count, {}, dataset, seed, solver, others)
 
 
-def _serve(dataset: Path, seed: int, solver: str) -> Callable[[str], Rows]:
+def _serve(dataset: Path, seed: int, solver: str, others: tuple[str, ...]) -> Callable[[str], Rows]:
     """What studies sequences by their names, in a child."""
 
     def study(name: str) -> Rows:
         try:
-            return study_sequence(read_sequence(dataset / name), seed, solver)
+            return study_sequence(read_sequence(dataset / name), seed, solver, others)
         except RsbenchError as error:
             raise EntryFailure(str(error)) from error
 
     return study
 
 
-def study_sequence(sequence: Sequence, seed: int = 0, solver: str = "rs-stereo-refined") -> Rows:
+def study_sequence(
+    sequence: Sequence, seed: int = 0, solver: str = "rs-stereo-refined", others: tuple[str, ...] = ()
+) -> Rows:
     """What ``study_dataset`` says of one sequence."""
     bench = Bench(sequence, seed, solver)
-    attempts = {method.key: bench.attempt(method.key) for method in METHODS}
+    attempts = {key: bench.attempt(key) for key in (*(method.key for method in METHODS), *others)}
     images: list[Row] = []
     bands: list[Row] = []
     for view in VIEWS:
-        found = {key: None if attempt is None else attempt[view] for key, attempt in attempts.items()}
+        found = {key: None if attempt is None else attempt.get(view) for key, attempt in attempts.items()}
         identity = {"sequence": sequence.name, "side": view[0], "frame": view[1]}
         images += [identity | row for row in _image_rows(sequence, view, found)]
         bands += [identity | row for row in _band_rows(found)]
@@ -192,12 +204,15 @@ class Bench:
         return row
 
     def attempt(self, key: str) -> dict[View, Attempt] | None:
-        """What one method makes of the four views; None when it found no motion."""
+        """What one method makes of the views, but those in which it found no motion; None when in none."""
         true = self.sequence.motion
         if key == "none":
             return self._nothing()
-        if key in ("mono", "gs-mono"):
-            return self._mono(self._velocity if key == "mono" else self._scaled_monocular)
+        alone = {"mono": self._velocity, "gs-mono": self._scaled_monocular, "zhuang": self._zhuang}
+        if key in alone:
+            return self._mono(alone[key])
+        if key in _ASKED:
+            return self._turned(key)
         motions = {"gs": self.gs_motion, "gyro": true, "true-motion": true, "truth": true}
         motions["gs-scaled"] = None if self.scaled is None else self.scaled.motion
         motion = motions.get(key, self.motion)
@@ -240,6 +255,20 @@ class Bench:
         solver = load_solver_entry(_MONOCULAR).solver
         return solved_alone(self.matches, self.rig, self.shutter, side, solver, self.options.robust, rng)
 
+    def _zhuang(self, side: Side) -> Motion | None:
+        return ZhuangCorrector(seed=self._seed).motion(self.matches, self.rig, self.shutter, side)
+
+    def _turned(self, key: str) -> dict[View, Attempt]:
+        """By a rotation that may be another one in each view."""
+        out: dict[View, Attempt] = {}
+        far = _infinitely_far(self.true[0].depth["left"])
+        for view in VIEWS:
+            motion = asked_rotation(key, self.sequence, self.images, view)
+            if motion is not None:
+                frames, _ = self.corrected(self.sgm, motion, "rotation-only", (view,))
+                out[view] = _attempt(frames[view], correction_flow(far, self.rig, self.shutter, motion, *view))
+        return out
+
     def _mono(self, motion_of: Callable[[Side], Motion | None]) -> dict[View, Attempt] | None:
         """Each camera by itself: its motion from its own matches, depth from its own flow in the same unit."""
         motions: dict[str, Motion] = {}
@@ -250,9 +279,8 @@ class Bench:
             motions[side] = motion
         depth = {}
         for side, frame in VIEWS:
-            flow = dense_flow(self.images[side, frame], self.images[side, 1 - frame])
-            rig = self.rig.about(side)
-            depth[side, frame] = monocular_depth(flow, rig, self.shutter, motions[side], side, frame)
+            about = self.rig.about(side)
+            depth[side, frame] = depth_alone(self.images, about, self.shutter, motions[side], (side, frame))
         options = replace(self.options, corrector=load_corrector("single-view"))
         out: dict[View, Attempt] = {}
         for view in VIEWS:
@@ -270,6 +298,8 @@ def _as_it_is(depth: Depth) -> Depth:
     return depth
 
 
+_ASKED = {method.key for method in UNPUBLISHED}
+_PUBLISHED = {method.key for method in METHODS}
 _CORRECTORS = {"gyro": "rotation-only", "rotation": "rotation-only", "plane": "one-plane"}
 _DEPTHS: dict[str, Callable[[Depth], Depth]] = {
     "gyro": _infinitely_far,
@@ -285,7 +315,7 @@ def _attempt(fused: Fused, flow: NDArray[np.float32]) -> Attempt:
 
 def _image_rows(sequence: Sequence, view: View, attempts: dict[str, Attempt | None]) -> list[Row]:
     truth, found = sequence.image("gs", *view), _found(attempts)
-    common = np.logical_and.reduce([attempt.covered for attempt in found.values()])
+    common = np.logical_and.reduce([attempt.covered for key, attempt in found.items() if key in _PUBLISHED])
     rows = []
     for key, attempt in attempts.items():
         if attempt is None:

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.statistics import median_interval
-from rsbench.benchmark.studies.correction_methods import METHODS
+from rsbench.benchmark.studies.correction_methods import methods_among
 from rsbench.core.so3 import FloatArray
 
 EXTRA = ("flip_covered", "flip_all", "ssim_deepunroll", "ssim_uniform")
@@ -53,7 +53,7 @@ def summarise(images: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for stratum, group in table.groupby("stratum", sort=False):
         ours = group[group["method"] == "ours"].set_index("sequence")
-        for method in METHODS:
+        for method in methods_among(set(group["method"])):
             own = group[group["method"] == method.key].set_index("sequence")
             row: dict[str, Any] = {"stratum": stratum, "method": method.key, "kind": method.kind}
             row |= {"sequences": len(own), "failures": int(np.count_nonzero(own["success"] < 1.0))}

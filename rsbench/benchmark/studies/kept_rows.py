@@ -28,6 +28,8 @@ class KeptRows:
     dataset: Path
     seed: int
     solver: str
+    others: tuple[str, ...] = ()
+    """Methods beside the published ones."""
 
     def read(self, name: str) -> Rows | None:
         """What was stored of a sequence; None when there is nothing current."""
@@ -56,6 +58,7 @@ class KeptRows:
             sequence=sha256(self.dataset / name / "sequence.json"),
             seed=self.seed,
             solver=self.solver,
+            others=self.others,
         )
 
 

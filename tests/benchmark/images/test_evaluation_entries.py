@@ -24,6 +24,7 @@ from rsbench.benchmark.metric_plugins import Column, ImageMetric, PoseMetric
 from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
 from rsbench.vision.corrector import Corrector, CorrectorSpec
 from rsbench.vision.feature_matcher import FeatureMatcher
+from rsbench.vision.fusion import Fused
 from rsbench.vision.stereo_matcher import StereoMatcher
 
 
@@ -82,6 +83,19 @@ class OddCorrector(Corrector):
     def correct(self, problem, views):
         behave(self.how)
         return {}
+
+
+@final
+@dataclass(frozen=True)
+class LeftAlone(Corrector):
+    # Takes matches, leaves left frames as they are and finds nothing for right ones.
+    spec = CorrectorSpec(needs={"matches"}, reference="none", assumes="nothing")
+
+    def correct(self, problem, views):
+        assert len(problem.matches.tracks) > 10 and problem.motion is None and problem.gyro is None
+        seen, images = np.ones(problem.images["left", 0].shape[:2], dtype=np.bool_), problem.images
+        left = {view: Fused.seen(images[view], seen) for view in views if view[0] == "left"}
+        return left | {view: Fused.failed(images[view], "too far right") for view in views if view[0] == "right"}
 
 
 class OddMetric(PoseMetric):
@@ -169,6 +183,31 @@ def test_other_components_that_break_the_contract_fail_alone(
     assert len(odd_rows) == 2 * 4 * 2 and not np.any(odd_rows["success"]) and np.all(odd_rows["psnr"] == 0.0)
     kinds = set(read_scores(tmp_path, "failures")["kind"])
     assert kinds == {"matcher", "correction", "metric"}
+
+
+def test_frames_that_a_corrector_gives_up_by_value_score_the_worst_and_the_others_their_own(
+    smoke_dataset: Path, tmp_path: Path, strangers: Path
+) -> None:
+    (strangers / "left-alone.toml").write_text('class = "evaluation_strangers:LeftAlone"\n')
+    evaluate(smoke_dataset, tmp_path, corrector=str(strangers / "left-alone.toml"), only=("castle",))
+    scores = read_scores(tmp_path, "correction")
+    own = scores[(scores["corrector"] == "left-alone") & (scores["sequence"] == "castle")].set_index("side")
+    assert set(own["solver"]) == set(own["matcher"]) == {"none"}
+    left, right = own[own.index == "left"], own[own.index == "right"]
+    assert np.all(left["success"]) and not np.any(right["success"])
+    assert np.all(right["psnr"] == 0.0) and np.all(right["coverage"] == 0.0)
+    as_it_is = scores[(scores["corrector"] == "none") & (scores["sequence"] == "castle")].set_index("side")
+    np.testing.assert_array_equal(own.loc["left", "psnr"], as_it_is.loc["left", "psnr"])
+    reasons = read_scores(tmp_path, "failures")["reason"].tolist()
+    assert "right_0: too far right" in reasons and len(reasons) == 2
+
+
+def test_without_the_channel_of_a_gyroscope_its_corrector_fails_and_says_why(
+    smoke_dataset: Path, tmp_path: Path
+) -> None:
+    evaluate(smoke_dataset, tmp_path, corrector="gyro", only=("castle",))
+    (reason,) = read_scores(tmp_path, "failures")["reason"]
+    assert "corrector 'gyro': needs the samples of a gyroscope" in reason and "channel imu" in reason
 
 
 def test_a_feature_matcher_that_fails_leaves_every_solver_without_matches(

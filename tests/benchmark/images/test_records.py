@@ -15,7 +15,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.dataset.files import read_table, save_arrays, write_json
 from rsbench.errors import RsbenchError
 
-DEPTH = {"matcher": "sgm", "entry": "sgm", "success": True, "reason": ""}
+DEPTH = {"matcher": "sgm", "entry": "sgm", "timed": False, "success": True, "reason": ""}
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ def store_truth(places: Places, plan: Plan, **changes: Any) -> None:
     artefact = places.depth(plan.chain.matcher)
     artefact.start()
     save_arrays(artefact.file(".npz"), disparities)
-    artefact.finish({"matcher": "sgm", "entry": "sgm", "success": True, "reason": ""})
+    artefact.finish({"matcher": "sgm", "entry": "sgm", "timed": False, "success": True, "reason": ""})
 
 
 def scored(sequence: Sequence, plan: Plan, folder: Path, **changes: Any) -> dict[str, list[Row]]:

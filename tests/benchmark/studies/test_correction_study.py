@@ -10,7 +10,7 @@ import pytest
 
 from rsbench.benchmark.studies import correction_study
 from rsbench.benchmark.studies.correction_methods import METHODS
-from rsbench.benchmark.studies.correction_study import ROW_BANDS, flow_error, study_dataset
+from rsbench.benchmark.studies.correction_study import ROW_BANDS, flow_error, study_dataset, study_sequence
 from rsbench.benchmark.studies.correction_summary import (
     EXTRA,
     SCORES,
@@ -22,7 +22,8 @@ from rsbench.benchmark.studies.correction_summary import (
     verdict,
 )
 from rsbench.benchmark.studies.kept_rows import Rows
-from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.sequence import Sequence, read_sequence
+from rsbench.errors import RsbenchError
 from rsbench.pipeline.robust_motion import RobustEstimate
 from rsbench.report.correction_page import study_page, write_study
 from rsbench.solvers.engine.base import MotionEstimate
@@ -175,6 +176,28 @@ def test_a_failed_method_scores_the_worst_and_the_study_goes_on(
         ] * 6
 
 
+def test_methods_in_no_published_table_take_part_when_they_are_asked_for(
+    smoke_dataset: Path, tables: Tables, tmp_path: Path
+) -> None:
+    """They change no number of the others; what gives a view up scores the worst; the page shows them."""
+    rows, bands, _ = study_sequence(read_sequence(smoke_dataset / "castle"), others=("zhuang", "lao-lines"))
+    images = pd.DataFrame(rows)
+    asked = images["method"].isin(["zhuang", "lao-lines"])
+    before = tables[0][tables[0]["sequence"] == "castle"].drop(columns="stratum").reset_index(drop=True)
+    pd.testing.assert_frame_equal(images[~asked].reset_index(drop=True), before)
+    assert images[asked].groupby("method").size().to_dict() == {"zhuang": 4, "lao-lines": 4}
+    lost = images[~images["success"]]
+    assert np.all(lost["psnr_all"] == 0.0) and np.all(lost["coverage"] == 0.0)
+    alone = images.groupby("method")["flow_median_px"].mean()
+    assert alone["zhuang"] < alone["none"]
+    images.insert(0, "stratum", "small")
+    summary = summarise(images)
+    assert set(summary["method"]) == set(images["method"]) and len(bands) == len(images) * ROW_BANDS
+    assert "monocular, Zhuang et al." in study_page(images, summary)
+    with pytest.raises(RsbenchError, match="imu"):
+        study_sequence(read_sequence(smoke_dataset / "castle"), others=("gyroscope",))
+
+
 def test_the_page_and_the_figure_come_from_the_stored_tables(tables: Tables, tmp_path: Path) -> None:
     images, bands, _ = tables
     images.to_csv(tmp_path / "views.csv", index=False)
@@ -200,7 +223,7 @@ def test_a_study_that_was_cut_off_goes_on_where_it_stopped(
 ) -> None:
     studied: list[str] = []
 
-    def study_sequence(sequence: Sequence, seed: int, solver: str) -> Rows:
+    def study_sequence(sequence: Sequence, seed: int, solver: str, others: tuple[str, ...]) -> Rows:
         studied.append(sequence.name)
         row = {"sequence": sequence.name, "psnr_all": 1 / 3, "flip_all": float("nan"), "success": True}
         return [row], [row | {"band": 1}], [row]

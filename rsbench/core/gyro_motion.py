@@ -1,0 +1,66 @@
+"""A motion whose rotation is what a gyroscope says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rsbench.core import so3
+from rsbench.core.motion import Motion
+from rsbench.core.se3 import Pose
+from rsbench.core.so3 import FloatArray
+
+
+@final
+@dataclass(frozen=True, eq=False, init=False)
+class GyroMotion(Motion):
+    """Rotation integrated from samples (n, 4), t(tau) = tau d; d may change, the samples stay."""
+
+    name: ClassVar[str] = "gyro"
+    samples: FloatArray
+    nodes: FloatArray
+    """(n, 3, 3) rotations at the samples, since the first of them."""
+    origin: FloatArray
+    """(3, 3) the inverse of that at time 0."""
+
+    def __init__(self, samples: FloatArray, d: ArrayLike) -> None:
+        samples = samples[np.lexsort(samples.T[::-1])]
+        tau, rates = samples[:, 0], samples[:, 1:]
+        steps = np.diff(tau)[:, None] * 0.5 * (rates[1:] + rates[:-1])
+        nodes = np.stack([np.eye(3), *so3.exp(steps)])
+        for k in range(1, len(nodes)):
+            nodes[k] = nodes[k] @ nodes[k - 1]
+        object.__setattr__(self, "samples", samples)
+        object.__setattr__(self, "nodes", nodes)
+        object.__setattr__(self, "origin", self._turned(np.zeros(())).T)
+        super().__init__(so3.log(self._turned(np.ones(())) @ self.origin), d)
+
+    def _turned(self, tau: FloatArray) -> FloatArray:
+        """Rotation (..., 3, 3) since the first sample; rates are linear between samples, and constant beyond."""
+        times, rates = self.samples[:, 0], self.samples[:, 1:]
+        k = np.clip(np.searchsorted(times, tau, side="right") - 1, 0, len(times) - 2)
+        s = (tau - times[k])[..., None]
+        inside = np.clip(s, 0.0, (times[k + 1] - times[k])[..., None])
+        slope = (rates[k + 1] - rates[k]) / np.maximum(times[k + 1] - times[k], 1e-300)[..., None]
+        angle = inside * rates[k] + 0.5 * inside**2 * slope + (s - inside) * (rates[k] + inside * slope)
+        return np.asarray(so3.exp(angle) @ self.nodes[k])
+
+    def body_from_world(self, tau: ArrayLike) -> Pose:
+        tau = np.asarray(tau, dtype=np.float64)
+        return Pose(self._turned(tau) @ self.origin, tau[..., None] * self.d)
+
+    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        tau, times = np.asarray(tau, dtype=np.float64), self.samples[:, 0]
+        rates = [np.interp(tau, times, self.samples[:, axis]) for axis in (1, 2, 3)]
+        return np.stack(rates, axis=-1), np.broadcast_to(self.d, (*tau.shape, 3))
+
+    def along(self, d: FloatArray) -> GyroMotion:
+        """The same rotation with another translation."""
+        other = object.__new__(GyroMotion)
+        for name in ("w", "samples", "nodes", "origin"):
+            object.__setattr__(other, name, getattr(self, name))
+        object.__setattr__(other, "d", d)
+        return other

@@ -1,0 +1,331 @@
+"""Depth from a known motion by a plane sweep in which each pixel has the pose of its own line.
+
+For every inverse depth of a grid the other views are resampled to what each pixel would show of them, were the
+surface there; that at which they look most alike wins. Over two frames of one camera this is depth from time, from
+the other camera depth from stereo, and from all views both. The planes face the camera of the pixel's line.
+
+Saurer, Koeser, Bouguet, Pollefeys, "Rolling shutter stereo", ICCV 2013. Ours are the aggregation (``semiglobal``)
+and the last rounds, in which the planes follow the surface that was found.
+Views that a pixel may be hidden from: Kang, Szeliski, Chai, "Handling occlusions in dense multi-view stereo",
+CVPR 2001.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal, final, get_args
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.arguments import check_ranges
+from rsbench.compiled import compiled
+from rsbench.core.motion import Motion
+from rsbench.core.projection import row_poses
+from rsbench.core.rig import VIEWS, StereoRig, View
+from rsbench.core.shutter import RollingShutter
+from rsbench.vision.images import grey_u8
+from rsbench.vision.other_view import Landing, land_pixels, landing, parallax_gain
+from rsbench.vision.resample import resample
+from rsbench.vision.semiglobal import aggregated, winners
+from rsbench.vision.stereo_matcher import F32, Cameras, MotionMatcher
+
+Sources = Literal["time", "stereo", "all"]
+_RANGES = {
+    "planes": (3, 1024),
+    "step_px": (0.05, 10.0),
+    "window": (3, 51),
+    "p1": (0, 4000),
+    "p2": (0, 4000),
+    "nearest_depth": (1e-6, 1e9),
+    "least_parallax_px": (1e-6, 1e6),
+    "consistency_px": (1e-6, 1e6),
+    "refine_rounds": (0, 20),
+}
+_COARSE, _RANGE_QUANTILE, _RANGE_MARGIN = 4, 0.999, 1.1
+"""The range is looked for at a quarter of the size, as ``stereo_depth`` does."""
+_FEWEST = 8
+_NOISE = 4.0
+"""Variance of grey levels, about that of noise and rounding: windows with less are alike by chance."""
+_FOLLOW_WINDOW = 7
+"""px, of the last rounds: where the plane follows the surface, a larger window is the better one."""
+_ROUND = (-2.0, -1.0, 0.0, 1.0, 2.0)
+"""Steps of a last round; they are a quarter of a plane's, and half of that in each further round."""
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class SweepMatcher(MotionMatcher):
+    """Plane sweep with a known motion, over time, stereo, or both."""
+
+    sources: Sources = "all"
+    """``time``: the other frame of the same camera; ``stereo``: the other camera; ``all``: the three others."""
+    rolling: bool = True
+    """False: all lines of a frame are believed to have the pose of the first."""
+    planes: int = 128
+    """At most so many; fewer where ``step_px`` needs fewer."""
+    step_px: float = 0.5
+    """Parallax between two planes, in the view in which it is largest."""
+    window: int = 3
+    """Side, px, of the window in which views are compared."""
+    p1: int = 24
+    """What a step to the next plane costs, of 255, which the worst likeness costs."""
+    p2: int = 200
+    """Of larger steps."""
+    nearest_depth: float | None = None
+    """Metres; None finds the range in the images, by a sweep at a quarter of the size."""
+    least_parallax_px: float = 0.5
+    """Depth of less parallax is unknown: hardly told from infinity."""
+    consistency_px: float = 1.0
+    """Largest difference of parallax to the depth of one other view, where that sees the pixel."""
+    refine_rounds: int = 2
+
+    def __post_init__(self) -> None:
+        if self.sources not in get_args(Sources):
+            raise ValueError(f"sources = {self.sources!r}: must be one of {', '.join(get_args(Sources))}")
+        if self.window % 2 == 0:
+            raise ValueError(f"window = {self.window}: must be odd")
+        if self.p1 > self.p2:
+            raise ValueError(f"p1 = {self.p1}: must not exceed p2, {self.p2}")
+        check_ranges(self, _RANGES)
+
+    @property
+    def cameras(self) -> Cameras:
+        return "any"
+
+    def depths(
+        self, images: Mapping[View, NDArray[Any]], rig: StereoRig, shutter: RollingShutter, motion: Motion
+    ) -> dict[View, F32]:
+        return sweep_depths(images, rig, shutter, motion, self)
+
+
+def sweep_depths(
+    images: Mapping[View, NDArray[Any]],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    options: SweepMatcher | None = None,
+) -> dict[View, F32]:
+    """Depth (H, W), metres, of the pixels of all four views, in each line's own camera; NaN where it is unknown.
+
+    ``images`` (H, W[, 3]) are uint8 or uint16. Unknown is what no other view sees or confirms, what has too little
+    parallax, and everything where the motion gives none.
+    """
+    options = options or SweepMatcher()
+    scene = _Scene({view: grey_u8(images[view]) for view in VIEWS}, rig, shutter, motion, options)
+    if not scene.gain > 0.0:
+        return {view: np.full(scene.size, np.nan, np.float32) for view in VIEWS}
+    nearest = options.nearest_depth
+    most = _range(scene.coarse()) if nearest is None else 1.0 / nearest
+    rhos = scene.confirmed(scene.sweep_all(most, options.refine_rounds))
+    with np.errstate(divide="ignore"):
+        return {view: np.where(rho > 0.0, 1.0 / rho, np.float32(np.nan)) for view, rho in rhos.items()}
+
+
+def _range(scene: _Scene) -> float:
+    """Largest inverse depth, 1 / m, that is to be searched."""
+    found = scene.confirmed(scene.sweep_all(0.5 * max(scene.size) / scene.gain, 0))
+    known = np.concatenate([rho[np.isfinite(rho)] for rho in found.values()])
+    largest = float(np.quantile(known, _RANGE_QUANTILE)) if known.size else 0.0
+    return largest * _RANGE_MARGIN + 1.0 / scene.gain
+
+
+class _Scene:
+    """Four grey images (H, W), float32, with the geometry between them."""
+
+    def __init__(
+        self,
+        images: Mapping[View, NDArray[np.uint8]],
+        rig: StereoRig,
+        shutter: RollingShutter,
+        motion: Motion,
+        options: SweepMatcher,
+    ) -> None:
+        self.images, self.rig, self.shutter, self.motion = images, rig, shutter, motion
+        self.options, self.size = options, images["left", 0].shape
+        self.greys = {view: image.astype(np.float32) for view, image in images.items()}
+        believed = shutter if options.rolling else shutter.at_once()
+        poses = {view: row_poses(rig, believed, motion, *view) for view in VIEWS}
+        axes = {view: believed.axis(view[0]) for view in VIEWS}
+        self.maps: dict[tuple[View, View], Landing] = {
+            (view, other): landing(rig.camera, poses[view], poses[other], (axes[view], axes[other]))
+            for view in VIEWS
+            for other in self._others(view)
+        }
+
+    def _others(self, view: View) -> list[View]:
+        side, frame = view
+        chosen = {"time": lambda v: v[0] == side, "stereo": lambda v: v[1] == frame, "all": lambda v: True}
+        return [other for other in VIEWS if other != view and chosen[self.options.sources](other)]
+
+    @cached_property
+    def gain(self) -> float:
+        """px that a point of inverse depth 1 / m moves at most between two views."""
+        return max(parallax_gain(self.rig.camera, m, self.maps[b, a]) for (a, b), m in self.maps.items())
+
+    def coarse(self) -> _Scene:
+        """The same at a quarter of the size; a line is then read 1.5 lines too early, which moves no range."""
+        height, width = (max(n // _COARSE, _FEWEST) for n in self.size)
+        camera = self.rig.camera
+        x, y = width / camera.width, height / camera.height
+        camera = replace(
+            camera,
+            width=width,
+            height=height,
+            fx=camera.fx * x,
+            fy=camera.fy * y,
+            cx=(camera.cx + 0.5) * x - 0.5,
+            cy=(camera.cy + 0.5) * y - 0.5,
+        )
+        small = {
+            view: np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+            for view, image in self.images.items()
+        }
+        shutter = self.shutter.scanning.shutter_of(width, height, self.shutter.readout_ratio)
+        return _Scene(small, replace(self.rig, camera=camera), shutter, self.motion, self.options)
+
+    def sweep_all(self, most: float, rounds: int) -> dict[View, F32]:
+        """Inverse depth (H, W), 1 / m, of every view, NaN where unknown, of 0 to ``most``."""
+        with ThreadPoolExecutor(2) as pool:
+            return dict(zip(VIEWS, pool.map(lambda view: self._sweep(view, most, rounds), VIEWS), strict=True))
+
+    def _sweep(self, view: View, most: float, rounds: int) -> F32:
+        options, others = self.options, self._others(view)
+        count = math.ceil(self.gain * most / options.step_px) + 1
+        grid = np.linspace(0.0, most, min(max(count, _FEWEST), options.planes), dtype=np.float32)
+        comparer = _Comparer(self.greys[view], options.window)
+        lines = [self._first_lines(view, other) for other in others]
+        volume = np.zeros((*self.size, len(grid)), dtype=np.uint8)
+        for k, rho in enumerate(grid):
+            plane = np.full(self.size, rho)
+            cost = self._cost(comparer, view, plane, lines, cubic=False)
+            volume[:, :, k] = np.nan_to_num(255.0 * cost + 0.5, nan=255.0)
+        step = grid[1] - grid[0]
+        rho = winners(aggregated(volume, options.p1, options.p2)) * step
+        rho[rho >= most - 0.5 * step] = np.nan  # beyond the range, where nothing is searched
+        comparer = _Comparer(self.greys[view], _FOLLOW_WINDOW)
+        for number in range(rounds):
+            rho = self._follow(comparer, view, rho, step * 0.25 / 2**number, lines)
+        parallax = self._parallax(view, rho, lines)
+        return np.where(parallax >= options.least_parallax_px, rho, np.float32(np.nan))
+
+    def _first_lines(self, view: View, other: View) -> NDArray[np.int32]:
+        row, column = np.indices(self.size, dtype=np.int32)
+        return row if self.maps[view, other].there is False else column
+
+    def _cost(
+        self, comparer: _Comparer, view: View, rho: F32, lines: Sequence[NDArray[np.int32]], *, cubic: bool
+    ) -> F32:
+        """Unlikeness (H, W), 0 to 1, of surfaces of inverse depth (H, W); NaN where no view sees them.
+
+        The mean of all views that see a pixel but the one that is least like it, for which it may be hidden.
+        """
+        costs = []
+        for other, start in zip(self._others(view), lines, strict=True):
+            places, _ = land_pixels(self.maps[view, other], rho, start)
+            costs.append(comparer.unlikeness(self.greys[other], places, cubic=cubic))
+        if len(costs) == 1:
+            return costs[0]
+        found = np.zeros_like(costs[0])
+        _all_but_the_worst(np.stack(costs), found)
+        return found
+
+    def _follow(
+        self, comparer: _Comparer, view: View, rho: F32, step: float, lines: Sequence[NDArray[np.int32]]
+    ) -> F32:
+        """A last round: inverse depths near those that were found, with the parabola's minimum."""
+        steps = np.array(_ROUND, dtype=np.float32) * np.float32(step)
+        smooth = _smoothed(rho)
+        costs = np.stack([self._cost(comparer, view, smooth + each, lines, cubic=True) for each in steps])
+        best = np.argmin(np.nan_to_num(costs, nan=2.0), axis=0)
+        inner = np.clip(best, 1, len(steps) - 2)[None]
+        before, here, after = (np.take_along_axis(costs, inner + k, axis=0)[0] for k in (-1, 0, 1))
+        bend = before - 2.0 * here + after
+        with np.errstate(divide="ignore", invalid="ignore"):
+            offset = np.where(bend > 0.0, np.clip(0.5 * (before - after) / bend, -1.0, 1.0), 0.0)
+        moved = smooth + steps[inner[0]] + np.float32(step) * offset
+        return np.where(np.isfinite(rho) & np.isfinite(moved), np.maximum(moved, 0.0), rho).astype(np.float32)
+
+    def _parallax(self, view: View, rho: F32, lines: Sequence[NDArray[np.int32]]) -> F32:
+        """px (H, W) that the pixel's own inverse depth moves it, in the view where it does so most."""
+        found = np.zeros(self.size, np.float32)
+        for other, start in zip(self._others(view), lines, strict=True):
+            maps = self.maps[view, other]
+            here, far = (land_pixels(maps, at, start)[0] for at in (rho, np.zeros_like(rho)))
+            # What is infinitely far may lie beside the image: then there is parallax enough.
+            moved = np.linalg.norm(here - far, axis=-1)
+            moved = np.where(np.isfinite(here[..., 0]), np.nan_to_num(moved, nan=np.inf), 0.0)
+            found = np.maximum(found, moved).astype(np.float32)
+        return found
+
+    def confirmed(self, rhos: Mapping[View, F32]) -> dict[View, F32]:
+        """The inverse depths that one other view at least confirms where it sees the point."""
+        found = {}
+        for view, rho in rhos.items():
+            agrees = np.zeros(self.size, np.bool_)
+            for other in self._others(view):
+                places, factors = land_pixels(self.maps[view, other], rho, self._first_lines(view, other))
+                seen = np.isfinite(places[..., 0])
+                nearest = np.rint(np.where(seen[..., None], places, 0.0)).astype(np.int64)
+                x, y = np.moveaxis(np.clip(nearest, 0, [self.size[1] - 1, self.size[0] - 1]), -1, 0)
+                off = np.abs(rhos[other][y, x] - rho * factors)
+                agrees |= seen & (off * self.gain <= self.options.consistency_px)
+            found[view] = np.where(agrees, rho, np.float32(np.nan))
+        return found
+
+
+class _Comparer:
+    """Zero-mean normalised cross-correlation of one image with others."""
+
+    def __init__(self, grey: F32, window: int) -> None:
+        self._grey, self._window = grey - np.float32(128.0), (window, window)
+        self._mean = self._box(self._grey)
+        self._variance = self._box(self._grey * self._grey) - self._mean * self._mean
+
+    def _box(self, values: NDArray[Any]) -> F32:
+        return np.asarray(cv2.boxFilter(values, -1, self._window, borderType=cv2.BORDER_REFLECT))
+
+    def unlikeness(self, other: F32, places: F32, *, cubic: bool) -> F32:
+        """0 (alike) to 1 (H, W) of the other image (H, W) at places (H, W, 2) px; NaN where those are NaN."""
+        seen = self._seen(other, places, cubic) - np.float32(128.0)
+        mean = self._box(seen)
+        variance = self._box(seen * seen) - mean * mean
+        together = self._box(seen * self._grey) - mean * self._mean
+        noise = np.float32(_NOISE)
+        alike = together / np.sqrt((np.maximum(variance, 0) + noise) * (np.maximum(self._variance, 0) + noise))
+        return np.where(np.isnan(places[..., 0]), np.float32(np.nan), np.float32(0.5) * (1.0 - alike))
+
+    @staticmethod
+    def _seen(other: F32, places: F32, cubic: bool) -> F32:
+        if cubic:
+            return np.asarray(resample(other, places))
+        known = np.nan_to_num(places, nan=0.0)
+        return np.asarray(cv2.remap(other, known, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _smoothed(rho: F32) -> F32:
+    """Inverse depth without the steps of its planes; a surface of a few pixels keeps its own."""
+    known = np.isfinite(rho)
+    filled = np.where(known, rho, np.float32(0.0))
+    return np.where(known, cv2.medianBlur(filled, 5), np.float32(np.nan))
+
+
+@compiled(error_model="numpy")
+def _all_but_the_worst(costs: F32, found: F32) -> None:
+    """Mean (H, W) of the costs (n, H, W) that are known, without the largest where there are two or more."""
+    n, height, width = costs.shape
+    for y in range(height):
+        for x in range(width):
+            total, worst, known = np.float32(0.0), np.float32(-1.0), 0
+            for k in range(n):
+                cost = costs[k, y, x]
+                if cost == cost:
+                    total, worst, known = total + cost, max(worst, cost), known + 1
+            if known > 1:
+                total, known = total - worst, known - 1
+            found[y, x] = total / np.float32(known) if known > 0 else np.nan

@@ -1,0 +1,134 @@
+"""Correctors of the rotation alone, from a gyroscope or from lines in one image: each row turned, no depth."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import final
+
+import numpy as np
+
+from rsbench.core.gyro_motion import GyroMotion
+from rsbench.core.motion import LinearMotion
+from rsbench.core.rig import View
+from rsbench.vision.correction import WarpOptions
+from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
+from rsbench.vision.correctors import turned
+from rsbench.vision.curves import image_curves
+from rsbench.vision.fusion import Fused
+from rsbench.vision.line_rotation import LineOptions, rotation_of_lines
+from rsbench.vision.manhattan import ManhattanOptions, rotation_of_directions
+from rsbench.vision.straightness import Points, Turn
+
+_SHORTEST = 0.08
+"""Of a curve, in heights of the image."""
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class GyroCorrector(Corrector):
+    """Everything at infinity, turned as a gyroscope says; what it has wrong (bias, noise, delay) stays wrong."""
+
+    warp: WarpOptions = field(default_factory=WarpOptions)
+
+    spec = CorrectorSpec(
+        needs={"gyro"},
+        reference="Karpenko, Jacobs, Baek, Levoy: Rolling shutter correction using gyroscopes, CSTR 2011-03",
+        assumes="a gyroscope aligned with the cameras; a scene so far away that translation moves no pixel",
+        cameras="any",
+    )
+
+    def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
+        if problem.gyro is None:
+            raise ValueError("there is no gyroscope: 'gyro' must be among the needs of the corrector")
+        if len(problem.gyro) < 2 or not np.ptp(problem.gyro[:, 0]) > 0.0:
+            reason = f"{len(problem.gyro)} samples of a gyroscope: needs two of different times at least"
+            return {view: Fused.failed(problem.images[view], reason) for view in views}
+        known = replace(problem, motion=GyroMotion(problem.gyro, np.zeros(3)))
+        return {view: turned(known, view, self.warp) for view in views}
+
+
+class ImageRotationCorrector(Corrector):
+    """Everything at infinity, turned as the one image tells; no second image."""
+
+    @property
+    @abstractmethod
+    def options(self) -> WarpOptions:
+        """Of the warp."""
+
+    @abstractmethod
+    def rotation(self, problem: CorrectionProblem, view: View) -> LinearMotion | str:
+        """The rotation of one frame by its own curves, or why there is none."""
+
+    def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
+        return {view: self._turned(problem, view) for view in views}
+
+    def _turned(self, problem: CorrectionProblem, view: View) -> Fused:
+        motion = self.rotation(problem, view)
+        if isinstance(motion, str):
+            return Fused.failed(problem.images[view], motion)
+        return turned(replace(problem, motion=motion), view, self.options)
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class LinesCorrector(ImageRotationCorrector):
+    """Turned such that curves become straight lines."""
+
+    lines: LineOptions = field(default_factory=LineOptions)
+    seed: int = 0
+    warp: WarpOptions = field(default_factory=WarpOptions)
+
+    spec = CorrectorSpec(
+        needs=set(),
+        reference="Lao, Ait-Aider: A Robust Method for Strong Rolling Shutter Effects Correction Using Lines with "
+        "Automatic Feature Selection, CVPR 2018",
+        assumes="constant rotation without translation; straight lines in space across many rows, some slanted",
+    )
+
+    @property
+    def options(self) -> WarpOptions:
+        return self.warp
+
+    def rotation(self, problem: CorrectionProblem, view: View) -> LinearMotion | str:
+        rng = np.random.default_rng(self.seed)
+        return _told(rotation_of_lines(_points(problem, view), self.lines, rng), self.lines.prior)
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class ManhattanCorrector(ImageRotationCorrector):
+    """Turned such that lines run along three orthogonal directions."""
+
+    manhattan: ManhattanOptions = field(default_factory=ManhattanOptions)
+    seed: int = 0
+    warp: WarpOptions = field(default_factory=WarpOptions)
+
+    spec = CorrectorSpec(
+        needs=set(),
+        reference="Purkait, Zach, Leonardis: Rolling Shutter Correction in Manhattan World, ICCV 2017",
+        assumes="constant rotation without translation; lines in space along three orthogonal directions",
+    )
+
+    @property
+    def options(self) -> WarpOptions:
+        return self.warp
+
+    def rotation(self, problem: CorrectionProblem, view: View) -> LinearMotion | str:
+        rng = np.random.default_rng(self.seed)
+        return _told(rotation_of_directions(_points(problem, view), self.manhattan, rng), self.manhattan.prior)
+
+
+def _points(problem: CorrectionProblem, view: View) -> Points | None:
+    """Of the curves in an image; None where there are none."""
+    camera = problem.rig.camera
+    curves = image_curves(problem.images[view], _SHORTEST * camera.height)
+    return Points.of(curves, camera, problem.shutter, view) if curves else None
+
+
+def _told(turn: Turn | str, prior: float) -> LinearMotion | str:
+    if isinstance(turn, str):
+        return turn
+    w = turn.determined(prior)
+    return "the lines leave the rotation open" if w is None else LinearMotion(w, np.zeros(3))

@@ -1,0 +1,112 @@
+"""Depth by plane sweeps in the closed-form world of conftest, and which of them know the rolling shutter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rsbench.core.motion import LinearMotion
+from rsbench.core.rig import VIEWS
+from rsbench.errors import RsbenchError
+from rsbench.vision.plane_sweep import SweepMatcher, sweep_depths
+from rsbench.vision.stereo_matcher import load_matcher
+
+Build = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def scene(world: Build, shapes: Any) -> Any:
+    """A slanted wall at 5 to 9 m with a board 3 m away before it; it moves by some 20 px between the frames."""
+    plane = shapes[0]
+
+    def board(X: np.ndarray) -> np.ndarray:
+        return (np.abs(X[..., 0] + 0.2) < 0.3) & (np.abs(X[..., 1]) < 0.3)
+
+    surfaces = (plane((0.2, 0.3, 1.0), 7.0), plane((0.0, 0.0, 1.0), 3.0, board))
+    return world(surfaces, size=(100, 128), focal=160.0, d=(0.35, -0.1, 0.1), w_deg=(4.0, 1.0, -2.0))
+
+
+@pytest.fixture(scope="module")
+def frames(scene: Any, u8: Any) -> dict[str, Any]:
+    seen = {view: scene.rolling(*view) for view in VIEWS}
+    return {
+        "images": {view: u8(image) for view, (image, _) in seen.items()},
+        "truth": {view: depth for view, (_, depth) in seen.items()},
+    }
+
+
+def found(scene: Any, frames: Any, **options: Any) -> dict[Any, np.ndarray]:
+    return sweep_depths(frames["images"], scene.rig, scene.shutter, scene.motion, SweepMatcher(**options))
+
+
+def off_px(scene: Any, depth: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Errors as parallax over a frame period, px."""
+    known = np.isfinite(depth)
+    step = scene.rig.camera.fx * np.linalg.norm(scene.motion.d)
+    return step * np.abs(1.0 / depth[known] - 1.0 / truth[known])
+
+
+@pytest.mark.parametrize("sources", ["time", "stereo", "all"])
+def test_depth_is_within_a_plane_of_the_truth(scene: Any, frames: Any, sources: str) -> None:
+    depths = found(scene, frames, sources=sources)
+    for view in VIEWS:
+        off = off_px(scene, depths[view], frames["truth"][view])
+        # A fifth of the image leaves the other frame, or is hidden there.
+        assert off.size > (0.85 if sources == "all" else 0.7) * depths[view].size
+        # Planes lie half a pixel of parallax apart. Beside the board's edges windows see both surfaces.
+        assert np.median(off) < 0.15
+        assert np.mean(off < 0.5) > 0.85
+
+
+def test_who_ignores_the_shutter_is_biased(scene: Any, frames: Any) -> None:
+    """Turning by 4 deg about x moves the image by 11 of 100 rows: times between rows are 9 % from a period."""
+    exact, wrong = (
+        np.median(off_px(scene, depths["left", 0], frames["truth"]["left", 0]))
+        for depths in (found(scene, frames, sources="time", rolling=rolling) for rolling in (True, False))
+    )
+    assert wrong > 5.0 * exact and wrong > 0.5
+    # The other camera of a moment reads its rows at the same times: without time nothing is wrong.
+    one, other = (found(scene, frames, sources="stereo", rolling=rolling)["left", 0] for rolling in (True, False))
+    # Rounding of the poses alone tells them apart; at edges it may tip a choice.
+    assert np.mean(np.isfinite(one) != np.isfinite(other)) < 0.01
+    assert np.nanquantile(np.abs(one / other - 1.0), 0.95) < 1e-3
+
+
+def test_a_range_that_is_given_is_kept(scene: Any, frames: Any) -> None:
+    depth = found(scene, frames, nearest_depth=4.0)["left", 0]
+    assert np.nanmin(depth) > 3.9
+    near = frames["truth"]["left", 0] < 3.5
+    assert np.mean(np.isfinite(depth[near])) < 0.3  # the board lies nearer than what is searched
+
+
+def test_nothing_alike_and_no_parallax_have_no_depth(scene: Any, frames: Any) -> None:
+    rng = np.random.default_rng(1)
+    noise = {view: rng.integers(0, 255, (100, 128), dtype=np.uint8) for view in VIEWS}
+    depths = sweep_depths(noise, scene.rig, scene.shutter, scene.motion, SweepMatcher(sources="time"))
+    assert all(np.mean(np.isfinite(depth)) < 0.2 for depth in depths.values())
+    still = LinearMotion(scene.motion.w, np.zeros(3))
+    about_left = scene.rig.about("left")
+    depth = sweep_depths(
+        frames["images"], about_left, scene.shutter.at_once(), still, SweepMatcher(sources="time")
+    )["left", 0]
+    assert not np.any(np.isfinite(depth))  # a turn about the left camera shows it no depth
+
+
+def test_the_cards_are_what_they_say(tmp_path: Path) -> None:
+    assert load_matcher("sweep").component == SweepMatcher()
+    assert load_matcher("sweep-time").component == SweepMatcher(sources="time")
+    assert load_matcher("sweep-time-gs").component == SweepMatcher(sources="time", rolling=False)
+    card = tmp_path / "wrong.toml"
+    for line, words in (
+        ("planes = 2", "planes = 2: must lie in"),
+        ("window = 4", "window = 4: must be odd"),
+        ("p1 = 300", "p1 = 300: must not exceed p2, 200"),
+        ('sources = "both"', "sources"),
+    ):
+        card.write_text(f'class = "rsbench.vision.plane_sweep:SweepMatcher"\n[parameters]\n{line}\n', "utf-8")
+        with pytest.raises(RsbenchError, match=words):
+            load_matcher(card)
