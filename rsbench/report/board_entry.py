@@ -25,6 +25,7 @@ def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
     """Of the template board_entry.html.j2."""
     header = line.scored.header
     said = asdict(header)
+    compared = [line, *_best_peer(each, line), *_oracles(each, line)]
     return {
         "header": header,
         "split": each.named,
@@ -33,7 +34,8 @@ def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
         "ties": ", ".join(line.ties),
         "tables": [_by(each, line, name, kinds) for name, kinds in each.known() if _words(kinds)],
         "worst": None if each.secret else _worst(each, line, album),
-        "figures_found": each.figures([line, *_best_peer(each, line), *_oracles(each, line)]),
+        "figures_found": each.figures(compared),
+        "figures_within": each.figures_within(compared),
         "calibration": _calibration(line),
     }
 

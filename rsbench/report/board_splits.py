@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.leaderboard.board import about_split, entries_of, place
+from rsbench.benchmark.leaderboard.picture_parts import PARTINGS, TITLES, columns
 from rsbench.benchmark.leaderboard.protocols import Protocol, protocol_of_id
 from rsbench.benchmark.leaderboard.standings import Standing, standings
 from rsbench.report.board_figures import ErrorLine, curves, drawable, legend
@@ -109,6 +110,28 @@ class Board:
             "legend": legend(shown),
             "drawn": [{"title": title, "svg": svg} for title, svg in drawn if svg is not None],
         }
+
+    def figures_within(self, lines: Sequence[Standing]) -> dict[str, Any]:
+        """Errors of some of its lines in parts of the pictures, where stored scores have them."""
+        asks, drawn, shown = self.protocol.asks, list[dict[str, Any]](), list[ErrorLine]()
+        for parting in PARTINGS if self.protocol.pictures and not self.secret else ():
+            names = columns(asks, parting)
+            having = [line for line in lines if set(names) <= set(line.scored.scores)]
+            if not having:
+                continue
+            stacked = [line.scored.scores[names].to_numpy(dtype=np.float64).ravel() for line in having]
+            known = np.all(np.isfinite(stacked), axis=0)  # a picture need not have pixels of each part
+            found = [
+                ErrorLine(line.scored.header.method, errors[known], line.rank is None)
+                for line, errors in zip(having, stacked, strict=True)
+            ]
+            starts = pd.Series(np.tile(parting.starts, len(self.problems))[known])
+            scenes = np.repeat(self.scenes, len(names))[known].tolist()
+            svg = curves(starts, drawable(found), scenes) if np.any(known) else None
+            if svg is not None:
+                drawn.append({"title": parting.title, "svg": svg})
+                shown = drawable(found)
+        return {"legend": legend(shown), "drawn": drawn, "error": TITLES.get(asks, "")}
 
     def _line(self, line: Standing) -> ErrorLine:
         errors = line.scored.scores[self.protocol.error].to_numpy(dtype=np.float64)

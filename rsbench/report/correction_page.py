@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.studies.correction_methods import METHODS
+from rsbench.benchmark.studies.correction_methods import METHODS, UNPUBLISHED, methods_among
 from rsbench.benchmark.studies.correction_study import ROW_BANDS
 from rsbench.benchmark.studies.correction_summary import by_scene, loss_to_true_motion, masks, verdict
 from rsbench.report import pages
 
-_TITLES = {method.key: method.title for method in METHODS}
+_TITLES = {method.key: method.title for method in (*METHODS, *UNPUBLISHED)}
 _BOUNDED = 6
 """Sequences of a stratum below which a median has no interval, so that nothing is judged by one."""
 _LINES = {
@@ -41,7 +41,7 @@ def study_page(images: pd.DataFrame, summary: pd.DataFrame) -> str:
     return pages.markdown(
         "correction.md.j2",
         strata=", ".join(strata),
-        methods=METHODS,
+        methods=methods_among(set(summary["method"])),
         tables=[_sections(images, summary, stratum) for stratum in strata],
         findings=_findings(images, summary),
         bands=ROW_BANDS,
@@ -68,7 +68,7 @@ def _scene_tables(scenes: pd.DataFrame) -> tuple[str, str]:
     headings = [f"{name} ({counts[name]})" for name in names]
     scores = ["| method | " + " | ".join(headings) + " |", "|" + "---|" * (1 + len(names))]
     gains = [scores[0].replace("method", "ours above"), scores[1]]
-    for method in METHODS:
+    for method in methods_among(set(scenes["method"])):
         own = scenes[scenes["method"] == method.key].set_index("scene")
         cells = [f"{own.loc[name, 'psnr_covered']:.2f} / {own.loc[name, 'psnr_all']:.2f}" for name in names]
         scores.append("| " + " | ".join([method.title, *cells]) + " |")

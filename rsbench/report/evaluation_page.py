@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.evaluation import read_headings, read_scores
 from rsbench.benchmark.images.predict import depth_of, load_disparities
+from rsbench.benchmark.images.store import read_record
 from rsbench.benchmark.statistics import median_and_quartiles
 from rsbench.core.rig import View
 from rsbench.dataset.corrected_frames import read_origin
 from rsbench.dataset.files import load_arrays, load_matches, read_json, read_png, write_bytes
 from rsbench.dataset.sequence import Sequence, read_pairs
-from rsbench.dataset.workplace import named
+from rsbench.dataset.workplace import files_below, listed, named
 from rsbench.errors import RsbenchError
 from rsbench.report import pictures
 from rsbench.report.pictures import Image
@@ -231,12 +232,14 @@ def publish(evaluation: Path, out: Path) -> Path:
 
 def _files(folder: Path, *parts: str) -> list[str]:
     """Files in some parts of a folder, by their paths below it; without those that a killed run was writing."""
-    paths = (path for part in parts for path in (folder / part).rglob("*") if path.is_file())
-    return [path.relative_to(folder).as_posix() for path in paths if not path.name.endswith(".partial")]
+    there = [part for part in parts if (folder / part).exists()]
+    paths = (f"{part}/{path}" for part in there for path in files_below(folder / part))
+    return [path for path in paths if not path.endswith(".partial")]
 
 
 def _motions(evaluation: Path) -> list[str]:
-    paths = sorted(evaluation.glob("predictions/*/motion/*.json"))
+    folders = listed(evaluation / "predictions")
+    paths = [path for folder in folders if folder.is_dir() for path in listed(folder / "motion", ".json")]
     return [path.relative_to(evaluation).as_posix() for path in paths]
 
 
@@ -327,7 +330,8 @@ def _draw_depth(sequence: Sequence, folder: Path, matcher: str) -> Drawn:
     stored = folder / "depth" / f"{matcher}.npz"
     if stored.is_file():
         found = load_disparities(stored, sequence.rig)
-        depth = depth_of(found[f"{_SHOWN[0]}_{_SHOWN[1]}"], sequence, *_SHOWN)
+        timed = bool((read_record(stored.with_suffix(".json")) or {}).get("timed"))
+        depth = depth_of(found[f"{_SHOWN[0]}_{_SHOWN[1]}"], sequence, *_SHOWN, timed=timed)
         error = np.where(surface & (depth > 0), np.abs(depth - truth), np.nan)
         drawn["depth"] = (inverse(depth), f"Depth by {matcher} (dark: invalid)")
         drawn["depth-error"] = (

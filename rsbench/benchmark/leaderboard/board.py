@@ -84,12 +84,21 @@ class Scored:
     """SHA-256 of its pictures and matches, by paths below ``folder`` such as ``pictures/castle/left_1.exr``."""
 
 
-def add(board: Path, predictions: Path, split: Split, made: dict[str, Any], *, replace: bool = False) -> Scored:
+def add(
+    board: Path,
+    predictions: Path,
+    split: Split,
+    made: dict[str, Any],
+    *,
+    replace: bool = False,
+    workers: int = 1,
+) -> Scored:
     """Score a file of predictions and keep both.
 
     Args:
         made: how it came about, for entry.json.
         replace: whether an entry of that name may be replaced.
+        workers: see ``mark``.
 
     Raises:
         RsbenchError: the file is at fault; an entry of that name has other predictions; the board cannot be
@@ -105,7 +114,7 @@ def add(board: Path, predictions: Path, split: Split, made: dict[str, Any], *, r
             _refuse_another(folder, hashlib.sha256(data).hexdigest(), kept)
         _write_split(board, split)
         submission = dataclasses.replace(submission, folder=new)
-        _put(new, folder, _contents(submission, data, split, made, kept))
+        _put(new, folder, _contents(submission, data, split, made, kept, workers))
     return _read_entry(folder)
 
 
@@ -140,7 +149,12 @@ def _files_of(submission: Submission, split: Split) -> Iterator[str]:
 
 
 def _contents(
-    submission: Submission, data: bytes, split: Split, made: dict[str, Any], files: dict[str, str]
+    submission: Submission,
+    data: bytes,
+    split: Split,
+    made: dict[str, Any],
+    files: dict[str, str],
+    workers: int,
 ) -> tuple[bytes, pd.DataFrame, dict[str, Any]]:
     record: dict[str, Any] = {
         "format": FORMAT,
@@ -150,7 +164,7 @@ def _contents(
         **({"files": files} if files else {}),
         "made": made,
     }
-    return data, mark(submission, split), record
+    return data, mark(submission, split, workers), record
 
 
 def _put(new: Path, folder: Path, contents: tuple[bytes, pd.DataFrame, dict[str, Any]]) -> None:
@@ -352,8 +366,8 @@ def _check_files(folder: Path, files: dict[str, str], found: dict[str, str]) -> 
             )
 
 
-def rescore(board: Path, split: Split) -> dict[str, list[str]]:
-    """Score the stored predictions of a split again; no method runs.
+def rescore(board: Path, split: Split, workers: int = 1) -> dict[str, list[str]]:
+    """Score the stored predictions of a split again; no method runs. ``workers``: see ``mark``.
 
     Returns:
         For each entry whose scores were others, the columns that changed; all of them where there was no table.
@@ -373,7 +387,7 @@ def rescore(board: Path, split: Split) -> dict[str, list[str]]:
             submission = read_submission(path, split)
             if submission.header != record.header:
                 raise RsbenchError(f"{path}: its header is not that of {FILES[2]}; submit it again")
-            write_table(folder / FILES[1], mark(submission, split))
+            write_table(folder / FILES[1], mark(submission, split, workers))
             now = _read_entry(folder).scores
             if columns := [str(name) for name in now if not now[name].equals(old.get(name, pd.Series()))]:
                 changed[folder.name] = columns

@@ -22,6 +22,7 @@ from rsbench.benchmark.leaderboard.protocols import (
     SUCCESS_DEG,
     protocol_of_id,
 )
+from rsbench.benchmark.leaderboard.scoring_workers import rows_of_workers
 from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.submissions import Submission
 from rsbench.benchmark.scoring import answered, pose_errors
@@ -37,15 +38,22 @@ _WORST_READOUT = 1.0
 Row = dict[str, Any]
 
 
-def mark(submission: Submission, split: Split) -> pd.DataFrame:
+def mark(submission: Submission, split: Split, workers: int = 1) -> pd.DataFrame:
     """One row for each problem, in the order of the split; the columns are those of docs/submit.md.
+
+    Args:
+        submission: what was answered.
+        split: the truth.
+        workers: processes, which score pictures; the rest takes no time.
 
     Raises:
         RsbenchError: a picture is at fault, or the truth has changed since the split was read.
     """
     model, found = submission.header.motion_model, submission.answers
+    if split.protocol.pictures and workers > 1:
+        return pd.DataFrame(rows_of_workers(submission, split, workers))
     if split.protocol.pictures:
-        return pd.DataFrame([_picture_row(truth, submission) for truth in split.truths])
+        return pd.DataFrame([picture_row(truth, submission) for truth in split.truths])
     if split.protocol.asks == "readout":
         return pd.DataFrame([_readout_row(truth, found.get(truth.name)) for truth in split.truths])
     rows = [_motion_row(truth, found.get(truth.name), model) for truth in split.truths]
@@ -57,7 +65,7 @@ def mark(submission: Submission, split: Split) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _picture_row(truth: Truth, submission: Submission) -> Row:
+def picture_row(truth: Truth, submission: Submission) -> Row:
     """Of pictures, which are read here, one problem at a time."""
     answer, pictures, folder = submission.answers.get(truth.name), truth.pictures, submission.folder / FOLDER
     assert pictures is not None

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.benchmark.leaderboard.picture_parts import SquareErrors, depth_parts
 from rsbench.benchmark.leaderboard.true_pictures import TruePictures
 from rsbench.core.rig import StereoRig
 from rsbench.vision.flow import dense_flow
@@ -45,16 +46,24 @@ _WORST_FRAME: Numbers = {
 def depth_scores(pictures: TruePictures, depth: NDArray[np.float32] | None) -> Numbers:
     """Of a depth map (H, W), m, 0 unknown; None: a failure."""
     truth, rig, seen = pictures.depth(), pictures.sequence.rig, pictures.seen_by_both()
-    found = _part(depth, truth, rig, np.ones_like(seen))
+    found = part_scores(depth, truth, rig, np.ones_like(seen))
     for name, part in (("visible", seen), ("occluded", ~seen)):
-        scores = _part(depth, truth, rig, part)
+        scores = part_scores(depth, truth, rig, part)
         found |= {f"{key}_{name}": scores[key] for key in ("bad_1", "abs_rel", "rmse_m")}
+    wrong = np.ones_like(seen) if depth is None else _wrong(depth, truth, rig)
+    found |= depth_parts(pictures.rolling(), truth > 0.0, wrong)
     sky = truth == 0.0
     invented = 1.0 if depth is None else float(np.mean(depth[sky] > 0.0)) if np.any(sky) else 0.0
     return {**found, "on_sky": invented}
 
 
-def _part(
+def _wrong(depth: NDArray[np.float32], truth: NDArray[np.float32], rig: StereoRig) -> NDArray[np.bool_]:
+    """(H, W) where the disparity is off by more than 1 px, or not known; of a surface."""
+    found, true = (rig.disparity(np.where(each > 0.0, each, 1.0).astype(np.float64)) for each in (depth, truth))
+    return (depth <= 0.0) | (np.abs(found - true) > 1.0)
+
+
+def part_scores(
     depth: NDArray[np.float32] | None, truth: NDArray[np.float32], rig: StereoRig, part: NDArray[np.bool_]
 ) -> Numbers:
     """Of some pixels. Where none of them shows a surface nothing is wrong; errors in metres do not exist."""
@@ -78,18 +87,20 @@ def _part(
 
 def frame_scores(pictures: TruePictures, frames: Sequence[Frame] | None) -> Numbers:
     """Of corrected frames, one for each that is asked; None: a failure. Means over these, of dB too."""
-    rows = [each.stem.rpartition("_")[2] for each in pictures.asked]
-    if frames is None:
-        scores = [_WORST_FRAME for _ in rows]
-    else:
-        scores = [
-            _frame(image, drawn, pictures.frame(each.row), pictures.common(each.row))
-            for each, (image, drawn) in zip(pictures.asked, frames, strict=True)
-        ]
+    rows, scores, squares = (
+        [each.stem.rpartition("_")[2] for each in pictures.asked],
+        list[Numbers](),
+        SquareErrors(),
+    )
+    for number, each in enumerate(pictures.asked):
+        truth, common = pictures.frame(each.row), pictures.common(each.row)
+        image = None if frames is None else frames[number][0]
+        squares.add(image, truth, common, each.row)
+        scores.append(_WORST_FRAME if frames is None else _frame(*frames[number], truth, common))
     found = {key: float(np.mean([each[key] for each in scores])) for key in _WORST_FRAME}
     by_row = {f"psnr_{name}": math.nan for name in ("first", "middle")}
     by_row |= {f"psnr_{name}": each["psnr"] for name, each in zip(rows, scores, strict=True)}
-    return {**found, **by_row, "error": 1.0 - found["ssim"]}
+    return {**found, **by_row, **squares.scores(), "error": 1.0 - found["ssim"]}
 
 
 def _frame(

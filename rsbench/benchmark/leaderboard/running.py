@@ -229,7 +229,7 @@ def _identity(entry: SolverEntry, split: Split, data: str, limits: Limits) -> st
         **({} if limits == Limits() else {"limits": list(limits)}),
         source=numeric_version(),
         solver=entry.key,
-        options=asdict(entry.options),
+        options=entry.options.deciding,
         robust=asdict(RobustOptions()),
         protocol=split.protocol.id,
         data=data,

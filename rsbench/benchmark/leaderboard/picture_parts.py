@@ -1,0 +1,112 @@
+"""Scores of pictures by parts of their pixels: how far from the reference row they lie, and how textured they are.
+
+What a part is decides the truth alone, so that all entries are scored on the same pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.benchmark.leaderboard.protocols import Asks
+from rsbench.core.so3 import FloatArray
+
+WINDOW = 9
+"""Pixels, of the square over which texture is measured."""
+_MOST = 255.0
+BoolArray = NDArray[np.bool_]
+
+
+class Parting(NamedTuple):
+    """A number of each pixel, and by which of its values pixels make up parts."""
+
+    name: str
+    title: str
+    starts: tuple[float, ...]
+    """Least value of each part, which figures write at it."""
+
+
+PARTINGS = (
+    Parting(
+        name="rows",
+        title="rows from the reference row, as a share of all (0.2: from there to 0.4)",
+        starts=(0.0, 0.2, 0.4, 0.6, 0.8),
+    ),
+    Parting(
+        name="texture",
+        title=f"texture: deviation of grey levels within {WINDOW} px (2: from there to 5)",
+        starts=(0.0, 2.0, 5.0, 10.0, 20.0),
+    ),
+)
+_SCORES: dict[Asks, str] = {"depth": "bad_1", "frames": "rms"}
+TITLES: dict[Asks, str] = {"depth": "bad@1", "frames": "RMS error of the common pixels, of 255"}
+"""What figures call them."""
+
+
+def columns(asks: Asks, parting: Parting) -> list[str]:
+    """Of scores.csv, such as ``bad_1_rows_1``, in the order of the parts."""
+    return [f"{_SCORES[asks]}_{parting.name}_{number}" for number in range(1, len(parting.starts) + 1)]
+
+
+def parts_of(image: NDArray[np.uint8], row: int) -> Iterator[tuple[Parting, list[BoolArray]]]:
+    """The pixels (H, W) of each part of a picture of row ``row``'s time.
+
+    Args:
+        image: (H, W, 3) what the texture is of.
+        row: reference row.
+    """
+    height, width = image.shape[:2]
+    away = np.broadcast_to(np.abs(np.arange(height) - row)[:, None] / height, (height, width))
+    for parting, value in zip(PARTINGS, (away, texture(image)), strict=True):
+        part = np.searchsorted(parting.starts, value, side="right") - 1
+        yield parting, [part == number for number in range(len(parting.starts))]
+
+
+def texture(image: NDArray[np.uint8]) -> FloatArray:
+    """(H, W) standard deviation of the mean of the colours in a window around each pixel, 8-bit levels."""
+    grey = np.mean(image.astype(np.float64), axis=-1)
+    mean, square = (
+        cv2.blur(each, (WINDOW, WINDOW), borderType=cv2.BORDER_REFLECT_101) for each in (grey, grey * grey)
+    )
+    return np.sqrt(np.maximum(square - mean * mean, 0.0))
+
+
+class SquareErrors:
+    """Root mean squares of frames by part; what was not drawn is black."""
+
+    def __init__(self) -> None:
+        self._sums = {name: np.zeros(2) for parting in PARTINGS for name in columns("frames", parting)}
+        """Of squared errors, and how many."""
+
+    def add(self, image: NDArray[np.uint8] | None, truth: NDArray[np.uint8], common: BoolArray, row: int) -> None:
+        """A frame (H, W, 3) of a row's time; None: a failure, which errs by all levels."""
+        off = np.full(truth.shape, _MOST) if image is None else image.astype(np.float64) - truth
+        squares = np.mean(off * off, axis=-1)
+        for parting, parts in parts_of(truth, row):
+            for name, part in zip(columns("frames", parting), parts, strict=True):
+                self._sums[name] += np.array([np.sum(squares[part & common]), np.count_nonzero(part & common)])
+
+    def scores(self) -> dict[str, float]:
+        """By column; NaN for a part without pixels."""
+        return {name: math.sqrt(s / n) if n else math.nan for name, (s, n) in self._sums.items()}
+
+
+def depth_parts(image: NDArray[np.uint8], surface: BoolArray, wrong: BoolArray) -> dict[str, float]:
+    """Share of ``wrong`` (H, W) of the ``surface`` (H, W) of each part, by column; NaN for one without any.
+
+    Args:
+        image: (H, W, 3) the rolling-shutter frame.
+        surface: where there is one.
+        wrong: where its depth is.
+    """
+    found = {}
+    for parting, parts in parts_of(image, 0):
+        for name, part in zip(columns("depth", parting), parts, strict=True):
+            inside = part & surface
+            found[name] = float(np.mean(wrong[inside])) if np.any(inside) else math.nan
+    return found
