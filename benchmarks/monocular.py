@@ -24,7 +24,7 @@ import time
 
 import numpy as np
 
-from rsbench.benchmark.simulated.bound import bound_from_information, motion_bound
+from rsbench.benchmark.simulated.bound import bound_from_root, joined, motion_bound
 from rsbench.benchmark.simulated.simulation import (
     GYRO_RATE,
     Simulation,
@@ -100,10 +100,10 @@ def noise_factors(solver: Solver, trials: int) -> FloatArray:
     for seed in range(trials):
         exact, s = trial(solver, seed), trial(solver, seed, noise_px=NOISE_PX)
         found.append(errors(solver.estimate(given(solver, s), RIG, SHUTTER), s))
-        F = motion_bound(given(solver, exact), rig_of(solver), SHUTTER, s.motion, NOISE_PX).information
+        root = motion_bound(given(solver, exact), rig_of(solver), SHUTTER, s.motion, NOISE_PX).root
         if "gyro" in solver.spec.needs:
-            F[:3, :3] += 1e12 * np.eye(3)
-        bound = bound_from_information(F, s.motion.w, s.motion.d)
+            root = joined(root, 1e6 * np.eye(6)[:3])
+        bound = bound_from_root(root, s.motion.w, s.motion.d)
         bounds.append(np.rad2deg([bound.rotation, bound.direction]))
     return np.sqrt(np.mean((np.array(found) / bounds) ** 2, axis=0))
 

@@ -58,7 +58,7 @@ def seconds_of(work: Callable[[], object]) -> float:
     return time.monotonic() - start
 
 
-def reproduce(target: Target, folder: Path, seeds: int = SEEDS) -> float:
+def reproduce(target: Target, folder: Path, seeds: int | None = None) -> float:
     return seconds_of(lambda: command.reproduce(target, folder / "results", folder / "data", None, seeds))
 
 

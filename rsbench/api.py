@@ -234,6 +234,7 @@ def correct(
     target_row: float = 0.0,
     inpaint: bool = False,
     seed: int = 0,
+    gyro: ArrayLike | None = None,
 ) -> CorrectedFrames:
     """The global-shutter frames that the cameras would have taken, from their four rolling-shutter frames.
 
@@ -242,25 +243,24 @@ def correct(
         rig: the cameras, with their lens where they have one; the result has it too.
         readout_ratio: readout time over frame period; None has it estimated, of cameras without a lens.
         solver: finds the motion, in metres; as in ``estimate_motion``.
-        matcher: name or card of the stereo matcher that finds depth.
-        features: name or card of the feature matcher that finds the matches of the motion.
+        matcher, features: names or cards of what finds depth, and the matches of the motion.
         corrector: name or card of what makes the corrected frames.
-        target_row: the time of this row of a frame is the time of its corrected image.
-        inpaint: invent what nobody saw.
-        seed: of the samples that the robust loop draws.
+        target_row: the time of this row of a frame is that of its corrected image.
+        inpaint, seed: invent what nobody saw; of the samples that the robust loop draws.
+        gyro: (n, 4) samples of a gyroscope, as of ``Correspondences``, for correctors that need them.
 
     Returns:
         ``frames["left", 0]`` and so on, each with ``image``, ``depth`` and ``origin``; ``motion``, ``shutter``.
 
     Raises:
         ValueError: images of another type or size than the rig's cameras, a ratio or row out of its range.
-        RsbenchError: frames that cannot be what they are said to be, or no such component. As its subclass
-            NoMotionError: the matches determine no motion or readout ratio, or the solver no metres.
+        RsbenchError: frames that cannot be what they are said to be, or no such component; NoMotionError: the
+            matches determine no motion or readout ratio, or the solver no metres; NotCorrectedError.
     """
-    from rsbench.pipeline.chain import correct_four
+    from rsbench.pipeline.chain import Given, correct_four
     from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.isolated_parts import Isolation
-    from rsbench.vision.corrector import load_corrector
+    from rsbench.vision.corrector import demand_corrected, load_corrector
     from rsbench.vision.feature_matcher import load_features
     from rsbench.vision.stereo_matcher import load_matcher
 
@@ -273,12 +273,12 @@ def correct(
         inpaint=inpaint,
         seed=seed,
     )
-    views = arguments.four_images(images, rig)
-    if readout_ratio is not None:
-        arguments.check_number("readout_ratio", readout_ratio, 0.0, 1.0)
-    arguments.check_number("target_row", target_row, 0.0, rig.camera.height - 1.0)
+    views, given = arguments.four_images(images, rig), Given(gyro=arguments.gyro_samples(gyro))
+    arguments.check_times(readout_ratio, target_row, rig)
     with Isolation() as isolation:
-        return correct_four(views, rig, readout_ratio, isolation.chain(options))
+        found = correct_four(views, rig, readout_ratio, isolation.chain(options), given=given)
+    demand_corrected(found.frames, options.corrector.name)
+    return found
 
 
 def read_dataset(folder: AnyPath) -> list[Sequence]:
@@ -327,7 +327,7 @@ def verify(
         folder: of the dataset.
         stride: compare every n-th pixel in both directions.
         rerender: rows to render again where the scene can be built here: "no", "auto" (seconds) or "all".
-        scenes: cards of scenes that are not rsbench's own.
+        scenes: cards of scenes that are not rsbench's own, and mesh files of objects that move.
     """
     from rsbench.dataset.verification import verify_dataset
 

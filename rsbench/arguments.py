@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import FRAMES, SIDES, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -28,6 +29,18 @@ def check_number(name: str, value: float, least: float, most: float = math.inf) 
     if not (math.isfinite(value) and least <= value <= most):
         allowed = f"at least {least:g}" if math.isinf(most) else f"from {least:g} to {most:g}"
         raise ValueError(f"{name} = {value!r}: must be a number {allowed}")
+
+
+def check_times(readout_ratio: float | None, target_row: float, rig: StereoRig) -> None:
+    """Raises ValueError unless the ratio (None: unknown) and the row of an image are in their ranges."""
+    if readout_ratio is not None:
+        check_number("readout_ratio", readout_ratio, 0.0, 1.0)
+    check_number("target_row", target_row, 0.0, rig.camera.height - 1.0)
+
+
+def gyro_samples(samples: ArrayLike | None) -> FloatArray | None:
+    """Samples (n, 4) as ``Correspondences`` has them; raises ValueError as it does."""
+    return None if samples is None else Correspondences(gyro=np.asarray(samples, dtype=np.float64)).gyro
 
 
 def check_whole(name: str, value: object, least: int, most: float = math.inf) -> None:

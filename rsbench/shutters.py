@@ -67,3 +67,24 @@ def with_shutter(table: Mapping[str, Any], where: str) -> dict[str, Any]:
     if isinstance(period, int | float) and period > 0.0:
         left["readout_ratio"] = min(readout / period, 1.0)
     return left
+
+
+def with_shutters(card: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """A dataset's card in which every ``shutter`` is replaced by what it means; what is wrong stays so.
+
+    Raises:
+        RsbenchError: as ``with_shutter``.
+    """
+
+    def meant(value: Any) -> Any:
+        return with_shutter(value, where) if isinstance(value, dict) else value
+
+    def values(axis: Any) -> Any:
+        return {key: meant(value) for key, value in axis.items()} if isinstance(axis, dict) else axis
+
+    made = with_shutter(card, where)
+    if isinstance(sequences := made.get("sequence"), list):
+        made["sequence"] = [meant(sequence) for sequence in sequences]
+    if isinstance(grid := made.get("grid"), dict):
+        made["grid"] = {name: values(axis) for name, axis in grid.items()}
+    return made

@@ -64,9 +64,16 @@ def row_times(sequence: Recorded, frame: int, y: Array) -> Array:
 
 
 def truth(
-    sequence: Recorded, world: World, channel: PairChannel, side: str, frame: int, row: int = 0
+    sequence: Recorded,
+    world: World,
+    channel: PairChannel,
+    side: str,
+    frame: int,
+    row: int = 0,
+    *,
+    back: bool = False,
 ) -> tuple[Array, Array, NDArray[np.int64]]:
-    """As ``traced_truth.truth``, of all pixels; and the thing (n,) that each sees."""
+    """As ``traced_truth.truth``, of all pixels, ``back``: to the frame before; and the thing (n,) of each."""
     width, height = sequence.rig.camera.width, sequence.rig.camera.height
     y, x = (each.ravel().astype(float) for each in np.mgrid[:height, :width])
     pixels, start = np.column_stack([x, y]), row_times(sequence, frame, y)
@@ -78,7 +85,7 @@ def truth(
     if channel == "disparity":
         there, tau = ("right" if side == "left" else "left"), start
     elif channel == "flow":
-        to = 1 - frame
+        to = frame - 1 if back or frame == sequence.frames - 1 else frame + 1
         low, high = np.full(len(X), -0.5), np.full(len(X), height - 0.5)
 
         def below(at: Array) -> Array:

@@ -115,6 +115,15 @@ def test_the_search_for_machine_paths_can_find_them(text: str, bad: bool) -> Non
     assert bool(_FORBIDDEN.search(text)) == bad
 
 
+@in_checkout
+def test_no_document_holds_the_marks_of_a_merge() -> None:
+    marks = re.compile(r"^(<{7}|={7}|>{7})( |$)", re.MULTILINE)
+    assert not [
+        path for path in _tracked() if path.suffix in (".md", ".toml", ".txt") if marks.search(path.read_text())
+    ]
+    assert marks.search("a\n<<<<<<< HEAD\nb\n=======\nc\n")
+
+
 def test_constraints_are_exact_and_hashed() -> None:
     text = (ROOT / "constraints.txt").read_text("utf-8")
     assert "://" not in text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     import pandas as pd
+    from rich.table import Table
 
+_GAP = 2
+"""Cells between columns."""
 _quiet = False
 
 
@@ -111,21 +115,73 @@ def print_table(title: str, frame: pd.DataFrame, digits: dict[str, int] | None =
 def print_rows(
     title: str, columns: Sequence[str], rows: Sequence[Sequence[object]], right: Iterable[str] = ()
 ) -> None:
-    """A terminal table; the columns in ``right`` are aligned there."""
-    from rich import box
+    """A table on stdout; the columns in ``right`` are aligned there.
+
+    One that is wider than the terminal goes on below itself, with the columns that tell its rows apart: no word or
+    number is broken. Redirected, it takes the room that it needs, unless COLUMNS says otherwise.
+    """
+    from rich.cells import cell_len
     from rich.console import Console
-    from rich.table import Table
     from rich.text import Text
 
     if _quiet:
         return
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    right = set(right)
-    for column in columns:
-        table.add_column(column, justify="right" if column in right else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*(Text(str(value)) for value in row))
-    Console().print(table)
+    console, texts, right = Console(), [[str(value) for value in row] for row in rows], set(right)
+    cells = [[column, *(row[k] for row in texts)] for k, column in enumerate(columns)]
+    words = [max((cell_len(word) for cell in each for word in cell.split()), default=0) for each in cells]
+    lines = [max(cell_len(line) for cell in each for line in cell.split("\n")) for each in cells]
+    if not (console.is_terminal or "COLUMNS" in os.environ):
+        console.width = max(80, sum(lines) + _GAP * len(lines) + 1)
+    for number, block in enumerate(_blocks(words, _keys(texts), console.width)):
+        table = _empty_table(title if number == 0 else "")
+        widths = _shared(
+            [words[k] for k in block], [lines[k] for k in block], console.width - _GAP * len(block) - 1
+        )
+        for k, width in zip(block, widths, strict=True):
+            justify = "right" if columns[k] in right else "left"
+            table.add_column(columns[k], justify=justify, overflow="fold", width=width)
+        for row in texts:
+            table.add_row(*(Text(row[k]) for k in block))
+        console.print(table)
+
+
+def _keys(rows: Sequence[Sequence[str]]) -> int:
+    """How many of the first columns tell all rows apart; 1 when none do."""
+    counts = range(1, len(rows[0]) if rows else 1)
+    return next((count for count in counts if len({tuple(row[:count]) for row in rows}) == len(rows)), 1)
+
+
+def _blocks(widths: Sequence[int], keys: int, room: int) -> list[list[int]]:
+    """Columns of the tables into which one is cut, each with the keys; one of all where a word has no room."""
+    room -= sum(widths[:keys]) + _GAP * keys + 1
+    blocks: list[list[int]] = [[]]
+    for k in range(keys, len(widths)):
+        if blocks[-1] and sum(widths[j] + _GAP for j in (*blocks[-1], k)) > room:
+            blocks.append([])
+        blocks[-1].append(k)
+    if any(sum(widths[k] + _GAP for k in block) > room for block in blocks):
+        return [list(range(len(widths)))]
+    return [[*range(min(keys, len(widths))), *block] for block in blocks]
+
+
+def _shared(least: Sequence[int], most: Sequence[int], room: int) -> Sequence[int | None]:
+    """Widths of columns, which share what their longest words leave; None where these have no room."""
+    spare = room - sum(least)
+    if spare < 0:
+        return [None] * len(least)
+    wanted = [high - low for low, high in zip(least, most, strict=True)]
+    # What wants little has it before sentences, which can go on in another line.
+    level = max(
+        range(max(wanted, default=0) + 1), key=lambda k: (sum(min(each, k) for each in wanted) <= spare) * k
+    )
+    return [low + min(each, level) for low, each in zip(least, wanted, strict=True)]
+
+
+def _empty_table(title: str) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    return Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
 
 
 def _cell(value: Any, digits: int | None) -> str:

@@ -79,6 +79,7 @@ def correct(
     """Correct your own rolling-shutter stereo frames: two times of a rig, or a whole sequence."""
     from rsbench.pipeline.frame_motion import NoMotionError
     from rsbench.pipeline.isolated_parts import Isolation
+    from rsbench.vision.corrector import NotCorrectedError
 
     given = _given(frames, rig, out, left, right)
     others = {"find_sky": sky, "inpaint": inpaint, "seed": seed, "motion_model": motion_model}
@@ -90,7 +91,7 @@ def correct(
                 _correct_four(given.four, given.card, given.out, target, options)
             else:
                 _correct_sequence(*given.footage(), given.card, given.out, target, options)
-    except NoMotionError as error:
+    except (NoMotionError, NotCorrectedError) as error:
         typer.echo(f"rsbench: not corrected: {error}", err=True)
         raise typer.Exit(1) from None
 
@@ -227,6 +228,7 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
     from rsbench.pipeline.chain import correct_four
     from rsbench.pipeline.footage import read_four
     from rsbench.report.corrected_page import card_of
+    from rsbench.vision.corrector import demand_corrected
 
     order = (("left", 0), ("right", 0), ("left", 1), ("right", 1))
     images = read_four(dict(zip(order, paths, strict=True)))  # pyrefly: ignore[bad-argument-type]
@@ -244,6 +246,7 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
                 disparity_offset=card.disparity_offset,
                 scanning=card.scanning,
             )
+        demand_corrected(result.frames, options.corrector.name)
         for (side, frame), fused in result.frames.items():
             write_frame(folder, f"{side}_{frame}", fused)
         record = rig_record(rig, result.shutter, result.readout, options, card.disparity_offset)

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rsbench.cli.kinds import complete
-from rsbench.cli.leaderboard_tracks import Data, Hidden, Secret, Track, problems_of, split_of, write_frames_of
+from rsbench.cli.leaderboard_tracks import (
+    Data,
+    Hidden,
+    Secret,
+    Track,
+    Workers,
+    problems_of,
+    split_of,
+    write_frames_of,
+)
 from rsbench.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -119,6 +128,7 @@ def submit(
     seed_file: Secret = None,
     secret: Hidden = False,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
+    workers: Workers = 1,
 ) -> None:
     """Score a file of predictions and add it to a board."""
     from rsbench.benchmark.leaderboard.board import add
@@ -128,7 +138,7 @@ def submit(
     split = split_of(_track_of(file), data, seed_file, secret)
     for note in check_submission(file, split).notes:
         typer.echo(f"note: {note}", err=True)
-    scored = add(board, file, split, provenance("rsbench leaderboard submit"), replace=replace)
+    scored = add(board, file, split, provenance("rsbench leaderboard submit"), replace=replace, workers=workers)
     _show(board, split.protocol.id, split.name, None, scored.header.method)
 
 
@@ -146,7 +156,7 @@ def run(
     data: Data = None,
     seed_file: Secret = None,
     secret: Hidden = False,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    workers: Workers = 1,
     time_limit: Annotated[
         float | None, typer.Option(min=0.001, help="Seconds per problem; what takes longer is a failure.")
     ] = None,
@@ -166,7 +176,8 @@ def run(
     _load_cards(entry, split)  # before anything is written
     files = _predict(entry, split, board, data, seed_file, workers, Limits(time_limit, memory))
     for file in files:
-        add(board, file, split, provenance(RUN), replace=made_by(board, split, file.parent.name) == RUN)
+        ours = made_by(board, split, file.parent.name) == RUN
+        add(board, file, split, provenance(RUN), replace=ours, workers=workers)
     _show(board, split.protocol.id, split.name, None)
 
 
@@ -241,11 +252,13 @@ def merge(
 
 
 @board_app.command()
-def rescore(track: Track, board: _Board, data: Data = None, seed_file: Secret = None) -> None:
+def rescore(
+    track: Track, board: _Board, data: Data = None, seed_file: Secret = None, workers: Workers = 1
+) -> None:
     """Score the stored predictions again and say which scores changed; runs no method."""
     from rsbench.benchmark.leaderboard.board import rescore
 
-    changed = rescore(board, split_of(track, data, seed_file))
+    changed = rescore(board, split_of(track, data, seed_file), workers)
     for method, columns in changed.items():
         typer.echo(f"{method}: other scores: {', '.join(columns)}")
     if changed:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from rsbench.cli.kinds import complete
+from rsbench.cli.leaderboard_tracks import Workers
 from rsbench.errors import RsbenchError
 
 _Seed = Annotated[
@@ -59,6 +60,7 @@ def score(
         Path | None, typer.Option(metavar="DIR", help="The keeper's folder, where the truth is depth or frames.")
     ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
+    workers: Workers = 1,
 ) -> None:
     """Draw the truth of a secret split from its text again, see that it is the announced one, and score."""
     from rsbench.benchmark.leaderboard.board import add
@@ -73,5 +75,6 @@ def score(
     split = announced_split(announced, protocol, card or announced.card, text, keep)
     for note in check_submission(file, split).notes:
         typer.echo(f"note: {note}", err=True)
-    scored = add(board, file, split, provenance("rsbench leaderboard score"), replace=replace)
+    made = provenance("rsbench leaderboard score")
+    scored = add(board, file, split, made, replace=replace, workers=workers)
     typer.echo(f"entry: {scored.folder}")

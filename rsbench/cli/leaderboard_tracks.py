@@ -28,6 +28,8 @@ Hidden = Annotated[
     bool, typer.Option("--secret", help="The dataset's truth is not to be told: not exported, not used by check.")
 ]
 
+Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
+
 
 def split_of(track: str, data: Path | None, seed_file: Path | None, secret: bool = False) -> Split:
     from rsbench.benchmark.leaderboard.protocols import protocol_of_track

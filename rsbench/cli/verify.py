@@ -36,7 +36,7 @@ def verify(
     scene: Annotated[
         list[str] | None,
         typer.Option(
-            help="Card of a scene that is not rsbench's own; repeatable.", autocompletion=complete("scenes")
+            help="Card, or moving mesh, that is not rsbench's own; repeatable.", autocompletion=complete("scenes")
         ),
     ] = None,
 ) -> None:

@@ -54,6 +54,9 @@ class Correspondences:
             object.__setattr__(self, name, _matches(getattr(self, name), name, columns))
         for name in ("gyro", "gravity"):
             object.__setattr__(self, name, _matches(getattr(self, name), name, 4))
+        flat = np.flatnonzero(~np.any(self.gravity[:, 1:], axis=1))
+        if len(flat):
+            raise ValueError(f"gravity[{flat[0]}] has no direction: gx, gy, gz are 0")
 
 
 def _matches(value: ArrayLike, name: str, columns: int) -> FloatArray:
@@ -64,7 +67,7 @@ def _matches(value: ArrayLike, name: str, columns: int) -> FloatArray:
         raise ValueError(f"{name} must have {columns} numbers per match, got shape {rows.shape}")
     bad = np.flatnonzero(~np.all(np.isfinite(rows), axis=1))
     if len(bad):
-        raise ValueError(f"{name}[{bad[0]}] must be finite pixels, got {rows[bad[0]].tolist()}")
+        raise ValueError(f"{name}[{bad[0]}] must be finite numbers, got {rows[bad[0]].tolist()}")
     rows.setflags(write=False)
     return rows
 

@@ -15,18 +15,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal, final
+from typing import Literal, final
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike
 
-from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.epipolar import in_front, row_pair_pose, rs_constraint
-from rsbench.core.motion import Motion
+from rsbench.core.gyro_motion import GyroMotion
 from rsbench.core.rig import SIDES, Side, StereoRig
-from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
@@ -35,57 +32,6 @@ from rsbench.solvers.engine.packed import inverse_definite
 
 _MAX_SCALE_SIGMA = 0.5
 """Relative standard deviation of the length of d above which it does not count as metric, as in ``refined``."""
-
-
-@dataclass(frozen=True, eq=False, init=False)
-class GyroMotion(Motion):
-    """Rotation integrated from samples (n, 4), t(tau) = tau d; d may change, the samples stay."""
-
-    name: ClassVar[str] = "gyro"
-    samples: FloatArray
-    nodes: FloatArray
-    """(n, 3, 3) rotations at the samples, since the first of them."""
-    origin: FloatArray
-    """(3, 3) the inverse of that at time 0."""
-
-    def __init__(self, samples: FloatArray, d: ArrayLike) -> None:
-        samples = samples[np.lexsort(samples.T[::-1])]
-        tau, rates = samples[:, 0], samples[:, 1:]
-        steps = np.diff(tau)[:, None] * 0.5 * (rates[1:] + rates[:-1])
-        nodes = np.stack([np.eye(3), *so3.exp(steps)])
-        for k in range(1, len(nodes)):
-            nodes[k] = nodes[k] @ nodes[k - 1]
-        object.__setattr__(self, "samples", samples)
-        object.__setattr__(self, "nodes", nodes)
-        object.__setattr__(self, "origin", self._turned(np.zeros(())).T)
-        super().__init__(so3.log(self._turned(np.ones(())) @ self.origin), d)
-
-    def _turned(self, tau: FloatArray) -> FloatArray:
-        """Rotation (..., 3, 3) since the first sample; rates are linear between samples, and constant beyond."""
-        times, rates = self.samples[:, 0], self.samples[:, 1:]
-        k = np.clip(np.searchsorted(times, tau, side="right") - 1, 0, len(times) - 2)
-        s = (tau - times[k])[..., None]
-        inside = np.clip(s, 0.0, (times[k + 1] - times[k])[..., None])
-        slope = (rates[k + 1] - rates[k]) / np.maximum(times[k + 1] - times[k], 1e-300)[..., None]
-        angle = inside * rates[k] + 0.5 * inside**2 * slope + (s - inside) * (rates[k] + inside * slope)
-        return np.asarray(so3.exp(angle) @ self.nodes[k])
-
-    def body_from_world(self, tau: ArrayLike) -> Pose:
-        tau = np.asarray(tau, dtype=np.float64)
-        return Pose(self._turned(tau) @ self.origin, tau[..., None] * self.d)
-
-    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        tau, times = np.asarray(tau, dtype=np.float64), self.samples[:, 0]
-        rates = [np.interp(tau, times, self.samples[:, axis]) for axis in (1, 2, 3)]
-        return np.stack(rates, axis=-1), np.broadcast_to(self.d, (*tau.shape, 3))
-
-    def along(self, d: FloatArray) -> GyroMotion:
-        """The same rotation with another translation."""
-        other = object.__new__(GyroMotion)
-        for name in ("w", "samples", "nodes", "origin"):
-            object.__setattr__(other, name, getattr(self, name))
-        object.__setattr__(other, "d", d)
-        return other
 
 
 @final
@@ -151,14 +97,15 @@ class GyroSolver(Solver):
         d, metric = _translation(constraints.m, constraints.beta)
         if d is None:
             return MotionEstimate.failed("the matches leave the direction of d open: degenerate motion or scene")
-        if not metric:
-            d = _signed(motion, d, about, shutter, matches)
-        sigma = np.inf
+        signed, sigma = metric, np.inf
         if descend:
             d, sigma = constraints.refined(d)
         metric = metric and (not descend or sigma <= _MAX_SCALE_SIGMA)
-        if not np.all(np.isfinite(d)):
+        if not (np.all(np.isfinite(d)) and np.any(d)):
             return MotionEstimate.failed("no finite translation fits")
+        if not signed:
+            # At last: where lengths are open, a step of the descent may lead through zero to the other side.
+            d = _signed(motion, d, about, shutter, matches)
         reason = "" if metric else "the length of d is not determined by these matches"
         d = d if self._stereo else d / np.linalg.norm(d)
         return MotionEstimate(w=motion.w, d=d, success=True, metric=metric, reason=reason)

@@ -25,9 +25,8 @@ from rsbench.solvers.engine.poselib_adapter import (
     poselib_module,
     poselib_pose,
 )
-from rsbench.solvers.engine.stereo_points import stereo_points, with_depth
+from rsbench.solvers.engine.stereo_points import FRAME_1, stereo_points, with_depth
 
-_COLUMNS: dict[Side, slice] = {"left": slice(4, 6), "right": slice(6, 8)}
 _LEAST = 10
 """Samples, as in rsbench's own robust loop."""
 _BUNDLE = {"loss_type": "TRIVIAL", "max_iterations": 100, "gradient_tol": 1e-14, "step_tol": 1e-14}
@@ -89,9 +88,9 @@ class P3pSolver(Solver):
         """PoseLib's pose of the body, from the pixels near it."""
         points, camera = stereo_points(tracks, rig), poselib_camera(rig.camera)
         sides: tuple[Side, ...] = SIDES if self.cameras_used == "both" else ("left",)
-        near = [self._near(start, points, tracks[:, _COLUMNS[side]], rig, side) for side in sides]
+        near = [self._near(start, points, tracks[:, FRAME_1[side]], rig, side) for side in sides]
         end, _ = poselib.refine_generalized_absolute_pose(
-            [tracks[mask, _COLUMNS[side]] for side, mask in zip(sides, near, strict=True)],
+            [tracks[mask, FRAME_1[side]] for side, mask in zip(sides, near, strict=True)],
             [points[mask] for mask in near],
             start,
             [poselib_pose(poselib, np.eye(3), rig.offset(side)) for side in sides],

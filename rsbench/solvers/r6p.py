@@ -30,14 +30,13 @@ from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.stereo_points import stereo_points, with_depth
+from rsbench.solvers.engine.stereo_points import FRAME_1, propose_together, stereo_points, with_depth
 
 _LEAST = 6
 _STEPS = 6
 """Linear ones; of motions of some degrees each gains two digits."""
 _QUICK, _FULL = 4, 20
 _SMALL = 1e-13
-_COLUMNS: dict[Side, slice] = {"left": slice(4, 6), "right": slice(6, 8)}
 _OPEN = "the matches leave the pose and the velocity of frame 1 open"
 
 
@@ -85,8 +84,8 @@ class Resection(NamedTuple):
         return cls(
             stereo_points(tracks, rig),
             tau0 if moved else 0.0 * tau0,
-            np.stack([rig.camera.unproject(tracks[:, _COLUMNS[side]]) for side in sides]),
-            np.stack([shutter.pixel_time(tracks[:, _COLUMNS[side]], 1, side) - 1.0 for side in sides]),
+            np.stack([rig.camera.unproject(tracks[:, FRAME_1[side]]) for side in sides]),
+            np.stack([shutter.pixel_time(tracks[:, FRAME_1[side]], 1, side) - 1.0 for side in sides]),
             np.stack([rig.offset(side) for side in sides])[:, None],
             np.array([rig.camera.fx, rig.camera.fy]),
         )
@@ -248,17 +247,13 @@ class R6pSolver(Solver):
     def propose_all(
         self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
     ) -> Iterable[list[MotionEstimate]]:
-        tracks = [with_depth(sample.tracks)[:_LEAST] for sample in samples]
-        whole = [each for each in tracks if len(each) == _LEAST]
-        poses: list[RowPose] = []
-        if whole:
-            data = self._data(np.concatenate(whole), rig, shutter, minimal=True).in_samples(len(whole))
+        def solve(tracks: FloatArray) -> Iterable[list[MotionEstimate]]:
+            data = self._data(tracks.reshape(-1, 8), rig, shutter, minimal=True).in_samples(len(tracks))
             with np.errstate(all="ignore"):
                 found = linear_pose(data, self.linearisation == "single")
-            poses = [RowPose(*parts) for parts in zip(*found, strict=True)]
-        rest = iter(poses)
-        few = MotionEstimate.failed(f"fewer than {_LEAST} points of a sample have positive disparity")
-        return [[_reported(next(rest)) if len(each) == _LEAST else few] for each in tracks]
+            return [[_reported(RowPose(*parts))] for parts in zip(*found, strict=True)]
+
+        return propose_together(samples, _LEAST, with_depth, solve)
 
     def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
         return {"tracks": _LEAST}

@@ -30,7 +30,7 @@ from rsbench.core.so3 import FloatArray, hat
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.optimise import levenberg_marquardt
 from rsbench.solvers.engine.packed import pack
-from rsbench.solvers.engine.stereo_points import stereo_points, with_depth
+from rsbench.solvers.engine.stereo_points import propose_together, stereo_points, with_depth
 
 View = tuple[Literal[0, 1], Side]
 """The frame that sees a point which the other one knows, and its camera."""
@@ -144,17 +144,13 @@ class TripletSolver(Solver):
     def propose_all(
         self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
     ) -> Iterable[list[MotionEstimate]]:
-        tracks = [_with_depths(sample.tracks)[:_LEAST] for sample in samples]
-        whole = [each for each in tracks if len(each) == _LEAST]
-        poses: list[list[MotionEstimate]] = [[] for _ in whole]
-        for pattern in _PATTERNS if whole else ():
+        def solve(tracks: FloatArray) -> Iterable[list[MotionEstimate]]:
             with np.errstate(all="ignore"):
-                pose = newton(Triplets.of(np.stack(whole), pattern, rig))
-            for motions, *each in zip(poses, *pose, strict=True):
-                motions.append(_reported(Pose(*each)))
-        rest = iter(poses)
-        few = MotionEstimate.failed(f"fewer than {_LEAST} points of a sample have positive disparities")
-        return [next(rest) if len(each) == _LEAST else [few] for each in tracks]
+                found = [newton(Triplets.of(tracks, pattern, rig)) for pattern in _PATTERNS]
+            each = (zip(*pose, strict=True) for pose in found)
+            return [[_reported(Pose(*one)) for one in poses] for poses in zip(*each, strict=True)]
+
+        return propose_together(samples, _LEAST, _with_depths, solve)
 
     def improve(
         self,

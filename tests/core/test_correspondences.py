@@ -31,7 +31,7 @@ def test_an_empty_list_is_an_empty_set(name: str) -> None:
 def test_a_number_that_is_not_finite_is_named_by_set_and_match(name: str, columns: int, bad: float) -> None:
     rows = np.ones((5, columns))
     rows[3, 1] = bad
-    with pytest.raises(ValueError, match=rf"{name}\[3\] must be finite pixels, got .*{bad}"):
+    with pytest.raises(ValueError, match=rf"{name}\[3\] must be finite numbers, got .*{bad}"):
         Correspondences(**{name: rows})
 
 
@@ -48,3 +48,8 @@ def test_input_is_copied_and_the_copy_is_read_only() -> None:
     assert matches.left[0, 0] == 1.0
     with pytest.raises(ValueError, match="read-only"):
         matches.left[0, 0] = 2.0
+
+
+def test_gravity_without_a_direction_is_refused_by_its_row() -> None:
+    with pytest.raises(ValueError, match=r"gravity\[1\] has no direction: gx, gy, gz are 0"):
+        Correspondences(gravity=np.array([[0.0, 0.0, 9.8, 0.0], [1.0, 0.0, 0.0, 0.0]]))

@@ -11,6 +11,7 @@ from rsbench.benchmark.simulated.bound import motion_bound
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.gyro_motion import GyroMotion
 from rsbench.core.metrics import rotation_error, scale_error, translation_error
 from rsbench.core.motion import AcceleratedMotion
 from rsbench.core.rig import StereoRig
@@ -18,7 +19,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.registry import load_solver
-from rsbench.solvers.gyro import GyroMotion, GyroSolver
+from rsbench.solvers.gyro import GyroSolver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
@@ -48,6 +49,14 @@ def test_rotations_are_those_of_the_motion_that_was_sampled() -> None:
         gyro = GyroMotion(np.column_stack([at, shaking.velocity(at)[0]]), shaking.d)
         errors.append(np.max(np.abs(gyro.body_from_world(tau).R - shaking.body_from_world(tau).R)))
     assert errors[0] < 1e-3 and 3.0 < errors[0] / errors[1] < 5.0  # the trapezoidal rule's second order
+
+
+def test_the_descent_keeps_the_side_of_a_translation_without_a_length() -> None:
+    """Its errors are the same for every length: a step may be as long as to the other side of zero."""
+    for seed in range(40):
+        s = trial(seed, stereo=False)
+        found = GyroSolver().estimate(s.correspondences, RIG, SHUTTER)
+        assert translation_error(found.d, s.motion.d) < 1e-8, seed
 
 
 @pytest.mark.parametrize("how", ["none", "sampson"])

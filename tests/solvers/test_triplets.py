@@ -71,7 +71,7 @@ def test_samples_without_depth_are_told_and_leave_the_others_alone() -> None:
     far = Correspondences(tracks=good.tracks[:, [2, 3, 0, 1, 6, 7, 4, 5]])
     same = Correspondences(tracks=good.tracks[[0, 0, 0]])
     first, second, third = solver.propose_all([far, good, same], RIG, GLOBAL)
-    assert "positive disparities" in first[0].reason and not solver.estimate(far, RIG, GLOBAL).success
+    assert "positive disparity" in first[0].reason and not solver.estimate(far, RIG, GLOBAL).success
     alone = solver.propose(good, RIG, GLOBAL)
     assert [m.d.tolist() for m in second] == [m.d.tolist() for m in alone] and all(m.success for m in second)
     assert len(third) == 2

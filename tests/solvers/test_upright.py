@@ -132,9 +132,8 @@ def test_gravity_turns_with_the_camera_and_has_its_noise() -> None:
 
 def test_what_is_no_gravity_is_told_by_value() -> None:
     c, solver = trial(0).correspondences, load_solver("gs-upright-3pt")
-    for gravity in ([[0.0, 0.0, 1.0, 0.0]] * 2, [[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0]]):
-        found = solver.estimate(replace(c, gravity=np.array(gravity)), RIG, GLOBAL)
-        assert not found.success and "no direction of gravity" in found.reason
+    found = solver.estimate(replace(c, gravity=np.array([[0.0, 0.0, 1.0, 0.0]] * 2)), RIG, GLOBAL)
+    assert not found.success and "no direction of gravity" in found.reason
     assert (
         "0 directions of gravity, need 2"
         in solver.estimate(replace(c, gravity=np.zeros((0, 4))), RIG, GLOBAL).reason

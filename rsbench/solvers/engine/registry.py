@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from rsbench import plugins
 from rsbench.errors import RsbenchError
@@ -19,12 +19,19 @@ class SolverOptions:
 
     robust: Literal["ransac", "own"] = "ransac"
     """``own``: the solver throws outliers out by itself; it is given all matches, timed and scored as it is."""
+    use: str = ""
+    """When to take this one rather than another, in a line for people; nothing else reads it."""
     time_limit_s: float = 60.0
     """Wall-clock time for one problem, after which a solver of another package has failed."""
 
     def __post_init__(self) -> None:
         if not self.time_limit_s > 0.0:
             raise ValueError(f"time_limit_s = {self.time_limit_s}: must be a positive number of seconds")
+
+    @property
+    def deciding(self) -> dict[str, Any]:
+        """What may change an answer, by name."""
+        return {"robust": self.robust, "time_limit_s": self.time_limit_s}
 
 
 def _check_spec(solver: Solver) -> None:
