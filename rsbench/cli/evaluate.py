@@ -100,7 +100,7 @@ UNPUBLISHED = (
     "rs-r6p",
     "rs-r6p-single",
 )
-"""Solvers that are in no published table or board yet."""
+"""Solvers that are in no published table of images yet."""
 _ON_REQUEST = (
     "rs-stereo",  # another name of rs-stereo-refined: one row of it is enough
     *("rs-mono-refined", "rs-zhuang-8pt", "rs-zhuang-9pt", "rs-gyro-5pt", "rs-gyro-stereo"),
