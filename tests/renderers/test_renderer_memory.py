@@ -70,8 +70,8 @@ def test_scenes_are_given_back_and_hold_no_texture_twice() -> None:
     # copy would be in every scene; in one, on a busy machine, what is about to be freed may still be there.
     shares = [(scene["full"] - scene["empty"]) / (scene["texels"] * 16 / 2**20) for scene in later]
     assert statistics.median(shares) < 1.25, shares
-    # The first scene brings what stays, compiled kernels above all. Scenes that stayed would be 100 MB each, 300 by
-    # the fourth; a moment's memory of the run time has been seen to add 20 to one of them on a busy machine.
+    # The first scene brings what stays, compiled kernels above all. Scenes that stayed would be 100 MB each, 300
+    # by the fourth; a moment's memory of the run time has been seen to add 20 to one of them on a busy machine.
     assert min(scene["after"] for scene in later[2:]) - first["after"] < 30, found(first, later)
 
 
