@@ -32,6 +32,8 @@ PIXELS = 1 << 21
 """Of one frame, 1920 x 1080 and a little more: correcting four takes 0.5 to 0.7 kB for each."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,119}")
 """Names that become folders: of sequences, in cards and in what they were rendered to."""
+_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?|.*\.", re.IGNORECASE)
+"""What Windows takes for a device, with any ending, and names whose last dot it drops."""
 _KINDS = "biufU"
 _IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM")
 
@@ -68,6 +70,8 @@ def check_name(name: str) -> None:
             f"name = {name!r}: must be a folder's name: a letter or digit, then at most 119 letters, digits, "
             "'.', '_' and '-'"
         )
+    if _DEVICE.fullmatch(name):
+        raise ValueError(f"name = {name!r}: cannot be a folder's name on Windows: a device, or a dot at its end")
 
 
 def inside(folder: Path, relative: str) -> Path:
@@ -126,18 +130,28 @@ def read_json(path: Path) -> dict[str, Any]:
 def parse_json(text: str, where: object) -> dict[str, Any]:
     """A JSON object in a text; errors as ``read_json``, with ``where`` in front."""
     try:
-        content = json.loads(text)
+        content = json.loads(text, object_pairs_hook=_keyed)
     except json.JSONDecodeError as error:
         raise RsbenchError(
             f"{where}: not valid JSON: {error.msg} at line {error.lineno} column {error.colno}"
         ) from error
-    except ValueError as error:  # a number of thousands of digits
+    except ValueError as error:  # a number of thousands of digits, a key that stands there twice
         raise RsbenchError(f"{where}: not valid JSON: {error}") from error
     except RecursionError as error:
         raise RsbenchError(f"{where}: not valid JSON: nested too deeply") from error
     if not isinstance(content, dict):
         raise RsbenchError(f"{where}: must hold a JSON object, holds a {type(content).__name__}")
     return content
+
+
+def _keyed(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object, of whose two values for one key none is silently dropped."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        seen: set[str] = set()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))
+        raise ValueError(f"the key {twice[:100]!r} stands twice in one object")
+    return found
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:

@@ -288,7 +288,7 @@ def read_table(
         if name not in table:
             raise RsbenchError(f"{path}: lacks the column {name!r}")
     for name in numbers if len(table) else ():
-        if not pd.api.types.is_numeric_dtype(table[name]):
+        if not pd.api.types.is_numeric_dtype(table[name]) or pd.api.types.is_bool_dtype(table[name]):
             raise RsbenchError(f"{path}: the column {name!r} must hold numbers")
     return table
 

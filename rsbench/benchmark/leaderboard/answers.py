@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from rsbench.benchmark.leaderboard.protocols import Asks, protocol_of_id
+from rsbench.core.so3 import FloatArray
 from rsbench.reading import check_name
 
 LARGEST = 1e9
@@ -83,6 +84,15 @@ class Answer:
             len(self.covariance) != 6 or any(len(row) != 6 for row in self.covariance)
         ):
             raise ValueError("covariance: must be 6 x 6 numbers, of w and d")
+        if self.covariance is not None and not _symmetric(np.array(self.covariance)):
+            raise ValueError("covariance: must be symmetric: both halves of it are asked")
+
+
+def _symmetric(covariance: FloatArray) -> bool:
+    """To 0.001 of the standard deviations of row and column: rounded numbers are, a triangle alone is not."""
+    sizes = np.sqrt(np.abs(np.diag(covariance)))
+    with np.errstate(over="ignore"):
+        return bool(np.all(np.abs(covariance - covariance.T) <= 1e-3 * np.outer(sizes, sizes)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.leaderboard.picture_files import check_own
+from rsbench.benchmark.leaderboard.splits import Truth
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
@@ -56,11 +57,12 @@ def match_files(beside: Path) -> list[str]:
     return found
 
 
-def read_own_matches(beside: Path, problems: Mapping[str, object]) -> dict[str, Correspondences] | None:
+def read_own_matches(beside: Path, problems: Mapping[str, Truth]) -> dict[str, Correspondences] | None:
     """Matches by the name of the problem; None where there is no folder of them.
 
     Raises:
-        RsbenchError: see ``match_files``; a file is no such table, or names no problem.
+        RsbenchError: see ``match_files``; a file is no such table, names no problem, or has more matches of one
+            than its images have pixels.
     """
     names = match_files(beside)
     tables = {name.removesuffix(".csv"): _table(beside / FOLDER / name, problems) for name in names}
@@ -69,13 +71,22 @@ def read_own_matches(beside: Path, problems: Mapping[str, object]) -> dict[str, 
     found: dict[str, dict[str, FloatArray]] = {problem: {} for problem in problems}
     for key, table in tables.items():
         for problem, rows in table.groupby("name", sort=False):
+            camera = problems[str(problem)].rig.camera
+            if len(rows) > (most := camera.width * camera.height):
+                raise RsbenchError(
+                    f"{beside / FOLDER / key}.csv: {len(rows)} matches of {problem}: more than pixels, {most}"
+                )
             found[str(problem)][key] = rows[COLUMNS[key].split(", ")].to_numpy(dtype=np.float64)
     return {problem: Correspondences(**sets) for problem, sets in found.items()}
 
 
-def _table(path: Path, problems: Mapping[str, object]) -> pd.DataFrame:
+def _table(path: Path, problems: Mapping[str, Truth]) -> pd.DataFrame:
     columns = COLUMNS[path.stem].split(", ")
     table = read_table(path, ("name",), columns, dtype={"name": str}, keep_default_na=False, na_values=["nan"])
+    if others := sorted({*map(str, table.columns)} - {"name", *columns}):
+        raise RsbenchError(
+            f"{path}: the column {others[0][:100]!r} is not asked; there are: name, {', '.join(columns)}"
+        )
     for name in table["name"].unique():
         if name not in problems:
             raise RsbenchError(f"{path}: name = {str(name)[:100]!r}: is no problem of the split")
@@ -94,7 +105,7 @@ def match_scores(sequence: Sequence, matches: Correspondences | None) -> dict[st
         return {"matches": math.nan, "matches_1px": math.nan}
     found = arranged(matches)
     errors = [
-        match_errors(sequence, views, found.pixels[found.sets == number].reshape(-1, 4))
+        match_errors(sequence, views, np.unique(found.pixels[found.sets == number].reshape(-1, 4), axis=0))
         for number, views in enumerate(MATCHED.values())
     ]
     right = np.concatenate(errors) <= RIGHT_PX

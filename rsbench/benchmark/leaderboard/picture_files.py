@@ -205,6 +205,8 @@ def _read_png(path: Path, size: tuple[int, int], bits: int, colours: tuple[str, 
         raise RsbenchError(f"{path}: is {is_now}: must be {' or '.join(colours)} of {bits} bits")
     try:
         with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+            if image.size != size:  # a second header
+                raise ValueError(f"its headers differ: {image.size[0]} x {image.size[1]} pixels")
             pixels = np.asarray(image)
     except Exception as error:  # Pillow raises what a damaged file makes it stumble over
         raise RsbenchError(f"{path}: is a damaged PNG file: {' '.join(str(error).split())[:100]}") from error

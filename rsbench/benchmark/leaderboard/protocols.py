@@ -235,6 +235,8 @@ class Protocol:
                 )
         if not uses:
             raise ValueError(f"uses: must name what the method works on, of {', '.join(self.allowed)}")
+        if len(set(uses)) < len(uses):
+            raise ValueError("uses: names something twice; once is enough")
 
 
 PROTOCOLS = {

@@ -22,9 +22,13 @@ from rsbench.dataset.files import write_depth, write_exr, write_png
 from rsbench.errors import RsbenchError
 
 
-def _png(width: int, height: int, bits: int, colour: int, body: bytes = b"") -> bytes:
+def _png(
+    width: int, height: int, bits: int, colour: int, body: bytes = b"", more: tuple[tuple[bytes, bytes], ...] = ()
+) -> bytes:
+    """``more``: chunks between the header and the pixels."""
     chunks = (
-        (b"IHDR", struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)),
+        (b"IHDR", _header(width, height, bits, colour)),
+        *more,
         (b"IDAT", zlib.compress(body)),
         (b"IEND", b""),
     )
@@ -34,11 +38,28 @@ def _png(width: int, height: int, bits: int, colour: int, body: bytes = b"") -> 
     )
 
 
+def _header(width: int, height: int, bits: int, colour: int) -> bytes:
+    return struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
+
+
 def _with_hole(value: float) -> Callable[[Path], None]:
     def damage(picture: Path) -> None:
         depth = np.full((80, 96), 5.0, dtype=np.float32)
         depth[3, 4] = value
         write_depth(picture, depth)
+
+    return damage
+
+
+def _with_window(x: int, y: int) -> Callable[[Path], None]:
+    """Of an EXR file, from (x, y) on where that leaves the size as it is, else up to there."""
+
+    def damage(picture: Path) -> None:
+        key = b"dataWindow\0box2i\0\x10\0\0\0"
+        data = picture.read_bytes()
+        place = data.index(key) + len(key)
+        window = (0, 0, x, y) if x > 1000 else (x, y, x + 95, y + 79)
+        picture.write_bytes(data[:place] + struct.pack("<4i", *window) + data[place + 16 :])
 
     return damage
 
@@ -99,6 +120,8 @@ DEPTH_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda p: write_depth(p, np.ones((96, 80), np.float32)),
         "is 80 x 96 pixels, the camera 96 x 80",
     ),
+    "huge by its header": (_with_window(2**31 - 1, 2**31 - 1), "left_1.exr: "),
+    "a window elsewhere": (_with_window(5, 3), "left_1.exr: "),
     "NaN": (_with_hole(np.nan), "1 pixels are NaN; unknown depth and sky are 0"),
     "infinity": (_with_hole(np.inf), "1 pixels are infinite"),
     "negative": (_with_hole(-1.0), "1 pixels are negative"),
@@ -118,6 +141,39 @@ FRAME_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda p: p.write_bytes(_png(2**31 - 1, 2**31 - 1, 8, 2)),
         "is 2147483647 x 2147483647 pixels",
     ),
+    # 64 million pixels pass Pillow's own limit.
+    "a second header": (
+        lambda p: p.write_bytes(_png(96, 80, 8, 2, more=((b"IHDR", _header(8000, 8000, 8, 2)),))),
+        "its headers differ: 8000 x 8000 pixels",
+    ),
+    "a second kind": (
+        lambda p: p.write_bytes(_png(96, 80, 8, 2, bytes(97 * 80), ((b"IHDR", _header(96, 80, 8, 0)),))),
+        "is RGB of 8 bits, and holds something else",
+    ),
+    "a text that unfolds": (
+        lambda p: p.write_bytes(_png(96, 80, 8, 2, more=((b"zTXt", b"x\0\0" + zlib.compress(bytes(1 << 22))),))),
+        "is a damaged PNG file: Decompressed data too large",
+    ),
+    "a profile that unfolds": (
+        lambda p: p.write_bytes(_png(96, 80, 8, 2, more=((b"iCCP", b"x\0\0" + zlib.compress(bytes(1 << 22))),))),
+        "is a damaged PNG file: Decompressed data too large",
+    ),
+    "a film of huge pictures": (
+        lambda p: p.write_bytes(
+            _png(
+                96,
+                80,
+                8,
+                2,
+                more=(
+                    (b"acTL", struct.pack(">II", 2, 0)),
+                    (b"fcTL", struct.pack(">IIIIIHHBB", 0, 60000, 60000, 0, 0, 1, 1, 0, 0)),
+                ),
+            )
+        ),
+        "is a damaged PNG file",
+    ),
+    "another check sum": (lambda p: p.write_bytes(p.read_bytes()[:29] + b"abcd" + p.read_bytes()[33:]), "damaged"),
     "no pixels": (lambda p: p.write_bytes(_png(96, 80, 8, 2)), "is a damaged PNG file"),
     "only a header": (lambda p: p.write_bytes(_png(96, 80, 8, 2)[:30]), "is no PNG file"),
     "nothing": (lambda p: p.write_bytes(b""), "is no PNG file"),

@@ -85,6 +85,7 @@ def test_right_matches_are_counted(split: Split, tmp_path: Path) -> None:
     assert truth.sequence is not None
     found = match_scores(truth.sequence, Correspondences(tracks=tracks, left=left))
     assert found["matches"] == 4 * len(tracks) and found["matches_1px"] > 0.98
+    assert match_scores(truth.sequence, Correspondences(left=np.tile(left[:7], (9, 1))))["matches"] == 7.0
 
 
 def test_motions_without_matches_have_none(split: Split, tmp_path: Path) -> None:
@@ -120,6 +121,20 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "another problem": (
         lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\n../x,1,2,3,4\n"),
         "name = '../x': is no problem",
+    ),
+    "truth values": (
+        lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\nplanes,True,False,True,True\n"),
+        "must hold numbers",
+    ),
+    "a column twice": (lambda p: (p / "left.csv").write_text("name,x0,x0,y0,x1,y1\n"), "'x0.1' is not asked"),
+    "an open quote": (lambda p: (p / "left.csv").write_text('name,x0,y0,x1,y1\n"planes'), "not a table"),
+    "rows that are too long": (
+        lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\nplanes,1,2,3,4,5,6\n"),
+        "name =",
+    ),
+    "more than pixels": (
+        lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\n" + "planes,1,2,3,4\n" * 7681),
+        "7681 matches of planes: more than pixels, 7680",
     ),
     "other bytes": (lambda p: (p / "left.csv").write_bytes(b"\xff\xfe\x00"), "not UTF-8"),
 }

@@ -77,6 +77,15 @@ FAULTS: dict[str, tuple[str, str]] = {
     "another point": (_text(_changed(reference_point="right")), ":2: reference_point = 'right'"),
     "negative time": (_text(_changed(seconds=-1.0)), ":2: seconds = -1.0"),
     "small covariance": (_text(_changed(covariance=[[1.0]])), ":2: covariance: must be 6 x 6"),
+    "half a covariance": (_text(_changed(covariance=np.triu(np.ones((6, 6))).tolist())), "must be symmetric"),
+    "two names": (_text(TRUTH[:1]) + '{"name": "p000", "name": "p001"}\n', ":2: not valid JSON: the key 'name'"),
+    "two methods": (_text(TRUTH).replace("{", '{"method": "mine", ', 1), ":1: not valid JSON: the key 'method'"),
+    "uses it twice": (_text(_header(uses=["left"] * 6000)), "uses: names something twice"),
+    "a device": (_text(_header(method="nul.txt")), "method = 'nul.txt': cannot be a folder's name on Windows"),
+    "a dot at the end": (_text(_header(method="mine.")), "method = 'mine.': cannot be"),
+    "a number beyond all": (_text(TRUTH[:1]) + '{"name": "p000", "seconds": 1' + "0" * 400 + "}\n", ":2: seconds"),
+    "half a character": (_text(_header(authors="\ud800")), ":1: "),
+    "truth values": (_text(_changed(w=[True, False, True])), ":2: w.0 = True"),
     "unknown key": (_text(_changed(omega=[0, 0, 0])), ":2: unknown key 'omega'"),
 }
 
