@@ -363,8 +363,10 @@ def _number(value: float) -> str:
 
 def register(app: typer.Typer) -> None:
     from rsbench.cli.leaderboard_secret import publish, score
+    from rsbench.cli.leaderboard_smoke import EPILOG as SMOKE
     from rsbench.cli.leaderboard_smoke import smoke
 
-    for command in (smoke, publish, score):
+    board_app.command(epilog=SMOKE)(smoke)
+    for command in (publish, score):
         board_app.command()(command)
     app.add_typer(board_app, name="leaderboard", help="Tracks, entries, ranks with intervals; for any language.")

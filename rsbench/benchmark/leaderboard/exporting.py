@@ -53,10 +53,7 @@ def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:
     records = [_record(problem, split.protocol) for problem in given]
     write_bytes(out / "problems.jsonl", "".join(json.dumps(each) + "\n" for each in records).encode())
     write_bytes(out / "problems.csv", _csv(("name", *columns), ((p.name, *_rig(p, columns)) for p in given)))
-    for key, names in COLUMNS.items():
-        rows = [(p.name, *row) for p in given for row in getattr(p.correspondences, key).tolist()]
-        if rows:
-            write_bytes(out / f"{key}.csv", _csv(("name", *names.split(", ")), rows))
+    write_matches(given, out)
     save_arrays(out / "problems.npz", _arrays(given, columns))
     if split.protocol.asks == "frames":
         write_bytes(out / "pictures.csv", _csv(("name", "picture", "row", "time"), _asked(split)))
@@ -65,6 +62,19 @@ def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:
     elif split.public:
         write_bytes(out / "truth.jsonl", truth_text(split).encode())
     write_json(out / "split.json", split_record(split))
+
+
+def write_matches(problems: Sequence[Problem], out: Path) -> None:
+    """Write ``left.csv`` and the like, with the name of its problem in each row; a set without matches has none.
+
+    Raises:
+        RsbenchError: a file cannot be written.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    for key, names in COLUMNS.items():
+        rows = [(p.name, *row) for p in problems for row in getattr(p.correspondences, key).tolist()]
+        if rows:
+            write_bytes(out / f"{key}.csv", _csv(("name", *names.split(", ")), rows))
 
 
 def split_record(split: Split) -> dict[str, Any]:

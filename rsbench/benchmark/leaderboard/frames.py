@@ -7,11 +7,12 @@ from pathlib import Path
 
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.files import write_bytes
+from rsbench.dataset.files import read_png, write_bytes
 from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import Images
 from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.problem import Problem
 from rsbench.reading import inside, read_bytes
@@ -47,6 +48,17 @@ def write_frames(data: Path, out: Path) -> None:
             sequence.image("rs", side, frame)  # that it can be read
             path = inside(sequence.folder, picture_file("rs", side, frame + sequence.first))
             write_bytes(folder / f"{side}_{frame}.png", read_bytes(path))
+
+
+def read_frames(inputs: Path, problem: Problem) -> Images:
+    """The frames of a problem, as ``write_frames`` wrote them.
+
+    Raises:
+        RsbenchError: one is missing, or is no image of the camera's size.
+    """
+    folder, camera = inputs / "frames" / problem.name, problem.rig.camera
+    size = camera.width, camera.height
+    return {view: read_png(folder / f"{view[0]}_{view[1]}.png", size) for view in VIEWS}
 
 
 def _problem(sequence: Sequence, matches: Correspondences) -> Problem:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.benchmark.images.store import identity_of, read_record
+from rsbench.benchmark.leaderboard.frames import read_frames
 from rsbench.benchmark.leaderboard.picture_files import FARTHEST, FOLDER, frame_png
 from rsbench.benchmark.leaderboard.protocols import Protocol, protocol_of_id
 from rsbench.benchmark.leaderboard.running import Limits, jobs_done, read_inputs
@@ -24,8 +25,8 @@ from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.submissions import submission_text
 from rsbench.benchmark.leaderboard.true_pictures import VIEW, Asked
 from rsbench.benchmark.provenance import numeric_version, processor
-from rsbench.core.rig import SIDES, VIEWS
-from rsbench.dataset.files import read_png, write_bytes, write_depth, write_json
+from rsbench.core.rig import SIDES
+from rsbench.dataset.files import write_bytes, write_depth, write_json
 from rsbench.dataset.workplace import remove
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
@@ -201,11 +202,7 @@ def _serve(inputs: Path, limits: Limits) -> Callable[[_Job], None]:
 
     def run(job: _Job) -> None:
         problem = problems[job.problem]
-        images = {
-            view: read_png(inputs / "frames" / job.problem / f"{view[0]}_{view[1]}.png", _size(problem))
-            for view in VIEWS
-        }
-        made = _Made(problem, images, job.asked)
+        made = _Made(problem, read_frames(inputs, problem), job.asked)
         for card, folder, identity in job.cards:
             if card not in chains:
                 chains[card] = isolation.chain(load_chains([card], protocol)[card])
@@ -216,10 +213,6 @@ def _serve(inputs: Path, limits: Limits) -> Callable[[_Job], None]:
             _keep(folder, job.problem, identity, answer)
 
     return run
-
-
-def _size(problem: Problem) -> tuple[int, int]:
-    return problem.rig.camera.width, problem.rig.camera.height
 
 
 class _Made:

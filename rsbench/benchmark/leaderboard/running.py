@@ -179,7 +179,7 @@ def jobs_done(
     Args:
         serve: see ``IsolatedWorker``; called with ``inputs`` and ``limits``.
         jobs: what is to be done.
-        workers: processes.
+        workers: processes; 0: in this one, without limits, for components of ours.
         inputs: folder of the exported inputs.
         limits: with some, a job that takes more, or ends its process, is handed to ``fail`` with the reason.
         fail: keeps that as an answer.
@@ -188,6 +188,12 @@ def jobs_done(
     Raises:
         RsbenchError: see ``finished_jobs``; only without limits.
     """
+    if workers == 0:
+        run = serve(inputs, limits)
+        for job in jobs:
+            run(job)
+            yield job
+        return
     one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
     if limits == Limits():
         with closing(finished_jobs(serve, jobs, workers, one_thread, inputs, limits)) as found:

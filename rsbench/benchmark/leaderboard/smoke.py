@@ -1,42 +1,127 @@
-"""Every entry of ours on the first problems of ``points``, compared with stored scores: what a change moved."""
+"""A few entries of every track on a few problems, compared with stored scores: what a change moved."""
 
 from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import pandas as pd
 
+from rsbench.benchmark.images.store import read_record
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.running import answer_problem, header_of, load_entries
+from rsbench.benchmark.leaderboard.smoke_tracks import metrics_of, track_scores
 from rsbench.benchmark.leaderboard.splits import PUBLIC_SEED, points_split, simulated_problem
 from rsbench.benchmark.leaderboard.submissions import read_submission, submission_text
 from rsbench.dataset.files import read_table, write_bytes
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.isolated_jobs import finished_jobs
 from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 
 PROBLEMS = 6
-"""A minute for all solvers of ours."""
-FILE = "scores.csv"
+"""Of points; a minute for all solvers of ours."""
 _NAMES = ("method", "problem", "success")
-_NUMBERS = ("e_R_deg", "e_T_deg", "e_s", "metres", "e_row_deg", "nees")
 _SAME, _NOTHING = 1e-4, 1e-7
 """Relative and absolute difference of equal scores. The same code on the same machine gives the same digits; a
 processor that sums in another order changes the last ones, and now and then a choice of RANSAC: with OpenBLAS and
 Numba told to use no AVX, 113 of 114 answers agreed so far, and one was another."""
+Row = dict[str, Any]
+
+
+class Job(NamedTuple):
+    """Entries of a track that one process runs."""
+
+    track: str
+    entries: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.track}: {', '.join(self.entries)}"
+
+
+def file_of(track: str) -> str:
+    """Where the scores of a track are stored."""
+    return "scores.csv" if track == "points" else f"{track}.csv"
+
+
+def record_of(track: str) -> str:
+    """Where is stored how they came about."""
+    return "provenance.json" if track == "points" else f"{track}.json"
 
 
 def run_smoke(
-    cards: Sequence[str], problems: int = PROBLEMS, step: Callable[[str], None] = lambda word: None
-) -> pd.DataFrame:
-    """Scores of solvers on the first problems of the public split of ``points``; no stored prediction is used.
+    jobs: Sequence[Job],
+    data: Path | None = None,
+    problems: int | None = None,
+    workers: int = 1,
+    step: Callable[[str], None] = lambda word: None,
+) -> dict[str, pd.DataFrame]:
+    """Scores of entries on the first problems of their tracks; no stored prediction is used.
+
+    Args:
+        jobs: what to run.
+        data: dataset of the tracks of frames.
+        problems: how many; by default ``PROBLEMS`` of points, and all sequences of the dataset.
+        workers: processes of one thread; with 1 it is this one.
+        step: called after each job.
 
     Returns:
-        A row for each solver and problem: method, problem, success, and the errors of docs/submit.md.
+        By track, a row for each entry and problem: method, problem, success, and ``metrics_of`` the track.
+
+    Raises:
+        RsbenchError: no such entry, or no such number of problems.
+    """
+    rows: dict[str, list[Row]] = {job.track: [] for job in jobs}
+    if workers == 1:
+        run = _serve(data, problems)
+        done = ((job, run(job)) for job in jobs)
+    else:
+        done = finished_jobs(_serve_child, jobs, workers, dict.fromkeys(THREAD_VARIABLES, "1"), data, problems)
+    with closing(done) as found:
+        for job, scores in found:
+            rows[job.track] += scores
+            step(job.track)
+    order = {track: [name for job in jobs if job.track == track for name in job.entries] for track in rows}
+    return {
+        track: pd.DataFrame(sorted(found, key=lambda row: order[track].index(row["method"])))
+        for track, found in rows.items()
+    }
+
+
+def _serve(data: Path | None, problems: int | None) -> Callable[[Job], list[Row]]:
+    use_one_thread()
+
+    def run(job: Job) -> list[Row]:
+        if job.track == "points":
+            table = points_scores(job.entries, PROBLEMS if problems is None else problems)
+        else:
+            assert data is not None
+            table = track_scores(job.track, data, job.entries, problems)
+        return [{str(key): value for key, value in row.items()} for row in table.to_dict("records")]
+
+    return run
+
+
+def _serve_child(data: Path | None, problems: int | None) -> Callable[[Job], list[Row]]:
+    run = _serve(data, problems)
+
+    def told(job: Job) -> list[Row]:
+        try:
+            return run(job)
+        except RsbenchError as error:
+            raise EntryFailure(str(error)) from error
+
+    return told
+
+
+def points_scores(cards: Sequence[str], problems: int = PROBLEMS) -> pd.DataFrame:
+    """Scores of solvers on the first problems of the public split of ``points``.
 
     Raises:
         RsbenchError: no such solver, or no such number of problems.
@@ -48,37 +133,53 @@ def run_smoke(
     given = [simulated_problem(PUBLIC_SEED, number) for number in range(problems)]
     runner, tables = SolverRunner(single_thread=True), list[pd.DataFrame]()
     with tempfile.TemporaryDirectory() as folder:
-        for entry in load_entries(cards, split.protocol).values():
+        for card, entry in load_entries(cards, split.protocol).items():
             answers = (answer_problem(problem, entry, runner) for problem in given)
             path = Path(folder) / "predictions.jsonl"
             write_bytes(path, submission_text(header_of(entry, split), answers).encode())
             scores = mark(read_submission(path, split), split)
-            tables.append(scores.assign(method=entry.name)[[*_NAMES, *_NUMBERS]])
-            step(entry.name)
+            tables.append(scores.assign(method=card)[[*_NAMES, *metrics_of("points")]])
     return pd.concat(tables, ignore_index=True)
 
 
-def read_scores(folder: Path) -> pd.DataFrame:
-    """What ``run_smoke`` gave when it was stored.
+# Stored scores
+
+
+def read_scores(folder: Path, track: str = "points") -> pd.DataFrame:
+    """What ``run_smoke`` gave of a track when it was stored.
 
     Raises:
         RsbenchError: it is not there, or damaged.
     """
-    return read_table(folder / FILE, _NAMES, _NUMBERS, dtype={"method": str, "problem": str})
+    return read_table(folder / file_of(track), _NAMES, metrics_of(track), dtype={"method": str, "problem": str})
 
 
-def differences(found: pd.DataFrame, stored: pd.DataFrame) -> Iterator[str]:
-    """A line for each score of ``found`` that is not the stored one."""
+def other_frames(folder: Path, track: str, frames: dict[str, str]) -> list[str]:
+    """Problems whose pictures are not those of the stored scores; ``frames`` is of ``hashes_of_frames``."""
+    inputs = (read_record(folder / record_of(track)) or {}).get("inputs")
+    stored = inputs.get("frames") if isinstance(inputs, dict) else None
+    return [name for name, digest in frames.items() if not isinstance(stored, dict) or stored.get(name) != digest]
+
+
+def differences(
+    track: str, found: pd.DataFrame, stored: pd.DataFrame, others: Collection[str] = ()
+) -> Iterator[str]:
+    """A line for each score of ``found`` that is not the stored one: track, problem, entry, metric, both values.
+
+    Args:
+        others: problems whose frames are other ones, see ``OTHER_FRAMES``.
+    """
     known = {(row["method"], row["problem"]): row for row in stored.to_dict("records")}
     for row in found.to_dict("records"):
-        name, old = f"{row['method']}, {row['problem']}", known.get((row["method"], row["problem"]))
+        name = f"{track}, {row['problem']}, {row['method']}"
+        old = known.get((row["method"], row["problem"]))
         if old is None:
             yield f"{name}: has no stored scores"
             continue
         if bool(row["success"]) != bool(old["success"]):
             yield f"{name}: success = {row['success']}, stored {old['success']}"
             continue
-        for key in _NUMBERS:
+        for key in metrics_of(track):
             if not _equal(row[key], old[key]):
                 yield f"{name}: {key} = {row[key]:.6g}, stored {old[key]:.6g}"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,9 @@ import pytest
 from commands import assert_refused, run_here
 
 from rsbench.benchmark.leaderboard.smoke import differences, read_scores
+from rsbench.benchmark.leaderboard.smoke_tracks import CARD, ENTRIES, metrics_of
+from rsbench.dataset.card import load_dataset_card
+from rsbench.dataset.generation import generate_dataset
 
 STORED = Path(__file__).parents[3] / "results" / "leaderboard" / "smoke"
 QUICK = ("rs-stereo-refined", "gs-poselib", "gs-stereo-tracks")
@@ -18,9 +22,10 @@ QUICK = ("rs-stereo-refined", "gs-poselib", "gs-stereo-tracks")
 @pytest.mark.skipif(not STORED.is_dir(), reason="needs the committed results")
 def test_the_stored_scores_are_those_of_this_code() -> None:
     entries = [word for name in QUICK for word in ("--entry", name)]
-    ran = run_here("leaderboard", "smoke", "--stored", STORED, "--problems", 2, *entries)
+    where = ("--track", "points", "--stored", STORED, "--workers", 1)
+    ran = run_here("leaderboard", "smoke", *where, "--problems", 2, *entries)
     assert ran.returncode == 0, ran.stdout
-    assert ran.stdout.startswith("6 answers of 3 solvers, 0 differ from ")
+    assert ran.stdout.startswith("6 answers of 3 entries of 1 tracks, 0 differ from ")
 
 
 def test_each_difference_is_named(tmp_path: Path) -> None:
@@ -30,20 +35,79 @@ def test_each_difference_is_named(tmp_path: Path) -> None:
     stored = read_scores(tmp_path)
     (tmp_path / "scores.csv").write_text(text + "".join(rows), "utf-8")
     found = read_scores(tmp_path)
-    assert list(differences(found, stored)) == ["b, p000: has no stored scores"]
+    assert list(differences("points", found, stored)) == ["points, p000, b: has no stored scores"]
     found.loc[0, "e_T_deg"], found.loc[1, "success"] = 2.0 * (1 + 1e-3), True
     found.loc[0, "e_R_deg"] = 0.5 * (1 + 1e-6)  # rounding
-    assert list(differences(found.iloc[:2], stored)) == [
-        "a, p000: e_T_deg = 2.002, stored 2",
-        "a, p001: success = True, stored False",
+    assert list(differences("points", found.iloc[:2], stored)) == [
+        "points, p000, a: e_T_deg = 2.002, stored 2",
+        "points, p001, a: success = True, stored False",
     ]
     found.loc[0, "nees"] = np.inf
-    assert "a, p000: nees = inf, stored nan" in differences(found, stored)
+    assert "points, p000, a: nees = inf, stored nan" in differences("points", found, stored)
 
 
 def test_without_stored_scores_nothing_runs(tmp_path: Path) -> None:
-    assert_refused(run_here("leaderboard", "smoke", "--stored", tmp_path), "scores.csv")
+    points = ("leaderboard", "smoke", "--track", "points", "--stored", tmp_path)
+    assert_refused(run_here(*points), "scores.csv")
     assert_refused(
-        run_here("leaderboard", "smoke", "--write", "--stored", tmp_path, "--problems", 251, "--entry", "gs-8pt"),
-        "--problems 251",
+        run_here(*points, "--write", "--workers", 1, "--problems", 251, "--entry", "gs-8pt"), "--problems 251"
     )
+
+
+@pytest.fixture(scope="module")
+def corridor(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first sequence of the tracks of frames."""
+    card = load_dataset_card(CARD)
+    folder = tmp_path_factory.mktemp("data") / CARD
+    generate_dataset(card.only([card.sequence[0].name]), folder)
+    return folder
+
+
+@pytest.mark.skipif(not STORED.is_dir(), reason="needs the committed results")
+def test_the_stored_scores_of_frames_are_those_of_this_code(corridor: Path) -> None:
+    """All tracks, with what costs least of each: both kinds of cards, and oracles."""
+    entries = ("rs-stereo-refined", "gs-stereo-tracks-scaled", "sgm-plain", "fusion", "uncorrected", "truth")
+    words = [word for name in entries for word in ("--entry", name)]
+    tracks = [word for track in ENTRIES for word in ("--track", track)]
+    where = ("--stored", STORED, "--data", corridor, "--workers", 1)
+    ran = run_here("leaderboard", "smoke", *where, *tracks, *words)
+    assert ran.returncode == 0, ran.stdout
+    assert ran.stdout.splitlines()[-1].startswith("13 answers of 13 entries of 5 tracks, 0 differ from ")
+
+
+@pytest.mark.skipif(not STORED.is_dir(), reason="needs the committed results")
+@pytest.mark.parametrize("track", ENTRIES)
+def test_the_stored_truth_errs_nowhere(track: str) -> None:
+    """What the best score of each metric is needs no code."""
+    scores = read_scores(STORED, track)
+    best = {"coverage": 1.0, "matches": math.nan, "matches_1px": math.nan, "nees": math.nan}
+    rows = scores[scores["method"] == "truth"].to_dict("records")
+    assert [row["problem"] for row in rows] == [sequence.name for sequence in load_dataset_card(CARD).sequence]
+    for row in rows:
+        for key in metrics_of(track):
+            expected = (
+                1.0 if key.startswith("ssim") else math.inf if key.startswith("psnr") else best.get(key, 0.0)
+            )
+            assert row[key] == pytest.approx(expected, abs=1e-6, nan_ok=True), (row["problem"], key)
+    assert set(scores["method"]) == set(ENTRIES[track])
+
+
+def test_scores_are_stored_by_track(smoke_dataset: Path, tmp_path: Path) -> None:
+    """One of another dataset, which has frames of its own: stored, found again, and named where they are others."""
+    smoke = ("leaderboard", "smoke", "--stored", tmp_path, "--data", smoke_dataset, "--workers", 1)
+    part = ("--track", "pose", "--entry", "gs-stereo-tracks-scaled", "--entry", "truth")
+    assert run_here(*smoke, *part, "--write").returncode == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["pose.csv", "pose.json"]
+    ran = run_here(*smoke, *part)
+    assert ran.returncode == 0 and ran.stdout.startswith("4 answers of 2 entries of 1 tracks, 0 differ from ")
+    text = (tmp_path / "pose.csv").read_text("utf-8")
+    (tmp_path / "pose.csv").write_text(text.replace("truth,castle,True,0,", "truth,castle,True,9,"), "utf-8")
+    record = (tmp_path / "pose.json").read_text("utf-8")
+    (tmp_path / "pose.json").write_text(record.replace('"castle": "', '"castle": "0'), "utf-8")
+    ran = run_here(*smoke, *part, "--problems", 1)
+    assert ran.returncode == 1
+    assert "note: pose: other frames than those of the stored scores: castle\n" in ran.stdout
+    assert "pose, castle, truth: e_R_deg = 0, stored 9\n" in ran.stdout
+    assert_refused(run_here(*smoke, "--track", "depth"), "depth.csv")
+    assert_refused(run_here(*smoke, "--track", "points", "--entry", "sgm"), "--entry sgm: is not run on points")
+    assert_refused(run_here(*smoke, "--track", "dept"), "dept")
