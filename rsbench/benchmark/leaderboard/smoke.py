@@ -32,6 +32,10 @@ _SAME, _NOTHING = 1e-4, 1e-7
 """Relative and absolute difference of equal scores. The same code on the same machine gives the same digits; a
 processor that sums in another order changes the last ones, and now and then a choice of RANSAC: with OpenBLAS and
 Numba told to use no AVX, 113 of 114 answers agreed so far, and one was another."""
+OTHER_FRAMES = 0.15
+"""Relative difference of equal scores where the frames are others: twice the largest that was seen. Rendered with
+AVX2 in place of AVX-512, up to 0.09 % of the values of these frames were others, by up to 26 codes, and no depth: 56
+of 57 answers kept their scores to 7.3 %; one, of the corrector zhuang, was better by 4 dB, another choice of RANSAC."""
 Row = dict[str, Any]
 
 
@@ -167,7 +171,7 @@ def differences(
     """A line for each score of ``found`` that is not the stored one: track, problem, entry, metric, both values.
 
     Args:
-        others: problems whose frames are other ones, see ``OTHER_FRAMES``.
+        others: problems whose frames are not those of the stored scores, see ``OTHER_FRAMES``.
     """
     known = {(row["method"], row["problem"]): row for row in stored.to_dict("records")}
     for row in found.to_dict("records"):
@@ -179,10 +183,11 @@ def differences(
         if bool(row["success"]) != bool(old["success"]):
             yield f"{name}: success = {row['success']}, stored {old['success']}"
             continue
+        tolerance = OTHER_FRAMES if row["problem"] in others else _SAME
         for key in metrics_of(track):
-            if not _equal(row[key], old[key]):
+            if not _equal(row[key], old[key], tolerance):
                 yield f"{name}: {key} = {row[key]:.6g}, stored {old[key]:.6g}"
 
 
-def _equal(a: float, b: float) -> bool:
-    return (math.isnan(a) and math.isnan(b)) or math.isclose(a, b, rel_tol=_SAME, abs_tol=_NOTHING)
+def _equal(a: float, b: float, tolerance: float) -> bool:
+    return (math.isnan(a) and math.isnan(b)) or math.isclose(a, b, rel_tol=tolerance, abs_tol=_NOTHING)

@@ -42,6 +42,8 @@ def test_each_difference_is_named(tmp_path: Path) -> None:
         "points, p000, a: e_T_deg = 2.002, stored 2",
         "points, p001, a: success = True, stored False",
     ]
+    found.loc[0, "e_T_deg"], found.loc[1, "success"] = 2.2, False
+    assert list(differences("points", found.iloc[:2], stored, ["p000"])) == []  # of other frames
     found.loc[0, "nees"] = np.inf
     assert "points, p000, a: nees = inf, stored nan" in differences("points", found, stored)
 
@@ -85,15 +87,13 @@ def test_the_stored_truth_errs_nowhere(track: str) -> None:
     assert [row["problem"] for row in rows] == [sequence.name for sequence in load_dataset_card(CARD).sequence]
     for row in rows:
         for key in metrics_of(track):
-            expected = (
-                1.0 if key.startswith("ssim") else math.inf if key.startswith("psnr") else best.get(key, 0.0)
-            )
+            expected = {"ssim": 1.0, "psnr": math.inf}.get(key[:4], best.get(key, 0.0))
             assert row[key] == pytest.approx(expected, abs=1e-6, nan_ok=True), (row["problem"], key)
     assert set(scores["method"]) == set(ENTRIES[track])
 
 
 def test_scores_are_stored_by_track(smoke_dataset: Path, tmp_path: Path) -> None:
-    """One of another dataset, which has frames of its own: stored, found again, and named where they are others."""
+    """Of another dataset: stored, found again, and named where they are others."""
     smoke = ("leaderboard", "smoke", "--stored", tmp_path, "--data", smoke_dataset, "--workers", 1)
     part = ("--track", "pose", "--entry", "gs-stereo-tracks-scaled", "--entry", "truth")
     assert run_here(*smoke, *part, "--write").returncode == 0
