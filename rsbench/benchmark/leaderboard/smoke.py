@@ -34,9 +34,9 @@ processor that sums in another order changes the last ones, and now and then a c
 Numba told to use no AVX, 113 of 114 answers agreed so far, and one was another."""
 OTHER_FRAMES = 0.15
 """Relative difference of equal scores where the frames are others: twice the largest that was seen. Rendered
-with AVX2 in place of AVX-512, up to 0.09 % of the values of these frames were others, by up to 26 codes, and no depth:
-56 of 57 answers kept their scores to 7.3 %. One, of the corrector zhuang, was better by 4 dB, by another choice of
-RANSAC."""
+with AVX2 in place of AVX-512, up to 0.09 % of the values of these frames were others, by up to 26 codes, and no
+depth: 56 of 57 answers kept their scores to 7.3 %. One, of the corrector zhuang, was better by 4 dB, by another
+choice of RANSAC."""
 Row = dict[str, Any]
 
 
