@@ -159,9 +159,9 @@ def _store(stored: Path, found: dict[str, Any], frames: dict[str, str]) -> None:
 def _compare(stored: Path, found: dict[str, Any], known: dict[str, Any], frames: dict[str, str]) -> None:
     from rsbench.benchmark.leaderboard.smoke import differences, other_frames
 
-    lines = []
+    lines = list[str]()
     for track, table in found.items():
-        others = [] if track == "points" else other_frames(stored, track, frames)
+        others = list[str]() if track == "points" else other_frames(stored, track, frames)
         if others:
             typer.echo(f"note: {track}: other frames than those of the stored scores: {', '.join(others)}")
         lines += differences(track, table, known[track], others)

@@ -149,7 +149,7 @@ def _with_own_matches(cards: Sequence[str], split: Split, inputs: Path, work: Pa
 
 def hashes_of_frames(data: Path) -> dict[str, str]:
     """Of each sequence of a dataset, a hash of its images and depth maps."""
-    manifest, found = read_dataset_manifest(data), {}
+    manifest, found = read_dataset_manifest(data), dict[str, str]()
     for name in manifest.sequences:
         pictures = [
             f"{path} {each.sha256}\n"
