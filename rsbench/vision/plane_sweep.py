@@ -30,8 +30,8 @@ from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.vision.images import grey_u8
+from rsbench.vision.likeness import Comparer
 from rsbench.vision.other_view import Landing, land_pixels, landing, parallax_gain
-from rsbench.vision.resample import resample
 from rsbench.vision.semiglobal import aggregated, winners
 from rsbench.vision.stereo_matcher import F32, Cameras, MotionMatcher
 
@@ -50,8 +50,6 @@ _RANGES = {
 _COARSE, _RANGE_QUANTILE, _RANGE_MARGIN = 4, 0.999, 1.1
 """The range is looked for at a quarter of the size, as ``stereo_depth`` does."""
 _FEWEST = 8
-_NOISE = 4.0
-"""Variance of grey levels, about that of noise and rounding: windows with less are alike by chance."""
 _FOLLOW_WINDOW = 7
 """px, of the last rounds: where the plane follows the surface, a larger window is the better one."""
 _ROUND = (-2.0, -1.0, 0.0, 1.0, 2.0)
@@ -198,7 +196,7 @@ class _Scene:
         options, others = self.options, self._others(view)
         count = math.ceil(self.gain * most / options.step_px) + 1
         grid = np.linspace(0.0, most, min(max(count, _FEWEST), options.planes), dtype=np.float32)
-        comparer = _Comparer(self.greys[view], options.window)
+        comparer = Comparer(self.greys[view], options.window)
         lines = [self._first_lines(view, other) for other in others]
         volume = np.zeros((*self.size, len(grid)), dtype=np.uint8)
         for k, rho in enumerate(grid):
@@ -208,7 +206,7 @@ class _Scene:
         step = grid[1] - grid[0]
         rho = winners(aggregated(volume, options.p1, options.p2)) * step
         rho[rho >= most - 0.5 * step] = np.nan  # beyond the range, where nothing is searched
-        comparer = _Comparer(self.greys[view], _FOLLOW_WINDOW)
+        comparer = Comparer(self.greys[view], _FOLLOW_WINDOW)
         for number in range(rounds):
             rho = self._follow(comparer, view, rho, step * 0.25 / 2**number, lines)
         parallax = self._parallax(view, rho, lines)
@@ -219,7 +217,7 @@ class _Scene:
         return row if self.maps[view, other].there is False else column
 
     def _cost(
-        self, comparer: _Comparer, view: View, rho: F32, lines: Sequence[NDArray[np.int32]], *, cubic: bool
+        self, comparer: Comparer, view: View, rho: F32, lines: Sequence[NDArray[np.int32]], *, cubic: bool
     ) -> F32:
         """Unlikeness (H, W), 0 to 1, of surfaces of inverse depth (H, W); NaN where no view sees them.
 
@@ -236,7 +234,7 @@ class _Scene:
         return found
 
     def _follow(
-        self, comparer: _Comparer, view: View, rho: F32, step: float, lines: Sequence[NDArray[np.int32]]
+        self, comparer: Comparer, view: View, rho: F32, step: float, lines: Sequence[NDArray[np.int32]]
     ) -> F32:
         """A last round: inverse depths near those that were found, with the parabola's minimum."""
         steps = np.array(_ROUND, dtype=np.float32) * np.float32(step)
@@ -277,35 +275,6 @@ class _Scene:
                 agrees |= seen & (off * self.gain <= self.options.consistency_px)
             found[view] = np.where(agrees, rho, np.float32(np.nan))
         return found
-
-
-class _Comparer:
-    """Zero-mean normalised cross-correlation of one image with others."""
-
-    def __init__(self, grey: F32, window: int) -> None:
-        self._grey, self._window = grey - np.float32(128.0), (window, window)
-        self._mean = self._box(self._grey)
-        self._variance = self._box(self._grey * self._grey) - self._mean * self._mean
-
-    def _box(self, values: NDArray[Any]) -> F32:
-        return np.asarray(cv2.boxFilter(values, -1, self._window, borderType=cv2.BORDER_REFLECT))
-
-    def unlikeness(self, other: F32, places: F32, *, cubic: bool) -> F32:
-        """0 (alike) to 1 (H, W) of the other image (H, W) at places (H, W, 2) px; NaN where those are NaN."""
-        seen = self._seen(other, places, cubic) - np.float32(128.0)
-        mean = self._box(seen)
-        variance = self._box(seen * seen) - mean * mean
-        together = self._box(seen * self._grey) - mean * self._mean
-        noise = np.float32(_NOISE)
-        alike = together / np.sqrt((np.maximum(variance, 0) + noise) * (np.maximum(self._variance, 0) + noise))
-        return np.where(np.isnan(places[..., 0]), np.float32(np.nan), np.float32(0.5) * (1.0 - alike))
-
-    @staticmethod
-    def _seen(other: F32, places: F32, cubic: bool) -> F32:
-        if cubic:
-            return np.asarray(resample(other, places))
-        known = np.nan_to_num(places, nan=0.0)
-        return np.asarray(cv2.remap(other, known, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _smoothed(rho: F32) -> F32:
