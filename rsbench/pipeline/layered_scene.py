@@ -1,0 +1,145 @@
+"""Correction with one camera alone that believes in a scene of a few planes: layers and motion in turn.
+
+Vasu, Mohan M. R., Rajagopalan, "Occlusion-aware rolling shutter rectification of 3D scenes", CVPR 2018. The text of
+the paper was not read, but its abstract: motion of the camera and structure of the scene one after the other, with
+shutter and occlusion in mind, then a rectification that knows depth and occlusion, of several frames. What we
+took for what it leaves open stands at the fields and in ``rsbench.vision.layers`` and ``layer_fit``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.correspondences import Correspondences, temporal_pairs
+from rsbench.core.motion import LinearMotion, Motion
+from rsbench.core.rig import FRAMES, SIDES, Side, View
+from rsbench.core.so3 import FloatArray
+from rsbench.motions import make_motion
+from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.refined import RefinedSolver
+from rsbench.vision.correction import WarpOptions
+from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
+from rsbench.vision.fusion import Fused, Origin, SourceView, fuse
+from rsbench.vision.images import grey_u8
+from rsbench.vision.layer_fit import PlaneOptions, followed, fronto_parallel, refined
+from rsbench.vision.layers import LabelOptions, Labelled, MovingCamera, label_pixels
+
+_STILL_PX = 0.1
+"""Matches that move by less, in the median, show no motion."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LayeredScene:
+    """What one camera knows after its two frames."""
+
+    camera: MovingCamera
+    """With its motion, about its own centre; d has length 1, or 0 where there is no translation."""
+    planes: FloatArray
+    """(n, 3), see ``rsbench.vision.layers``."""
+    labelled: Labelled
+    rounds: int
+    """In which layers and motion were found."""
+
+    def depth(self, frame: int) -> NDArray[np.float32]:
+        """(H, W) of a frame, in the row's own camera and the unit of d; inf at infinity."""
+        rho = self.camera.inverse_depths(self.planes, frame)
+        chosen = np.take_along_axis(rho, self.labelled.labels[frame][None], axis=0)[0]
+        with np.errstate(divide="ignore"):
+            return np.where(chosen > 0.0, 1.0 / chosen, np.float32(np.inf)).astype(np.float32)
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class LayersCorrector(Corrector):
+    """Each camera's frames as layers of a few planes, rendered nearer ones over farther ones, from both frames."""
+
+    motion_model: str = "linear"
+    """Of the rows' poses: constant velocity over both frames, in place of a pose of each row."""
+    planes: PlaneOptions = field(default_factory=PlaneOptions)
+    labels: LabelOptions = field(default_factory=LabelOptions)
+    rounds: int = 3
+    """Of layers and motion, at most; the first one that costs no less than the one before is the last."""
+    use_other_frame: bool = True
+    """Fill what the frame did not see from the other one of its camera."""
+    robust: RobustOptions = field(default_factory=RobustOptions)
+    seed: int = 0
+    warp: WarpOptions = field(default_factory=WarpOptions)
+
+    spec = CorrectorSpec(
+        needs={"matches"},
+        reference="Vasu, Mohan M. R., Rajagopalan: Occlusion-aware rolling shutter rectification of 3D scenes, "
+        "CVPR 2018",
+        assumes="one camera, two frames: constant velocity; a scene that stands still and is a few planes, each at "
+        "one depth",
+    )
+
+    def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
+        scenes = {side: self.scene(problem, side) for side in dict(views)}
+        return {view: self._rendered(problem, view, scenes[view[0]]) for view in views}
+
+    def scene(self, problem: CorrectionProblem, side: Side) -> LayeredScene | str:
+        """Layers and motion of one camera, or why there are none.
+
+        Raises ValueError without matches.
+        """
+        if problem.matches is None:
+            raise ValueError("the matches are not known: 'matches' must be among the needs of the corrector")
+        started = self._start(problem, side)
+        if isinstance(started, str):
+            return started
+        camera, matches = started
+        planes = fronto_parallel(matches, camera, self.planes)
+        first, second = (grey_u8(problem.images[side, frame]).astype(np.float32) for frame in FRAMES)
+        greys = first, second
+        best: LayeredScene | None = None
+        for number in range(1, self.rounds + 1):
+            step = self.planes.thickness_px
+            labelled = label_pixels(greys, camera, planes, self.labels, step)
+            if best is not None and labelled.cost >= best.labelled.cost:
+                break
+            best = LayeredScene(camera=camera, planes=planes, labelled=labelled, rounds=number)
+            motion, planes = refined(*followed(greys, labelled), camera, planes)
+            camera = camera._replace(motion=motion)
+        return best if best is not None else "no round"
+
+    def _start(self, problem: CorrectionProblem, side: Side) -> tuple[MovingCamera, FloatArray] | str:
+        """The camera with the motion that explains its matches over time, and those (n, 4) that it explains."""
+        pairs = temporal_pairs(problem.matches, side)
+        moved = float(np.median(np.linalg.norm(pairs[:, 2:] - pairs[:, :2], axis=1))) if len(pairs) else 0.0
+        if len(pairs) and moved < _STILL_PX:
+            return f"the matches of the {side} camera move by {moved:.2g} px: no motion, nothing to correct it by"
+        solver = RefinedSolver(one_camera=True, motion_model=self.motion_model)
+        rng = np.random.default_rng([self.seed, SIDES.index(side)])
+        rig = problem.rig.about(side)
+        given = Correspondences(left=pairs)
+        found = estimate_motion(given, problem.rig, problem.shutter, solver, self.robust, rng)
+        if not found.estimate.success:
+            return f"no motion of the {side} camera explains its matches: {found.estimate.reason}"
+        d = found.estimate.d
+        length = float(np.linalg.norm(d))
+        motion = make_motion(self.motion_model, found.estimate.w, d / length if length > 0.0 else d)
+        return MovingCamera(rig, problem.shutter, side, motion), pairs[found.inliers["left"]]
+
+    def _rendered(self, problem: CorrectionProblem, view: View, scene: LayeredScene | str) -> Fused:
+        if isinstance(scene, str):
+            return Fused.failed(problem.images[view], scene)
+        side, frame = view
+        known = replace(problem, rig=scene.camera.rig, motion=scene.camera.motion)
+        order = [(frame, Origin.HERE)]
+        if self.use_other_frame:
+            order.append((1 - frame, Origin.OTHER_FRAME))
+        sources = [
+            SourceView(
+                image=problem.images[side, each],
+                depth=scene.depth(each),
+                poses=scene.camera.row_poses(each),
+                origin=origin,
+            )
+            for each, origin in order
+        ]
+        return fuse(sources, known.rig.camera, known.target_pose(view), self.warp)
