@@ -1,9 +1,9 @@
 """Correction with one camera alone that believes in a scene of a few planes: layers and motion in turn.
 
-Vasu, Mohan M. R., Rajagopalan, "Occlusion-aware rolling shutter rectification of 3D scenes", CVPR 2018. The text of
-the paper was not read, but its abstract: motion of the camera and structure of the scene one after the other, with
-shutter and occlusion in mind, then a rectification that knows depth and occlusion, of several frames. What we
-took for what it leaves open stands at the fields and in ``rsbench.vision.layers`` and ``layer_fit``.
+Vasu, Mohan M. R., Rajagopalan, "Occlusion-aware rolling shutter rectification of 3D scenes", CVPR 2018. We had its
+abstract and not its text: motion of the camera and structure of the scene one after the other, with shutter and
+occlusion in mind, then a rectification that knows depth and occlusion, of several frames. All else is our choice
+and stands at the fields, in ``rsbench.vision.layers``, ``layer_fit`` and ``layer_motion``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.correspondences import Correspondences, temporal_pairs
-from rsbench.core.motion import LinearMotion, Motion
 from rsbench.core.rig import FRAMES, SIDES, Side, View
 from rsbench.core.so3 import FloatArray
 from rsbench.motions import make_motion
@@ -26,8 +25,9 @@ from rsbench.vision.correction import WarpOptions
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
 from rsbench.vision.fusion import Fused, Origin, SourceView, fuse
 from rsbench.vision.images import grey_u8
-from rsbench.vision.layer_fit import PlaneOptions, followed, fronto_parallel, refined
-from rsbench.vision.layers import LabelOptions, Labelled, MovingCamera, label_pixels
+from rsbench.vision.layer_fit import PlaneOptions, fronto_parallel
+from rsbench.vision.layer_motion import followed, on_layers, refined
+from rsbench.vision.layers import Labelled, LabelOptions, MovingCamera, label_pixels
 
 _STILL_PX = 0.1
 """Matches that move by less, in the median, show no motion."""
@@ -74,13 +74,20 @@ class LayersCorrector(Corrector):
         needs={"matches"},
         reference="Vasu, Mohan M. R., Rajagopalan: Occlusion-aware rolling shutter rectification of 3D scenes, "
         "CVPR 2018",
-        assumes="one camera, two frames: constant velocity; a scene that stands still and is a few planes, each at "
-        "one depth",
+        assumes="one camera, two frames: constant velocity; a scene that stands still and is a few planes, each "
+        "at one depth",
     )
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
         scenes = {side: self.scene(problem, side) for side in dict(views)}
-        return {view: self._rendered(problem, view, scenes[view[0]]) for view in views}
+        found = {}
+        for view in views:
+            scene = scenes[view[0]]
+            failed = isinstance(scene, str)
+            found[view] = (
+                Fused.failed(problem.images[view], scene) if failed else self.rendered(problem, view, scene)
+            )
+        return found
 
     def scene(self, problem: CorrectionProblem, side: Side) -> LayeredScene | str:
         """Layers and motion of one camera, or why there are none.
@@ -103,7 +110,7 @@ class LayersCorrector(Corrector):
             if best is not None and labelled.cost >= best.labelled.cost:
                 break
             best = LayeredScene(camera=camera, planes=planes, labelled=labelled, rounds=number)
-            motion, planes = refined(*followed(greys, labelled), camera, planes)
+            motion, planes = refined([on_layers(matches, labelled), followed(greys, labelled)], camera, planes)
             camera = camera._replace(motion=motion)
         return best if best is not None else "no round"
 
@@ -125,9 +132,8 @@ class LayersCorrector(Corrector):
         motion = make_motion(self.motion_model, found.estimate.w, d / length if length > 0.0 else d)
         return MovingCamera(rig, problem.shutter, side, motion), pairs[found.inliers["left"]]
 
-    def _rendered(self, problem: CorrectionProblem, view: View, scene: LayeredScene | str) -> Fused:
-        if isinstance(scene, str):
-            return Fused.failed(problem.images[view], scene)
+    def rendered(self, problem: CorrectionProblem, view: View, scene: LayeredScene) -> Fused:
+        """A frame of a camera whose scene is known: nearer layers hide farther ones."""
         side, frame = view
         known = replace(problem, rig=scene.camera.rig, motion=scene.camera.motion)
         order = [(frame, Origin.HERE)]

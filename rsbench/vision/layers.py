@@ -30,11 +30,19 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.likeness import Comparer
 from rsbench.vision.other_view import F32, land_pixels, landing
+from rsbench.vision.resample import resample
 from rsbench.vision.semiglobal import aggregated
 from rsbench.vision.stereo_depth import known_beside
 
 Labels = NDArray[np.int64]
-_RANGES = {"window": (3, 51), "p1": (0, 4000), "p2": (0, 4000), "unseen": (0.0, 1.0), "rounds": (0, 20)}
+_RANGES = {
+    "window": (3, 51),
+    "full_levels": (0.1, 255.0),
+    "p1": (0, 4000),
+    "p2": (0, 4000),
+    "unseen": (0.0, 1.0),
+    "rounds": (0, 20),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +51,8 @@ class LabelOptions:
 
     window: int = 5
     """Side, px, of the window in which frames are compared."""
+    full_levels: float = 30.0
+    """Grey levels of 256; pixels that differ by more are as unlike as can be."""
     p1: int = 24
     """What a step to the next layer costs, of 255, which the worst likeness costs."""
     p2: int = 96
@@ -68,6 +78,11 @@ class MovingCamera(NamedTuple):
     shutter: RollingShutter
     side: Side
     motion: Motion
+
+    @property
+    def parallax_px(self) -> float:
+        """px that a point of inverse depth 1, in the unit of the motion, moves in a frame period, about."""
+        return self.rig.camera.fx * float(np.linalg.norm(self.motion.d))
 
     def row_poses(self, frame: int) -> Pose:
         """``cam_from_world`` (lines, 3, 3), (lines, 3)."""
@@ -145,8 +160,7 @@ class _Pair:
         self._options = options
         poses = [camera.row_poses(frame) for frame in FRAMES]
         axis = camera.shutter.axis(camera.side)
-        # px of parallax of a step of inverse depth, about
-        self._step = step / (camera.rig.camera.fx * max(float(np.linalg.norm(camera.motion.d)), 1e-12))
+        self._step = step / max(camera.parallax_px, np.finfo(np.float64).tiny)
         self._rhos = [camera.inverse_depths(planes, frame) for frame in FRAMES]
         self.costs, self._places, self._factors = [], [], []
         for frame in FRAMES:
@@ -156,9 +170,14 @@ class _Pair:
             landed = [land_pixels(maps, rho, start) for rho in self._rhos[frame]]
             self._places.append(np.stack([places for places, _ in landed]))
             self._factors.append(np.stack([factors for _, factors in landed]))
-            self.costs.append(
-                np.stack([comparer.unlikeness(greys[1 - frame], places, cubic=True) for places, _ in landed])
-            )
+            self.costs.append(np.stack([self._unlike(comparer, greys, frame, places) for places, _ in landed]))
+
+    def _unlike(self, comparer: Comparer, greys: tuple[F32, F32], frame: int, places: F32) -> F32:
+        """0 to 1 (H, W), NaN outside: half by the windows around pixels, which tell them apart, and half by the
+        pixels alone, which tell on which side of a border they are."""
+        windows = comparer.unlikeness(greys[1 - frame], places, cubic=True)
+        levels = np.abs(resample(greys[1 - frame], places) - greys[frame])
+        return 0.5 * windows + 0.25 * np.minimum(levels / np.float32(self._options.full_levels), np.float32(1.0))
 
     def across(self, frame: int) -> NDArray[np.bool_]:
         """(H, W) where parallax moves a pixel rather along its row than along its column."""

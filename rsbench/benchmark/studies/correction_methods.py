@@ -84,6 +84,12 @@ UNPUBLISHED = (
         kind="baseline",
         knows="one camera, two frames: its motion by `rs-zhuang-8pt`, depth from dense flow in the same unit",
     ),
+    Method(
+        key="vasu-layers",
+        title="monocular, Vasu et al.",
+        kind="baseline",
+        knows="one camera, two frames: planes of one depth each, and its motion, in turn",
+    ),
     Method(key="lao-lines", title="lines, Lao et al.", kind="baseline", knows="one image: curves that were lines"),
     Method(
         key="purkait-manhattan",

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.standard_metrics import Flip, Psnr, Ssim
+from rsbench.benchmark.studies.asked_layers import asked_layers
 from rsbench.benchmark.studies.asked_rotations import asked_rotation
 from rsbench.benchmark.studies.correction_methods import METHODS, UNPUBLISHED
 from rsbench.benchmark.studies.kept_rows import KeptRows, Row, Rows
@@ -211,6 +212,9 @@ class Bench:
         alone = {"mono": self._velocity, "gs-mono": self._scaled_monocular, "zhuang": self._zhuang}
         if key in alone:
             return self._mono(alone[key])
+        if key == "vasu-layers":
+            layered = asked_layers(key, self.sequence, self.images, self.matches, self._seed)
+            return {view: _attempt(fused, flow) for view, (fused, flow) in layered.items()}
         if key in _ASKED:
             return self._turned(key)
         motions = {"gs": self.gs_motion, "gyro": true, "true-motion": true, "truth": true}

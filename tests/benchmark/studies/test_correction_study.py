@@ -180,16 +180,16 @@ def test_methods_in_no_published_table_take_part_when_they_are_asked_for(
     smoke_dataset: Path, tables: Tables, tmp_path: Path
 ) -> None:
     """They change no number of the others; what gives a view up scores the worst; the page shows them."""
-    rows, bands, _ = study_sequence(read_sequence(smoke_dataset / "castle"), others=("zhuang", "lao-lines"))
+    rows, bands, _ = study_sequence(read_sequence(smoke_dataset / "castle"), others=("zhuang", "vasu-layers", "lao-lines"))
     images = pd.DataFrame(rows)
-    asked = images["method"].isin(["zhuang", "lao-lines"])
+    asked = images["method"].isin(["zhuang", "vasu-layers", "lao-lines"])
     before = tables[0][tables[0]["sequence"] == "castle"].drop(columns="stratum").reset_index(drop=True)
     pd.testing.assert_frame_equal(images[~asked].reset_index(drop=True), before)
-    assert images[asked].groupby("method").size().to_dict() == {"zhuang": 4, "lao-lines": 4}
+    assert images[asked].groupby("method").size().to_dict() == {"zhuang": 4, "vasu-layers": 4, "lao-lines": 4}
     lost = images[~images["success"]]
     assert np.all(lost["psnr_all"] == 0.0) and np.all(lost["coverage"] == 0.0)
     alone = images.groupby("method")["flow_median_px"].mean()
-    assert alone["zhuang"] < alone["none"]
+    assert alone["zhuang"] < alone["none"] and alone["vasu-layers"] < alone["none"]
     images.insert(0, "stratum", "small")
     summary = summarise(images)
     assert set(summary["method"]) == set(images["method"]) and len(bands) == len(images) * ROW_BANDS
