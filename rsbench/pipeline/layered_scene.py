@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from typing import final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rsbench.arguments import check_whole
 from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.rig import FRAMES, SIDES, Side, View
 from rsbench.core.so3 import FloatArray
@@ -28,6 +28,7 @@ from rsbench.vision.images import grey_u8
 from rsbench.vision.layer_fit import PlaneOptions, fronto_parallel
 from rsbench.vision.layer_motion import followed, on_layers, refined
 from rsbench.vision.layers import Labelled, LabelOptions, MovingCamera, label_pixels
+from rsbench.vision.other_view import F32
 
 _STILL_PX = 0.1
 """Matches that move by less, in the median, show no motion."""
@@ -45,12 +46,12 @@ class LayeredScene:
     rounds: int
     """In which layers and motion were found."""
 
-    def depth(self, frame: int) -> NDArray[np.float32]:
-        """(H, W) of a frame, in the row's own camera and the unit of d; inf at infinity."""
+    def depth(self, frame: int) -> F32:
+        """(H, W) of a frame, in the row's own camera and the unit of d; inf at infinity, NaN behind the camera."""
         rho = self.camera.inverse_depths(self.planes, frame)
         chosen = np.take_along_axis(rho, self.labelled.labels[frame][None], axis=0)[0]
         with np.errstate(divide="ignore"):
-            return np.where(chosen > 0.0, 1.0 / chosen, np.float32(np.inf)).astype(np.float32)
+            return np.asarray(1.0 / np.abs(chosen), dtype=np.float32)
 
 
 @final
@@ -78,24 +79,23 @@ class LayersCorrector(Corrector):
         "at one depth",
     )
 
+    def __post_init__(self) -> None:
+        check_whole("rounds", self.rounds, 1, 20)
+        self._solver()
+
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
         scenes = {side: self.scene(problem, side) for side in dict(views)}
-        found = {}
+        found: dict[View, Fused] = {}
         for view in views:
             scene = scenes[view[0]]
-            failed = isinstance(scene, str)
-            found[view] = (
-                Fused.failed(problem.images[view], scene) if failed else self.rendered(problem, view, scene)
-            )
+            if isinstance(scene, str):
+                found[view] = Fused.failed(problem.images[view], scene)
+            else:
+                found[view] = self.rendered(problem, view, scene)
         return found
 
     def scene(self, problem: CorrectionProblem, side: Side) -> LayeredScene | str:
-        """Layers and motion of one camera, or why there are none.
-
-        Raises ValueError without matches.
-        """
-        if problem.matches is None:
-            raise ValueError("the matches are not known: 'matches' must be among the needs of the corrector")
+        """Layers and motion of one camera, or why there are none. Raises ValueError without matches."""
         started = self._start(problem, side)
         if isinstance(started, str):
             return started
@@ -103,32 +103,35 @@ class LayersCorrector(Corrector):
         planes = fronto_parallel(matches, camera, self.planes)
         first, second = (grey_u8(problem.images[side, frame]).astype(np.float32) for frame in FRAMES)
         greys = first, second
-        best: LayeredScene | None = None
-        for number in range(1, self.rounds + 1):
-            step = self.planes.thickness_px
-            labelled = label_pixels(greys, camera, planes, self.labels, step)
-            if best is not None and labelled.cost >= best.labelled.cost:
+        best = LayeredScene(camera=camera, planes=planes, labelled=self._labelled(greys, camera, planes), rounds=1)
+        for number in range(2, self.rounds + 1):
+            sets = on_layers(matches, best.labelled), followed(greys, best.labelled)
+            motion, planes = refined(sets, best.camera, best.planes)
+            camera = best.camera._replace(motion=motion)
+            labelled = self._labelled(greys, camera, planes)
+            if labelled.cost >= best.labelled.cost:
                 break
             best = LayeredScene(camera=camera, planes=planes, labelled=labelled, rounds=number)
-            motion, planes = refined([on_layers(matches, labelled), followed(greys, labelled)], camera, planes)
-            camera = camera._replace(motion=motion)
-        return best if best is not None else "no round"
+        return best
+
+    def _labelled(self, greys: tuple[F32, F32], camera: MovingCamera, planes: FloatArray) -> Labelled:
+        return label_pixels(greys, camera, planes, self.labels, self.planes.thickness_px)
 
     def _start(self, problem: CorrectionProblem, side: Side) -> tuple[MovingCamera, FloatArray] | str:
         """The camera with the motion that explains its matches over time, and those (n, 4) that it explains."""
+        if problem.matches is None:
+            raise ValueError("the matches are not known: 'matches' must be among the needs of the corrector")
         pairs = temporal_pairs(problem.matches, side)
         moved = float(np.median(np.linalg.norm(pairs[:, 2:] - pairs[:, :2], axis=1))) if len(pairs) else 0.0
         if len(pairs) and moved < _STILL_PX:
             return f"the matches of the {side} camera move by {moved:.2g} px: no motion, nothing to correct it by"
-        solver = RefinedSolver(one_camera=True, motion_model=self.motion_model)
         rng = np.random.default_rng([self.seed, SIDES.index(side)])
         rig = problem.rig.about(side)
         given = Correspondences(left=pairs)
-        found = estimate_motion(given, problem.rig, problem.shutter, solver, self.robust, rng)
+        found = estimate_motion(given, problem.rig, problem.shutter, self._solver(), self.robust, rng)
         if not found.estimate.success:
             return f"no motion of the {side} camera explains its matches: {found.estimate.reason}"
-        d = found.estimate.d
-        length = float(np.linalg.norm(d))
+        d, length = found.estimate.d, float(np.linalg.norm(found.estimate.d))
         motion = make_motion(self.motion_model, found.estimate.w, d / length if length > 0.0 else d)
         return MovingCamera(rig, problem.shutter, side, motion), pairs[found.inliers["left"]]
 
@@ -149,3 +152,6 @@ class LayersCorrector(Corrector):
             for each, origin in order
         ]
         return fuse(sources, known.rig.camera, known.target_pose(view), self.warp)
+
+    def _solver(self) -> RefinedSolver:
+        return RefinedSolver(one_camera=True, motion_model=self.motion_model)

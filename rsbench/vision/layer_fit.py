@@ -22,9 +22,9 @@ _ROUNDS = 30
 class PlaneOptions:
     """How many layers there are."""
 
-    most: int = 12
+    most: int = 24
     """Layers, beside that at infinity."""
-    thickness_px: float = 0.5
+    thickness_px: float = 0.25
     """Layers are split until their matches scatter by no more parallax over a frame period (root mean square)."""
 
     def __post_init__(self) -> None:

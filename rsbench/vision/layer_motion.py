@@ -28,7 +28,8 @@ from rsbench.core.so3 import FloatArray
 from rsbench.motions import make_motion, model_name
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.layer_fit import FEWEST
-from rsbench.vision.layers import F32, Labelled, MovingCamera, planes_seen
+from rsbench.vision.layers import Labelled, MovingCamera, planes_seen
+from rsbench.vision.other_view import F32
 from rsbench.vision.resample import resample
 
 _GRID = 4
@@ -111,7 +112,7 @@ def refined(sets: Sequence[Followed], camera: MovingCamera, planes: FloatArray) 
     def errors(x: FloatArray) -> FloatArray:
         moving, moved = made(x)
         seen = camera._replace(motion=moving)
-        parts = []
+        parts: list[FloatArray] = []
         for one, weight in zip(sets, weights, strict=True):
             across, along, _ = _split(_ends(one.matches, seen, moved[one.layer]))
             parts += [across / weight.across, along / weight.along]

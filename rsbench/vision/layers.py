@@ -162,7 +162,9 @@ class _Pair:
         axis = camera.shutter.axis(camera.side)
         self._step = step / max(camera.parallax_px, np.finfo(np.float64).tiny)
         self._rhos = [camera.inverse_depths(planes, frame) for frame in FRAMES]
-        self.costs, self._places, self._factors = [], [], []
+        self.costs: list[F32] = []
+        self._places: list[F32] = []
+        self._factors: list[F32] = []
         for frame in FRAMES:
             maps = landing(camera.rig.camera, poses[frame], poses[1 - frame], (axis, axis))
             comparer = Comparer(greys[frame], options.window)
@@ -176,8 +178,8 @@ class _Pair:
         """0 to 1 (H, W), NaN outside: half by the windows around pixels, which tell them apart, and half by the
         pixels alone, which tell on which side of a border they are."""
         windows = comparer.unlikeness(greys[1 - frame], places, cubic=True)
-        levels = np.abs(resample(greys[1 - frame], places) - greys[frame])
-        return 0.5 * windows + 0.25 * np.minimum(levels / np.float32(self._options.full_levels), np.float32(1.0))
+        levels = np.abs(resample(greys[1 - frame], places) - greys[frame]) / self._options.full_levels
+        return np.asarray(0.5 * windows + 0.25 * np.minimum(levels, 1.0), dtype=np.float32)
 
     def across(self, frame: int) -> NDArray[np.bool_]:
         """(H, W) where parallax moves a pixel rather along its row than along its column."""

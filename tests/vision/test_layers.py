@@ -248,7 +248,13 @@ def test_what_tells_no_motion_fails_by_value(filmed: Filmed, count: int, moves: 
         LayersCorrector().correct(replace(problem, matches=None), LEFT)
 
 
-def test_labels_refuse_what_cannot_be() -> None:
-    for wrong_options in ({"window": 4}, {"p1": 200}, {"unseen": 2.0}):
-        with pytest.raises(ValueError, match=next(iter(wrong_options))):
-            LabelOptions(**wrong_options)
+def test_options_refuse_what_cannot_be() -> None:
+    for name, build in (
+        ("window", lambda: LabelOptions(window=4)),
+        ("p1", lambda: LabelOptions(p1=200)),
+        ("unseen", lambda: LabelOptions(unseen=2.0)),
+        ("most", lambda: PlaneOptions(most=0)),
+        ("rounds", lambda: LayersCorrector(rounds=0)),
+    ):
+        with pytest.raises(ValueError, match=name):
+            build()

@@ -180,7 +180,9 @@ def test_methods_in_no_published_table_take_part_when_they_are_asked_for(
     smoke_dataset: Path, tables: Tables, tmp_path: Path
 ) -> None:
     """They change no number of the others; what gives a view up scores the worst; the page shows them."""
-    rows, bands, _ = study_sequence(read_sequence(smoke_dataset / "castle"), others=("zhuang", "vasu-layers", "lao-lines"))
+    rows, bands, _ = study_sequence(
+        read_sequence(smoke_dataset / "castle"), others=("zhuang", "vasu-layers", "lao-lines")
+    )
     images = pd.DataFrame(rows)
     asked = images["method"].isin(["zhuang", "vasu-layers", "lao-lines"])
     before = tables[0][tables[0]["sequence"] == "castle"].drop(columns="stratum").reset_index(drop=True)
