@@ -26,22 +26,29 @@ PLANES = ((np.array([0.05, 1.0, -0.15]), 1.2), (np.array([0.1, 0.05, 1.0]), 9.0)
 """Normal n and offset c of n . X = c, world frame."""
 
 
-def plane_depth(camera: PinholeCamera, poses: Pose) -> NDArray[np.float32]:
-    """z along each pixel's ray to the nearest plane, from the row's own pose."""
-    rays = camera.unproject(camera.pixel_grid())
-    directions = np.einsum("hji,hwj->hwi", poses.R, rays)
-    centres = -np.einsum("hji,hj->hi", poses.R, poses.t)
+def _spread(poses: Pose, columns: bool) -> Pose:
+    """Poses of lines, such that they broadcast over an image: (H or 1, 1 or W, 3, 3) and (..., 3)."""
+    return Pose(*(part[None] if columns else part[:, None] for part in poses))
+
+
+def plane_depth(camera: PinholeCamera, poses: Pose, columns: bool = False) -> NDArray[np.float32]:
+    """z along each pixel's ray to the nearest plane, from the pose of its own row, or column."""
+    R, t = _spread(poses, columns)
+    directions = np.einsum("...ji,...j->...i", R, camera.unproject(camera.pixel_grid()))
+    centres = -np.einsum("...ji,...j->...i", R, t)
     depths = []
     for normal, offset in PLANES:
-        z = (offset - centres @ normal)[:, None] / (directions @ normal)
+        z = (offset - centres @ normal) / (directions @ normal)
         depths.append(np.where(z > 0, z, np.inf))
     return np.min(depths, axis=0).astype(np.float32)
 
 
-def plane_colours(camera: PinholeCamera, poses: Pose, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
+def plane_colours(
+    camera: PinholeCamera, poses: Pose, depth: NDArray[np.float32], columns: bool = False
+) -> NDArray[np.uint8]:
     """What is painted on the planes: waves in the world, some 12 px long, others in each channel."""
-    x_in_cam = depth[..., None] * camera.unproject(camera.pixel_grid())
-    X = np.einsum("hji,hwj->hwi", poses.R, x_in_cam - poses.t[:, None])
+    R, t = _spread(poses, columns)
+    X = np.einsum("...ji,...j->...i", R, depth[..., None] * camera.unproject(camera.pixel_grid()) - t)
     waves = np.array([[5.0, 4.0, 3.0], [-4.0, 5.0, 2.0], [3.0, -5.0, 4.0]])
     return np.round(128 + 50 * np.sin(X @ waves.T)).astype(np.uint8)
 
@@ -89,16 +96,15 @@ def write_analytic_dataset(
     camera = rig.camera
     for side, frame in views_of(frames):
         stated = row_poses(rig, shutter, motion, side, frame)
-        write_poses(
-            folder / f"poses/{side}_{frame}.csv", shutter.row_time(np.arange(shutter.height), frame), stated
-        )
+        write_poses(folder / f"poses/{side}_{frame}.csv", shutter.line_times(frame, side), stated)
         rolling = row_poses(rig, shutter, true_motion or motion, side, frame)
         pictures: list[tuple[Shutter, int]] = [("rs", 0), *(("gs", row) for row in (0, *twins))]
         for kind, row in pictures:
-            still = Pose(*(np.broadcast_to(part[row], part.shape) for part in rolling))
-            poses = rolling if kind == "rs" else still
-            depth = plane_depth(camera, poses)
-            write_png(folder / picture_file(kind, side, frame, row), plane_colours(camera, poses, depth))
+            line = abs(shutter.first_line(side) - row)
+            still = Pose(*(np.broadcast_to(part[line], part.shape) for part in rolling))
+            poses, columns = rolling if kind == "rs" else still, shutter.axis(side) == 0
+            depth = plane_depth(camera, poses, columns)
+            write_png(folder / picture_file(kind, side, frame, row), plane_colours(camera, poses, depth, columns))
             write_depth(folder / picture_file(kind, side, frame, row, depth=True), depth)
     manifest = sequence_manifest(
         name="planes", rig=rig, shutter=shutter, motion=motion, frame_period_s=0.1, frames=frames

@@ -29,6 +29,7 @@ _ADVICE = {
     "reproduce": _RESUMES,
     "demo": _RESUMES,
     "correct": "--out is as it was before",
+    "export": "--out is as it was before",
     "solve": "nothing is kept; what was answered stays answered",
 }
 """How to go on, by command."""

@@ -36,15 +36,19 @@ _LIST = f"{HIDDEN}/files.json"
 
 
 @contextmanager
-def fresh_folder(out: Path) -> Iterator[Path]:
+def fresh_folder(out: Path, by: str = "rsbench correct") -> Iterator[Path]:
     """A folder that takes the place and name of ``out`` when all is written; nothing is left after an error.
 
-    What ``rsbench correct`` wrote there before is replaced: moved aside, and removed when the new is in its place.
+    What the same command wrote there before is replaced: moved aside, and removed when the new is in its place.
     A kill in between leaves it aside, and the next run puts it back.
 
+    Args:
+        out: see above.
+        by: the command that writes.
+
     Raises:
-        RsbenchError: ``out`` cannot be written, holds something that ``rsbench correct`` did not write, is the
-            working folder, or another command works there.
+        RsbenchError: ``out`` cannot be written, holds something that this command did not write, is the working
+            folder, or another command works there.
     """
     place = out.resolve()
     if Path.cwd().is_relative_to(place):
@@ -54,29 +58,29 @@ def fresh_folder(out: Path) -> Iterator[Path]:
         if old.exists() and not place.exists():
             os.rename(old, place)
         remove(old)
-        _refuse_others(out, place)
+        _refuse_others(out, place, by)
         fresh.mkdir()
         yield fresh
         files = files_below(fresh)
         (fresh / _LIST).parent.mkdir()
-        write_json(fresh / _LIST, {"files": files})
-        _refuse_others(out, place)  # that came meanwhile
+        write_json(fresh / _LIST, {"by": by, "files": files})
+        _refuse_others(out, place, by)  # that came meanwhile
         _exchange(fresh, place, old)
         remove(old)
 
 
-def _refuse_others(out: Path, place: Path) -> None:
-    """What is to be replaced must be ours, to the last file."""
+def _refuse_others(out: Path, place: Path, by: str) -> None:
+    """What is to be replaced must be of this command, to the last file."""
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
         return
-    if not (place / _LIST).is_file():
-        raise RsbenchError(f"{out}: exists and was not written by 'rsbench correct'; choose another --out")
-    files = read_json(place / _LIST).get("files")
+    written = read_json(place / _LIST) if (place / _LIST).is_file() else {"by": None}
+    if written.get("by", "rsbench correct") != by:  # lists of the first versions named no command
+        raise RsbenchError(f"{out}: exists and was not written by {by!r}; choose another --out")
+    files = written.get("files")
     known = {_LIST, *files} if isinstance(files, list) else set()
     if others := strangers(place, known.__contains__):
         raise RsbenchError(
-            f"{out}: holds {named(others)}, which 'rsbench correct' did not write; move it away or choose another "
-            "--out"
+            f"{out}: holds {named(others)}, which {by!r} did not write; move it away or choose another --out"
         )
 
 

@@ -1,0 +1,69 @@
+"""``rsbench export``: a dataset in the layout of another program."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+EPILOG = """[bold]Examples[/bold]
+
+  rsbench export data/paper --to colmap --out out/colmap    [dim](global-shutter twins: one pose per image)[/dim]
+
+  rsbench export data/paper --to tum --out out/tum --sequence castle && evo_traj tum out/tum/castle/*_rows.txt"""
+
+
+class Target(StrEnum):
+    """Formats; tests hold them equal to ``rsbench.export.exporter.FORMATS``."""
+
+    COLMAP = "colmap"
+    TUM = "tum"
+    KALIBR = "kalibr"
+    NERFSTUDIO = "nerfstudio"
+    GSPLAT = "gsplat"
+    KITTI = "kitti"
+    CARLA_RS = "carla-rs"
+    WEBDATASET = "webdataset"
+
+
+class Pictures(StrEnum):
+    """Which images are written."""
+
+    RS = "rs"
+    GS = "gs"
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with a dataset.json.")],
+    to: Annotated[Target, typer.Option(help="Format; the document 'export' says what each holds.")],
+    out: Annotated[Path, typer.Option(help="Folder that appears when all is written.")],
+    images: Annotated[
+        Pictures | None,
+        typer.Option(help="Rolling-shutter frames or global-shutter twins, where a format takes either."),
+    ] = None,
+    sequence: Annotated[
+        list[str] | None, typer.Option("--sequence", "--only", help="Only this sequence; repeatable.")
+    ] = None,
+) -> None:
+    """Write a dataset for COLMAP, evo and others; what a format cannot hold is refused or told, never bent."""
+    from rsbench.cli.console import late_progress, say
+    from rsbench.export.exporter import export_dataset
+
+    with late_progress(f"exporting to {to}") as advance:
+        told = export_dataset(
+            folder,
+            to.value,
+            out,
+            images=None if images is None else images.value,
+            only=tuple(sequence or ()),
+            progress=advance,
+        )
+    for sentence in told:
+        say(f"note: {sentence}")
+    typer.echo(f"{out}: {to}; README.txt says what it holds")
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog=EPILOG)(export)
