@@ -103,7 +103,18 @@ def test_the_readme_runs_as_printed(installed: Path, tmp_path: Path, smoke_datas
     }
     commands = _printed_commands()
     verbs = [command.split()[1] for command in commands]
-    assert verbs == ["list", "generate", "verify", "evaluate", "solve", "correct", "simulate", "docs", "reproduce"]
+    assert verbs == [
+        "list",
+        "generate",
+        "verify",
+        "export",
+        "evaluate",
+        "solve",
+        "correct",
+        "simulate",
+        "docs",
+        "reproduce",
+    ]
     for command, verb in zip(commands, verbs, strict=True):
         if verb == "reproduce":
             continue  # renders at full size; its parts have tests of their own

@@ -10,9 +10,15 @@ import typer
 
 EPILOG = """[bold]Examples[/bold]
 
-  rsbench export data/paper --to colmap --out out/colmap    [dim](global-shutter twins: one pose per image)[/dim]
+  rsbench export data/paper --to colmap --out out/colmap    [dim](global-shutter twins)[/dim]
 
-  rsbench export data/paper --to tum --out out/tum --sequence castle && evo_traj tum out/tum/castle/*_rows.txt"""
+  rsbench export data/paper --to colmap --images rs --out out/rolling
+
+  rsbench export data/paper --to tum --out out/tum    [dim](then: evo_traj tum out/tum/*/left_rows.txt)[/dim]
+
+  rsbench export data/paper --to gsplat --out out/gsplat --sequence castle
+
+  rsbench export data/paper --to webdataset --out out/shards"""
 
 
 class Target(StrEnum):

@@ -56,7 +56,7 @@ def test_a_global_shutter_has_no_trajectory_of_rows(tmp_path: Path) -> None:
     body = file_interface.read_tum_trajectory_file(out / "planes/body.txt")
     turned = Rotation.from_rotvec(MOTION.w.copy()).inv()
     np.testing.assert_allclose(body.poses_se3[1][:3, :3], turned.as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(body.positions_xyz[1], -turned.apply(MOTION.d), atol=1e-12)
+    np.testing.assert_allclose(body.positions_xyz[1], -turned.apply(MOTION.d.copy()), atol=1e-12)
 
 
 # Calibrations
