@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,9 @@ MODELS = {"none": "PINHOLE", "brown": "OPENCV", "brown-k3": "FULL_OPENCV", "fish
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Path]:
     """Name of the lens, dataset and export: the scan must not matter to global-shutter twins."""
     folder = tmp_path_factory.mktemp("colmap")
-    scanning = {} if request.param == "none" else {"scan": "bottom", "right_scan": "top", "right_delay": 0.1}
+    scanning: dict[str, Any] = (
+        {} if request.param == "none" else {"scan": "bottom", "right_scan": "top", "right_delay": 0.1}
+    )
     data = dataset(folder / "data", request.param, **scanning)
     return request.param, data, exported(data, "colmap", folder / "out")[0] / "planes"
 
@@ -31,10 +34,10 @@ def _table(path: Path) -> list[list[str]]:
 
 def test_our_points_fall_on_their_pixels(made: tuple[str, Path, Path]) -> None:
     lens, data, out = made
-    for _, model, width, height, *values in _table(out / "sparse/cameras.txt"):
-        assert (model, width, height) == (MODELS[lens], "64", "49")
-        fx, fy, cx, cy = (float(value) for value in values[:4])
-        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    left, right = _table(out / "sparse/cameras.txt")
+    assert left[1:] == right[1:] and left[1:4] == [MODELS[lens], "64", "49"]
+    fx, fy, cx, cy = (float(value) for value in left[4:8])
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     poses = {row[-1]: np.array(row[1:8], dtype=float) for row in _table(out / "sparse/images.txt")[::2]}
     for side, frame in views_of(2):
         pose, shown = poses[f"{side}_{frame:04d}.png"], seen(only(data), side, frame, "gs")

@@ -106,7 +106,7 @@ def test_objects_that_move_are_told_of_and_are_no_points(tmp_path: Path) -> None
     thing = {
         "box": [1.0, 1.0, 1.0],
         "position": [0.0, 0.0, 3.0],
-        "motion": {"model": "linear", "w": [0.0, 0.0, 0.0], "d": [0.1, 0.0, 0.0], "parameters": {}},
+        "motion": {"model": "linear", "w": [0.0, 0.0, 0.0], "d": [0.1, 0.0, 0.0]},
     }
     path = data / "planes/sequence.json"
     write_json(path, read_json(path) | {"conventions": 4, "moving": [thing]})
@@ -115,7 +115,7 @@ def test_objects_that_move_are_told_of_and_are_no_points(tmp_path: Path) -> None
     for shutter, row in (("rs", 0), ("gs", 0), ("gs", 24)):
         for view in ("left_0", "left_1", "right_0", "right_1"):
             side, frame = view.split("_")
-            file = data / "planes" / moving_file(shutter, side, int(frame), row)  # pyrefly: ignore[bad-argument-type]
+            file = data / "planes" / moving_file(shutter, side, int(frame), row)
             file.parent.mkdir(parents=True, exist_ok=True)
             write_png(file, labels)
     for name in FORMATS:

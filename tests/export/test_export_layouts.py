@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -29,7 +30,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("scanning", [{}, {"scan": "bottom", "right_scan": "left", "right_delay": -0.1}])
-def test_evo_reads_the_pose_of_every_row_in_the_order_of_time(tmp_path: Path, scanning: dict[str, str]) -> None:
+def test_evo_reads_the_pose_of_every_row_in_the_order_of_time(tmp_path: Path, scanning: dict[str, Any]) -> None:
     data = dataset(tmp_path / "data", frames=3, **scanning)
     out, _ = exported(data, "tum", tmp_path / "out")
     sequence = only(data)
@@ -214,7 +215,7 @@ def test_carla_rs_velocities_and_radial_depth(tmp_path: Path, turning: bool) -> 
     ],
 )
 def test_what_a_format_cannot_hold_is_refused_by_name(
-    tmp_path: Path, name: str, lens: str, scanning: dict[str, str], images: str | None, words: str
+    tmp_path: Path, name: str, lens: str, scanning: dict[str, Any], images: str | None, words: str
 ) -> None:
     from rsbench.errors import RsbenchError
 

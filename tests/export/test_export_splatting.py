@@ -55,7 +55,7 @@ def _gsplat_pixels(start: FloatArray, end: FloatArray, world: FloatArray, K: Flo
     ],
 )
 def test_gsplat_sees_our_points_in_their_pixels(
-    tmp_path: Path, lens: str, scanning: dict[str, str], shutters: tuple[str, str]
+    tmp_path: Path, lens: str, scanning: dict[str, Any], shutters: tuple[str, str]
 ) -> None:
     data = dataset(tmp_path / "data", lens, **scanning)
     out, note = exported(data, "gsplat", tmp_path / "out")
