@@ -1,0 +1,166 @@
+"""How two cameras may read their lines, and the times that it gives the ends of matches."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Literal, get_args
+
+import numpy as np
+
+from rsbench.core.correspondences import BoolArray, Correspondences, unlinked_pairs
+from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.shutter import RollingShutter, Scan
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.packed import Packed, pack
+
+Start = Literal["global", "top", "bottom", "left", "right"]
+"""The side of the image at which a camera begins to read, or ``global`` for all lines at once."""
+_FRAMES = np.array([0.0, 1.0])
+STARTS: tuple[Start, ...] = get_args(Start)
+_ENDS: dict[Side, tuple[int, int]] = {"left": (0, 2), "right": (1, 3)}
+"""Ends of a track, of frame 0 and of frame 1, that a camera sees."""
+
+
+@dataclass(frozen=True, order=True)
+class Reading:
+    """Where each camera begins to read; those that roll share one readout ratio."""
+
+    left: Start
+    right: Start
+
+    @property
+    def rolls(self) -> bool:
+        """Whether any camera does."""
+        return self != GLOBAL
+
+    @property
+    def together(self) -> bool:
+        """Whether both read alike."""
+        return self.left == self.right
+
+    def start(self, side: Side) -> Start:
+        """Where one camera begins."""
+        return self.left if side == "left" else self.right
+
+    def __str__(self) -> str:
+        if self.together:
+            return "both cameras global" if self.left == "global" else f"both cameras from the {self.left}"
+        words = {
+            side: "global" if self.start(side) == "global" else f"from the {self.start(side)}" for side in SIDES
+        }
+        return f"left camera {words['left']}, right camera {words['right']}"
+
+
+GLOBAL = Reading("global", "global")
+READINGS = tuple(Reading(*starts) for starts in product(STARTS, STARTS))
+"""All 25."""
+
+
+def reading_of(shutter: RollingShutter) -> Reading:
+    """The reading of a known shutter."""
+    if shutter.readout_ratio == 0.0:
+        return GLOBAL
+    return Reading(shutter.scan_of("left"), shutter.scan_of("right"))
+
+
+def reading_line(reading: Reading, side: Side) -> FloatArray:
+    """Time (3,) of one camera's pixels per readout ratio: constant, per image width, per image height."""
+    return np.array(
+        {
+            "global": (0.0, 0.0, 0.0),
+            "top": (0.0, 0.0, 1.0),
+            "bottom": (1.0, 0.0, -1.0),
+            "left": (0.0, 1.0, 0.0),
+            "right": (1.0, -1.0, 0.0),
+        }[reading.start(side)]
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Lines:
+    """Per readout ratio: times of the ends after the start of their frame, and their derivatives by the pixel."""
+
+    pairs: FloatArray
+    """(n, 2) of both ends."""
+    slopes: FloatArray
+    """(n, 2)."""
+    tracks: FloatArray
+    """(m, 4) of the ends left 0, right 0, left 1, right 1."""
+    track_slopes: FloatArray
+    """(m, 4, 2)."""
+
+
+class TimedMatches:
+    """Matches whose ends can be given the times of any reading.
+
+    Every end has a time of its own here (``timed_tracks``), whatever the reading, so that all readings are judged
+    by the same errors.
+    """
+
+    def __init__(self, matches: Correspondences, rig: StereoRig, motion_model: str = "linear") -> None:
+        packs = {scan: pack(matches, rig, _late(rig, scan), motion_model) for scan in get_args(Scan)}
+        self._base = next(iter(packs.values()))
+        self.left: BoolArray = self._base.pairs[:, 6] >= 0.0
+        """(n,) which pairs are the left camera's."""
+        late = np.where(self.left, 0.0, 1.0)
+        self._lines: dict[Start, _Lines] = {
+            scan: _Lines(
+                pairs=packed.pairs[:, 4:6] - (0.0, 1.0) - late[:, None],
+                slopes=packed.pairs[:, 15:17],
+                tracks=packed.tracks[:, :, 2] - (0.0, 1.0, 1.0, 2.0),
+                track_slopes=packed.tracks[:, :, 7:9],
+            )
+            for scan, packed in packs.items()
+        }
+        pairs, tracks = len(self._base.pairs), len(self._base.tracks)
+        self.count = pairs + tracks
+        """Measurements: pairs that no track repeats, then tracks."""
+        sets = [getattr(matches, side)[unlinked_pairs(matches, side)] for side in SIDES]
+        self.pixels: FloatArray = np.concatenate([*(each[:, :2] for each in sets), matches.tracks[:, :2]])
+        """(count, 2) where each is seen in frame 0."""
+        self._lines["global"] = _Lines(
+            pairs=np.zeros((pairs, 2)),
+            slopes=np.zeros((pairs, 2)),
+            tracks=np.zeros((tracks, 4)),
+            track_slopes=np.zeros((tracks, 4, 2)),
+        )
+
+    def subset(self, chosen: BoolArray) -> TimedMatches:
+        """Of a mask (count,) over pairs and tracks."""
+        other = copy.copy(self)
+        other._base = self._base.only(chosen)
+        pairs, tracks = np.split(chosen, [len(self._base.pairs)])
+        other.left, other.pixels, other.count = self.left[pairs], self.pixels[chosen], int(np.count_nonzero(chosen))
+        other._lines = {
+            start: _Lines(
+                pairs=lines.pairs[pairs],
+                slopes=lines.slopes[pairs],
+                tracks=lines.tracks[tracks],
+                track_slopes=lines.track_slopes[tracks],
+            )
+            for start, lines in self._lines.items()
+        }
+        return other
+
+    def packed(self, reading: Reading, ratio: float, delay: float) -> Packed:
+        """The measurements as this reading times them, the right camera late by ``delay`` frame periods."""
+        pairs, tracks = self._base.pairs.copy(), self._base.tracks.copy()
+        for side in SIDES:
+            lines, late = self._lines[reading.start(side)], delay if side == "right" else 0.0
+            mine = self.left if side == "left" else ~self.left
+            pairs[mine, 4:6] = _FRAMES + late + ratio * lines.pairs[mine]
+            pairs[mine, 15:17] = ratio * lines.slopes[mine]
+            ends = list(_ENDS[side])
+            tracks[:, ends, 2] = _FRAMES + late + ratio * lines.tracks[:, ends]
+            tracks[:, ends, 7:9] = ratio * lines.track_slopes[:, ends]
+        return replace(self._base, pairs=pairs, tracks=tracks, h=0.0)
+
+
+def _late(rig: StereoRig, scan: Scan) -> RollingShutter:
+    """Both cameras read alike, the right one a period late: no two ends of a match are of one time."""
+    camera = rig.camera
+    return RollingShutter(
+        height=camera.height, width=camera.width, readout_ratio=1.0, scan=scan, right_delay=1.0
+    )
