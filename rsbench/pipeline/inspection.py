@@ -26,8 +26,8 @@ from rsbench.solvers.refined import RefinedSolver
 
 CERTAIN = 0.95
 """Probability of a reading that is told."""
-MAX_SIGMA = 0.1
-"""Standard deviation, at most, of a readout ratio that is told."""
+MAX_SIGMA = 0.015
+"""Standard deviation, at most, of a readout ratio that is told: 0.03 is then two of them."""
 FEWEST = 30
 """Matches between two times."""
 _LEAST_SHARE = 0.3
@@ -108,7 +108,10 @@ def inspect_window(
     moved = float(np.median(np.linalg.norm(pairs[:, 2:] - pairs[:, :2], axis=1))) if len(pairs) else 0.0
     if count < FEWEST:
         return Window(
-            evidence=None, reason=f"{count} matches between two times, need {FEWEST}", matches=count, moved_px=moved
+            evidence=None,
+            reason=f"{count} matches between two times, need {FEWEST}",
+            matches=count,
+            moved_px=moved,
         )
     start, lag = find_start(matches, rig, RefinedSolver(), options, seed)
     if start is None:
@@ -120,8 +123,12 @@ def inspect_window(
     return Window(evidence=evidence, reason=reason, matches=count, moved_px=moved)
 
 
-def conclude(windows: Sequence[Window]) -> Inspection:
-    """What all windows of one rig say together, at least one."""
+def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA) -> Inspection:
+    """What all windows of one rig say together, at least one.
+
+    Args:
+        max_sigma: standard deviation, at most, of a readout ratio that is told.
+    """
     used = [window.evidence for window in windows if window.evidence is not None]
     moved = float(np.median([window.moved_px for window in windows]))
     matches = sum(window.matches for window in windows)
@@ -140,12 +147,14 @@ def conclude(windows: Sequence[Window]) -> Inspection:
     logs = {key: _log_prior(key[1]) + peak.log_evidence for key, peak in peaks.items()}
     total = scipy.special.logsumexp(list(logs.values()))
     shares = {key: float(np.exp(value - total)) for key, value in logs.items()}
-    candidates = sorted((_candidate(reading, peaks, shares) for reading in READINGS), key=lambda each: -each.probability)
+    candidates = sorted(
+        (_candidate(reading, peaks, shares) for reading in READINGS), key=lambda each: -each.probability
+    )
     models = sorted({model for model, _ in peaks})
     kept = sum(window.used for window in used)
     return Inspection(
         candidates=tuple(each for each in candidates if each.probability >= _UNLIKELY),
-        reason=_doubt(candidates, kept / sum(window.of for window in used), moved),
+        reason=_doubt(candidates, kept / sum(window.of for window in used), moved, max_sigma),
         windows=len(used),
         matches=matches,
         used=kept,
@@ -187,15 +196,16 @@ def _mixture(weights: FloatArray, parts: Sequence[tuple[float, float]]) -> tuple
     return mean, float(np.sqrt(weights @ (sigmas**2 + (means - mean) ** 2)))
 
 
-def _doubt(candidates: Sequence[Candidate], share: float, moved_px: float) -> str:
+def _doubt(candidates: Sequence[Candidate], share: float, moved_px: float, max_sigma: float) -> str:
     """Why the best candidate cannot be told; empty where it can."""
     best = candidates[0]
     if share < _LEAST_SHARE:
         return f"only {share:.0%} of the matches agree with any motion and shutter"
-    if best.probability >= CERTAIN and best.sigma <= MAX_SIGMA:
+    if best.probability >= CERTAIN and best.sigma <= max_sigma:
         return ""
     still = f"; matches move by {moved_px:.1f} px only" if moved_px < _STILL_PX else ""
     if best.probability >= CERTAIN:
-        return f"{best.reading}, but the matches do not determine how fast: {best.ratio:.2f} +- {best.sigma:.2f}{still}"
+        ratio = f"{best.ratio:.2f} +- {best.sigma:.2f}"
+        return f"{best.reading}, but the matches do not determine how fast: {ratio}{still}"
     allowed = [f"{each.reading} ({each.probability:.0%})" for each in candidates if each.probability > 0.1]
     return f"the matches allow {', or '.join(allowed) or 'many readings'}{still}"

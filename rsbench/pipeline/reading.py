@@ -132,7 +132,11 @@ class TimedMatches:
         other = copy.copy(self)
         other._base = self._base.only(chosen)
         pairs, tracks = np.split(chosen, [len(self._base.pairs)])
-        other.left, other.pixels, other.count = self.left[pairs], self.pixels[chosen], int(np.count_nonzero(chosen))
+        other.left, other.pixels, other.count = (
+            self.left[pairs],
+            self.pixels[chosen],
+            int(np.count_nonzero(chosen)),
+        )
         other._lines = {
             start: _Lines(
                 pairs=lines.pairs[pairs],
@@ -161,6 +165,4 @@ class TimedMatches:
 def _late(rig: StereoRig, scan: Scan) -> RollingShutter:
     """Both cameras read alike, the right one a period late: no two ends of a match are of one time."""
     camera = rig.camera
-    return RollingShutter(
-        height=camera.height, width=camera.width, readout_ratio=1.0, scan=scan, right_delay=1.0
-    )
+    return RollingShutter(height=camera.height, width=camera.width, readout_ratio=1.0, scan=scan, right_delay=1.0)

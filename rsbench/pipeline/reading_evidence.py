@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import scipy
@@ -63,7 +64,9 @@ class Peak:
             ends = -ends[::-1]
         low, high = scipy.special.log_ndtr(ends)
         mass = high + np.log1p(-np.exp(min(low - high, -1e-12)))
-        return self.value + float(0.5 * np.log(2.0 * np.pi) + np.log(self.sigma) + mass - np.log(1.0 - LEAST_RATIO))
+        return self.value + float(
+            0.5 * np.log(2.0 * np.pi) + np.log(self.sigma) + mass - np.log(1.0 - LEAST_RATIO)
+        )
 
 
 Hypothesis = tuple[str, Reading]
@@ -99,29 +102,25 @@ def window_evidence(
     screened = _screened(first, motion, lag)
     if screened is None:
         return None
-    fits, likelihood = screened
-    best = min(fits.values(), key=lambda fit: fit.cost)
+    fits, likelihood, lost = screened
+    close = {reading: fit for reading, fit in fits.items() if reading not in lost}
+    best = min(close.values(), key=lambda fit: fit.cost)
     full = _distribution(first, np.ones(first.count, dtype=np.bool_), best, likelihood.scale)
     if full is None:
         return None
-    lost = {reading: (fit.cost - best.cost) / likelihood.scale**2 for reading, fit in fits.items()}
     slopes = {
         (model, reading): _Slope(ReadingCost(timed[model], reading, full), fit)
         for model in motion_models
-        for reading, fit in fits.items()
-        if lost[reading] <= _CLOSE or reading == GLOBAL
+        for reading, fit in close.items()
     }
-    top = min(slopes.values(), key=lambda slope: slope.least)
-    rolling = min((slope for slope in slopes.values() if slope.curvature), key=lambda slope: slope.least, default=None)
-    dispersion = 1.0 if rolling is None else _dispersion(rolling, first.pixels[full.chosen])
-    peaks = {
-        (model, reading): Peak(
-            value=-less, at=fits[reading].shutter[0], information=1.0 / _WIDE**2, delay=0.0, delay_sigma=1.0
-        )
-        for model in motion_models
-        for reading, less in lost.items()
-    }
-    peaks |= {key: slope.peak(top.least, full.scale**2 * dispersion) for key, slope in slopes.items()}
+    least = min(slope.least for slope in slopes.values())
+    rolling = [slope for (_, reading), slope in slopes.items() if reading.rolls]
+    sharp = min(rolling, key=lambda slope: slope.least, default=None)
+    dispersion = 1.0 if sharp is None else _dispersion(sharp, first.pixels[full.chosen])
+    peaks = {key: slope.peak(least, full.scale**2 * dispersion) for key, slope in slopes.items()}
+    for model, (reading, value) in product(motion_models, lost.items()):
+        at = float(fits[reading].shutter[0])
+        peaks[model, reading] = Peak(value=-value, at=at, information=1.0, delay=0.0, delay_sigma=1.0)
     return WindowEvidence(
         peaks=peaks,
         used=int(np.count_nonzero(full.chosen)),
@@ -133,17 +132,32 @@ def window_evidence(
 
 def _screened(
     timed: TimedMatches, motion: tuple[FloatArray, FloatArray], lag: Lag
-) -> tuple[dict[Reading, ReadingFit], Likelihood] | None:
-    """Every reading on some of the matches, all under the distribution of the errors that the best one shows."""
+) -> tuple[dict[Reading, ReadingFit], Likelihood, dict[Reading, float]] | None:
+    """Every reading on some of the matches, and what those put aside lack (``_far``).
+
+    The scale of the errors falls; what is too far off at one scale is further off at the next.
+    """
     some = np.arange(timed.count) % max(timed.count // _SCREENED, 1) == 0
     theta = timed.packed(GLOBAL, 0.0, 0.0).theta(*motion)
     fits = {reading: _start(reading, theta, first_shutter(reading, lag)) for reading in READINGS}
+    lost: dict[Reading, float] = {}
     for scale in _FIRST_SCALES:
         likelihood = Likelihood(nu=_FIRST_NU, scale=scale, chosen=some)
-        fits = _again(timed, likelihood, fits.values())
-    best = min(fits.values(), key=lambda fit: fit.cost)
+        fits |= _again(timed, likelihood, [fit for fit in fits.values() if fit.reading not in lost])
+        lost |= _far(fits, scale)
+    best = min((fit for fit in fits.values() if fit.reading not in lost), key=lambda fit: fit.cost)
     found = _distribution(timed, some, best, _FIRST_SCALES[-1])
-    return None if found is None else (_again(timed, found, fits.values()), found)
+    if found is None:
+        return None
+    fits |= _again(timed, found, [fit for fit in fits.values() if fit.reading not in lost])
+    return fits, found, lost | _far({key: fit for key, fit in fits.items() if key not in lost}, found.scale)
+
+
+def _far(fits: Mapping[Reading, ReadingFit], scale: float) -> dict[Reading, float]:
+    """Log-likelihood, below the best one's, of the readings that are put aside; never of the global one."""
+    least = min(fit.cost for fit in fits.values())
+    below = {reading: (fit.cost - least) / scale**2 for reading, fit in fits.items() if reading != GLOBAL}
+    return {reading: value for reading, value in below.items() if value > _CLOSE}
 
 
 def _start(reading: Reading, theta: FloatArray, shutter: FloatArray) -> ReadingFit:
@@ -249,7 +263,7 @@ def _tiles(points: FloatArray) -> NDArray[np.int64]:
 
 
 def combined(windows: Sequence[WindowEvidence]) -> dict[Hypothesis, Peak]:
-    """The peaks of several windows of one rig, multiplied; their scatter counts where it is larger than they say."""
+    """The peaks of several windows of one rig, multiplied; their scatter counts where they say less."""
     return {key: _product([window.peaks[key] for window in windows]) for key in windows[0].peaks}
 
 

@@ -82,22 +82,21 @@ class ReadingCost:
         return float(np.sum(self.each(theta, shutter))) + 0.5 * self._prior * float(shutter[1]) ** 2
 
     def local(self, theta: FloatArray, shutter: FloatArray, free: list[int]) -> tuple[FloatArray, FloatArray]:
-        """Gradient and Hessian by theta and the free ones of the shutter, these by central differences."""
+        """Gradient and Hessian by theta and the free ones of the shutter, these by differences."""
         at, by_theta, H_theta = self.tailed(shutter).normal_equations(theta)
         size = _MOTION + len(free)
         gradient, H, ahead = np.zeros(size), np.zeros((size, size)), 0.0
         gradient[:_MOTION], H[:_MOTION, :_MOTION] = by_theta, H_theta
         for k, j in enumerate(free, start=_MOTION):
             step = _DIFFERENCE * (np.arange(2) == j)
-            (above, g_above, _), (below, g_below, _) = (
-                self.tailed(shutter + sign * step).normal_equations(theta) for sign in (1.0, -1.0)
-            )
+            above, g_above, _ = self.tailed(shutter + step).normal_equations(theta)
+            below = float(np.sum(self.each(theta, shutter - step)))
             gradient[k] = (above - below) / (2.0 * _DIFFERENCE)
             H[k, k] = (above - 2.0 * at + below) / _DIFFERENCE**2
-            H[:_MOTION, k] = H[k, :_MOTION] = (g_above - g_below) / (2.0 * _DIFFERENCE)
+            H[:_MOTION, k] = H[k, :_MOTION] = (g_above - by_theta) / _DIFFERENCE
             ahead += above - at
         if len(free) == 2:
-            both, _, _ = self.tailed(shutter + _DIFFERENCE).normal_equations(theta)
+            both = float(np.sum(self.each(theta, shutter + _DIFFERENCE)))
             H[-1, -2] = H[-2, -1] = (both - at - ahead) / _DIFFERENCE**2
         gradient[-1] += self._prior * shutter[1]
         H[-1, -1] += self._prior
@@ -153,7 +152,9 @@ def _stepped(
     moves = np.ones(len(gradient), dtype=np.bool_)
     for k, j in enumerate(free, start=_MOTION):
         outwards = -gradient[k]
-        moves[k] = not ((shutter[j] <= _LEAST[j] and outwards < 0.0) or (shutter[j] >= _MOST[j] and outwards > 0.0))
+        moves[k] = not (
+            (shutter[j] <= _LEAST[j] and outwards < 0.0) or (shutter[j] >= _MOST[j] and outwards > 0.0)
+        )
     A, g = H[np.ix_(moves, moves)], gradient[moves]
     size = np.sqrt(np.maximum(np.abs(np.diagonal(A)), 1e-12 * np.abs(A).max()) + 1e-300)
     values, vectors = np.linalg.eigh(A / np.outer(size, size))
@@ -164,8 +165,6 @@ def _stepped(
     shutter[free] += np.clip(step[_MOTION:], -_LONGEST_STEP, _LONGEST_STEP)
     length = float(np.linalg.norm(theta[3:]))
     theta[3:] *= min(1.0, _MAX_TRANSLATION_M / max(length, _MAX_TRANSLATION_M))
-    held = shutter[0] if 0 in free else None
-    if held is not None:
-        shutter[0] = np.clip(held, _LEAST[0], _MOST[0])
-    shutter[1] = np.clip(shutter[1], _LEAST[1], _MOST[1])
+    for j in free:
+        shutter[j] = np.clip(shutter[j], _LEAST[j], _MOST[j])
     return theta, shutter

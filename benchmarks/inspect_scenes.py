@@ -1,0 +1,164 @@
+"""What `rsbench inspect` tells of rendered frames of built-in scenes, and of cameras that read otherwise.
+
+Renders small sequences that read rows, columns, and rows in opposite directions. More readings come of them without
+rendering: images turned upside down are read from the bottom, mirrored ones from the right, and the global-shutter
+twin of a frame is what a camera without rolling shutter shows.
+
+    python benchmarks/inspect_scenes.py --out DIR
+    python benchmarks/inspect_scenes.py --out DIR --rotation 1 --scene castle --scene room
+    python benchmarks/inspect_scenes.py --data DATASET       (frames that exist and are read from the top)
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.rig import SIDES, VIEWS, Side, StereoRig, View
+from rsbench.core.shutter import Scanning
+from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
+from rsbench.dataset.generation import generate_dataset
+from rsbench.dataset.sequence import Sequence as Rendered
+from rsbench.dataset.sequence import read_dataset
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.pipeline.inspection import conclude, inspect_window
+from rsbench.pipeline.reading import Reading
+
+SCENES = {"castle": 1.0, "old-town": 1.0, "room": 0.4, "street": 1.0, "corridor": 0.5, "shelves": 0.6}
+"""With the scale of their translation, as in the card `standard`."""
+RATIO, ALLOWED = 0.8, 0.03
+COLUMNS = ("sequence", "true", "told", "readout ratio", "matches", "noise (px)", "verdict")
+HEADER = f"| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|\n"
+SCANS: dict[str, dict[str, Any]] = {
+    "rows": {},
+    "columns": {"scan": "left"},
+    "opposite": {"right_scan": "bottom"},
+}
+Images = dict[View, NDArray[np.uint8]]
+Flip = Literal["", "upside down", "mirrored"]
+
+
+class Case(NamedTuple):
+    """Frames whose reading is known."""
+
+    reading: Reading
+    images: Images
+    rig: StereoRig
+
+
+DERIVED: dict[str, tuple[tuple[Reading, tuple[str, str], Flip], ...]] = {
+    "rows": (
+        (Reading("top", "top"), ("rs", "rs"), ""),
+        (Reading("bottom", "bottom"), ("rs", "rs"), "upside down"),
+        (Reading("global", "global"), ("gs", "gs"), ""),
+        (Reading("top", "global"), ("rs", "gs"), ""),
+        (Reading("global", "bottom"), ("gs", "rs"), "upside down"),
+    ),
+    "columns": (
+        (Reading("left", "left"), ("rs", "rs"), ""),
+        (Reading("right", "right"), ("rs", "rs"), "mirrored"),
+        (Reading("global", "left"), ("gs", "rs"), ""),
+    ),
+    "opposite": ((Reading("top", "bottom"), ("rs", "rs"), ""),),
+}
+"""Of each rendered sequence: the reading, which frames the left and the right camera show, how they are turned."""
+
+
+def card(name: str, rotation: float, size: int, scenes: Sequence[str]) -> DatasetCard:
+    motion = MotionCard(rotation_deg=rotation, rotation_axis="random", translation=0.2, translation_axis="random")
+    return DatasetCard(
+        name=f"inspect-{name}",
+        camera=CameraCard(width=size, height=size * 3 // 4, focal=float(size)),
+        baseline=0.4,
+        readout_ratio=RATIO,
+        motion=motion,
+        seed=3,
+        sequence=tuple(SequenceCard(name=scene, scene=scene, scale=SCENES.get(scene, 1.0)) for scene in scenes),
+        **SCANS[name],
+    ).expanded()
+
+
+def cases(sequence: Rendered, name: str) -> Iterator[Case]:
+    rig, camera = sequence.rig, sequence.rig.camera
+    for reading, kinds, flip in DERIVED[name]:
+        shown = {
+            (side, frame): sequence.image(kind, side, frame)  # pyrefly: ignore[bad-argument-type]
+            for side, kind in zip(SIDES, kinds, strict=True)
+            for frame in (0, 1)
+        }
+        other = camera
+        if flip == "upside down":
+            shown = {view: np.ascontiguousarray(image[::-1]) for view, image in shown.items()}
+            other = replace(camera, cy=camera.height - 1 - camera.cy)
+        elif flip == "mirrored":
+            shown = {
+                (_other(side), frame): np.ascontiguousarray(image[:, ::-1])
+                for (side, frame), image in shown.items()
+            }
+            other = replace(camera, cx=camera.width - 1 - camera.cx)
+        yield Case(reading, {view: shown[view] for view in VIEWS}, replace(rig, camera=other))
+
+
+def _other(side: Side) -> Side:
+    return "right" if side == "left" else "left"
+
+
+def row(name: str, case: Case, ratio: float) -> tuple[str, bool, bool, float]:
+    """A line of the table; whether it was told, and rightly; the error of the ratio."""
+    options = CorrectionOptions()
+    matches = find_matches_of_rig(case.images, case.rig, Scanning(scan="left"), options)
+    found = conclude([inspect_window(matches, case.rig)])
+    best, true = found.best, ratio if case.reading.rolls else 0.0
+    right = found.told and best is not None and best.reading == case.reading
+    error = abs(best.ratio - true) if found.told and best is not None else float("nan")
+    said = "cannot tell" if not found.told or best is None else f"{best.reading.left}, {best.reading.right}"
+    value = "-" if best is None or not found.told else f"{best.ratio:.3f} +- {best.sigma:.3f}"
+    verdict = "right" if right else "WRONG" if found.told else found.reason
+    truth = f"{case.reading.left}, {case.reading.right}"
+    cells = (name, truth, said, value, f"{found.used}/{found.matches}", f"{found.noise_px:.2f}", verdict)
+    return f"| {' | '.join(cells)} |", found.told, right, error
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument("--out", type=Path, help="folder of the datasets; rendered where they lack")
+    where.add_argument("--data", type=Path, help="dataset of rows read from the top instead")
+    parser.add_argument("--rotation", type=float, default=2.0, help="degrees per frame period")
+    parser.add_argument("--size", type=int, default=320, help="width of the images, px")
+    parser.add_argument("--scene", action="append", help="repeatable; default: six of the built-in ones")
+    parser.add_argument("--only", default="", help="sequences whose name holds this")
+    given = parser.parse_args(arguments)
+    folders = {"rows": given.data} if given.data else {name: given.out / name for name in SCANS}
+    told, rightly, errors, count = 0, 0, [], 0
+    sys.stdout.write(HEADER)
+    for name, folder in folders.items():
+        if given.data is None:
+            generate_dataset(card(name, given.rotation, given.size, given.scene or list(SCENES)), folder)
+        for sequence in read_dataset(folder):
+            if given.only not in sequence.name:
+                continue
+            for case in cases(sequence, name):
+                line, known, right, error = row(sequence.name, case, sequence.shutter.readout_ratio)
+                told, rightly, count = told + known, rightly + right, count + 1
+                errors += [error] if right and case.reading.rolls else []
+                sys.stdout.write(line + "\n")
+                sys.stdout.flush()
+    within = np.mean(np.array(errors) <= ALLOWED) if errors else float("nan")
+    sys.stdout.write(
+        f"\n{count} cases: told {told}, rightly {rightly}; of the {len(errors)} readout ratios of cameras that roll "
+        f"{within:.0%} within {ALLOWED}, worst {max(errors, default=float('nan')):.3f}\n"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,286 @@
+"""``rsbench inspect``: which camera of a rig rolls, from which side and how fast, from matches alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+
+from rsbench.cli.kinds import named
+from rsbench.errors import RsbenchError
+
+if TYPE_CHECKING:
+    from rsbench.core.rig import StereoRig
+    from rsbench.core.shutter import RollingShutter
+    from rsbench.pipeline.footage import FrameSource
+    from rsbench.pipeline.inspection import Inspection, Window
+
+EPILOG = """[bold]Examples[/bold]
+
+  rsbench inspect problem.json
+
+  rsbench inspect l0.png r0.png l1.png r1.png --rig rig.toml
+
+  rsbench inspect --left left.mp4 --right right.mp4 --rig rig.toml --json
+
+  rsbench inspect data/paper     [dim](each sequence of a dataset; or one sequence's folder)[/dim]
+
+What a card or problem says of the shutter is not believed, only shown beside what was found.
+
+Exit codes: 0 all told, 1 one that cannot be told, 2 one that is wrong.
+More: [bold]rsbench docs inspect[/bold]"""
+
+_MODEL = "Motion model to try; repeatable. Default: linear and twist"
+
+
+class _Case(NamedTuple):
+    """One rig to inspect."""
+
+    name: str
+    windows: Iterator[Window]
+    said: RollingShutter | None
+    """What its card, problem or dataset says."""
+
+
+class _Options(NamedTuple):
+    """What holds for all of them."""
+
+    models: tuple[str, ...]
+    windows: int
+    features: str
+    seed: int
+
+
+def inspect(
+    given: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="INPUT",
+            help="Problems (files, folders, -); or LEFT_0 RIGHT_0 LEFT_1 RIGHT_1; or a dataset or a sequence.",
+        ),
+    ] = None,
+    rig: Annotated[Path | None, typer.Option(metavar="RIG.toml", help="Camera and baseline, for frames.")] = None,
+    left: Annotated[Path | None, typer.Option(help="Folder of images or video of the left camera.")] = None,
+    right: Annotated[Path | None, typer.Option(help="The same of the right camera.")] = None,
+    windows: Annotated[int, typer.Option(min=1, help="Pairs of times of a longer sequence to use, at most.")] = 5,
+    max_sigma: Annotated[
+        float, typer.Option(min=0.0, help="Standard deviation, at most, of a readout ratio that is told.")
+    ] = 0.015,
+    motion_model: Annotated[list[str] | None, typer.Option(metavar="NAME", help=_MODEL)] = None,
+    features: Annotated[str, named("features", "Finds matches of frames: a name or a card.")] = "sift",
+    seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object per line and rig.")] = False,
+) -> None:
+    """Tell which camera rolls, from which side of the image it reads, and how fast."""
+    from rsbench.pipeline.inspection import MODELS, conclude
+    from rsbench.solvers.engine.kernel_type import load_kernel
+
+    options = _Options(tuple(motion_model or MODELS), windows, features, seed)
+    for model in options.models:
+        load_kernel(model)
+    answers, wrong, told = list[dict[str, Any]](), False, True
+    for case in _cases(given or [], rig, left, right, options):
+        if isinstance(case, RsbenchError):
+            wrong = True
+            typer.echo(f"rsbench: error: {' '.join(str(case).split())}", err=True)
+            continue
+        found = conclude(list(case.windows), max_sigma)
+        told = told and found.told
+        answers.append(_record(case, found))
+        if json:
+            _print_json(answers[-1])
+    if not json:
+        _show(answers)
+    if wrong or not told:
+        raise typer.Exit(2 if wrong else 1)
+
+
+def _cases(
+    given: list[Path], rig: Path | None, left: Path | None, right: Path | None, options: _Options
+) -> Iterator[_Case | RsbenchError]:
+    """Raises RsbenchError for another combination of arguments."""
+    footage = left is not None and right is not None
+    if rig is not None and not given and footage:
+        yield _of_footage(left, right, rig, options)
+    elif rig is not None and len(given) == 4 and left is None and right is None:
+        yield _of_four(given, rig, options)
+    elif rig is not None or left is not None or right is not None or not given:
+        raise RsbenchError(
+            "input: give problems, or a dataset, or with --rig LEFT_0 RIGHT_0 LEFT_1 RIGHT_1 or --left and --right"
+        )
+    else:
+        for path in given:
+            rendered = any((path / name).is_file() for name in ("dataset.json", "sequence.json"))
+            yield from _of_dataset(path, options) if rendered else _of_problems(path, options)
+
+
+def _of_problems(path: Path, options: _Options) -> Iterator[_Case | RsbenchError]:
+    import sys
+
+    from rsbench.pipeline.inspection import inspect_window
+    from rsbench.pipeline.problem import read_problems
+
+    for problem in read_problems(str(path), sys.stdin):
+        if isinstance(problem, RsbenchError):
+            yield problem
+            continue
+        window = inspect_window(problem.correspondences, problem.rig, models=options.models, seed=options.seed)
+        yield _Case(problem.name, iter([window]), problem.shutter)
+
+
+def _of_four(paths: list[Path], card: Path, options: _Options) -> _Case:
+    from rsbench.pipeline.footage import FrameSource
+
+    left, right = (FrameSource.of_files(paths[k::2]) for k in (0, 1))
+    return _framed(card.stem, left, right, card, options)
+
+
+def _of_footage(left: Path | None, right: Path | None, card: Path, options: _Options) -> _Case:
+    from rsbench.pipeline.footage import FrameSource
+
+    assert left is not None and right is not None
+    return _framed(card.stem, FrameSource(left), FrameSource(right), card, options)
+
+
+def _framed(name: str, left: FrameSource, right: FrameSource, card: Path, options: _Options) -> _Case:
+    """Frames of a user, whose card says the rig."""
+    from rsbench.pipeline.footage import read_rig_card
+
+    said = read_rig_card(card)
+    height, width = next(iter(left)).shape[:2]
+    try:
+        rig = said.rig(width, height)
+        ratio = said.readout_ratio
+        shutter = None if ratio is None else said.shutter_of(width, height, ratio)
+    except ValueError as error:
+        raise RsbenchError(f"--rig: of images of {width} x {height} pixels: {error}") from error
+    return _Case(name, _frame_windows(left, right, rig, options), shutter)
+
+
+def _of_dataset(folder: Path, options: _Options) -> Iterator[_Case]:
+    from rsbench.core.rig import SIDES
+    from rsbench.dataset.layout import picture_file
+    from rsbench.dataset.sequence import read_dataset_manifest, read_sequence
+    from rsbench.pipeline.footage import FrameSource
+
+    alone = (folder / "sequence.json").is_file()
+    folders = [folder] if alone else [folder / name for name in read_dataset_manifest(folder).sequences]
+    for each in folders:
+        sequence = read_sequence(each)
+        left, right = (
+            FrameSource.of_files([each / picture_file("rs", side, frame) for frame in range(sequence.frames)])
+            for side in SIDES
+        )
+        yield _Case(sequence.name, _frame_windows(left, right, sequence.rig, options), sequence.shutter)
+
+
+def _frame_windows(left: FrameSource, right: FrameSource, rig: StereoRig, options: _Options) -> Iterator[Window]:
+    """Of successive frames, evenly over the sequence."""
+    from itertools import pairwise
+
+    from rsbench.core.shutter import Scanning
+    from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.pipeline.footage import check_alike
+    from rsbench.pipeline.frame_motion import find_matches_of_rig
+    from rsbench.pipeline.inspection import inspect_window
+    from rsbench.pipeline.isolated_parts import Isolation
+    from rsbench.vision.feature_matcher import load_features
+
+    unknown = Scanning(scan="left")  # as where columns are read: partners may lie on any row
+    every = max((left.count - 1) // options.windows, 1)
+    with Isolation() as isolation:
+        chain = isolation.chain(CorrectionOptions(features=load_features(options.features), seed=options.seed))
+        for number, (first, second) in enumerate(pairwise(zip(left, right, strict=False))):
+            if number % every != 0 or number // every >= options.windows:
+                continue
+            images = {
+                (side, frame): pair[k]
+                for frame, pair in enumerate((first, second))
+                for k, side in enumerate(("left", "right"))
+            }
+            check_alike({f"{side} frame {number + frame}": image for (side, frame), image in images.items()})
+            matches = find_matches_of_rig(images, rig, unknown, chain)  # pyrefly: ignore[bad-argument-type]
+            yield inspect_window(matches, rig, models=options.models, seed=options.seed)
+
+
+def _record(case: _Case, found: Inspection) -> dict[str, Any]:
+    """What JSON says of one rig; what is not told is null."""
+    best = found.best if found.told else None
+    return {
+        "name": case.name,
+        "told": found.told,
+        "left": None if best is None else best.reading.left,
+        "right": None if best is None else best.reading.right,
+        "readout_ratio": None if best is None else best.ratio,
+        "readout_ratio_sigma": None if best is None else best.sigma,
+        "right_delay": None if best is None else best.delay,
+        "right_delay_sigma": None if best is None else best.delay_sigma,
+        "probability": None if best is None else best.probability,
+        "reason": found.reason,
+        "candidates": [
+            {
+                "left": each.reading.left,
+                "right": each.reading.right,
+                "probability": each.probability,
+                "readout_ratio": each.ratio,
+                "readout_ratio_sigma": each.sigma,
+            }
+            for each in found.candidates
+        ],
+        "motion_model": found.motion_model or None,
+        "windows": found.windows,
+        "matches": found.matches,
+        "used": found.used,
+        "noise_px": found.noise_px if found.used else None,
+        "moved_px": found.moved_px,
+        "said": _said(case.said),
+    }
+
+
+def _said(shutter: RollingShutter | None) -> dict[str, Any] | None:
+    from rsbench.pipeline.reading import reading_of
+
+    if shutter is None:
+        return None
+    reading = reading_of(shutter)
+    return {"left": reading.left, "right": reading.right, "readout_ratio": shutter.readout_ratio}
+
+
+def _print_json(answer: dict[str, Any]) -> None:
+    import json
+
+    typer.echo(json.dumps(answer, allow_nan=False))
+
+
+def _show(answers: list[dict[str, Any]]) -> None:
+    from rsbench.cli.console import is_quiet, print_rows
+
+    rows = [_row(answer) for answer in answers]
+    if is_quiet():
+        for row in rows:
+            typer.echo("\t".join(row.values()))
+    elif rows:
+        print_rows("", list(rows[0]), [list(row.values()) for row in rows], right=("matches", "moved (px)"))
+
+
+def _row(answer: dict[str, Any]) -> dict[str, str]:
+    said, told = answer["said"], answer["told"]
+    late = told and abs(answer["right_delay"]) > max(3.0 * answer["right_delay_sigma"], 0.01)
+    note = f"right camera late by {answer['right_delay']:+.3f} frame periods" if late else answer["reason"]
+    rolls = told and answer["readout_ratio"] > 0.0
+    return {
+        "rig": answer["name"],
+        "left": answer["left"] if told else "cannot tell",
+        "right": answer["right"] if told else "cannot tell",
+        "readout ratio": f"{answer['readout_ratio']:.3f} +- {answer['readout_ratio_sigma']:.3f}" if rolls else "-",
+        "said": "-" if said is None else f"{said['left']}, {said['right']}, {said['readout_ratio']:.2f}",
+        "matches": f"{answer['used']}/{answer['matches']}",
+        "moved (px)": f"{answer['moved_px']:.1f}",
+        "note": note,
+    }
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog=EPILOG)(inspect)
