@@ -1,8 +1,8 @@
 """What `rsbench inspect` tells of rendered frames of built-in scenes, and of cameras that read otherwise.
 
-Renders small sequences that read rows, columns, and rows in opposite directions. More readings come of them without
-rendering: images turned upside down are read from the bottom, mirrored ones from the right, and the global-shutter
-twin of a frame is what a camera without rolling shutter shows.
+Renders small sequences that read rows, columns, and rows in opposite directions. More readings come of them
+without rendering: images turned upside down are read from the bottom, mirrored ones from the right, and the
+global-shutter twin of a frame is what a camera without rolling shutter shows.
 
     python benchmarks/inspect_scenes.py --out DIR
     python benchmarks/inspect_scenes.py --out DIR --rotation 1 --scene castle --scene room
@@ -154,8 +154,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 sys.stdout.flush()
     within = np.mean(np.array(errors) <= ALLOWED) if errors else float("nan")
     sys.stdout.write(
-        f"\n{count} cases: told {told}, rightly {rightly}; of the {len(errors)} readout ratios of cameras that roll "
-        f"{within:.0%} within {ALLOWED}, worst {max(errors, default=float('nan')):.3f}\n"
+        f"\n{count} cases: told {told}, rightly {rightly}; of the {len(errors)} readout ratios of cameras that "
+        f"roll {within:.0%} within {ALLOWED}, worst {max(errors, default=float('nan')):.3f}\n"
     )
     return 0
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -14,7 +14,14 @@ from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.reading import GLOBAL, READINGS, Reading, TimedMatches
-from rsbench.pipeline.reading_fit import LEAST_RATIO, Likelihood, ReadingCost, ReadingFit, fit_reading
+from rsbench.pipeline.reading_fit import (
+    BEYOND_RATIO,
+    LEAST_RATIO,
+    Likelihood,
+    ReadingCost,
+    ReadingFit,
+    fit_reading,
+)
 from rsbench.pipeline.reading_start import Lag, first_shutter
 from rsbench.solvers.engine.each import each_term
 from rsbench.solvers.engine.heavy_tails import heavy_tailed
@@ -23,8 +30,11 @@ _SCREENED = 160
 """Measurements by which most readings are put aside."""
 _CLOSE = 30.0
 """Differences of the logarithm of the likelihood beyond which a reading is put aside after that."""
-_FIRST_SCALES, _FIRST_NU = (3.0, 1.0), 4.0
-"""Scales of the errors, px, from coarse to fine, and their tails, before their distribution is found."""
+_FIRST_SCALE, _FIRST_NU = 3.0, 4.0
+"""Scale of the errors, px, and their tails, before their distribution is found."""
+_FALLS, _STEADY = 10, 0.9
+_UNSETTLED = 5.0
+"""Times as far off as that a reading may be before it is fitted at the scale of the best one."""
 _ROUGHLY = 1e-2
 """Of the squared scale: a decrease of the cost at which the screening stops."""
 _REACH = 10.0
@@ -33,6 +43,7 @@ _TILES = (6, 4)
 """Columns and rows of tiles in which matches may err together."""
 _FIRST_REACH, _MOST_REACH, _LEAST_REACH = 0.02, 0.05, 0.001
 """Differences of the ratio by which the sharpness of a maximum is measured: about two deviations."""
+_ROUNDS = 5
 _WIDE = 1.0
 """Standard deviation of a ratio of which the matches say nothing."""
 
@@ -133,31 +144,45 @@ def window_evidence(
 def _screened(
     timed: TimedMatches, motion: tuple[FloatArray, FloatArray], lag: Lag
 ) -> tuple[dict[Reading, ReadingFit], Likelihood, dict[Reading, float]] | None:
-    """Every reading on some of the matches, and what those put aside lack (``_far``).
-
-    The scale of the errors falls; what is too far off at one scale is further off at the next.
-    """
+    """Every reading on some of the matches, and what those put aside lack (``_far``)."""
     some = np.arange(timed.count) % max(timed.count // _SCREENED, 1) == 0
     theta = timed.packed(GLOBAL, 0.0, 0.0).theta(*motion)
     fits = {reading: _start(reading, theta, first_shutter(reading, lag)) for reading in READINGS}
-    lost: dict[Reading, float] = {}
-    for scale in _FIRST_SCALES:
-        likelihood = Likelihood(nu=_FIRST_NU, scale=scale, chosen=some)
-        fits |= _again(timed, likelihood, [fit for fit in fits.values() if fit.reading not in lost])
-        lost |= _far(fits, scale)
-    best = min((fit for fit in fits.values() if fit.reading not in lost), key=lambda fit: fit.cost)
-    found = _distribution(timed, some, best, _FIRST_SCALES[-1])
-    if found is None:
+    found = {reading: _settled(timed, some, fit) for reading, fit in fits.items()}
+    scale = min(each for _, each in found.values())
+    best = min((fit for fit, each in found.values() if each == scale), key=lambda fit: fit.cost)
+    likelihood = _distribution(timed, some, best, scale)
+    if likelihood is None:
         return None
-    fits |= _again(timed, found, [fit for fit in fits.values() if fit.reading not in lost])
-    return fits, found, lost | _far({key: fit for key, fit in fits.items() if key not in lost}, found.scale)
+    fits = {
+        reading: replace(fit, cost=ReadingCost(timed, reading, likelihood)(fit.theta, fit.shutter))
+        for reading, (fit, _) in found.items()
+    }
+    lost = _far(fits, likelihood.scale, _UNSETTLED * _CLOSE)
+    fits |= _again(timed, likelihood, [fit for fit in fits.values() if fit.reading not in lost])
+    return fits, likelihood, lost | _far(fits, likelihood.scale, _CLOSE)
 
 
-def _far(fits: Mapping[Reading, ReadingFit], scale: float) -> dict[Reading, float]:
+def _settled(timed: TimedMatches, some: BoolArray, fit: ReadingFit) -> tuple[ReadingFit, float]:
+    """A reading at the scale of its own errors, which falls as it is fitted better; and that scale, px.
+
+    At a scale far below the errors that a wrong ratio leaves, matches would count the less the more they tell.
+    """
+    scale = _FIRST_SCALE
+    for _ in range(_FALLS):
+        cost = ReadingCost(timed, fit.reading, Likelihood(nu=_FIRST_NU, scale=scale, chosen=some))
+        fit = fit_reading(cost, fit.theta, fit.shutter, iterations=4, still=_ROUGHLY)
+        last, scale = scale, min(scale, cost.typical_error(fit.theta, fit.shutter))
+        if scale > _STEADY * last:
+            break
+    return fit, scale
+
+
+def _far(fits: Mapping[Reading, ReadingFit], scale: float, far: float) -> dict[Reading, float]:
     """Log-likelihood, below the best one's, of the readings that are put aside; never of the global one."""
     least = min(fit.cost for fit in fits.values())
     below = {reading: (fit.cost - least) / scale**2 for reading, fit in fits.items() if reading != GLOBAL}
-    return {reading: value for reading, value in below.items() if value > _CLOSE}
+    return {reading: value for reading, value in below.items() if value > far}
 
 
 def _start(reading: Reading, theta: FloatArray, shutter: FloatArray) -> ReadingFit:
@@ -190,17 +215,23 @@ class _Slope:
 
     def __init__(self, cost: ReadingCost, start: ReadingFit) -> None:
         self._cost, self.scale = cost, cost.likelihood.scale
-        self.best = fit_reading(cost, start.theta, start.shutter)
+        free = fit_reading(cost, start.theta, start.shutter)
+        # Once more as those beside it are found, or a start that is less settled than they looks like a valley.
+        self.best = fit_reading(cost, free.theta, free.shutter, hold_ratio=True)
         self.least, self.at, self.curvature = self.best.cost, 0.0, 0.0
         self._beside: tuple[ReadingFit, ReadingFit] = (self.best, self.best)
         if not cost.reading.rolls:
             return
         reach = _FIRST_REACH
-        for _ in range(2):
+        for _ in range(_ROUNDS):
             self._measure(reach)
             sigma = cost.likelihood.scale / np.sqrt(max(self.curvature, 1e-12))
-            if 0.5 * reach <= 2.0 * sigma <= 2.0 * reach:
+            away = float(np.clip(self.at, LEAST_RATIO, BEYOND_RATIO)) - self.best.shutter[0]
+            fits = 0.5 * reach <= 2.0 * sigma <= 2.0 * reach or reach in (_LEAST_REACH, _MOST_REACH)
+            if fits and abs(away) <= reach:
                 break
+            if abs(away) > reach:
+                self.best = self._held(self.best.shutter[0] + away)
             reach = float(np.clip(2.0 * sigma, _LEAST_REACH, _MOST_REACH))
 
     def _measure(self, reach: float) -> None:
@@ -209,8 +240,6 @@ class _Slope:
         steps = (-reach, reach)
         if ratio - reach < LEAST_RATIO:
             steps = (reach, 2.0 * reach)
-        elif ratio + reach > 1.0:
-            steps = (-2.0 * reach, -reach)
         beside = [self._held(ratio + step) for step in steps]
         lifts = [fit.cost - self.best.cost for fit in beside]
         matrix = [[step, 0.5 * step**2] for step in steps]

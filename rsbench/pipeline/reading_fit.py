@@ -17,15 +17,21 @@ from rsbench.solvers.engine.heavy_tails import HeavyTailed
 
 LEAST_RATIO = 0.05
 """Readout ratios below this are taken for a global shutter's."""
+BEYOND_RATIO = 1.2
+"""No ratio is beyond 1, but the top of what noise makes of one near 1 may be."""
 DELAY_SIGMA = 0.3
 """Frame periods by which a right camera is late or early: what is expected before the matches are seen."""
 _MAX_TRANSLATION_M = 50.0
 _DIFFERENCE = 0.002
 """A time that moves points by a fraction of their noise, far above rounding."""
-_LEAST, _MOST = np.array([LEAST_RATIO, -1.0]), np.array([1.0, 1.0])
+_LEAST, _MOST = np.array([LEAST_RATIO, -1.0]), np.array([BEYOND_RATIO, 1.0])
+"""Of ratio and delay."""
 _LONGEST_STEP = 0.4
-_LARGEST_DAMPING = 1e6
+_LEAST_DAMPING, _LARGEST_DAMPING = 1e-8, 1e6
+"""A motion makes up for most of a wrong ratio: more damping than this would hold the ratio where it is."""
 _MOTION = 6
+_MEDIAN, _LEAST_SCALE_PX = 0.6, 0.02
+"""Median of squared normal errors, one or five together; and what exact matches are taken for."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,6 +84,12 @@ class ReadingCost:
         factor = 0.5 * tailed.scale**2 * tailed.trust * (tailed.nu + tailed.freedom)
         return np.asarray(factor * np.log1p(squares / (tailed.nu * tailed.scale**2)))
 
+    def typical_error(self, theta: FloatArray, shutter: FloatArray) -> float:
+        """Scale of the errors, px, that their median shows: up to half of them may be wrong."""
+        tailed = self.tailed(shutter)
+        squares = np.concatenate([tailed.pair_residuals(theta) ** 2, tailed.track_squares(theta)])
+        return max(float(np.sqrt(np.median(squares / tailed.freedom) / _MEDIAN)), _LEAST_SCALE_PX)
+
     def __call__(self, theta: FloatArray, shutter: FloatArray) -> float:
         return float(np.sum(self.each(theta, shutter))) + 0.5 * self._prior * float(shutter[1]) ** 2
 
@@ -121,7 +133,7 @@ def fit_reading(
     rolls = cost.reading.rolls
     shutter = np.clip(shutter, _LEAST, _MOST) if rolls else np.array([0.0, np.clip(shutter[1], -1.0, 1.0)])
     free = [0, 1] if rolls and not hold_ratio else [1]
-    now, damping = cost(theta, shutter), 1e-4
+    now, damping = cost(theta, shutter), _LEAST_DAMPING
     gradient, H = cost.local(theta, shutter, free)
     for _ in range(iterations):
         before = now
@@ -130,7 +142,7 @@ def fit_reading(
             trial = cost(*moved)
             if trial <= now:
                 (theta, shutter), now = moved, trial
-                damping = max(0.1 * damping, 1e-8)
+                damping = max(0.1 * damping, _LEAST_DAMPING)
                 break
             damping *= 10.0
         if before - now < still * cost.likelihood.scale**2:
