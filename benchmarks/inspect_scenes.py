@@ -32,7 +32,17 @@ from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.inspection import conclude, inspect_window
 from rsbench.pipeline.reading import Reading
 
-SCENES = {"castle": 1.0, "old-town": 1.0, "room": 0.4, "street": 1.0, "corridor": 0.5, "shelves": 0.6}
+SCENES = {
+    "castle": 1.0,
+    "corridor": 0.5,
+    "forest": 0.5,
+    "old-town": 1.0,
+    "poles": 0.6,
+    "room": 0.4,
+    "shelves": 0.6,
+    "street": 1.0,
+    "terrain": 6.0,
+}
 """With the scale of their translation, as in the card `standard`."""
 RATIO, ALLOWED = 0.8, 0.03
 COLUMNS = ("sequence", "true", "told", "readout ratio", "matches", "noise (px)", "verdict")
@@ -133,8 +143,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     where.add_argument("--out", type=Path, help="folder of the datasets; rendered where they lack")
     where.add_argument("--data", type=Path, help="dataset of rows read from the top instead")
     parser.add_argument("--rotation", type=float, default=2.0, help="degrees per frame period")
-    parser.add_argument("--size", type=int, default=320, help="width of the images, px")
-    parser.add_argument("--scene", action="append", help="repeatable; default: six of the built-in ones")
+    parser.add_argument("--size", type=int, default=640, help="width of the images, px")
+    parser.add_argument("--scene", action="append", help="repeatable; default: all nine built-in ones")
     parser.add_argument("--only", default="", help="sequences whose name holds this")
     given = parser.parse_args(arguments)
     folders = {"rows": given.data} if given.data else {name: given.out / name for name in SCANS}
