@@ -54,13 +54,13 @@ def find_lag(tracks: FloatArray, rig: StereoRig) -> Lag:
     moved = 0.5 * (tracks[:, 5] - tracks[:, 1] + tracks[:, 7] - tracks[:, 3])
     A = np.concatenate([moved[:, None] * _columns(tracks[:, k : k + 2], rig) for k in (0, 4)])
     e = np.concatenate([tracks[:, 1] - tracks[:, 3], tracks[:, 5] - tracks[:, 7]])
-    line = _sampled(A, e)
+    line, H = _sampled(A, e), prior
     for _ in range(_ROUNDS):
         left = e - A @ line
         scale = max(1.4826 * float(np.median(np.abs(left))), _LEAST_PX)
         weights = 1.0 / (1.0 + (left / (2.0 * scale)) ** 2) ** 2 / scale**2
         H = (A * weights[:, None]).T @ A + prior
-        line = np.linalg.solve(H, A.T @ (weights * e))
+        line = np.asarray(np.linalg.solve(H, A.T @ (weights * e)), dtype=np.float64)
     return Lag(line, H)
 
 
@@ -99,7 +99,7 @@ def find_start(
     """The motion that explains most matches, of those under ``COARSE``; None when there is none."""
     lag = find_lag(matches.tracks, rig)
     taken = with_lag_taken(matches, lag, rig)
-    camera, found = rig.camera, []
+    camera, found = rig.camera, list[RobustEstimate]()
     for scan, ratio in COARSE:
         shutter = RollingShutter(height=camera.height, width=camera.width, readout_ratio=ratio, scan=scan)
         with np.errstate(invalid="ignore", over="ignore"):

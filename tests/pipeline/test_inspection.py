@@ -13,10 +13,11 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.lens import Lens
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.pipeline.inspection import Inspection, conclude, inspect_window
 from rsbench.pipeline.reading import READINGS, Reading, TimedMatches, reading_line, reading_of
-from rsbench.pipeline.reading_evidence import LEAST_RATIO, Peak, _product
+from rsbench.pipeline.reading_evidence import Peak, _product
+from rsbench.pipeline.reading_fit import LEAST_RATIO
 from rsbench.pipeline.reading_start import find_lag, first_shutter
 from rsbench.solvers.engine.packed import pack
 
@@ -26,7 +27,7 @@ MOTION = LinearMotion(w=np.radians([1.2, -0.7, 1.5]), d=[0.1, -0.15, 0.1])
 STILL = LinearMotion(w=[0.0, 0.0, 0.0], d=[0.0, 0.0, 0.0])
 
 
-def shutter(scan: str, right: str, ratio: float, delay: float = 0.0) -> RollingShutter:
+def shutter(scan: Scan, right: Scan, ratio: float, delay: float = 0.0) -> RollingShutter:
     return RollingShutter(
         height=480, width=640, readout_ratio=ratio, scan=scan, right_scan=right, right_delay=delay
     )
@@ -44,7 +45,7 @@ def inspected(given: Correspondences) -> Inspection:
 
 
 @pytest.mark.parametrize(("scan", "right", "delay"), [("left", "left", 0.0), ("top", "right", 0.1)])
-def test_camera_direction_and_ratio_are_told(scan: str, right: str, delay: float) -> None:
+def test_camera_direction_and_ratio_are_told(scan: Scan, right: Scan, delay: float) -> None:
     found = inspected(matches(shutter(scan, right, 0.7, delay)))
     assert found.told, found.reason
     best = found.best
@@ -94,7 +95,7 @@ def test_what_moves_along_its_rows_does_not_show_their_readout() -> None:
 
 @pytest.mark.parametrize("lens", [None, Lens(model="brown-conrady", k1=-0.1)])
 @pytest.mark.parametrize(("scan", "right"), [("top", "bottom"), ("left", "top"), ("right", "right")])
-def test_times_are_those_of_the_shutter(lens: Lens | None, scan: str, right: str) -> None:
+def test_times_are_those_of_the_shutter(lens: Lens | None, scan: Scan, right: Scan) -> None:
     """Against the packing for a known shutter; 1e-12: sums of a few numbers near 1."""
     camera = PinholeCamera(width=640, height=480, fx=600.0, fy=590.0, cx=310.0, cy=250.0, lens=lens)
     rig, known = StereoRig(camera=camera, baseline=0.4), shutter(scan, right, 0.6, 0.05)
@@ -126,7 +127,9 @@ def test_a_global_camera_reads_everything_at_once() -> None:
 @pytest.mark.parametrize("reading", [Reading("top", "bottom"), Reading("left", "right"), Reading("right", "top")])
 def test_row_differences_show_how_times_differ(reading: Reading) -> None:
     """To 0.1: that the flow itself changes while it is read is left out, a few hundredths of it at 2 deg."""
-    tracks = matches(shutter(reading.left, reading.right, 0.7), noise=0.0).tracks
+    assert reading.left != "global" and reading.right != "global"
+    scan, right = reading.left, reading.right
+    tracks = matches(shutter(scan, right, 0.7), noise=0.0).tracks
     lag = find_lag(tracks, RIG)
     expected = 0.7 * (reading_line(reading, "left") - reading_line(reading, "right"))
     np.testing.assert_allclose(lag.line, expected, atol=0.1)
