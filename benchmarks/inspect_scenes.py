@@ -30,7 +30,7 @@ from rsbench.dataset.sequence import read_dataset
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.inspection import conclude, inspect_window
-from rsbench.pipeline.reading import Reading
+from rsbench.pipeline.scan_reading import Reading
 
 SCENES = {
     "castle": 1.0,

@@ -240,7 +240,7 @@ def _record(case: _Case, found: Inspection) -> dict[str, Any]:
 
 
 def _said(shutter: RollingShutter | None) -> dict[str, Any] | None:
-    from rsbench.pipeline.reading import reading_of
+    from rsbench.pipeline.scan_reading import reading_of
 
     if shutter is None:
         return None

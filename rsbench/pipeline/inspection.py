@@ -18,10 +18,10 @@ from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.joining import join_stereo
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.reading import GLOBAL, READINGS, Reading
 from rsbench.pipeline.reading_evidence import Hypothesis, Peak, WindowEvidence, combined, window_evidence
 from rsbench.pipeline.reading_start import find_start
 from rsbench.pipeline.robust_motion import RobustOptions
+from rsbench.pipeline.scan_reading import GLOBAL, READINGS, Reading
 from rsbench.solvers.refined import RefinedSolver
 
 CERTAIN = 0.95

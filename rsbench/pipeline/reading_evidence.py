@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.reading import GLOBAL, READINGS, Reading, TimedMatches
 from rsbench.pipeline.reading_fit import (
     BEYOND_RATIO,
     LEAST_RATIO,
@@ -23,6 +22,7 @@ from rsbench.pipeline.reading_fit import (
     fit_reading,
 )
 from rsbench.pipeline.reading_start import Lag, first_shutter
+from rsbench.pipeline.scan_reading import GLOBAL, READINGS, Reading, TimedMatches
 from rsbench.solvers.engine.each import each_term
 from rsbench.solvers.engine.heavy_tails import heavy_tailed
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from rsbench.core.correspondences import BoolArray
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.reading import Reading, TimedMatches
+from rsbench.pipeline.scan_reading import Reading, TimedMatches
 from rsbench.solvers.engine.heavy_tails import HeavyTailed
 
 LEAST_RATIO = 0.05

@@ -15,8 +15,8 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.reading import Reading, reading_line
 from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions, estimate_motion
+from rsbench.pipeline.scan_reading import Reading, reading_line
 from rsbench.solvers.refined import RefinedSolver
 
 COARSE: tuple[tuple[Scan, float], ...] = (
