@@ -207,17 +207,17 @@ def _frame_windows(left: FrameSource, right: FrameSource, rig: StereoRig, option
 
 def _record(case: _Case, found: Inspection) -> dict[str, Any]:
     """What JSON says of one rig; what is not told is null."""
-    best = found.best if found.told else None
+    named, best = (found.best if known else None for known in (found.named, found.told))
     return {
         "name": case.name,
         "told": found.told,
-        "left": None if best is None else best.reading.left,
-        "right": None if best is None else best.reading.right,
+        "left": None if named is None else named.reading.left,
+        "right": None if named is None else named.reading.right,
         "readout_ratio": None if best is None else best.ratio,
         "readout_ratio_sigma": None if best is None else best.sigma,
         "right_delay": None if best is None else best.delay,
         "right_delay_sigma": None if best is None else best.delay_sigma,
-        "probability": None if best is None else best.probability,
+        "probability": None if named is None else named.probability,
         "reason": found.reason,
         "candidates": [
             {
@@ -269,12 +269,14 @@ def _row(answer: dict[str, Any]) -> dict[str, str]:
     said, told = answer["said"], answer["told"]
     late = told and abs(answer["right_delay"]) > max(3.0 * answer["right_delay_sigma"], 0.01)
     note = f"right camera late by {answer['right_delay']:+.3f} frame periods" if late else answer["reason"]
-    rolls = told and answer["readout_ratio"] > 0.0
+    ratio = "-" if {answer["left"], answer["right"]} == {"global"} else "cannot tell"
+    if told and answer["readout_ratio"] > 0.0:
+        ratio = f"{answer['readout_ratio']:.3f} +- {answer['readout_ratio_sigma']:.3f}"
     return {
         "rig": answer["name"],
-        "left": answer["left"] if told else "cannot tell",
-        "right": answer["right"] if told else "cannot tell",
-        "readout ratio": f"{answer['readout_ratio']:.3f} +- {answer['readout_ratio_sigma']:.3f}" if rolls else "-",
+        "left": answer["left"] or "cannot tell",
+        "right": answer["right"] or "cannot tell",
+        "readout ratio": ratio,
         "said": "-" if said is None else f"{said['left']}, {said['right']}, {said['readout_ratio']:.2f}",
         "matches": f"{answer['used']}/{answer['matches']}",
         "moved (px)": f"{answer['moved_px']:.1f}",

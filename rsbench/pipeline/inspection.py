@@ -60,6 +60,8 @@ class Inspection:
     """The most probable first; those below one in a hundred are left out."""
     reason: str
     """Why it cannot be told; empty where it is."""
+    named: bool
+    """Whether it is known which camera rolls and from where, though perhaps not how fast."""
     windows: int
     """Pairs of times that it rests on."""
     matches: int
@@ -136,6 +138,7 @@ def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA) -> Inspect
         return Inspection(
             candidates=(),
             reason=windows[0].reason,
+            named=False,
             windows=0,
             matches=matches,
             used=0,
@@ -152,9 +155,11 @@ def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA) -> Inspect
     )
     models = sorted({model for model, _ in peaks})
     kept = sum(window.used for window in used)
+    share = kept / sum(window.of for window in used)
     return Inspection(
         candidates=tuple(each for each in candidates if each.probability >= _UNLIKELY),
-        reason=_doubt(candidates, kept / sum(window.of for window in used), moved, max_sigma),
+        reason=_doubt(candidates, share, moved, max_sigma),
+        named=share >= _LEAST_SHARE and candidates[0].probability >= CERTAIN,
         windows=len(used),
         matches=matches,
         used=kept,

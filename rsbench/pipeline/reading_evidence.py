@@ -30,8 +30,8 @@ _SCREENED = 160
 """Measurements by which most readings are put aside."""
 _CLOSE = 30.0
 """Differences of the logarithm of the likelihood beyond which a reading is put aside after that."""
-_FIRST_SCALE, _FIRST_NU = 3.0, 4.0
-"""Scale of the errors, px, and their tails, before their distribution is found."""
+_MOST_SCALE, _FIRST_NU = 10.0, 4.0
+"""Scale of the errors, px, at most, and their tails, before their distribution is found."""
 _FALLS, _STEADY = 10, 0.9
 _UNSETTLED = 5.0
 """Times as far off as that a reading may be before it is fitted at the scale of the best one."""
@@ -124,9 +124,9 @@ def window_evidence(
         for model in motion_models
         for reading, fit in close.items()
     }
-    least = min(slope.least for slope in slopes.values())
+    least = min(slope.best.cost for slope in slopes.values())
     rolling = [slope for (_, reading), slope in slopes.items() if reading.rolls]
-    sharp = min(rolling, key=lambda slope: slope.least, default=None)
+    sharp = min(rolling, key=lambda slope: slope.best.cost, default=None)
     dispersion = 1.0 if sharp is None else _dispersion(sharp, first.pixels[full.chosen])
     peaks = {key: slope.peak(least, full.scale**2 * dispersion) for key, slope in slopes.items()}
     for model, (reading, value) in product(motion_models, lost.items()):
@@ -147,8 +147,12 @@ def _screened(
     """Every reading on some of the matches, and what those put aside lack (``_far``)."""
     some = np.arange(timed.count) % max(timed.count // _SCREENED, 1) == 0
     theta = timed.packed(GLOBAL, 0.0, 0.0).theta(*motion)
-    fits = {reading: _start(reading, theta, first_shutter(reading, lag)) for reading in READINGS}
-    found = {reading: _settled(timed, some, fit) for reading, fit in fits.items()}
+    found = {GLOBAL: _settled(timed, some, _start(GLOBAL, theta, first_shutter(GLOBAL, lag)))}
+    still = found[GLOBAL][0]
+    for reading in READINGS[1:]:
+        starts = [_start(reading, theta, first_shutter(reading, lag)), _start(reading, still.theta, still.shutter)]
+        # The second is nearly the global one, which any reading with a small ratio is.
+        found[reading] = min((_settled(timed, some, start) for start in starts), key=lambda each: each[1])
     scale = min(each for _, each in found.values())
     best = min((fit for fit, each in found.values() if each == scale), key=lambda fit: fit.cost)
     likelihood = _distribution(timed, some, best, scale)
@@ -168,10 +172,11 @@ def _settled(timed: TimedMatches, some: BoolArray, fit: ReadingFit) -> tuple[Rea
 
     At a scale far below the errors that a wrong ratio leaves, matches would count the less the more they tell.
     """
-    scale = _FIRST_SCALE
+    cost = ReadingCost(timed, fit.reading, Likelihood(nu=_FIRST_NU, scale=_MOST_SCALE, chosen=some))
+    scale = min(cost.typical_error(fit.theta, fit.shutter), _MOST_SCALE)
     for _ in range(_FALLS):
         cost = ReadingCost(timed, fit.reading, Likelihood(nu=_FIRST_NU, scale=scale, chosen=some))
-        fit = fit_reading(cost, fit.theta, fit.shutter, iterations=4, still=_ROUGHLY)
+        fit = fit_reading(cost, fit.theta, fit.shutter, iterations=6, still=_ROUGHLY)
         last, scale = scale, min(scale, cost.typical_error(fit.theta, fit.shutter))
         if scale > _STEADY * last:
             break
@@ -235,21 +240,15 @@ class _Slope:
             reach = float(np.clip(2.0 * sigma, _LEAST_REACH, _MOST_REACH))
 
     def _measure(self, reach: float) -> None:
-        """Top and curvature of the parabola through three ratios, the best one and two on possible sides of it."""
-        ratio = self.best.shutter[0]
-        steps = (-reach, reach)
-        if ratio - reach < LEAST_RATIO:
-            steps = (reach, 2.0 * reach)
-        beside = [self._held(ratio + step) for step in steps]
-        lifts = [fit.cost - self.best.cost for fit in beside]
-        matrix = [[step, 0.5 * step**2] for step in steps]
-        slope, curvature = np.linalg.solve(matrix, lifts)
-        self._beside = (beside[0], beside[1])
+        """Top and curvature of the parabola through three ratios, the best one and one on either side of it."""
+        ratio = float(self.best.shutter[0])
+        below, above = self._beside = (self._held(ratio - reach), self._held(ratio + reach))
+        slope = (above.cost - below.cost) / (2.0 * reach)
+        curvature = (above.cost - 2.0 * self.best.cost + below.cost) / reach**2
         self.curvature = max(float(curvature), 1e-9)
         away = float(np.clip(-slope / self.curvature, -_WIDE, _WIDE)) if curvature > 0.0 else 0.0
-        self.at = float(ratio + away)
-        # The parabola has its top at the fit, but where the fit is at an end of what is possible.
-        self.least = self.best.cost - (0.5 * self.curvature * away**2 if steps[0] * steps[1] > 0.0 else 0.0)
+        self.at = ratio + away
+        self.least = self.best.cost - 0.5 * self.curvature * away**2
 
     def _held(self, ratio: float) -> ReadingFit:
         shutter = np.array([ratio, self.best.shutter[1]])

@@ -131,8 +131,8 @@ def fit_reading(
         hold_ratio: whether the ratio stays as it is.
     """
     rolls = cost.reading.rolls
-    shutter = np.clip(shutter, _LEAST, _MOST) if rolls else np.array([0.0, np.clip(shutter[1], -1.0, 1.0)])
     free = [0, 1] if rolls and not hold_ratio else [1]
+    shutter = _within(shutter * (1.0 if rolls else (0.0, 1.0)), free)
     now, damping = cost(theta, shutter), _LEAST_DAMPING
     gradient, H = cost.local(theta, shutter, free)
     for _ in range(iterations):
@@ -177,6 +177,11 @@ def _stepped(
     shutter[free] += np.clip(step[_MOTION:], -_LONGEST_STEP, _LONGEST_STEP)
     length = float(np.linalg.norm(theta[3:]))
     theta[3:] *= min(1.0, _MAX_TRANSLATION_M / max(length, _MAX_TRANSLATION_M))
-    for j in free:
-        shutter[j] = np.clip(shutter[j], _LEAST[j], _MOST[j])
-    return theta, shutter
+    return theta, _within(shutter, free)
+
+
+def _within(shutter: FloatArray, free: list[int]) -> FloatArray:
+    """With those that are free within their limits."""
+    out = shutter.copy()
+    out[free] = np.clip(shutter[free], _LEAST[free], _MOST[free])
+    return out

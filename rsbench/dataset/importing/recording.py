@@ -1,0 +1,46 @@
+"""What any layout comes down to: images, cameras, and as far as it says, times, poses, depth and disparity.
+
+All in the conventions of rsbench: the centre of the top-left pixel is (0, 0), x right, y down, z forward, depth is
+z in the camera of the pixel's own row, poses are ``cam_from_world``. What a layout lacks is None or missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.rig import Side, View
+from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+
+PoseAt = Callable[[FloatArray], Pose]
+"""``cam_from_world`` (..., 3, 3), (..., 3) at times (...), frame periods; NaN where it is not known."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Recording:
+    """The images of one or two cameras over time."""
+
+    name: str
+    cameras: Mapping[Side, PinholeCamera]
+    images: Mapping[View, Path]
+    shutters: Mapping[Side, RollingShutter] = field(default_factory=dict)
+    """Of the cameras whose readout is known; a global one has the ratio 0."""
+    frame_period_s: float | None = None
+    right_from_left: Pose | None = None
+    """Between the cameras; a rectified pair has no rotation and minus the baseline along x."""
+    poses: Mapping[Side, PoseAt] = field(default_factory=dict)
+    depths: Mapping[View, Callable[[], FloatArray]] = field(default_factory=dict)
+    """(H, W) z, metres, 0 where there is none; read when asked for."""
+    disparities: Mapping[View, Callable[[], FloatArray]] = field(default_factory=dict)
+    """(H, W) px, such that ``fx baseline / disparity`` is z; NaN where there is none."""
+    notes: tuple[str, ...] = ()
+    """What the layout leaves open, and how it was taken."""
+
+    @property
+    def frames(self) -> int:
+        """Times at which there is an image."""
+        return 1 + max((frame for _, frame in self.images), default=-1)
