@@ -71,8 +71,15 @@ def evaluate(
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each solver, with other RANSAC samples.")] = 1,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
     rehash: Annotated[bool, typer.Option("--rehash", help="Read all data again, not only what changed.")] = False,
+    layout: Annotated[
+        str | None,
+        typer.Option("--from", metavar="LAYOUT", help="DIR is of others: carla-rs, colmap, euroc, kitti, ..."),
+    ] = None,
 ) -> None:
     """Pose, depth and correction against the truth of a dataset, with a report."""
+    if layout is not None:
+        _evaluate_others(folder, out, layout, matcher, seed)
+        return
     from rsbench.benchmark.images.plan import EvaluationOptions
 
     options = EvaluationOptions(
@@ -89,6 +96,29 @@ def evaluate(
         rehash=rehash,
     )
     evaluate_dataset(folder, out, options, f"rsbench evaluate {folder} --out {out}")
+
+
+def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, seed: int) -> None:
+    """Depth of pairs with disparities, and motion of one camera with poses: two tables."""
+    from rsbench.benchmark.others import depth_scores, pose_scores
+    from rsbench.cli.console import print_table
+    from rsbench.dataset.importing.formats import read_others
+    from rsbench.errors import RsbenchError
+    from rsbench.vision.stereo_matcher import load_matcher
+
+    recordings = read_others(folder, layout)
+    tables = {
+        "depth": depth_scores(recordings, load_matcher(matcher)),
+        "pose": pose_scores(recordings, seed),
+    }
+    if all(table.empty for table in tables.values()):
+        raise RsbenchError(f"{folder}: has neither pairs with disparities nor successive frames with poses")
+    (out / "scores").mkdir(parents=True, exist_ok=True)
+    for name, table in tables.items():
+        if not table.empty:
+            table.to_csv(out / "scores" / f"{name}.csv", index=False)
+            print_table(name, table)
+    typer.echo(f"scores: {(out / 'scores').resolve()}")
 
 
 UNPUBLISHED = (

@@ -16,7 +16,9 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench verify data/paper --stride 4 --rerender no     [dim](in a hurry)[/dim]
 
-  rsbench verify data/mine --scene my/scene.toml --rerender all"""
+  rsbench verify data/mine --scene my/scene.toml --rerender all
+
+  rsbench verify Carla-RS/test --from carla-rs     [dim](a layout of others: rsbench docs others)[/dim]"""
 
 
 class Rerender(StrEnum):
@@ -39,9 +41,17 @@ def verify(
             help="Card, or moving mesh, that is not rsbench's own; repeatable.", autocompletion=complete("scenes")
         ),
     ] = None,
+    layout: Annotated[
+        str | None,
+        typer.Option("--from", metavar="LAYOUT", help="DIR is of others: carla-rs, colmap, euroc, kitti, ..."),
+    ] = None,
 ) -> None:
     """Check files and lists, poses, all depth maps and images against each other, and rows rendered again."""
     import pandas as pd
+
+    if layout is not None:
+        _verify_others(folder, layout)
+        return
 
     from rsbench.cli.console import print_table, progress_bar, say
     from rsbench.dataset.files import read_json
@@ -71,6 +81,32 @@ def verify(
     for fault in faults:
         typer.echo(f"fault: {fault}", err=True)
     typer.echo(f"{folder}: {sum(report.name != DATASET for report in reports)} sequences, {len(faults)} faults")
+    if faults:
+        raise typer.Exit(1)
+
+
+def _verify_others(folder: Path, layout: str) -> None:
+    """Files, sizes, depth under poses and row times, and disparities, as far as a layout has them."""
+    from rsbench.cli.console import print_rows, say
+    from rsbench.dataset.importing.check import agreements, disparity_faults, file_faults
+    from rsbench.dataset.importing.formats import read_others
+
+    recordings, faults, rows = read_others(folder, layout), list[str](), list[list[str]]()
+    for recording in recordings:
+        for note in recording.notes:
+            say(f"{recording.name}: {note}")
+        found = [*file_faults(recording), *disparity_faults(recording)]
+        for each in agreements(recording):
+            found += [each.fault] if each.fault else []
+            share, typical = f"{100 * each.share:.2f}", f"{each.typical:.1e}"
+            rows.append([recording.name, each.side, *map(str, each.frames), str(each.pixels), share, typical])
+        faults += [f"{recording.name}: {fault}" for fault in found]
+    if rows:
+        columns = ["recording", "camera", "depth of", "against", "pixels", "agree (%)", "typical difference"]
+        print_rows("Depth agreement between frames (relative tolerance 1e-2)", columns, rows, right=columns[4:])
+    for fault in faults:
+        typer.echo(f"fault: {fault}", err=True)
+    typer.echo(f"{folder}: {len(recordings)} recordings, {len(faults)} faults")
     if faults:
         raise typer.Exit(1)
 

@@ -19,7 +19,7 @@ from rsbench.pipeline.footage import read_frame
 _ROWS = 30
 """Steps to the row that sees a point; each leaves readout ratio times speed, rows per row, of the error."""
 _TOLERANCE = 0.01
-"""Relative difference of depths that agree: depth of text has four decimals, and is interpolated between pixels."""
+"""Relative difference of depths that agree: text has four decimals, and depth is interpolated between pixels."""
 _TYPICAL = 2e-3
 """Median of the relative differences, at most: wrong poses, times or kinds of depth leave more."""
 _SHARE = 0.8

@@ -3,8 +3,8 @@
 ``mav0/cam0/sensor.yaml`` holds ``T_BS``, which takes the sensor's coordinates to the body's, ``data.csv`` times in
 nanoseconds and file names; poses are those of the body, p and q = (w, x, y, z), in ``mocap0`` or
 ``state_groundtruth_estimate0``. Times are whole numbers: as floats they would lose 256 ns. The layout says nothing
-of a rolling shutter: TUM RS-VI's line delay (29.4737 us of camera 1; camera 0 is global) is given beside it, and its
-times are taken for those of the first row.
+of a rolling shutter: TUM RS-VI's line delay (29.4737 us of camera 1; camera 0 is global) is given beside it, and
+its times are taken for those of the first row.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Rectified stereo with disparities: Middlebury (2014 and 2021) and KITTI (stereo 2012 and 2015).
 
-Middlebury: a scene is a folder with ``im0.png``, ``im1.png``, ``calib.txt`` and ``disp0.pfm``. Its principal points
-may differ by ``doffs``: z = baseline f / (d + doffs); lengths are millimetres; a PFM begins with its lowest row, and
-unknown disparities are infinite.
+Middlebury: a scene is a folder with ``im0.png``, ``im1.png``, ``calib.txt`` and ``disp0.pfm``. Its principal
+points may differ by ``doffs``: z = baseline f / (d + doffs); lengths are millimetres; a PFM begins with its lowest
+row, and unknown disparities are infinite.
 
 KITTI: a folder with ``image_2``, ``image_3`` (or 0 and 1, grey), ``disp_occ_0`` (or ``disp_occ``) and
 ``calib_cam_to_cam`` (or ``calib``). Disparities are 16 bits, 256 to the pixel, 0 unknown; the baseline is what the
