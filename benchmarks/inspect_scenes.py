@@ -166,8 +166,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 sys.stdout.flush()
     told = np.array([error for error in errors if np.isfinite(error)])
     sys.stdout.write(
-        f"\n{len(verdicts)} cases: named rightly {verdicts.count('right')}, wrongly {verdicts.count('WRONG')}, not "
-        f"{verdicts.count('cannot tell')}; readout ratio told of {len(told)} of the {len(errors)} that roll, "
+        f"\n{len(verdicts)} cases: named rightly {verdicts.count('right')}, wrongly {verdicts.count('WRONG')}, "
+        f"not {verdicts.count('cannot tell')}; readout ratio told of {len(told)} of the {len(errors)} that roll, "
         f"{np.sum(told <= ALLOWED)} of them within {ALLOWED}, worst {np.max(told, initial=0.0):.3f}\n"
     )
     return 0

@@ -102,10 +102,12 @@ def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, seed: i
     """Depth of pairs with disparities, and motion of one camera with poses: two tables."""
     from rsbench.benchmark.others import depth_scores, pose_scores
     from rsbench.cli.console import print_table
+    from rsbench.dataset.files import check_out, write_table
     from rsbench.dataset.importing.formats import read_others
     from rsbench.errors import RsbenchError
     from rsbench.vision.stereo_matcher import load_matcher
 
+    check_out(out)
     recordings = read_others(folder, layout)
     tables = {
         "depth": depth_scores(recordings, load_matcher(matcher)),
@@ -113,10 +115,10 @@ def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, seed: i
     }
     if all(table.empty for table in tables.values()):
         raise RsbenchError(f"{folder}: has neither pairs with disparities nor successive frames with poses")
-    (out / "scores").mkdir(parents=True, exist_ok=True)
     for name, table in tables.items():
         if not table.empty:
-            table.to_csv(out / "scores" / f"{name}.csv", index=False)
+            (out / "scores").mkdir(parents=True, exist_ok=True)
+            write_table(out / "scores" / f"{name}.csv", table)
             print_table(name, table)
     typer.echo(f"scores: {(out / 'scores').resolve()}")
 

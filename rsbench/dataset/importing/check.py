@@ -97,7 +97,7 @@ def _agreement(recording: Recording, side: Side, first: int, second: int) -> Agr
     pixels = np.stack([x[seen], y[seen]], axis=-1)
     in_camera = depth[seen][:, None] * camera.unproject(pixels)
     world = transform(inverse(pose_at(shutter.pixel_time(pixels, first, side))), in_camera)
-    landed = pixels
+    landed, points = pixels, world
     for _ in range(_ROWS):
         points = transform(pose_at(shutter.pixel_time(landed, second, side)), world)
         moved = camera.project(points)

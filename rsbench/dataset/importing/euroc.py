@@ -129,7 +129,7 @@ def _trajectory(root: Path, start_ns: int, period_s: float) -> PoseAt | None:
     path = next((root / name / "data.csv" for name in _POSES if (root / name / "data.csv").is_file()), None)
     if path is None:
         return None
-    stamps, rows = [], []
+    stamps, rows = list[float](), list[tuple[FloatArray, FloatArray]]()
     for where, line in lines(path):
         stamp, _, rest = line.partition(",")
         if not stamp.strip().isdigit():

@@ -14,6 +14,7 @@ Neither says when a row was read, and no shutter is made up for it.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +22,7 @@ import cv2
 import numpy as np
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.rig import View
+from rsbench.core.rig import SIDES, View
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.importing.recording import Recording
@@ -52,8 +53,9 @@ def _middlebury(folder: Path) -> Recording:
     offset = float(numbers(said["doffs"], path, 1)[0]) if "doffs" in said else float(K1[0, 2] - K0[0, 2])
     left, right = (_camera(K, int(width), int(height), path) for K in (K0, K1))
     images: dict[View, Path] = {("left", 0): folder / "im0.png", ("right", 0): folder / "im1.png"}
-    disparities = {}
-    for view, name in ((("left", 0), "disp0.pfm"), (("right", 0), "disp1.pfm")):
+    disparities: dict[View, Callable[[], FloatArray]] = {}
+    views: tuple[View, ...] = (("left", 0), ("right", 0))
+    for view, name in zip(views, ("disp0.pfm", "disp1.pfm"), strict=True):
         if (folder / name).is_file():
             disparities[view] = partial(_pfm, folder / name, offset)
     return Recording(
@@ -124,7 +126,7 @@ def _kitti(folder: Path, names: tuple[str, str], truth: str | None, calib: str, 
         matrices.append(numbers(said[key], path, 12).reshape(3, 4))
     files: dict[View, Path] = {
         (side, frame): folder / name / f"{number}_1{frame}.png"
-        for side, name in zip(("left", "right"), names, strict=True)
+        for side, name in zip(SIDES, names, strict=True)
         for frame in (0, 1)
     }
     height, width = read_frame(files["left", 0]).shape[:2]

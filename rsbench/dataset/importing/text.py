@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rsbench.core.so3 import FloatArray
+from rsbench.core.so3 import FloatArray, from_quaternion
 from rsbench.errors import RsbenchError
 from rsbench.reading import read_text
 
@@ -45,11 +45,4 @@ def rotation(q: FloatArray, where: object) -> FloatArray:
     length = float(np.linalg.norm(q))
     if not abs(length - 1.0) < 1e-2:
         raise RsbenchError(f"{where}: quaternion {q.tolist()} has length {length:g}, not 1")
-    w, x, y, z = q / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return from_quaternion(q)
