@@ -157,38 +157,45 @@ class _Pair:
     def __init__(
         self, greys: tuple[F32, F32], camera: MovingCamera, planes: FloatArray, options: LabelOptions, step: float
     ) -> None:
-        self._options = options
-        poses = [camera.row_poses(frame) for frame in FRAMES]
-        axis = camera.shutter.axis(camera.side)
+        self._options, self._camera = options, camera
         self._step = step / max(camera.parallax_px, np.finfo(np.float64).tiny)
         self._rhos = [camera.inverse_depths(planes, frame) for frame in FRAMES]
-        self.costs: list[F32] = []
-        self._places: list[F32] = []
-        self._factors: list[F32] = []
+        axes = (camera.shutter.axis(camera.side),) * 2
+        poses = [camera.row_poses(frame) for frame in FRAMES]
+        self._maps = [landing(camera.rig.camera, poses[f], poses[1 - f], axes) for f in FRAMES]
+        self.costs = [np.zeros_like(rho) for rho in self._rhos]
+        self._pixels = [np.zeros(rho.shape, dtype=np.int32) for rho in self._rhos]
+        """(n, H, W) the other frame's pixel, counted along its rows, at which a layer lands; any if at none."""
+        self._there = [np.zeros_like(rho) for rho in self._rhos]
+        """(n, H, W) its inverse depth there."""
         for frame in FRAMES:
-            maps = landing(camera.rig.camera, poses[frame], poses[1 - frame], (axis, axis))
             comparer = Comparer(greys[frame], options.window)
-            start = np.indices(greys[frame].shape, dtype=np.int32)[0 if axis == 1 else 1]
-            landed = [land_pixels(maps, rho, start) for rho in self._rhos[frame]]
-            self._places.append(np.stack([places for places, _ in landed]))
-            self._factors.append(np.stack([factors for _, factors in landed]))
-            self.costs.append(np.stack([self._unlike(comparer, greys, frame, places) for places, _ in landed]))
+            for k, rho in enumerate(self._rhos[frame]):
+                places, factors = self._landed(frame, rho)
+                self.costs[frame][k] = self._unlike(comparer, greys, frame, places)
+                self._pixels[frame][k], self._there[frame][k] = _numbered(places), rho * factors
+
+    def _landed(self, frame: int, rho: F32) -> tuple[F32, F32]:
+        lines = np.indices(rho.shape, dtype=np.int32)[1 - self._camera.shutter.axis(self._camera.side)]
+        return land_pixels(self._maps[frame], rho, lines)
 
     def _unlike(self, comparer: Comparer, greys: tuple[F32, F32], frame: int, places: F32) -> F32:
         """0 to 1 (H, W), NaN outside: half by the windows around pixels, which tell them apart, and half by the
         pixels alone, which tell on which side of a border they are."""
-        windows = comparer.unlikeness(greys[1 - frame], places, cubic=True)
-        levels = np.abs(resample(greys[1 - frame], places) - greys[frame]) / self._options.full_levels
-        return np.asarray(0.5 * windows + 0.25 * np.minimum(levels, 1.0), dtype=np.float32)
+        seen = resample(greys[1 - frame], places)
+        levels = np.abs(seen - greys[frame]) / np.float32(self._options.full_levels)
+        unlike = np.float32(0.5) * comparer.compared(seen) + np.float32(0.25) * np.minimum(levels, np.float32(1.0))
+        return np.where(np.isnan(places[..., 0]), np.float32(np.nan), unlike)
 
     def across(self, frame: int) -> NDArray[np.bool_]:
         """(H, W) where parallax moves a pixel rather along its row than along its column."""
-        way = np.abs(self._places[frame][-1] - self._places[frame][0])
+        near, far = (self._landed(frame, self._rhos[frame][k])[0] for k in (-1, 0))
+        way = np.abs(near - far)
         return ~(way[..., 1] > way[..., 0])
 
     def places(self, labels: Labels) -> F32:
         """(H, W, 2) px in frame 1 of the pixels of frame 0 on their layers (H, W)."""
-        return np.take_along_axis(self._places[0], labels[None, ..., None], axis=0)[0]
+        return self._landed(0, np.take_along_axis(self._rhos[0], labels[None], axis=0)[0])[0]
 
     def smoothed(self, costs: list[F32]) -> tuple[Labels, Labels]:
         """Layers of least cost (n, H, W) and smoothness, of both frames."""
@@ -196,8 +203,9 @@ class _Pair:
         return first, second
 
     def _winners(self, costs: F32) -> Labels:
-        levels = 255.0 * np.nan_to_num(costs, nan=self._options.unseen) + 0.5
-        volume = np.ascontiguousarray(np.moveaxis(levels, 0, -1)).astype(np.uint8)
+        known = np.where(np.isnan(costs), np.float32(self._options.unseen), costs)
+        volume = np.moveaxis((np.float32(255.0) * known + np.float32(0.5)).astype(np.uint8), 0, -1)
+        volume = np.ascontiguousarray(volume)
         return np.argmin(aggregated(volume, self._options.p1, self._options.p2), axis=-1)
 
     def hidden(self, labels: tuple[Labels, Labels]) -> list[F32]:
@@ -205,10 +213,14 @@ class _Pair:
         found = []
         for frame in FRAMES:
             there = np.take_along_axis(self._rhos[1 - frame], labels[1 - frame][None], axis=0)[0]
-            places = self._places[frame]
-            height, width = there.shape
-            nearest = np.rint(np.nan_to_num(places, nan=0.0)).astype(np.int64)
-            x, y = np.clip(nearest[..., 0], 0, width - 1), np.clip(nearest[..., 1], 0, height - 1)
-            hidden = there[y, x] > self._rhos[frame] * self._factors[frame] + self._step
+            hidden = there.ravel()[self._pixels[frame]] > self._there[frame] + self._step
             found.append(np.where(hidden, np.float32(np.nan), self.costs[frame]))
         return found
+
+
+def _numbered(places: F32) -> NDArray[np.int32]:
+    """The pixel (H, W), counted along the rows, that is nearest to each place (H, W, 2); 0 for NaN."""
+    height, width = places.shape[:2]
+    known = np.where(np.isnan(places), np.float32(0.0), places)
+    x, y = (np.clip(np.rint(known[..., k]).astype(np.int32), 0, most - 1) for k, most in ((0, width), (1, height)))
+    return np.asarray(y * np.int32(width) + x, dtype=np.int32)

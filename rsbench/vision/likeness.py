@@ -28,13 +28,19 @@ class Comparer:
 
     def unlikeness(self, other: F32, places: F32, *, cubic: bool) -> F32:
         """0 (alike) to 1 (H, W) of the other image (H, W) at places (H, W, 2) px; NaN where those are NaN."""
-        seen = self._seen(other, places, cubic) - np.float32(128.0)
+        return np.where(
+            np.isnan(places[..., 0]), np.float32(np.nan), self.compared(self._seen(other, places, cubic))
+        )
+
+    def compared(self, other: F32) -> F32:
+        """0 (alike) to 1 (H, W) of another image (H, W) that lies on the same pixels."""
+        seen = other - np.float32(128.0)
         mean = self._box(seen)
         variance = self._box(seen * seen) - mean * mean
         together = self._box(seen * self._grey) - mean * self._mean
         noise = np.float32(_NOISE)
         alike = together / np.sqrt((np.maximum(variance, 0) + noise) * (np.maximum(self._variance, 0) + noise))
-        return np.where(np.isnan(places[..., 0]), np.float32(np.nan), np.float32(0.5) * (1.0 - alike))
+        return np.asarray(np.float32(0.5) * (1.0 - alike), dtype=np.float32)
 
     @staticmethod
     def _seen(other: F32, places: F32, cubic: bool) -> F32:
