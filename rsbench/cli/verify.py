@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -47,11 +48,15 @@ def verify(
     ] = None,
 ) -> None:
     """Check files and lists, poses, all depth maps and images against each other, and rows rendered again."""
-    import pandas as pd
-
     if layout is not None:
         _verify_others(folder, layout)
-        return
+    else:
+        _verify_ours(folder, stride, rerender, [Path(each) for each in scene or []])
+
+
+def _verify_ours(folder: Path, stride: int, rerender: Rerender, scenes: Sequence[Path]) -> None:
+    """Each channel against all others, and rows rendered again."""
+    import pandas as pd
 
     from rsbench.cli.console import print_table, progress_bar, say
     from rsbench.dataset.files import read_json
@@ -59,8 +64,7 @@ def verify(
     from rsbench.dataset.verification.structure import DATASET
 
     with progress_bar("verifying", verification_steps(read_json(folder / "dataset.json"))) as advance:
-        cards = [Path(each) for each in scene or []]
-        reports = verify_dataset(folder, stride, advance, rerender=rerender.value, scenes=cards)
+        reports = verify_dataset(folder, stride, advance, rerender=rerender.value, scenes=scenes)
     rows = [
         {
             "sequence": report.name,

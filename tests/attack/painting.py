@@ -40,7 +40,7 @@ def show_frames(folder: Path) -> None:
     started = backend.Backend(variant=(folder / "variant").read_text())
     backend.start_backend = lambda *_, **__: started
     passage.obstacle = lambda *_, **__: ""  # it was looked for when the frames were rendered
-    scene.MitsubaScene = lambda *_: SimpleNamespace()  # pyrefly: ignore[bad-assignment]
+    scene.MitsubaScene = lambda built, *_: SimpleNamespace(glossy=built.glossy)  # pyrefly: ignore[bad-assignment]
     setattr(render, "render", show)  # noqa: B010  an assignment has the wrong type
 
 
