@@ -32,6 +32,8 @@ from rsbench.solvers.engine.packed import inverse_definite
 
 _MAX_SCALE_SIGMA = 0.5
 """Relative standard deviation of the length of d above which it does not count as metric, as in ``refined``."""
+_CONTRADICTED = 3.0
+"""Times as many points in front of the cameras for -d as for d, beyond which d has no length."""
 
 
 @final
@@ -97,15 +99,14 @@ class GyroSolver(Solver):
         d, metric = _translation(constraints.m, constraints.beta)
         if d is None:
             return MotionEstimate.failed("the matches leave the direction of d open: degenerate motion or scene")
-        signed, sigma = metric, np.inf
+        sigma = np.inf
         if descend:
             d, sigma = constraints.refined(d)
         metric = metric and (not descend or sigma <= _MAX_SCALE_SIGMA)
         if not (np.all(np.isfinite(d)) and np.any(d)):
             return MotionEstimate.failed("no finite translation fits")
-        if not signed:
-            # At last: where lengths are open, a step of the descent may lead through zero to the other side.
-            d = _signed(motion, d, about, shutter, matches)
+        # At last: a step of the descent may lead through zero to the other side.
+        d, metric = _signed(motion, d, metric, about, shutter, matches)
         reason = "" if metric else "the length of d is not determined by these matches"
         d = d if self._stereo else d / np.linalg.norm(d)
         return MotionEstimate(w=motion.w, d=d, success=True, metric=metric, reason=reason)
@@ -188,9 +189,18 @@ class _Constraints:
 
 
 def _signed(
-    motion: GyroMotion, d: FloatArray, rig: StereoRig, shutter: RollingShutter, matches: Mapping[Side, FloatArray]
-) -> FloatArray:
-    """d or -d, whichever has more points in front of the cameras."""
+    motion: GyroMotion,
+    d: FloatArray,
+    metric: bool,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    matches: Mapping[Side, FloatArray],
+) -> tuple[FloatArray, bool]:
+    """d or -d, whichever has more points in front of the cameras, and whether its length counts.
+
+    A length has a sign of its own, which what the gyroscope has wrong may turn: one that most points contradict
+    is none.
+    """
     votes = []
     for each in (d, -d):
         count = 0
@@ -199,4 +209,5 @@ def _signed(
             x, y = rig.camera.unproject(m[:, :2]), rig.camera.unproject(m[:, 2:])
             count += int(np.count_nonzero(in_front(pose, x, y)))
         votes.append(count)
-    return d if votes[0] >= votes[1] else -d
+    behind = votes[1] > (_CONTRADICTED * votes[0] if metric else votes[0])
+    return (-d, False) if behind else (d, metric)

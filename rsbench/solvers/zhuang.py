@@ -83,13 +83,16 @@ class Velocity(NamedTuple):
 
 
 def null_vectors(Z: FloatArray) -> FloatArray:
-    """(..., 9) null vectors of systems (..., n, 9), n >= 8, in unit columns; NaN where there are more."""
+    """(..., 9) null vectors of systems (..., n, 9), n >= 8, in unit columns; NaN where there are more.
+
+    A translation along an axis without rotation leaves that axis's column zero, which is then the null vector.
+    """
     norms = np.linalg.norm(Z, axis=-2, keepdims=True)
-    good = np.all(norms[..., 0, :] > ROUNDING * np.max(norms, axis=-1), axis=-1)
-    Z = np.where(good[..., None, None], Z, 1.0) / np.where(good[..., None, None], norms, 1.0)
-    _, s, Vt = np.linalg.svd(Z, full_matrices=Z.shape[-2] < 9)
-    good &= s[..., 7] > ROUNDING * s[..., 0]
-    return np.where(good[..., None], Vt[..., -1, :] / np.where(good[..., None], norms[..., 0, :], 1.0), np.nan)
+    norms = np.where(norms > ROUNDING * np.max(norms, axis=-1, keepdims=True), norms, 1.0)
+    finite = np.all(np.isfinite(Z), axis=(-2, -1))
+    _, s, Vt = np.linalg.svd(np.where(finite[..., None, None], Z, 0.0) / norms, full_matrices=Z.shape[-2] < 9)
+    good = s[..., 7] > ROUNDING * s[..., 0]
+    return np.where(good[..., None], Vt[..., -1, :] / norms[..., 0, :], np.nan)
 
 
 def accelerations(Z0: FloatArray, Z1: FloatArray) -> list[float]:

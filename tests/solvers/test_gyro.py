@@ -13,7 +13,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.gyro_motion import GyroMotion
 from rsbench.core.metrics import rotation_error, scale_error, translation_error
-from rsbench.core.motion import AcceleratedMotion
+from rsbench.core.motion import AcceleratedMotion, LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.spline_motion import SplineMotion
@@ -57,6 +57,16 @@ def test_the_descent_keeps_the_side_of_a_translation_without_a_length() -> None:
         s = trial(seed, stereo=False)
         found = GyroSolver().estimate(s.correspondences, RIG, SHUTTER)
         assert translation_error(found.d, s.motion.d) < 1e-8, seed
+
+
+def test_points_give_the_side_of_a_translation_whose_length_is_open() -> None:
+    """About the baseline no camera moves against the other: a wrong rotation gives d a length of any sign."""
+    motion = LinearMotion(np.array([0.03, 0.0, 0.0]), np.array([0.1, -0.2, 0.2]))
+    options = SimulationOptions(pairs=60, noise_px=0.3, gyro_rate=20, gyro_bias_deg=0.05)
+    for seed in range(10):
+        s = simulate(RIG, SHUTTER, motion, options, np.random.default_rng(seed))
+        found = STEREO.estimate(s.correspondences, RIG, SHUTTER)
+        assert translation_error(found.d, s.motion.d) < np.radians(5.0), seed
 
 
 @pytest.mark.parametrize("how", ["none", "sampson"])

@@ -15,6 +15,7 @@ from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.metrics import rotation_error, scale_error, translation_error, translation_of_offset
+from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -71,6 +72,16 @@ def test_one_of_the_motions_of_a_minimal_sample_is_the_true_one(name: str, sizes
         nearest.append(min(errors))
     # The roots of PoseLib's polynomial for a rig have 5 to 7 digits on exact matches, those for a camera 12.
     assert np.max(nearest) < (1e-3 if sizes[1] else 1e-8)
+
+
+def test_points_give_the_side_of_a_translation_whose_length_is_open() -> None:
+    """Without rotation no camera moves against the other."""
+    motion = LinearMotion(np.zeros(3), np.array([0.0, 0.0, 0.3]))
+    options = SimulationOptions(pairs=60, gravity=True, noise_px=0.3)
+    for seed in range(15):
+        s = simulate(RIG, GLOBAL, motion, options, np.random.default_rng(seed))
+        found = load_solver("gs-upright-4pt").estimate(s.correspondences, RIG, GLOBAL)
+        assert not found.metric and translation_error(found.d, s.motion.d) < np.radians(5.0), seed
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -71,6 +71,22 @@ def test_nine_matches_have_the_true_acceleration_among_the_eigenvalues() -> None
         assert s[-1] < 1e-10 * s[0]
 
 
+@pytest.mark.parametrize("kind", ["none", "constant"])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_translation_along_an_axis_is_exact(kind: str, axis: int) -> None:
+    """The flow of finite translations is along that of instantaneous ones: nothing is truncated."""
+    solver = SOLVERS[kind, "reprojection"]
+    d = 0.3 * np.eye(3)[axis]
+    motion = make_motion(solver.spec.motion_model, np.zeros(3), d, solver.spec.motion_parameters)
+    c = simulate(LEFT, SHUTTER, motion, SimulationOptions(pairs=60), np.random.default_rng(0)).correspondences
+    found = solver.estimate(c, LEFT, SHUTTER)
+    assert found.success, found.reason
+    assert rotation_error(found.w, motion.w) < 1e-8 and translation_error(found.d, d) < 1e-8
+    still = make_motion(solver.spec.motion_model, np.zeros(3), np.zeros(3), solver.spec.motion_parameters)
+    c = simulate(LEFT, SHUTTER, still, SimulationOptions(pairs=60), np.random.default_rng(0)).correspondences
+    assert "more than one solution" in solver.estimate(c, LEFT, SHUTTER).reason
+
+
 def errors(solver: ZhuangSolver, size: float) -> FloatArray:
     """Medians of rotation and direction (rad) on exact matches of finite motions, ten scenes."""
     found = []
