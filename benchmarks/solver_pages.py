@@ -1,259 +1,138 @@
-"""A section for each solver in docs/solvers.md: what it is, from its card and class, and what it does, measured.
+"""docs/solvers.md: a section for each solver, from its card, its class and the committed tables of measurements.
 
-    python benchmarks/solver_pages.py                # the page, from results/solvers/solvers.csv: a second
-    python benchmarks/solver_pages.py --measure      # the table too: a quarter of an hour of a processor
-    python benchmarks/solver_pages.py --measure --solver rs-dai-linear   # only that row; the others are kept
-
-Each solver gets the least information that it can use fully, and exact or noisy matches of the motion model
-that it declares, of the point of the rig that it declares. The bound is that of the same matches with six
-unknowns; a gyroscope's solvers are compared with that of a known rotation, those with gravity with that of
-two known angles.
+python benchmarks/solver_measurements.py    # the tables in results/solvers: half an hour of a processor
+python benchmarks/solver_pages.py           # the page: a second
 """
 
-# ruff: noqa: E402
 from __future__ import annotations
 
-import argparse
-import os
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ[variable] = "1"  # before NumPy and Numba load
-
+import json
 import sys
-import time
+import tomllib
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.provenance import provenance
-from rsbench.benchmark.simulated.bound import Bound, bound_from_information, motion_bound
-from rsbench.benchmark.simulated.simulation import (
-    GYRO_RATE,
-    Simulation,
-    SimulationOptions,
-    random_motion,
-    simulate,
-)
-from rsbench.benchmark.simulated.trials import Entrant, enter, given_matches
-from rsbench.core import so3
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.correspondences import Correspondences
-from rsbench.core.metrics import rotation_error, translation_error
-from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
-from rsbench.core.so3 import FloatArray
-from rsbench.dataset.files import write_bytes, write_json, write_table
-from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.pipeline.robust_motion import RobustOptions
-from rsbench.solvers.engine.base import SENSORS, MotionEstimate
-from rsbench.solvers.engine.registry import SolverEntry, list_solvers, load_solver_entry
-from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.benchmark.statistics import share_interval
+from rsbench.cards import list_cards
+from rsbench.dataset.files import write_bytes
+from rsbench.solvers.engine.base import SENSORS
+from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 
 ROOT = Path(__file__).parents[1]
-TABLE, PAGE = ROOT / "results/solvers/solvers.csv", ROOT / "docs/solvers.md"
-RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
-SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
-NOISE_PX, GOOD_DEG, TRIALS, SAMPLES = 0.3, (0.3, 5.0), 20, 50
-OUTLIERS = (0.0, 0.3, 0.5)
-_KNOWN = 1e12
-"""Information of what a sensor tells, 1 / rad^2."""
+PAGE = ROOT / "docs/solvers.md"
+REPOSITORY = "https://github.com/rsbench/rsbench/blob/main"
 HEAD = """# The solvers, one by one
 
-Made by `python benchmarks/solver_pages.py` from the solvers' cards and [the table of what was
-measured](https://github.com/rsbench/rsbench/blob/main/results/solvers/solvers.csv) ({date}): a rig of two
-cameras of 900 x 900 px, f = 810 px, baseline 0.6 m, readout ratio 0.8; 2 deg and 0.3 m per frame period in
-random directions, points at 2 to 10 m, {trials} trials.
+Made by `python benchmarks/solver_pages.py` from the solvers' cards and
+[tables]({repository}/results/solvers/solvers.csv) that `python benchmarks/solver_measurements.py` measured on
+{date}, on one core of a busy {cores}-core machine ({processor}): a rig of two cameras of 900 x 900 px, f = 810
+px, baseline 0.6 m, readout ratio 0.8; 2 deg and 0.3 m per frame period in random directions, points at 2 to 10
+m. Each section says how many trials it has: shares of 10 of 10 and 20 of 20 are above {ten:.2f} and
+{twenty:.2f} with 95 %, and factors of noise have their intervals.
 
-- **Bias**: median error on 100 exact matches per camera, of the motion model that the solver declares; the
-  order is what halving the motion divides it by. A solver that assumes a global shutter sees
-  rolling-shutter matches here.
-- **Noise**: root mean square error with {noise} px of noise, over the Cramer-Rao bound of what the solver is
-  given: 1 is best. A bias counts too.
-- **Time**: of the processor, one core: a minimal sample, and a whole robust estimate from 200 matches with
-  30 % outliers.
-- **Success**: share of robust estimates within {e_R} deg and {e_T} deg, at 0, 30 and 50 % outliers.
+- **Equations**: x and y are the rays of a match in frames 0 and 1, s0 and s1 the times of its rows, h the
+  readout time of a row, `[v]x u` = v x u. The source has the rest.
+- **Bias**: median error on 100 exact matches per camera, of the motion model that the solver declares; the order
+  is what halving the motion divides it by: about 2 is first order, 4 second. A solver that assumes a global
+  shutter sees rolling-shutter matches here.
+- **Noise**: root mean square error with {noise} px of noise over the Cramer-Rao bound of what the solver is
+  given, with a 95 % interval (median error over that of errors at the bound): 1 is best. A bias counts too, and
+  one failure, which errs 180 deg, is most of a root mean square. The bound has six unknowns: what velocities or
+  an acceleration that a solver leaves free cost is in its factor. Gyroscope and gravity are exact here, and
+  known to the bound.
+- **Time**: of the processor: a minimal sample, and a whole robust estimate from 200 matches with 30 % outliers.
+  "Alone" means that the solver has a robust loop of its own, to which budgets of samples do not apply.
+- **Success**: share of robust estimates within {e_R} deg and {e_T} deg, at 0, 30 and 50 % outliers and at most
+  1000 samples; then at 50 % with equal budgets: at most {few} samples, and as many as take about {ms:.0f} ms.
+- **Degenerate**: what of [the suite]({repository}/sweeps/degenerate.toml) of 11 motions and scenes is not always
+  solved, without noise and with 0.3 px, as trials solved: within {solved_R} deg and {solved_T} deg,
+  or three times the bound where that is more. A direction that the matches leave open cannot be wrong. The rest
+  are wrong answers, but for those that the solver itself called failures.
 
-Solvers of the left camera are scored on that camera's own motion. [How solvers are
-written](add-a-solver.md), [of one camera](monocular.md), [sweeps over noise, motion and
-scene](https://github.com/rsbench/rsbench/blob/main/results/sweeps/README.md).
+Solvers of the left camera are scored on that camera's own motion. [How solvers are written](add-a-solver.md),
+[of one camera](monocular.md), [sweeps over noise, motion and scene]({repository}/results/sweeps/README.md).
 """
-_SETS = {
+SETS = {
     "left": "matches over time of the left camera",
     "right": "of the right camera",
     "stereo": "left-right matches at both times",
     "tracks": "tracks through all four images",
     **SENSORS,
 }
+OUTLIERS = ("0%", "30%", "50%")
 
 
-# What is measured
-
-
-def rig_of(entry: SolverEntry) -> StereoRig:
-    """The rig about the point whose motion the solver finds, so that its model holds there exactly."""
-    return RIG if entry.solver.spec.reference_point == "body" else RIG.about("left")
-
-
-def trial(e: Entrant, seed: int, size: float = 1.0, count: int = 100, **noise: float) -> Simulation:
-    """2 degrees and 0.3 m times ``size``."""
-    spec, rng = e.solver.spec, np.random.default_rng([11, seed])
-    motion = random_motion(rng, np.deg2rad(2.0 * size), 0.3 * size, spec.motion_model)
-    linked = e.information in ("linked pairs", "tracks")
-    options = SimulationOptions(
-        pairs=0 if linked else count,
-        tracks=count if linked else 0,
-        gyro_rate=GYRO_RATE,
-        gravity=True,
-        **noise,  # pyrefly: ignore[bad-argument-type]
+def page(folder: Path) -> str:
+    """The document, from the tables of a folder and the cards of the solvers."""
+    made = json.loads((folder / "provenance.json").read_text("utf-8"))
+    given, machine = made["inputs"], made["machine"]
+    equations = tomllib.loads(Path(__file__).with_name("solver_equations.toml").read_text("utf-8"))
+    head = HEAD.format(
+        repository=REPOSITORY,
+        date=made["date"],
+        cores=machine["cores"],
+        processor=machine["processor"],
+        ten=share_interval(10, 10).low,
+        twenty=share_interval(20, 20).low,
+        noise=given["noise_px"],
+        e_R=given["good_deg"][0],
+        e_T=given["good_deg"][1],
+        few=given["few_samples"],
+        ms=given["time_ms"],
+        solved_R=given["solved_deg"][0],
+        solved_T=given["solved_deg"][1],
     )
-    return simulate(rig_of(e.entry), SHUTTER, motion, options, np.random.default_rng(seed))
+    rows = {str(row["solver"]): row for row in pd.read_csv(folder / "solvers.csv").to_dict("records")}
+    hard = pd.read_csv(folder / "degenerate.csv", keep_default_na=False)
+    sections = [
+        section(load_solver_entry(name), rows.get(name), hard[hard["solver"] == name], equations)
+        for name in list_cards("solvers")
+    ]
+    return "\n".join([head, *sections])
 
 
-def given(e: Entrant, s: Simulation) -> Correspondences:
-    """What the solver gets: its matches, and the sensors that it needs."""
-    sensed = {name: getattr(s.correspondences, name) for name in SENSORS if name in e.solver.spec.needs}
-    return replace(given_matches(s, e.information), **sensed)
-
-
-def errors(estimate: MotionEstimate, s: Simulation) -> tuple[float, float]:
-    """e_R and e_T, degrees; 180 of a failure."""
-    if not estimate.success:
-        return 180.0, 180.0
-    e_R, e_T = rotation_error(estimate.w, s.motion.w), translation_error(estimate.d, s.motion.d)
-    return float(np.rad2deg(e_R)), float(np.rad2deg(e_T))
-
-
-def bound(e: Entrant, exact: Simulation) -> Bound:
-    """Of the matches and sensors that the solver is given, for ``NOISE_PX``."""
-    c, w = exact.correspondences, exact.motion.w
-    sets = {
-        "left pairs": ("left",),
-        "left and right pairs": ("left", "right"),
-        "linked pairs": ("tracks",),
-        "tracks": ("tracks",),
-    }[e.information]
-    matches = Correspondences(**{name: getattr(c, name) for name in sets})
-    F = motion_bound(matches, rig_of(e.entry), SHUTTER, exact.motion, NOISE_PX).information.copy()
-    if "gyro" in e.solver.spec.needs:
-        F[:3, :3] += _KNOWN * np.eye(3)
-    elif "gravity" in e.solver.spec.needs:
-        down, J = c.gravity[1, 1:], so3.left_jacobian(w)
-        F[:3, :3] += _KNOWN * J.T @ (np.eye(3) - np.outer(down, down)) @ J
-    return bound_from_information(F, w, exact.motion.d)
-
-
-def bias(e: Entrant, size: float) -> FloatArray:
-    """Median errors (2,) on exact matches."""
-    found = []
-    for seed in range(TRIALS):
-        s = trial(e, seed, size)
-        found.append(errors(e.solver.estimate(given(e, s), RIG, SHUTTER), s))
-    return np.median(found, axis=0)
-
-
-def over_bound(e: Entrant) -> FloatArray:
-    """Root mean square errors (2,) with noise over the bound."""
-    ratios = []
-    for seed in range(TRIALS):
-        s = trial(e, seed, noise_px=NOISE_PX)
-        least = bound(e, trial(e, seed))
-        found = errors(e.solver.estimate(given(e, s), RIG, SHUTTER), s)
-        ratios.append(np.array(found) / np.rad2deg([least.rotation, least.direction]))
-    return np.sqrt(np.mean(np.square(ratios), axis=0))
-
-
-def sample_ms(e: Entrant) -> float:
-    """Milliseconds of a minimal sample, of ``SAMPLES`` in batches of ten; NaN where the loop is its own."""
-    if e.entry.options.robust == "own":
-        return np.nan
-    c, rng = given(e, trial(e, 0)), np.random.default_rng(0)
-    sizes = e.solver.sample_sizes(c)
-    names = ("left", "right", "stereo_0", "stereo_1", "tracks")
-    samples = []
-    for _ in range(SAMPLES):
-        sets = {name: rng.choice(getattr(c, name), sizes.get(name, 0), replace=False) for name in names}
-        samples.append(replace(c, **sets))
-    list(e.solver.propose_all(samples[:1], RIG, SHUTTER))
-    start = time.process_time()
-    for first in range(0, SAMPLES, 10):
-        list(e.solver.propose_all(samples[first : first + 10], RIG, SHUTTER))
-    return 1e3 * (time.process_time() - start) / SAMPLES
-
-
-def robust(e: Entrant, outliers: float, runner: SolverRunner) -> tuple[float, float]:
-    """Share within ``GOOD_DEG`` of robust estimates, and their median milliseconds of the processor."""
-    good, seconds = [], []
-    for seed in range(TRIALS):
-        s = trial(e, seed, count=200, noise_px=NOISE_PX, outlier_ratio=outliers)
-        c, rng = given(e, s), np.random.default_rng(seed)
-        start = time.process_time()
-        found = runner.robust(e.entry, c, RIG, SHUTTER, RobustOptions(), rng)
-        seconds.append(time.process_time() - start)
-        good.append(np.all(np.array(errors(found.estimate, s)) < GOOD_DEG))
-    return float(np.mean(good)), 1e3 * float(np.median(seconds))
-
-
-def measured(name: str, runner: SolverRunner) -> dict[str, Any]:
-    """A row of the table."""
-    e = enter(load_solver_entry(name))
-    warm_up([e.solver.spec.motion_model])
-    full, half, factor = bias(e, 1.0), bias(e, 0.5), over_bound(e)
-    runs = [robust(e, outliers, runner) for outliers in OUTLIERS]
-    row: dict[str, Any] = {"solver": name, "information": e.information}
-    for k, error in enumerate(("e_R", "e_T")):
-        row |= {f"bias_{error}_deg": full[k], f"bias_half_{error}_deg": half[k], f"{error}_over_bound": factor[k]}
-    row |= {"sample_ms": sample_ms(e), "robust_ms": runs[1][1]}
-    return row | {f"success_{outliers:.0%}": share for outliers, (share, _) in zip(OUTLIERS, runs, strict=True)}
-
-
-def measure(names: list[str]) -> None:
-    """Make the rows of these solvers again; the table keeps those of the others."""
-    kept = pd.read_csv(TABLE).to_dict("records") if TABLE.exists() else []
-    rows = {str(row["solver"]): row for row in kept}
-    TABLE.parent.mkdir(parents=True, exist_ok=True)
-    with SolverRunner() as runner:
-        for name in names:
-            start = time.process_time()
-            rows[name] = measured(name, runner)
-            write_table(TABLE, pd.DataFrame([rows[each] for each in sorted(rows)]))
-            sys.stdout.write(f"{name}: {time.process_time() - start:.0f} s\n")
-            sys.stdout.flush()
-    command = "python benchmarks/solver_pages.py --measure"
-    write_json(TABLE.parent / "provenance.json", provenance(command, trials=TRIALS, noise_px=NOISE_PX))
-
-
-# The page
-
-
-def page(table: pd.DataFrame, date: str) -> str:
-    """The document, from the table and the cards."""
-    parts = [HEAD.format(date=date, trials=TRIALS, noise=NOISE_PX, e_R=GOOD_DEG[0], e_T=GOOD_DEG[1])]
-    rows = {str(row["solver"]): row for row in table.to_dict("records")}
-    parts += [section(load_solver_entry(name), rows.get(name)) for name in list_solvers() if name in rows]
-    return "\n".join(parts)
-
-
-def section(entry: SolverEntry, row: Mapping[Any, Any]) -> str:
-    spec = entry.solver.spec
-    needs = "; ".join(f"{spec.minimum[name]} {_SETS[name]}" for name in _SETS if name in spec.needs)
+def section(
+    entry: SolverEntry, row: Mapping[Any, Any] | None, hard: pd.DataFrame, equations: Mapping[str, str]
+) -> str:
+    """Of one solver; one that is new has no measurements yet."""
+    spec, module = entry.solver.spec, type(entry.solver).__module__
+    needs = "; ".join(f"{spec.minimum[name]} {SETS[name]}" for name in SETS if name in spec.needs)
     gives = f"w and {'d in metres' if spec.metric else 'the direction of d'}, of the "
     gives += "rig" if spec.reference_point == "body" else "left camera"
+    source = f"{REPOSITORY}/{module.replace('.', '/')}.py"
     lines = [
         f"- Paper: {spec.reference}.",
-        f"- Needs at least {needs}; measured with {row['information']}. Gives {gives}.",
+        f"- Equations: `{equations[module.rpartition('.')[2]]}` ([source]({source})).",
+        f"- Needs at least {needs}. Gives {gives}.",
         f"- Assumes {spec.assumes}; motion model `{spec.motion_model}`.",
-        f"- Bias {_angle(row['bias_e_R_deg'])}, {_angle(row['bias_e_T_deg'])} (e_R, e_T){_order(row)}.",
-        f"- Noise {_times(row['e_R_over_bound'])}, {_times(row['e_T_over_bound'])} the bound (e_R, e_T).",
-        f"- Time {_sample(row['sample_ms'])}{_number(row['robust_ms'])} ms robust. Success "
-        + ", ".join(f"{row[f'success_{outliers:.0%}']:.2f}" for outliers in OUTLIERS)
-        + ".",
+        *(measured(row) if row else ["- Bias, noise, time and success: not measured yet."]),
+        *(degenerate(hard) if len(hard) else ["- Degenerate: not measured yet."]),
         f"- Take it: {entry.options.use}",
     ]
     return "\n".join([f"## {entry.name}\n", f"{entry.description}.\n", *lines, ""])
+
+
+def measured(row: Mapping[Any, Any]) -> list[str]:
+    """Lines from a row of the table of numbers."""
+    shares = ", ".join(_share(row[f"success_{each}"]) for each in OUTLIERS)
+    return [
+        f"- Measured with {row['information']}, {row['trials']} trials; samples are {row['sample']}.",
+        f"- Bias {_angle(row['bias_e_R_deg'])}, {_angle(row['bias_e_T_deg'])} (e_R, e_T){_order(row)}.",
+        f"- Noise: e_R {_factor(row, 'e_R')}, e_T {_factor(row, 'e_T')}{_failures(row)}.",
+        f"- Time: {_sample(row['sample_ms'])}, {_number(row['robust_ms_30%'])} ms robust.",
+        f"- Success {shares}; {_budgets(row)}.",
+    ]
+
+
+def degenerate(hard: pd.DataFrame) -> list[str]:
+    """Lines from a solver's rows of the degenerate suite."""
+    return [
+        f"- Degenerate, {words}: {_unsolved(hard, noise)}." for noise, words in ((0.0, "exact"), (0.3, "0.3 px"))
+    ]
 
 
 def _order(row: Mapping[Any, Any]) -> str:
@@ -267,12 +146,44 @@ def _angle(degrees: float) -> str:
     return "none (fails)" if degrees >= 180.0 else "0" if degrees < 1e-7 else f"{_number(degrees)} deg"
 
 
-def _times(ratio: float) -> str:
-    return "-" if not np.isfinite(ratio) or ratio > 1e3 else f"{ratio:.2g} times"
+def _factor(row: Mapping[Any, Any], error: str) -> str:
+    middle = row[f"{error}_median_over_bound"]
+    if not np.isfinite(middle):
+        return "what the gyroscope has"
+    ratio, low, high = (row[f"{error}_over_bound{end}"] for end in ("", "_low", "_high"))
+    return f"{_number(ratio)} [{_number(low)}, {_number(high)}] times the bound (median {_number(middle)})"
+
+
+def _failures(row: Mapping[Any, Any]) -> str:
+    count = int(row["noisy_failures"])
+    return f"; {count} failed" if count else ""
 
 
 def _sample(ms: float) -> str:
-    return "" if not np.isfinite(ms) else f"{_number(ms)} ms a sample, "
+    return f"{_number(ms)} ms a sample" if np.isfinite(ms) else "alone"
+
+
+def _share(value: float) -> str:
+    return f"{value:.2f}"
+
+
+def _budgets(row: Mapping[Any, Any]) -> str:
+    """Success at 50 % with equal times and equal numbers of samples; how many samples the time was good for."""
+    told = f"in {_number(row['ms_quick'])} ms {_share(row['success_quick'])}"
+    if np.isfinite(row["sample_ms"]):
+        told = f"{told} (at most {row['most_quick']:.0f} samples), in few samples {_share(row['success_few'])}"
+    return f"at 50 % {told}"
+
+
+def _unsolved(hard: pd.DataFrame, noise: float) -> str:
+    """Motions and scenes of the suite in which a trial in ten or more is not solved."""
+    bad = hard[(hard["noise_px"] == noise) & (hard["solved"] < 0.9 * hard["trials"])]
+    told = [
+        f"{row['variant']} {row['solved']} of {row['trials']}"
+        + (f" ({row['failed']} failed)" if row["failed"] else "")
+        for row in bad.to_dict("records")
+    ]
+    return "; ".join(told) or "all solved"
 
 
 def _number(value: float) -> str:
@@ -280,14 +191,7 @@ def _number(value: float) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--measure", action="store_true")
-    parser.add_argument("--solver", action="append", help="with --measure: only this one; may be repeated")
-    options = parser.parse_args()
-    if options.measure:
-        measure(options.solver or list_solvers())
-    made = pd.read_json(TABLE.parent / "provenance.json", typ="series")
-    write_bytes(PAGE, page(pd.read_csv(TABLE), str(made["date"])).encode())
+    write_bytes(PAGE, page(ROOT / "results/solvers").encode())
     return 0
 
 
