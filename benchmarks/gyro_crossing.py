@@ -22,8 +22,9 @@ import pandas as pd
 
 from rsbench.benchmark.provenance import provenance
 from rsbench.benchmark.simulated.run_sweep import read_sweep, read_trials
+from rsbench.benchmark.simulated.sweep_card import load_sweep
 from rsbench.benchmark.simulated.sweep_summary import read_card, score_trials
-from rsbench.benchmark.statistics import bootstrap_interval, typical_interval
+from rsbench.benchmark.statistics import bootstrap_interval, in_words, typical_interval
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.files import write_json, write_table
 
@@ -35,7 +36,7 @@ PAIRS = (
     ("rs-gyro-stereo", "rs-stereo-refined"),
 )
 """A solver with a gyroscope, and vision alone; the first two on the same matches."""
-MEASURES = {"e_R_deg": "e_R (deg)", "e_T_deg": "e_T (deg)", "e_s": "e_s"}
+MEASURES = {"e_R_deg": "e_R", "e_T_deg": "e_T", "e_s": "e_s"}
 UNITS = {"gyro-bias": "deg/s", "gyro-noise": "deg/s", "gyro-delay": "ms"}
 FACTORS = {"gyro-bias": FRAMES_PER_S, "gyro-noise": FRAMES_PER_S, "gyro-delay": 1e3 / FRAMES_PER_S}
 Scores = dict[tuple[str, str], FloatArray]
@@ -72,7 +73,7 @@ def crossing(values: FloatArray, gyro: FloatArray, vision: FloatArray) -> FloatA
     def at(rows: FloatArray, k: FloatArray) -> FloatArray:
         return np.take_along_axis(rows, k[..., None], axis=-1)[..., 0]
 
-    with np.errstate(invalid="ignore", over="ignore"):
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         gap = gyro**2 - vision**2
         low, high = at(gap, last), at(gap, first)
         share = np.where(np.isfinite(high - low) & (high > low), -low / (high - low), 1.0)
@@ -119,6 +120,21 @@ def tables(data: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     return pd.DataFrame(medians), pd.DataFrame(crossings)
 
 
+def shown(crossings: pd.DataFrame) -> list[str]:
+    """Rows of Markdown, as docs/monocular.md has them: crossings of angles, of each pair of solvers."""
+    lines = []
+    angles = crossings[crossings.measure != "e_s"]
+    for (sweep, variant, measure), rows in angles.groupby(["sweep", "variant", "measure"], sort=False):
+        most = max(load_sweep(str(sweep)).values) * FACTORS[str(sweep)]
+        cells = [
+            in_words(row.crossing, row.low, row.high) if np.isfinite(row.low) else f"beyond {most:g}"
+            for row in rows.itertuples(index=False)
+        ]
+        name = str(sweep).removeprefix("gyro-") + ("" if variant == "all" else f", {variant}")
+        lines.append(f"| {name} ({UNITS[str(sweep)]}) | {MEASURES[str(measure)]} | {' | '.join(cells)} |")
+    return lines
+
+
 _STYLES: dict[str, dict[str, Any]] = {
     "rs-gyro-stereo": {"color": "#0072B2", "linestyle": "-", "marker": "o"},
     "rs-gyro-5pt": {"color": "#56B4E9", "linestyle": "--", "marker": "s"},
@@ -147,7 +163,7 @@ def draw(medians: pd.DataFrame, path: Path) -> None:
             for axes, measure in zip(grid[:, column], ("e_R_deg", "e_T_deg"), strict=True):
                 for solver, style in _STYLES.items():
                     rows = here[(here.solver == solver) & (here.measure == measure)]
-                    axes.plot(rows.value, rows["median"], label=solver, **style)
+                    axes.plot(rows.value, rows["median"].where(rows["median"] > 1e-9), label=solver, **style)
                     axes.fill_between(
                         rows.value, rows.low, rows.high, color=style["color"], alpha=0.2, linewidth=0
                     )
@@ -155,11 +171,13 @@ def draw(medians: pd.DataFrame, path: Path) -> None:
                 axes.set_yscale("log")
                 axes.grid(True, color="0.88", linewidth=0.6)
                 axes.set_xlim(left=0.0)
+                ticks = [0.0, *(each for each in (0.1, 1.0, 10.0) if each <= here.value.max())]
+                axes.set_xticks(ticks, [f"{each:g}" for each in ticks])
             grid[0, column].set_title(_TITLES[sweep] + ("" if variant == "all" else f", {variant}"), loc="left")
             grid[1, column].set_xlabel(f"{sweep.removeprefix('gyro-')} ({UNITS[sweep]})")
         grid[0, 0].set_ylim(bottom=1e-3)
         for axes, name in zip(grid[:, 0], ("e_R_deg", "e_T_deg"), strict=True):
-            axes.set_ylabel(f"median {MEASURES[name]}")
+            axes.set_ylabel(f"median {MEASURES[name]} (deg)")
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="upper center", ncol=len(labels), frameon=False)
         figure.tight_layout(rect=(0, 0, 1, 0.95))
@@ -181,9 +199,7 @@ def main() -> int:
     inputs = {sweep: {"seed": card.seed, "trials": card.trials} for sweep, card in cards.items()}
     command = f"python benchmarks/gyro_crossing.py DATA --out {options.out.as_posix()}"
     write_json(options.out / "provenance.json", provenance(command, frames_per_s=FRAMES_PER_S, **inputs))
-    for row in crossings.to_dict("records"):
-        where = f"{row['sweep']} {row['variant']}: {row['gyro']} / {row['vision']} {row['measure']}"
-        sys.stdout.write(f"{where}: {row['crossing']:.3g} [{row['low']:.3g}, {row['high']:.3g}] {row['unit']}\n")
+    sys.stdout.write("\n".join(shown(crossings)) + "\n")
     return 0
 
 
