@@ -26,6 +26,7 @@ from rsbench.cli import (
     simulate,
     solve,
     verify,
+    view,
 )
 from rsbench.cli import list_cards as cards
 from rsbench.cli.stopping import stoppable
@@ -73,6 +74,7 @@ for module in (
     doctor,
     generate,
     verify,
+    view,
     export,
     solve,
     inspect,

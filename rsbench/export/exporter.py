@@ -71,7 +71,7 @@ def export_dataset(
         one = f"is made of {', '.join(kind.images)}" if kind.images else "takes no choice of images"
         raise RsbenchError(f"--images {images}: {name} {one}")
     chosen: Images = images or (kind.images[0] if kind.images else "rs")
-    sequences = _chosen(read_dataset(folder), only)
+    sequences = chosen_sequences(folder, only)
     module: Any = import_module(f"rsbench.export.{kind.module}")
     for sequence in sequences:
         module.check(sequence, chosen)
@@ -99,7 +99,9 @@ def _written(module: Any, sequences: list[Sequence], fresh: Path, images: Images
         yield module.write(sequence, fresh, images)
 
 
-def _chosen(sequences: list[Sequence], only: tuple[str, ...]) -> list[Sequence]:
+def chosen_sequences(folder: Path, only: tuple[str, ...]) -> list[Sequence]:
+    """Those of a dataset that are named, all without names; RsbenchError for a name that none has."""
+    sequences = read_dataset(folder)
     names = [sequence.name for sequence in sequences]
     if unknown := [name for name in only if name not in names]:
         raise RsbenchError(

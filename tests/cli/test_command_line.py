@@ -55,7 +55,7 @@ def test_help_loads_nothing_heavy() -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["demo", "list", "doctor", "generate", "verify", "export", "solve", "evaluate", "reproduce"]
+    "command", ["demo", "list", "doctor", "generate", "verify", "view", "export", "solve", "evaluate", "reproduce"]
 )
 def test_every_command_has_help_with_an_example(command: str) -> None:
     result = run_here(command, "--help")
