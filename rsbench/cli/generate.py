@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rsbench.cli.clusters import Scheduler, chosen_workers, shared_path
 from rsbench.cli.kinds import complete
 
 if TYPE_CHECKING:
@@ -80,7 +81,10 @@ def generate(
     out: Annotated[Path, typer.Option(help="Folder of the dataset; an interrupted run resumes there.")],
     sequence: _Only = None,
     shard: _Shard = None,
-    workers: Annotated[int, typer.Option(min=1, help="Processes; each renders whole sequences.")] = 1,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes; each renders whole sequences. Default: 1.")
+    ] = None,
+    scheduler: Scheduler = None,
     full_frames: _FullFrames = False,
     channels: _Channels = None,
     trajectory: _Trajectory = None,
@@ -96,6 +100,7 @@ def generate(
     from rsbench.dataset.generation import generate_dataset, steps_of
     from rsbench.renderers.backend import start_backend
 
+    crew, out = chosen_workers(workers, scheduler), shared_path(out, scheduler)
     dataset = load_dataset_card(card, trajectory, tuple(seed or ()))
     if sequence:
         dataset = dataset.only(sequence)
@@ -114,7 +119,7 @@ def generate(
     steps = steps_of(dataset) * len(dataset.sequence)
     with progress_bar(f"rendering {dataset.name}", steps) as advance:
         rendered = generate_dataset(
-            dataset, out, workers=workers, full_frames=full_frames, rehash=rehash, progress=advance
+            dataset, out, workers=crew, full_frames=full_frames, rehash=rehash, progress=advance
         )
     typer.echo(f"{out}: {len(dataset.sequence)} sequences, {len(rendered)} rendered now")
 

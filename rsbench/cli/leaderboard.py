@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rsbench.cli.clusters import Scheduler, chosen_workers, shared_path
 from rsbench.cli.kinds import complete
 from rsbench.cli.leaderboard_tracks import (
     Data,
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from rsbench.benchmark.leaderboard.running import Limits
     from rsbench.benchmark.leaderboard.splits import Split
     from rsbench.benchmark.leaderboard.standings import Standing
+    from rsbench.pipeline.crew import Workers as Crewed
     from rsbench.pipeline.problem import Problem
 
 EPILOG = """[bold]Examples[/bold]
@@ -156,7 +158,8 @@ def run(
     data: Data = None,
     seed_file: Secret = None,
     secret: Hidden = False,
-    workers: Workers = 1,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes. Default: 1.")] = None,
+    scheduler: Scheduler = None,
     time_limit: Annotated[
         float | None, typer.Option(min=0.001, help="Seconds per problem; what takes longer is a failure.")
     ] = None,
@@ -170,14 +173,15 @@ def run(
     from rsbench.benchmark.leaderboard.running import Limits
     from rsbench.benchmark.provenance import provenance
 
+    crew, board = chosen_workers(workers, scheduler), shared_path(board, scheduler)
     split = split_of(track, data, seed_file, secret)
     if track == "pose-own":
         raise RsbenchError(f"track {track!r}: solvers of cards take given matches; run them on the track 'pose'")
     _load_cards(entry, split)  # before anything is written
-    files = _predict(entry, split, board, data, seed_file, workers, Limits(time_limit, memory))
+    files = _predict(entry, split, board, data, seed_file, crew, Limits(time_limit, memory))
     for file in files:
         ours = made_by(board, split, file.parent.name) == RUN
-        add(board, file, split, provenance(RUN), replace=ours, workers=workers)
+        add(board, file, split, provenance(RUN), replace=ours, workers=crew)
     _show(board, split.protocol.id, split.name, None)
 
 
@@ -271,7 +275,7 @@ def _predict(
     board: Path,
     data: Path | None,
     seed_file: Path | None,
-    workers: int,
+    workers: Crewed,
     limits: Limits,
 ) -> list[Path]:
     """Files of predictions of cards, in the hidden folder of the board."""

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rsbench.cli.clusters import Scheduler, chosen_workers, shared_path
 from rsbench.cli.kinds import complete
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from rsbench.benchmark.simulated.sweep_card import SweepCard
+    from rsbench.pipeline.crew import Workers
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -44,6 +47,7 @@ def simulate(
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of every trial instead of the card's.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
+    scheduler: Scheduler = None,
     time_limit: Annotated[
         float | None,
         typer.Option(
@@ -59,7 +63,8 @@ def simulate(
     if change:
         card = card.with_setting(**_changes(change))
     command = f"rsbench simulate {sweep} --out {out}"
-    table = run_and_summarise(card, out, workers, command, time_limit_s=time_limit, force=force)
+    crew, place = chosen_workers(workers, scheduler, os.cpu_count() or 1), shared_path(out, scheduler)
+    table = run_and_summarise(card, place, crew, command, time_limit_s=time_limit, force=force)
     show(card, table)
     typer.echo(f"table: {(out / 'summary.csv').resolve()}")
 
@@ -67,15 +72,13 @@ def simulate(
 def run_and_summarise(
     card: SweepCard,
     out: Path,
-    workers: int | None,
+    workers: Workers | None,
     command: str,
     *,
     time_limit_s: float | None = None,
     force: bool = False,
 ) -> pd.DataFrame:
     """Run a sweep with a progress bar and write its summary and provenance; returns the summary."""
-    import os
-
     from rsbench.benchmark.provenance import provenance
     from rsbench.benchmark.simulated.run_sweep import run_sweep, sweep_steps
     from rsbench.benchmark.simulated.sweep_summary import summarise_sweep

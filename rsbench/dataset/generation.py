@@ -35,6 +35,7 @@ from rsbench.dataset.shots import Geometry, Shot
 from rsbench.dataset.stage import Build, Built, Stage
 from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, remove, strangers, workplace
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.crew import Cluster, Workers
 from rsbench.pipeline.isolated_jobs import finished_jobs
 from rsbench.pipeline.isolation import EntryFailure
 from rsbench.renderers.options import RendererOptions
@@ -62,7 +63,7 @@ def generate_dataset(
     card: DatasetCard,
     out: Path,
     *,
-    workers: int = 1,
+    workers: Workers = 1,
     full_frames: bool = False,
     rehash: bool = False,
     progress: Progress | None = None,
@@ -75,7 +76,7 @@ def generate_dataset(
     Args:
         card: what to make.
         out: folder of the dataset, made if missing.
-        workers: processes; each renders whole sequences.
+        workers: processes, or a cluster; each renders whole sequences.
         full_frames: make every rolling-shutter frame as the paper did, from one whole global-shutter image per
             row, and keep these images as gs_stack/<side>_<frame>/<row>.png.
         rehash: read every file again, also those that have the size and times that they had when last read.
@@ -83,8 +84,7 @@ def generate_dataset(
 
     Raises:
         RsbenchError: ``out`` cannot be written, another command works there, or it holds a dataset of another
-            card or files of others in a sequence that is damaged; a scene, viewpoint, renderer or feature
-            matcher of the card does not exist.
+            card or files of others in a sequence that is damaged; something that the card names does not exist.
         LostJobsError: see ``finished_jobs``.
     """
     options = load_card(RendererOptions, "renderers", card.renderer)
@@ -236,17 +236,17 @@ def _render_all(
     plans: dict[str, Plan],
     build: Build,
     out: Path,
-    workers: int,
+    workers: Workers,
 ) -> Iterator[tuple[str, int]]:
     """Names of sequences, with steps that were done; the last of a sequence is given when it is complete."""
-    if workers <= 1 or len(todo) <= 1:
+    if workers == 1 or not todo:
         stage = Stage(build)
         for sequence in todo:
             for _ in _render_sequence(card, sequence, options, plans[sequence.name], stage, out):
                 yield sequence.name, 1
         return
     jobs = [(sequence, plans[sequence.name]) for sequence in todo]
-    threads = max(1, (os.cpu_count() or 1) // workers)
+    threads = 1 if isinstance(workers, Cluster) else max(1, (os.cpu_count() or 1) // workers)
     given = card, options, out, threads
     found = finished_jobs(_serve_renders, jobs, workers, {}, *given, name=lambda job: f"sequence {job[0].name}")
     with closing(found):

@@ -10,6 +10,8 @@ from contextlib import closing
 from typing import Any, TypeVar
 
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.cluster_jobs import run_on_cluster
+from rsbench.pipeline.crew import TRIES, Cluster, Crew, Workers
 from rsbench.pipeline.isolation import Cancelled, IsolatedWorker, Outcome, Server
 
 Job = TypeVar("Job")
@@ -20,7 +22,7 @@ _Done = tuple[Job, Outcome | BaseException]
 
 
 class LostJobsError(RsbenchError):
-    """Jobs whose process ended twice; what the others did is kept."""
+    """Jobs whose process ended each time they were tried; what the others did is kept."""
 
     exit_code = 1
 
@@ -28,7 +30,7 @@ class LostJobsError(RsbenchError):
 def finished_jobs(
     factory: Callable[..., Server],
     jobs: Sequence[Job],
-    workers: int,
+    workers: Workers,
     environment: Mapping[str, str],
     *arguments: object,
     name: Callable[[Job], str] = str,
@@ -36,14 +38,14 @@ def finished_jobs(
     """Jobs with their answers, as of ``run_jobs``; ``name`` says in errors which job it was.
 
     Raises:
-        LostJobsError: names jobs whose process ended twice, when all others are done or ``_MOST_LOST`` are lost.
+        LostJobsError: names jobs whose process ended ``TRIES`` times, when the others are done, or many are.
         RsbenchError: at once, for a job that failed.
     """
     lost = []
     with closing(run_jobs(factory, jobs, workers, environment, *arguments)) as outcomes:
         for job, outcome in outcomes:
             if outcome.ended:
-                lost.append(f"{name(job)} ({outcome.reason}, twice)")
+                lost.append(f"{name(job)} ({outcome.reason}, {TRIES} times)")
             elif not outcome.success:
                 raise RsbenchError(f"{name(job)}: {outcome.reason}")
             else:
@@ -61,7 +63,7 @@ def finished_jobs(
 def run_jobs(
     factory: Callable[..., Server],
     jobs: Sequence[Job],
-    workers: int,
+    workers: Workers,
     environment: Mapping[str, str],
     *arguments: object,
     seconds_of: Callable[[Job], float] | None = None,
@@ -69,21 +71,38 @@ def run_jobs(
 ) -> Generator[tuple[Job, Outcome], None, None]:
     """Jobs with their outcomes, as they become ready.
 
-    A job whose process ended is tried once more, in a fresh one; where there are limits, it fails. When the
+    A job whose process ended is tried ``TRIES`` times, in fresh ones; where there are limits, it fails. When the
     iterator is closed or an exception passes through it, such as Ctrl-C, jobs that wait are dropped and all
     processes end at once.
 
     Args:
         factory: see ``IsolatedWorker``; what it returns is called with a job.
         jobs: picklable.
-        workers: processes.
+        workers: processes, or a cluster.
         environment, arguments: see ``IsolatedWorker``.
         seconds_of: limit of time of a job, perhaps infinite; without one there is none.
         memory_mb: of a process; see ``IsolatedWorker``.
 
     Raises:
+        RsbenchError: the cluster cannot be reached.
         RuntimeError: rsbench's own code in a child is at fault.
     """
+    crew = Crew(
+        factory=factory,
+        arguments=arguments,
+        environment=environment,
+        memory_mb=memory_mb,
+        tries=TRIES if seconds_of is None and memory_mb is None else 1,
+    )
+    if isinstance(workers, Cluster):
+        yield from run_on_cluster(workers, crew, jobs, seconds_of)
+    else:
+        yield from _run_here(workers, crew, jobs, seconds_of)
+
+
+def _run_here(
+    workers: int, crew: Crew, jobs: Sequence[Job], seconds_of: Callable[[Job], float] | None
+) -> Generator[tuple[Job, Outcome], None, None]:
     waiting: queue.SimpleQueue[Job] = queue.SimpleQueue()
     done: queue.SimpleQueue[_Done[Job]] = queue.SimpleQueue()
     cancel = threading.Event()
@@ -91,14 +110,12 @@ def run_jobs(
         waiting.put(job)
 
     def work() -> None:
-        with IsolatedWorker(
-            factory, *arguments, environment=environment, cancel=cancel, memory_mb=memory_mb
-        ) as worker:
-            _work(worker, waiting, done, seconds_of, memory_mb is not None)
+        with crew.hire(cancel) as worker:
+            _work(crew, worker, waiting, done, seconds_of)
 
-    crew = [threading.Thread(target=work, daemon=True) for _ in range(min(workers, len(jobs)))]
+    threads = [threading.Thread(target=work, daemon=True) for _ in range(min(workers, len(jobs)))]
     try:
-        for member in crew:
+        for member in threads:
             member.start()
         for _ in jobs:
             job, outcome = done.get()
@@ -107,16 +124,16 @@ def run_jobs(
             yield job, outcome
     finally:
         cancel.set()
-        for member in crew:
+        for member in threads:
             member.join()
 
 
 def _work(
+    crew: Crew,
     worker: IsolatedWorker,
     waiting: queue.SimpleQueue[Job],
     done: queue.SimpleQueue[_Done[Job]],
     seconds_of: Callable[[Job], float] | None,
-    limited: bool,
 ) -> None:
     """Hand jobs to a process until none waits."""
     while True:
@@ -125,9 +142,7 @@ def _work(
         except queue.Empty:
             return
         try:
-            outcome = worker.call(job, limit_s=math.inf if seconds_of is None else seconds_of(job))
-            if outcome.ended and seconds_of is None and not limited:
-                outcome = worker.call(job, limit_s=math.inf)
+            outcome = crew.done_by(worker, job, math.inf if seconds_of is None else seconds_of(job))
         except Cancelled:
             return
         except BaseException as error:  # for whoever waits in the other thread

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from rsbench.errors import RsbenchError
+from rsbench.imports import signals_later
 from rsbench.renderers import llvm, verdicts
 
 Preference = Literal["auto", "llvm", "cuda", "scalar"]
@@ -141,10 +142,11 @@ def _adopted() -> tuple[Backend, None] | None:
 
 
 def _set_variant(variant: str) -> None:
-    import mitsuba
+    with signals_later():
+        import mitsuba
 
-    if mitsuba.variant() != variant:
-        mitsuba.set_variant(variant)
+        if mitsuba.variant() != variant:
+            mitsuba.set_variant(variant)
 
 
 def set_threads(count: int) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from rsbench.cli.stopping import stoppable
+from rsbench.imports import signals_later
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 
@@ -137,3 +138,16 @@ def test_an_import_that_is_tried_ends_with_its_parent(tmp_path: Path) -> None:
         time.sleep(0.01)
     os.kill(int(pid), signal.SIGKILL)
     pytest.fail("it goes on")
+
+
+def test_signals_wait_for_an_import_to_end() -> None:
+    """Native code does not survive an exception out of a handler."""
+    ended = []
+    with pytest.raises(KeyboardInterrupt), signals_later():
+        signal.raise_signal(signal.SIGINT)
+        ended.append(True)
+    assert ended == [True]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    thread = threading.Thread(target=lambda: signals_later().__enter__())
+    thread.start()
+    thread.join()  # elsewhere no handler runs, and none may be changed

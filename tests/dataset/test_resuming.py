@@ -225,11 +225,11 @@ def test_two_commands_do_not_share_a_folder(card: DatasetCard, copy: Path) -> No
 
 def test_lost_jobs_end_a_command_with_code_1(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def lose(*arguments: object, **options: object) -> None:
-        raise LostJobsError("not done: sequence a (killed by signal 9 (SIGKILL), twice)")
+        raise LostJobsError("not done: sequence a (killed by signal 9 (SIGKILL), 3 times)")
 
     monkeypatch.setattr(generation, "generate_dataset", lose)
     result = run_here("generate", "smoke", "--out", tmp_path)
-    assert result.returncode == 1 and "sequence a (killed by signal 9 (SIGKILL), twice)" in result.stderr
+    assert result.returncode == 1 and "sequence a (killed by signal 9 (SIGKILL), 3 times)" in result.stderr
 
 
 def test_hidden_files_are_no_part_of_the_dataset(dataset: Path) -> None:

@@ -38,6 +38,7 @@ from rsbench.cards import parse_card
 from rsbench.dataset.files import read_table, write_bytes, write_json, write_table
 from rsbench.dataset.workplace import WORK, workplace
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.crew import Workers
 from rsbench.reading import NAME, read_bytes, read_json
 
 FORMAT = 1
@@ -91,7 +92,7 @@ def add(
     made: dict[str, Any],
     *,
     replace: bool = False,
-    workers: int = 1,
+    workers: Workers = 1,
 ) -> Scored:
     """Score a file of predictions and keep both.
 
@@ -154,7 +155,7 @@ def _contents(
     split: Split,
     made: dict[str, Any],
     files: dict[str, str],
-    workers: int,
+    workers: Workers,
 ) -> tuple[bytes, pd.DataFrame, dict[str, Any]]:
     record: dict[str, Any] = {
         "format": FORMAT,
@@ -366,7 +367,7 @@ def _check_files(folder: Path, files: dict[str, str], found: dict[str, str]) -> 
             )
 
 
-def rescore(board: Path, split: Split, workers: int = 1) -> dict[str, list[str]]:
+def rescore(board: Path, split: Split, workers: Workers = 1) -> dict[str, list[str]]:
     """Score the stored predictions of a split again; no method runs. ``workers``: see ``mark``.
 
     Returns:

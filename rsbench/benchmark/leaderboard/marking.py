@@ -30,6 +30,7 @@ from rsbench.core import so3
 from rsbench.core.metrics import translation_of_offset
 from rsbench.core.so3 import FloatArray
 from rsbench.motions import make_motion
+from rsbench.pipeline.crew import Workers
 
 _TIMES = 33
 """Row times, from the first row of frame 0 to the last of frame 1, at which poses are compared."""
@@ -38,7 +39,7 @@ _WORST_READOUT = 1.0
 Row = dict[str, Any]
 
 
-def mark(submission: Submission, split: Split, workers: int = 1) -> pd.DataFrame:
+def mark(submission: Submission, split: Split, workers: Workers = 1) -> pd.DataFrame:
     """One row for each problem, in the order of the split; the columns are those of docs/submit.md.
 
     Args:
@@ -50,7 +51,7 @@ def mark(submission: Submission, split: Split, workers: int = 1) -> pd.DataFrame
         RsbenchError: a picture is at fault, or the truth has changed since the split was read.
     """
     model, found = submission.header.motion_model, submission.answers
-    if split.protocol.pictures and workers > 1:
+    if split.protocol.pictures and workers != 1:
         return pd.DataFrame(rows_of_workers(submission, split, workers))
     if split.protocol.pictures:
         return pd.DataFrame([picture_row(truth, submission) for truth in split.truths])

@@ -31,6 +31,7 @@ from rsbench.dataset.workplace import remove
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.crew import Workers
 from rsbench.pipeline.frame_depth import Images
 from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.isolated_parts import Isolation
@@ -97,14 +98,14 @@ def run_picture_cards(
     inputs: Path,
     work: Path,
     *,
-    workers: int = 1,
+    workers: Workers = 1,
     limits: Limits = Limits(),  # noqa: B008  it is a constant
     step: Callable[[str], None] = lambda word: None,
 ) -> list[Path]:
     """Run matchers or correctors on exported inputs; returns for each a file of answers, ready to be submitted.
 
     Raises:
-        RsbenchError: no such card; processes died twice over the same problems: what is done is kept.
+        RsbenchError: no such card; processes died each time over the same problems: what is done is kept.
     """
     chains = load_chains(cards, split.protocol)
     folders = {card: work / _name(chain, split.protocol) for card, chain in chains.items()}

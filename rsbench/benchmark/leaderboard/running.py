@@ -29,6 +29,7 @@ from rsbench.core.joining import join_stereo
 from rsbench.dataset.files import sha256, write_bytes, write_json
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.answer import Extra, solve_problem
+from rsbench.pipeline.crew import Workers
 from rsbench.pipeline.frame_motion import check_readout
 from rsbench.pipeline.isolated_jobs import finished_jobs, run_jobs
 from rsbench.pipeline.isolated_solver import SolverRunner
@@ -128,15 +129,15 @@ def run_cards(
     inputs: Path,
     work: Path,
     *,
-    workers: int = 1,
+    workers: Workers = 1,
     limits: Limits = Limits(),  # noqa: B008  it is a constant
     step: Callable[[str], None] = lambda word: None,
 ) -> list[Path]:
     """Run solvers on exported inputs; returns for each a file of predictions in ``work``, ready to be submitted.
 
     Raises:
-        RsbenchError: no such solver; it uses what the protocol does not give; processes died twice over the same
-            problems: what is done is kept.
+        RsbenchError: no such solver; it uses what the protocol does not give; processes died each time over
+            the same problems: what is done is kept.
     """
     entries = load_entries(cards, split.protocol)
     data, count = sha256(inputs / "problems.jsonl"), len(split.truths)
@@ -168,7 +169,7 @@ def run_cards(
 def jobs_done(
     serve: Callable[..., Callable[[Job], None]],
     jobs: Sequence[Job],
-    workers: int,
+    workers: Workers,
     inputs: Path,
     limits: Limits,
     fail: Callable[[Job, str], None],

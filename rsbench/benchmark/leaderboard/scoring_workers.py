@@ -12,17 +12,18 @@ from typing import Any
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import Submission
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.crew import Workers
 from rsbench.pipeline.isolated_jobs import run_jobs
 from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 
 Row = dict[str, Any]
 
 
-def rows_of_workers(submission: Submission, split: Split, workers: int) -> list[Row]:
+def rows_of_workers(submission: Submission, split: Split, workers: Workers) -> list[Row]:
     """``marking.picture_row`` of each problem, in the order of the split.
 
     Raises:
-        RsbenchError: as it does; or a process ended twice over the same problem.
+        RsbenchError: as it does; or a process ended each time over the same problem.
     """
     rows: dict[str, Row] = {}
     names = [truth.name for truth in split.truths]

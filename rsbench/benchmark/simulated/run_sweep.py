@@ -30,6 +30,7 @@ from rsbench.dataset.workplace import listed, remove, workplace
 from rsbench.errors import RsbenchError
 from rsbench.identity import source_version
 from rsbench.motions import motion_model
+from rsbench.pipeline.crew import Workers
 from rsbench.pipeline.isolated_jobs import finished_jobs
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
@@ -101,7 +102,7 @@ def run_sweep(
     card: SweepCard,
     out: Path,
     *,
-    workers: int = 1,
+    workers: Workers = 1,
     progress: Progress | None = None,
     time_limit_s: float | None = None,
     force: bool = False,
@@ -120,7 +121,7 @@ def run_sweep(
 
     Raises:
         RsbenchError: no such solver, or two of one name; ``out`` holds another sweep; a motion leaves too few
-            points in view; a worker was killed twice over the same trials.
+            points in view; a worker was killed each time over the same trials.
     """
     step, plan = progress or (lambda word: None), _plan(card, entrants(card))
     with workplace(out) as hidden:
@@ -311,7 +312,7 @@ def _compile(card: SweepCard) -> None:
     warm_up(_motions(card, entrants(card)))
 
 
-def _run_all(todo: list[_Job], workers: int, time_limit_s: float | None) -> Iterator[_Part]:
+def _run_all(todo: list[_Job], workers: Workers, time_limit_s: float | None) -> Iterator[_Part]:
     """Always in children, so that BLAS has one thread and one summation order whatever the parent has loaded."""
     one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
     with closing(finished_jobs(_serve_jobs, todo, workers, one_thread, time_limit_s)) as found:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,9 @@ from rsbench.dataset.verification.png import png_fault
 from rsbench.dataset.verification.rough import roughly_alike
 from rsbench.errors import RsbenchError
 from rsbench.reading import inside
+
+Judge = Callable[[Shot], bool]
+"""Says of a file of a shot, from what nobody who made the dataset could change, that it is right."""
 
 
 @dataclass(eq=False)
@@ -186,16 +190,38 @@ class Comparison:
         """What the pairs show of sequence.json; where that is wrong they show nothing else."""
         return depth.geometry_fault(self.agreements)
 
-    def faults(self, elsewhere: Elsewhere, is_right: Callable[[Shot], bool] = lambda shot: False) -> Iterator[str]:
-        """What the pairs show, each with its likely cause; ``is_right`` acquits a depth map that they accuse."""
+    def faults(
+        self, elsewhere: Elsewhere, is_right: Judge = lambda shot: False, shows: Judge = lambda shot: False
+    ) -> Iterator[str]:
+        """What the pairs show, each with its likely cause.
+
+        ``is_right`` acquits a depth map that they accuse, ``shows`` an image.
+        """
         wrong = self._wrong_maps(is_right)
         for shot, fault in wrong.items():
             cause = likely_cause(self.content.sequence, self.content.maps, shot, fault.rows)
             yield finding(shot.depth, fault.what, rows_of(fault.rows), cause)
         yield from depth.pair_faults(self.agreements, wrong)
-        yield from self._image_faults(wrong.keys(), elsewhere)
+        yield from self._acquitted(list(self._image_faults(wrong.keys(), elsewhere)), shows)
 
-    def _wrong_maps(self, is_right: Callable[[Shot], bool]) -> dict[Shot, depth.MapFault]:
+    def _acquitted(self, accused: list[tuple[Shot, str]], shows: Judge) -> Iterator[str]:
+        """Faults of images without those that are what is rendered again: fine things look different from each
+        place. A partner that is not what is rendered again is then what was wrong."""
+        judged = lru_cache(maxsize=None)(shows)
+        for shot, fault in accused:
+            if not judged(shot):
+                yield fault
+                continue
+            what = "others contradict it, and it is what is rendered again, all of it"
+            self.notes.append(finding(shot.image, what))
+            pairs = {(each.source, each.target) for each in self.likenesses}
+            for other in sorted(
+                {one for pair in pairs if shot in pair for one in pair} - {one for one, _ in accused}
+            ):
+                if not judged(other):
+                    yield finding(other.image, f"shows other colours than {shot.image} at the same surface")
+
+    def _wrong_maps(self, is_right: Judge) -> dict[Shot, depth.MapFault]:
         """Faults of maps; one without a flat place is none, where it is roughly what others see."""
         wrong, right = depth.map_faults(self.verdicts), set[Shot]()
         while acquitted := {shot for shot in wrong if is_right(shot)}:
@@ -212,24 +238,24 @@ class Comparison:
                 self.notes.append(finding(shot.depth, what))
         return wrong
 
-    def _image_faults(self, blamed: Collection[Shot], elsewhere: Elsewhere) -> Iterator[str]:
+    def _image_faults(self, blamed: Collection[Shot], elsewhere: Elsewhere) -> Iterator[tuple[Shot, str]]:
         """Images compared through depth that is in order; a wrong map would accuse its image too."""
         content, told = self.content, set()
         for shot, picture in content.pictures.items():
             fault = image_checks.colour_fault(picture, content.pictures)
             if fault:
                 told.add(shot)
-                yield fault
+                yield shot, fault
         sound = [each for each in self.likenesses if not {each.source, each.target} & {*blamed, *told}]
         heard = image_checks.heard(sound)
         for shot, fault in likeness_faults(content.sequence, content.maps, content.pictures, heard, elsewhere):
             told.add(shot)
-            yield fault
+            yield shot, fault
         for shot, votes in self.votes.items():
             rows = image_checks.tile_rows(votes)
             if shot not in told and shot not in blamed and np.any(rows):
                 what = "a part of these rows shows other colours than two partners at the same surface"
-                yield finding(shot.image, what, rows_of(rows))
+                yield shot, finding(shot.image, what, rows_of(rows))
 
 
 def images_elsewhere(sequence: Sequence, others: Callable[[], Iterable[Sequence]]) -> Elsewhere:

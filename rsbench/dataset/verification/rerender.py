@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rsbench import __version__
 from rsbench.cards import list_cards, parse_card
@@ -29,11 +28,11 @@ from rsbench.dataset.shots import SHOTS, Shot, shots_of
 from rsbench.dataset.verification.affine_checks import affine_again
 from rsbench.dataset.verification.channel_checks import channels_again
 from rsbench.dataset.verification.content import Content, clean_picture
-from rsbench.dataset.verification.findings import finding, rows_of
-from rsbench.dataset.verification.image_checks import CHANGES, Picture
-from rsbench.dataset.verification.landing import DepthMap
+from rsbench.dataset.verification.findings import finding
+from rsbench.dataset.verification.image_checks import Picture
 from rsbench.dataset.verification.match_checks import matches_again
 from rsbench.dataset.verification.mesh_files import with_files
+from rsbench.dataset.verification.rendered_checks import SAME_DEPTH, Check, depth_check, image_check, label_checks
 from rsbench.dataset.verification.stacks import stack_rows
 from rsbench.dataset.verification.surface_checks import surfaces_again
 from rsbench.dataset.verification.track_checks import tracks_again
@@ -58,15 +57,6 @@ _COMPRESSED = 4
 """Of the rows of a compressed frame one in so many: each takes 48 rows of the sensor."""
 _MOST_RAYS = 2e8
 """Of a sequence, with ``auto``: fewer rows where the samples are many."""
-_SAME_DEPTH = 2e-6
-"""Relative: rays in float32 on another processor; on the same one they have the same bits."""
-_OTHER_CODES, _FAR_CODES = 0.05, 0.005
-"""Shares of pixels that may differ at all, and by more than ``_NEAR``: rounding on another processor moves a
-sample across an edge now and then."""
-_NEAR = 2.0
-_OTHER_DEPTH = 0.005
-_OTHER_LABELS, _FEW_LABELS = 1e-3, 8
-"""Share and number of labels that rounding on another processor may change, at edges."""
 
 
 @dataclass(eq=False)
@@ -84,7 +74,20 @@ class Again:
         """Whether a depth map is what its scene looks like, at every pixel: that takes but one ray for each."""
         with contextlib.suppress(RsbenchError):  # told by ``check``
             stored, rendered = content.maps[shot].depth, self.whole(content, shot)[1].depth
-            return bool(np.all(np.abs(stored - rendered) <= _SAME_DEPTH * np.maximum(stored, rendered)))
+            return bool(np.all(np.abs(stored - rendered) <= SAME_DEPTH * np.maximum(stored, rendered)))
+        return False
+
+    def shows(self, content: Content, shot: Shot) -> bool:
+        """Whether a picture, without its sensor, is what its scene looks like: all of it, with all samples."""
+        manifest, camera = content.sequence.manifest, content.sequence.rig.camera
+        with contextlib.suppress(RsbenchError):  # told by ``check``
+            options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
+            rows = list(range(camera.height))
+            if _rays_of(camera.width, options) * camera.height > _MOST_RAYS:
+                return False
+            scene, _ = self.scene(content.sequence)
+            check = _picture_check(content, _render(content, scene, options, shot, rows), options, shot, rows)
+            return check.same_bits or not (check.fault or _made_here(content))
         return False
 
     def cleared(self, content: Content, accused: Collection[str]) -> set[str]:
@@ -148,20 +151,11 @@ class Again:
         return self._built[2], self._built[1]
 
 
-@dataclass(frozen=True)
-class _Check:
-    """One file against its rows rendered again; ``fault`` is "" when they are alike."""
-
-    file: str
-    fault: str
-    same_bits: bool
-
-
 class Redone:
     """Rows of one sequence rendered again, some frames after the other."""
 
     def __init__(self, again: Again, sequence: Sequence) -> None:
-        self._sequence, self._checks = sequence, list[_Check]()
+        self._sequence, self._checks = sequence, list[Check]()
         self._begun, self._seconds, self._refusal = time.perf_counter(), 0.0, ""
         try:
             self._options = parse_card(
@@ -181,7 +175,7 @@ class Redone:
         if not self._refusal:
             self._take(_checks(content, self._scene, self._options, self._rows, told))
 
-    def _take(self, checks: Iterator[_Check]) -> None:
+    def _take(self, checks: Iterator[Check]) -> None:
         start = time.perf_counter()
         self._checks += checks
         self._seconds += time.perf_counter() - start
@@ -195,7 +189,7 @@ class Redone:
         of_matches = (each for first in pairs for each in matches_again(self._sequence, first, rays, told))
         of_points = (made(self._sequence, rays, told) for made in (tracks_again, affine_again))
         again = chain(*of_points, of_matches)
-        self._take(_Check(*check) for check in again)
+        self._take(Check(*check) for check in again)
         wrong = [check for check in checks if check.fault]
         done = f"{len(self._rows)} rows of each image and depth map rendered again in {self._seconds:.1f} s"
         if _table(manifest, "scene").get("sha256") != self._digest:
@@ -222,14 +216,17 @@ def _rows_of(mode: Rerender, sequence: Sequence, options: RendererOptions) -> li
     camera = sequence.rig.camera
     if mode == "all":
         return list(range(camera.height))
-    depth = options.max_depth if options.integrator == "path" else 1
     shots = len(SHOTS) * sequence.frames // 2
-    affordable = int(_MOST_RAYS / (shots * camera.width * options.samples * depth))
+    affordable = int(_MOST_RAYS / (shots * _rays_of(camera.width, options)))
     count = min(_ROWS, camera.height, affordable)
     digest = hashlib.sha256(repr(sequence.manifest.get("files")).encode()).digest()
     rng = np.random.default_rng(int.from_bytes(digest[:8], "little"))
     edges = np.linspace(0, camera.height, count + 1).astype(int)
     return [int(rng.integers(low, high)) for low, high in pairwise(edges)]
+
+
+def _rays_of(pixels: int, options: RendererOptions) -> int:
+    return pixels * options.samples * (options.max_depth if options.integrator == "path" else 1)
 
 
 def _table(manifest: Mapping[str, Any], key: str) -> dict[str, Any]:
@@ -241,11 +238,9 @@ def _table(manifest: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 def _checks(
     content: Content, scene: MitsubaScene, options: RendererOptions, rows: list[int], told: set[str]
-) -> Iterator[_Check]:
-    from rsbench.renderers.image import to_srgb8
+) -> Iterator[Check]:
     from rsbench.renderers.segments import SceneRays
 
-    elsewhere = not _made_here(content)
     own = shots_of(content.times)
     twins = (each._replace(row=row) for row in content.sequence.twins for each in own if each.shutter == "gs")
     for shot in (*own, *twins):
@@ -253,23 +248,28 @@ def _checks(
             continue
         frame = _render(content, scene, options, shot, rows)
         if shot in content.maps:
-            yield _depth_check(content.maps[shot], frame.depth, rows)
-            yield from _label_checks(content.maps[shot], frame.labels, rows)
+            yield depth_check(content.maps[shot], frame.depth, rows)
+            yield from label_checks(content.maps[shot], frame.labels, rows)
         if shot in content.pictures:
-            noisy = options.integrator == "path" and elsewhere
-            rendered = to_srgb8(frame.image, options.exposure)
-            file = clean_picture(content.sequence, shot)
-            yield _image_check(file, content.pictures[shot], rendered, rows, noisy)
+            yield _picture_check(content, frame, options, shot, rows)
         for made in (channels_again, surfaces_again):
             again = made(content.sequence, shot, rows, frame, SceneRays(scene, content.sequence.objects), told)
-            yield from (_Check(*check) for check in again)
+            yield from (Check(*check) for check in again)
         if shot.shutter == "rs":
             yield from _frame_checks(content, scene, options, shot, rows, told)
 
 
+def _picture_check(content: Content, frame: Frame, options: RendererOptions, shot: Shot, rows: list[int]) -> Check:
+    from rsbench.renderers.image import to_srgb8
+
+    noisy = options.integrator == "path" and not _made_here(content)
+    rendered = to_srgb8(frame.image, options.exposure)
+    return image_check(clean_picture(content.sequence, shot), content.pictures[shot], rendered, rows, noisy)
+
+
 def _frame_checks(
     content: Content, scene: MitsubaScene, options: RendererOptions, shot: Shot, rows: list[int], told: set[str]
-) -> Iterator[_Check]:
+) -> Iterator[Check]:
     """What lies beside a clean rolling-shutter frame: what its sensor makes of it, and the stack of whole frames.
 
     Each row of a sensor has random numbers of its own, and so its bits without the others; of an image that was
@@ -295,7 +295,7 @@ def _frame_checks(
                 some,
                 sequence.objects,
             )
-            yield _image_check(shot.image, seen, sensed, some, elsewhere)
+            yield image_check(shot.image, seen, sensed, some, elsewhere)
     with contextlib.suppress(RsbenchError):
         if whole_frames(sequence.manifest):
             yield _stack_check(content, scene, chosen, shot, rows)
@@ -303,7 +303,7 @@ def _frame_checks(
 
 def _stack_check(
     content: Content, scene: MitsubaScene, chosen: RendererOptions, shot: Shot, rows: list[int]
-) -> _Check:
+) -> Check:
     """Of whole frames at the poses of some rows, other rows: each of these rows at the pose of another."""
     from rsbench.renderers.image import to_srgb8
     from rsbench.renderers.render import render
@@ -318,7 +318,7 @@ def _stack_check(
     frame = render(scene, sequence.rig.camera, R, t, chosen, objects=poses_of(sequence.objects, tau), rows=rows)
     rendered = to_srgb8(frame.image, chosen.exposure)
     noisy = chosen.integrator == "path" and not _made_here(content)
-    return _image_check(f"gs_stack/{shot.side}_{shot.frame}", seen, rendered, rows, noisy)
+    return image_check(f"gs_stack/{shot.side}_{shot.frame}", seen, rendered, rows, noisy)
 
 
 def _made_here(content: Content) -> bool:
@@ -341,55 +341,3 @@ def _render(content: Content, scene: MitsubaScene, options: RendererOptions, sho
     sequence = content.sequence
     poses = row_poses(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame)
     return render_shot(scene, sequence, shot, poses, _of_image(content, options, shot), rows=rows)
-
-
-def _label_checks(stored: DepthMap, rendered: NDArray[np.uint8], rows: list[int]) -> Iterator[_Check]:
-    if stored.labels is None:
-        return
-    wrong, file = stored.labels[rows] != rendered, stored.shot.labels
-    what = f"{100 * np.mean(wrong):.2g} % of {wrong.size} labels differ from what is rendered again"
-    in_rows = np.isin(np.arange(len(stored.labels)), np.asarray(rows)[np.any(wrong, axis=1)])
-    bad = np.sum(wrong) > max(_OTHER_LABELS * wrong.size, _FEW_LABELS)
-    yield _Check(file, finding(file, what, rows_of(in_rows)) if bad else "", not np.any(wrong))
-
-
-def _depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]) -> _Check:
-    depth, file = stored.depth[rows], stored.shot.depth
-    wrong = np.abs(depth - rendered) > _SAME_DEPTH * np.maximum(depth, rendered)
-    share = float(np.mean(wrong))
-    if share <= _OTHER_DEPTH:
-        return _Check(file, "", np.array_equal(depth, rendered))
-    both = wrong & (depth > 0) & (rendered > 0)
-    ratio = depth[both] / rendered[both] if np.any(both) else np.ones(1)
-    middle = float(np.median(ratio))
-    scaled = np.median(np.abs(ratio / middle - 1)) < 1e-6 and abs(middle - 1) > _SAME_DEPTH
-    cause = f"looks scaled by {middle:.7g}" if scaled else ""
-    what = f"depth differs from what is rendered again on {100 * share:.3g} % of {wrong.size} pixels"
-    if np.any(both):
-        what += f", typically by {np.median(np.abs(ratio - 1)):.1e} of itself"
-    return _Check(file, finding(file, what, _rows(wrong, rows, len(stored.depth)), cause), False)
-
-
-def _image_check(file: str, stored: Picture, rendered: NDArray[np.uint8], rows: list[int], noisy: bool) -> _Check:
-    truth = rendered.astype(np.float32)
-    difference = np.max(np.abs(stored.colours[rows] - truth), axis=-1)
-    far = difference > _NEAR + (4 * stored.noise if noisy else 0.0)
-    other = far if noisy else difference > 0
-    if np.mean(far) <= _FAR_CODES and np.mean(other) <= _OTHER_CODES:
-        return _Check(file, "", not np.any(difference))
-    what = (
-        f"the image differs from what is rendered again on {100 * np.mean(other):.3g} % of {far.size} pixels, "
-        f"by up to {np.max(difference):g} codes"
-    )
-    y, x = (each.ravel() for each in np.meshgrid(rows, np.arange(truth.shape[1]), indexing="ij"))
-    costs = [np.mean(np.abs(change.undone(stored.colours, y, x) - truth.reshape(-1, 3))) for change in CHANGES]
-    best = int(np.argmin(costs))
-    cause = f"looks {CHANGES[best].words}" if best and costs[best] < 0.5 * costs[0] else ""
-    return _Check(file, finding(file, what, _rows(other, rows, len(stored.colours)), cause), False)
-
-
-def _rows(wrong: NDArray[np.bool_], rows: list[int], height: int) -> str:
-    """Words for the rendered rows in which many pixels are wrong."""
-    flags = np.zeros(height, dtype=np.bool_)
-    flags[np.asarray(rows)[np.mean(wrong, axis=1) > _OTHER_DEPTH]] = True
-    return "all rows that were rendered" if np.sum(flags) == len(rows) else rows_of(flags)

@@ -96,10 +96,10 @@ class Walk:
                 self.agreements.setdefault((agreement.source, agreement.target), agreement)
             step(self.sequence.name)
         again = self.again
-        acquits = (lambda shot: False) if again is None else partial(again.is_right, content)
+        judges = () if again is None else (partial(again.is_right, content), partial(again.shows, content))
         geometry = comparison.geometry()
         if geometry is None:
-            self.faults += comparison.faults(self.elsewhere, acquits)
+            self.faults += comparison.faults(self.elsewhere, *judges)
         else:
             self.apart[content.times[0], content.times[-1]] = geometry
         self.notes += comparison.notes

@@ -150,7 +150,7 @@ def test_a_worker_killed_twice_is_one_line_that_names_its_trials(
     monkeypatch.setattr(module, "_serve_jobs", importlib.import_module("deadly").serve)
     with pytest.raises(
         RsbenchError,
-        match=r"small, low, rotation_deg = 1, trials 0 to 6 .ended its process with exit code 9, twice.*again",
+        match=r"small, low, rotation_deg = 1, trials 0 to 6 .ended its process with exit code 9, 3 times.*again",
     ):
         run_sweep(replace(CARD, values=(1.0,), variant=CARD.variant[:1]), tmp_path / "killed")
     sys.modules.pop("deadly")

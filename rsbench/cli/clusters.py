@@ -1,0 +1,43 @@
+"""The option ``--scheduler`` of commands whose work can be done by many machines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rsbench.pipeline.crew import Workers
+
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Dask scheduler whose workers do it, in place of --workers: tcp://host:8786 or a file.json. "
+        "All paths must be the same there (rsbench docs cluster).",
+    ),
+]
+
+
+def chosen_workers(workers: int | None, scheduler: str | None, default: int = 1) -> Workers:
+    """Processes here, or a cluster.
+
+    Raises:
+        RsbenchError: both are given.
+    """
+    if scheduler is None:
+        return workers or default
+    from rsbench.errors import RsbenchError
+    from rsbench.pipeline.crew import Cluster
+
+    if workers is not None:
+        raise RsbenchError(
+            f"--workers {workers}: the cluster of --scheduler {scheduler} has its own; give one of both"
+        )
+    return Cluster(address=str(Path(scheduler).resolve()) if scheduler.endswith(".json") else scheduler)
+
+
+def shared_path(path: Path, scheduler: str | None) -> Path:
+    """A path as the machines of a cluster, which work in other folders, must be told it."""
+    return path if scheduler is None else path.resolve()

@@ -1,0 +1,96 @@
+"""Jobs on a Dask cluster of this machine: the same answers, whoever dies."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsbench.errors import RsbenchError
+from rsbench.pipeline.crew import Cluster
+from rsbench.pipeline.isolated_jobs import LostJobsError, finished_jobs, run_jobs
+
+pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="needs rsbench[cluster]")
+
+
+@pytest.fixture(scope="module")
+def local() -> Iterator[Any]:
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as cluster:
+        yield cluster
+
+
+@pytest.fixture
+def there(local: Any) -> Cluster:
+    return Cluster(address=local.scheduler_address)
+
+
+def test_all_jobs_are_done(there: Cluster) -> None:
+    jobs = [float(k * k) for k in range(20)]
+    done = {job: outcome.value for job, outcome in run_jobs(functools.partial, jobs, there, {}, math.sqrt)}
+    assert done == {float(k * k): float(k) for k in range(20)}
+
+
+def test_a_job_that_always_dies_is_named_when_the_others_are_done(there: Cluster, tmp_path: Path) -> None:
+    note = tmp_path / "tries"
+    deadly, done = f"printf x >> {note}; kill -9 $PPID", []
+    with pytest.raises(LostJobsError, match="3 times"):
+        for job, _ in finished_jobs(functools.partial, [deadly, "true", "exit 3"], there, {}, os.system):
+            done.append(job)
+    assert sorted(done) == ["exit 3", "true"] and note.read_text() == "xxx"
+
+
+def test_limits_hold_there_too(there: Cluster) -> None:
+    jobs = run_jobs(
+        functools.partial, ["__import__('time').sleep(1000)"], there, {}, eval, seconds_of=lambda job: 0.3
+    )
+    ((_, outcome),) = jobs
+    assert outcome.reason == "took longer than 0.3 s"
+
+
+def test_a_worker_of_the_cluster_that_is_killed_loses_nothing(there: Cluster, local: Any, tmp_path: Path) -> None:
+    """The first job kills the worker that serves it, the parent of its parent."""
+    mark = tmp_path / "mark"
+    kill = f"test -e {mark} || {{ touch {mark}; kill -9 $(ps -o ppid= -p $PPID); }}; sleep 0.2"
+    jobs = [kill, *(f"sleep 0.0{k}" for k in range(1, 8))]
+    done = [job for job, outcome in run_jobs(functools.partial, jobs, there, {}, os.system) if outcome.value == 0]
+    assert sorted(done) == sorted(jobs) and mark.exists()
+
+
+def test_what_is_stopped_ends_there(there: Cluster, tmp_path: Path) -> None:
+    """Jobs that wait are dropped, and the children at work end."""
+    command = f"echo $$ > {tmp_path}/$$; exec sleep 1000"
+    jobs = ["true", *(f"{command} # {k}" for k in range(4))]
+    with closing(run_jobs(functools.partial, jobs, there, {}, os.system)) as outcomes:
+        next(outcomes)
+        while not (found := list(tmp_path.iterdir())):
+            time.sleep(0.05)
+    start = time.monotonic()
+    while any(_alive(int(path.name)) for path in found):
+        assert time.monotonic() - start < 5.0
+        time.sleep(0.05)
+    time.sleep(1.0)
+    assert set(tmp_path.iterdir()) == set(found)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rsbench.pipeline.cluster_jobs._CONNECT_S", 0.5)
+    with pytest.raises(RsbenchError, match=r"^--scheduler tcp://127.0.0.1:1: "):
+        list(run_jobs(functools.partial, ["1"], Cluster(address="tcp://127.0.0.1:1"), {}, eval))
