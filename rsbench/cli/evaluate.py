@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rsbench.cli.clusters import Scheduler, chosen_workers, shared_path
 from rsbench.cli.kinds import complete
 
 if TYPE_CHECKING:
     from rsbench.benchmark.images.plan import EvaluationOptions
+    from rsbench.pipeline.crew import Workers
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -71,6 +73,10 @@ def evaluate(
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each solver, with other RANSAC samples.")] = 1,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
     rehash: Annotated[bool, typer.Option("--rehash", help="Read all data again, not only what changed.")] = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes of one thread that predict a sequence each. Default: 1.")
+    ] = None,
+    scheduler: Scheduler = None,
     layout: Annotated[
         str | None,
         typer.Option("--from", metavar="LAYOUT", help="DIR is of others: carla-rs, colmap, euroc, kitti, ..."),
@@ -82,6 +88,8 @@ def evaluate(
         return
     from rsbench.benchmark.images.plan import EvaluationOptions
 
+    crew, command = chosen_workers(workers, scheduler), f"rsbench evaluate {folder} --out {out}"
+    folder, out = shared_path(folder, scheduler), shared_path(out, scheduler)
     options = EvaluationOptions(
         solvers=tuple(solver or every_solver()),
         correction_solver=correct_with,
@@ -95,7 +103,7 @@ def evaluate(
         seed=seed,
         rehash=rehash,
     )
-    evaluate_dataset(folder, out, options, f"rsbench evaluate {folder} --out {out}")
+    evaluate_dataset(folder, out, options, command, crew)
 
 
 def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, seed: int) -> None:
@@ -148,7 +156,9 @@ def every_solver() -> list[str]:
     return [name for name in list_solvers() if name not in _ON_REQUEST]
 
 
-def evaluate_dataset(folder: Path, out: Path, options: EvaluationOptions | None, command: str) -> Path:
+def evaluate_dataset(
+    folder: Path, out: Path, options: EvaluationOptions | None, command: str, workers: Workers = 1
+) -> Path:
     """Evaluate with a progress bar, print the tables, and return the path of the report.
 
     ``options`` None takes every solver.
@@ -160,7 +170,7 @@ def evaluate_dataset(folder: Path, out: Path, options: EvaluationOptions | None,
 
     evaluation = open_evaluation(folder, out, options or EvaluationOptions(solvers=tuple(every_solver())))
     with progress_bar(f"evaluating {folder.name}", evaluation.steps) as advance:
-        stale = evaluation.run(command, advance)
+        stale = evaluation.run(command, advance, workers)
     for table in summary_tables(out):
         print_table(table.title, table.brief)
     if stale:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import secrets
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -33,7 +34,7 @@ from rsbench.dataset.scene_hashes import SceneHashes, hashes_of_meshes, mesh_fil
 from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.dataset.shots import Geometry, Shot
 from rsbench.dataset.stage import Build, Built, Stage
-from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, remove, strangers, workplace
+from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, strangers, workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.crew import Cluster, Workers
 from rsbench.pipeline.isolated_jobs import finished_jobs
@@ -287,13 +288,12 @@ def _render_sequence(
     from rsbench.renderers.backend import start_backend
     from rsbench.renderers.passage import obstacle
 
-    backend = start_backend()
-    mitsuba_scene, digest = stage.set_for(sequence)
+    backend, (mitsuba_scene, digest) = start_backend(), stage.set_for(sequence)
     if words := obstacle(mitsuba_scene, *card.geometry_of(sequence)):
         raise RsbenchError(f"sequence {sequence.name}: {words}; choose another motion, viewpoint or baseline")
     plan = _with_gloss(plan, mitsuba_scene.glossy)
-    partial = out / HIDDEN / WORK / sequence.name
-    remove(partial)  # of a worker that was killed
+    # Of this try alone: another machine may not know yet that its run was killed.
+    partial = out / HIDDEN / WORK / f"{sequence.name}.{secrets.token_hex(4)}"
     for folder in {Path(name).parent for name in files_of(plan)}:
         (partial / folder).mkdir(parents=True, exist_ok=True)
     for side, frame in views_of(card.frames):
@@ -311,7 +311,7 @@ def _render_sequence(
     place = out / sequence.name
     if os.path.lexists(place):
         _refuse_strangers(place, "it is to be replaced")
-        os.rename(place, partial.with_name(f"{sequence.name}.old"))
+        os.rename(place, partial.with_suffix(".old"))
     os.rename(partial, place)
     yield
 

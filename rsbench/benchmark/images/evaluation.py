@@ -11,7 +11,7 @@ import pandas as pd
 
 from rsbench.benchmark.images.plan import EvaluationOptions, Places, Plan, make_plan
 from rsbench.benchmark.images.predict import Bench, Step, prediction_steps
-from rsbench.benchmark.images.repeats import repeat, repeats_of
+from rsbench.benchmark.images.repeats import predict_apart, repeat, repeats_of
 from rsbench.benchmark.images.score import AFTER, KEYS, TABLES, Row, Scorer
 from rsbench.benchmark.isolated_metric import isolated_metrics
 from rsbench.benchmark.metric_plugins import DepthCase, ImageCase, PoseCase
@@ -21,6 +21,7 @@ from rsbench.dataset.hashes import HASHES, FileHashes
 from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.dataset.workplace import workplace
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.crew import Workers
 from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.pipeline.isolated_solver import SolverRunner
 
@@ -43,11 +44,11 @@ class Evaluation:
         own = len(self.plan.sequence_names) * prediction_steps(self.plan)
         return own + len(repeats_of(self.plan)) + len(self.sequences)
 
-    def run(self, command: str, step: Step) -> list[str]:
+    def run(self, command: str, step: Step, workers: Workers = 1) -> list[str]:
         """Predict and score; writes predictions/, scores/*.csv and provenance.json below ``out``.
 
         Predictions made before from the same data, components and options are kept and scored, whoever asked for
-        them.
+        them. ``workers`` predict one sequence each; 1 is this process, with all its threads.
 
         Returns:
             Stored predictions that are not current: they are neither scored nor deleted.
@@ -59,10 +60,16 @@ class Evaluation:
         with workplace(self.out), SolverRunner() as runner, Isolation() as isolation:
             plan = self._isolated(isolation)
             hashes = FileHashes(self.dataset, self.out / HASHES, self.options.rehash)
-            for sequence in self.sequences:
-                if sequence.name in plan.sequence_names:
+            due = [sequence for sequence in self.sequences if sequence.name in plan.sequence_names]
+            if workers == 1:
+                for sequence in due:
                     Bench(sequence, self._folder(sequence), plan, runner, hashes.sha256).predict(step)
-            repeat(self.dataset, self.out, self.options, plan, self.sequences, hashes, step)
+            else:
+                names = [sequence.name for sequence in due]
+                for name in predict_apart(self.dataset, self.out, self.options, names, workers):
+                    for _ in range(prediction_steps(self.plan)):
+                        step(name)
+            repeat(self.dataset, self.out, self.options, plan, self.sequences, hashes, step, workers)
             stale = self._score(plan, hashes, step)
             hashes.flush()
             write_json(self.out / "scores" / "columns.json", described_columns(self.plan))

@@ -1,0 +1,75 @@
+"""What several processes, here or on a cluster, make: the same bytes as one."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import run_here
+
+MACHINE = {"seconds.json", "seconds.csv", "provenance.json", "hashes.jsonl", "report.html", "seconds"}
+"""Files that hold times, the date and the machine."""
+NEEDS_DASK = pytest.mark.skipif(
+    find_spec("distributed") is None or sys.platform != "linux", reason="needs rsbench[cluster]"
+)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files = [each for each in folder.rglob("*") if each.is_file() and not MACHINE & {each.name, each.parent.name}]
+    return {each.relative_to(folder).as_posix(): each.read_bytes() for each in files}
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    from distributed import LocalCluster
+
+    options: Any = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "host": "127.0.0.1"}
+    with LocalCluster(**options) as cluster:
+        yield cluster.scheduler_address
+
+
+def evaluated(folder: Path, out: Path, *options: object) -> dict[str, bytes]:
+    run = run_here("-q", "evaluate", folder, "--out", out, "--solver", "rs-stereo-linear", *options)
+    assert run.returncode == 0, run.stderr
+    return contents(out)
+
+
+def test_two_processes_evaluate_to_the_same_bytes(smoke_dataset: Path, tmp_path: Path) -> None:
+    one = evaluated(smoke_dataset, tmp_path / "one")
+    two = evaluated(smoke_dataset, tmp_path / "two", "--workers", 2)
+    assert len(one) > 20 and one == two
+
+
+def test_processes_and_a_cluster_are_not_both_taken(smoke_dataset: Path, tmp_path: Path) -> None:
+    run = run_here(
+        "evaluate", smoke_dataset, "--out", tmp_path / "out", "--workers", 2, "--scheduler", "tcp://127.0.0.1:1"
+    )
+    assert run.returncode == 2 and "give one of both" in run.stderr and run.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cluster_without_distributed_is_one_line(tmp_path: Path) -> None:
+    run = run_here("simulate", "noise", "--out", tmp_path / "out", "--scheduler", str(tmp_path / "none.json"))
+    assert run.returncode == 2 and "--scheduler" in run.stderr
+
+
+@NEEDS_DASK
+def test_a_cluster_generates_evaluates_and_simulates_the_same_bytes(
+    smoke_dataset: Path, tmp_path: Path, address: str
+) -> None:
+    run = run_here("-q", "generate", "smoke", "--out", tmp_path / "data", "--scheduler", address)
+    assert run.returncode == 0, run.stderr
+    assert contents(tmp_path / "data") == contents(smoke_dataset)
+    one = evaluated(smoke_dataset, tmp_path / "one")
+    assert one == evaluated(smoke_dataset, tmp_path / "there", "--scheduler", address)
+    made = []
+    for name, how in (("here", ("--workers", 1)), ("far", ("--scheduler", address))):
+        trials = ("--trials", 2, "--solver", "gs-8pt")
+        run = run_here("-q", "simulate", "noise", "--out", tmp_path / name, *trials, *how)
+        assert run.returncode == 0, run.stderr
+        made.append(contents(tmp_path / name))
+    assert made[0] == made[1]
