@@ -34,7 +34,7 @@ def run_on_cluster(
         RsbenchError: there is no such scheduler, it has no worker, or distributed is not installed.
         RuntimeError: rsbench's own code in a child is at fault.
     """
-    from distributed import KilledWorker, as_completed
+    from distributed import CancelledError, KilledWorker, as_completed
 
     content = bytes(ForkingPickler.dumps(crew))
     key = hashlib.sha256(content).hexdigest()
@@ -53,11 +53,16 @@ def run_on_cluster(
                 except KilledWorker as error:
                     reason = f"workers of the cluster died: {error.last_worker.address}"
                     outcome = Outcome(value=None, reason=reason, output="", ended=True)
+                except CancelledError as error:
+                    raise RsbenchError(
+                        f"--scheduler {cluster.address}: the connection is lost; what is done is kept, and the "
+                        "same command goes on there"
+                    ) from error
                 future.release()
                 yield job, outcome
         finally:
-            client.cancel(list(futures), force=True)
-            with contextlib.suppress(Exception):  # a worker that is gone has no children
+            with contextlib.suppress(Exception):  # who is gone has no children
+                client.cancel(list(futures), force=True)
                 client.run(_dismiss, key)
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import math
 import os
+import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -99,3 +101,25 @@ def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("rsbench.pipeline.cluster_jobs._CONNECT_S", 0.5)
     with pytest.raises(RsbenchError, match=r"^--scheduler tcp://127.0.0.1:1: "):
         list(run_jobs(functools.partial, ["1"], Cluster(address="tcp://127.0.0.1:1"), {}, eval))
+
+
+CLUSTER = """
+from distributed import LocalCluster
+if __name__ == "__main__":
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as cluster:
+        print(cluster.scheduler_address, flush=True)
+        input()
+"""
+
+
+def test_a_scheduler_that_dies_ends_the_run_with_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rsbench.pipeline.cluster_jobs._CONNECT_S", 3)
+    script = tmp_path / "cluster.py"
+    script.write_text(CLUSTER)
+    command = [sys.executable, str(script)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        address = process.stdout.readline().strip()
+        threading.Timer(3.0, process.kill).start()
+        with pytest.raises(RsbenchError, match="the connection is lost"):
+            list(run_jobs(functools.partial, ["sleep 1000"], Cluster(address=address), {}, os.system))
