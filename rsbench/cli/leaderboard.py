@@ -22,7 +22,8 @@ from rsbench.cli.leaderboard_tracks import (
 from rsbench.errors import RsbenchError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
+    from contextlib import AbstractContextManager
 
     from rsbench.benchmark.leaderboard.running import Limits
     from rsbench.benchmark.leaderboard.splits import Split
@@ -133,7 +134,7 @@ def submit(
     workers: Workers = 1,
 ) -> None:
     """Score a file of predictions and add it to a board."""
-    from rsbench.benchmark.leaderboard.board import add
+    from rsbench.benchmark.leaderboard.adding import add
     from rsbench.benchmark.leaderboard.submissions import check_submission
     from rsbench.benchmark.provenance import provenance
 
@@ -169,7 +170,8 @@ def run(
     ] = None,
 ) -> None:
     """Run cards on a track, keep what they predict, and score it. An interrupted run goes on there."""
-    from rsbench.benchmark.leaderboard.board import RUN, add, made_by
+    from rsbench.benchmark.leaderboard.adding import add_all
+    from rsbench.benchmark.leaderboard.board import RUN, made_by
     from rsbench.benchmark.leaderboard.running import Limits
     from rsbench.benchmark.provenance import provenance
 
@@ -179,9 +181,16 @@ def run(
         raise RsbenchError(f"track {track!r}: solvers of cards take given matches; run them on the track 'pose'")
     _load_cards(entry, split)  # before anything is written
     files = _predict(entry, split, board, data, seed_file, crew, Limits(time_limit, memory))
-    for file in files:
-        ours = made_by(board, split, file.parent.name) == RUN
-        add(board, file, split, provenance(RUN), replace=ours, workers=crew)
+    with _scoring(split) as step:
+        add_all(
+            board,
+            files,
+            split,
+            provenance(RUN),
+            replace=lambda method: made_by(board, split, method) == RUN,
+            workers=crew,
+            step=step,
+        )
     _show(board, split.protocol.id, split.name, None)
 
 
@@ -209,7 +218,7 @@ def oracles(track: Track, board: _Board, data: Data = None, seed_file: Secret = 
     """Add the truth and others that know it, as rows without a rank; to correction, frames as they are too."""
     import tempfile
 
-    from rsbench.benchmark.leaderboard.board import add, add_texts
+    from rsbench.benchmark.leaderboard.adding import add_all, add_texts
     from rsbench.benchmark.leaderboard.oracles import bound_text
     from rsbench.benchmark.leaderboard.picture_oracles import write_oracles
     from rsbench.benchmark.leaderboard.splits import seed_of
@@ -221,9 +230,8 @@ def oracles(track: Track, board: _Board, data: Data = None, seed_file: Secret = 
         raise RsbenchError(f"split {split.name}: its truth is secret, and would be told as an entry of the board")
     made = provenance("rsbench leaderboard oracles")
     if split.protocol.pictures:
-        with tempfile.TemporaryDirectory() as folder:
-            for path in write_oracles(split, Path(folder)):
-                add(board, path, split, made, replace=True)
+        with tempfile.TemporaryDirectory() as folder, _scoring(split) as step:
+            add_all(board, write_oracles(split, Path(folder)), split, made, step=step)
     else:
         texts = [truth_text(split), *([bound_text(split, seed_of(None))] if data is None else [])]
         add_texts(board, texts, split, made)
@@ -249,7 +257,7 @@ def merge(
     other: Annotated[Path, typer.Argument(metavar="OTHER", help="Board to copy from.")], board: _Board
 ) -> None:
     """Copy the entries of another board that this one lacks."""
-    from rsbench.benchmark.leaderboard.board import merge
+    from rsbench.benchmark.leaderboard.merging import merge
 
     for name in merge(other, board):
         typer.echo(name)
@@ -262,7 +270,9 @@ def rescore(
     """Score the stored predictions again and say which scores changed; runs no method."""
     from rsbench.benchmark.leaderboard.board import rescore
 
-    changed = rescore(board, split_of(track, data, seed_file), workers)
+    split = split_of(track, data, seed_file)
+    with _scoring(split) as step:
+        changed = rescore(board, split, workers, step)
     for method, columns in changed.items():
         typer.echo(f"{method}: other scores: {', '.join(columns)}")
     if changed:
@@ -301,6 +311,17 @@ def _predict(
         else:
             files = run_cards(entry, split, place / "inputs", place, workers=workers, limits=limits, step=advance)
     return files
+
+
+def _scoring(split: Split) -> AbstractContextManager[Callable[[str], None]]:
+    """A bar of the problems whose pictures are scored."""
+    from contextlib import nullcontext
+
+    from rsbench.cli.console import progress_bar
+
+    if not split.protocol.pictures:  # the rest takes no time
+        return nullcontext(lambda word: None)
+    return progress_bar(f"scoring {split.name}", len(split.truths))
 
 
 def _load_cards(cards: list[str], split: Split) -> None:

@@ -63,7 +63,7 @@ def score(
     workers: Workers = 1,
 ) -> None:
     """Draw the truth of a secret split from its text again, see that it is the announced one, and score."""
-    from rsbench.benchmark.leaderboard.board import add
+    from rsbench.benchmark.leaderboard.adding import add
     from rsbench.benchmark.leaderboard.protocols import protocol_of_id
     from rsbench.benchmark.leaderboard.publishing import announced_split, read_announcement
     from rsbench.benchmark.leaderboard.submissions import check_submission

@@ -13,34 +13,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.so3 import FloatArray
-from rsbench.vision.quality import ssim_map, to_unit
+from rsbench.vision.quality import Picture, Window, picture_of, ssim_map
 
 _SIZE, _SIGMA = 11, 1.5
 _UNIFORM = 7
+Image = NDArray[np.uint8] | Picture
+"""(H, W[, C])."""
 
 
-def ssim_deepunroll(estimate: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
+def ssim_deepunroll(estimate: Image, truth: Image) -> float:
     """SSIM of images (H, W[, C]) with DeepUnrollNet's window, centred at 5.5 of 0 ... 10; all windows count."""
+    return float(np.mean(ssim_map(picture_of(estimate), picture_of(truth), _DEEPUNROLL)))
+
+
+def ssim_uniform(estimate: Image, truth: Image) -> float:
+    """SSIM of images (H, W[, C]) over the 7 x 7 uniform windows inside the image, with the sample covariance."""
+    rim = _UNIFORM // 2
+    scores = ssim_map(picture_of(estimate), picture_of(truth), _SAMPLES)
+    return float(np.mean(scores[rim:-rim, rim:-rim]))
+
+
+def _off_centre(image: FloatArray) -> FloatArray:
     window = np.exp(-((np.arange(_SIZE) - _SIZE / 2) ** 2) / (2 * _SIGMA**2))
     window /= window.sum()
-
-    def mean(image: FloatArray) -> FloatArray:
-        # Not mirrored, as a network's convolution.
-        filtered = cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(filtered).reshape(image.shape)
-
-    return float(np.mean(ssim_map(to_unit(estimate), to_unit(truth), mean)))
+    # Not mirrored, as a network's convolution.
+    filtered = cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(filtered).reshape(image.shape)
 
 
-def ssim_uniform(estimate: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
-    """SSIM of images (H, W[, C]) over the 7 x 7 uniform windows inside the image, with the sample covariance."""
-    rim, count = _UNIFORM // 2, _UNIFORM**2
+def _evenly(image: FloatArray) -> FloatArray:
+    return np.asarray(cv2.blur(image, (_UNIFORM, _UNIFORM))).reshape(image.shape)
 
-    def mean(image: FloatArray) -> FloatArray:
-        return np.asarray(cv2.blur(image, (_UNIFORM, _UNIFORM))).reshape(image.shape)
 
-    scores = ssim_map(to_unit(estimate), to_unit(truth), mean, count / (count - 1))
-    return float(np.mean(scores[rim:-rim, rim:-rim]))
+_DEEPUNROLL = Window(_off_centre)
+_SAMPLES = Window(_evenly, _UNIFORM**2 / (_UNIFORM**2 - 1))
 
 
 def flip(estimate: NDArray[np.uint8], truth: NDArray[np.uint8]) -> FloatArray | None:

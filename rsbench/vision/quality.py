@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,21 +25,78 @@ _RADIUS, _SIGMA = 5, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
 
 
-def psnr(estimate: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float:
+class Window(NamedTuple):
+    """Around every pixel, of SSIM."""
+
+    mean: Callable[[FloatArray], FloatArray]
+    """Averages an image (H, W[, C]) over the window of every pixel."""
+    factor: float = 1.0
+    """Of variances and covariance."""
+
+
+class Moments(NamedTuple):
+    """Of the windows of an image (H, W[, C])."""
+
+    mean: FloatArray
+    variance: FloatArray
+
+
+class Picture:
+    """An image (H, W[, C]), and what comparisons with others need of it: each is found once."""
+
+    def __init__(self, image: NDArray[Any]) -> None:
+        self.image = image
+        self._moments: dict[Window, Moments] = {}
+
+    @cached_property
+    def unit(self) -> FloatArray:
+        """See ``to_unit``."""
+        return to_unit(self.image)
+
+    def moments(self, window: Window) -> Moments:
+        """Of its values in [0, 1]."""
+        if window not in self._moments:
+            unit = self.unit
+            mean = window.mean(unit)
+            self._moments[window] = Moments(mean, window.factor * (window.mean(unit * unit) - mean * mean))
+        return self._moments[window]
+
+
+def picture_of(image: NDArray[Any] | Picture) -> Picture:
+    return image if isinstance(image, Picture) else Picture(image)
+
+
+def psnr(
+    estimate: NDArray[Any] | Picture, truth: NDArray[Any] | Picture, mask: NDArray[np.bool_] | None = None
+) -> float:
     """Peak signal-to-noise ratio in dB of images (H, W[, C]); inf when equal, NaN when the mask is empty.
 
     Images are uint8, uint16 or floating point in [0, 1]; ``mask`` (H, W) tells which pixels count, all by default.
     Raises ValueError on shapes or types that do not fit.
     """
-    a, b = _pair(estimate, truth, mask)
-    difference = a - b if mask is None else (a - b)[mask]
-    if difference.size == 0:
+    return psnr_within(estimate, truth, (mask,))[0]
+
+
+def psnr_within(
+    estimate: NDArray[Any] | Picture, truth: NDArray[Any] | Picture, masks: Sequence[NDArray[np.bool_] | None]
+) -> list[float]:
+    """``psnr`` for each of several masks."""
+    a, b = _pair(estimate, truth, masks)
+    difference = a.unit - b.unit
+    squares = difference * difference
+    return [_decibels(squares if mask is None else squares[mask]) for mask in masks]
+
+
+def _decibels(squares: FloatArray) -> float:
+    if squares.size == 0:
         return math.nan
-    error = float(np.mean(difference * difference))
+    error = float(np.mean(squares))
     return math.inf if error == 0.0 else -10.0 * math.log10(error)
 
 
-def ssim(estimate: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float:
+def ssim(
+    estimate: NDArray[Any] | Picture, truth: NDArray[Any] | Picture, mask: NDArray[np.bool_] | None = None
+) -> float:
     """Structural similarity of images (H, W[, C]) over the windows that ``mask`` covers entirely.
 
     NaN when no window is covered. Arguments and errors as for ``psnr``.
@@ -47,16 +105,14 @@ def ssim(estimate: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.bool_] | 
 
 
 def ssim_within(
-    estimate: NDArray[Any], truth: NDArray[Any], masks: Sequence[NDArray[np.bool_] | None]
+    estimate: NDArray[Any] | Picture, truth: NDArray[Any] | Picture, masks: Sequence[NDArray[np.bool_] | None]
 ) -> list[float]:
     """``ssim`` for each of several masks, at the cost of one."""
-    for mask in masks:
-        _check_pair(estimate, truth, mask)
-    a, b = to_unit(estimate), to_unit(truth)
-    chosen = [window_mask(truth.shape[:2], mask) for mask in masks]
+    a, b = _pair(estimate, truth, masks)
+    chosen = [window_mask(b.image.shape[:2], mask) for mask in masks]
     if not any(np.any(windows) for windows in chosen):
         return [math.nan for _ in chosen]
-    scores = ssim_map(a, b, _blur)
+    scores = ssim_map(a, b, _GAUSSIAN)
     return [float(np.mean(scores[windows])) if np.any(windows) else math.nan for windows in chosen]
 
 
@@ -67,19 +123,13 @@ def window_mask(size: tuple[int, ...], mask: NDArray[np.bool_] | None) -> NDArra
     return cv2.erode(covered, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0).astype(np.bool_)
 
 
-def ssim_map(
-    a: FloatArray, b: FloatArray, mean: Callable[[FloatArray], FloatArray], factor: float = 1.0
-) -> FloatArray:
-    """Local SSIM (H, W[, C]) of images in [0, 1].
-
-    ``mean`` averages an image over the window of every pixel; ``factor`` multiplies variances and covariance.
-    """
-    mean_a, mean_b = mean(a), mean(b)
-    var_a = factor * (mean(a * a) - mean_a * mean_a)
-    var_b = factor * (mean(b * b) - mean_b * mean_b)
-    covariance = factor * (mean(a * b) - mean_a * mean_b)
-    luminance = (2.0 * mean_a * mean_b + _C1) / (mean_a * mean_a + mean_b * mean_b + _C1)
-    return luminance * (2.0 * covariance + _C2) / (var_a + var_b + _C2)
+def ssim_map(a: Picture, b: Picture, window: Window) -> FloatArray:
+    """Local SSIM (H, W[, C]) of images."""
+    first, second = a.moments(window), b.moments(window)
+    product = first.mean * second.mean
+    covariance = window.factor * (window.mean(a.unit * b.unit) - product)
+    luminance = (2.0 * product + _C1) / (first.mean * first.mean + second.mean * second.mean + _C1)
+    return luminance * (2.0 * covariance + _C2) / (first.variance + second.variance + _C2)
 
 
 def _blur(image: FloatArray) -> FloatArray:
@@ -87,18 +137,22 @@ def _blur(image: FloatArray) -> FloatArray:
     return cv2.GaussianBlur(image, (size, size), _SIGMA, borderType=cv2.BORDER_REFLECT).reshape(image.shape)
 
 
+_GAUSSIAN = Window(_blur)
+
+
 def _pair(
-    estimate: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.bool_] | None
-) -> tuple[FloatArray, FloatArray]:
-    _check_pair(estimate, truth, mask)
-    return to_unit(estimate), to_unit(truth)
-
-
-def _check_pair(estimate: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.bool_] | None) -> None:
-    if estimate.shape != truth.shape or truth.ndim not in (2, 3):
-        raise ValueError(f"images must have one shape (H, W) or (H, W, C), got {estimate.shape} and {truth.shape}")
-    if mask is not None and (mask.shape != truth.shape[:2] or mask.dtype != np.bool_):
-        raise ValueError(f"mask must be bool of shape {truth.shape[:2]}, got {mask.dtype} {mask.shape}")
+    estimate: NDArray[Any] | Picture,
+    truth: NDArray[Any] | Picture,
+    masks: Sequence[NDArray[np.bool_] | None],
+) -> tuple[Picture, Picture]:
+    a, b = picture_of(estimate), picture_of(truth)
+    shape = b.image.shape
+    if a.image.shape != shape or len(shape) not in (2, 3):
+        raise ValueError(f"images must have one shape (H, W) or (H, W, C), got {a.image.shape} and {shape}")
+    for mask in masks:
+        if mask is not None and (mask.shape != shape[:2] or mask.dtype != np.bool_):
+            raise ValueError(f"mask must be bool of shape {shape[:2]}, got {mask.dtype} {mask.shape}")
+    return a, b
 
 
 def to_unit(image: NDArray[Any]) -> FloatArray:

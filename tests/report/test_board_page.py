@@ -20,7 +20,7 @@ from analytic_dataset import write_analytic_dataset
 from browser import CHROMIUM, Browser, started
 from leaderboards import Line, named, small_split, truth_lines, write
 
-from rsbench.benchmark.leaderboard.board import add
+from rsbench.benchmark.leaderboard.adding import add
 from rsbench.benchmark.leaderboard.picture_oracles import write_truth
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.splits import dataset_split

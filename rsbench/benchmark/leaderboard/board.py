@@ -12,31 +12,25 @@ An entry is written under another name and renamed, so that it is there whole or
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import hashlib
 import os
-import tempfile
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.leaderboard.answers import Header
 from rsbench.benchmark.leaderboard.exporting import split_record
-from rsbench.benchmark.leaderboard.marking import mark
-from rsbench.benchmark.leaderboard.own_matches import FOLDER as MATCHES
-from rsbench.benchmark.leaderboard.own_matches import match_files
-from rsbench.benchmark.leaderboard.picture_files import FOLDER as PICTURES
-from rsbench.benchmark.leaderboard.picture_files import copy_files, file_bytes, find_picture
+from rsbench.benchmark.leaderboard.marking import Step, mark_all
+from rsbench.benchmark.leaderboard.picture_files import file_bytes
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS, protocol_of_id
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import SUBMISSION_BYTES, Submission, read_submission
 from rsbench.cards import parse_card
-from rsbench.dataset.files import read_table, write_bytes, write_json, write_table
-from rsbench.dataset.workplace import WORK, workplace
+from rsbench.dataset.files import read_table, write_json, write_table
+from rsbench.dataset.workplace import workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.crew import Workers
 from rsbench.reading import NAME, read_bytes, read_json
@@ -85,49 +79,6 @@ class Scored:
     """SHA-256 of its pictures and matches, by paths below ``folder`` such as ``pictures/castle/left_1.exr``."""
 
 
-def add(
-    board: Path,
-    predictions: Path,
-    split: Split,
-    made: dict[str, Any],
-    *,
-    replace: bool = False,
-    workers: Workers = 1,
-) -> Scored:
-    """Score a file of predictions and keep both.
-
-    Args:
-        made: how it came about, for entry.json.
-        replace: whether an entry of that name may be replaced.
-        workers: see ``mark``.
-
-    Raises:
-        RsbenchError: the file is at fault; an entry of that name has other predictions; the board cannot be
-            written, or another command is at work there.
-    """
-    submission, data = read_submission(predictions, split), read_bytes(predictions)
-    with workplace(board) as hidden:
-        _open(board)
-        folder = place(board, split.protocol.id, split.name) / "entries" / submission.header.method
-        new = hidden / WORK / "entry"
-        kept = copy_files(submission.folder, _files_of(submission, split), new)
-        if not replace:
-            _refuse_another(folder, hashlib.sha256(data).hexdigest(), kept)
-        _write_split(board, split)
-        submission = dataclasses.replace(submission, folder=new)
-        _put(new, folder, _contents(submission, data, split, made, kept, workers))
-    return _read_entry(folder)
-
-
-def add_texts(board: Path, texts: Sequence[str], split: Split, made: dict[str, Any]) -> None:
-    """``add`` for predictions that are no files yet; entries of their names are replaced."""
-    with tempfile.TemporaryDirectory() as folder:
-        for text in texts:
-            path = Path(folder) / "predictions.jsonl"
-            write_bytes(path, text.encode())
-            add(board, path, split, made, replace=True)
-
-
 def made_by(board: Path, split: Split, method: str) -> str:
     """The command that made an entry; ``RUN`` where there is none."""
     path = place(board, split.protocol.id, split.name) / "entries" / method / FILES[2]
@@ -137,48 +88,8 @@ def made_by(board: Path, split: Split, method: str) -> str:
     return str(made.get("command", "")) if isinstance(made, dict) else ""
 
 
-def _files_of(submission: Submission, split: Split) -> Iterator[str]:
-    """Paths of all that the answers hold beside their file."""
-    if split.protocol.own_matches:
-        yield from (f"{MATCHES}/{name}" for name in match_files(submission.folder))
-    for truth in split.truths:
-        answer = submission.answers.get(truth.name)
-        if truth.pictures is not None and answer is not None and answer.success:
-            for asked in truth.pictures.asked:
-                found = find_picture(submission.folder / PICTURES, truth.name, asked, split.protocol.asks)
-                yield f"{PICTURES}/{truth.name}/{found.name}"
-
-
-def _contents(
-    submission: Submission,
-    data: bytes,
-    split: Split,
-    made: dict[str, Any],
-    files: dict[str, str],
-    workers: Workers,
-) -> tuple[bytes, pd.DataFrame, dict[str, Any]]:
-    record: dict[str, Any] = {
-        "format": FORMAT,
-        "header": asdict(submission.header),
-        "predictions_sha256": hashlib.sha256(data).hexdigest(),
-        "fingerprint": split.fingerprint,
-        **({"files": files} if files else {}),
-        "made": made,
-    }
-    return data, mark(submission, split, workers), record
-
-
-def _put(new: Path, folder: Path, contents: tuple[bytes, pd.DataFrame, dict[str, Any]]) -> None:
-    """Write an entry aside, and rename it to its place."""
-    data, scores, record = contents
-    new.mkdir(parents=True, exist_ok=True)
-    write_bytes(new / FILES[0], data)
-    write_table(new / FILES[1], scores)
-    write_json(new / FILES[2], record)
-    _move(new, folder)
-
-
-def _move(new: Path, folder: Path) -> None:
+def move_entry(new: Path, folder: Path) -> None:
+    """Rename what was made aside to its place; what was there goes aside."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     if folder.is_symlink() or folder.exists():
         os.replace(folder, new.with_name(f"{new.name}~"))  # no name of an entry
@@ -190,7 +101,7 @@ def place(board: Path, protocol: str, split: str) -> Path:
     return board / protocol / split
 
 
-def _open(board: Path) -> None:
+def open_board(board: Path) -> None:
     """Make a board of a folder that is empty or is one.
 
     Raises:
@@ -213,14 +124,16 @@ def _check_board(board: Path) -> None:
         raise RsbenchError(f"{path}: format = {found!r}: must be {FORMAT}")
 
 
-def _write_split(board: Path, split: Split) -> None:
+def write_split(board: Path, split: Split) -> None:
+    """The split.json of a board, with facts of the problems where those are public."""
     path = place(board, split.protocol.id, split.name) / "split.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     facts = {truth.name: truth.facts for truth in split.truths} if split.public else {}
     write_json(path, {**split_record(split), "facts": facts})
 
 
-def _refuse_another(folder: Path, sha256: str, files: dict[str, str]) -> None:
+def refuse_another(folder: Path, sha256: str, files: dict[str, str]) -> None:
+    """Raises RsbenchError where an entry is there that has other predictions."""
     if not folder.is_dir():
         return
     there = read_json(folder / FILES[2])
@@ -265,7 +178,7 @@ def entries_of(board: Path, protocol: str, split: str) -> list[Scored]:
     Raises:
         RsbenchError: an entry is damaged.
     """
-    return [_read_entry(folder) for folder in _folders(place(board, protocol, split) / "entries")]
+    return [read_entry(folder) for folder in _folders(place(board, protocol, split) / "entries")]
 
 
 def _folders(folder: Path) -> Iterator[Path]:
@@ -276,7 +189,8 @@ def _folders(folder: Path) -> Iterator[Path]:
                 yield path
 
 
-def _read_entry(folder: Path) -> Scored:
+def read_entry(folder: Path) -> Scored:
+    """An entry from its folder. Raises RsbenchError when it is damaged."""
     record = _read_record(folder)
     return Scored(
         folder=folder,
@@ -316,50 +230,11 @@ def _read_scores(folder: Path, protocol_id: str) -> pd.DataFrame:
     return scores
 
 
-# Merging, and scoring again
+# Scoring again
 
 
-def merge(other: Path, board: Path) -> list[str]:
-    """Copy the entries of another board that are not here yet; returns what was copied.
-
-    Scores are copied as they are: ``rescore`` tells whether the truth agrees.
-
-    Raises:
-        RsbenchError: an entry of one name has two predictions; one of the boards is none, or damaged.
-    """
-    theirs = [
-        (scored, place(board, protocol, split) / "entries" / scored.header.method)
-        for protocol, split in splits_of(other)
-        for scored in entries_of(other, protocol, split)
-    ]
-    told = {scored.folder.parents[1]: about_split(scored.folder.parents[1]) for scored, _ in theirs}
-    copied = []
-    with workplace(board) as hidden:
-        _open(board)
-        for scored, folder in theirs:
-            _refuse_another(folder, scored.predictions_sha256, scored.files)
-        for number, (scored, folder) in enumerate(theirs):
-            if not folder.exists():
-                new = hidden / WORK / str(number)
-                _copy(scored, new)
-                about = folder.parents[1] / "split.json"
-                if not about.exists():
-                    about.parent.mkdir(parents=True, exist_ok=True)
-                    write_json(about, asdict(told[scored.folder.parents[1]]))
-                _move(new, folder)
-                copied.append("/".join(folder.parts[-4:-2]) + f"/{folder.name}")
-    return copied
-
-
-def _copy(scored: Scored, new: Path) -> None:
-    """An entry of another board, and nothing else that lies in its folder."""
-    new.mkdir(parents=True)
-    for name in FILES:
-        write_bytes(new / name, read_bytes(scored.folder / name))
-    _check_files(scored.folder, scored.files, copy_files(scored.folder, scored.files, new))
-
-
-def _check_files(folder: Path, files: dict[str, str], found: dict[str, str]) -> None:
+def check_files(folder: Path, files: dict[str, str], found: dict[str, str]) -> None:
+    """Raises RsbenchError where the SHA-256 ``found`` of an entry's files are not those that it says."""
     for name, digest in files.items():
         if found[name] != digest:
             raise RsbenchError(
@@ -367,8 +242,8 @@ def _check_files(folder: Path, files: dict[str, str], found: dict[str, str]) -> 
             )
 
 
-def rescore(board: Path, split: Split, workers: Workers = 1) -> dict[str, list[str]]:
-    """Score the stored predictions of a split again; no method runs. ``workers``: see ``mark``.
+def rescore(board: Path, split: Split, workers: int = 1, step: Step = lambda word: None) -> dict[str, list[str]]:
+    """Score the stored predictions of a split again; no method runs. ``workers`` and ``step``: see ``mark_all``.
 
     Returns:
         For each entry whose scores were others, the columns that changed; all of them where there was no table.
@@ -379,17 +254,27 @@ def rescore(board: Path, split: Split, workers: Workers = 1) -> dict[str, list[s
     changed: dict[str, list[str]] = {}
     _check_board(board)
     with workplace(board):
-        for folder in _folders(place(board, split.protocol.id, split.name) / "entries"):
-            record, path, old = _read_record(folder), folder / FILES[0], pd.DataFrame()
+        folders = list(_folders(place(board, split.protocol.id, split.name) / "entries"))
+        stored = [_stored(folder, split) for folder in folders]
+        for folder, scores in zip(folders, mark_all(stored, split, workers, step), strict=True):
+            if isinstance(scores, RsbenchError):
+                raise scores
+            old = pd.DataFrame()
             with contextlib.suppress(RsbenchError):
                 old = _read_scores(folder, split.protocol.id)
-            stored = {name: hashlib.sha256(file_bytes(folder, name)).hexdigest() for name in record.files}
-            _check_files(folder, record.files, stored)
-            submission = read_submission(path, split)
-            if submission.header != record.header:
-                raise RsbenchError(f"{path}: its header is not that of {FILES[2]}; submit it again")
-            write_table(folder / FILES[1], mark(submission, split, workers))
-            now = _read_entry(folder).scores
+            write_table(folder / FILES[1], scores)
+            now = read_entry(folder).scores
             if columns := [str(name) for name in now if not now[name].equals(old.get(name, pd.Series()))]:
                 changed[folder.name] = columns
     return changed
+
+
+def _stored(folder: Path, split: Split) -> Submission:
+    """The predictions of an entry, which must be those that were handed in."""
+    record, path = _read_record(folder), folder / FILES[0]
+    found = {name: hashlib.sha256(file_bytes(folder, name)).hexdigest() for name in record.files}
+    check_files(folder, record.files, found)
+    submission = read_submission(path, split)
+    if submission.header != record.header:
+        raise RsbenchError(f"{path}: its header is not that of {FILES[2]}; submit it again")
+    return submission

@@ -6,29 +6,27 @@ A problem without an answer is a failure, and a failure scores the worst value o
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.leaderboard.answers import Answer
 from rsbench.benchmark.leaderboard.own_matches import match_scores, read_own_matches
-from rsbench.benchmark.leaderboard.picture_files import FOLDER, read_answer_depth, read_answer_frame
-from rsbench.benchmark.leaderboard.picture_marking import depth_scores, frame_scores
 from rsbench.benchmark.leaderboard.protocols import (
     AUC_DEG,
     AUC_READOUT,
     FLIP_DEG,
     SUCCESS_DEG,
-    protocol_of_id,
 )
-from rsbench.benchmark.leaderboard.scoring_workers import rows_of_workers
+from rsbench.benchmark.leaderboard.scoring_workers import Row, last, named, rows_of_workers
 from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.submissions import Submission
 from rsbench.benchmark.scoring import answered, pose_errors
 from rsbench.core import so3
 from rsbench.core.metrics import translation_of_offset
 from rsbench.core.so3 import FloatArray
+from rsbench.errors import RsbenchError
 from rsbench.motions import make_motion
 from rsbench.pipeline.crew import Workers
 
@@ -36,7 +34,7 @@ _TIMES = 33
 """Row times, from the first row of frame 0 to the last of frame 1, at which poses are compared."""
 _WORST_READOUT = 1.0
 """Error of a failure: between the two ends of what a ratio can be."""
-Row = dict[str, Any]
+Step = Callable[[str], None]
 
 
 def mark(submission: Submission, split: Split, workers: Workers = 1) -> pd.DataFrame:
@@ -50,55 +48,60 @@ def mark(submission: Submission, split: Split, workers: Workers = 1) -> pd.DataF
     Raises:
         RsbenchError: a picture is at fault, or the truth has changed since the split was read.
     """
+    (found,) = mark_all([submission], split, workers)
+    if isinstance(found, RsbenchError):
+        raise found
+    return found
+
+
+def mark_all(
+    submissions: Sequence[Submission], split: Split, workers: int = 1, step: Step = lambda word: None
+) -> list[pd.DataFrame | RsbenchError]:
+    """``mark`` of several submissions, which share what is found of the truth; an error is that of one of them.
+
+    Args:
+        submissions, split, workers: as of ``mark``.
+        step: called with the name of each problem whose pictures are scored.
+
+    Raises:
+        RsbenchError: the truth has changed since the split was read.
+    """
+    if not split.protocol.pictures:
+        return [pd.DataFrame(_rows(submission, split)) for submission in submissions]
+    marked, names = dict[str, list[Row | str]](), [truth.name for truth in split.truths]
+    for name, rows in rows_of_workers(submissions, split, workers):
+        marked[name] = rows
+        step(name)
+    tables = list[pd.DataFrame | RsbenchError]()
+    for rows in zip(*(marked[name] for name in names), strict=True):
+        faults = [row for row in rows if isinstance(row, str)]
+        tables.append(RsbenchError(faults[0]) if faults else pd.DataFrame(list(rows)))
+    return tables
+
+
+def _rows(submission: Submission, split: Split) -> list[Row]:
+    """Of what holds no pictures."""
     model, found = submission.header.motion_model, submission.answers
-    if split.protocol.pictures and workers != 1:
-        return pd.DataFrame(rows_of_workers(submission, split, workers))
-    if split.protocol.pictures:
-        return pd.DataFrame([picture_row(truth, submission) for truth in split.truths])
     if split.protocol.asks == "readout":
-        return pd.DataFrame([_readout_row(truth, found.get(truth.name)) for truth in split.truths])
+        return [_readout_row(truth, found.get(truth.name)) for truth in split.truths]
     rows = [_motion_row(truth, found.get(truth.name), model) for truth in split.truths]
     if split.protocol.own_matches:
         own = read_own_matches(submission.folder, split.by_name)
         for row, truth in zip(rows, split.truths, strict=True):
             assert truth.sequence is not None
             row |= match_scores(truth.sequence, None if own is None else own[truth.name])
-    return pd.DataFrame(rows)
-
-
-def picture_row(truth: Truth, submission: Submission) -> Row:
-    """Of pictures, which are read here, one problem at a time."""
-    answer, pictures, folder = submission.answers.get(truth.name), truth.pictures, submission.folder / FOLDER
-    assert pictures is not None
-    success = answer is not None and answer.success
-    pictures.check()
-    if protocol_of_id(submission.header.protocol).asks == "depth":
-        depth = read_answer_depth(folder, truth, submission.header.png_unit_m) if success else None
-        scores = depth_scores(pictures, depth)
-    else:
-        frames = [read_answer_frame(folder, truth, each) for each in pictures.asked] if success else None
-        scores = frame_scores(pictures, frames)
-    return {**_named(truth, success), **scores, **_last(success, answer)}
+    return rows
 
 
 def _readout_row(truth: Truth, answer: Answer | None) -> Row:
     ratio = None if answer is None or not answer.success else answer.readout_ratio
     error = _WORST_READOUT if ratio is None else abs(ratio - truth.shutter.readout_ratio)
     return {
-        **_named(truth, ratio is not None),
+        **named(truth, ratio is not None),
         "e_readout": error,
         **{name: max(0.0, 1.0 - error / limit) for name, limit in AUC_READOUT.items()},
-        **_last(ratio is not None, answer),
+        **last(ratio is not None, answer),
     }
-
-
-def _named(truth: Truth, success: bool) -> Row:
-    return {"problem": truth.name, "scene": truth.scene, "success": success}
-
-
-def _last(success: bool, answer: Answer | None) -> Row:
-    seconds = math.nan if answer is None or answer.seconds is None else answer.seconds
-    return {"failure": float(not success), "seconds": seconds}
 
 
 def _motion_row(truth: Truth, answer: Answer | None, model: str) -> Row:
@@ -119,7 +122,7 @@ def _motion_row(truth: Truth, answer: Answer | None, model: str) -> Row:
     found = {name: float(value) for name, value in errors.items()}
     worst = float(np.fmax(found["e_R_deg"], found["e_T_deg"]))
     return {
-        **_named(truth, success),
+        **named(truth, success),
         **found,
         "metres": _metres(d, truth, point) if success and metric else math.nan if success else math.inf,
         "e_row_deg": _row_angle(w, d, truth, model) if success else 180.0,
@@ -128,7 +131,7 @@ def _motion_row(truth: Truth, answer: Answer | None, model: str) -> Row:
         "within": float(found["e_R_deg"] < SUCCESS_DEG[0] and not found["e_T_deg"] >= SUCCESS_DEG[1]),
         "flip": float(success and found["e_T_deg"] > FLIP_DEG),
         "nees": _nees(answer, w, d, truth) if answer is not None and success and metric else math.nan,
-        **_last(success, answer),
+        **last(success, answer),
     }
 
 

@@ -8,17 +8,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.benchmark.leaderboard.picture_parts import SquareErrors, depth_parts
+from rsbench.benchmark.leaderboard.picture_parts import (
+    Parts,
+    SquareErrors,
+    depth_parts,
+    frame_parts,
+    shares,
+)
 from rsbench.benchmark.leaderboard.true_pictures import TruePictures
 from rsbench.core.rig import StereoRig
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.legacy_quality import flip, ssim_deepunroll, ssim_uniform
-from rsbench.vision.quality import psnr, ssim_within
+from rsbench.vision.quality import Picture, psnr_within, ssim_within
 from rsbench.vision.stereo_depth import depth_metrics
 
 Numbers = dict[str, float]
@@ -43,15 +50,60 @@ _WORST_FRAME: Numbers = {
 }
 
 
-def depth_scores(pictures: TruePictures, depth: NDArray[np.float32] | None) -> Numbers:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrueDepth:
+    """What depth maps of a problem are compared with."""
+
+    rig: StereoRig
+    depth: NDArray[np.float32]
+    """(H, W) m, 0 where there is no surface."""
+    seen: NDArray[np.bool_]
+    """(H, W) by both cameras."""
+    parts: Parts
+    """Of the surface."""
+
+    @classmethod
+    def of(cls, pictures: TruePictures) -> TrueDepth:
+        """Read it."""
+        depth, rig = pictures.depth(), pictures.sequence.rig
+        parts = depth_parts(pictures.rolling(), depth > 0.0)
+        return cls(rig=rig, depth=depth, seen=pictures.seen_by_both(depth), parts=parts)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrueFrame:
+    """What a corrected frame is compared with."""
+
+    name: str
+    """Of the row: ``first`` or ``middle``."""
+    picture: Picture
+    """(H, W, 3) of a global shutter."""
+    common: NDArray[np.bool_]
+    """(H, W) see ``TruePictures.common``."""
+    parts: Parts
+    """Of the common pixels."""
+
+    @classmethod
+    def all_of(cls, pictures: TruePictures) -> list[TrueFrame]:
+        """Read those that are asked of a problem."""
+        found, commons = list[TrueFrame](), pictures.commons()
+        for each, common in zip(pictures.asked, commons, strict=True):
+            image = pictures.frame(each.row)
+            parts = frame_parts(image, common, each.row)
+            name = each.stem.rpartition("_")[2]
+            found.append(cls(name=name, picture=Picture(image), common=common, parts=parts))
+        return found
+
+
+def depth_scores(true: TrueDepth, depth: NDArray[np.float32] | None) -> Numbers:
     """Of a depth map (H, W), m, 0 unknown; None: a failure."""
-    truth, rig, seen = pictures.depth(), pictures.sequence.rig, pictures.seen_by_both()
+    truth, rig, seen = true.depth, true.rig, true.seen
     found = part_scores(depth, truth, rig, np.ones_like(seen))
     for name, part in (("visible", seen), ("occluded", ~seen)):
         scores = part_scores(depth, truth, rig, part)
         found |= {f"{key}_{name}": scores[key] for key in ("bad_1", "abs_rel", "rmse_m")}
     wrong = np.ones_like(seen) if depth is None else _wrong(depth, truth, rig)
-    found |= depth_parts(pictures.rolling(), truth > 0.0, wrong)
+    found |= shares(true.parts, wrong)
     sky = truth == 0.0
     invented = 1.0 if depth is None else float(np.mean(depth[sky] > 0.0)) if np.any(sky) else 0.0
     return {**found, "on_sky": invented}
@@ -85,41 +137,33 @@ def part_scores(
     }
 
 
-def frame_scores(pictures: TruePictures, frames: Sequence[Frame] | None) -> Numbers:
+def frame_scores(truths: Sequence[TrueFrame], frames: Sequence[Frame] | None) -> Numbers:
     """Of corrected frames, one for each that is asked; None: a failure. Means over these, of dB too."""
-    rows, scores, squares = (
-        [each.stem.rpartition("_")[2] for each in pictures.asked],
-        list[Numbers](),
-        SquareErrors(),
-    )
-    for number, each in enumerate(pictures.asked):
-        truth, common = pictures.frame(each.row), pictures.common(each.row)
-        image = None if frames is None else frames[number][0]
-        squares.add(image, truth, common, each.row)
-        scores.append(_WORST_FRAME if frames is None else _frame(*frames[number], truth, common))
+    scores, squares = list[Numbers](), SquareErrors()
+    for number, true in enumerate(truths):
+        squares.add(None if frames is None else frames[number][0], true.picture.image, true.parts)
+        scores.append(_WORST_FRAME if frames is None else _frame(*frames[number], true))
     found = {key: float(np.mean([each[key] for each in scores])) for key in _WORST_FRAME}
     by_row = {f"psnr_{name}": math.nan for name in ("first", "middle")}
-    by_row |= {f"psnr_{name}": each["psnr"] for name, each in zip(rows, scores, strict=True)}
+    by_row |= {f"psnr_{true.name}": each["psnr"] for true, each in zip(truths, scores, strict=True)}
     return {**found, **by_row, **squares.scores(), "error": 1.0 - found["ssim"]}
 
 
-def _frame(
-    image: NDArray[np.uint8], drawn: NDArray[np.bool_], truth: NDArray[np.uint8], common: NDArray[np.bool_]
-) -> Numbers:
+def _frame(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame) -> Numbers:
+    common, truth, drawing = true.common, true.picture, Picture(image)
     masks = dict(zip(_PIXELS, (common, drawn, np.ones_like(common)), strict=True))
-    both = common & drawn
-    found = dict(
-        zip((f"ssim{end}" for end in _PIXELS), ssim_within(image, truth, list(masks.values())), strict=True)
-    )
-    found |= {f"psnr{end}": psnr(image, truth, mask) for end, mask in masks.items()}
+    both, values = common & drawn, list(masks.values())
+    found = dict(zip((f"ssim{end}" for end in _PIXELS), ssim_within(drawing, truth, values), strict=True))
+    found |= dict(zip((f"psnr{end}" for end in _PIXELS), psnr_within(drawing, truth, values), strict=True))
     found["coverage"] = np.count_nonzero(both) / max(int(np.count_nonzero(common)), 1)
-    off = np.linalg.norm(dense_flow(image, truth)[both].astype(np.float64), axis=-1)
+    off = np.linalg.norm(dense_flow(image, truth.image)[both].astype(np.float64), axis=-1)
     found["epe_px"] = float(np.mean(off)) if off.size else math.inf
-    found["ssim_deepunroll"], found["ssim_uniform"] = ssim_deepunroll(image, truth), ssim_uniform(image, truth)
+    found["ssim_deepunroll"] = ssim_deepunroll(drawing, truth)
+    found["ssim_uniform"] = ssim_uniform(drawing, truth)
     # Where no pixel counts there is no value; where SSIM is below 0, nothing of the picture is left.
     found = {key: _WORST_FRAME[key] if math.isnan(value) else value for key, value in found.items()}
     found |= {key: max(value, 0.0) for key, value in found.items() if key.startswith("ssim")}
-    return {**found, **_flips(image, truth, masks)}
+    return {**found, **_flips(image, truth.image, masks)}
 
 
 def _flips(image: NDArray[np.uint8], truth: NDArray[np.uint8], masks: dict[str, Any]) -> Numbers:

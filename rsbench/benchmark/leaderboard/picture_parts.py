@@ -69,11 +69,33 @@ def parts_of(image: NDArray[np.uint8], row: int) -> Iterator[tuple[Parting, list
 
 def texture(image: NDArray[np.uint8]) -> FloatArray:
     """(H, W) standard deviation of the mean of the colours in a window around each pixel, 8-bit levels."""
-    grey = np.mean(image.astype(np.float64), axis=-1)
+    grey = _mean(image.astype(np.float64))
     mean, square = (
         cv2.blur(each, (WINDOW, WINDOW), borderType=cv2.BORDER_REFLECT_101) for each in (grey, grey * grey)
     )
     return np.sqrt(np.maximum(square - mean * mean, 0.0))
+
+
+Parts = dict[str, BoolArray]
+"""Pixels (H, W) of each part, by column."""
+
+
+def frame_parts(image: NDArray[np.uint8], common: BoolArray, row: int) -> Parts:
+    """Of the ``common`` pixels of a frame (H, W, 3) of row ``row``'s time."""
+    return {
+        name: part & common
+        for parting, parts in parts_of(image, row)
+        for name, part in zip(columns("frames", parting), parts, strict=True)
+    }
+
+
+def depth_parts(image: NDArray[np.uint8], surface: BoolArray) -> Parts:
+    """Of the pixels of a rolling-shutter frame (H, W, 3) that show a ``surface``."""
+    return {
+        name: part & surface
+        for parting, parts in parts_of(image, 0)
+        for name, part in zip(columns("depth", parting), parts, strict=True)
+    }
 
 
 class SquareErrors:
@@ -83,30 +105,24 @@ class SquareErrors:
         self._sums = {name: np.zeros(2) for parting in PARTINGS for name in columns("frames", parting)}
         """Of squared errors, and how many."""
 
-    def add(self, image: NDArray[np.uint8] | None, truth: NDArray[np.uint8], common: BoolArray, row: int) -> None:
-        """A frame (H, W, 3) of a row's time; None: a failure, which errs by all levels."""
+    def add(self, image: NDArray[np.uint8] | None, truth: NDArray[np.uint8], parts: Parts) -> None:
+        """A frame (H, W, 3) and its ``frame_parts``; None: a failure, which errs by all levels."""
         off = np.full(truth.shape, _MOST) if image is None else image.astype(np.float64) - truth
-        squares = np.mean(off * off, axis=-1)
-        for parting, parts in parts_of(truth, row):
-            for name, part in zip(columns("frames", parting), parts, strict=True):
-                self._sums[name] += np.array([np.sum(squares[part & common]), np.count_nonzero(part & common)])
+        squares = _mean(off * off)
+        for name, part in parts.items():
+            inside = squares[part]
+            self._sums[name] += np.array([np.sum(inside), inside.size])
 
     def scores(self) -> dict[str, float]:
         """By column; NaN for a part without pixels."""
         return {name: math.sqrt(s / n) if n else math.nan for name, (s, n) in self._sums.items()}
 
 
-def depth_parts(image: NDArray[np.uint8], surface: BoolArray, wrong: BoolArray) -> dict[str, float]:
-    """Share of ``wrong`` (H, W) of the ``surface`` (H, W) of each part, by column; NaN for one without any.
+def shares(parts: Parts, wrong: BoolArray) -> dict[str, float]:
+    """Share of ``wrong`` (H, W) of each part, by column; NaN for one without pixels."""
+    return {name: float(np.mean(wrong[part])) if np.any(part) else math.nan for name, part in parts.items()}
 
-    Args:
-        image: (H, W, 3) the rolling-shutter frame.
-        surface: where there is one.
-        wrong: where its depth is.
-    """
-    found = {}
-    for parting, parts in parts_of(image, 0):
-        for name, part in zip(columns("depth", parting), parts, strict=True):
-            inside = part & surface
-            found[name] = float(np.mean(wrong[inside])) if np.any(inside) else math.nan
-    return found
+
+def _mean(image: FloatArray) -> FloatArray:
+    """(H, W) of the colours of an image (H, W, 3) of whole numbers; numpy's mean takes far longer over so few."""
+    return (image[..., 0] + image[..., 1] + image[..., 2]) / 3.0

@@ -1,16 +1,29 @@
-"""Scores of pictures, which take longest, in several processes: each problem in one of them, of one thread.
+"""Scores of pictures, which take longest: problem by problem, for what is found of the truth serves all entries.
 
-A score does not depend on which process it comes from: none draws at random, or adds in an order of its own.
+In several processes each problem is in one of them, of one thread. A score does not depend on which process it
+comes from, or on the other entries: none draws at random, or adds in an order of its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from typing import Any
 
-from rsbench.benchmark.leaderboard.splits import Split
+from rsbench.benchmark.leaderboard.answers import Answer
+from rsbench.benchmark.leaderboard.picture_files import FOLDER, read_answer_depth, read_answer_frame
+from rsbench.benchmark.leaderboard.picture_marking import (
+    Numbers,
+    TrueDepth,
+    TrueFrame,
+    depth_scores,
+    frame_scores,
+)
+from rsbench.benchmark.leaderboard.protocols import Asks
+from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.submissions import Submission
+from rsbench.benchmark.leaderboard.true_pictures import TruePictures
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.crew import Workers
 from rsbench.pipeline.isolated_jobs import run_jobs
@@ -19,32 +32,86 @@ from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_t
 Row = dict[str, Any]
 
 
-def rows_of_workers(submission: Submission, split: Split, workers: Workers) -> list[Row]:
-    """``marking.picture_row`` of each problem, in the order of the split.
+def rows_of_workers(
+    submissions: Sequence[Submission], split: Split, workers: int
+) -> Iterator[tuple[str, list[Row | str]]]:
+    """``picture_rows`` of each problem by its name, as they become ready; with one worker, in this process.
 
     Raises:
         RsbenchError: as it does; or a process ended each time over the same problem.
     """
-    rows: dict[str, Row] = {}
+    if workers == 1:
+        yield from ((truth.name, picture_rows(truth, submissions, split.protocol.asks)) for truth in split.truths)
+        return
     names = [truth.name for truth in split.truths]
-    outcomes = run_jobs(_serve, names, workers, dict.fromkeys(THREAD_VARIABLES, "1"), submission, split)
+    outcomes = run_jobs(_serve, names, workers, dict.fromkeys(THREAD_VARIABLES, "1"), tuple(submissions), split)
     with closing(outcomes) as ready:
         for name, outcome in ready:
             if not outcome.success:
                 raise RsbenchError(f"problem {name}: {outcome.reason}" if outcome.ended else outcome.reason)
-            rows[name] = outcome.value
-    return [rows[name] for name in names]
+            yield name, outcome.value
 
 
-def _serve(submission: Submission, split: Split) -> Callable[[str], Row]:
-    from rsbench.benchmark.leaderboard.marking import picture_row
-
+def _serve(submissions: Sequence[Submission], split: Split) -> Callable[[str], list[Row | str]]:
     use_one_thread()
 
-    def run(name: str) -> Row:
+    def run(name: str) -> list[Row | str]:
         try:
-            return picture_row(split.by_name[name], submission)
+            return picture_rows(split.by_name[name], submissions, split.protocol.asks)
         except RsbenchError as error:
             raise EntryFailure(str(error)) from error
 
     return run
+
+
+def picture_rows(truth: Truth, submissions: Sequence[Submission], asks: Asks) -> list[Row | str]:
+    """Of each submission the scores of its pictures, which are read here, or what is at fault with them.
+
+    Raises:
+        RsbenchError: the truth has changed since the split was read.
+    """
+    assert truth.pictures is not None
+    truth.pictures.check()
+    scores_of = _scores_of(truth, truth.pictures, asks)
+    rows = list[Row | str]()
+    for submission in submissions:
+        answer = submission.answers.get(truth.name)
+        success = answer is not None and answer.success
+        try:
+            scores = scores_of(submission, success)
+        except RsbenchError as error:
+            rows.append(str(error))
+        else:
+            rows.append({**named(truth, success), **scores, **last(success, answer)})
+    return rows
+
+
+def _scores_of(truth: Truth, pictures: TruePictures, asks: Asks) -> Callable[[Submission, bool], Numbers]:
+    """Scores of the answers of submissions to one problem, by whether it is none that failed."""
+    if asks == "depth":
+        depth = TrueDepth.of(pictures)
+
+        def of_depth(submission: Submission, success: bool) -> Numbers:
+            folder, unit = submission.folder / FOLDER, submission.header.png_unit_m
+            return depth_scores(depth, read_answer_depth(folder, truth, unit) if success else None)
+
+        return of_depth
+    frames = TrueFrame.all_of(pictures)
+
+    def of_frames(submission: Submission, success: bool) -> Numbers:
+        folder = submission.folder / FOLDER
+        drawn = [read_answer_frame(folder, truth, each) for each in pictures.asked] if success else None
+        return frame_scores(frames, drawn)
+
+    return of_frames
+
+
+def named(truth: Truth, success: bool) -> Row:
+    """The first columns."""
+    return {"problem": truth.name, "scene": truth.scene, "success": success}
+
+
+def last(success: bool, answer: Answer | None) -> Row:
+    """The last columns."""
+    seconds = math.nan if answer is None or answer.seconds is None else answer.seconds
+    return {"failure": float(not success), "seconds": seconds}

@@ -88,14 +88,15 @@ class TruePictures:
         """(H, W, 3) the frame as it is."""
         return self.sequence.image("rs", *VIEW)
 
-    def seen_by_both(self) -> NDArray[np.bool_]:
-        """(H, W) pixels of the frame whose point the right camera sees too."""
-        return seen_by_other(self.depth(), self.sequence.depth("rs", "right", 1), self.sequence.rig, "left")
+    def seen_by_both(self, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(H, W) pixels of the frame, of that true ``depth`` (H, W), whose point the right camera sees too."""
+        return seen_by_other(depth, self.sequence.depth("rs", "right", 1), self.sequence.rig, "left")
 
-    def common(self, row: int) -> NDArray[np.bool_]:
-        """(H, W) pixels of a corrected frame whose place the rolling-shutter frame saw, the same for all."""
+    def commons(self) -> list[NDArray[np.bool_]]:
+        """(H, W) pixels of each corrected frame whose place the rolling-shutter frame saw, the same for all."""
         images = {view: self.sequence.image("rs", *view) for view in VIEWS}
-        return visible_pixels(self.sequence, true_pairs(self.sequence, images), (VIEW,), row)[VIEW]
+        pairs = true_pairs(self.sequence, images)
+        return [visible_pixels(self.sequence, pairs, (VIEW,), each.row)[VIEW] for each in self.asked]
 
 
 def true_pictures(folder: Path, sequences: Iterable[Sequence], protocol: Protocol) -> dict[str, TruePictures]:

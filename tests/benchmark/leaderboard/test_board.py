@@ -17,9 +17,11 @@ from commands import assert_refused, run_here
 from leaderboards import Line, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard import running
-from rsbench.benchmark.leaderboard.board import add, entries_of, merge, rescore, splits_of
+from rsbench.benchmark.leaderboard.adding import add
+from rsbench.benchmark.leaderboard.board import entries_of, rescore, splits_of
 from rsbench.benchmark.leaderboard.exporting import write_inputs
 from rsbench.benchmark.leaderboard.marking import mark
+from rsbench.benchmark.leaderboard.merging import merge
 from rsbench.benchmark.leaderboard.protocols import AUC_DEG, KNOWLEDGE, PROTOCOLS
 from rsbench.benchmark.leaderboard.running import run_cards, uses_of
 from rsbench.benchmark.leaderboard.splits import (

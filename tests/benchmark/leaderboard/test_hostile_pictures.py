@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from leaderboards import Line, files_below, lines_of, pictures_of, write
 
-from rsbench.benchmark.leaderboard.board import add
+from rsbench.benchmark.leaderboard.adding import add
 from rsbench.benchmark.leaderboard.picture_oracles import write_truth
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import check_submission

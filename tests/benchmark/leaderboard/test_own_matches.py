@@ -13,8 +13,10 @@ from analytic_dataset import PLANES, write_analytic_dataset
 from commands import run_here
 from leaderboards import truth_lines, write
 
-from rsbench.benchmark.leaderboard.board import add, entries_of, merge, rescore
+from rsbench.benchmark.leaderboard.adding import add
+from rsbench.benchmark.leaderboard.board import entries_of, rescore
 from rsbench.benchmark.leaderboard.marking import mark
+from rsbench.benchmark.leaderboard.merging import merge
 from rsbench.benchmark.leaderboard.own_matches import match_scores
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.splits import Split, dataset_split

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from leaderboards import PLANES, TRACKS, lines_of, named, pictures_of, write
 
-from rsbench.benchmark.leaderboard.board import add, place
+from rsbench.benchmark.leaderboard.adding import add
+from rsbench.benchmark.leaderboard.board import place
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.picture_oracles import write_truth
 from rsbench.benchmark.leaderboard.picture_parts import PARTINGS, WINDOW, columns, texture
@@ -81,10 +82,10 @@ def test_errors_of_frames_are_rooted_by_part(splits: dict[str, Split], tmp_path:
     for number, truth in enumerate(split.truths):
         assert truth.pictures is not None
         parts = dict[str, list[float]]()
-        for each in truth.pictures.asked:
+        for each, common in zip(truth.pictures.asked, truth.pictures.commons(), strict=True):
             frame = truth.pictures.frame(each.row)
             squares = np.mean(((frame + off) % 256 - frame.astype(np.float64)) ** 2, axis=-1)
-            for name, values in _by_hand(squares, truth.pictures.common(each.row), frame, each.row).items():
+            for name, values in _by_hand(squares, common, frame, each.row).items():
                 parts.setdefault(name, []).extend(values)
         for name in (*columns("frames", ROWS), *columns("frames", TEXTURE)):
             expected = parts.get(name.removeprefix("rms_"), [math.nan])

@@ -17,8 +17,10 @@ import pytest
 from analytic_dataset import write_analytic_dataset
 from leaderboards import PLANES, TRACKS, lines_of, pictures_of, write
 
-from rsbench.benchmark.leaderboard.board import add, entries_of, merge, rescore
+from rsbench.benchmark.leaderboard.adding import add
+from rsbench.benchmark.leaderboard.board import entries_of, rescore
 from rsbench.benchmark.leaderboard.marking import mark
+from rsbench.benchmark.leaderboard.merging import merge
 from rsbench.benchmark.leaderboard.picture_oracles import write_oracles, write_template, write_truth
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.splits import Split, dataset_split
@@ -103,7 +105,7 @@ def test_depth_scores_are_those_of_a_count(splits: dict[str, Split], tmp_path: P
         assert abs(scores["rmse_m"][number] - np.sqrt(squares.mean())) < 1e-9
         assert scores["coverage"][number] == known.mean() and scores["on_sky"][number] == 0.0
         # The classes make up the whole: what the right camera sees, and the rest.
-        seen = truth.pictures.seen_by_both().mean()
+        seen = truth.pictures.seen_by_both(truth.pictures.depth()).mean()
         whole = seen * scores["bad_1_visible"][number] + (1.0 - seen) * scores["bad_1_occluded"][number]
         assert abs(whole - scores["bad_1"][number]) < 1e-12
 
@@ -130,7 +132,7 @@ def test_frame_scores_follow_their_formulas(splits: dict[str, Split], tmp_path: 
     assert np.all(half["psnr_all"] < 12.0)
     for truth, share in zip(split.truths, half["coverage"], strict=True):
         assert truth.pictures is not None
-        masks = [truth.pictures.common(each.row) for each in truth.pictures.asked]
+        masks = truth.pictures.commons()
         assert abs(share - np.mean([mask[:40].sum() / mask.sum() for mask in masks])) < 1e-12
 
 
@@ -140,14 +142,14 @@ def test_the_common_pixels_are_those_that_the_frame_saw(splits: dict[str, Split]
 
     truth = splits["correction"].truths[1]
     assert truth.pictures is not None
-    for each in truth.pictures.asked:
+    for each, common in zip(truth.pictures.asked, truth.pictures.commons(), strict=True):
         sequence = truth.pictures.sequence
         pose = RIG.cam_from_world(truth.motion, truth.shutter.time_after(each.row, 1, "left"), "left")
         z = sequence.depth("gs", "left", 1, each.row)[..., None]
         X = (RIG.camera.unproject(RIG.camera.pixel_grid()) * z - pose.t) @ pose.R
         seen = rs_project(RIG, truth.shutter, truth.motion, "left", 1, X.reshape(-1, 3)).pixels
         inside = np.all((seen >= 0.0) & (seen <= [95.0, 79.0]), axis=-1).reshape(80, 96)
-        assert np.mean(inside == truth.pictures.common(each.row)) > 0.97  # but for the rims
+        assert np.mean(inside == common) > 0.97  # but for the rims
 
 
 # What is told

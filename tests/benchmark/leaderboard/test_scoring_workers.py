@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from leaderboards import lines_of, named, pictures_of, write
 
-from rsbench.benchmark.leaderboard.board import FILES, add, rescore
-from rsbench.benchmark.leaderboard.picture_oracles import write_truth
+from rsbench.benchmark.leaderboard.adding import add, add_all
+from rsbench.benchmark.leaderboard.board import FILES, entries_of, rescore
+from rsbench.benchmark.leaderboard.marking import mark_all
+from rsbench.benchmark.leaderboard.picture_oracles import write_oracles, write_truth
 from rsbench.benchmark.leaderboard.scoring_workers import _serve
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import read_submission
-from rsbench.dataset.files import read_png, write_png
+from rsbench.dataset.files import read_png, write_depth, write_png
+from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolation import EntryFailure
 
 
@@ -37,14 +42,55 @@ def test_two_processes_give_the_bytes_of_one(splits: dict[str, Split], tmp_path:
     assert rescore(tmp_path / "2", split) == {}
 
 
-def test_a_child_says_what_is_wrong(splits: dict[str, Split], tmp_path: Path) -> None:
-    """In this process, as a child would: a picture that went after the file was read."""
+@pytest.mark.parametrize("track", ["depth", "correction"])
+def test_entries_that_are_scored_together_score_as_alone(
+    track: str, splits: dict[str, Split], tmp_path: Path
+) -> None:
+    """The truth, which the board has alone too, beside two that know less; and each process shares it anew."""
+    split = splits[track]
+    paths = list(write_oracles(split, tmp_path / "oracles"))
+    for path in paths:
+        add(tmp_path / "alone", path, split, {})
+    for workers in (1, 2):
+        add_all(tmp_path / str(workers), paths, split, {}, workers=workers)
+        for path in paths:
+            alone, together = (
+                tmp_path / each / split.protocol.id / split.name / "entries" / path.parent.name / "scores.csv"
+                for each in ("alone", str(workers))
+            )
+            assert alone.read_bytes() == together.read_bytes()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_who_is_at_fault_fails_alone(workers: int, splits: dict[str, Split], tmp_path: Path) -> None:
+    """A picture that went after the file was read: the other entry is scored."""
     split = splits["depth"]
-    path = write_truth(split, tmp_path)
-    submission = read_submission(path, split)
-    (first, _) = pictures_of(path)
-    first.unlink()
-    run = _serve(submission, split)
-    with pytest.raises(EntryFailure, match=r"left_1\.exr: is missing"):
-        run(split.truths[0].name)
-    assert run(split.truths[1].name)["bad_1"] == 0.0
+    broken, whole = (read_submission(write_truth(split, tmp_path / name), split) for name in ("broken", "whole"))
+    pictures_of(broken.folder / "predictions.jsonl")[0].unlink()
+    fault, table = mark_all([broken, whole], split, workers)
+    assert isinstance(fault, RsbenchError) and "left_1.exr: is missing" in str(fault)
+    assert isinstance(table, pd.DataFrame) and np.all(table["bad_1"] == 0.0)
+
+
+def test_a_fault_is_told_after_the_others_are_on_the_board(splits: dict[str, Split], tmp_path: Path) -> None:
+    split = splits["depth"]
+    paths = list(write_oracles(split, tmp_path / "oracles"))
+    write_depth(pictures_of(paths[0])[0], np.full((80, 96), -1.0, dtype=np.float32))
+    with pytest.raises(RsbenchError, match=r"left_1\.exr: 7680 pixels are negative"):
+        add_all(tmp_path / "board", paths, split, {})
+    (entry,) = entries_of(tmp_path / "board", split.protocol.id, split.name)
+    assert entry.header.method == "constant"
+
+
+def test_a_child_says_that_the_truth_has_changed(splits: dict[str, Split], tmp_path: Path) -> None:
+    """In this process, as a child would."""
+    split = splits["depth"]
+    first, second = split.truths
+    assert first.pictures is not None
+    changed = replace(first.pictures, files=dict.fromkeys(first.pictures.files, "0" * 64))
+    broken = replace(split, truths=(replace(first, pictures=changed), second))
+    run = _serve([read_submission(write_truth(split, tmp_path), split)], broken)
+    with pytest.raises(EntryFailure, match=r"is not the file that dataset\.json names"):
+        run(first.name)
+    (row,) = run(second.name)
+    assert isinstance(row, dict) and row["bad_1"] == 0.0

@@ -1,0 +1,168 @@
+"""Submissions become entries of a board: read, copied aside, scored together, and renamed to their places."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from rsbench.benchmark.leaderboard.board import (
+    FILES,
+    FORMAT,
+    Scored,
+    move_entry,
+    open_board,
+    place,
+    read_entry,
+    refuse_another,
+    write_split,
+)
+from rsbench.benchmark.leaderboard.marking import Step, mark_all
+from rsbench.benchmark.leaderboard.own_matches import FOLDER as MATCHES
+from rsbench.benchmark.leaderboard.own_matches import match_files
+from rsbench.benchmark.leaderboard.picture_files import FOLDER as PICTURES
+from rsbench.benchmark.leaderboard.picture_files import copy_files, find_picture
+from rsbench.benchmark.leaderboard.splits import Split
+from rsbench.benchmark.leaderboard.submissions import Submission, read_submission
+from rsbench.dataset.files import write_bytes, write_json, write_table
+from rsbench.dataset.workplace import WORK, workplace
+from rsbench.errors import RsbenchError
+from rsbench.reading import read_bytes
+
+
+class _Taken(NamedTuple):
+    """A file of predictions that becomes an entry."""
+
+    submission: Submission
+    """In the folder where the entry is made."""
+    data: bytes
+    files: dict[str, str]
+    """As of ``Recorded``."""
+
+
+def add(
+    board: Path,
+    predictions: Path,
+    split: Split,
+    made: dict[str, Any],
+    *,
+    replace: bool = False,
+    workers: int = 1,
+) -> Scored:
+    """Score a file of predictions and keep both.
+
+    Args:
+        made: how it came about, for entry.json.
+        replace: whether an entry of that name may be replaced.
+        workers: see ``mark``.
+
+    Raises:
+        RsbenchError: the file is at fault; an entry of that name has other predictions; the board cannot be
+            written, or another command is at work there.
+    """
+    (scored,) = add_all(board, [predictions], split, made, replace=lambda method: replace, workers=workers)
+    return scored
+
+
+def add_all(
+    board: Path,
+    files: Iterable[Path],
+    split: Split,
+    made: dict[str, Any],
+    *,
+    replace: Callable[[str], bool] = lambda method: True,
+    workers: int = 1,
+    step: Step = lambda word: None,
+) -> list[Scored]:
+    """``add`` for several files, which share what is found of the truth; ``replace`` is asked by the method.
+
+    Raises:
+        RsbenchError: as ``add``; where there are other files, after they are on the board.
+    """
+    read, faults = _read_all(files, split)
+    if not read and faults:
+        raise faults[0]
+    scored = list[Scored]()
+    with workplace(board) as hidden:
+        open_board(board)
+        entries = place(board, split.protocol.id, split.name) / "entries"
+        taken = list[_Taken]()
+        for number, (submission, data) in enumerate(read):
+            method, new = submission.header.method, hidden / WORK / str(number)
+            kept = copy_files(submission.folder, _files_of(submission, split), new)
+            if not replace(method):
+                refuse_another(entries / method, hashlib.sha256(data).hexdigest(), kept)
+            taken.append(_Taken(dataclasses.replace(submission, folder=new), data, kept))
+        write_split(board, split)
+        for each, scores in zip(
+            taken, mark_all([each.submission for each in taken], split, workers, step), strict=True
+        ):
+            if isinstance(scores, RsbenchError):
+                faults.append(scores)
+            else:
+                scored.append(_put(each, scores, _record(each, split, made), entries))
+    if faults:
+        raise faults[0]
+    return scored
+
+
+def _read_all(files: Iterable[Path], split: Split) -> tuple[list[tuple[Submission, bytes]], list[RsbenchError]]:
+    """Submissions with the content of their files, and what is wrong with the others."""
+    read, faults = list[tuple[Submission, bytes]](), list[RsbenchError]()
+    for file in files:
+        try:
+            read.append((read_submission(file, split), read_bytes(file)))
+        except RsbenchError as error:
+            faults.append(error)
+    return read, faults
+
+
+def add_texts(board: Path, texts: Sequence[str], split: Split, made: dict[str, Any]) -> None:
+    """``add`` for predictions that are no files yet; entries of their names are replaced."""
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder) / str(number) / "predictions.jsonl" for number in range(len(texts))]
+        for path, text in zip(paths, texts, strict=True):
+            path.parent.mkdir()
+            write_bytes(path, text.encode())
+        add_all(board, paths, split, made)
+
+
+def _files_of(submission: Submission, split: Split) -> Iterator[str]:
+    """Paths of all that the answers hold beside their file."""
+    if split.protocol.own_matches:
+        yield from (f"{MATCHES}/{name}" for name in match_files(submission.folder))
+    for truth in split.truths:
+        answer = submission.answers.get(truth.name)
+        if truth.pictures is not None and answer is not None and answer.success:
+            for asked in truth.pictures.asked:
+                found = find_picture(submission.folder / PICTURES, truth.name, asked, split.protocol.asks)
+                yield f"{PICTURES}/{truth.name}/{found.name}"
+
+
+def _record(taken: _Taken, split: Split, made: dict[str, Any]) -> dict[str, Any]:
+    """What entry.json says."""
+    return {
+        "format": FORMAT,
+        "header": asdict(taken.submission.header),
+        "predictions_sha256": hashlib.sha256(taken.data).hexdigest(),
+        "fingerprint": split.fingerprint,
+        **({"files": taken.files} if taken.files else {}),
+        "made": made,
+    }
+
+
+def _put(taken: _Taken, scores: pd.DataFrame, record: dict[str, Any], entries: Path) -> Scored:
+    """Write an entry aside, and rename it to its place."""
+    new, folder = taken.submission.folder, entries / taken.submission.header.method
+    new.mkdir(parents=True, exist_ok=True)
+    write_bytes(new / FILES[0], taken.data)
+    write_table(new / FILES[1], scores)
+    write_json(new / FILES[2], record)
+    move_entry(new, folder)
+    return read_entry(folder)
