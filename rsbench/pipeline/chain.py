@@ -7,7 +7,7 @@ looked for: one chain serves users, tables, and studies with their oracles.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +30,7 @@ from rsbench.pipeline.frame_depth import (
 )
 from rsbench.pipeline.frame_motion import FoundMotion, match_frames, solve_frames, solve_shutter
 from rsbench.pipeline.readout import ReadoutEstimate
-from rsbench.vision.corrector import CorrectionProblem, find_corrected
+from rsbench.vision.corrector import CorrectionProblem, find_corrected_rows
 from rsbench.vision.fusion import Fused, Origin, inpaint
 from rsbench.vision.stereo_matcher import needs_motion, refuse_motion
 
@@ -67,6 +67,8 @@ class CorrectedFrames:
     pairs: Pairs | None
     """The frames with the depth that they were corrected with."""
     frames: dict[View, Fused]
+    at_rows: list[dict[View, Fused]]
+    """At each of the further rows that were asked for."""
     seconds: dict[str, float]
     """Of each of ``STEPS``."""
 
@@ -81,6 +83,7 @@ def correct_four(
     views: tuple[View, ...] = VIEWS,
     disparity_offset: float | None = None,
     scanning: Scanning | None = None,
+    rows: Sequence[float] = (),
 ) -> CorrectedFrames:
     """Correct four frames (H, W[, 3]), uint8 or uint16, of a rig over one frame period.
 
@@ -94,6 +97,7 @@ def correct_four(
         views: the frames that are wanted.
         disparity_offset: see ``solve_frames``.
         scanning: how the cameras read their lines; None: rows from the top, both at once.
+        rows: further target rows, at whose times the frames are wanted too.
 
     Raises:
         RsbenchError: frames that cannot be what they are said to be, cameras that the options do not take (see
@@ -116,7 +120,9 @@ def correct_four(
     )
     clock("depth")
     known = replace(given, matches=matches, motion=motion, pairs=pairs)
-    frames = correct_known(images, known, rig, shutter, options, views, offset)
+    frames, *at_rows = _correct_rows(
+        images, known, rig, shutter, options, views, offset, (options.target_row, *rows)
+    )
     clock("correction")
     return CorrectedFrames(
         motion=motion,
@@ -126,6 +132,7 @@ def correct_four(
         matches=matches,
         pairs=pairs,
         frames=frames,
+        at_rows=at_rows,
         seconds=clock.seconds,
     )
 
@@ -277,9 +284,24 @@ def correct_known(
         RsbenchError: the corrector needs a gyroscope's samples and there are none, or another package's corrector
             failed, see ``find_corrected``.
     """
+    rows = (options.target_row,)
+    return _correct_rows(images, known, rig, shutter, options, views, disparity_offset, rows)[0]
+
+
+def _correct_rows(
+    images: Images,
+    known: Given,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    options: CorrectionOptions,
+    views: tuple[View, ...],
+    disparity_offset: float,
+    rows: Sequence[float],
+) -> list[dict[View, Fused]]:
+    """``correct_known`` at the times of several target rows, in place of that of the options."""
     pairs, needs = known.pairs, options.corrector.component.spec.needs
     if shutter.readout_ratio == 0.0:
-        return uncorrected(images, views, pairs)
+        return [uncorrected(images, views, pairs) for _ in rows]
     if "gyro" in needs and known.gyro is None:
         raise RsbenchError(
             f"corrector {options.corrector.name!r}: needs the samples of a gyroscope, which frames do not show: "
@@ -297,8 +319,10 @@ def correct_known(
         matches=known.matches if "matches" in needs else None,
         gyro=known.gyro if "gyro" in needs else None,
     )
-    corrected = find_corrected(options.corrector, problem, views)
-    return {view: _finish(fused, options) for view, fused in corrected.items()}
+    return [
+        {view: _finish(fused, options) for view, fused in corrected.items()}
+        for corrected in find_corrected_rows(options.corrector, problem, views, rows)
+    ]
 
 
 def _finish(fused: Fused, options: CorrectionOptions) -> Fused:

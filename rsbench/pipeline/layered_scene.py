@@ -84,15 +84,20 @@ class LayersCorrector(Corrector):
         self._solver()
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
+        return self.correct_rows(problem, views, (problem.target_row,))[0]
+
+    def correct_rows(
+        self, problem: CorrectionProblem, views: Sequence[View], rows: Sequence[float]
+    ) -> list[dict[View, Fused]]:
         scenes = {side: self.scene(problem, side) for side in dict(views)}
-        found: dict[View, Fused] = {}
-        for view in views:
+
+        def corrected(view: View, row: float) -> Fused:
             scene = scenes[view[0]]
             if isinstance(scene, str):
-                found[view] = Fused.failed(problem.images[view], scene)
-            else:
-                found[view] = self.rendered(problem, view, scene)
-        return found
+                return Fused.failed(problem.images[view], scene)
+            return self.rendered(replace(problem, target_row=row), view, scene)
+
+        return [{view: corrected(view, row) for view in views} for row in rows]
 
     def scene(self, problem: CorrectionProblem, side: Side) -> LayeredScene | str:
         """Layers and motion of one camera, or why there are none. Raises ValueError without matches."""

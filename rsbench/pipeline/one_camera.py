@@ -60,11 +60,27 @@ class ZhuangCorrector(Corrector):
     )
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
+        return self.correct_rows(problem, views, (problem.target_row,))[0]
+
+    def correct_rows(
+        self, problem: CorrectionProblem, views: Sequence[View], rows: Sequence[float]
+    ) -> list[dict[View, Fused]]:
         if problem.matches is None:
             raise ValueError("the matches are not known: 'matches' must be among the needs of the corrector")
         known = problem.matches, problem.rig, problem.shutter
         motions = {side: self.motion(*known, side) for side in dict(views)}
-        return {view: self._corrected(problem, view, motions[view[0]]) for view in views}
+        moved = {view: self._moved(problem, view, motions[view[0]]) for view in views}
+        single = FusionCorrector(use_other_views=False, guess_depth=False, warp=self.warp)
+
+        def corrected(view: View, row: float) -> Fused:
+            one = moved[view]
+            if one is None:
+                return Fused.failed(
+                    problem.images[view], f"no motion of the {view[0]} camera explains its matches"
+                )
+            return single.correct(replace(one, target_row=row), [view])[view]
+
+        return [{view: corrected(view, row) for view in views} for row in rows]
 
     def motion(
         self, matches: Correspondences, rig: StereoRig, shutter: RollingShutter, side: Side
@@ -74,11 +90,10 @@ class ZhuangCorrector(Corrector):
         rng = np.random.default_rng([self.seed, SIDES.index(side)])
         return solved_alone(matches, rig, shutter, side, solver, self.robust, rng, solver.spec.motion_model)
 
-    def _corrected(self, problem: CorrectionProblem, view: View, motion: Motion | None) -> Fused:
+    def _moved(self, problem: CorrectionProblem, view: View, motion: Motion | None) -> CorrectionProblem | None:
+        """That of one frame whose motion and depth are known; None without a motion."""
         if motion is None:
-            return Fused.failed(problem.images[view], f"no motion of the {view[0]} camera explains its matches")
+            return None
         rig = problem.rig.about(view[0])
         depth = depth_alone(problem.images, rig, problem.shutter, motion, view)
-        known = replace(problem, rig=rig, motion=motion, depth={view: depth}, guess=None, disparity_offset=0.0)
-        single = FusionCorrector(use_other_views=False, guess_depth=False, warp=self.warp)
-        return single.correct(known, [view])[view]
+        return replace(problem, rig=rig, motion=motion, depth={view: depth}, guess=None, disparity_offset=0.0)

@@ -123,6 +123,16 @@ class Corrector(ABC):
         the reason: a value, never an exception or the frame as it was.
         """
 
+    def correct_rows(
+        self, problem: CorrectionProblem, views: Sequence[View], rows: Sequence[float]
+    ) -> list[dict[View, Fused]]:
+        """``correct`` at the times of several target rows, in place of the problem's.
+
+        To be replaced where what takes long does not depend on the row. Of other packages' correctors, which work
+        in processes of their own, it is not asked.
+        """
+        return [self.correct(replace(problem, target_row=row), views) for row in rows]
+
 
 CorrectorEntry = Entry[Corrector, RunOptions]
 
@@ -155,7 +165,14 @@ def load_corrector(name_or_path: str | Path) -> CorrectorEntry:
 
 
 def find_corrected(entry: CorrectorEntry, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
-    """What a corrector makes of four frames, checked.
+    """What a corrector makes of four frames, checked; errors as ``find_corrected_rows``."""
+    return find_corrected_rows(entry, problem, views, (problem.target_row,))[0]
+
+
+def find_corrected_rows(
+    entry: CorrectorEntry, problem: CorrectionProblem, views: Sequence[View], rows: Sequence[float]
+) -> list[dict[View, Fused]]:
+    """What a corrector makes of four frames at the times of several target rows, checked.
 
     Raises:
         RsbenchError: another package's corrector raised, or answered something else: one line with its name.
@@ -164,12 +181,15 @@ def find_corrected(entry: CorrectorEntry, problem: CorrectionProblem, views: Seq
     if entry.component.spec.cameras == "ideal":
         check_plain(problem.rig, problem.shutter, where)
     with plugins.blame(CORRECTORS, entry):
-        found = entry.component.correct(problem, views)
-    if not isinstance(found, dict) or set(found) != set(views):
-        raise RsbenchError(f"{where}: must return a dict of the views asked for, {', '.join(map(str, views))}")
-    for view, fused in found.items():
-        _check(fused, problem.images[view], f"{where}: {view[0]} {view[1]}")
-    return {view: found[view] for view in views}
+        answers = entry.component.correct_rows(problem, views, rows)
+    if not isinstance(answers, list) or len(answers) != len(rows):
+        raise RsbenchError(f"{where}: correct_rows must return a list of {len(rows)}, one for each row")
+    for found in answers:
+        if not isinstance(found, dict) or set(found) != set(views):
+            raise RsbenchError(f"{where}: must return a dict of the views asked for, {', '.join(map(str, views))}")
+        for view, fused in found.items():
+            _check(fused, problem.images[view], f"{where}: {view[0]} {view[1]}")
+    return [{view: found[view] for view in views} for found in answers]
 
 
 def demand_corrected(frames: Mapping[View, Fused], corrector: str) -> None:

@@ -62,13 +62,20 @@ class ImageRotationCorrector(Corrector):
         """The rotation of one frame by its own curves, or why there is none."""
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
-        return {view: self._turned(problem, view) for view in views}
+        return self.correct_rows(problem, views, (problem.target_row,))[0]
 
-    def _turned(self, problem: CorrectionProblem, view: View) -> Fused:
-        motion = self.rotation(problem, view)
-        if isinstance(motion, str):
-            return Fused.failed(problem.images[view], motion)
-        return turned(replace(problem, motion=motion), view, self.options)
+    def correct_rows(
+        self, problem: CorrectionProblem, views: Sequence[View], rows: Sequence[float]
+    ) -> list[dict[View, Fused]]:
+        motions = {view: self.rotation(problem, view) for view in views}
+
+        def corrected(view: View, row: float) -> Fused:
+            motion = motions[view]
+            if isinstance(motion, str):
+                return Fused.failed(problem.images[view], motion)
+            return turned(replace(problem, motion=motion, target_row=row), view, self.options)
+
+        return [{view: corrected(view, row) for view in views} for row in rows]
 
 
 @final

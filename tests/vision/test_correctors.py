@@ -19,6 +19,7 @@ from rsbench.vision.corrector import (
     Corrector,
     CorrectorSpec,
     find_corrected,
+    find_corrected_rows,
     load_corrector,
 )
 from rsbench.vision.correctors import FusionCorrector, PlaneCorrector, RotationCorrector
@@ -200,3 +201,18 @@ def test_views_must_be_those_asked_for(world: Build, shapes: Any) -> None:
 
     with pytest.raises(RsbenchError, match="views asked for"):
         find_corrected(wrap(CORRECTORS, Forgets(_changed())), problem, VIEWS)
+
+
+def test_rows_must_be_as_many_as_were_asked_for(world: Build, shapes: Any) -> None:
+    problem = problem_of(world((shapes[0]((0.0, 0.0, 1.0), 5.0),)))
+
+    @dataclass(frozen=True)
+    class Forgets(Says):
+        def correct_rows(
+            self, problem: CorrectionProblem, views: Sequence[View], rows: Sequence[float]
+        ) -> list[dict[View, Any]]:
+            return super().correct_rows(problem, views, rows[1:])
+
+    with pytest.raises(RsbenchError, match="must return a list of 2"):
+        find_corrected_rows(wrap(CORRECTORS, Forgets(_changed())), problem, VIEWS, (0.0, 80.0))
+    assert len(find_corrected_rows(wrap(CORRECTORS, Says(_changed())), problem, VIEWS, (0.0, 80.0))) == 2

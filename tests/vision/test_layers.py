@@ -20,7 +20,13 @@ from rsbench.core.se3 import Pose
 from rsbench.pipeline.layered_scene import LayersCorrector
 from rsbench.plugins import wrap
 from rsbench.vision.correction import correct_frame
-from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, find_corrected, load_corrector
+from rsbench.vision.corrector import (
+    CORRECTORS,
+    CorrectionProblem,
+    find_corrected,
+    find_corrected_rows,
+    load_corrector,
+)
 from rsbench.vision.fusion import Origin
 from rsbench.vision.layer_fit import PlaneOptions, fronto_parallel, grouped
 from rsbench.vision.layer_motion import Followed, refined
@@ -246,6 +252,21 @@ def test_what_tells_no_motion_fails_by_value(filmed: Filmed, count: int, moves: 
         assert reason in fused.reason and np.all(fused.origin == Origin.NOBODY)
     with pytest.raises(ValueError, match="'matches' must be among the needs"):
         LayersCorrector().correct(replace(problem, matches=None), LEFT)
+
+
+@pytest.mark.parametrize("name", ["vasu-layers", "zhuang", "purkait-manhattan", "lao-lines"])
+def test_frames_of_several_rows_are_those_of_each(filmed: Filmed, name: str) -> None:
+    """What is found once for all rows must not depend on the row; a failure is one at each."""
+    entry, rows = load_corrector(name), (0.0, 40.0, 95.0)
+    together = find_corrected_rows(entry, filmed.problem, LEFT, rows)
+    for row, frames in zip(rows, together, strict=True):
+        alone = find_corrected(entry, replace(filmed.problem, target_row=row), LEFT)
+        for view, fused in frames.items():
+            assert fused.reason == alone[view].reason
+            for one, other in ((fused.image, alone[view].image), (fused.origin, alone[view].origin)):
+                np.testing.assert_array_equal(one, other)
+    drawn = [frames["left", 1].image for frames in together if frames["left", 1].success]
+    assert name in ("purkait-manhattan", "lao-lines") or not np.array_equal(drawn[0], drawn[1])
 
 
 def test_options_refuse_what_cannot_be() -> None:

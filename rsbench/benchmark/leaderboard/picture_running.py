@@ -253,7 +253,7 @@ class _Made:
 
     def frames(self, chain: CorrectionOptions, place: Path) -> dict[str, Any]:
         """Write the corrected frames."""
-        needs, seconds = chain.corrector.component.spec.needs, 0.0
+        needs = chain.corrector.component.spec.needs
         rig, shutter = self.problem.rig, self.problem.shutter
         drawn: dict[str, bytes] = {}
         try:
@@ -262,20 +262,22 @@ class _Made:
                 matches = find_matches_of_rig(self.images, rig, shutter.scanning, chain)
                 self.given = replace(self.given, matches=matches)
                 self.spent["matching"] = time.perf_counter() - start
-            for each in self.asked:
-                found = correct_four(
-                    self.images,
-                    rig,
-                    shutter.readout_ratio,
-                    replace(chain, target_row=float(each.row)),
-                    given=self.given,
-                    views=(VIEW,),
-                    scanning=shutter.scanning,
-                )
-                demand_corrected(found.frames, chain.corrector.name)
-                self._share(found)
-                seconds += found.seconds["correction"]
-                fused = found.frames[VIEW]
+            first, *others = (float(each.row) for each in self.asked)
+            found = correct_four(
+                self.images,
+                rig,
+                shutter.readout_ratio,
+                replace(chain, target_row=first),
+                given=self.given,
+                views=(VIEW,),
+                scanning=shutter.scanning,
+                rows=others,
+            )
+            self._share(found)
+            seconds = found.seconds["correction"]
+            for each, frames in zip(self.asked, (found.frames, *found.at_rows), strict=True):
+                demand_corrected(frames, chain.corrector.name)
+                fused = frames[VIEW]
                 drawn[each.stem] = frame_png(fused.image, fused.origin != Origin.NOBODY)
         except RsbenchError as error:
             return {"success": False, "reason": str(error)[:300]}
