@@ -88,9 +88,9 @@ def depth_of_pair(
     for side in SIDES:
         sky = sky_mask(levels[side], disparities[side]) if find_sky else np.zeros(left.shape[:2], np.bool_)
         disparity = np.where(sky, np.float32(0.0), disparities[side])
-        depth[side] = _depth(disparity, rig)
+        depth[side] = metres(disparity, rig)
         filled = fill_holes(disparity)
-        guess[side] = np.where(np.isnan(disparity), _depth(filled, rig), np.float32(0.0))
+        guess[side] = np.where(np.isnan(disparity), metres(filled, rig), np.float32(0.0))
     return FramePair(images=images, depth=depth, guess=guess, timed=rig.camera.lens is None)
 
 
@@ -126,11 +126,19 @@ def motion_pairs(
 
 
 def motion_disparities(
-    entry: MatcherEntry, images: Images, rig: StereoRig, shutter: RollingShutter, motion: Motion
+    entry: MatcherEntry,
+    images: Images,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    views: Sequence[View] | None = None,
 ) -> dict[View, NDArray[np.float32]]:
-    """Disparity (H, W), ideal px, that depth in each line's own camera means; 0 infinitely far, NaN unknown."""
+    """Disparity (H, W), ideal px, that depth in each line's own camera means; 0 infinitely far, NaN unknown.
+
+    ``views``: whose is wanted; of all images when None.
+    """
     levels = dict(zip(images, eight_bit(list(images.values())), strict=True))
-    found = find_depths(entry, levels, rig, shutter, motion)
+    found = find_depths(entry, levels, rig, shutter, motion, views)
     return {view: rig.disparity(depth).astype(np.float32) for view, depth in found.items()}
 
 
@@ -206,7 +214,7 @@ def _completed(pair: FramePair, found: dict[Side, NDArray[np.float32]]) -> Frame
     return replace(pair, depth=depth, guess=guess, with_motion=True)
 
 
-def _depth(disparity: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:
+def metres(disparity: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:
     """Metres (H, W): inf where there is no disparity, 0 where it is unknown."""
     depth = np.where(np.isnan(disparity), 0.0, rig.depth(disparity))
     return np.nan_to_num(depth, nan=np.inf, posinf=np.inf).astype(np.float32)

@@ -101,6 +101,16 @@ class SweepMatcher(MotionMatcher):
     ) -> dict[View, F32]:
         return sweep_depths(images, rig, shutter, motion, self)
 
+    def depths_of(
+        self,
+        images: Mapping[View, NDArray[Any]],
+        rig: StereoRig,
+        shutter: RollingShutter,
+        motion: Motion,
+        views: Sequence[View],
+    ) -> dict[View, F32]:
+        return sweep_depths(images, rig, shutter, motion, self, views)
+
 
 def sweep_depths(
     images: Mapping[View, NDArray[Any]],
@@ -108,8 +118,9 @@ def sweep_depths(
     shutter: RollingShutter,
     motion: Motion,
     options: SweepMatcher | None = None,
+    views: Sequence[View] = VIEWS,
 ) -> dict[View, F32]:
-    """Depth (H, W), metres, of the pixels of all four views, in each line's own camera; NaN where it is unknown.
+    """Depth (H, W), metres, of the pixels of these views, in each line's own camera; NaN where it is unknown.
 
     ``images`` (H, W[, 3]) are uint8 or uint16. Unknown is what no other view sees or confirms, what has too little
     parallax, and everything where the motion gives none.
@@ -117,17 +128,17 @@ def sweep_depths(
     options = options or SweepMatcher()
     scene = _Scene({view: grey_u8(images[view]) for view in VIEWS}, rig, shutter, motion, options)
     if not scene.gain > 0.0:
-        return {view: np.full(scene.size, np.nan, np.float32) for view in VIEWS}
+        return {view: np.full(scene.size, np.nan, np.float32) for view in views}
     nearest = options.nearest_depth
     most = _range(scene.coarse()) if nearest is None else 1.0 / nearest
-    rhos = scene.confirmed(scene.sweep_all(most, options.refine_rounds))
+    rhos = scene.confirmed(scene.sweep_all(most, options.refine_rounds, scene.confirming(views)), views)
     with np.errstate(divide="ignore"):
         return {view: np.where(rho > 0.0, 1.0 / rho, np.float32(np.nan)) for view, rho in rhos.items()}
 
 
 def _range(scene: _Scene) -> float:
     """Largest inverse depth, 1 / m, that is to be searched."""
-    found = scene.confirmed(scene.sweep_all(0.5 * max(scene.size) / scene.gain, 0))
+    found = scene.confirmed(scene.sweep_all(0.5 * max(scene.size) / scene.gain, 0, VIEWS), VIEWS)
     known = np.concatenate([rho[np.isfinite(rho)] for rho in found.values()])
     largest = float(np.quantile(known, _RANGE_QUANTILE)) if known.size else 0.0
     return largest * _RANGE_MARGIN + 1.0 / scene.gain
@@ -187,10 +198,14 @@ class _Scene:
         shutter = self.shutter.scanning.shutter_of(width, height, self.shutter.readout_ratio)
         return _Scene(small, replace(self.rig, camera=camera), shutter, self.motion, self.options)
 
-    def sweep_all(self, most: float, rounds: int) -> dict[View, F32]:
-        """Inverse depth (H, W), 1 / m, of every view, NaN where unknown, of 0 to ``most``."""
+    def confirming(self, views: Sequence[View]) -> list[View]:
+        """Some views, and all that may confirm what is found of them."""
+        return [view for view in VIEWS if view in views or set(views) & set(self._others(view))]
+
+    def sweep_all(self, most: float, rounds: int, views: Sequence[View]) -> dict[View, F32]:
+        """Inverse depth (H, W), 1 / m, of some views, NaN where unknown, of 0 to ``most``."""
         with ThreadPoolExecutor(2) as pool:
-            return dict(zip(VIEWS, pool.map(lambda view: self._sweep(view, most, rounds), VIEWS), strict=True))
+            return dict(zip(views, pool.map(lambda view: self._sweep(view, most, rounds), views), strict=True))
 
     def _sweep(self, view: View, most: float, rounds: int) -> F32:
         options, others = self.options, self._others(view)
@@ -202,7 +217,7 @@ class _Scene:
         for k, rho in enumerate(grid):
             plane = np.full(self.size, rho)
             cost = self._cost(comparer, view, plane, lines, cubic=False)
-            volume[:, :, k] = np.nan_to_num(255.0 * cost + 0.5, nan=255.0)
+            _store(cost, volume, k)
         step = grid[1] - grid[0]
         rho = winners(aggregated(volume, options.p1, options.p2)) * step
         rho[rho >= most - 0.5 * step] = np.nan  # beyond the range, where nothing is searched
@@ -261,10 +276,11 @@ class _Scene:
             found = np.maximum(found, moved).astype(np.float32)
         return found
 
-    def confirmed(self, rhos: Mapping[View, F32]) -> dict[View, F32]:
-        """The inverse depths that one other view at least confirms where it sees the point."""
+    def confirmed(self, rhos: Mapping[View, F32], views: Sequence[View]) -> dict[View, F32]:
+        """The inverse depths of some views that one other at least confirms where it sees the point."""
         found = {}
-        for view, rho in rhos.items():
+        for view in views:
+            rho = rhos[view]
             agrees = np.zeros(self.size, np.bool_)
             for other in self._others(view):
                 places, factors = land_pixels(self.maps[view, other], rho, self._first_lines(view, other))
@@ -282,6 +298,16 @@ def _smoothed(rho: F32) -> F32:
     known = np.isfinite(rho)
     filled = np.where(known, rho, np.float32(0.0))
     return np.where(known, cv2.medianBlur(filled, 5), np.float32(np.nan))
+
+
+@compiled(error_model="numpy")
+def _store(cost: F32, volume: NDArray[np.uint8], k: int) -> None:
+    """Put a cost (H, W), 0 to 1, into plane k of a volume (H, W, n) as 0 to 255, rounded; NaN costs most."""
+    height, width = cost.shape
+    for y in range(height):
+        for x in range(width):
+            level = np.float32(255.0) * cost[y, x] + np.float32(0.5)
+            volume[y, x, k] = np.uint8(level) if level == level else np.uint8(255)
 
 
 @compiled(error_model="numpy")

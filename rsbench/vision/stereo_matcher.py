@@ -6,7 +6,7 @@ Those of a rectified pair give its disparity; those that need a motion give the 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, final
 
@@ -61,6 +61,22 @@ class MotionMatcher(StereoMatcher):
         Images (H, W) or (H, W, 3) RGB by side and frame; NaN is unknown, inf infinitely far. ``motion`` is the
         body's over one frame period, in metres.
         """
+
+    def depths_of(
+        self,
+        images: Mapping[View, NDArray[np.uint8]],
+        rig: StereoRig,
+        shutter: RollingShutter,
+        motion: Motion,
+        views: Sequence[View],
+    ) -> dict[View, NDArray[Any]]:
+        """``depths`` of some of the images.
+
+        To be replaced where that takes less. Of other packages' matchers, which work in processes of their own, it
+        is not asked.
+        """
+        found = self.depths(images, rig, shutter, motion)
+        return {view: found[view] for view in views}
 
     @final
     def disparities(
@@ -130,8 +146,11 @@ def find_depths(
     rig: StereoRig,
     shutter: RollingShutter,
     motion: Motion,
+    views: Sequence[View] | None = None,
 ) -> dict[View, F32]:
     """What a matcher that needs a motion makes of four images, checked: float32 (H, W) metres, inf or NaN.
+
+    ``views``: the images whose depth is wanted; all when None.
 
     Raises:
         RsbenchError: it takes no such cameras, or another package's matcher raised or answered something else.
@@ -141,10 +160,14 @@ def find_depths(
     if matcher.cameras == "ideal":
         check_plain(rig, shutter, where)
     with plugins.blame(STEREO_MATCHERS, entry):
-        answer = matcher.depths(images, rig, shutter, motion)
-    if not isinstance(answer, Mapping) or set(answer) != set(images):
-        raise RsbenchError(f"{where}: must return the depth of each image, by {', '.join(map(str, images))}")
-    return {view: _checked_depth(answer[view], images[view].shape[:2], f"{where}: {view}") for view in images}
+        if views is None:
+            answer = matcher.depths(images, rig, shutter, motion)
+        else:
+            answer = matcher.depths_of(images, rig, shutter, motion, views)
+    wanted = images if views is None else views
+    if not isinstance(answer, Mapping) or set(answer) != set(wanted):
+        raise RsbenchError(f"{where}: must return the depth of each image, by {', '.join(map(str, wanted))}")
+    return {view: _checked_depth(answer[view], images[view].shape[:2], f"{where}: {view}") for view in wanted}
 
 
 def _checked_depth(depth: object, size: tuple[int, ...], where: str) -> F32:

@@ -1,7 +1,7 @@
 """Running cards of stereo matchers and correctors: predictions first, each problem kept as soon as it is made.
 
-A job is one problem, for all cards whose answer is not current: correctors share the motion and the depth, which
-take longer than they do. The seconds of an entry are those that it would have taken alone.
+A job is one problem, for all cards whose answer is not current: matchers share the motion, correctors the motion
+and the depth. The seconds of an entry are those that it would have taken alone.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rsbench.benchmark.images.store import identity_of, read_record
 from rsbench.benchmark.leaderboard.frames import read_frames
@@ -25,15 +24,15 @@ from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.submissions import submission_text
 from rsbench.benchmark.leaderboard.true_pictures import VIEW, Asked
 from rsbench.benchmark.provenance import numeric_version, processor
+from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES
 from rsbench.dataset.files import write_bytes, write_depth, write_json
 from rsbench.dataset.workplace import remove
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.crew import Workers
-from rsbench.pipeline.frame_depth import Images
-from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.pipeline.frame_depth import Images, metres, motion_disparities
+from rsbench.pipeline.frame_motion import find_matches_of_rig, match_frames, solve_frames
 from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.pipeline.isolation import use_one_thread
 from rsbench.pipeline.problem import Problem
@@ -217,7 +216,7 @@ def _serve(inputs: Path, limits: Limits) -> Callable[[_Job], None]:
 
 
 class _Made:
-    """The pictures of one problem, and what several correctors share."""
+    """The pictures of one problem, and what several entries share."""
 
     def __init__(self, problem: Problem, images: Images, asked: tuple[Asked, ...]) -> None:
         self.problem, self.images, self.asked = problem, images, asked
@@ -227,29 +226,41 @@ class _Made:
     def depth(self, chain: CorrectionOptions, place: Path) -> dict[str, Any]:
         """Write the depth map; 0 where it is not known."""
         rig, (side, frame) = self.problem.rig, VIEW
-        start = time.perf_counter()
+        shared = 0.0
         try:
             if needs_motion(chain.matcher):
-                depth = self._depth_by_motion(chain)
+                motion = self._motion(chain)
+                shared, start = sum(self.spent.values()), time.perf_counter()
+                found = motion_disparities(chain.matcher, self.images, rig, self.problem.shutter, motion, (VIEW,))
+                depth = metres(found[VIEW], rig)
             else:
+                start = time.perf_counter()
                 pair = [self.images[each, frame] for each in SIDES]
                 disparity = sensor_disparities(chain.matcher, pair[0], pair[1], rig)[SIDES.index(side)]
                 depth = np.nan_to_num(rig.depth(disparity), nan=0.0)
         except RsbenchError as error:
             return {"success": False, "reason": str(error)[:300]}
-        seconds = time.perf_counter() - start
+        seconds = shared + time.perf_counter() - start
         place.mkdir(parents=True)
         (each,) = self.asked
         write_depth(place / f"{each.stem}.exr", np.where(depth > FARTHEST, 0.0, depth).astype(np.float32))
         return {"seconds": round(seconds, 4)}
 
-    def _depth_by_motion(self, chain: CorrectionOptions) -> NDArray[np.float32]:
-        """Of the matcher alone, with the motion that the default solver estimates."""
-        rig, shutter, (side, frame) = self.problem.rig, self.problem.shutter, VIEW
-        plain = replace(chain, depth_from_motion=False, find_sky=False)
-        found = correct_four(self.images, rig, shutter.readout_ratio, plain, views=(), scanning=shutter.scanning)
-        assert found.pairs is not None
-        return found.pairs[frame].depth[side]
+    def _motion(self, chain: CorrectionOptions) -> Motion:
+        """That the default solver estimates, the same for all matchers: of frames that are looked at first.
+
+        Raises:
+            RsbenchError: see ``match_frames`` and ``solve_frames``.
+        """
+        rig, shutter, start = self.problem.rig, self.problem.shutter, time.perf_counter()
+        if self.given.motion is None:
+            matches = match_frames(self.images, rig, chain, shutter.scanning)
+            matched = time.perf_counter()
+            found, _, _ = solve_frames(matches, rig, shutter.readout_ratio, chain, scanning=shutter.scanning)
+            self.given = Given(motion=found.motion)
+            self.spent = {"matching": matched - start, "motion": time.perf_counter() - matched}
+        assert self.given.motion is not None
+        return self.given.motion
 
     def frames(self, chain: CorrectionOptions, place: Path) -> dict[str, Any]:
         """Write the corrected frames."""
