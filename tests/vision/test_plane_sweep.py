@@ -62,6 +62,19 @@ def test_depth_is_within_a_plane_of_the_truth(scene: Any, frames: Any, sources: 
         assert np.mean(off < 0.5) > 0.85
 
 
+@pytest.mark.parametrize("sources", ["time", "stereo", "all"])
+def test_the_depth_of_some_views_is_that_of_all(scene: Any, frames: Any, sources: Any) -> None:
+    """What is not asked is found no more only where nothing that is asked depends on it."""
+    known = scene.rig, scene.shutter, scene.motion
+    matcher = SweepMatcher(sources=sources)
+    whole = matcher.depths(frames["images"], *known)
+    for views in ([("left", 1)], [("right", 0), ("left", 1)]):
+        some = matcher.depths_of(frames["images"], *known, views)
+        assert list(some) == views
+        for view in views:
+            np.testing.assert_array_equal(some[view], whole[view])
+
+
 def test_who_ignores_the_shutter_is_biased(scene: Any, frames: Any) -> None:
     """Turning by 4 deg about x moves the image by 11 of 100 rows: times between rows are 9 % from a period."""
     exact, wrong = (
