@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rsbench.core.motion import LinearMotion
-from rsbench.core.rig import VIEWS
+from rsbench.core.rig import VIEWS, View
 from rsbench.errors import RsbenchError
 from rsbench.vision.plane_sweep import SweepMatcher, sweep_depths
 from rsbench.vision.stereo_matcher import load_matcher
@@ -68,7 +68,8 @@ def test_the_depth_of_some_views_is_that_of_all(scene: Any, frames: Any, sources
     known = scene.rig, scene.shutter, scene.motion
     matcher = SweepMatcher(sources=sources)
     whole = matcher.depths(frames["images"], *known)
-    for views in ([("left", 1)], [("right", 0), ("left", 1)]):
+    chosen: tuple[list[View], ...] = ([("left", 1)], [("right", 0), ("left", 1)])
+    for views in chosen:
         some = matcher.depths_of(frames["images"], *known, views)
         assert list(some) == views
         for view in views:
