@@ -33,6 +33,7 @@ from rsbench.benchmark.leaderboard.submissions import Submission, read_submissio
 from rsbench.dataset.files import write_bytes, write_json, write_table
 from rsbench.dataset.workplace import WORK, workplace
 from rsbench.errors import RsbenchError
+from rsbench.pipeline.crew import Workers
 from rsbench.reading import read_bytes
 
 
@@ -53,7 +54,7 @@ def add(
     made: dict[str, Any],
     *,
     replace: bool = False,
-    workers: int = 1,
+    workers: Workers = 1,
 ) -> Scored:
     """Score a file of predictions and keep both.
 
@@ -77,7 +78,7 @@ def add_all(
     made: dict[str, Any],
     *,
     replace: Callable[[str], bool] = lambda method: True,
-    workers: int = 1,
+    workers: Workers = 1,
     step: Step = lambda word: None,
 ) -> list[Scored]:
     """``add`` for several files, which share what is found of the truth; ``replace`` is asked by the method.

@@ -242,7 +242,9 @@ def check_files(folder: Path, files: dict[str, str], found: dict[str, str]) -> N
             )
 
 
-def rescore(board: Path, split: Split, workers: int = 1, step: Step = lambda word: None) -> dict[str, list[str]]:
+def rescore(
+    board: Path, split: Split, workers: Workers = 1, step: Step = lambda word: None
+) -> dict[str, list[str]]:
     """Score the stored predictions of a split again; no method runs. ``workers`` and ``step``: see ``mark_all``.
 
     Returns:

@@ -55,7 +55,7 @@ def mark(submission: Submission, split: Split, workers: Workers = 1) -> pd.DataF
 
 
 def mark_all(
-    submissions: Sequence[Submission], split: Split, workers: int = 1, step: Step = lambda word: None
+    submissions: Sequence[Submission], split: Split, workers: Workers = 1, step: Step = lambda word: None
 ) -> list[pd.DataFrame | RsbenchError]:
     """``mark`` of several submissions, which share what is found of the truth; an error is that of one of them.
 

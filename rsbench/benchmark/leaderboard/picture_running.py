@@ -31,6 +31,7 @@ from rsbench.dataset.workplace import remove
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.crew import Workers
 from rsbench.pipeline.frame_depth import Images, metres, motion_disparities
 from rsbench.pipeline.frame_motion import find_matches_of_rig, match_frames, solve_frames
 from rsbench.pipeline.isolated_parts import Isolation

@@ -33,7 +33,7 @@ Row = dict[str, Any]
 
 
 def rows_of_workers(
-    submissions: Sequence[Submission], split: Split, workers: int
+    submissions: Sequence[Submission], split: Split, workers: Workers
 ) -> Iterator[tuple[str, list[Row | str]]]:
     """``picture_rows`` of each problem by its name, as they become ready; with one worker, in this process.
 
