@@ -34,11 +34,11 @@ def run_on_cluster(
         RsbenchError: there is no such scheduler, it has no worker, or distributed is not installed.
         RuntimeError: rsbench's own code in a child is at fault.
     """
-    from distributed import CancelledError, KilledWorker, as_completed
-
     content = bytes(ForkingPickler.dumps(crew))
     key = hashlib.sha256(content).hexdigest()
     with _connected(cluster) as client:
+        from distributed import CancelledError, KilledWorker, as_completed
+
         try:
             # A task of its own: it is sent to each worker once, and made again where all that had it died.
             shared = client.submit(bytes, content, key=f"rsbench-crew-{key[:16]}")
