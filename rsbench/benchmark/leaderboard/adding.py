@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
@@ -30,8 +31,9 @@ from rsbench.benchmark.leaderboard.picture_files import FOLDER as PICTURES
 from rsbench.benchmark.leaderboard.picture_files import copy_files, find_picture
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import Submission, read_submission
+from rsbench.benchmark.provenance import numeric_version
 from rsbench.dataset.files import write_bytes, write_json, write_table
-from rsbench.dataset.workplace import WORK, workplace
+from rsbench.dataset.workplace import WORK, remove, workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.crew import Workers
 from rsbench.reading import read_bytes
@@ -46,6 +48,11 @@ class _Taken(NamedTuple):
     files: dict[str, str]
     """As of ``Recorded``."""
 
+    @property
+    def identity(self) -> list[Any]:
+        """What decides its scores, but for the split."""
+        return [hashlib.sha256(self.data).hexdigest(), sorted(self.files.items())]
+
 
 def add(
     board: Path,
@@ -55,19 +62,22 @@ def add(
     *,
     replace: bool = False,
     workers: Workers = 1,
+    step: Step = lambda word: None,
 ) -> Scored:
     """Score a file of predictions and keep both.
 
     Args:
         made: how it came about, for entry.json.
         replace: whether an entry of that name may be replaced.
-        workers: see ``mark``.
+        workers, step: see ``mark_all``.
 
     Raises:
         RsbenchError: the file is at fault; an entry of that name has other predictions; the board cannot be
             written, or another command is at work there.
     """
-    (scored,) = add_all(board, [predictions], split, made, replace=lambda method: replace, workers=workers)
+    (scored,) = add_all(
+        board, [predictions], split, made, replace=lambda method: replace, workers=workers, step=step
+    )
     return scored
 
 
@@ -101,16 +111,26 @@ def add_all(
                 refuse_another(entries / method, hashlib.sha256(data).hexdigest(), kept)
             taken.append(_Taken(dataclasses.replace(submission, folder=new), data, kept))
         write_split(board, split)
-        for each, scores in zip(
-            taken, mark_all([each.submission for each in taken], split, workers, step), strict=True
-        ):
+        kept = _kept(hidden, taken, split)
+        marked = mark_all([each.submission for each in taken], split, workers, step, kept)
+        for each, scores in zip(taken, marked, strict=True):
             if isinstance(scores, RsbenchError):
                 faults.append(scores)
             else:
                 scored.append(_put(each, scores, _record(each, split, made), entries))
+        remove(kept.parent)
     if faults:
         raise faults[0]
     return scored
+
+
+def _kept(hidden: Path, taken: Sequence[_Taken], split: Split) -> Path:
+    """Folder for scores of these predictions by this code; those of others, whose run was cut off, are removed."""
+    of = [split.fingerprint, numeric_version(), *(each.identity for each in taken)]
+    kept = hidden / "scoring" / hashlib.sha256(json.dumps(of).encode()).hexdigest()
+    if not kept.is_dir():
+        remove(kept.parent)
+    return kept
 
 
 def _read_all(files: Iterable[Path], split: Split) -> tuple[list[tuple[Submission, bytes]], list[RsbenchError]]:

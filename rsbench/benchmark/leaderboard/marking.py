@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -55,13 +56,18 @@ def mark(submission: Submission, split: Split, workers: Workers = 1) -> pd.DataF
 
 
 def mark_all(
-    submissions: Sequence[Submission], split: Split, workers: Workers = 1, step: Step = lambda word: None
+    submissions: Sequence[Submission],
+    split: Split,
+    workers: Workers = 1,
+    step: Step = lambda word: None,
+    kept: Path | None = None,
 ) -> list[pd.DataFrame | RsbenchError]:
     """``mark`` of several submissions, which share what is found of the truth; an error is that of one of them.
 
     Args:
         submissions, split, workers: as of ``mark``.
         step: called with the name of each problem whose pictures are scored.
+        kept: folder for what is done of them, so that a run that is cut off goes on there.
 
     Raises:
         RsbenchError: the truth has changed since the split was read.
@@ -69,7 +75,7 @@ def mark_all(
     if not split.protocol.pictures:
         return [pd.DataFrame(_rows(submission, split)) for submission in submissions]
     marked, names = dict[str, list[Row | str]](), [truth.name for truth in split.truths]
-    for name, rows in rows_of_workers(submissions, split, workers):
+    for name, rows in rows_of_workers(submissions, split, workers, kept):
         marked[name] = rows
         step(name)
     tables = list[pd.DataFrame | RsbenchError]()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 from rsbench.benchmark.leaderboard.answers import Answer
@@ -24,26 +25,47 @@ from rsbench.benchmark.leaderboard.protocols import Asks
 from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.submissions import Submission
 from rsbench.benchmark.leaderboard.true_pictures import TruePictures
+from rsbench.dataset.files import write_bytes
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.crew import Workers
 from rsbench.pipeline.isolated_jobs import run_jobs
 from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.pipeline.plain_data import decode, encode
+from rsbench.reading import read_bytes
 
 Row = dict[str, Any]
 
 
 def rows_of_workers(
-    submissions: Sequence[Submission], split: Split, workers: Workers
+    submissions: Sequence[Submission], split: Split, workers: Workers, kept: Path | None = None
 ) -> Iterator[tuple[str, list[Row | str]]]:
     """``picture_rows`` of each problem by its name, as they become ready; with one worker, in this process.
+
+    A folder ``kept`` holds those of a run that was cut off, and gets those that are new.
 
     Raises:
         RsbenchError: as it does; or a process ended each time over the same problem.
     """
+    names = list[str]()
+    for truth in split.truths:
+        if kept is not None and (path := kept / truth.name).is_file():
+            yield truth.name, decode(read_bytes(path), {})
+        else:
+            names.append(truth.name)
+    for name, rows in _rows_of(submissions, split, workers, names):
+        if kept is not None:
+            kept.mkdir(parents=True, exist_ok=True)
+            write_bytes(kept / name, encode(rows))
+        yield name, rows
+
+
+def _rows_of(
+    submissions: Sequence[Submission], split: Split, workers: Workers, names: list[str]
+) -> Iterator[tuple[str, list[Row | str]]]:
     if workers == 1:
-        yield from ((truth.name, picture_rows(truth, submissions, split.protocol.asks)) for truth in split.truths)
+        for name in names:
+            yield name, picture_rows(split.by_name[name], submissions, split.protocol.asks)
         return
-    names = [truth.name for truth in split.truths]
     outcomes = run_jobs(_serve, names, workers, dict.fromkeys(THREAD_VARIABLES, "1"), tuple(submissions), split)
     with closing(outcomes) as ready:
         for name, outcome in ready:

@@ -62,6 +62,25 @@ def test_entries_that_are_scored_together_score_as_alone(
 
 
 @pytest.mark.parametrize("workers", [1, 2])
+def test_a_run_that_was_cut_off_goes_on(workers: int, splits: dict[str, Split], tmp_path: Path) -> None:
+    split, path = splits["depth"], write_truth(splits["depth"], tmp_path)
+    scored = list[str]()
+
+    def stop(name: str) -> None:
+        scored.append(name)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        add(tmp_path / "cut", path, split, {}, workers=workers, step=stop)
+    (kept,) = (tmp_path / "cut" / ".rsbench" / "scoring").glob("*/*")
+    kept.write_bytes(kept.read_bytes().replace(b'"planes"', b'"marble"'))  # seen only if it is taken
+    add(tmp_path / "cut", path, split, {}, workers=workers)
+    table = pd.read_csv(next((tmp_path / "cut").rglob("scores.csv")))
+    assert kept.name == scored[0] and list(table["scene"]).count("marble") == 1
+    assert not (tmp_path / "cut" / ".rsbench" / "scoring").exists()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
 def test_who_is_at_fault_fails_alone(workers: int, splits: dict[str, Split], tmp_path: Path) -> None:
     """A picture that went after the file was read: the other entry is scored."""
     split = splits["depth"]
