@@ -20,6 +20,7 @@ from rsbench.benchmark.leaderboard.submissions import read_submission
 from rsbench.dataset.files import read_png, write_depth, write_png
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolation import EntryFailure
+from rsbench.pipeline.plain_data import decode, encode
 
 
 def test_two_processes_give_the_bytes_of_one(splits: dict[str, Split], tmp_path: Path) -> None:
@@ -73,7 +74,8 @@ def test_a_run_that_was_cut_off_goes_on(workers: int, splits: dict[str, Split], 
     with pytest.raises(KeyboardInterrupt):
         add(tmp_path / "cut", path, split, {}, workers=workers, step=stop)
     (kept,) = (tmp_path / "cut" / ".rsbench" / "scoring").glob("*/*")
-    kept.write_bytes(kept.read_bytes().replace(b'"planes"', b'"marble"'))  # seen only if it is taken
+    (row,) = decode(kept.read_bytes(), {})
+    kept.write_bytes(encode([{**row, "scene": "marble"}]))  # seen only if it is taken
     add(tmp_path / "cut", path, split, {}, workers=workers)
     table = pd.read_csv(next((tmp_path / "cut").rglob("scores.csv")))
     assert kept.name == scored[0] and list(table["scene"]).count("marble") == 1
