@@ -12,13 +12,20 @@ of the step before: a few linear steps. The single one (C. Albl, Z. Kukelova, V.
 Shutter Camera Absolute Pose, PAMI 2020, by a Groebner basis) is solved by the same steps here, whose v turns R
 after each: of its solutions the one next to the orientation of frame 0.
 
+As published, P3P turns the points first, so that R is near the identity, and samples are judged by the
+reprojection errors of all twelve unknowns, not by the pose alone: of free velocities the pose of six points is far
+off where the whole of them fits.
+
+Points of one plane leave one combination open to first order: facing it at Z and at rest, with s = a (y - y0), a
+pitch of 1, a rise of Z and a speed of -Z / a along the axis. Noise decides it (compare C. Albl, A. Sugimoto, T.
+Pajdla, Degeneracies in Rolling Shutter SfM, ECCV 2016).
+
 The points are from the stereo pair of frame 0, whose rows move too: see ``R6pSolver.frame_0``. All lies in the
 body's axes, so that C is its translation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, final
 
@@ -29,8 +36,10 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.stereo_points import FRAME_1, propose_together, stereo_points, with_depth
+from rsbench.robust.ransac import BoolArray, IntArray, RansacOptions, ransac
+from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.engine.stereo_points import FRAME_1, stereo_points, with_depth
+from rsbench.solvers.p3p import P3pSolver
 
 _LEAST = 6
 _STEPS = 6
@@ -138,30 +147,30 @@ def _solved(A: FloatArray, y: FloatArray) -> FloatArray:
     return found.reshape(*A.shape[:-2], 12)
 
 
-def linear_pose(data: Resection, turning: bool) -> RowPose:
+def linear_pose(data: Resection, turning: bool, R0: FloatArray) -> RowPose:
     """The pose that the linear steps end at; NaN where there is none.
 
     Args:
+        data: points and what is seen of them.
         turning: whether v turns R after each step, so that it vanishes: the single linearisation.
+        R0: (3, 3) where R begins; the double linearisation is about it.
     """
     batch = data.body.shape[:-2]
-    R: FloatArray = np.broadcast_to(np.eye(3), (*batch, 3, 3))
+    R: FloatArray = np.broadcast_to(R0, (*batch, 3, 3))
     z, v = np.zeros((*batch, 12)), np.zeros((*batch, 3))
-    w, d = v, v
+    w, d = np.broadcast_to(so3.log(R0), v.shape), v
     for _ in range(_STEPS):
-        X = data.points(w, d)
-        if turning:
-            X = (R[..., None, :, :] @ X[..., None])[..., 0]
+        X = (R[..., None, :, :] @ data.points(w, d)[..., None])[..., 0]
         before, z = z, linear_step(data, X, v)
         turn, d = z[..., :3], z[..., 3:6]
         if turning:
             R = so3.exp(turn) @ R
-            w = so3.log(R)
         else:
-            v = w = turn
+            v = turn
+        w = so3.log(so3.exp(v) @ R)
         if np.all(np.abs(z - before)[..., 3:] < _SMALL):
             break
-    return RowPose(R if turning else so3.exp(v), d, z[..., 6:9], z[..., 9:])
+    return RowPose(so3.exp(v) @ R, d, z[..., 6:9], z[..., 9:])
 
 
 def errors(data: Resection, pose: RowPose, X: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -203,6 +212,55 @@ def refined(data: Resection, start: RowPose, most: int) -> RowPose:
     return best
 
 
+class _Search:
+    """What LO-RANSAC asks of the method: all twelve unknowns of a sample, judged by their own reprojection."""
+
+    sample_size = (_LEAST,)
+
+    def __init__(self, tracks: FloatArray, solver: R6pSolver, rig: StereoRig, shutter: RollingShutter) -> None:
+        self.tracks, self.solver, self.rig, self.shutter = tracks, solver, rig, shutter
+        self.R0 = solver.beginning(tracks, rig, shutter)
+        self.data = self.of(tracks)
+
+    @property
+    def num_data(self) -> tuple[int, ...]:
+        return (len(self.tracks),)
+
+    def of(self, tracks: FloatArray, minimal: bool = False) -> Resection:
+        """Of some tracks (n, 8): minimal samples are seen by the left camera alone."""
+        sides: tuple[Side, ...] = ("left",) if minimal else self.solver.sides
+        return Resection.of(tracks, self.rig, self.shutter, sides, self.solver.frame_0 == "moved")
+
+    def linear(self, data: Resection) -> RowPose:
+        with np.errstate(all="ignore"):
+            return linear_pose(data, self.solver.linearisation == "single", self.R0)
+
+    def generate(self, samples: IntArray) -> list[list[RowPose]]:
+        found = self.linear(self.of(self.tracks[samples].reshape(-1, 8), minimal=True).in_samples(len(samples)))
+        poses = (RowPose(*parts) for parts in zip(*found, strict=True))
+        return [[pose] if pose.finite else [] for pose in poses]
+
+    def residuals(self, model: RowPose) -> FloatArray:
+        """(n,) px, of the camera that errs more."""
+        with np.errstate(all="ignore"):
+            e, _ = errors(self.data, model, self.data.points(so3.log(model.R), model.C))
+            squares = np.sum(e.reshape(len(self.data.x), -1, 2) ** 2, axis=-1)
+        return np.sqrt(np.max(squares, axis=0))
+
+    def refine(self, model: RowPose, inliers: BoolArray) -> RowPose | None:
+        return self.fit(inliers, model, _QUICK)
+
+    def fit(self, inliers: BoolArray, start: RowPose | None, most: int) -> RowPose | None:
+        """Of all inliers together, from a start if there is one."""
+        data = self.of(self.tracks[inliers])
+        if start is None or self.solver.refinement == "none":
+            start = self.linear(data)
+        if self.solver.refinement == "reprojection" and start.finite:
+            with np.errstate(all="ignore"):
+                start = refined(data, start, most)
+        return start if start.finite else None
+
+
 @final
 @dataclass(frozen=True, kw_only=True)
 class R6pSolver(Solver):
@@ -216,6 +274,17 @@ class R6pSolver(Solver):
     cameras_used: Literal["left", "both"] = "both"
     """Whose pixels of frame 1 count; minimal samples take the left camera's alone."""
     refinement: Literal["none", "reprojection"] = "reprojection"
+    start: Literal["p3p", "still"] = "p3p"
+    """Whether R begins at the orientation that P3P gives of all matches, as published, or at frame 0's."""
+    threshold_px: float = 4.0
+    """Largest reprojection error of an inlier: beyond the noise of pixels and points."""
+    confidence: float = 0.999
+    max_iterations: int = 1000
+    lo_steps: int = 3
+    """Refinements of each better sample; 0: of the last one alone."""
+
+    def __post_init__(self) -> None:
+        self._options()
 
     spec = SolverSpec(
         needs=frozenset({"tracks"}),
@@ -225,7 +294,7 @@ class R6pSolver(Solver):
         shutter="rolling",
         reference_point="body",
         reference="Albl, Kukelova, Pajdla: R6P, CVPR 2015; Kukelova et al., ACCV 2018; Albl et al., PAMI 2020",
-        assumes="constant velocity; depth of frame 0 without noise",
+        assumes="constant velocity; depth of frame 0 without noise; points beyond one plane",
     )
 
     def estimate(
@@ -234,53 +303,40 @@ class R6pSolver(Solver):
         tracks = with_depth(correspondences.tracks)
         if len(tracks) < _LEAST:
             return MotionEstimate.failed(f"{len(tracks)} tracks with positive disparity, need {_LEAST}")
-        data = self._data(tracks, rig, shutter)
-        with np.errstate(all="ignore"):
-            pose = linear_pose(data, self.linearisation == "single")
-            if self.refinement == "reprojection" and pose.finite:
-                pose = refined(data, pose, _FULL)
-        return _reported(pose)
+        search = _Search(tracks, self, rig, shutter)
+        best, inliers = None, np.ones(len(tracks), dtype=np.bool_)
+        if len(tracks) > _LEAST:  # six fit always
+            report = ransac(search, self._options(), np.random.default_rng(0))
+            if report.model is None:
+                return MotionEstimate.failed(f"{report.reason}; {_OPEN}")
+            best, inliers = report.model, report.inliers
+        return _reported(search.fit(inliers, best, _FULL) or best)
 
-    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
-        return next(iter(self.propose_all([sample], rig, shutter)))
+    @property
+    def sides(self) -> tuple[Side, ...]:
+        """Of the cameras whose pixels count."""
+        return SIDES if self.cameras_used == "both" else ("left",)
 
-    def propose_all(
-        self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
-    ) -> Iterable[list[MotionEstimate]]:
-        def solve(tracks: FloatArray) -> Iterable[list[MotionEstimate]]:
-            data = self._data(tracks.reshape(-1, 8), rig, shutter, minimal=True).in_samples(len(tracks))
-            with np.errstate(all="ignore"):
-                found = linear_pose(data, self.linearisation == "single")
-            return [[_reported(RowPose(*parts))] for parts in zip(*found, strict=True)]
+    def beginning(self, tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
+        """Where R (3, 3) begins; at no rotation where P3P finds none."""
+        if self.start == "still":
+            return np.eye(3)
+        pose = P3pSolver(threshold_px=self.threshold_px, cameras_used="left").estimate(
+            Correspondences(tracks=tracks), rig, shutter
+        )
+        return so3.exp(pose.w) if pose.success else np.eye(3)
 
-        return propose_together(samples, _LEAST, with_depth, solve)
-
-    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
-        return {"tracks": _LEAST}
-
-    def improve(
-        self,
-        motion: MotionEstimate,
-        correspondences: Correspondences,
-        rig: StereoRig,
-        shutter: RollingShutter,
-        quick: bool = False,
-    ) -> MotionEstimate:
-        tracks = with_depth(correspondences.tracks)
-        if self.refinement == "none" or len(tracks) < _LEAST:
-            return self.estimate(correspondences, rig, shutter)
-        start = RowPose(so3.exp(motion.w), motion.d, motion.w, motion.d)
-        with np.errstate(all="ignore"):
-            return _reported(refined(self._data(tracks, rig, shutter), start, _QUICK if quick else _FULL))
-
-    def _data(
-        self, tracks: FloatArray, rig: StereoRig, shutter: RollingShutter, minimal: bool = False
-    ) -> Resection:
-        sides: tuple[Side, ...] = SIDES if self.cameras_used == "both" and not minimal else ("left",)
-        return Resection.of(tracks, rig, shutter, sides, self.frame_0 == "moved")
+    def _options(self) -> RansacOptions:
+        """As the search wants it; checks the values."""
+        return RansacOptions(
+            threshold=self.threshold_px,
+            confidence=self.confidence,
+            max_iterations=self.max_iterations,
+            lo_steps=self.lo_steps,
+        )
 
 
-def _reported(pose: RowPose) -> MotionEstimate:
-    if not pose.finite:
+def _reported(pose: RowPose | None) -> MotionEstimate:
+    if pose is None or not pose.finite:
         return MotionEstimate.failed(_OPEN)
     return MotionEstimate(w=so3.log(pose.R), d=pose.C, success=True, metric=True)
