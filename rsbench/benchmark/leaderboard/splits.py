@@ -132,7 +132,7 @@ def simulated_problem(seed: int, number: int) -> Problem:
     Raises:
         RsbenchError: the motion leaves too few points in view; another seed is needed.
     """
-    setting = _setting(seed, number)
+    setting = points_setting(seed, number)
     try:
         found = _simulated(setting, seed, number)
     except ValueError as error:
@@ -146,7 +146,7 @@ def exact_problem(seed: int, number: int) -> tuple[Problem, float]:
     Raises:
         RsbenchError: as ``simulated_problem``.
     """
-    setting = _setting(seed, number)
+    setting = points_setting(seed, number)
     try:
         found = _simulated(setting.exact(), seed, number)
     except ValueError as error:
@@ -163,7 +163,7 @@ def exact_problem(seed: int, number: int) -> tuple[Problem, float]:
 
 
 def _simulated(setting: Setting, seed: int, number: int) -> Simulation:
-    motion = _motion(setting, seed, number)
+    motion = points_motion(setting, seed, number)
     rng = generator(seed, "leaderboard", "scene", number)
     return simulate(setting.rig(), setting.shutter(), motion, replace(setting.options(True), pairs=0), rng)
 
@@ -172,11 +172,11 @@ def _name(number: int) -> str:
     return f"p{number:03d}"
 
 
-def _motion(setting: Setting, seed: int, number: int) -> Motion:
+def points_motion(setting: Setting, seed: int, number: int) -> Motion:
     return setting.motion(generator(seed, "leaderboard", "motion", number))
 
 
-def _setting(seed: int, number: int) -> Setting:
+def points_setting(seed: int, number: int) -> Setting:
     """Every size at random over what phones, drones and cars do; the camera is the paper's."""
     rng = generator(seed, "leaderboard", "setting", number)
 
@@ -201,9 +201,9 @@ def _setting(seed: int, number: int) -> Setting:
 
 
 def _drawn(seed: int, number: int) -> Truth:
-    setting = _setting(seed, number)
+    setting = points_setting(seed, number)
     facts = {
-        **_sizes(_motion(setting, seed, number), setting.rig(), setting.shutter()),
+        **_sizes(points_motion(setting, seed, number), setting.rig(), setting.shutter()),
         "noise_px": setting.noise_px,
         "outliers": setting.outlier_ratio,
         "points": setting.points,
@@ -213,7 +213,7 @@ def _drawn(seed: int, number: int) -> Truth:
         name=_name(number),
         rig=setting.rig(),
         shutter=setting.shutter(),
-        motion=_motion(setting, seed, number),
+        motion=points_motion(setting, seed, number),
         scene=_name(number),
         facts=facts,
     )
