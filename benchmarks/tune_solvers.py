@@ -44,7 +44,7 @@ from rsbench.solvers.engine.registry import load_solver_entry
 from rsbench.solvers.engine.warm_up import warm_up
 
 SEED = 7
-PROBLEMS, SLOW_PROBLEMS = 60, 24
+PROBLEMS, SLOW_PROBLEMS = 60, 16
 LIMIT_DEG = 5.0
 GRAVITY_NOISE_DEG, GYRO_NOISE_DEG = 0.5, 1.0 / 30.0
 """Of a telephone's: 1 deg/s of a sample at 30 frames a second."""
