@@ -1,6 +1,6 @@
 """Whether a method of a paper would do better with other thresholds, refinement or search than its card has.
 
-    nice python benchmarks/tune_solvers.py --out results/tuning                   # ten minutes of a processor
+    nice python benchmarks/tune_solvers.py --out results/tuning                   # six minutes of a processor
     nice python benchmarks/tune_solvers.py --out results/tuning --solver rs-r6p    # those rows; others are kept
 
 Problems are drawn as those of the track `points`, of a seed of which nothing is published; gravity and gyroscopes,
@@ -44,7 +44,7 @@ from rsbench.solvers.engine.registry import load_solver_entry
 from rsbench.solvers.engine.warm_up import warm_up
 
 SEED = 7
-PROBLEMS, SLOW_PROBLEMS = 60, 16
+PROBLEMS, SLOW_PROBLEMS = 40, 16
 LIMIT_DEG = 5.0
 GRAVITY_NOISE_DEG, GYRO_NOISE_DEG = 0.5, 1.0 / 30.0
 """Of a telephone's: 1 deg/s of a sample at 30 frames a second."""
