@@ -89,7 +89,8 @@ def test_it_is_at_the_bound_of_two_known_angles(name: str) -> None:
     """What the information says when only turns about the vertical are left."""
     solver = load_solver(name)
     assert isinstance(solver, UprightSolver)
-    solver, distances = replace(solver, refinement="upright"), []
+    solver = replace(solver, refinement="upright")
+    distances = []
     for seed in range(16):
         s, exact = trial(seed, noise_px=0.3), trial(seed)
         rig = RIG.about("left") if name == "gs-upright-3pt" else RIG
