@@ -78,7 +78,8 @@ def ask(program: str, method: str, problems: Sequence[FloatArray], repeat: int =
     answers = []
     for line in done.stdout.splitlines():
         us, count, *numbers = line.split()
-        answers.append(Answer(float(us), np.array(numbers, dtype=np.float64).reshape(int(count), -1)))
+        found = np.array(numbers, dtype=np.float64)
+        answers.append(Answer(float(us), found.reshape(int(count), -1) if numbers else np.zeros((0, 0))))
     if len(answers) != len(problems):
         raise ValueError(f"{program} {method}: {len(answers)} lines for {len(problems)} problems")
     return answers
@@ -216,7 +217,7 @@ def r6p(program: str, trials: int) -> Iterator[str]:
 def _among(found: FloatArray, solutions: FloatArray) -> bool:
     """Whether v C w t (12,) is one of solutions (count, 12)."""
     scale = np.repeat([np.linalg.norm(part) + 1e-3 for part in found.reshape(4, 3)], 3)
-    return bool(np.any(np.all(np.abs(solutions - found) < _SAME * scale, axis=-1)))
+    return bool(np.any(np.all(np.abs(solutions.reshape(-1, 12) - found) < _SAME * scale, axis=-1)))
 
 
 # Zhuang et al.
