@@ -270,7 +270,7 @@ def zhuang(program: str, trials: int) -> Iterator[str]:
 def ours_flow(given: Flow, accelerated: bool, most: int) -> FloatArray:
     """Solutions (count, 7), w v k, of the ``most`` smallest accelerations."""
     Z0, Z1 = given.system()
-    values = accelerations(Z0, Z1)[:most] if accelerated else [0.0]
+    values = (accelerations(Z0, Z1) or [0.0])[:most] if accelerated else [0.0]
     found = [velocity_of(given, null_vectors(Z0 + k * Z1), k) for k in values]
     return np.array([[*f.w, *f.v, f.k] for f in found if not isinstance(f, str)]).reshape(-1, 7)
 

@@ -11,7 +11,7 @@ Absolute Pose Rolling Shutter Problem, ACCV 2018, solve the double linearisation
 of the step before: a few linear steps. Here these are Newton's, linear about the w' of the step before too: as
 dear, and of cameras that turn by 30 degrees within the frame they end at the solution in 9 of 10 samples, where
 frozen ones do in 6. The single one (C. Albl, Z. Kukelova, V. Larsson, T. Pajdla, Rolling Shutter Camera Absolute
-Pose, PAMI 2020, by a Groebner basis) is solved by the same steps, whose v turns R after each. The algebraic solvers
+Pose, PAMI 2020, by a Groebner basis) is solved by the same steps, whose v turns R after each. Algebraic solvers
 give all solutions; this gives one, next to the orientation of frame 0.
 
 As published, P3P turns the points first, so that R is near the identity, and samples are judged by the
