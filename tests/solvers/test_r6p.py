@@ -65,7 +65,8 @@ def test_samples_of_a_camera_that_turns_by_thirty_degrees_in_the_frame_are_exact
     kind: Literal["double", "single"],
 ) -> None:
     spin = np.radians(30.0) / SHUTTER.readout_ratio * SPIN / np.linalg.norm(SPIN)
-    solver, found = R6pSolver(linearisation=kind, frame_0="still"), []
+    solver = R6pSolver(linearisation=kind, frame_0="still", start="still", refinement="none")
+    found = list[bool]()
     for seed in range(30):
         (one,) = solver.propose(own_model(kind, 6, seed, spin), RIG, SHUTTER)
         found.append(one.success and max(np.abs(one.w - W).max(), np.abs(one.d - D).max()) < 1e-6)

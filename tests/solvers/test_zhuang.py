@@ -72,7 +72,7 @@ def test_nine_matches_have_the_true_acceleration_among_the_eigenvalues() -> None
 
 
 def test_nine_noisy_matches_without_a_real_acceleration_give_a_motion_without_one() -> None:
-    solver, found = SOLVERS["constant", "none"], []
+    solver, found = SOLVERS["constant", "none"], list[float]()
     for seed in range(40):
         noise = 0.1 * np.random.default_rng([1, seed]).normal(size=(9, 4))
         matches = Correspondences(left=instantaneous(9, 0.4, seed).left + noise)

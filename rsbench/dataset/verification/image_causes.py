@@ -83,12 +83,13 @@ def _cause(
         return ""
     own = image[y, x]
     candidates = [(change.words, change.undone(image, y, x)) for change in CHANGES]
-    candidates += [(f"like {name}", colours[y, x]) for name, colours in others if colours.shape == image.shape]
     gain = float(np.median(own) / max(1.0, float(np.median(shown))))
     candidates.append((f"{gain:.3g} times as bright", own / max(gain, 1e-3)))
+    changes = len(candidates)
+    candidates += [(f"like {name}", colours[y, x]) for name, colours in others if colours.shape == image.shape]
     costs = [float(np.mean(difference(colours, shown))) for _, colours in candidates]
     best = int(np.argmin(costs))
-    changed = int(np.argmin(costs[: len(CHANGES)]))
+    changed = int(np.argmin(costs[:changes]))
     best = changed if costs[changed] < _NEARLY * costs[best] else best
     if best and costs[best] < min(_PLAIN * costs[0], _AS_LIKE * _usual(likenesses)):
         return f"looks {candidates[best][0]}"
