@@ -152,6 +152,8 @@ def _pair(
     for mask in masks:
         if mask is not None and (mask.shape != shape[:2] or mask.dtype != np.bool_):
             raise ValueError(f"mask must be bool of shape {shape[:2]}, got {mask.dtype} {mask.shape}")
+    for picture in (a, b):
+        picture.unit  # noqa: B018  raises for other types, also where no window is compared
     return a, b
 
 
