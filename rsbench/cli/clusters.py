@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,7 +25,7 @@ def chosen_workers(workers: int | None, scheduler: str | None, default: int = 1)
     """Processes here, or a cluster.
 
     Raises:
-        RsbenchError: both are given.
+        RsbenchError: both are given, or distributed is not installed.
     """
     if scheduler is None:
         return workers or default
@@ -35,6 +36,8 @@ def chosen_workers(workers: int | None, scheduler: str | None, default: int = 1)
         raise RsbenchError(
             f"--workers {workers}: the cluster of --scheduler {scheduler} has its own; give one of both"
         )
+    if find_spec("distributed") is None:  # before scenes are built
+        raise RsbenchError("--scheduler needs distributed: pip install 'rsbench[cluster]'")
     return Cluster(address=str(Path(scheduler).resolve()) if scheduler.endswith(".json") else scheduler)
 
 

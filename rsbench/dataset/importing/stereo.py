@@ -18,13 +18,13 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import SIDES, View
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
+from rsbench.dataset.files import read_grey_png
 from rsbench.dataset.importing.recording import Recording
 from rsbench.dataset.importing.text import lines, numbers, only_file
 from rsbench.errors import RsbenchError
@@ -139,12 +139,10 @@ def _kitti(folder: Path, names: tuple[str, str], truth: str | None, calib: str, 
         cameras={"left": left, "right": right},
         images={view: file for view, file in files.items() if file.is_file()},
         right_from_left=_apart(float(baseline)),
-        disparities={("left", 0): partial(_png, found, offset)} if found and found.is_file() else {},
+        disparities={("left", 0): partial(_png, found, (width, height), offset)} if found and found.is_file() else {},
     )
 
 
-def _png(path: Path, offset: float) -> FloatArray:
-    values = cv2.imdecode(np.frombuffer(read_bytes(path), dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    if values is None or values.dtype != np.uint16 or values.ndim != 2:
-        raise RsbenchError(f"{path}: is no grey PNG of 16 bits")
+def _png(path: Path, size: tuple[int, int], offset: float) -> FloatArray:
+    values = read_grey_png(path, size, 16)
     return np.where(values > 0, values / 256.0 + offset, np.nan)
