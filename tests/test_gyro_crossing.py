@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pandas as pd
+import programs
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -16,12 +16,7 @@ FOLDER = ROOT / "results/gyro"
 
 @pytest.fixture(scope="module")
 def program() -> ModuleType:
-    path = ROOT / "benchmarks/gyro_crossing.py"
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return programs.program("benchmarks/gyro_crossing.py")
 
 
 VALUES = np.array([0.0, 1.0, 3.0, 10.0])

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from pathlib import Path
 from types import ModuleType
 
 import cv2
 import numpy as np
+import programs
 import pytest
 
 from rsbench.core import so3
@@ -19,11 +19,7 @@ F, BASELINE, DEPTH, STEP = 200.0, 0.5, 10.0, 6
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("score_kitti", ROOT / "examples" / "score_kitti.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return programs.program("examples/score_kitti.py")
 
 
 @pytest.fixture

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pandas as pd
+import programs
 import pytest
 
 from rsbench.benchmark.leaderboard.splits import PUBLIC_SEED
@@ -19,12 +19,7 @@ FOLDER = ROOT / "results/tuning"
 
 @pytest.fixture(scope="module")
 def program() -> ModuleType:
-    path = ROOT / "benchmarks/tune_solvers.py"
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return programs.program("benchmarks/tune_solvers.py")
 
 
 def test_one_option_at_a_time_differs_and_the_house_s_loop_is_for_those_in_it(program: ModuleType) -> None:

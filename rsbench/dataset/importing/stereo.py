@@ -134,12 +134,15 @@ def _kitti(folder: Path, names: tuple[str, str], truth: str | None, calib: str, 
     baseline = matrices[0][0, 3] / matrices[0][0, 0] - matrices[1][0, 3] / matrices[1][0, 0]
     offset = right.cx - left.cx
     found = None if truth is None else folder / truth / f"{number}_10.png"
+    read = None if found is None or not found.is_file() else partial(_png, found, (width, height), offset)
     return Recording(
         name=number,
         cameras={"left": left, "right": right},
         images={view: file for view, file in files.items() if file.is_file()},
         right_from_left=_apart(float(baseline)),
-        disparities={("left", 0): partial(_png, found, (width, height), offset)} if found and found.is_file() else {},
+        disparities={("left", 0): partial(_png, found, (width, height), offset)}
+        if found and found.is_file()
+        else {},
     )
 
 
