@@ -140,9 +140,7 @@ def _kitti(folder: Path, names: tuple[str, str], truth: str | None, calib: str, 
         cameras={"left": left, "right": right},
         images={view: file for view, file in files.items() if file.is_file()},
         right_from_left=_apart(float(baseline)),
-        disparities={("left", 0): partial(_png, found, (width, height), offset)}
-        if found and found.is_file()
-        else {},
+        disparities={} if read is None else {("left", 0): read},
     )
 
 
