@@ -19,6 +19,7 @@ from pathlib import Path
 
 from rsbench.cards import load_card
 from rsbench.core.rig import VIEWS
+from rsbench.dataset.beside import beside
 from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.channels import CHANNELS
 from rsbench.dataset.generation import build_scene, render_camera
@@ -38,10 +39,11 @@ def seconds(card: DatasetCard, options: RendererOptions, scene: MitsubaScene, vi
         for parent in {Path(name).parent for name in files_of(card.manifest_of(sequence))}:
             (Path(folder) / parent).mkdir(parents=True, exist_ok=True)
         begun, used = time.perf_counter(), time.process_time()
-        for view in VIEWS:
-            for _ in render_camera(card, sequence, options, scene, *view, Path(folder)):
-                pass
-        write_sequence_channels(Path(folder), card, sequence, scene, asdict(viewpoint))
+        with beside() as later:
+            for view in VIEWS:
+                for _ in render_camera(card, sequence, options, scene, *view, Path(folder), later):
+                    pass
+            write_sequence_channels(Path(folder), card, sequence, scene, asdict(viewpoint))
         return time.perf_counter() - begun, time.process_time() - used
 
 

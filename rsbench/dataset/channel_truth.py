@@ -95,20 +95,32 @@ class SeenSurfaces:
         return times_at(self.geometry, self.source, self.grid).ravel() if self.geometry.objects else None
 
 
-def pair_truth(surfaces: SeenSurfaces, target: Shot, blocked: Blocked) -> PairTruth:
-    """Carry every pixel of a rolling-shutter frame into another picture; ``blocked`` is asked once."""
+class Carried(NamedTuple):
+    """The surfaces that the pixels of a source see, in another picture."""
+
+    landed: Landed
+    points: FloatArray
+    """(H, W, 3) where they are when the target sees them, world frame, metres."""
+
+
+def carry(surfaces: SeenSurfaces, target: Shot) -> Carried:
+    """Where another picture sees what every pixel of a rolling-shutter frame sees, hidden or not."""
     start = surfaces.grid[..., surfaces.geometry.shutter.axis(target.side)]
     landed = find(surfaces.geometry, target, surfaces.points, start)
     if surfaces.numbers is None or not surfaces.geometry.objects:
-        return PairTruth(
-            landed.pixels - surfaces.grid, _classes(surfaces, target, landed, surfaces.points, blocked)
-        )
+        return Carried(landed, surfaces.points)
     points = surfaces.points.copy()
     for number in np.unique(surfaces.numbers[surfaces.numbers > 0]):
         chosen = surfaces.numbers == number
         points[chosen], own = _landed_with(surfaces, target, int(number), chosen, start)
         for whole, part in zip(landed, own, strict=True):
             whole[chosen] = part
+    return Carried(landed, points)
+
+
+def pair_truth(surfaces: SeenSurfaces, target: Shot, carried: Carried, blocked: Blocked) -> PairTruth:
+    """What became of the pixels that ``carry`` carried into the target; ``blocked`` is asked once."""
+    landed, points = carried
     return PairTruth(landed.pixels - surfaces.grid, _classes(surfaces, target, landed, points, blocked))
 
 

@@ -9,13 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.channel_truth import Rays, SeenSurfaces, pair_truth, surface_truth, target_of
+from rsbench.dataset.beside import Later, begun
+from rsbench.dataset.channel_truth import (
+    PairTruth,
+    Rays,
+    SeenSurfaces,
+    carry,
+    pair_truth,
+    surface_truth,
+    target_of,
+)
 from rsbench.dataset.channels import (
     COMPONENTS,
     NORMAL_COMPONENTS,
     PAIR_CHANNELS,
     RADIANCE_COMPONENTS,
     STEP_PX,
+    Layer,
     PairChannel,
     pair_layers,
     radiance_file,
@@ -25,6 +35,7 @@ from rsbench.dataset.files import write_exr, write_png, write_png16
 from rsbench.dataset.movers import numbers_of
 from rsbench.dataset.shots import Geometry, Shot
 from rsbench.renderers.render import Frame
+from rsbench.renderers.segments import Surfaces
 
 _BRIGHTEST = float(np.finfo(np.float16).max)
 
@@ -36,6 +47,7 @@ def write_channels(
     shot: Shot,
     rendered: Frame,
     rays: Rays,
+    later: Later,
     twins: Iterable[int] = (),
 ) -> None:
     """The files of the channels of these names that tell of one rolling-shutter frame.
@@ -46,35 +58,51 @@ def write_channels(
         geometry: of the sequence.
         shot: the frame.
         rendered: its light and depth.
-        rays: through its scene.
+        rays: through its scene, asked by this thread alone.
+        later: has files written beside, see ``written_beside``.
         twins: rows of global-shutter twins to which ``gs_flow`` leads too.
     """
     if "hdr" in names:
         light = {name: rendered.image[..., k] for k, name in enumerate(RADIANCE_COMPONENTS)}
-        bright = {name: np.minimum(each, _BRIGHTEST) for name, each in light.items()}
-        write_exr(folder / radiance_file(shot.side, shot.frame), bright, half=True)
+        later(_write_radiance, folder / radiance_file(shot.side, shot.frame), light)
     if not set(names) & {*PAIR_CHANNELS, "normals", "instances"}:
         return
     seen = SeenSurfaces(geometry, shot, rendered.depth, numbers=numbers_of(rendered.labels))
-    for layer in pair_layers(names, twins, geometry.frames):
-        if shot[1:3] not in layer.views(geometry.frames):
-            continue
-        truth = pair_truth(seen, target_of(layer, shot, geometry.frames), rays.blocked)
-        values = pair_values(layer.channel, shot, truth.offset)
-        pixels = {name: values[..., k] for k, name in enumerate(COMPONENTS[layer.channel])}
-        write_exr(folder / layer.values(shot.side, shot.frame), pixels)
-        write_png(folder / layer.mask(shot.side, shot.frame), truth.classes)
+    layers = [
+        each for each in pair_layers(names, twins, geometry.frames) if shot[1:3] in each.views(geometry.frames)
+    ]
+    targets = [target_of(layer, shot, geometry.frames) for layer in layers]
+    carried = begun(later, lambda target: carry(seen, target), targets)
     if {"normals", "instances"} & set(names):
-        surfaces = surface_truth(seen, rays)
-        if "normals" in names:
-            normals = {name: surfaces.normals[..., k] for k, name in enumerate(NORMAL_COMPONENTS)}
-            write_exr(folder / surface_file("normals", shot.side, shot.frame), normals)
-        if "instances" in names:
-            write_png16(folder / surface_file("instances", shot.side, shot.frame), surfaces.instances)
+        later(_write_surfaces, folder, names, shot, surface_truth(seen, rays))
+    for layer, target, landed in zip(layers, targets, carried, strict=True):
+        later(_write_pair, folder, layer, shot, pair_truth(seen, target, landed, rays.blocked))
+
+
+def _write_surfaces(folder: Path, names: Collection[str], shot: Shot, surfaces: Surfaces) -> None:
+    if "normals" in names:
+        normals = {name: surfaces.normals[..., k] for k, name in enumerate(NORMAL_COMPONENTS)}
+        write_exr(folder / surface_file("normals", shot.side, shot.frame), normals)
+    if "instances" in names:
+        write_png16(folder / surface_file("instances", shot.side, shot.frame), surfaces.instances)
+
+
+def _write_radiance(path: Path, light: dict[str, NDArray[np.float32]]) -> None:
+    write_exr(path, {name: np.minimum(each, _BRIGHTEST) for name, each in light.items()}, half=True)
+
+
+def _write_pair(folder: Path, layer: Layer, shot: Shot, truth: PairTruth) -> None:
+    values = pair_values(layer.channel, shot, truth.offset)
+    pixels = {name: values[..., k] for k, name in enumerate(COMPONENTS[layer.channel])}
+    write_exr(folder / layer.values(shot.side, shot.frame), pixels)
+    write_png(folder / layer.mask(shot.side, shot.frame), truth.classes)
 
 
 def pair_values(channel: PairChannel, source: Shot, offset: FloatArray) -> NDArray[np.float32]:
     """What a channel stores (..., components) of offsets (..., 2), px: a disparity is x_left - x_right."""
     if channel == "disparity":
         offset = offset[..., :1] * (1.0 if source.side == "right" else -1.0)
-    return (np.round(offset / STEP_PX) * STEP_PX + 0.0).astype(np.float32)  # no -0
+    values = offset / STEP_PX
+    np.round(values, out=values)
+    values *= STEP_PX
+    return (values + 0.0).astype(np.float32)  # no -0

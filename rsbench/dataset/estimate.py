@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from rsbench.cards import load_card
 from rsbench.core.rig import SIDES
+from rsbench.dataset.beside import beside
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.generation import build_scene, render_camera, scene_name
 from rsbench.dataset.layout import files_of
@@ -99,8 +100,11 @@ def _of_kind(
         times, middle = list[float](), (card.frames - 1) // 2
         for _ in range(1 if warm else 2):
             begun = time.monotonic()
-            for _ in render_camera(card, sequences[0], options, scene, SIDES[0], middle, Path(temporary)):
-                pass
+            with beside() as later:
+                for _ in render_camera(
+                    card, sequences[0], options, scene, SIDES[0], middle, Path(temporary), later
+                ):
+                    pass
             times.append(time.monotonic() - begun)
         written = sum((Path(temporary) / name).stat().st_size for name in files_below(Path(temporary)))
     cameras = len(SIDES) * card.frames * len(sequences)

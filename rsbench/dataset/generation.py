@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import secrets
 from collections import Counter
@@ -23,6 +22,7 @@ from rsbench.core.moving import poses_of
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.se3 import Pose
+from rsbench.dataset.beside import Later, beside
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channel_writer import write_channels
 from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_mask, write_png, write_poses
@@ -32,7 +32,7 @@ from rsbench.dataset.manifest import Files, write_manifest
 from rsbench.dataset.matches import Matching
 from rsbench.dataset.scene_hashes import SceneHashes, hashes_of_meshes, mesh_file_hash, scene_hash
 from rsbench.dataset.sequence_channels import write_sequence_channels
-from rsbench.dataset.shots import Geometry, Shot
+from rsbench.dataset.shots import Geometry, Shot, image_seed
 from rsbench.dataset.stage import Build, Built, Stage
 from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, strangers, workplace
 from rsbench.errors import RsbenchError
@@ -296,9 +296,10 @@ def _render_sequence(
     partial = out / HIDDEN / WORK / f"{sequence.name}.{secrets.token_hex(4)}"
     for folder in {Path(name).parent for name in files_of(plan)}:
         (partial / folder).mkdir(parents=True, exist_ok=True)
-    for side, frame in views_of(card.frames):
-        yield from render_camera(card, sequence, options, mitsuba_scene, side, frame, partial)
-    write_sequence_channels(partial, card, sequence, mitsuba_scene, plan["scene"])
+    with beside() as later:
+        for side, frame in views_of(card.frames):
+            yield from render_camera(card, sequence, options, mitsuba_scene, side, frame, partial, later)
+        write_sequence_channels(partial, card, sequence, mitsuba_scene, plan["scene"])
     files = {name: sha256(partial / name) for name in files_below(partial)}
     made_by = {
         "rsbench": __version__,
@@ -324,10 +325,12 @@ def render_camera(
     side: Side,
     frame: int,
     folder: Path,
+    later: Later,
 ) -> Iterator[None]:
     """One camera at one time: the rolling-shutter frame, then the global-shutter frames at poses of its rows.
 
-    What a sensor does is done to the rolling-shutter frame alone; its clean twin is kept.
+    What a sensor does is done to the rolling-shutter frame alone; its clean twin is kept. Channels are written
+    ``later``.
     """
     from rsbench.renderers.image import to_srgb8
     from rsbench.renderers.segments import SceneRays
@@ -359,7 +362,7 @@ def render_camera(
             seen = sensed_rows(scene, rig, shutter, motion, own, period, side, frame, options, objects=things)
             write_png(folder / shot.image, seen)
         if kind == "rs":
-            write_channels(folder, card.channels, geometry, shot, rendered, SceneRays(scene, things), twins)
+            write_channels(folder, card.channels, geometry, shot, rendered, SceneRays(scene, things), later, twins)
         if shot.row == 0:
             yield
 
@@ -392,9 +395,3 @@ def _stack_writer(folder: Path, options: RendererOptions) -> Callable[[int, NDAr
 
     folder.mkdir(parents=True, exist_ok=True)
     return lambda row, image: write_png(folder / f"{row:04d}.png", to_srgb8(image, options.exposure))
-
-
-def image_seed(seed: int, sequence: str, side: Side, frame: int) -> int:
-    """Independent noise per image; rolling- and global-shutter twins share it, so that row 0 is the same."""
-    text = f"{seed}/{sequence}/{side}/{frame}"
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "little")

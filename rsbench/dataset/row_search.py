@@ -127,20 +127,24 @@ def land_rows(
 ) -> None:
     """Fill what ``Landed`` has; NumPy: ``core.projection.rs_project``.
 
-    Each point starts where its neighbour in the row landed. That no other row is heard keeps the bits of a row
-    the same whatever rows are asked for with it.
+    Each point starts where its two neighbours in the row landed would lead, with the slope found there. That no
+    other row is heard keeps the bits of a row the same whatever rows are asked for with it.
     """
     pose = np.zeros(12)
+    _pose_between(table, 0.0, pose)
     for row in range(start.shape[0]):
-        offset = 0.0
+        offset, change, slope = 0.0, 0.0, -1.0
         for k in range(start.shape[1]):
             X = points[row, k, 0], points[row, k, 1], points[row, k, 2]
-            x, y, line, found = _line(table, per_line, camera, axis, lines, X, start[row, k] + offset, pose)
+            near = start[row, k] + offset + change
+            x, y, line, slope, found = _line(table, per_line, camera, axis, lines, X, near, slope, pose)
             status[row, k] = found
-            offset = 0.0
             if found == _SEEN:
-                offset = line - start[row, k]
+                change = line - start[row, k] - offset
+                offset += change
                 pixels[row, k, 0], pixels[row, k, 1] = x, y
+            else:
+                offset, change, slope = 0.0, 0.0, -1.0
             for j in range(3):
                 eyes[row, k, j] = -(pose[j] * pose[9] + pose[3 + j] * pose[10] + pose[6 + j] * pose[11])
 
@@ -154,13 +158,15 @@ def _line(
     lines: int,
     X: tuple[float, float, float],
     start: float,
+    slope: float,
     pose: FloatArray,
-) -> tuple[float, float, float, int]:
-    """Pixel, line and status of one point, by secant steps; leaves the pose of that line in ``pose`` (12,)."""
-    line, step, before, slope = start, 0.0, 0.0, -1.0
+) -> tuple[float, float, float, float, int]:
+    """Pixel, line, slope and status of one point, by secant steps; leaves the line's pose in ``pose`` (12,)."""
+    line, step, before = start, 0.0, 0.0
     x, y, off = math.nan, math.nan, math.nan
     for _ in range(_MOST_STEPS):
-        _pose_between(table, (line + 1.0) * per_line, pose)
+        if per_line > 0.0:
+            _pose_between(table, (line + 1.0) * per_line, pose)
         x, y = _pixel(pose, camera, X)
         off = (x if axis == 0 else y) - line
         if not abs(off) > _TOLERANCE_PX:
@@ -173,17 +179,17 @@ def _line(
         line += step
     if abs(off) <= _TOLERANCE_PX:
         if -0.5 <= x <= camera[0] - 0.5 and -0.5 <= y <= camera[1] - 0.5:
-            return x, y, line, _SEEN
+            return x, y, line, slope, _SEEN
         if -0.5 <= line <= lines - 0.5:
-            return x, y, line, _NOT_SEEN
+            return x, y, line, slope, _NOT_SEEN
     # Another crossing, or one behind a pole, cannot be told from here: the solver that looks for all of them does.
     first = _off(table, per_line, camera, axis, X, -0.5, pose)
     last = _off(table, per_line, camera, axis, X, lines - 0.5, pose)
     if math.isnan(first) and math.isnan(last):
-        return x, y, line, _NOT_SEEN
+        return x, y, line, slope, _NOT_SEEN
     if abs(off) <= _TOLERANCE_PX and first * last > 0.0:
-        return x, y, line, _NOT_SEEN
-    return x, y, line, _UNSURE
+        return x, y, line, slope, _NOT_SEEN
+    return x, y, line, slope, _UNSURE
 
 
 @compiled

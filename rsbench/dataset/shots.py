@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Iterator
 from itertools import product
 from typing import NamedTuple, Protocol
@@ -181,3 +182,9 @@ def _time(geometry: Geometry, shot: Shot) -> FloatArray:
 
 def _pose(geometry: Geometry, shot: Shot) -> Pose:
     return geometry.rig.cam_from_world(geometry.motion, _time(geometry, shot), shot.side)
+
+
+def image_seed(seed: int, sequence: str, side: Side, frame: int) -> int:
+    """Independent noise per image; rolling- and global-shutter twins share it, so that row 0 is the same."""
+    text = f"{seed}/{sequence}/{side}/{frame}"
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "little")

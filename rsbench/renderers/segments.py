@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.compiled import compiled
 from rsbench.core.moving import MovingObject
 from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
@@ -90,25 +91,23 @@ def blocked(scene: Any, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool
     found = [np.zeros(0, dtype=np.bool_)]
     for ray in _rays(eyes, points):
         ray.maxt = REACH
-        found.append(np.atleast_1d(np.array(scene.ray_test(ray), dtype=np.bool_)))
+        found.append(np.atleast_1d(np.array(scene.ray_test(ray, coherent=True), dtype=np.bool_)))
     return np.concatenate(found)
 
 
 def _met(scene: Any, eyes: FloatArray, points: FloatArray) -> _Met:
     """See ``SceneRays.surfaces``, of one scene of Mitsuba."""
+    import drjit as dr
     import mitsuba as mi
 
     found = []
     for ray in _rays(eyes, points):
         hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True)
-        normal, way = (np.array(each, dtype=np.float32).reshape(3, -1) for each in (hit.n, ray.d))
-        normal *= np.where(np.sum(normal * way, axis=0) > 0, np.float32(-1.0), np.float32(1.0))
-        numbers = _numbers(scene, hit)
-        normal[:, numbers == 0] = 0.0
-        found.append(
-            (normal.T + np.float32(0.0), numbers, np.atleast_1d(np.array(hit.t, dtype=np.float32)))
-        )  # no -0
-    return _Met(*(np.concatenate(each) for each in zip(*found, strict=True)))
+        dr.eval(hit.n, hit.t, hit.shape)  # together: asked for one by one, each traces the rays again
+        normals, ways = (np.array(each, dtype=np.float32).reshape(3, -1) for each in (hit.n, ray.d))
+        numbers, distance = _numbers(scene, hit), np.atleast_1d(np.array(hit.t, dtype=np.float32))
+        found.append((_towards_eyes(normals, ways, numbers), numbers, distance))
+    return _Met(*(each[0] if len(each) == 1 else np.concatenate(each) for each in zip(*found, strict=True)))
 
 
 def _numbers(scene: Any, hit: Any) -> NDArray[np.uint16]:
@@ -140,10 +139,33 @@ def _rays(eyes: FloatArray, points: FloatArray) -> list[Any]:
     import mitsuba as mi
 
     origins, ways = np.zeros((2, 3, len(points)), dtype=np.float32)
-    for k in range(3):
-        origins[k] = eyes[:, k]
-        np.subtract(points[:, k], eyes[:, k], out=ways[k], casting="same_kind")
-    ways[np.abs(ways) < LEAST_COMPONENT] = 0.0
+    _fill_rays(eyes, points, origins, ways)
     if _wide():
         return [mi.Ray3f(mi.Point3f(origins), mi.Vector3f(ways))]
     return [mi.Ray3f(o, d) for o, d in zip(origins.T.tolist(), ways.T.tolist(), strict=True)]
+
+
+@compiled
+def _fill_rays(
+    eyes: FloatArray, points: FloatArray, origins: NDArray[np.float32], ways: NDArray[np.float32]
+) -> None:
+    """Origins and ways (3, n) in one pass: NumPy's, a component at a time, takes as long as tracing them."""
+    for n in range(points.shape[0]):
+        for k in range(3):
+            way = np.float32(points[n, k] - eyes[n, k])
+            origins[k, n] = eyes[n, k]
+            ways[k, n] = np.float32(0.0) if abs(way) < LEAST_COMPONENT else way  # NaN stays
+
+
+@compiled
+def _towards_eyes(
+    normals: NDArray[np.float32], ways: NDArray[np.float32], numbers: NDArray[np.uint16]
+) -> NDArray[np.float32]:
+    """Normals (n, 3) of those (3, n) that are met by ways (3, n); 0 where the number (n,) is."""
+    out = np.zeros((numbers.size, 3), np.float32)
+    for n in np.flatnonzero(numbers):
+        along = normals[0, n] * ways[0, n] + normals[1, n] * ways[1, n] + normals[2, n] * ways[2, n]
+        sign = np.float32(-1.0) if along > 0 else np.float32(1.0)
+        for k in range(3):
+            out[n, k] = sign * normals[k, n] + np.float32(0.0)  # no -0
+    return out

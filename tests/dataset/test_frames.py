@@ -25,6 +25,7 @@ from rsbench.core.se3 import compose, inverse, transform
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
+from rsbench.dataset.beside import beside
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.channel_writer import write_channels
 from rsbench.dataset.channels import CHANNELS, STEP_PX, Layer, channel_files, pair_layers
@@ -228,7 +229,8 @@ def flowing(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         image, labels = np.zeros((54, 64, 3), np.float32), np.zeros((54, 64), np.uint8)
         gloss = np.zeros(labels.shape, np.bool_)
         seen = Frame(image=image, depth=whole.depth("rs", *view), labels=labels, gloss=gloss)
-        write_channels(whole.folder, ["flow"], whole, Shot("rs", *view), seen, Open())
+        with beside() as later:
+            write_channels(whole.folder, ["flow"], whole, Shot("rs", *view), seen, Open(), later)
     own = json.loads((whole.folder / "sequence.json").read_text()) | {"channels": ["flow"]}
     own["files"] |= dict.fromkeys(channel_files(["flow"], (), COUNT), "")
     (whole.folder / "sequence.json").write_text(json.dumps(own))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.rig import FRAMES
-from rsbench.dataset.channel_truth import Rays, SeenSurfaces, pair_truth, target_of
+from rsbench.dataset.channel_truth import Rays, SeenSurfaces, carry, pair_truth, target_of
 from rsbench.dataset.channel_writer import pair_values
 from rsbench.dataset.channels import STEP_PX, Layer, PixelClass, pair_layers
 from rsbench.dataset.movers import numbers_of
@@ -122,7 +122,8 @@ def channels_again(
         except RsbenchError:  # told already
             continue
         seen = SeenSurfaces(sequence, shot, frame.depth, rows, numbers_of(frame.labels))
-        truth = pair_truth(seen, target_of(layer, shot, frames), rays.blocked)
+        target = target_of(layer, shot, frames)
+        truth = pair_truth(seen, target, carry(seen, target), rays.blocked)
         made = pair_values(layer.channel, shot, truth.offset)
         far = np.any(~((np.abs(values - made) <= _SAME_PX) | (np.isnan(values) & np.isnan(made))), axis=-1)
         unlike = classes != truth.classes

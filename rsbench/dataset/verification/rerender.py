@@ -20,11 +20,11 @@ from rsbench.cards import list_cards, parse_card
 from rsbench.core.moving import poses_of
 from rsbench.core.projection import row_poses
 from rsbench.dataset.channels import AFFINE, TRACKS, matches_file
-from rsbench.dataset.generation import image_seed, render_shot
+from rsbench.dataset.generation import render_shot
 from rsbench.dataset.layout import whole_frames
 from rsbench.dataset.scene_hashes import scene_hash
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.shots import SHOTS, Shot, shots_of
+from rsbench.dataset.shots import SHOTS, Shot, image_seed, shots_of
 from rsbench.dataset.verification.affine_checks import affine_again
 from rsbench.dataset.verification.channel_checks import channels_again
 from rsbench.dataset.verification.content import Content, clean_picture

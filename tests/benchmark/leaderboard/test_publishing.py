@@ -32,10 +32,10 @@ from rsbench.benchmark.leaderboard.submissions import read_submission, truth_tex
 from rsbench.core.rig import views_of
 from rsbench.dataset.card import DatasetCard
 from rsbench.dataset.files import sha256, write_json, write_png
-from rsbench.dataset.generation import image_seed
 from rsbench.dataset.hashes import HashedFile
 from rsbench.dataset.manifest import write_manifest
 from rsbench.dataset.secret import Secret, secret_card
+from rsbench.dataset.shots import image_seed
 from rsbench.errors import RsbenchError
 
 TEXT = "f3b1 a secret that nobody guesses"

@@ -1,0 +1,45 @@
+"""Work on other threads while this one goes on: the renderer's, whose kernels leave cores idle between them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from itertools import islice
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+R = TypeVar("R")
+Later = Callable[..., "Future[Any]"]
+"""Called with a function and its arguments: it is called soon."""
+_THREADS = 2
+
+
+@contextmanager
+def beside() -> Iterator[Later]:
+    """Gives what hands work to other threads. At the end all of it is done, or the first error is raised."""
+    with ThreadPoolExecutor(_THREADS) as pool:
+        jobs: list[Future[Any]] = []
+
+        def later(work: Callable[..., Any], *given: Any) -> Future[Any]:
+            jobs.append(pool.submit(work, *given))
+            return jobs[-1]
+
+        yield later
+        for job in jobs:
+            job.result()
+
+
+def begun(later: Later, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """``work`` on each item, in order. The first are begun now, the others as results are taken."""
+    rest = iter(items)
+    waiting = deque(later(work, item) for item in islice(rest, _THREADS))
+
+    def results() -> Iterator[R]:
+        while waiting:
+            first = waiting.popleft()
+            yield first.result()
+            waiting.extend(later(work, item) for item in islice(rest, 1))
+
+    return results()
