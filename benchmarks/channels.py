@@ -3,7 +3,7 @@
 Both are rendered and written in turn, so that a busy machine disturbs them alike. The ratio of the clock's times
 is the cost; that of CPU times tells what a machine with other work would show.
 
-    python benchmarks/channels.py --scene castle --runs 3
+    python benchmarks/channels.py --scene castle --runs 3 --twins middle,last
 """
 
 from __future__ import annotations
@@ -52,10 +52,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--dataset", default="paper", help="whose camera, motion and renderer (default paper)")
     parser.add_argument("--scene", default="castle", help="sequence of it (default castle)")
     parser.add_argument("--channels", default=",".join(CHANNELS), help="with commas between (default all)")
+    parser.add_argument("--twins", default="", help="more global-shutter frames, as middle,last")
     parser.add_argument("--runs", type=int, default=3, help="runs of each (default 3)")
     parser.add_argument("--limit", type=float, default=1.5, help="exit with 1 above this ratio (default 1.5)")
     given = parser.parse_args(arguments)
     plain = load_dataset_card(given.dataset).only([given.scene])
+    if given.twins:
+        plain = replace(plain, twins=tuple(given.twins.split(",")))
     full = replace(plain, channels=tuple(given.channels.split(",")))
     options = load_card(RendererOptions, "renderers", plain.renderer)
     built = build_scene(plain.sequence[0].scene).scene
@@ -65,7 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     runs = [tuple(seconds(card, options, scene, viewpoint) for card in (plain, full)) for _ in range(given.runs)]
     clock, cpu = (statistics.median(with_[k] / without[k] for without, with_ in runs) for k in (0, 1))
     size = f"{plain.camera.width} x {plain.camera.height}, {options.samples} samples"
-    rows = [f"{given.dataset}, {given.scene}: {size}, {given.runs} runs of each; channels {given.channels}"]
+    rows = [
+        f"{given.dataset}, {given.scene}: {size}, {given.runs} runs of each; twins {given.twins or plain.twins}; channels {given.channels}"
+    ]
     for name, place in (("images and depth alone", 0), ("with channels", 1)):
         times = [statistics.median(run[place][k] for run in runs) for k in (0, 1)]
         rows.append(f"{name:24}{times[0]:7.2f} s of the clock {times[1]:7.2f} s of CPU")
