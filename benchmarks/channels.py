@@ -68,9 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     runs = [tuple(seconds(card, options, scene, viewpoint) for card in (plain, full)) for _ in range(given.runs)]
     clock, cpu = (statistics.median(with_[k] / without[k] for without, with_ in runs) for k in (0, 1))
     size = f"{plain.camera.width} x {plain.camera.height}, {options.samples} samples"
-    rows = [
-        f"{given.dataset}, {given.scene}: {size}, {given.runs} runs of each; twins {given.twins or plain.twins}; channels {given.channels}"
-    ]
+    twins = ", ".join(("first", *map(str, plain.twins)))
+    rows = [f"{given.dataset}, {given.scene}: {size}, twins {twins}, {given.runs} runs of each; {given.channels}"]
     for name, place in (("images and depth alone", 0), ("with channels", 1)):
         times = [statistics.median(run[place][k] for run in runs) for k in (0, 1)]
         rows.append(f"{name:24}{times[0]:7.2f} s of the clock {times[1]:7.2f} s of CPU")
