@@ -103,10 +103,21 @@ def _clustered(
     values: FloatArray, statistic: Statistic, clusters: NDArray[Any], rng: np.random.Generator, resamples: int
 ) -> FloatArray:
     _, labels = np.unique(clusters, return_inverse=True)
+    draws = rng.integers(0, int(labels.max()) + 1, (resamples, int(labels.max()) + 1))
+    if statistic is median and values.ndim == 1:
+        return _medians(values, labels, draws)
     members = [np.flatnonzero(labels == label) for label in range(int(labels.max()) + 1)]
-    draws = rng.integers(0, len(members), (resamples, len(members)))
     samples = [np.concatenate([members[k] for k in draw]) for draw in draws]
     return np.array([float(statistic(values[sample][None])[0]) for sample in samples])
+
+
+def _medians(values: FloatArray, labels: NDArray[np.intp], draws: NDArray[np.int64]) -> FloatArray:
+    """Of each draw of clusters (resamples, clusters), the median of their values, of all (n,)."""
+    order = np.argsort(values, kind="stable")
+    times = np.sum(draws[:, :, None] == np.arange(draws.shape[1]), axis=1)
+    below = np.cumsum(times[:, labels[order]], axis=1)
+    middle = ((below[:, -1:] - 1) // 2, below[:, -1:] // 2)
+    return np.asarray(np.mean([values[order][np.argmax(below > rank, axis=1)] for rank in middle], axis=0))
 
 
 def typical_interval(values: FloatArray, seed: int, clusters: Sequence[Any] | None = None) -> Interval:

@@ -25,6 +25,8 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench reproduce leaderboard --out results --data data  [dim](our solvers on points: 25 minutes of a core)[/dim]
 
+  rsbench reproduce boards --out results --data data       [dim](tracks of frames, 216 sequences: 3 hours)[/dim]
+
   rsbench reproduce everything                             [dim](hours; goes on where it stopped)[/dim]"""
 
 
@@ -42,6 +44,7 @@ class Target(StrEnum):
     sgm = "sgm"
     real = "real"
     leaderboard = "leaderboard"
+    boards = "boards"
     everything = "everything"
 
 
@@ -52,7 +55,11 @@ _ORDER = (
 """Of everything: claims make Figure 3 on their way, and those about images judge what the others have stored."""
 _SEEDS = {Target.images: 20, Target.real: 10}
 """Runs of each solver in what is committed."""
-_FOLDERS = {Target.claims: ("fig3", "claims"), Target.image_claims: ("claims",)}
+_FOLDERS = {
+    Target.claims: ("fig3", "claims"),
+    Target.image_claims: ("claims",),
+    Target.boards: ("leaderboard",),
+}
 """Where a target writes below ``--out``, if not in the folder of its name."""
 
 
@@ -68,6 +75,7 @@ def reproduce(
             "mild, moderate, aggressive and poles. sgm: stereo matching when the cameras' rows are not in step. "
             "real: the default pipeline on a real camera's frames, beside an ideal one's. "
             "leaderboard: our solvers on the public split of points, its site, and the scores of the smoke run. "
+            "boards: the same of the tracks of frames, on the dataset standard. "
             "everything: all of these, one after the other, with the time that each took."
         ),
     ],
@@ -116,6 +124,8 @@ def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds
             _real(out, data, seeds, width)
         elif target is Target.leaderboard:
             _leaderboard(out, data, workers)
+        elif target is Target.boards:
+            _boards(out, data, workers)
         elif target in (Target.fig4, Target.sgm):
             _depth(target, out, data)
         else:
@@ -132,6 +142,12 @@ def _leaderboard(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.cli.reproduce_leaderboard import leaderboard
 
     leaderboard(out, data, workers)
+
+
+def _boards(out: Path, data: Path, workers: int | None) -> None:
+    from rsbench.cli.reproduce_leaderboard import boards
+
+    boards(out, data, workers)
 
 
 def _real(out: Path, data: Path, seeds: int, width: int | None) -> None:

@@ -6,6 +6,7 @@ Everything comes from a board's stored scores. Nothing is fetched, and what entr
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +27,12 @@ from rsbench.report.board_splits import Board, read_split
 from rsbench.report.board_tables import as_csv, as_latex, as_markdown
 
 
-def build_site(board: Path, out: Path, data: Sequence[Path] = ()) -> Path:
+def build_site(board: Path, out: Path, data: Sequence[Path] = (), *, problem_pages: bool = True) -> Path:
     """Write the site of a board into a folder; returns its first page.
 
     Args:
         data: datasets, of which pages of their problems show pictures.
+        problem_pages: without them the site is a tenth as large; the table of all problems has their errors too.
 
     Raises:
         RsbenchError: it is no board, an entry or a dataset is damaged, or the folder cannot be written.
@@ -48,7 +50,7 @@ def build_site(board: Path, out: Path, data: Sequence[Path] = ()) -> Path:
         write_bytes(path, environment.get_template(f"{template}.html.j2").render(**context).encode())
 
     boards = [read_split(board, protocol, split) for protocol, split in splits_of(board)]
-    boards = [each for each in boards if each.lines]
+    boards = [replace(each, problem_pages=problem_pages) for each in boards if each.lines]
     out.mkdir(parents=True, exist_ok=True)
     for each, album in zip(boards, albums(boards, out, data), strict=True):
         for suffix, text in (

@@ -37,6 +37,8 @@ class Board:
     lines: list[Standing]
     facts: pd.DataFrame
     """By the name of the problem; without columns where they are secret."""
+    problem_pages: bool = True
+    """Whether rendered sequences may have pages of their own."""
 
     @property
     def id(self) -> str:
@@ -66,7 +68,7 @@ class Board:
     @property
     def pages(self) -> bool:
         """Whether its problems have pages: simulated ones, of which nothing is to be seen, have a row."""
-        return self.protocol.track != "points" and not self.secret
+        return self.problem_pages and self.protocol.track != "points" and not self.secret
 
     def page_of(self, problem: str) -> str:
         """Where a problem is told, from the folder of the index."""
