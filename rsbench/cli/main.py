@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import sys
 from typing import Annotated
 
@@ -64,6 +65,8 @@ def _root(
 ) -> None:
     from rsbench.cli.console import be_quiet
 
+    # Before OpenCV is imported, here and in children: what it warns of in a damaged image is in our line.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     be_quiet(quiet)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -164,6 +165,25 @@ def test_bad_calls_are_refused_and_leave_nothing(tmp_path: Path, frames: list[Pa
     assert_refused(correct(*frames, *common, "--solver", "nobody"), "nobody", "does not exist")
     assert_refused(correct(*frames, "--rig", tmp_path / "no.toml", "--out", out), "no.toml")
     assert {path.name for path in tmp_path.iterdir()} == {"rig.toml", "small.png", "flat.png"}
+
+
+def test_a_cut_image_is_one_line_without_one_of_opencv(tmp_path: Path, frames: list[Path], rig: Path) -> None:
+    cut = tmp_path / "cut.png"
+    cut.write_bytes(frames[0].read_bytes()[:2000])
+    command = [
+        sys.executable,
+        "-m",
+        "rsbench",
+        "correct",
+        cut,
+        *frames[1:],
+        "--rig",
+        rig,
+        "--out",
+        tmp_path / "out",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True)  # OpenCV has read its environment here
+    assert_refused(done, "cut.png", "cannot be decoded")
 
 
 def test_a_folder_of_others_is_not_touched(tmp_path: Path, frames: list[Path], rig: Path) -> None:
