@@ -117,7 +117,7 @@ class SplineMotion(Motion):
         return _through(self.interval, self.shake, Pose(so3.exp(self.w), self.d))
 
     def body_from_world(self, tau: ArrayLike) -> Pose:
-        return self._spline.at(tau)[0]
+        return self._spline.pose(tau)
 
     def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
         (_, t), twist, _ = self._spline.at(tau)
@@ -167,6 +167,17 @@ class _Spline:
         self.interval, self.control = interval, control
         later, earlier = Pose(control.R[1:], control.t[1:]), Pose(control.R[:-1], control.t[:-1])
         self.steps = se3.log(compose(later, inverse(earlier)))
+
+    def pose(self, tau: ArrayLike) -> Pose:
+        """The pose alone at times (...): a third of the work of ``at``, the same bits."""
+        tau = np.asarray(tau, dtype=np.float64)
+        if not np.all((tau >= 0.0) & (tau <= (len(self.steps) - 2) * self.interval)):
+            return self.at(tau)[0]
+        i, u = _place(tau, self.interval, len(self.steps) + 1)
+        pose = Pose(self.control.R[i], self.control.t[i])
+        for j, share in enumerate(_cumulative(u)):
+            pose = compose(se3.exp(share[..., None] * self.steps[i + j]), pose)
+        return pose
 
     def at(self, tau: ArrayLike) -> tuple[Pose, FloatArray, FloatArray]:
         """Pose, spatial twist (..., 6) and its derivative (..., 6) at times (...): dP/dtau = [twist] P."""

@@ -280,3 +280,13 @@ def test_a_spline_refuses_what_it_cannot_be(parameters: dict[str, object], words
 def test_a_spline_of_half_a_turn_is_refused() -> None:
     with pytest.raises(ValueError, match="below a half turn"):
         SplineMotion([0.0, 3.2, 0.0], np.zeros(3))
+
+
+def test_the_pose_alone_of_a_spline_is_that_of_its_pose_with_velocity() -> None:
+    """To the bit: a frame's rows are asked for one way, and for channels of truth the other."""
+    motion = SplineMotion([0.02, 0.01, -0.03], [0.1, 0.0, 0.2], seed=4)
+    inside = np.concatenate([np.linspace(0.0, motion.lasts, 97), motion.interval * np.arange(5)])
+    for tau in (inside, np.array([-0.3, 0.5]), np.array([0.5, motion.lasts + 0.1])):
+        whole, alone = motion._spline.at(tau)[0], motion.body_from_world(tau)
+        np.testing.assert_array_equal(alone.R, whole.R)
+        np.testing.assert_array_equal(alone.t, whole.t)
