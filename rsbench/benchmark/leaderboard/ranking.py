@@ -53,13 +53,16 @@ def mean_interval(means: FloatArray) -> Interval:
 def score_interval(values: FloatArray, scenes: Sequence[str]) -> tuple[float, float, float]:
     """The mean over scenes of values (n,) in [0, 1], and the ends of its interval.
 
-    Nothing lies outside [0, 1]; of yes or no of problems that are independent the interval is exact.
+    Nothing lies outside [0, 1]. Of yes or no of problems that are independent the interval is exact; of those that
+    share scenes it has that one inside: scenes that all say no do not bound the share to 0.
     """
     means = scene_means(values, scenes)
-    if len(means) == len(values) and np.all((values == 0.0) | (values == 1.0)):
-        low, high = share_interval(int(np.sum(values)), len(values))
-        return float(np.mean(means)), low, high
     low, high = mean_interval(means)
+    if np.all((values == 0.0) | (values == 1.0)):
+        exact = share_interval(int(np.sum(values)), len(values))
+        if len(means) == len(values):
+            return float(np.mean(means)), *exact
+        low, high = min(low, exact.low), max(high, exact.high)
     return float(np.mean(means)), max(low, 0.0), min(high, 1.0)
 
 

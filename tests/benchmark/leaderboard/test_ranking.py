@@ -68,6 +68,13 @@ def test_scores_of_few_scenes_keep_their_interval() -> None:
     assert 0.93 <= held / trials <= 0.97
 
 
+def test_none_of_many_in_few_scenes_is_not_none_for_sure() -> None:
+    """At least what as many independent problems leave open: here 1 - 0.025^(1 / 216)."""
+    scenes = [str(k // 24) for k in range(216)]
+    assert score_interval(np.zeros(216), scenes) == pytest.approx((0.0, 0.0, 1.0 - 0.025 ** (1 / 216)))
+    assert score_interval(np.ones(216), scenes) == pytest.approx((1.0, 0.025 ** (1 / 216), 1.0))
+
+
 def _tables(rng: np.random.Generator, truth: np.ndarray, scenes: int, trials: int) -> np.ndarray:
     """Scenes' means (trials, entries, scenes) with a difficulty that entries share."""
     common = 0.1 * rng.standard_normal((trials, 1, scenes))
