@@ -70,7 +70,9 @@ def _scores(line: Standing) -> list[dict[str, str]]:
 def _by(each: Board, line: Standing, name: str, kinds: pd.Series) -> dict[str, Any]:
     scores, protocol, rows = line.scored.scores, each.protocol, list[list[object]]()
     for kind, part in scores.groupby(kinds.astype(str).to_numpy()):
-        share = in_words(*score_interval(part[protocol.primary.key].to_numpy(), list(part["scene"])))
+        value, low, high = score_interval(part[protocol.primary.key].to_numpy(), list(part["scene"]))
+        # One scene bounds nothing: an interval of it would only round its value away.
+        share = f"{value:.3g}" if part["scene"].nunique() == 1 else in_words(value, low, high)
         medians = (part[key].median() for key in protocol.of_kind("median")[:BRIEF])
         rows.append([str(kind), len(part), share, *(f"{x:.3g}" for x in medians), int(part["failure"].sum())])
     return {
