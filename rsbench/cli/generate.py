@@ -44,6 +44,13 @@ _Card = Annotated[
         autocompletion=complete("datasets"),
     ),
 ]
+_Out = Annotated[
+    str,
+    typer.Option(
+        metavar="DIR",
+        help="Folder of the dataset, or a URL such as s3://bucket/folder; an interrupted run resumes there.",
+    ),
+]
 _Only = Annotated[
     list[str] | None, typer.Option("--sequence", "--only", help="Only this sequence of the card; repeatable.")
 ]
@@ -81,13 +88,7 @@ _Estimate = Annotated[
 
 def generate(
     card: _Card,
-    out: Annotated[
-        str,
-        typer.Option(
-            metavar="DIR",
-            help="Folder of the dataset, or a URL such as s3://bucket/folder; an interrupted run resumes there.",
-        ),
-    ],
+    out: _Out,
     sequence: _Only = None,
     shard: _Shard = None,
     workers: Annotated[
@@ -104,20 +105,13 @@ def generate(
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.channels import named_channels
     from rsbench.dataset.files import check_out
     from rsbench.dataset.generation import generate_dataset, steps_of
     from rsbench.dataset.store import open_store, path_or_url, shown
     from rsbench.renderers.backend import start_backend
 
     crew, place = chosen_workers(workers, scheduler), shared_path(path_or_url(out), scheduler)
-    dataset = load_dataset_card(card, trajectory, tuple(seed or ()))
-    if sequence:
-        dataset = dataset.only(sequence)
-    if shard is not None:
-        dataset = dataset.shard(*_part(shard))
-    if channels is not None:
-        dataset = dataset.with_channels(named_channels(channels))
+    dataset = _chosen(load_dataset_card(card, trajectory, tuple(seed or ())), sequence, shard, channels)
     if not estimate:
         _ = check_out(place) if isinstance(place, Path) else open_store(place)
     backend = start_backend()
@@ -133,6 +127,19 @@ def generate(
         )
     words = f"{len(dataset.sequence)} sequences, {len(rendered)} rendered now"
     typer.echo(f"{shown(str(place))}: {words}")
+
+
+def _chosen(
+    dataset: DatasetCard, sequence: list[str] | None, shard: str | None, channels: str | None
+) -> DatasetCard:
+    """What the options leave of a card."""
+    from rsbench.dataset.channels import named_channels
+
+    if sequence:
+        dataset = dataset.only(sequence)
+    if shard is not None:
+        dataset = dataset.shard(*_part(shard))
+    return dataset if channels is None else dataset.with_channels(named_channels(channels))
 
 
 def _part(word: str) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from rsbench.errors import RsbenchError
 
-_URL = re.compile(r"[a-z][a-z0-9+.-]+://")
+_URL = re.compile(r"[a-z][a-z0-9+.:-]+://")
 _LOCAL = ("file", "local")
 _TOKENS = ("ETag", "etag", "md5Hash", "mtime", "LastModified", "last_modified", "updated", "created")
 """What listings of the kinds of stores call that which changes with an object's content."""
@@ -41,7 +41,7 @@ def path_or_url(out: str) -> Path | str:
     protocol, _, rest = out.partition("://")
     if protocol in _LOCAL:
         if not rest.startswith("/"):
-            raise RsbenchError(f"--out {out}: must be an absolute path, such as {protocol}:///data/{rest}")
+            raise RsbenchError(f"--out {out}: must be an absolute path, such as {protocol}:///{rest}")
         return Path(rest[1:] if os.name == "nt" else rest)
     if "::" in out or re.search(r"[*?\[]", rest):
         raise RsbenchError(f"--out {shown(out)}: must be a plain URL, such as s3://bucket/folder")
