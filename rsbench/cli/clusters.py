@@ -46,4 +46,9 @@ _Place = TypeVar("_Place", Path, Path | str)
 
 def shared_path(path: _Place, scheduler: str | None) -> _Place:
     """A path as the machines of a cluster, which work in other folders, must be told it; a URL is what it was."""
-    return path if scheduler is None or isinstance(path, str) else path.resolve()
+    if scheduler is None or isinstance(path, str):
+        return path
+    from rsbench.dataset.workplace import refuse_url
+
+    refuse_url(path)
+    return path.resolve()

@@ -256,6 +256,12 @@ def test_urls_that_cannot_be_taken_are_one_line(out: str, words: str) -> None:
     assert "secret" not in result.stderr
 
 
+def test_other_commands_name_the_url_that_they_do_not_take() -> None:
+    for command in (("simulate", "noise"), ("evaluate", "data"), ("reproduce", "fig3")):
+        assert_refused(run_here(*command, "--out", "s3://bucket/x"), "s3://bucket/x: is a URL, which only")
+    assert not Path("s3:").exists()
+
+
 def test_without_its_packages_a_store_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "s3fs", None)
     assert_refused(run_here("generate", "smoke", "--out", "s3://bucket/x"), "install", "s3fs")
