@@ -3,9 +3,9 @@
     python benchmarks/resume_store.py [SEQUENCES] [--server]        # needs fsspec, or s3fs and moto[server]
 
 True manifests and made-up files, in a store in the memory of this process, or on a server of S3 (moto) in another.
-Two runs: of a machine that has never seen the dataset, which reads every sequence.json, and one that reads none, in
-fresh processes where there is a server. 10,000 sequences must take the second less than 20 s of the processor and
-1 GB, here with the store itself. A page of a listing costs moto more than a real server: it is told apart.
+Two runs: of a machine that has never seen the dataset, which reads every sequence.json, and one that reads none,
+in fresh processes where there is a server. 10,000 sequences must take the second less than 20 s of the processor
+and 1 GB, here with the store itself. A page of a listing costs moto more than a real server: it is told apart.
 """
 
 from __future__ import annotations

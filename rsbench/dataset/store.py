@@ -43,7 +43,7 @@ def path_or_url(out: str) -> Path | str:
         if not rest.startswith("/"):
             raise RsbenchError(f"--out {out}: must be an absolute path, such as {protocol}:///{rest}")
         return Path(rest[1:] if os.name == "nt" else rest)
-    if "::" in out or re.search(r"[*?\[]", rest):
+    if "::" in out or not rest.strip("/") or re.search(r"[*?\[]", rest):
         raise RsbenchError(f"--out {shown(out)}: must be a plain URL, such as s3://bucket/folder")
     return out.rstrip("/")
 

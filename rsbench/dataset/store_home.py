@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from rsbench.caches import temporary, user_cache
 from rsbench.dataset.card import DatasetCard, SequenceCard
-from rsbench.dataset.files import write_json
+from rsbench.dataset.files import check_out, write_json
 from rsbench.dataset.hashes import HashedFile
 from rsbench.dataset.layout import is_of_sequence
 from rsbench.dataset.manifest import Files, manifest_of, says
@@ -103,7 +103,13 @@ class StoreHome:
     def learned(self, name: str) -> Files:
         self._list(name, [name])
         self._learn([name], {})
-        return self._known(name).files
+        known = self._known(name)
+        if missing := [file for file in hashes_in(known.manifest) if file not in known.sizes]:
+            raise RsbenchError(
+                f"{self._store.url}/{name}: {named(missing)} is not there although it was sent; run the same "
+                "command again"
+            )
+        return known.files
 
     def finish(self, card: DatasetCard, made: Mapping[str, Files]) -> None:
         content = manifest_of(card, made)
@@ -131,23 +137,30 @@ class StoreHome:
     def _known(self, name: str) -> _Known:
         return _Known(*json.loads(self._lines[name])[1:])
 
-    def _learn(self, names: Iterable[str], sizes: Mapping[str, int]) -> None:
-        """Read each sequence.json; files have their ``sizes``, else those that they have there now."""
+    def _learn(self, names: Iterable[str], sizes: Mapping[tuple[str, str], int]) -> None:
+        """Read each sequence.json; files have the ``sizes`` of their paths and hashes, else those that they have
+        there now."""
         with (self.hidden / _OBJECTS).open("a", encoding="utf-8") as stream:
             for path, data in self._store.read([f"{name}/{_MANIFEST}" for name in names]):
                 name = path.partition("/")[0]
                 objects = self._objects[name]
                 manifest = _parsed(data, f"{self._store.url}/{path}")
-                of_files = {file: sizes.get(f"{name}/{file}", there.size) for file, there in objects.items()}
-                token, digest = _state(objects[_MANIFEST]), hashlib.sha256(data).hexdigest()
-                self._lines[name] = json.dumps([name, token, digest, of_files, manifest])
+                digest = hashlib.sha256(data).hexdigest()
+                hashes = {_MANIFEST: digest, **hashes_in(manifest)}
+                own = {
+                    file: sizes.get((f"{name}/{file}", str(hashes.get(file))), there.size)
+                    for file, there in objects.items()
+                }
+                state = _state(objects.get(_MANIFEST, Listed(0, "")))
+                self._lines[name] = json.dumps([name, state, digest, own, manifest])
                 stream.write(f"\n{self._lines[name]}\n")  # the line before may have been cut by a kill
 
-    def _sizes_of_dataset(self) -> dict[str, int]:
-        """What dataset.json says, as far as it can be read."""
+    def _sizes_of_dataset(self) -> dict[tuple[str, str], int]:
+        """What dataset.json says of paths and hashes, as far as it can be read."""
         with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, RecursionError):
             for _, data in self._store.read([_DATASET]):
-                return {path: int(file["size"]) for path, file in json.loads(data)["files"].items()}
+                files = json.loads(data)["files"].items()
+                return {(path, str(file["sha256"])): int(file["size"]) for path, file in files}
         return {}
 
     def _complete(self, sequence: SequenceCard, plan: Plan, scene_hashes: SceneHashes) -> _Known | None:
@@ -218,10 +231,20 @@ def store_home(url: str, workers: Workers, rehash: bool) -> Iterator[StoreHome]:
     if url.startswith("memory:") and workers != 1:
         raise RsbenchError(f"--out {url}: lives in one process: without --workers and --scheduler")
     store = open_store(url)
-    hidden = (user_cache() or temporary() or Path(tempfile.mkdtemp())) / "stores" / _key(url)
+    hidden = _hidden(_key(url))
     with workplace(hidden, hidden):
         target = StoreTarget(url, None if isinstance(workers, Cluster) else hidden / WORK)
         yield StoreHome(store, hidden, target, rehash)
+
+
+def _hidden(key: str) -> Path:
+    """In the user's cache, else where temporary files go."""
+    for base in (user_cache(), temporary()):
+        if base is not None:
+            with contextlib.suppress(RsbenchError):
+                check_out(base)
+                return base / "stores" / key
+    raise RsbenchError("no folder for what is being made: set TMPDIR to one that can be written")
 
 
 def _key(url: str) -> str:

@@ -246,6 +246,7 @@ def test_a_file_url_is_a_folder(tmp_path: Path) -> None:
         ("file://data/x", "must be an absolute path, such as file:///data/x"),
         ("nothing://bucket/x", "nothing://bucket/x: cannot open it: Protocol not known: nothing; choose another"),
         ("simplecache::s3://bucket/x", "must be a plain URL, such as s3://bucket/folder"),
+        ("s3://", "must be a plain URL, such as s3://bucket/folder"),
         ("s3://bucket/[x]", "must be a plain URL, such as s3://bucket/folder"),
         ("ftp://me:secret@host::s3://x", "--out ftp://host::s3://x: must be"),
     ],
@@ -263,8 +264,8 @@ def test_other_commands_name_the_url_that_they_do_not_take() -> None:
 
 
 def test_without_its_packages_a_store_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "s3fs", None)
-    assert_refused(run_here("generate", "smoke", "--out", "s3://bucket/x"), "install", "s3fs")
+    monkeypatch.setitem(sys.modules, "gcsfs", None)
+    assert_refused(run_here("generate", "smoke", "--out", "gs://bucket/x"), "gcsfs", "install the package of this")
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
     result = run_here("generate", "smoke", "--out", "s3://bucket/other")
     assert_refused(result, "s3://bucket/other: needs fsspec: pip install 'rsbench[cloud]'")
