@@ -107,7 +107,7 @@ def generate(
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.files import check_out
     from rsbench.dataset.generation import generate_dataset, steps_of
-    from rsbench.dataset.store import open_store, path_or_url, shown
+    from rsbench.dataset.object_store import open_store, path_or_url, shown
     from rsbench.renderers.backend import start_backend
 
     crew, place = chosen_workers(workers, scheduler), shared_path(path_or_url(out), scheduler)

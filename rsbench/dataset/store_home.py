@@ -24,9 +24,9 @@ from rsbench.dataset.files import check_out, write_json
 from rsbench.dataset.hashes import HashedFile
 from rsbench.dataset.layout import is_of_sequence
 from rsbench.dataset.manifest import Files, manifest_of, says
+from rsbench.dataset.object_store import Listed, Store, open_store
 from rsbench.dataset.plans import Plan, check_same, hashes_in, wanted_files
 from rsbench.dataset.scene_hashes import SceneHashes
-from rsbench.dataset.store import Listed, Store, open_store
 from rsbench.dataset.workplace import WORK, files_below, named, remove, workplace
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.crew import Cluster, Workers

@@ -20,8 +20,8 @@ from small_scenes import write_box_scene, write_small_card
 from rsbench.dataset import generation
 from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.generation import generate_dataset
+from rsbench.dataset.object_store import Store, path_or_url
 from rsbench.dataset.stage import Built
-from rsbench.dataset.store import Store, path_or_url
 from rsbench.dataset.store_home import store_home
 from rsbench.dataset.workplace import HIDDEN
 from rsbench.errors import RsbenchError
@@ -258,7 +258,7 @@ def test_urls_that_cannot_be_taken_are_one_line(out: str, words: str) -> None:
 
 
 def test_other_commands_name_the_url_that_they_do_not_take() -> None:
-    for command in (("simulate", "noise"), ("evaluate", "data"), ("reproduce", "fig3")):
+    for command in (("simulate", "noise"), ("reproduce", "fig3")):
         assert_refused(run_here(*command, "--out", "s3://bucket/x"), "s3://bucket/x: is a URL, which only")
     assert not Path("s3:").exists()
 
