@@ -60,7 +60,7 @@ def main() -> None:
     if not (arguments.data / "dataset.json").is_file():
         from rsbench.cli.generate import generate
 
-        generate("paper", arguments.data, None, workers=1)
+        generate("paper", str(arguments.data), None, workers=1)
     sequence = next(one for one in read_dataset(arguments.data) if one.name == arguments.sequence)
     options = CorrectionOptions()
     run(sequence, options)  # compiles and warms up

@@ -88,7 +88,7 @@ def line(few: float, more: float, share_few: float, share_more: float) -> float:
 def rendered(folder: Path) -> dict[str, float]:
     """Seconds of one sequence: rendered, drawn in Figure 4, corrected by all methods of the study, matched."""
     data = folder / "data"
-    found = {"render": seconds_of(lambda: generate("moderate", data / "moderate", THREE))}
+    found = {"render": seconds_of(lambda: generate("moderate", str(data / "moderate"), THREE))}
     with patched(
         reproduce_correction,
         _generate=lambda card, data: None,  # it is there

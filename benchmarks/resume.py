@@ -49,7 +49,7 @@ def make_up(card: Path, out: Path) -> None:
     from rsbench.renderers import passage, scene
 
     def render(*arguments: Any) -> Iterator[None]:
-        side, frame, folder = arguments[-3:]
+        side, frame, folder = arguments[4:7]
         for name in RELATIVE_FILES:
             if Path(name).stem == f"{side}_{frame}":
                 (folder / name).write_text(f"{folder.name}/{name}")
@@ -60,11 +60,11 @@ def make_up(card: Path, out: Path) -> None:
     vars(generation)["build_scene"] = lambda name: Built(nothing, "0" * 64)  # pyrefly: ignore[bad-argument-type]
     vars(generation)["render_camera"] = render
     vars(passage)["obstacle"] = lambda *moving: ""
-    vars(scene)["MitsubaScene"] = lambda scene: None
+    vars(scene)["MitsubaScene"] = lambda scene: SimpleNamespace(glossy=False)
     generation.generate_dataset(load_dataset_card(str(card)), out)
 
 
-def resume(card: Path, out: Path, rehash: bool) -> None:
+def resume(card: Path, out: Path | str, rehash: bool) -> None:
     """In a process of its own: resume, and print seconds and the largest memory, MB."""
     from rsbench.dataset import generation
     from rsbench.dataset.card import load_dataset_card

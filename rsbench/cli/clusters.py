@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -41,6 +41,14 @@ def chosen_workers(workers: int | None, scheduler: str | None, default: int = 1)
     return Cluster(address=str(Path(scheduler).resolve()) if scheduler.endswith(".json") else scheduler)
 
 
-def shared_path(path: Path, scheduler: str | None) -> Path:
-    """A path as the machines of a cluster, which work in other folders, must be told it."""
-    return path if scheduler is None else path.resolve()
+_Place = TypeVar("_Place", Path, Path | str)
+
+
+def shared_path(path: _Place, scheduler: str | None) -> _Place:
+    """A path as the machines of a cluster, which work in other folders, must be told it; a URL is what it was."""
+    if scheduler is None or isinstance(path, str):
+        return path
+    from rsbench.dataset.workplace import refuse_url
+
+    refuse_url(path)
+    return path.resolve()

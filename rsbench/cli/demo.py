@@ -17,7 +17,7 @@ def demo(
     from rsbench.cli.evaluate import evaluate_dataset
     from rsbench.cli.generate import generate
 
-    generate("paper", out / scene, [scene], workers=1)
+    generate("paper", str(out / scene), [scene], workers=1)
     options = EvaluationOptions(solvers=("rs-stereo-refined", "rs-stereo-linear", "gs-8pt"))
     evaluate_dataset(out / scene, out / f"{scene}-evaluation", options, "rsbench demo")
 

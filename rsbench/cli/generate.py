@@ -24,6 +24,9 @@ EPILOG = """[bold]Examples[/bold]
   rsbench generate moderate --out data/moderate --shard 2/4 [dim](on the second of four machines; then bring all
   folders into one and run it without --shard: it checks them and writes dataset.json)[/dim]
 
+  rsbench generate paper --out s3://bucket/paper --workers 8 [dim](sequences go there as they become complete:
+  rsbench docs cluster)[/dim]
+
   rsbench generate paper --out data/flow --channels disparity,flow
 
   rsbench generate smoke --out data/walk --trajectory walk.txt [dim](along your own poses, one pair of frames
@@ -39,6 +42,13 @@ _Card = Annotated[
     typer.Argument(
         help="Name of a dataset card (see: rsbench list datasets) or path to one.",
         autocompletion=complete("datasets"),
+    ),
+]
+_Out = Annotated[
+    str,
+    typer.Option(
+        metavar="DIR",
+        help="Folder of the dataset, or a URL such as s3://bucket/folder; an interrupted run resumes there.",
     ),
 ]
 _Only = Annotated[
@@ -78,7 +88,7 @@ _Estimate = Annotated[
 
 def generate(
     card: _Card,
-    out: Annotated[Path, typer.Option(help="Folder of the dataset; an interrupted run resumes there.")],
+    out: _Out,
     sequence: _Only = None,
     shard: _Shard = None,
     workers: Annotated[
@@ -95,21 +105,15 @@ def generate(
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.channels import named_channels
     from rsbench.dataset.files import check_out
     from rsbench.dataset.generation import generate_dataset, steps_of
+    from rsbench.dataset.object_store import open_store, path_or_url, shown
     from rsbench.renderers.backend import start_backend
 
-    crew, out = chosen_workers(workers, scheduler), shared_path(out, scheduler)
-    dataset = load_dataset_card(card, trajectory, tuple(seed or ()))
-    if sequence:
-        dataset = dataset.only(sequence)
-    if shard is not None:
-        dataset = dataset.shard(*_part(shard))
-    if channels is not None:
-        dataset = dataset.with_channels(named_channels(channels))
+    crew, place = chosen_workers(workers, scheduler), shared_path(path_or_url(out), scheduler)
+    dataset = _chosen(load_dataset_card(card, trajectory, tuple(seed or ())), sequence, shard, channels)
     if not estimate:
-        check_out(out)
+        _ = check_out(place) if isinstance(place, Path) else open_store(place)
     backend = start_backend()
     if backend.message:
         typer.echo(backend.message, err=True)
@@ -119,9 +123,23 @@ def generate(
     steps = steps_of(dataset) * len(dataset.sequence)
     with progress_bar(f"rendering {dataset.name}", steps) as advance:
         rendered = generate_dataset(
-            dataset, out, workers=crew, full_frames=full_frames, rehash=rehash, progress=advance
+            dataset, place, workers=crew, full_frames=full_frames, rehash=rehash, progress=advance
         )
-    typer.echo(f"{out}: {len(dataset.sequence)} sequences, {len(rendered)} rendered now")
+    words = f"{len(dataset.sequence)} sequences, {len(rendered)} rendered now"
+    typer.echo(f"{shown(str(place))}: {words}")
+
+
+def _chosen(
+    dataset: DatasetCard, sequence: list[str] | None, shard: str | None, channels: str | None
+) -> DatasetCard:
+    """What the options leave of a card."""
+    from rsbench.dataset.channels import named_channels
+
+    if sequence:
+        dataset = dataset.only(sequence)
+    if shard is not None:
+        dataset = dataset.shard(*_part(shard))
+    return dataset if channels is None else dataset.with_channels(named_channels(channels))
 
 
 def _part(word: str) -> tuple[int, int]:

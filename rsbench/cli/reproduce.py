@@ -177,7 +177,7 @@ def _images(out: Path, data: Path, seeds: int) -> None:
     from rsbench.cli.generate import generate
     from rsbench.report.evaluation_page import publish
 
-    generate("paper", data / "paper", None, workers=1)
+    generate("paper", str(data / "paper"), None, workers=1)
     evaluation = data / "paper-evaluation"
     options = EvaluationOptions(solvers=tuple(every_solver()), seeds=seeds)
     evaluate_dataset(data / "paper", evaluation, options, "rsbench reproduce images")

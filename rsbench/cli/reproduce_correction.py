@@ -190,7 +190,7 @@ def _generate(card: str, data: Path) -> None:
     """Render what is missing of a card: all its sequences, so that every target finds the same dataset."""
     from rsbench.cli.generate import generate
 
-    generate(card, data / card, None, workers=1)
+    generate(card, str(data / card), None, workers=1)
 
 
 def _render_right(card: str, name: str, timing: Timing, path: Path) -> None:

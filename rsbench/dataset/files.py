@@ -21,6 +21,7 @@ from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
+from rsbench.dataset.workplace import refuse_url
 from rsbench.errors import RsbenchError
 from rsbench.reading import check_image_size, check_size, read_bytes, read_text
 from rsbench.reading import load_arrays as load_arrays
@@ -69,6 +70,7 @@ def check_out(out: Path) -> None:
     Raises:
         RsbenchError: it cannot.
     """
+    refuse_url(out)
     try:
         place = next(path for path in (out, *out.absolute().parents) if path.exists() or path.is_symlink())
         tempfile.TemporaryFile(dir=place).close()

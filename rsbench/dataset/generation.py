@@ -7,7 +7,7 @@ import secrets
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench import __version__
-from rsbench.cards import card_path, load_card
+from rsbench.cards import load_card
 from rsbench.core.moving import poses_of
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, Side, views_of
@@ -25,22 +25,23 @@ from rsbench.core.se3 import Pose
 from rsbench.dataset.beside import Later, beside
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channel_writer import write_channels
-from rsbench.dataset.files import read_json, sha256, write_depth, write_json, write_mask, write_png, write_poses
-from rsbench.dataset.hashes import HASHES, FileHashes
-from rsbench.dataset.layout import clean_file, files_of, is_of_sequence
-from rsbench.dataset.manifest import Files, write_manifest
+from rsbench.dataset.files import sha256, write_depth, write_json, write_mask, write_png, write_poses
+from rsbench.dataset.homes import Target, home_at
+from rsbench.dataset.layout import clean_file, files_of
+from rsbench.dataset.manifest import Files
 from rsbench.dataset.matches import Matching
-from rsbench.dataset.scene_hashes import SceneHashes, hashes_of_meshes, mesh_file_hash, scene_hash
+from rsbench.dataset.plans import Plan, of_scene, plans_of, with_gloss
+from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.dataset.shots import Geometry, Shot, image_seed
 from rsbench.dataset.stage import Build, Built, Stage
-from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, strangers, workplace
+from rsbench.dataset.workplace import files_below
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.crew import Cluster, Workers
 from rsbench.pipeline.isolated_jobs import finished_jobs
 from rsbench.pipeline.isolation import EntryFailure
 from rsbench.renderers.options import RendererOptions
-from rsbench.scenes.load import SceneCard, load_scene, read_scene_card
+from rsbench.scenes.load import load_scene
 from rsbench.vision.feature_matcher import load_features
 
 if TYPE_CHECKING:
@@ -56,13 +57,9 @@ def steps_of(card: DatasetCard) -> int:
     return 1 + 2 * len(SIDES) * card.frames
 
 
-Plan = dict[str, Any]
-"""All that decides the bytes of a sequence, as it stands in its sequence.json; but for the hash of the scene."""
-
-
 def generate_dataset(
     card: DatasetCard,
-    out: Path,
+    out: Path | str,
     *,
     workers: Workers = 1,
     full_frames: bool = False,
@@ -76,11 +73,13 @@ def generate_dataset(
 
     Args:
         card: what to make.
-        out: folder of the dataset, made if missing.
+        out: folder of the dataset, made if missing, or the URL of a store, to which sequences are sent when they
+            are complete (``store_home``).
         workers: processes, or a cluster; each renders whole sequences.
         full_frames: make every rolling-shutter frame as the paper did, from one whole global-shutter image per
             row, and keep these images as gs_stack/<side>_<frame>/<row>.png.
-        rehash: read every file again, also those that have the size and times that they had when last read.
+        rehash: read every file again, also those that have the size and times that they had when last read;
+            those of a store are downloaded.
         progress: see ``Progress``.
 
     Raises:
@@ -93,32 +92,24 @@ def generate_dataset(
         options = replace(options, method="stitched", full_frames=True)
     if "matches" in card.channels:
         load_features((card.matches or Matching()).features)  # before hours of rendering
-    scenes = lru_cache(maxsize=None)(_scene_card)
-    mesh_hash = lru_cache(maxsize=None)(mesh_file_hash)
-    plans = {
-        each.name: _plan(card, each, options, scenes(each.scene)) | hashes_of_meshes(each.moving, mesh_hash)
-        for each in card.sequence
-    }
-    with workplace(out) as hidden:
+    plans = plans_of(card, options)
+    with home_at(out, workers, rehash) as home:
         # Of this run alone, and the last one only: a scene takes hundreds of MB, and its card may change.
         build = lru_cache(maxsize=1)(build_scene)
-        hashes = FileHashes(out, out / HASHES, rehash)
-        scene_hashes = SceneHashes(hidden / "scenes.json", lambda name: build(name).sha256)
+        scene_hashes = SceneHashes(home.hidden / "scenes.json", lambda name: build(name).sha256)
         made: dict[str, Files] = {}
-        for sequence in card.sequence:
-            files = _complete(out, sequence, plans[sequence.name], scene_hashes, hashes)
-            if files is not None:
-                made[sequence.name] = files
-                _repeat(progress, sequence.name, steps_of(card))
-        hashes.flush()
+        for name, files in home.complete(card.sequence, plans, scene_hashes):
+            made[name] = files
+            _repeat(progress, name, steps_of(card))
         todo = [sequence for sequence in card.sequence if sequence.name not in made]
         done: Counter[str] = Counter()
-        for name, steps in _render_all(card, sorted(todo, key=scene_name), options, plans, build, out, workers):
+        ordered = sorted(todo, key=scene_name)
+        for name, steps in _render_all(card, ordered, options, plans, build, home.target, workers):
             done[name] += steps
             if done[name] == steps_of(card):
-                made[name] = _learned(out, name, hashes)
+                made[name] = home.learned(name)
             _repeat(progress, name, steps)
-        write_manifest(card, out, made)
+        home.finish(card, made)
     return [sequence.name for sequence in todo]
 
 
@@ -136,119 +127,25 @@ def build_scene(name: str) -> Built:
     return Built(scene, scene_hash(scene))
 
 
-def _scene_card(name: str) -> SceneCard:
-    return read_scene_card(card_path("scenes", name))[0]
-
-
-def _plan(card: DatasetCard, sequence: SequenceCard, options: RendererOptions, scene: SceneCard) -> Plan:
-    if sequence.viewpoint not in scene.viewpoints:
-        names = ", ".join(scene.viewpoints)
-        raise RsbenchError(f"scene {sequence.scene}: no viewpoint {sequence.viewpoint!r}; there are: {names}")
-    if sequence.moving and (options.integrator != "sunsky" or options.sky_rays):
-        raise RsbenchError(
-            f"sequence {sequence.name}: moving objects are not for the integrator {options.integrator!r} of the "
-            f"renderer {card.renderer} with sky_rays = {options.sky_rays}: take 'sunsky' without sky_rays"
-        )
-    viewpoint = scene.viewpoints[sequence.viewpoint]
-    start = {} if sequence.start is None else {"start": _listed(asdict(sequence.start))}
-    return card.manifest_of(sequence) | {
-        "scene": {
-            "name": scene.name,
-            "sha256": "",
-            "viewpoint": sequence.viewpoint,
-            **_listed(asdict(viewpoint)),
-            **start,
-        },
-        "renderer": _listed(options.record),
-        "seed": card.seed_of(sequence),
-    }
-
-
-def _of_scene(plan: Plan, sha256: str) -> Plan:
-    return plan | {"scene": plan["scene"] | {"sha256": sha256}}
-
-
-def _with_gloss(plan: Plan, glossy: bool) -> Plan:
-    """What only the scene says: whether any of its surfaces is glossy."""
-    return plan | {"glossy": True} if glossy else plan
-
-
-def _listed(values: dict[str, Any]) -> dict[str, Any]:
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
-
-
-def _complete(
-    out: Path, sequence: SequenceCard, plan: Plan, scene_hashes: SceneHashes, hashes: FileHashes
-) -> Files | None:
-    """The files of a sequence that was made from the same plan and has the bytes it had then; else None."""
-    folder = out / sequence.name
-    if not os.path.lexists(folder):
-        return None
-    if not (folder / "sequence.json").is_file():
-        raise RsbenchError(
-            f"{folder}: holds no sequence.json, so rsbench did not make it; move it away or choose another --out"
-        )
-    manifest = read_json(folder / "sequence.json")
-    expected = dict.fromkeys(("sensor", "channels", "imu", "matches", "twins", "frames", "moving", "meshes"))
-    expected |= _of_scene(plan, scene_hashes.of(sequence.scene))
-    other = [key for key, value in expected.items() if manifest.get(key) != value]
-    if other:
-        raise RsbenchError(
-            f"{folder}: holds a sequence of another card (differs in {', '.join(other)}); choose another --out"
-        )
-    listed = manifest.get("files")
-    listed = listed if isinstance(listed, dict) else {}
-    files = {name: hashes.of(f"{sequence.name}/{name}") for name in listed if is_of_sequence(name)}
-    damaged = [
-        name
-        for name in {**dict.fromkeys(files_of(_with_gloss(plan, manifest.get("glossy") is True))), **listed}
-        if (found := files.get(name)) is None or found.sha256 != listed.get(name)
-    ]
-    if damaged:
-        _refuse_strangers(folder, f"{named(damaged)} differs from what was written")
-        return None
-    own = hashes.of(f"{sequence.name}/sequence.json")
-    return {"sequence.json": own, **files} if own else None  # pyrefly: ignore[bad-return]
-
-
-def _refuse_strangers(folder: Path, why: str) -> None:
-    """What is to be removed must be rsbench's own, to the last file."""
-    if folder.is_symlink():
-        raise RsbenchError(f"{folder}: {why}, and it is a link: move it away, then run the same command again")
-    if others := strangers(folder, is_of_sequence):
-        raise RsbenchError(
-            f"{folder}: {why}, but {named(others)} is not rsbench's: move it away, then run the same command again"
-        )
-
-
-def _learned(out: Path, name: str, hashes: FileHashes) -> Files:
-    """The files of a sequence that was just rendered."""
-    listed = read_json(out / name / "sequence.json")["files"]
-    listed = {"sequence.json": sha256(out / name / "sequence.json"), **listed}
-    files = {file: hashes.learn(f"{name}/{file}", digest) for file, digest in listed.items()}
-    hashes.flush()
-    return files
-
-
 def _render_all(
     card: DatasetCard,
     todo: list[SequenceCard],
     options: RendererOptions,
     plans: dict[str, Plan],
     build: Build,
-    out: Path,
+    target: Target,
     workers: Workers,
 ) -> Iterator[tuple[str, int]]:
     """Names of sequences, with steps that were done; the last of a sequence is given when it is complete."""
     if workers == 1 or not todo:
         stage = Stage(build)
         for sequence in todo:
-            for _ in _render_sequence(card, sequence, options, plans[sequence.name], stage, out):
+            for _ in _render_sequence(card, sequence, options, plans[sequence.name], stage, target):
                 yield sequence.name, 1
         return
     jobs = [(sequence, plans[sequence.name]) for sequence in todo]
     threads = 1 if isinstance(workers, Cluster) else max(1, (os.cpu_count() or 1) // workers)
-    given = card, options, out, threads
+    given = card, options, target, threads
     found = finished_jobs(_serve_renders, jobs, workers, {}, *given, name=lambda job: f"sequence {job[0].name}")
     with closing(found):
         for (sequence, _), _ in found:
@@ -256,7 +153,7 @@ def _render_all(
 
 
 def _serve_renders(
-    card: DatasetCard, options: RendererOptions, out: Path, threads: int
+    card: DatasetCard, options: RendererOptions, target: Target, threads: int
 ) -> Callable[[tuple[SequenceCard, Plan]], None]:
     """What renders sequences, in a child."""
     from rsbench.renderers.backend import set_threads, start_backend
@@ -268,7 +165,7 @@ def _serve_renders(
     def render(job: tuple[SequenceCard, Plan]) -> None:
         sequence, plan = job
         try:
-            for _ in _render_sequence(card, sequence, options, plan, stage, out):
+            for _ in _render_sequence(card, sequence, options, plan, stage, target):
                 pass
         except RsbenchError as error:
             raise EntryFailure(str(error)) from error
@@ -282,18 +179,18 @@ def _render_sequence(
     options: RendererOptions,
     plan: Plan,
     stage: Stage,
-    out: Path,
+    target: Target,
 ) -> Iterator[None]:
-    """Render into a folder of the workplace and move it when complete; yields after each step."""
+    """Render into a folder of the workplace and place it when complete; yields after each step."""
     from rsbench.renderers.backend import start_backend
     from rsbench.renderers.passage import obstacle
 
     backend, (mitsuba_scene, digest) = start_backend(), stage.set_for(sequence)
     if words := obstacle(mitsuba_scene, *card.geometry_of(sequence)):
         raise RsbenchError(f"sequence {sequence.name}: {words}; choose another motion, viewpoint or baseline")
-    plan = _with_gloss(plan, mitsuba_scene.glossy)
+    plan = with_gloss(plan, mitsuba_scene.glossy)
     # Of this try alone: another machine may not know yet that its run was killed.
-    partial = out / HIDDEN / WORK / f"{sequence.name}.{secrets.token_hex(4)}"
+    partial = target.workplace() / f"{sequence.name}.{secrets.token_hex(4)}"
     for folder in {Path(name).parent for name in files_of(plan)}:
         (partial / folder).mkdir(parents=True, exist_ok=True)
     with beside() as later:
@@ -307,13 +204,9 @@ def _render_sequence(
         "drjit": version("drjit"),
         "variant": backend.variant,
     }
-    content = _of_scene(plan, digest) | {"made_by": made_by, "files": files}
+    content = of_scene(plan, digest) | {"made_by": made_by, "files": files}
     write_json(partial / "sequence.json", content)
-    place = out / sequence.name
-    if os.path.lexists(place):
-        _refuse_strangers(place, "it is to be replaced")
-        os.rename(place, partial.with_suffix(".old"))
-    os.rename(partial, place)
+    target.place(partial, sequence.name)
     yield
 
 

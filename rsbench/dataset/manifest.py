@@ -12,10 +12,11 @@ from typing import Any
 from rsbench import __version__
 from rsbench.core.rig import FRAMES
 from rsbench.dataset.card import DatasetCard
-from rsbench.dataset.files import read_json, write_json
+from rsbench.dataset.files import write_json
 from rsbench.dataset.hashes import HashedFile
 from rsbench.dataset.sequence import FORMAT, UNITS
 from rsbench.errors import RsbenchError
+from rsbench.reading import read_bytes
 
 Files = dict[str, HashedFile]
 """The files of a sequence by their paths below its folder, in the order of dataset.json."""
@@ -23,12 +24,23 @@ Files = dict[str, HashedFile]
 
 def write_manifest(card: DatasetCard, out: Path, made: Mapping[str, Files]) -> None:
     """Write dataset.json, unless it says this already; ``made``: the files of each sequence."""
+    content, path = manifest_of(card, made), out / "dataset.json"
+    try:
+        stands = says(read_bytes(path), content)
+    except RsbenchError:
+        stands = False
+    if not stands:
+        write_json(path, content)
+
+
+def manifest_of(card: DatasetCard, made: Mapping[str, Files]) -> dict[str, Any]:
+    """The content of dataset.json; ``made`` as of ``write_manifest``."""
     files = {
         f"{sequence.name}/{name}": {"sha256": file.sha256, "size": file.size}
         for sequence in card.sequence
         for name, file in made[sequence.name].items()
     }
-    content = {
+    return {
         "format": FORMAT,
         "name": card.name,
         "description": card.description,
@@ -39,19 +51,17 @@ def write_manifest(card: DatasetCard, out: Path, made: Mapping[str, Files]) -> N
         "sequences": [sequence.name for sequence in card.sequence],
         "files": files,
     }
-    if not _stands(out / "dataset.json", content):
-        write_json(out / "dataset.json", content)
+
+
+def says(data: bytes, content: dict[str, Any]) -> bool:
+    """Whether a file holds this already; to read millions of lines is much faster than to write them."""
+    try:
+        return bool(json.loads(data) == json.loads(json.dumps(content)))
+    except (ValueError, RecursionError):
+        return False
 
 
 def _record(card: DatasetCard) -> dict[str, Any]:
     """The card, complete; two frames are told by nothing, as before there could be more."""
     own = asdict(card)
     return own if card.frames > len(FRAMES) else {key: value for key, value in own.items() if key != "frames"}
-
-
-def _stands(path: Path, content: dict[str, Any]) -> bool:
-    """Whether a file holds this already; to read millions of lines is much faster than to write them."""
-    try:
-        return read_json(path) == json.loads(json.dumps(content))
-    except RsbenchError:
-        return False

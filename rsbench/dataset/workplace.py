@@ -16,6 +16,7 @@ import errno
 import json
 import os
 import platform
+import re
 import shutil
 import stat
 import sys
@@ -50,6 +51,7 @@ def workplace(out: Path, hidden: Path | None = None) -> Iterator[Path]:
     Raises:
         RsbenchError: another command works there, or the folder cannot be written.
     """
+    refuse_url(out)
     hidden = out / HIDDEN if hidden is None else hidden
     fresh = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
     descriptor = _take(out, hidden)
@@ -62,6 +64,13 @@ def workplace(out: Path, hidden: Path | None = None) -> Iterator[Path]:
     finally:
         done.set()
         _leave(hidden, descriptor, fresh)
+
+
+def refuse_url(out: Path) -> None:
+    """Raise RsbenchError for what was a URL before it became a path: it would be a folder of a strange name."""
+    if re.match(r"[a-z][a-z0-9+.-]+:/", out.as_posix()):
+        url = out.as_posix().replace(":/", "://", 1)
+        raise RsbenchError(f"{url}: is a URL, which only 'rsbench generate' takes for --out; give a folder")
 
 
 def remove(path: Path) -> None:
