@@ -30,7 +30,7 @@ def boards(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.cli.leaderboard import oracles, run
 
     board, frames, count = data / BOARD, data / "standard", workers or os.cpu_count() or 1
-    generate("standard", frames, None, workers=count)
+    generate("standard", str(frames), None, workers=count)
     for track, entries in entries_of_frames().items():
         run(track, entries, board, frames, workers=count)
         oracles(track, board, frames)

@@ -61,7 +61,7 @@ def score_interval(values: FloatArray, scenes: Sequence[str]) -> tuple[float, fl
     if np.all((values == 0.0) | (values == 1.0)):
         exact = share_interval(int(np.sum(values)), len(values))
         if len(means) == len(values):
-            return float(np.mean(means)), *exact
+            return float(np.mean(means)), exact.low, exact.high
         low, high = min(low, exact.low), max(high, exact.high)
     return float(np.mean(means)), max(low, 0.0), min(high, 1.0)
 
