@@ -26,6 +26,7 @@ from rsbench.plugins import Entry, Kind, RunOptions
 from rsbench.vision.fusion import Fused, Origin
 
 Knowledge = Literal["motion", "depth", "matches", "gyro"]
+OtherFrames = Literal["stereo", "time"]
 Cameras = Literal["ideal", "any"]
 Depths = Mapping[View, NDArray[np.float32]]
 
@@ -43,13 +44,20 @@ class CorrectorSpec:
     """What must hold for it to work, in words."""
     cameras: Cameras = "ideal"
     """``ideal``: without a lens, rows read from the top by both at once; others are refused by name. ``any``."""
+    sees: Set[OtherFrames] = frozenset(get_args(OtherFrames))
+    """Which other frames it works on beside the corrected one, by itself or in what it needs: of the other camera
+    (``stereo``), of the other ``time``. Matches of the chain are checked in both."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "needs", frozenset(self.needs))
+        object.__setattr__(self, "sees", frozenset(self.sees))
         allowed = get_args(Knowledge)
         for value in self.needs:
             if value not in allowed:
                 raise ValueError(f"needs: {value!r} is nothing that is known; there are: {', '.join(allowed)}")
+        others = set(get_args(OtherFrames))
+        if not self.sees <= others or (self.needs - {"gyro"} and self.sees < others):
+            raise ValueError(f"sees = {sorted(self.sees)}: of stereo and time; what the chain finds needs both")
         if self.cameras not in get_args(Cameras):
             raise ValueError(f"cameras = {self.cameras!r}: must be one of {', '.join(get_args(Cameras))}")
         for field in ("reference", "assumes"):

@@ -34,6 +34,7 @@ class GyroCorrector(Corrector):
 
     spec = CorrectorSpec(
         needs={"gyro"},
+        sees=set(),
         reference="Karpenko, Jacobs, Baek, Levoy: Rolling shutter correction using gyroscopes, CSTR 2011-03",
         assumes="a gyroscope aligned with the cameras; a scene so far away that translation moves no pixel",
         cameras="any",
@@ -89,6 +90,7 @@ class LinesCorrector(ImageRotationCorrector):
 
     spec = CorrectorSpec(
         needs=set(),
+        sees=set(),
         reference="Lao, Ait-Aider: A Robust Method for Strong Rolling Shutter Effects Correction Using Lines with "
         "Automatic Feature Selection, CVPR 2018",
         assumes="constant rotation without translation; straight lines in space across many rows, some slanted",
@@ -114,6 +116,7 @@ class ManhattanCorrector(ImageRotationCorrector):
 
     spec = CorrectorSpec(
         needs=set(),
+        sees=set(),
         reference="Purkait, Zach, Leonardis: Rolling Shutter Correction in Manhattan World, ICCV 2017",
         assumes="constant rotation without translation; lines in space along three orthogonal directions",
     )

@@ -138,7 +138,13 @@ def test_what_is_not_known_is_not_guessed(world: Build, shapes: Any, field: str)
 
 @pytest.mark.parametrize(
     ("changes", "word"),
-    [({"needs": {"sky"}}, "'sky'"), ({"reference": ""}, "reference"), ({"assumes": None}, "assumes")],
+    [
+        ({"needs": {"sky"}}, "'sky'"),
+        ({"reference": ""}, "reference"),
+        ({"assumes": None}, "assumes"),
+        ({"sees": {"space"}}, "sees"),
+        ({"sees": {"time"}}, "sees"),  # motion is found in the frames of both cameras
+    ],
 )
 def test_a_spec_is_checked(changes: dict[str, Any], word: str) -> None:
     spec: dict[str, Any] = {"needs": {"motion"}, "reference": "r", "assumes": "a"}

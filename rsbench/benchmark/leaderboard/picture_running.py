@@ -45,8 +45,8 @@ from rsbench.vision.fusion import Origin
 from rsbench.vision.stereo_matcher import load_matcher, needs_motion
 from rsbench.vision.undistortion import sensor_disparities
 
-_USES = {"depth": ("images", "stereo"), "frames": ("readout", "images", "stereo", "time")}
-"""What matchers, and correctors with our motion and depth, work on."""
+_OF_PAIR, _OF_ALL = ("images", "stereo"), ("readout", "images", "stereo", "time")
+"""What a matcher of two images works on, and one that our motion tells where to look."""
 
 
 class _Job(NamedTuple):
@@ -178,7 +178,7 @@ def _joined(chain: CorrectionOptions, split: Split, folder: Path, limits: Limits
         "protocol": split.protocol.id,
         "split": split.name,
         "method": entry.name,
-        "uses": _USES["frames" if depth and needs_motion(chain.matcher) else split.protocol.asks],
+        "uses": _uses(chain, depth),
         "description": entry.description[:300],
         "paper": reference[:300],
         "code": "rsbench" if entry.built_in else "",
@@ -188,6 +188,12 @@ def _joined(chain: CorrectionOptions, split: Split, folder: Path, limits: Limits
     path = folder / "predictions.jsonl"
     write_bytes(path, submission_text(header, (each for each in found if each is not None)).encode())
     return path
+
+
+def _uses(chain: CorrectionOptions, depth: bool) -> list[str]:
+    if depth:
+        return list(_OF_ALL if needs_motion(chain.matcher) else _OF_PAIR)
+    return ["readout", "images", *sorted(chain.corrector.component.spec.sees)]
 
 
 # In the child

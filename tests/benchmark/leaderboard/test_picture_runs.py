@@ -28,7 +28,8 @@ def _here(serve: Any, jobs: Any, workers: int, environment: object, *arguments: 
 
 
 @pytest.mark.parametrize(
-    ("track", "entries"), [("depth", ("sgm", "sgm-plain")), ("correction", ("rotation-only", "fusion"))]
+    ("track", "entries"),
+    [("depth", ("sgm", "sgm-plain")), ("correction", ("rotation-only", "fusion", "lao-lines"))],
 )
 def test_cards_run_and_go_on(
     track: str, entries: tuple[str, ...], smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -55,6 +56,8 @@ def test_cards_run_and_go_on(
     else:
         psnr = {name: entry.scores["psnr"] for name, entry in found.items()}
         assert np.all(psnr["fusion"] > psnr["uncorrected"] + 3.0)
+        assert found["lao-lines"].header.uses == ("readout", "images")
+        assert found["fusion"].header.uses == ("readout", "images", "stereo", "time")
         assert np.all(psnr["fusion-true"] > psnr["rotation-only"])
 
 
