@@ -22,7 +22,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, bool]]:
     tried: list[tuple[str, bool]] = []
 
     def render(card: DatasetCard, sequence: SequenceCard, *rest: Any) -> Iterator[None]:
-        side, frame, folder = rest[-3:]
+        side, frame, folder, _ = rest[-4:]
         real = card.sensor_of(sequence) is not None
         tried.append((sequence.scene, real))
         Path(folder, "rs", f"{side}_{frame}.png").write_bytes(b"x" * (300 if real else 100))
