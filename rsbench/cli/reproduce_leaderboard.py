@@ -40,7 +40,7 @@ def boards(out: Path, data: Path, workers: int | None) -> None:
 def entries_of_frames() -> dict[str, list[str]]:
     """By track, what comes with rsbench and needs no more than the track gives.
 
-    ``readout`` has those that are right with the right ratio alone: the others have no optimum there.
+    ``readout`` has those that look for a ratio: the maximum-likelihood ones of both cameras, which it takes alone.
     """
     from rsbench.cli.leaderboard_smoke import own_solvers
     from rsbench.plugins import Kind, offers
@@ -53,7 +53,7 @@ def entries_of_frames() -> dict[str, list[str]]:
     images_alone = [name for name in own(CORRECTORS) if "gyro" not in load_corrector(name).component.spec.needs]
     return {
         "pose": own_solvers(),
-        "readout": ["rs-stereo-refined", "rs-stereo-refined-pairs", "rs-stereo-tracks"],
+        "readout": [f"rs-stereo-{name}" for name in ("refined", "refined-pairs", "refined-twist", "tracks")],
         "depth": own(STEREO_MATCHERS),
         "correction": images_alone,
     }
