@@ -134,10 +134,8 @@ def _command_alone() -> tuple[float, float]:
     """Seconds, for each of many made-up sequences of as many files: when it is finished, and in the manifest."""
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.files import sha256, write_json
-    from rsbench.dataset.generation import _learned
-    from rsbench.dataset.hashes import FileHashes
+    from rsbench.dataset.homes import folder_home
     from rsbench.dataset.layout import files_of
-    from rsbench.dataset.manifest import write_manifest
 
     card = load_dataset_card(CARD)
     with tempfile.TemporaryDirectory() as folder:
@@ -149,13 +147,13 @@ def _command_alone() -> tuple[float, float]:
                 (out / sequence.name / name).write_text(name)
             listed = {name: sha256(out / sequence.name / name) for name in files}
             write_json(out / sequence.name / "sequence.json", {"files": listed})
-        hashes = FileHashes(out, out / "hashes.jsonl", False)
-        begun = time.perf_counter()
-        for sequence in card.sequence:
-            made[sequence.name] = _learned(out, sequence.name, hashes)
-        between = time.perf_counter()
-        write_manifest(card, out, made)
-        end = time.perf_counter()
+        with folder_home(out, rehash=False) as home:
+            begun = time.perf_counter()
+            for sequence in card.sequence:
+                made[sequence.name] = home.learned(sequence.name)
+            between = time.perf_counter()
+            home.finish(card, made)
+            end = time.perf_counter()
     return (between - begun) / len(card.sequence), (end - between) / len(card.sequence)
 
 

@@ -14,21 +14,28 @@ R = TypeVar("R")
 Later = Callable[..., "Future[Any]"]
 """Called with a function and its arguments: it is called soon."""
 _THREADS = 2
+_WAITING = 8
+"""Jobs at most that are not done: each may hold a frame's arrays, and a disk may be slower than the renderer."""
 
 
 @contextmanager
 def beside() -> Iterator[Later]:
-    """Gives what hands work to other threads. At the end all of it is done, or the first error is raised."""
+    """Gives what hands work to other threads. At the end all of it is done.
+
+    The first error is raised at the end, or when more work is handed over; results are kept by who asked alone.
+    """
     with ThreadPoolExecutor(_THREADS) as pool:
-        jobs: list[Future[Any]] = []
+        jobs: deque[Future[Any]] = deque()
 
         def later(work: Callable[..., Any], *given: Any) -> Future[Any]:
+            while jobs and (jobs[0].done() or len(jobs) >= _WAITING):
+                jobs.popleft().result()
             jobs.append(pool.submit(work, *given))
             return jobs[-1]
 
         yield later
-        for job in jobs:
-            job.result()
+        while jobs:
+            jobs.popleft().result()
 
 
 def begun(later: Later, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:

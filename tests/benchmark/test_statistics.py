@@ -162,3 +162,14 @@ def test_rounding_moves_a_value_by_little_of_its_interval(value: float, half: fl
     low, high = value - half, value + half
     # Half a unit of the last digit, which is below a third of half the interval.
     assert abs(float(rounded(value, decimals(low, high))) - value) <= half / 6.0 * (1 + 1e-6) + 1e-9
+
+
+_PROBLEMS = st.tuples(st.integers(0, 4), st.sampled_from([0.0, 0.5, 1.0, 2.5, np.inf]))
+
+
+@given(st.lists(_PROBLEMS, min_size=1, max_size=40))
+def test_the_median_of_drawn_clusters_is_that_of_their_values(problems: list[tuple[int, float]]) -> None:
+    """Counted without drawing, against NumPy's of each draw: ties, infinite errors, clusters of any size."""
+    clusters, values = [k for k, _ in problems], np.array([x for _, x in problems])
+    drawn = bootstrap_interval(values, lambda each: np.median(each, axis=-1), 3, clusters, resamples=40)
+    assert bootstrap_interval(values, median, 3, clusters, resamples=40) == drawn
