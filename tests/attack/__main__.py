@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 CASES = ("generate", "evaluate", "simulate", "correct", "reproduce")
 HERE = ("kills", "files", "fuzz", "environment")
-ATTACKS = (*HERE, "verify")
+ATTACKS = (*HERE, "crews", "verify")
 """The last one is ``attack.verifying``, a program of its own."""
 HEADING = "| attack | counts | faults | made by |"
 SHOWN = 40
@@ -129,8 +130,22 @@ def _attacks(
         yield _timed(f"inputs of {len(every)} loaders", partial(fuzz.attack, every, extent.inputs, seed, keep))
     if "environment" in wanted:
         yield _timed("surroundings", partial(_surroundings, arena, references, extent, seed))
+    if "crews" in wanted:
+        yield from _crews(arena, extent, seed)
     if "verify" in wanted:
         yield _timed("verify", partial(_verify, seed))
+
+
+def _crews(arena: Arena, extent: Extent, seed: int) -> Iterator[tuple[str, Tally, float]]:
+    """Kills among processes here, and on a cluster where distributed is installed."""
+    import numpy as np
+
+    from attack import crews
+
+    for number, where in enumerate(("workers", "a cluster")):
+        if where == "workers" or find_spec("distributed"):
+            rng = np.random.default_rng([seed, len(CASES), number])
+            yield _timed(f"kills among {where}", partial(crews.attack, arena, rng, extent.kills, bool(number)))
 
 
 def _verify(seed: int) -> Tally:
