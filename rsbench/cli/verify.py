@@ -90,24 +90,38 @@ def _verify_ours(folder: Path, stride: int, rerender: Rerender, scenes: Sequence
 
 
 def _verify_others(folder: Path, layout: str) -> None:
-    """Files, sizes, depth under poses and row times, and disparities, as far as a layout has them."""
-    from rsbench.cli.console import print_rows, say
+    """Files, sizes, depth and matches under poses and row times, and disparities, as far as a layout has them."""
+    from rsbench.cli.console import late_progress, print_rows, say
     from rsbench.dataset.importing.check import agreements, disparity_faults, file_faults
     from rsbench.dataset.importing.formats import read_others
+    from rsbench.dataset.importing.sight_check import NEAR_PX, sights
 
-    recordings, faults, rows = read_others(folder, layout), list[str](), list[list[str]]()
-    for recording in recordings:
-        for note in recording.notes:
-            say(f"{recording.name}: {note}")
-        found = [*file_faults(recording), *disparity_faults(recording)]
-        for each in agreements(recording):
-            found += [each.fault] if each.fault else []
-            share, typical = f"{100 * each.share:.2f}", f"{each.typical:.1e}"
-            rows.append([recording.name, each.side, *map(str, each.frames), str(each.pixels), share, typical])
-        faults += [f"{recording.name}: {fault}" for fault in found]
-    if rows:
+    recordings, faults = read_others(folder, layout), list[str]()
+    depths, seen = list[list[str]](), list[list[str]]()
+    with late_progress("Checking") as advance:
+        for recording in recordings:
+            for note in recording.notes:
+                say(f"{recording.name}: {note}")
+            found = [*file_faults(recording, advance), *disparity_faults(recording)]
+            for each in agreements(recording):
+                found += [each.fault] if each.fault else []
+                share, typical = f"{100 * each.share:.2f}", f"{each.typical:.1e}"
+                depths.append(
+                    [recording.name, each.side, *map(str, each.frames), str(each.pixels), share, typical]
+                )
+            for sight in sights(recording):
+                advance(sight.what)
+                found += [sight.fault] if sight.fault else []
+                told = str(sight.count), f"{100 * sight.share:.1f}", f"{sight.typical:.2f}"
+                if sight.count:
+                    seen.append([recording.name, sight.what, *told])
+            faults += [f"{recording.name}: {fault}" for fault in found]
+    if depths:
         columns = ["recording", "camera", "depth of", "against", "pixels", "agree (%)", "typical difference"]
-        print_rows("Depth agreement between frames (relative tolerance 1e-2)", columns, rows, right=columns[4:])
+        print_rows("Depth agreement between frames (relative tolerance 1e-2)", columns, depths, right=columns[4:])
+    if seen:
+        columns = ["recording", "seen", "count", f"within {NEAR_PX:g} px (%)", "typical (px)"]
+        print_rows("Features where cameras and poses say", columns, seen, right=columns[2:])
     for fault in faults:
         typer.echo(f"fault: {fault}", err=True)
     typer.echo(f"{folder}: {len(recordings)} recordings, {len(faults)} faults")

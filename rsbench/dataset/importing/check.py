@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -50,10 +50,11 @@ class Agreement:
         )
 
 
-def file_faults(recording: Recording) -> Iterator[str]:
-    """Images that are missing, cannot be read, or have another size than their camera."""
+def file_faults(recording: Recording, progress: Callable[[str], object] = str) -> Iterator[str]:
+    """Images that are missing, cannot be read, or are not of their camera's size; ``progress`` gets their names."""
     for (side, _), path in recording.images.items():
         camera = recording.cameras[side]
+        progress(path.name)
         try:
             height, width = read_frame(path).shape[:2]
         except RsbenchError as error:

@@ -1,4 +1,4 @@
-"""COLMAP's text model: cameras.txt and images.txt.
+"""COLMAP's text model: cameras.txt, images.txt and, where it is there, points3D.txt.
 
 Its pixels are counted from the corner of the image, where ours are from the centre of the first pixel: half a
 pixel less. A quaternion is (w, x, y, z), and a pose ``cam_from_world``, as ours. Nothing is said of times: images
@@ -7,9 +7,11 @@ come in the order of their names, one pose each, and there is no shutter.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Callable, Mapping
+from functools import lru_cache, partial
+from operator import attrgetter
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,6 +39,14 @@ _MODELS: Mapping[str, tuple[str, str | None]] = {
 _CORNER = 0.5
 
 
+class Shot(NamedTuple):
+    """An image: its name, its pose, and what gives pixels and points that are seen there."""
+
+    name: str
+    pose: Pose
+    seen: Callable[[], tuple[FloatArray, FloatArray]] | None
+
+
 def read_colmap(folder: Path, images: Path | None = None) -> list[Recording]:
     """One recording of each camera, its images in the order of their names.
 
@@ -51,21 +61,23 @@ def read_colmap(folder: Path, images: Path | None = None) -> list[Recording]:
     root = images or next(
         (each / "images" for each in (folder, *folder.parents[:2]) if (each / "images").is_dir()), folder
     )
-    shots: dict[str, list[tuple[str, Pose]]] = {}
+    shots: dict[str, list[Shot]] = {}
+    points = folder / "points3D.txt"
     path = only_file(folder, "images.txt")
     rows = [line for line in read_text(path).splitlines() if not line.lstrip().startswith("#")]
     while rows and not rows[-1].strip():
         rows.pop()
     for number, line in enumerate(rows[::2]):  # every second one lists points, and may be empty
-        name, camera, pose = _image(f"{path}, image {number + 1}", line)
+        where = f"{path}, image {number + 1}"
+        name, camera, pose = _image(where, line)
         if camera not in cameras:
             raise RsbenchError(f"{path}: {name} is of camera {camera}, which cameras.txt lacks")
-        shots.setdefault(camera, []).append((name, pose))
-    return [_recording(camera, cameras[camera], sorted(each, key=_name), root) for camera, each in shots.items()]
-
-
-def _name(shot: tuple[str, Pose]) -> str:
-    return shot[0]
+        seen = partial(_seen, points, "".join(rows[2 * number + 1 : 2 * number + 2]), where)
+        shots.setdefault(camera, []).append(Shot(name, pose, seen if points.is_file() else None))
+    return [
+        _recording(camera, cameras[camera], sorted(each, key=attrgetter("name")), root)
+        for camera, each in shots.items()
+    ]
 
 
 def _camera(where: str, line: str) -> tuple[str, PinholeCamera]:
@@ -94,14 +106,35 @@ def _image(where: str, line: str) -> tuple[str, str, Pose]:
     return words[9].strip(), words[8], Pose(rotation(values[:4], where), values[4:])
 
 
-def _recording(number: str, camera: PinholeCamera, shots: list[tuple[str, Pose]], root: Path) -> Recording:
-    files: dict[View, Path] = {("left", k): inside(root, name) for k, (name, _) in enumerate(shots)}
-    R, t = np.array([pose.R for _, pose in shots]), np.array([pose.t for _, pose in shots])
+def _seen(points: Path, line: str, where: str) -> tuple[FloatArray, FloatArray]:
+    """Pixels and points of a line of x, y and a point's number, -1 for none."""
+    known, values = _points(points), numbers(line, where)
+    if len(values) % 3:
+        raise RsbenchError(f"{where}: its points must be x, y and a number each")
+    rows = [row for row in values.reshape(-1, 3) if int(row[2]) in known]
+    found = np.array([known[int(row[2])] for row in rows]).reshape(-1, 3)
+    return np.array(rows).reshape(-1, 3)[:, :2] - _CORNER, found
+
+
+@lru_cache(maxsize=2)
+def _points(path: Path) -> dict[int, FloatArray]:
+    """Places by number."""
+    found = {}
+    for where, line in lines(path):
+        number, *place = numbers(" ".join(line.split()[:4]), where, 4)
+        found[int(number)] = np.array(place)
+    return found
+
+
+def _recording(number: str, camera: PinholeCamera, shots: list[Shot], root: Path) -> Recording:
+    files: dict[View, Path] = {("left", k): inside(root, shot.name) for k, shot in enumerate(shots)}
+    R, t = np.array([shot.pose.R for shot in shots]), np.array([shot.pose.t for shot in shots])
     return Recording(
         name=f"camera {number}",
         cameras={"left": camera},
         images=files,
         poses={"left": partial(_at, R, t)},
+        sightings={("left", k): shot.seen for k, shot in enumerate(shots) if shot.seen is not None},
         notes=("the layout does not say when images were taken, or how rows were read",),
     )
 

@@ -37,6 +37,8 @@ class Recording:
     """(H, W) z, metres, 0 where there is none; read when asked for."""
     disparities: Mapping[View, Callable[[], FloatArray]] = field(default_factory=dict)
     """(H, W) px, such that ``fx baseline / disparity`` is z; NaN where there is none."""
+    sightings: Mapping[View, Callable[[], tuple[FloatArray, FloatArray]]] = field(default_factory=dict)
+    """Pixels (n, 2) and the points (n, 3) of the world that the layout says are seen there."""
     notes: tuple[str, ...] = ()
     """What the layout leaves open, and how it was taken."""
 
