@@ -51,7 +51,7 @@ class Agreement:
 
 
 def file_faults(recording: Recording, progress: Callable[[str], object] = str) -> Iterator[str]:
-    """Images that are missing, cannot be read, or are not of their camera's size; ``progress`` gets their names."""
+    """Images that are missing, unreadable, or not of their camera's size; ``progress`` gets their names."""
     for (side, _), path in recording.images.items():
         camera = recording.cameras[side]
         progress(path.name)
