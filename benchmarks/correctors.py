@@ -1,4 +1,4 @@
-"""Correctors that are in no published table yet, beside those that are, with and without a translation.
+"""Correctors that the correction study has on request, beside the others, with and without a translation.
 
 Renders 18 small sequences (320 x 320, benchmarks/correctors.toml), runs the correction study on them with all its
 methods, and prints the median of each motion over its scenes: PSNR on the pixels that the published methods cover,
@@ -17,14 +17,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.studies.correction_methods import METHODS, UNPUBLISHED
+from rsbench.benchmark.studies.correction_methods import METHODS, ON_REQUEST
 from rsbench.benchmark.studies.correction_study import study_dataset
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
 from rsbench.renderers.backend import start_backend
 
 CARD = Path(__file__).with_suffix(".toml")
-SHOWN = ("none", "gyro", "rotation", "gs-mono", "mono", *(method.key for method in UNPUBLISHED), "ours", "truth")
+SHOWN = ("none", "gyro", "rotation", "gs-mono", "mono", *(method.key for method in ON_REQUEST), "ours", "truth")
 MOTIONS = ("turn-mild", "turn-moderate", "turn-aggressive", "mild", "moderate", "aggressive")
 
 
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not (data / "dataset.json").exists():
         start_backend()
         generate_dataset(load_dataset_card(str(CARD)), data)
-    others = tuple(method.key for method in UNPUBLISHED)
+    others = tuple(method.key for method in ON_REQUEST)
     done = folder / "kept"
     views, _, _ = study_dataset(data, lambda name: None, kept=done, others=others)
     for line in table(pd.DataFrame(views)):
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def table(views: pd.DataFrame) -> list[str]:
     """As Markdown: PSNR in dB / median flow error in px, and how many of the views have failed."""
     views["motion"] = views["sequence"].str.extract(r"^(?:castle|old-town|room)-(.*)$")
-    titles = {method.key: method.title for method in (*METHODS, *UNPUBLISHED)}
+    titles = {method.key: method.title for method in (*METHODS, *ON_REQUEST)}
     lines = ["| method | " + " | ".join(MOTIONS) + " |", "|" + " --- |" * (1 + len(MOTIONS))]
     for key in SHOWN:
         cells = [_cell(views[(views["method"] == key) & (views["motion"] == motion)]) for motion in MOTIONS]

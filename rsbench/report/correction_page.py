@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.studies.correction_methods import METHODS, UNPUBLISHED, methods_among
+from rsbench.benchmark.studies.correction_methods import METHODS, ON_REQUEST, methods_among
 from rsbench.benchmark.studies.correction_study import ROW_BANDS
 from rsbench.benchmark.studies.correction_summary import by_scene, loss_to_true_motion, masks, verdict
 from rsbench.report import pages
 
-_TITLES = {method.key: method.title for method in (*METHODS, *UNPUBLISHED)}
+_TITLES = {method.key: method.title for method in (*METHODS, *ON_REQUEST)}
 _BOUNDED = 6
 """Sequences of a stratum below which a median has no interval, so that nothing is judged by one."""
 _LINES = {

@@ -1,4 +1,4 @@
-"""Frames by layers of planes, a method of the correction study that is in no published table yet."""
+"""Frames by layers of planes, a method of the correction study on request."""
 
 from __future__ import annotations
 

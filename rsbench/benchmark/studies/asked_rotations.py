@@ -1,4 +1,4 @@
-"""Rotations of single frames by methods of the correction study that are in no published table yet."""
+"""Rotations of single frames by methods of the correction study on request."""
 
 from __future__ import annotations
 

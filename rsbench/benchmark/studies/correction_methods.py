@@ -71,7 +71,7 @@ METHODS = (
     Method(key="true-depth", title="our motion, true depth", kind="oracle", knows="true depth"),
     Method(key="truth", title="true motion, true depth", kind="oracle", knows="true motion and depth"),
 )
-UNPUBLISHED = (
+ON_REQUEST = (
     Method(
         key="gyroscope",
         title="rotation only, measured",
@@ -98,9 +98,9 @@ UNPUBLISHED = (
         knows="one image: lines along three orthogonal directions",
     ),
 )
-"""Methods that are in no published table yet: a study has them when it is asked for them."""
+"""Methods that a study has when it is asked for them: docs/correctors.md compares them."""
 
 
 def methods_among(keys: Collection[str]) -> list[Method]:
     """The methods of these keys, in the order of tables."""
-    return [method for method in (*METHODS, *UNPUBLISHED) if method.key in keys]
+    return [method for method in (*METHODS, *ON_REQUEST) if method.key in keys]

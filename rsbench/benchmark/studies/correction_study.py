@@ -4,7 +4,7 @@ A method is a depth, a motion and a corrector of the chain that users have. Thos
 frame did not see from the other frames; what remains is invented (inpainted), so that every method gives a whole
 picture, which 'all' scores. 'Covered' scores the pixels that every method of a view draws from the frame itself:
 nothing there is filled or invented. A method that finds no motion has failed: it scores the worst values, and
-takes no pixels from the others. Nor do methods that are in no published table, which are compared when they are
+takes no pixels from the others. Nor do methods on request, which are compared when they are
 asked for: what they do not cover is invented.
 """
 
@@ -25,7 +25,7 @@ from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.standard_metrics import Flip, Psnr, Ssim
 from rsbench.benchmark.studies.asked_layers import asked_layers
 from rsbench.benchmark.studies.asked_rotations import asked_rotation
-from rsbench.benchmark.studies.correction_methods import METHODS, UNPUBLISHED
+from rsbench.benchmark.studies.correction_methods import METHODS, ON_REQUEST
 from rsbench.benchmark.studies.kept_rows import KeptRows, Row, Rows
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, VIEWS, Side, View
@@ -85,7 +85,7 @@ def study_dataset(
 
     ``solver`` names the solver of "our" motion, whose model the corrections take. ``step`` is called with the name
     of each sequence done; ``workers`` processes share them, one per core for None. A folder ``kept`` holds what is
-    done of a run that is cut off. ``others`` are keys of ``UNPUBLISHED`` methods to have too.
+    done of a run that is cut off. ``others`` are keys of ``ON_REQUEST`` methods to have too.
 
     Raises:
         RsbenchError: the dataset cannot be read, or there is no such solver.
@@ -302,7 +302,7 @@ def _as_it_is(depth: Depth) -> Depth:
     return depth
 
 
-_ASKED = {method.key for method in UNPUBLISHED}
+_ASKED = {method.key for method in ON_REQUEST}
 _PUBLISHED = {method.key for method in METHODS}
 _CORRECTORS = {"gyro": "rotation-only", "rotation": "rotation-only", "plane": "one-plane"}
 _DEPTHS: dict[str, Callable[[Depth], Depth]] = {
