@@ -137,7 +137,7 @@ _ON_REQUEST = (
     *("gs-p3p", "gs-stereo-triplets", "rs-r6p", "rs-r6p-single"),
     *("gs-upright-3pt", "gs-upright-4pt", "rs-gyro-5pt", "rs-gyro-stereo"),  # need a sensor
 )
-"""Solvers that run only when they are named, for they would double the time; boards of images have most of them."""
+"""Solvers that run only when they are named: they would double the time; boards of images have most."""
 
 
 def every_solver() -> list[str]:
