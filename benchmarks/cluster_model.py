@@ -2,11 +2,12 @@
 
 Measured here, one process of one thread as on a cluster: of each scene of the card, building it on a machine that
 has never seen it, having it from the machine's cache, and rendering a sequence; of each sequence, what the command
-itself does when it is finished, and of all of them the manifest. Then jobs are handed out as ``--scheduler`` hands
-them out, in the order of scenes, to processes that build or load a scene when it is another one than before; files
-go through one storage. Nothing else is simulated: machines are equal, and none dies.
+itself does when it is finished, and of all of them the manifest; of a job, what Dask takes to hand it out. Then
+jobs are handed out as ``--scheduler`` hands them out, in the order of scenes, to processes that build or load a
+scene when it is another one than before; files go through one storage. Nothing else is simulated: machines are
+equal, and none dies.
 
-    python benchmarks/cluster_model.py --measure costs.json       # minutes of a processor
+    python benchmarks/cluster_model.py --measure costs.json       # minutes of a processor; needs distributed
     python benchmarks/cluster_model.py --costs costs.json --seeds 50
 """
 
@@ -21,12 +22,14 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 import heapq
 import json
+import math
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,6 +52,8 @@ class Costs(NamedTuple):
     """Of the command, for each sequence."""
     manifest: float
     """Of the command at the end, for each sequence."""
+    handed: float
+    """Of scheduler and command, for each job that a cluster is given and answers."""
 
 
 # Measuring
@@ -70,6 +75,7 @@ def measure() -> Costs:
         size,
         finished,
         manifest,
+        *_in_child("handed", "", ""),
     )
 
 
@@ -92,9 +98,11 @@ def _in_child(what: str, scene: str, cache: str) -> list[float]:
 
 
 def child(what: str, scene: str) -> list[float]:
-    """In a process of its own: what one of the three measurements found."""
+    """In a process of its own: what one of the measurements found."""
     if what == "many":
         return list(_command_alone())
+    if what == "handed":
+        return [_handed()]
     from rsbench.renderers.backend import set_threads, start_backend
 
     start_backend()
@@ -157,6 +165,22 @@ def _command_alone() -> tuple[float, float]:
     return (between - begun) / len(card.sequence), (end - between) / len(card.sequence)
 
 
+def _handed(jobs: int = 2000) -> float:
+    """Seconds of the processor for a job that does nothing, with distributed; the scheduler is in this process."""
+    from distributed import LocalCluster
+
+    from rsbench.pipeline.crew import Cluster
+    from rsbench.pipeline.isolated_jobs import run_jobs
+
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as cluster:
+        there = Cluster(address=cluster.scheduler_address)
+        for todo in ([0.0], list(map(float, range(jobs)))):  # the first one starts the children
+            begun = time.process_time()
+            for _ in run_jobs(partial, todo, there, {}, math.sqrt):
+                pass
+    return (time.process_time() - begun) / jobs
+
+
 # Simulating
 
 
@@ -196,12 +220,12 @@ def simulate(costs: Costs, jobs: Sequence[str], machines: int, cores: int, bytes
         now, rendering = now + costs.rendered[scene], rendering + costs.rendered[scene]
         storage = max(storage, now) + costs.bytes / bytes_per_s
         storing, now = storing + storage - now, storage
-        command = max(command, now) + costs.finished
+        command = max(command, now) + costs.finished + costs.handed
         heapq.heappush(free, (now, number, process))
     end = max(command, *(time for time, _, _ in free)) + len(jobs) * costs.manifest
     whole = end * machines * cores
     idle = whole - building - storing - rendering
-    busy = len(jobs) * (costs.finished + costs.manifest) / end
+    busy = len(jobs) * (costs.finished + costs.handed + costs.manifest) / end
     return Result(end / 3600.0, building / whole, storing / whole, idle / whole, busy)
 
 

@@ -3,9 +3,10 @@
     nice python benchmarks/memory.py                          # 500 sequences of 96 x 64 px, some minutes
     nice python benchmarks/memory.py 500 --workers 2 --scene castle --scene room
 
-Each sequence is rendered, as another seed of a card of a few scenes, by processes that live as long as the run.
-Printed are the resident memory of the command and of the largest of its children at each tenth, and the slope
-of the second half by least squares: a leak of one float image a sequence would be 0.07 MB here.
+Each sequence is rendered, as another seed of a card of a few scenes, by processes that live as long as the run,
+one scene after the other. Printed are the resident memory of the command and of the largest of its children at
+four times in each scene, and slopes by least squares: of the command over the run, of the child over the last
+three quarters of each scene. A leak of one float image a sequence would be 0.07 MB here.
 """
 
 from __future__ import annotations
@@ -85,13 +86,17 @@ def main() -> None:
         card.write_text(CARD.format(seeds=seeds) + parts, "utf-8")
         command = [sys.executable, "-m", "rsbench", "--quiet", "generate", str(card), "--out", str(out)]
         seen = np.array(watch([*command, "--workers", str(given.workers)], out))
-    for done in np.linspace(0, seen[-1, 0], 11)[1:]:
-        row = seen[np.flatnonzero(seen[:, 0] <= done)[-1]]
-        sys.stdout.write(f"{row[0]:.0f} sequences: the command {row[1]:.0f} MB, a child {row[2]:.0f} MB\n")
-    late = seen[(seen[:, 0] >= seen[-1, 0] / 2) & (seen[:, 2] > 0.0)]
-    for name, column in (("the command", 1), ("a child", 2)):
-        slope = np.polyfit(late[:, 0], late[:, column], 1)[0]
-        sys.stdout.write(f"{name}: {slope:+.4f} MB a sequence in the second half\n")
+    each = seen[-1, 0] / len(scenes)
+    for k, scene in enumerate(sorted(scenes)):
+        inside = seen[(seen[:, 0] > each * k) & (seen[:, 0] < each * (k + 1)) & (seen[:, 2] > 0.0)]
+        for part in (0.25, 0.5, 0.75, 1.0):
+            row = inside[np.flatnonzero(inside[:, 0] <= each * (k + part))[-1]]
+            sys.stdout.write(f"{scene}, {row[0]:.0f} done: the command {row[1]:.0f} MB, a child {row[2]:.0f} MB\n")
+        late = inside[inside[:, 0] > each * (k + 0.25)]
+        slope = np.polyfit(late[:, 0], late[:, 2], 1)[0]
+        sys.stdout.write(f"{scene}: a child {slope:+.3f} MB a sequence\n")
+    slope = np.polyfit(seen[:, 0], seen[:, 1], 1)[0]
+    sys.stdout.write(f"the command: {slope:+.3f} MB a sequence\n")
 
 
 if __name__ == "__main__":

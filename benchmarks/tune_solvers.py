@@ -1,6 +1,6 @@
 """Whether a method of a paper would do better with other thresholds, refinement or search than its card has.
 
-    nice python benchmarks/tune_solvers.py --out results/tuning                   # six minutes of a processor
+    nice python benchmarks/tune_solvers.py --out results/tuning                   # a quarter of an hour
     nice python benchmarks/tune_solvers.py --out results/tuning --solver rs-r6p    # those rows; others are kept
 
 Problems are drawn as those of the track `points`, of a seed of which nothing is published; gravity and gyroscopes,
@@ -44,7 +44,7 @@ from rsbench.solvers.engine.registry import load_solver_entry
 from rsbench.solvers.engine.warm_up import warm_up
 
 SEED = 7
-PROBLEMS, SLOW_PROBLEMS = 40, 16
+PROBLEMS = 40
 LIMIT_DEG = 5.0
 GRAVITY_NOISE_DEG, GYRO_NOISE_DEG = 0.5, 1.0 / 30.0
 """Of a telephone's: 1 deg/s of a sample at 30 frames a second."""
@@ -52,11 +52,10 @@ _LEAST_GAIN = 1e-3
 """Of AUC@5: less is no reason, and two problems that change can have it beyond a bootstrap's interval."""
 CARDS = (
     *("gs-5pt-opencv", "gs-8pt", "gs-p3p", "gs-poselib", "gs-poselib-stereo", "gs-stereo-pnp"),
-    *("gs-stereo-triplets", "gs-upright-3pt", "gs-upright-4pt", "rs-gyro-5pt", "rs-gyro-stereo"),
-    *("rs-r6p", "rs-r6p-single", "rs-zhuang-8pt", "rs-zhuang-9pt"),
+    *("gs-stereo-triplets", "gs-upright-3pt", "gs-upright-4pt", "rs-12param", "rs-dai-linear", "rs-dai-uniform"),
+    *("rs-gyro-5pt", "rs-gyro-stereo", "rs-r6p", "rs-r6p-single", "rs-stereo-linear"),
+    *("rs-zhuang-8pt", "rs-zhuang-9pt"),
 )
-SLOW_CARDS = ("rs-12param", "rs-dai-linear", "rs-dai-uniform", "rs-stereo-linear")
-"""More than 0.3 s for a problem."""
 
 
 class Setting(NamedTuple):
@@ -152,23 +151,22 @@ def rows_of(card: str, found: Sequence[tuple[Setting, FloatArray]]) -> list[dict
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--solver", action="append", choices=[*CARDS, *SLOW_CARDS], help="only these rows")
+    parser.add_argument("--solver", action="append", choices=CARDS, help="only these rows")
     options = parser.parse_args()
     assert SEED != PUBLIC_SEED, "tuned on what is published"
     options.out.mkdir(parents=True, exist_ok=True)
-    path, cards = options.out / "tuning.csv", options.solver or [*CARDS, *SLOW_CARDS]
+    path, cards = options.out / "tuning.csv", options.solver or CARDS
     warm_up(["linear"])
     table = pd.read_csv(path, keep_default_na=False) if options.solver and path.is_file() else pd.DataFrame()
     for card in cards:
-        rows = pd.DataFrame(rows_of(card, errors_of(card, SLOW_PROBLEMS if card in SLOW_CARDS else PROBLEMS)))
+        rows = pd.DataFrame(rows_of(card, errors_of(card, PROBLEMS)))
         kept = table[table["solver"] != card] if len(table) else table
         table = pd.concat([kept, rows], ignore_index=True).sort_values("solver", kind="stable")
         write_table(path, table)
         sys.stdout.write(rows.to_string(index=False) + "\n")
     command = f"python benchmarks/tune_solvers.py --out {options.out.as_posix()}"
-    counts = {"problems": PROBLEMS, "slow_problems": SLOW_PROBLEMS}
     noise = {"gravity_noise_deg": GRAVITY_NOISE_DEG, "gyro_noise_deg": GYRO_NOISE_DEG}
-    write_json(options.out / "provenance.json", provenance(command, seed=SEED, **counts, **noise))
+    write_json(options.out / "provenance.json", provenance(command, seed=SEED, problems=PROBLEMS, **noise))
     return 0
 
 

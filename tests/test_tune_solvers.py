@@ -60,7 +60,7 @@ def test_the_card_stands_unless_another_setting_is_better_beyond_its_interval(pr
 def test_what_is_committed_is_of_a_seed_of_its_own_and_the_cards_stand(program: ModuleType) -> None:
     assert program.SEED != PUBLIC_SEED
     table = pd.read_csv(FOLDER / "tuning.csv", keep_default_na=False)
-    assert set(table["solver"]) <= {*program.CARDS, *program.SLOW_CARDS}
+    assert set(table["solver"]) == set(program.CARDS)
     for name, rows in table.groupby("solver"):
         entry = load_solver_entry(str(name))
         settings = list(program.settings_of(entry.solver, entry.options.robust == "own"))
