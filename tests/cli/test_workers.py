@@ -54,9 +54,10 @@ def test_processes_and_a_cluster_are_not_both_taken(smoke_dataset: Path, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-def test_a_cluster_without_distributed_is_one_line(tmp_path: Path) -> None:
+def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     run = run_here("simulate", "noise", "--out", tmp_path / "out", "--scheduler", str(tmp_path / "none.json"))
-    assert run.returncode == 2 and "--scheduler" in run.stderr
+    assert run.returncode == 2 and "--scheduler" in run.stderr and run.stderr.count("\n") == 1
+    assert ("no such file" in run.stderr) == (find_spec("distributed") is not None)
 
 
 @NEEDS_DASK
