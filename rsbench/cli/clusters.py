@@ -25,7 +25,7 @@ def chosen_workers(workers: int | None, scheduler: str | None, default: int = 1)
     """Processes here, or a cluster.
 
     Raises:
-        RsbenchError: both are given, or distributed is not installed.
+        RsbenchError: both are given, distributed is not installed, or there is no such scheduler file.
     """
     if scheduler is None:
         return workers or default
@@ -38,7 +38,13 @@ def chosen_workers(workers: int | None, scheduler: str | None, default: int = 1)
         )
     if find_spec("distributed") is None:  # before scenes are built
         raise RsbenchError("--scheduler needs distributed: pip install 'rsbench[cluster]'")
-    return Cluster(address=str(Path(scheduler).resolve()) if scheduler.endswith(".json") else scheduler)
+    if not scheduler.endswith(".json"):
+        return Cluster(address=scheduler)
+    if not Path(scheduler).is_file():  # for which distributed would wait without end
+        raise RsbenchError(
+            f"--scheduler {scheduler}: no such file; make it with: dask scheduler --scheduler-file {scheduler}"
+        )
+    return Cluster(address=str(Path(scheduler).resolve()))
 
 
 _Place = TypeVar("_Place", Path, Path | str)

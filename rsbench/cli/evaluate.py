@@ -58,6 +58,11 @@ _Only = Annotated[
     typer.Option(metavar="SOLVER|SEQUENCE", help="Predict nothing else; repeatable. All is scored."),
 ]
 
+_Workers = Annotated[
+    int | None,
+    typer.Option(min=1, help="Processes of one thread that predict and score a sequence each. Default: 1."),
+]
+
 
 def evaluate(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with a dataset.json.")],
@@ -73,9 +78,7 @@ def evaluate(
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each solver, with other RANSAC samples.")] = 1,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
     rehash: Annotated[bool, typer.Option("--rehash", help="Read all data again, not only what changed.")] = False,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes of one thread that predict a sequence each. Default: 1.")
-    ] = None,
+    workers: _Workers = None,
     scheduler: Scheduler = None,
     layout: Annotated[
         str | None,

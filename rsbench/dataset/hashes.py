@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import stat
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -69,10 +70,20 @@ class FileHashes:
 
     def flush(self) -> None:
         """Append what is new."""
-        if self._new:
+        self.append(self.taken())
+
+    def taken(self) -> list[str]:
+        """What is new, for ``append`` of another process's: here it is not new any more."""
+        lines = self._new
+        self._new = []
+        return lines
+
+    def append(self, lines: Sequence[str]) -> None:
+        """Keep lines of ``taken``."""
+        self._known |= _parsed(lines)
+        if lines:
             with self._store.open("a", encoding="utf-8") as stream:
-                stream.write("\n" + "\n".join(self._new) + "\n")  # the line before may have been cut by a kill
-            self._new.clear()
+                stream.write("\n" + "\n".join(lines) + "\n")  # the line before may have been cut by a kill
 
     def _keep(self, name: str, file: HashedFile) -> HashedFile:
         self._known[name] = file
@@ -81,13 +92,17 @@ class FileHashes:
 
 
 def _read(store: Path) -> dict[str, HashedFile]:
-    known = {}
     try:
         with store.open(encoding="utf-8", errors="replace") as stream:
-            for line in stream:
-                with contextlib.suppress(ValueError, TypeError, RecursionError):  # empty, cut, or not ours
-                    name, size, modified, changed, digest = json.loads(line)
-                    known[name] = HashedFile(size, modified, changed, digest)
+            return _parsed(stream)
     except OSError:
         return {}
+
+
+def _parsed(lines: Iterable[str]) -> dict[str, HashedFile]:
+    known = dict[str, HashedFile]()
+    for line in lines:
+        with contextlib.suppress(ValueError, TypeError, RecursionError):  # empty, cut, or not ours
+            name, size, modified, changed, digest = json.loads(line)
+            known[name] = HashedFile(size, modified, changed, digest)
     return known

@@ -38,9 +38,11 @@ def evaluated(folder: Path, out: Path, *options: object) -> dict[str, bytes]:
     return contents(out)
 
 
-def test_two_processes_evaluate_to_the_same_bytes(smoke_dataset: Path, tmp_path: Path) -> None:
-    one = evaluated(smoke_dataset, tmp_path / "one")
-    two = evaluated(smoke_dataset, tmp_path / "two", "--workers", 2)
+@pytest.mark.parametrize("seeds", [1, 2])  # scores come with predictions, or after the repeats
+def test_two_processes_evaluate_to_the_same_bytes(smoke_dataset: Path, tmp_path: Path, seeds: int) -> None:
+    one = evaluated(smoke_dataset, tmp_path / "one", "--seeds", seeds)
+    two = evaluated(smoke_dataset, tmp_path / "two", "--seeds", seeds, "--workers", 2)
+    assert {f"scores/{name}.csv" for name in ("pose", "depth", "correction", "failures")} <= one.keys()
     assert len(one) > 20 and one == two
 
 
@@ -52,9 +54,10 @@ def test_processes_and_a_cluster_are_not_both_taken(smoke_dataset: Path, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-def test_a_cluster_without_distributed_is_one_line(tmp_path: Path) -> None:
+def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     run = run_here("simulate", "noise", "--out", tmp_path / "out", "--scheduler", str(tmp_path / "none.json"))
-    assert run.returncode == 2 and "--scheduler" in run.stderr
+    assert run.returncode == 2 and "--scheduler" in run.stderr and run.stderr.count("\n") == 1
+    assert ("no such file" in run.stderr) == (find_spec("distributed") is not None)
 
 
 @NEEDS_DASK

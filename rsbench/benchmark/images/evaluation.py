@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 
 from rsbench.benchmark.images.plan import EvaluationOptions, Places, Plan, make_plan
 from rsbench.benchmark.images.predict import Bench, Step, prediction_steps
-from rsbench.benchmark.images.repeats import predict_apart, repeat, repeats_of
-from rsbench.benchmark.images.score import AFTER, KEYS, TABLES, Row, Scorer
-from rsbench.benchmark.isolated_metric import isolated_metrics
+from rsbench.benchmark.images.repeats import repeat, repeats_of
+from rsbench.benchmark.images.score import AFTER, KEYS, TABLES, Row
+from rsbench.benchmark.images.sequence_jobs import Scores, SequenceJob, done_apart, isolated
 from rsbench.benchmark.metric_plugins import DepthCase, ImageCase, PoseCase
 from rsbench.benchmark.provenance import dataset_record, provenance
 from rsbench.dataset.files import read_json, read_table, write_json, write_table
@@ -48,7 +48,7 @@ class Evaluation:
         """Predict and score; writes predictions/, scores/*.csv and provenance.json below ``out``.
 
         Predictions made before from the same data, components and options are kept and scored, whoever asked for
-        them. ``workers`` predict one sequence each; 1 is this process, with all its threads.
+        them. ``workers`` predict and score one sequence each; 1 is this process, with all its threads.
 
         Returns:
             Stored predictions that are not current: they are neither scored nor deleted.
@@ -57,45 +57,60 @@ class Evaluation:
             RsbenchError: the dataset is damaged, a stored prediction is of another entry of the same name, or
                 another command works in ``out``.
         """
-        with workplace(self.out), SolverRunner() as runner, Isolation() as isolation:
-            plan = self._isolated(isolation)
+        with workplace(self.out):
             hashes = FileHashes(self.dataset, self.out / HASHES, self.options.rehash)
-            due = [sequence for sequence in self.sequences if sequence.name in plan.sequence_names]
-            if workers == 1:
-                for sequence in due:
-                    Bench(sequence, self._folder(sequence), plan, runner, hashes.sha256).predict(step)
-            else:
-                names = [sequence.name for sequence in due]
-                for name in predict_apart(self.dataset, self.out, self.options, names, workers):
-                    for _ in range(prediction_steps(self.plan)):
-                        step(name)
-            repeat(self.dataset, self.out, self.options, plan, self.sequences, hashes, step, workers)
-            stale = self._score(plan, hashes, step)
+            scored = self._here(hashes, step) if workers == 1 else self._apart(hashes, step, workers)
+            found = [scored[sequence.name] for sequence in self.sequences]
+            for table in TABLES:
+                rows = [row for scores in found for row in scores.rows[table]]
+                write_table(self.out / "scores" / f"{table}.csv", _frame(table, rows, self.plan))
             hashes.flush()
             write_json(self.out / "scores" / "columns.json", described_columns(self.plan))
             write_json(self.out / "provenance.json", self._provenance(command))
-        return stale
+        return [name for scores in found for name in scores.stale]
 
-    def _score(self, plan: Plan, hashes: FileHashes, step: Step) -> list[str]:
-        """Write all tables; what is not current is returned."""
-        rows: dict[str, list[Row]] = {table: [] for table in TABLES}
-        stale: list[str] = []
-        for sequence in self.sequences:
-            places = Places(sequence, self._folder(sequence), plan.chain, hashes.sha256)
-            scorer = Scorer(places, plan)
-            scorer.score()
-            for table in TABLES:
-                rows[table] += scorer.rows[table]
-            stale += scorer.stale
-            step(f"{sequence.name}: scores")
-        for table, content in rows.items():
-            write_table(self.out / "scores" / f"{table}.csv", _frame(table, content, self.plan))
-        return stale
+    def _here(self, hashes: FileHashes, step: Step) -> dict[str, Scores]:
+        """Scores by the name of the sequence, all by this process but for the repeats."""
+        scored = {}
+        with SolverRunner() as runner, Isolation() as isolation:
+            plan = isolated(self.plan, isolation)
+            for sequence in self.sequences:
+                if sequence.name in plan.sequence_names:
+                    Bench(sequence, self._folder(sequence), plan, runner, hashes.sha256).predict(step)
+            self._repeat(hashes, step, 1)
+            for sequence in self.sequences:
+                places = Places(sequence, self._folder(sequence), plan.chain, hashes.sha256)
+                scored[sequence.name] = Scores.of(places, plan)
+                step(f"{sequence.name}: scores")
+        return scored
 
-    def _isolated(self, isolation: Isolation) -> Plan:
-        """The plan with other packages' components in child processes."""
-        metrics = isolated_metrics(isolation, self.plan.metrics)
-        return replace(self.plan, chain=isolation.chain(self.plan.chain), metrics=metrics)
+    def _apart(self, hashes: FileHashes, step: Step, workers: Workers) -> dict[str, Scores]:
+        """The same by ``workers``."""
+        due = self.plan.sequence_names
+        if repeats_of(self.plan):  # which need the matches, and are scored with the others
+            jobs = [SequenceJob(sequence=name, predict=True, score=False) for name in sorted(due)]
+            self._done(jobs, hashes, step, workers)
+            self._repeat(hashes, step, workers)
+            due = frozenset[str]()
+        jobs = [SequenceJob(sequence=each.name, predict=each.name in due, score=True) for each in self.sequences]
+        jobs.sort(key=lambda job: not job.predict)  # what takes long is begun early
+        return self._done(jobs, hashes, step, workers)
+
+    def _done(
+        self, jobs: list[SequenceJob], hashes: FileHashes, step: Step, workers: Workers
+    ) -> dict[str, Scores]:
+        scored = {}
+        for job, scores in done_apart(self.dataset, self.out, self.options, jobs, workers, hashes):
+            if job.predict:
+                for _ in range(prediction_steps(self.plan)):
+                    step(job.sequence)
+            if scores is not None:
+                scored[job.sequence] = scores
+                step(f"{job.sequence}: scores")
+        return scored
+
+    def _repeat(self, hashes: FileHashes, step: Step, workers: Workers) -> None:
+        repeat(self.dataset, self.out, self.options, self.plan, self.sequences, hashes, step, workers)
 
     def _folder(self, sequence: Sequence) -> Path:
         return self.out / "predictions" / sequence.name

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 
 from rsbench.benchmark.images.plan import EvaluationOptions, Plan, make_plan
@@ -15,7 +14,6 @@ from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.crew import Workers
 from rsbench.pipeline.isolated_jobs import finished_jobs
-from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 
@@ -68,44 +66,6 @@ def repeat(
     with closing(finished_jobs(_serve, todo, crew, one_thread, dataset, out, options, name=_name)) as found:
         for (sequence, solver, _), _ in found:
             step(f"{sequence}: {solver}")
-
-
-def predict_apart(
-    dataset: Path, out: Path, options: EvaluationOptions, names: list[str], workers: Workers
-) -> Iterator[str]:
-    """Make what is predicted of sequences, each in a child process of one thread; names as they are done.
-
-    Raises:
-        RsbenchError: as ``Bench.predict``.
-        LostJobsError: see ``finished_jobs``.
-    """
-    one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
-    jobs = finished_jobs(_serve_predictions, names, workers, one_thread, dataset, out, options)
-    with closing(jobs) as found:
-        for name, _ in found:
-            yield name
-
-
-def _serve_predictions(dataset: Path, out: Path, options: EvaluationOptions) -> Callable[[str], None]:
-    """What predicts, in a child."""
-    use_one_thread()
-    try:
-        sequences = {each.name: each for each in read_pairs(dataset)}
-        plan = make_plan(options, list(sequences.values()))
-    except RsbenchError as error:
-        raise EntryFailure(str(error)) from error
-
-    def run(name: str) -> None:
-        with SolverRunner(single_thread=True) as runner, Isolation() as isolation:
-            apart = replace(plan, chain=isolation.chain(plan.chain))
-            hashes = FileHashes(dataset, out / HASHES)  # the parent has read all again, if that was asked
-            try:
-                bench = Bench(sequences[name], out / "predictions" / name, apart, runner, hashes.sha256)
-                bench.predict(lambda word: None)
-            except RsbenchError as error:
-                raise EntryFailure(str(error)) from error
-
-    return run
 
 
 def _name(job: Job) -> str:
