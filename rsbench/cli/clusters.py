@@ -1,7 +1,9 @@
-"""The option ``--scheduler`` of commands whose work can be done by many machines."""
+"""Options of commands whose work can be done by many machines, or whose results can go to a store."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
@@ -58,3 +60,28 @@ def shared_path(path: _Place, scheduler: str | None) -> _Place:
 
     refuse_url(path)
     return path.resolve()
+
+
+@contextmanager
+def results_at(out: str, scheduler: str | None) -> Iterator[Path]:
+    """The folder into which a command writes what is for ``out``: that folder, or one whose files go to that URL.
+
+    Raises:
+        RsbenchError: a URL that cannot be taken, or one with a cluster; see ``mirrored``.
+    """
+    from rsbench.dataset.object_store import path_or_url, shown
+    from rsbench.errors import RsbenchError
+
+    place = path_or_url(out)
+    if isinstance(place, Path):
+        yield shared_path(place, scheduler)
+        return
+    if scheduler is not None:
+        raise RsbenchError(
+            f"{shown(place)}: not with --scheduler, whose jobs write into a folder that all machines see: give a "
+            "folder, or --workers"
+        )
+    from rsbench.dataset.mirror import mirrored
+
+    with mirrored(place) as folder:
+        yield folder

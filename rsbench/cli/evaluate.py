@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rsbench.cli.clusters import Scheduler, chosen_workers, shared_path
+from rsbench.cli.clusters import Scheduler, chosen_workers, results_at, shared_path
 from rsbench.cli.kinds import complete
 
 if TYPE_CHECKING:
@@ -27,6 +27,13 @@ DIR gets [bold]predictions/[/bold], [bold]scores/*.csv[/bold] (docs/score-files.
 components, is kept and scored; nothing is deleted."""
 
 
+_Out = Annotated[
+    str,
+    typer.Option(
+        metavar="DIR",
+        help="Folder for predictions, scores, pictures and the report, or a URL such as s3://bucket/folder.",
+    ),
+]
 _Solvers = Annotated[
     list[str] | None,
     typer.Option(
@@ -66,7 +73,7 @@ _Workers = Annotated[
 
 def evaluate(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with a dataset.json.")],
-    out: Annotated[Path, typer.Option(help="Folder for predictions, scores, pictures and the report.")],
+    out: _Out,
     solver: _Solvers = None,
     correct_with: _CorrectWith = "rs-stereo-refined",
     matcher: _Matcher = "sgm",
@@ -87,12 +94,12 @@ def evaluate(
 ) -> None:
     """Pose, depth and correction against the truth of a dataset, with a report."""
     if layout is not None:
-        _evaluate_others(folder, out, layout, matcher, seed)
+        with results_at(out, scheduler) as place:
+            _evaluate_others(folder, place, layout, matcher, seed)
         return
     from rsbench.benchmark.images.plan import EvaluationOptions
 
     crew, command = chosen_workers(workers, scheduler), f"rsbench evaluate {folder} --out {out}"
-    folder, out = shared_path(folder, scheduler), shared_path(out, scheduler)
     options = EvaluationOptions(
         solvers=tuple(solver or every_solver()),
         correction_solver=correct_with,
@@ -106,7 +113,8 @@ def evaluate(
         seed=seed,
         rehash=rehash,
     )
-    evaluate_dataset(folder, out, options, command, crew)
+    with results_at(out, scheduler) as place:
+        evaluate_dataset(shared_path(folder, scheduler), place, options, command, crew)
 
 
 def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, seed: int) -> None:
@@ -115,6 +123,7 @@ def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, seed: i
     from rsbench.cli.console import print_table
     from rsbench.dataset.files import check_out, write_table
     from rsbench.dataset.importing.formats import read_others
+    from rsbench.dataset.mirror import name_of
     from rsbench.errors import RsbenchError
     from rsbench.vision.stereo_matcher import load_matcher
 
@@ -131,7 +140,7 @@ def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, seed: i
             (out / "scores").mkdir(parents=True, exist_ok=True)
             write_table(out / "scores" / f"{name}.csv", table)
             print_table(name, table)
-    typer.echo(f"scores: {(out / 'scores').resolve()}")
+    typer.echo(f"scores: {name_of(out / 'scores')}")
 
 
 _ON_REQUEST = (
@@ -160,6 +169,7 @@ def evaluate_dataset(
     from rsbench.benchmark.images.evaluation import open_evaluation
     from rsbench.benchmark.images.plan import EvaluationOptions
     from rsbench.cli.console import print_table, progress_bar
+    from rsbench.dataset.mirror import name_of
     from rsbench.report.evaluation_page import summary_tables, write_report
 
     evaluation = open_evaluation(folder, out, options or EvaluationOptions(solvers=tuple(every_solver())))
@@ -171,7 +181,7 @@ def evaluate_dataset(
         why = "made from other data, components or options, or by a card that was not named"
         typer.echo(f"not scored, {why}: {', '.join(stale)}", err=True)
     page = write_report(folder, out)
-    typer.echo(f"report: {page.resolve()}")
+    typer.echo(f"report: {name_of(page)}")
     return page
 
 

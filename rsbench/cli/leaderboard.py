@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rsbench.cli.clusters import Scheduler, chosen_workers, shared_path
+from rsbench.cli.clusters import Scheduler, chosen_workers, results_at
 from rsbench.cli.kinds import complete
+from rsbench.cli.leaderboard_run import load_cards, predict
 from rsbench.cli.leaderboard_tracks import (
     Data,
     Hidden,
@@ -25,10 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from contextlib import AbstractContextManager
 
-    from rsbench.benchmark.leaderboard.running import Limits
     from rsbench.benchmark.leaderboard.splits import Split
     from rsbench.benchmark.leaderboard.standings import Standing
-    from rsbench.pipeline.crew import Workers as Crewed
     from rsbench.pipeline.problem import Problem
 
 EPILOG = """[bold]Examples[/bold]
@@ -50,6 +49,9 @@ More: [bold]rsbench docs submit[/bold] and [bold]rsbench docs protocols[/bold]""
 board_app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", epilog=EPILOG)
 
 _Board = Annotated[Path, typer.Option(help="Folder of the board.")]
+_BoardOrUrl = Annotated[
+    str, typer.Option(metavar="DIR", help="Folder of the board, or a URL such as s3://bucket/folder.")
+]
 _File = Annotated[
     Path,
     typer.Argument(metavar="FILE", help="Predictions: JSON lines; the folder 'pictures' beside it is read too."),
@@ -155,7 +157,7 @@ def run(
             autocompletion=complete("solvers"),
         ),
     ],
-    board: _Board,
+    board: _BoardOrUrl,
     data: Data = None,
     seed_file: Secret = None,
     secret: Hidden = False,
@@ -175,23 +177,23 @@ def run(
     from rsbench.benchmark.leaderboard.running import Limits
     from rsbench.benchmark.provenance import provenance
 
-    crew, board = chosen_workers(workers, scheduler), shared_path(board, scheduler)
-    split = split_of(track, data, seed_file, secret)
+    crew, split = chosen_workers(workers, scheduler), split_of(track, data, seed_file, secret)
     if track == "pose-own":
         raise RsbenchError(f"track {track!r}: solvers of cards take given matches; run them on the track 'pose'")
-    _load_cards(entry, split)  # before anything is written
-    files = _predict(entry, split, board, data, seed_file, crew, Limits(time_limit, memory))
-    with _scoring(split) as step:
-        add_all(
-            board,
-            files,
-            split,
-            provenance(RUN),
-            replace=lambda method: made_by(board, split, method) == RUN,
-            workers=crew,
-            step=step,
-        )
-    _show(board, split.protocol.id, split.name, None)
+    load_cards(entry, split)  # before anything is written
+    with results_at(board, scheduler) as place:
+        files = predict(entry, split, place, data, seed_file, crew, Limits(time_limit, memory))
+        with _scoring(split) as step:
+            add_all(
+                place,
+                files,
+                split,
+                provenance(RUN),
+                replace=lambda method: made_by(place, split, method) == RUN,
+                workers=crew,
+                step=step,
+            )
+        _show(place, split.protocol.id, split.name, None)
 
 
 @board_app.command()
@@ -279,40 +281,6 @@ def rescore(
         raise typer.Exit(1)
 
 
-def _predict(
-    entry: list[str],
-    split: Split,
-    board: Path,
-    data: Path | None,
-    seed_file: Path | None,
-    workers: Crewed,
-    limits: Limits,
-) -> list[Path]:
-    """Files of predictions of cards, in the hidden folder of the board."""
-    from rsbench.benchmark.leaderboard.picture_running import run_picture_cards
-    from rsbench.benchmark.leaderboard.running import prepare_inputs, run_cards, steps_of
-    from rsbench.cli.console import progress_bar
-    from rsbench.dataset.workplace import workplace
-
-    steps = len(split.truths) if split.protocol.pictures else steps_of(entry, split, limits)
-    with workplace(board) as hidden, progress_bar(f"running {split.name}", steps) as advance:
-        place = hidden / "runs" / split.protocol.id / split.name
-        place.mkdir(parents=True, exist_ok=True)
-        prepare_inputs(
-            split,
-            lambda: problems_of(split, data, seed_file),
-            place / "inputs",
-            lambda folder: write_frames_of(split, data, folder) if data and split.protocol.pictures else None,
-        )
-        if split.protocol.pictures:
-            files = run_picture_cards(
-                entry, split, place / "inputs", place, workers=workers, limits=limits, step=advance
-            )
-        else:
-            files = run_cards(entry, split, place / "inputs", place, workers=workers, limits=limits, step=advance)
-    return files
-
-
 def _scoring(split: Split) -> AbstractContextManager[Callable[[str], None]]:
     """A bar of the problems whose pictures are scored."""
     from contextlib import nullcontext
@@ -322,14 +290,6 @@ def _scoring(split: Split) -> AbstractContextManager[Callable[[str], None]]:
     if not split.protocol.pictures:  # the rest takes no time
         return nullcontext(lambda word: None)
     return progress_bar(f"scoring {split.name}", len(split.truths))
-
-
-def _load_cards(cards: list[str], split: Split) -> None:
-    """Raises RsbenchError when one of them is wrong, or is none of the track's kind."""
-    from rsbench.benchmark.leaderboard.picture_running import load_chains
-    from rsbench.benchmark.leaderboard.running import load_entries
-
-    (load_chains if split.protocol.pictures else load_entries)(cards, split.protocol)
 
 
 def _counted(problems: Iterator[Problem], advance: object) -> Iterator[Problem]:

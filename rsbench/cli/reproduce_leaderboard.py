@@ -18,7 +18,7 @@ def leaderboard(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.cli.leaderboard_smoke import own_solvers, smoke
 
     board = data / BOARD
-    run("points", own_solvers(), board, workers=workers or os.cpu_count() or 1)
+    run("points", own_solvers(), str(board), workers=workers or os.cpu_count() or 1)
     oracles("points", board)
     smoke(out / "leaderboard" / "smoke", write=True)
     publish(board, out / "leaderboard")
@@ -32,7 +32,7 @@ def boards(out: Path, data: Path, workers: int | None) -> None:
     board, frames, count = data / BOARD, data / "standard", workers or os.cpu_count() or 1
     generate("standard", str(frames), None, workers=count)
     for track, entries in entries_of_frames().items():
-        run(track, entries, board, frames, workers=count)
+        run(track, entries, str(board), frames, workers=count)
         oracles(track, board, frames)
     publish(board, out / "leaderboard")
 

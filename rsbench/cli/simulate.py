@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rsbench.cli.clusters import Scheduler, chosen_workers, shared_path
+from rsbench.cli.clusters import Scheduler, chosen_workers, results_at
 from rsbench.cli.kinds import complete
 
 if TYPE_CHECKING:
@@ -28,6 +28,15 @@ their reasons), [bold]trials/*.npz[/bold] (truth and every prediction) and [bold
 Solvers of other packages run in processes of their own: what they do wrong is a failed trial."""
 
 
+_Out = Annotated[
+    str,
+    typer.Option(
+        metavar="DIR",
+        help="Folder of the results, or a URL such as s3://bucket/folder; an interrupted run resumes there.",
+    ),
+]
+
+
 def simulate(
     sweep: Annotated[
         str,
@@ -36,7 +45,7 @@ def simulate(
             autocompletion=complete("sweeps"),
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Folder of the results; an interrupted run resumes there.")],
+    out: _Out,
     trials: Annotated[int | None, typer.Option(min=1, help="Repetitions per value instead of the card's.")] = None,
     solver: Annotated[
         list[str] | None,
@@ -58,15 +67,17 @@ def simulate(
 ) -> None:
     """Simulate points seen by a moving rolling-shutter rig, solve for its motion, and tabulate the errors."""
     from rsbench.benchmark.simulated.sweep_card import load_sweep, with_options
+    from rsbench.dataset.mirror import name_of
 
     card = with_options(load_sweep(sweep), solver, trials, seed)
     if change:
         card = card.with_setting(**_changes(change))
     command = f"rsbench simulate {sweep} --out {out}"
-    crew, place = chosen_workers(workers, scheduler, os.cpu_count() or 1), shared_path(out, scheduler)
-    table = run_and_summarise(card, place, crew, command, time_limit_s=time_limit, force=force)
-    show(card, table)
-    typer.echo(f"table: {(out / 'summary.csv').resolve()}")
+    crew = chosen_workers(workers, scheduler, os.cpu_count() or 1)
+    with results_at(out, scheduler) as place:
+        table = run_and_summarise(card, place, crew, command, time_limit_s=time_limit, force=force)
+        show(card, table)
+        typer.echo(f"table: {name_of(place / 'summary.csv')}")
 
 
 def run_and_summarise(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +29,10 @@ class Listed(NamedTuple):
     token: str
     """Another one where the content is another; empty where the store tells none."""
 
+    @property
+    def state(self) -> str:
+        return f"{self.size} {self.token}"
+
 
 def path_or_url(out: str) -> Path | str:
     """A folder of this machine, as which ``file:///...`` counts too, or the URL of a store.
@@ -41,10 +45,10 @@ def path_or_url(out: str) -> Path | str:
     protocol, _, rest = out.partition("://")
     if protocol in _LOCAL:
         if not rest.startswith("/"):
-            raise RsbenchError(f"--out {out}: must be an absolute path, such as {protocol}:///{rest}")
+            raise RsbenchError(f"{out}: must be an absolute path, such as {protocol}:///{rest}")
         return Path(rest[1:] if os.name == "nt" else rest)
     if "::" in out or not rest.strip("/") or re.search(r"[*?\[]", rest):
-        raise RsbenchError(f"--out {shown(out)}: must be a plain URL, such as s3://bucket/folder")
+        raise RsbenchError(f"{shown(out)}: must be a plain URL, such as s3://bucket/folder")
     return out.rstrip("/")
 
 
@@ -66,7 +70,7 @@ class Store:
         try:
             from fsspec.core import url_to_fs
         except ImportError as error:
-            raise RsbenchError(f"--out {self.url}: needs fsspec: pip install 'rsbench[cloud]'") from error
+            raise RsbenchError(f"{self.url}: needs fsspec: pip install 'rsbench[cloud]'") from error
         with self._asked("open it"):
             self._fs, root = url_to_fs(url)
         self._root = root.rstrip("/")
@@ -95,13 +99,19 @@ class Store:
             for full, content in contents.items():
                 yield some[full], content
 
+    def download(self, files: Mapping[str, Path]) -> None:
+        """Objects to files of this machine, which are not whole until this returns."""
+        with self._asked(f"read {next(iter(files), '')}"):
+            self._fs.get([self._full(path) for path in files], [str(file) for file in files.values()])
+
     def upload(self, files: Mapping[str, Path]) -> None:
         """Files of this machine, in any order; what has their path is replaced."""
         with self._asked(f"write {next(iter(files), '')}"):
             self._fs.put([str(path) for path in files.values()], [self._full(path) for path in files])
 
     def remove(self, path: str) -> None:
-        with self._asked(f"remove {path}"):
+        """Remove an object, if it is there."""
+        with self._asked(f"remove {path}"), suppress(FileNotFoundError):
             self._fs.rm_file(self._full(path))
 
     def _full(self, path: str) -> str:
@@ -132,11 +142,11 @@ def _remedy(error: Exception) -> str:
     if isinstance(error, ImportError):
         return "install the package of this kind of store, such as s3fs for s3"
     if isinstance(error, NotImplementedError | ValueError):
-        return "choose another --out, such as s3://bucket/folder"
+        return "choose another URL, such as s3://bucket/folder"
     if "redential" in f"{type(error)} {error}":
         return "give its package credentials (for s3: AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE)"
     if isinstance(error, PermissionError):
-        return "ask for the right to list, read and write there, or choose another --out"
+        return "ask for the right to list, read and write there, or choose another URL"
     if isinstance(error, FileNotFoundError):
-        return "make the bucket first, or choose another --out"
+        return "make the bucket first, or choose another URL"
     return "see that the store can be reached; the same command goes on there"

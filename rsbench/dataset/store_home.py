@@ -132,7 +132,7 @@ class StoreHome:
     def _is_new(self, name: str) -> bool:
         """Whether there is a sequence.json that has not been read, or has changed since."""
         there = self._objects[name].get(_MANIFEST)
-        return there is not None and (name not in self._lines or self._known(name).token != _state(there))
+        return there is not None and (name not in self._lines or self._known(name).token != there.state)
 
     def _known(self, name: str) -> _Known:
         return _Known(*json.loads(self._lines[name])[1:])
@@ -151,7 +151,7 @@ class StoreHome:
                     file: sizes.get((f"{name}/{file}", str(hashes.get(file))), there.size)
                     for file, there in objects.items()
                 }
-                state = _state(objects.get(_MANIFEST, Listed(0, "")))
+                state = objects.get(_MANIFEST, Listed(0, "")).state
                 self._lines[name] = json.dumps([name, state, digest, own, manifest])
                 stream.write(f"\n{self._lines[name]}\n")  # the line before may have been cut by a kill
 
@@ -197,10 +197,6 @@ class StoreHome:
         return there is not None and there.size == size
 
 
-def _state(listed: Listed) -> str:
-    return f"{listed.size} {listed.token}"
-
-
 def _parsed(data: bytes, path: str) -> Plan:
     with contextlib.suppress(ValueError, RecursionError):
         content = json.loads(data)
@@ -231,19 +227,23 @@ def store_home(url: str, workers: Workers, rehash: bool) -> Iterator[StoreHome]:
     if url.startswith("memory:") and workers != 1:
         raise RsbenchError(f"--out {url}: lives in one process: without --workers and --scheduler")
     store = open_store(url)
-    hidden = _hidden(_key(url))
+    hidden = cache_of(url)
     with workplace(hidden, hidden):
         target = StoreTarget(url, None if isinstance(workers, Cluster) else hidden / WORK)
         yield StoreHome(store, hidden, target, rehash)
 
 
-def _hidden(key: str) -> Path:
-    """In the user's cache, else where temporary files go."""
+def cache_of(url: str) -> Path:
+    """Folder for what is known of a store: in the user's cache, else where temporary files go.
+
+    Raises:
+        RsbenchError: neither can be written.
+    """
     for base in (user_cache(), temporary()):
         if base is not None:
             with contextlib.suppress(RsbenchError):
                 check_out(base)
-                return base / "stores" / key
+                return base / "stores" / _key(url)
     raise RsbenchError("no folder for what is being made: set TMPDIR to one that can be written")
 
 

@@ -33,7 +33,8 @@ HIDDEN = ".rsbench"
 """Name of the hidden folder; it may be deleted when no command runs."""
 WORK = "work"
 """Name of the folder in it for what is not complete; fresh for each command."""
-_LOCK = "lock"
+LOCK = "lock"
+"""Name of the file in it that is locked; without it the folder is not rsbench's."""
 _BEAT_S = 15.0
 _TRIES = 100
 _DEAD_S = 90.0
@@ -56,7 +57,7 @@ def workplace(out: Path, hidden: Path | None = None) -> Iterator[Path]:
     fresh = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
     descriptor = _take(out, hidden)
     done = threading.Event()
-    threading.Thread(target=_beat, args=(hidden / _LOCK, done), daemon=True).start()
+    threading.Thread(target=_beat, args=(hidden / LOCK, done), daemon=True).start()
     try:
         remove(hidden / WORK)
         (hidden / WORK).mkdir()
@@ -70,7 +71,7 @@ def refuse_url(out: Path) -> None:
     """Raise RsbenchError for what was a URL before it became a path: it would be a folder of a strange name."""
     if re.match(r"[a-z][a-z0-9+.-]+:/", out.as_posix()):
         url = out.as_posix().replace(":/", "://", 1)
-        raise RsbenchError(f"{url}: is a URL, which only 'rsbench generate' takes for --out; give a folder")
+        raise RsbenchError(f"{url}: is a URL, which this command does not take there; give a folder")
 
 
 def remove(path: Path) -> None:
@@ -137,7 +138,7 @@ def _take(out: Path, hidden: Path) -> int:
             hidden.mkdir(parents=True, exist_ok=True)
             _refuse_foreign(hidden)
             flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
-            descriptor = os.open(hidden / _LOCK, flags, 0o644)
+            descriptor = os.open(hidden / LOCK, flags, 0o644)
         except OSError as error:
             gone = isinstance(error, FileNotFoundError | FileExistsError) and not hidden.is_file()
             if gone and tries > 1:  # its last owner removed it meanwhile
@@ -145,7 +146,7 @@ def _take(out: Path, hidden: Path) -> int:
             raise RsbenchError(f"{out}: cannot be written: {error.strerror}; choose another folder") from error
         try:
             _claim(out, descriptor)
-            if _is_at(hidden / _LOCK, descriptor):
+            if _is_at(hidden / LOCK, descriptor):
                 return descriptor
         except BaseException:
             os.close(descriptor)
@@ -156,7 +157,7 @@ def _take(out: Path, hidden: Path) -> int:
 
 def _refuse_foreign(hidden: Path) -> None:
     names = {path.name for path in hidden.iterdir()}
-    if hidden.is_symlink() or (names and _LOCK not in names):
+    if hidden.is_symlink() or (names and LOCK not in names):
         raise RsbenchError(f"{hidden}: is not a folder that rsbench made; move it away or choose another folder")
 
 
@@ -226,8 +227,8 @@ def _leave(hidden: Path, descriptor: int, fresh: list[Path]) -> None:
     with contextlib.suppress(OSError):
         remove(hidden / WORK)
         os.ftruncate(descriptor, 0)
-        if [path.name for path in hidden.iterdir()] == [_LOCK]:
-            (hidden / _LOCK).unlink()
+        if [path.name for path in hidden.iterdir()] == [LOCK]:
+            (hidden / LOCK).unlink()
             hidden.rmdir()
         for folder in fresh:
             folder.rmdir()
