@@ -248,7 +248,7 @@ def test_a_file_url_is_a_folder(tmp_path: Path) -> None:
         ("simplecache::s3://bucket/x", "must be a plain URL, such as s3://bucket/folder"),
         ("s3://", "must be a plain URL, such as s3://bucket/folder"),
         ("s3://bucket/[x]", "must be a plain URL, such as s3://bucket/folder"),
-        ("ftp://me:secret@host::s3://x", "--out ftp://host::s3://x: must be"),
+        ("ftp://me:secret@host::s3://x", "error: ftp://host::s3://x: must be"),
     ],
 )
 def test_urls_that_cannot_be_taken_are_one_line(out: str, words: str) -> None:
@@ -258,8 +258,8 @@ def test_urls_that_cannot_be_taken_are_one_line(out: str, words: str) -> None:
 
 
 def test_other_commands_name_the_url_that_they_do_not_take() -> None:
-    for command in (("simulate", "noise"), ("reproduce", "fig3")):
-        assert_refused(run_here(*command, "--out", "s3://bucket/x"), "s3://bucket/x: is a URL, which only")
+    for command in (("reproduce", "fig3"), ("leaderboard", "export", "points")):
+        assert_refused(run_here(*command, "--out", "s3://bucket/x"), "s3://bucket/x: is a URL, which this command")
     assert not Path("s3:").exists()
 
 
