@@ -174,58 +174,71 @@ def _command(send: Callable[[], object], folder: Path) -> list[str]:
 
 
 @contextmanager
-def _counted(kind: type, monkeypatch: pytest.MonkeyPatch, left: list[int]) -> Iterator[None]:
-    """Every operation on the store from the one of this number on is a ``_Stop``."""
+def _stopped(number: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Before this operation on the store or on files here; nothing more happens on either."""
+    left = itertools.count(number - 1, -1)
 
     def counted(real: Callable[..., Any]) -> Callable[..., Any]:
         def operation(*arguments: Any, **options: Any) -> Any:
-            left[0] -= 1
-            if left[0] <= 0:
+            if next(left) <= 0:
                 raise _Stop
             return real(*arguments, **options)
 
         return operation
 
+    kind = fsspec.filesystem("memory").__class__
+    operations = [(kind, name) for name in ("put_file", "get_file", "find", "rm_file")]
     with monkeypatch.context() as patch:
-        for name in ("put_file", "get_file", "find", "rm_file"):
-            patch.setattr(kind, name, counted(getattr(kind, name)))
+        for owner, name in [*operations, (os, "replace"), (mirror._Mirror, "_drop")]:
+            patch.setattr(owner, name, counted(getattr(owner, name)))
         yield
 
 
-@pytest.mark.parametrize("elsewhere", [False, True])
+def _others(memory: Any, cache: Path) -> dict[str, bytes]:
+    """They changed the store after a command here, whose next one was killed before it sent anything."""
+    (folder,) = cache.rglob("results")
+    (folder / "stray").write_bytes(b"not sent")
+    memory.rm("/bucket/mine/end.json")
+    theirs = {"data/0.bin": b"theirs", "more/1": b"theirs", "more/2": b"theirs"}
+    for path, data in theirs.items():
+        memory.pipe(f"/bucket/mine/{path}", data)
+    return theirs
+
+
+@pytest.mark.parametrize("where", ["here", "elsewhere", "overtaken"])
 def test_stopped_before_any_operation_it_goes_on_to_the_same_bytes(
-    elsewhere: bool,
-    memory: Any,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    open_mirrors: queue.Queue[Any],
+    where: str, memory: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, open_mirrors: queue.Queue[Any]
 ) -> None:
     """On the machine of the one that was stopped, and on another one; where the end is, all of it is."""
 
     def run() -> list[str]:
+        open_mirrors.queue.clear()
         with mirrored(URL) as folder:
             return _command(open_mirrors.get().send, folder)
 
-    for stop in itertools.count(1):
+    for number in itertools.count(1):
         memory.store.clear()
         shutil.rmtree(tmp_path / "cache", ignore_errors=True)
         memory.pipe("/bucket/mine/notes.txt", b"not ours")
+        expected = {**_RESULTS, "notes.txt": b"not ours"}
+        if where == "overtaken":
+            run()
+            expected |= _others(memory, tmp_path / "cache")
         try:
-            with _counted(type(memory), monkeypatch, [stop]):
+            with _stopped(number, monkeypatch):
                 run()
         except _Stop:
             there = stored(memory)
-            assert "end.json" not in there or _RESULTS.items() <= there.items()
+            assert "end.json" not in there or expected.items() <= there.items()
         else:
             break
-        kept = sum("chunks/" in path or path.startswith("data/") for path in there)
-        if elsewhere:
+        if where == "elsewhere":
             shutil.rmtree(tmp_path / "cache")
-        open_mirrors.queue.clear()
-        made = run()
-        assert len({f"data/{Path(path).name}" for path in there if path.endswith(".bin")} & set(made)) == 0, kept
-        assert stored(memory) == {**_RESULTS, "notes.txt": b"not ours"}
-    assert stop > 20
+        assert not {f"data/{Path(path).name}" for path in there if path.endswith(".bin")} & set(run()), (
+            "made again"
+        )
+        assert stored(memory) == expected
+    assert number > 15
 
 
 # What is there, and what others do there
