@@ -167,7 +167,6 @@ def _command(send: Callable[[], object], folder: Path) -> list[str]:
         for name in (name for name in _RESULTS if name.startswith("data/")):
             if not (folder / name).is_file():
                 write_bytes(folder / name, (hidden / "chunks" / Path(name).name).read_bytes())
-        send()
         shutil.rmtree(hidden / "chunks", ignore_errors=True)
         write_bytes(folder / "end.json", _RESULTS["end.json"])
     return made
@@ -230,6 +229,7 @@ def test_stopped_before_any_operation_it_goes_on_to_the_same_bytes(
         except _Stop:
             there = stored(memory)
             assert "end.json" not in there or expected.items() <= there.items()
+            assert "plan.json" in there or not any(path.endswith(".bin") for path in there)
         else:
             break
         if where == "elsewhere":
@@ -280,6 +280,28 @@ def test_what_others_change_is_brought_and_nothing_else(memory: Any, monkeypatch
         assert brought == ["a/x", "d/x"] and not (folder / "b").exists()
         assert {name: (folder / name / "x").read_text() for name in "acd"} == {"a": "new", "c": "old", "d": "new"}
     assert stored(memory) == {"a/x": b"new", "c/x": b"old", "d/x": b"new"}
+    times = {path: memory.info(path)["created"] for path in memory.find("/bucket/mine")}
+    with mirrored(URL):
+        assert brought == ["a/x", "d/x"]
+    assert times == {path: memory.info(path)["created"] for path in memory.find("/bucket/mine")}
+
+
+def test_what_a_command_removes_while_it_is_sent_is_no_fault(
+    memory: Any, monkeypatch: pytest.MonkeyPatch, open_mirrors: queue.Queue[Any]
+) -> None:
+    with mirrored(URL) as folder:
+        (folder / "a").write_text("a")
+        (folder / "b").write_text("b")
+        real = mirror.Store.upload
+        with monkeypatch.context() as patch:
+            patch.setattr(
+                mirror.Store,
+                "upload",
+                lambda self, files: ((folder / "a").unlink(missing_ok=True), real(self, files)),
+            )
+            open_mirrors.get().send()
+        assert stored(memory).keys() == {"b", ".rsbench/lock"}
+    assert stored(memory) == {"b": b"b"}
 
 
 @pytest.mark.usefixtures("open_mirrors")
@@ -322,23 +344,21 @@ def test_a_store_that_refuses_is_told_before_the_work(memory: Any, monkeypatch: 
 def test_a_store_that_fails_later_loses_nothing(
     memory: Any, monkeypatch: pytest.MonkeyPatch, open_mirrors: queue.Queue[Any]
 ) -> None:
-    def fail(send: Callable[[], object], folder: Path) -> None:
-        _command(send, folder)
-        monkeypatch.setattr(type(memory), "put_file", _refuse)
+    with mirrored(URL) as folder:
+        write_bytes(folder / "plan.json", b"old")
+    real = type(memory).put_file
 
-    with monkeypatch.context() as patch:
-        real = type(memory).put_file
-        with (
-            pytest.raises(
-                RsbenchError, match=r"^memory://bucket/mine: cannot write end\.json: denied; .*: the same"
-            ),
-            mirrored(URL) as folder,
-        ):
-            fail(open_mirrors.get().send, folder)
-        patch.setattr(type(memory), "put_file", real)
-        assert "end.json" not in stored(memory)
-        with mirrored(URL) as folder:
-            assert _command(open_mirrors.get().send, folder) == []
+    def refuse(self: Any, here: str, there: str, **more: Any) -> None:
+        (real if there.endswith("plan.json") else _refuse)(self, here, there, **more)
+
+    words = r"^memory://bucket/mine: cannot write data/0\.bin: denied; .*cache/rsbench/stores/.*: the same command"
+    with monkeypatch.context() as patch, pytest.raises(RsbenchError, match=words), mirrored(URL) as folder:
+        patch.setattr(type(memory), "put_file", refuse)
+        assert len(_command(lambda: None, folder)) == 4
+    assert stored(memory).items() == {"plan.json": b"plan", ".rsbench/lock": b""}.items()
+    open_mirrors.queue.clear()
+    with mirrored(URL) as folder:
+        assert _command(lambda: None, folder) == []
     assert stored(memory) == _RESULTS
 
 
