@@ -215,6 +215,7 @@ def test_stopped_before_any_operation_it_goes_on_to_the_same_bytes(
         with mirrored(URL) as folder:
             return _command(open_mirrors.get().send, folder)
 
+    sent = set[str]()
     for number in itertools.count(1):
         memory.store.clear()
         shutil.rmtree(tmp_path / "cache", ignore_errors=True)
