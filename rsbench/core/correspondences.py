@@ -18,7 +18,7 @@ numbers, below the noise of keypoints and the distance between two of them."""
 BEYOND_PX = float(np.nextafter(JOIN_TOLERANCE_PX, 1.0))
 
 _TRACK_HALF: dict[Side, list[int]] = {"left": [0, 1, 4, 5], "right": [2, 3, 6, 7]}
-_COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8}
+_COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8, "lines": 16}
 
 
 def _none(columns: int) -> FloatArray:
@@ -43,6 +43,9 @@ class Correspondences:
     """(n, 4) xl, yl, xr, yr: left to right in frame 1."""
     tracks: FloatArray = field(default_factory=lambda: _none(8))
     """(n, 8) xl0, yl0, xr0, yr0, xl1, yl1, xr1, yr1: one point in all four images."""
+    lines: FloatArray = field(default_factory=lambda: _none(16))
+    """(n, 16) two ends xa, ya, xb, yb in left 0, right 0, left 1, right 1: one straight line in all four images.
+    The ends of one image are no points of another: the line alone is the same."""
     gyro: FloatArray = field(default_factory=lambda: _none(4))
     """(n, 4) tau, w: what a gyroscope says of the rotation between the rows, dR/dtau = [w]x R, rad per period."""
 

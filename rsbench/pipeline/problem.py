@@ -27,7 +27,12 @@ COLUMNS = {
 }
 _CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 _LINES = (".jsonl", ".ndjson")
-_SENSED = {"gyro": "tau, wx, wy, wz", "gravity": "tau, gx, gy, gz"}
+_BESIDE = {
+    "gyro": "tau, wx, wy, wz",
+    "gravity": "tau, gx, gy, gz",
+    "lines": ", ".join(f"{xy}{image}{end}" for image in ("l0", "r0", "l1", "r1") for end in "ab" for xy in "xy"),
+}
+"""What most solvers do without, and JSON alone holds."""
 SUFFIXES = (".json", *_LINES, ".npz")
 EXAMPLE = shipped_folder("examples", "_docs/examples") / "problem.json"
 """A small problem that every installation has."""
@@ -58,6 +63,7 @@ class _Content(Scanning):
     tracks: _Rows = ()
     gyro: _Rows = ()
     gravity: _Rows = ()
+    lines: _Rows = ()
 
 
 def read_problems(source: str | Path, stdin: TextIO) -> Iterator[Problem | RsbenchError]:
@@ -184,7 +190,7 @@ def parse_problem(text: str, where: str, name: str = "") -> Problem:
     data = parse_json(text, where)  # reads NaN, which parse_card refuses with the field's name
     content = parse_card(_Content, data, where)
     _check_sets(data, where)
-    given = COLUMNS | _SENSED
+    given = COLUMNS | _BESIDE
     for key, columns in given.items():
         _check_widths(getattr(content, key), key, columns, where)
     sets = {key: getattr(content, key) for key in given}
@@ -206,7 +212,7 @@ def _check_sets(data: Mapping[str, Any], where: str) -> None:
 
 
 def _check_widths(rows: _Rows, name: str, columns: str, where: str) -> None:
-    width, unit = columns.count(",") + 1, "" if name in _SENSED else " in pixels"
+    width, unit = columns.count(",") + 1, " in pixels" if name in (*COLUMNS, "lines") else ""
     for k, row in enumerate(rows):
         if len(row) != width:
             raise RsbenchError(f"{where}: {name}[{k}] = {list(row)}: must be {width} numbers{unit}: {columns}")

@@ -7,7 +7,7 @@ import pytest
 
 from rsbench.core.correspondences import Correspondences
 
-COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8}
+COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8, "lines": 16}
 
 
 def test_absent_sets_are_empty_with_their_columns() -> None:

@@ -6,6 +6,7 @@ Row times come from the true rows, solved for exactly; a solver only ever sees t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal, get_args
 
 import numpy as np
@@ -16,7 +17,7 @@ from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.projection import ROW_TOLERANCE_PX, ProjectionStatus, back_project, project_at, rs_project
-from rsbench.core.rig import Side, StereoRig
+from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.motions import make_motion
@@ -37,6 +38,9 @@ class SimulationOptions:
     """Matches over time per camera, each camera with points of its own."""
     tracks: int = 0
     """Points seen in all four images."""
+    lines: int = 0
+    """Straight lines seen in all four images, each by two ends that are other points of it in every image; a
+    rolling shutter reads each end at its row's time, and bends the line between them."""
     noise_px: float = 0.0
     """Standard deviation of the noise on every pixel coordinate."""
     outlier_ratio: float = 0.0
@@ -63,6 +67,7 @@ class SimulationOptions:
     def __post_init__(self) -> None:
         check_whole("pairs", self.pairs, 0)
         check_whole("tracks", self.tracks, 0)
+        check_whole("lines", self.lines, 0)
         check_number("noise_px", self.noise_px, 0.0)
         check_number("outlier_ratio", self.outlier_ratio, 0.0, 1.0)
         check_number("outlier_px", self.outlier_px, 0.0)
@@ -86,7 +91,7 @@ class Simulation:
     shutter: RollingShutter
     motion: Motion
     outliers: dict[str, np.ndarray]
-    """Per set (``left``, ``right``, ``tracks``), which matches are outliers."""
+    """Per set (``left``, ``right``, ``tracks``, ``lines``), which matches are outliers."""
 
 
 def random_direction(rng: np.random.Generator) -> FloatArray:
@@ -133,6 +138,10 @@ def simulate(
         outliers[name] = _displace(noisy[name], options, wrong)
     noisy["gyro"] = _gyro(motion, options, rng.spawn(1)[0])
     noisy["gravity"] = _gravity(motion, options, rng.spawn(1)[0])
+    scene, noise, wrong = rng.spawn(3)
+    exact = _exact_lines(rig, shutter, motion, options, scene)
+    noisy["lines"] = exact + options.noise_px * noise.standard_normal(exact.shape)
+    outliers["lines"] = _displace(noisy["lines"], options, wrong)
     return Simulation(
         correspondences=Correspondences(**noisy),
         rig=rig,
@@ -206,6 +215,41 @@ def _exact(
     if total < count:
         raise ValueError(f"the motion leaves only {total} of {count} points in view; use a slower one")
     return np.concatenate(found)[:count]
+
+
+_SLIDE = 0.2
+"""Share of a line's length by which its ends differ between images, at most."""
+
+
+def _exact_lines(
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    options: SimulationOptions,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Noise-free ends (lines, 16) of lines that all four images see."""
+    camera, count = rig.camera, options.lines
+    found = [np.zeros((0, 16))]
+    for _ in range(60):
+        total = sum(len(each) for each in found)
+        if total >= count:
+            return np.concatenate(found)[:count]
+        draws = rng.uniform(size=(2 * (count - total) + 8, 14))
+        places = draws[:, :6].reshape(-1, 3)
+        pixels = places[:, :2] * (camera.width - 1, camera.height - 1)
+        depth = _depths(options, places[:, 2], camera.unproject(pixels))
+        ends = back_project(rig, shutter, motion, "left", 0, pixels, depth).reshape(-1, 2, 3)
+        rows = pixels[:, 1].reshape(-1, 2)
+        seen = []
+        for k, (frame, side) in enumerate(product(FRAMES, SIDES)):
+            share = _SLIDE * draws[:, 6 + 2 * k : 8 + 2 * k]
+            # From either end towards the other.
+            points = ends + share[..., None] * (ends[:, ::-1] - ends)
+            seen += [_seen_once(rig, shutter, motion, side, frame, points[:, e], rows[:, e]) for e in (0, 1)]
+        stacked = np.concatenate(seen, axis=1)
+        found.append(stacked[np.all(np.isfinite(stacked), axis=1)])
+    raise ValueError(f"the motion leaves fewer than {count} lines in view; use a slower one")
 
 
 _SECANT_STEPS = 12
