@@ -48,12 +48,13 @@ _COLUMNS: dict[View, int] = {(0, "left"): 0, (0, "right"): 2, (1, "left"): 4, (1
 
 
 class Triplets(NamedTuple):
-    """Points known in one frame and rays of the other; batch axes (...)."""
+    """Features known in one frame and seen in the other: each says c . P = 0 twice; batch axes (...)."""
 
     X: FloatArray
-    """(..., n, 3) metres, in the body of the frame that knows them."""
-    x: FloatArray
-    """(..., n, 3) rays of the third image, z = 1."""
+    """(..., n, k, 3) k points of a feature, metres, in the body of the frame that knows them."""
+    c: FloatArray
+    """(..., n, k, 2 / k, 3) what each is at right angles to in the third image's camera: (1, 0, -x) and (0, 1, -y)
+    of a point's ray (x, y, 1)."""
     offset: FloatArray
     """(..., n, 3)"""
     backward: FloatArray
@@ -63,32 +64,41 @@ class Triplets(NamedTuple):
     def of(cls, tracks: FloatArray, views: Sequence[View], rig: StereoRig) -> Triplets:
         """Of tracks (..., n, 8) with depth in both frames; one view for each of n."""
         shape = (*tracks.shape[:-1], 3)
-        known = [stereo_points(tracks.reshape(-1, 8)[:, columns:], rig).reshape(shape) for columns in (0, 4)]
+        X = [stereo_points(tracks.reshape(-1, 8)[:, columns:], rig).reshape(shape) for columns in (0, 4)]
         backward = np.array([frame == 0 for frame, _ in views])
         pixels = np.stack([tracks[..., k, c : c + 2] for k, c in enumerate(_COLUMNS[v] for v in views)], axis=-2)
+        known = np.where(backward[:, None], X[1], X[0])
         return cls(
-            np.where(backward[:, None], known[1], known[0]),
-            rig.camera.unproject(pixels),
+            known[..., None, :],
+            point_rows(rig.camera.unproject(pixels))[..., None, :, :],
             np.broadcast_to([rig.offset(side) for _, side in views], shape),
             np.broadcast_to(backward, shape[:-1]),
         )
 
 
+def point_rows(rays: FloatArray) -> FloatArray:
+    """Rows (..., 2, 3) at right angles to rays (..., 3), z = 1."""
+    out = np.zeros((*rays.shape[:-1], 2, 3))
+    out[..., 0, 0] = out[..., 1, 1] = 1.0
+    out[..., 2] = -rays[..., :2]
+    return out
+
+
 def newton(triplets: Triplets) -> Pose:
-    """Motion (..., 3, 3), (..., 3) of n >= 3 points by Gauss-Newton steps, of three Newton's; NaN where open."""
-    X, x, offset, backward = triplets
-    batch = X.shape[:-2]
+    """Motion (..., 3, 3), (..., 3) of n >= 3 features by Gauss-Newton steps, of three Newton's; NaN where open."""
+    X, c, offset, back = triplets.X, triplets.c, triplets.offset[..., None, :], triplets.backward[..., None, None]
+    batch = X.shape[:-3]
     R: FloatArray = np.broadcast_to(np.eye(3), (*batch, 3, 3))
-    d, eye, back = np.zeros((*batch, 3)), np.eye(3), backward[..., None, None]
+    d, eye, turned = np.zeros((*batch, 3)), np.eye(3), back[..., None]
     for _ in range(_STEPS):
-        Q, inverse = R[..., None, :, :], np.swapaxes(R, -1, -2)[..., None, :, :]
-        moved, rest = (Q @ X[..., None])[..., 0], X - d[..., None, :]
-        P = np.where(backward[..., None], (inverse @ rest[..., None])[..., 0], moved + d[..., None, :]) + offset
-        by_turn = np.where(back, inverse @ hat(rest), -hat(moved))
-        J = np.concatenate([by_turn, np.where(back, -inverse, eye)], axis=-1)
-        # x P_z = P_x and y P_z = P_y, over the depth.
-        A = (J[..., :2, :] - x[..., :2, None] * J[..., 2:, :]) / P[..., 2:, None]
-        e = P[..., :2] / P[..., 2:] - x[..., :2]
+        Q, inverse = R[..., None, None, :, :], np.swapaxes(R, -1, -2)[..., None, None, :, :]
+        moved, rest = (Q @ X[..., None])[..., 0], X - d[..., None, None, :]
+        P = np.where(back, (inverse @ rest[..., None])[..., 0], moved + d[..., None, None, :]) + offset
+        by_turn = np.where(turned, inverse @ hat(rest), -hat(moved))
+        J = np.concatenate([by_turn, np.where(turned, -inverse, eye)], axis=-1)
+        # c . P = 0, over the depth.
+        A = (c @ J) / P[..., 2:, None]
+        e = (c @ P[..., None])[..., 0] / P[..., 2:]
         step = _step(A.reshape(*batch, -1, 6), e.reshape(*batch, -1))
         R, d = so3.exp(step[..., :3]) @ R, d + step[..., 3:]
     return Pose(R, d)

@@ -47,8 +47,10 @@ def test_points_known_in_frame_0_are_poselib_s_generalised_absolute_pose() -> No
         s = trial(seed, noise_px=0.5)
         triplets = Triplets.of(s.correspondences.tracks, views, RIG)
         pose = newton(triplets)
-        unit = triplets.x / np.linalg.norm(triplets.x, axis=1, keepdims=True)
-        roots = poselib.gp3p(-triplets.offset, unit, triplets.X)
+        seen = s.correspondences.tracks[[0, 1, 2], [[4, 6, 4], [5, 7, 5]]].T
+        rays = RIG.camera.unproject(seen)
+        unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        roots = poselib.gp3p(-triplets.offset, unit, triplets.X[:, 0])
         apart.append(min(max(np.abs(r.R - pose.R).max(), np.abs(r.t - pose.t).max()) for r in roots))
     # Half the digits are left of close roots in PoseLib's polynomial of degree eight.
     assert np.median(apart) < 1e-9 and np.sum(np.array(apart) < 1e-6) >= 8

@@ -9,7 +9,6 @@ degrees of freedom.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
@@ -160,9 +159,3 @@ def _solve(A: FloatArray, b: FloatArray) -> FloatArray:
     N[:, diagonal, diagonal] *= 1.0 + _HELD
     N[:, diagonal, diagonal] += 1e-300
     return np.asarray(np.linalg.solve(N, At @ b))
-
-
-def triplet_rows(rays: FloatArray, images: Sequence[int]) -> FloatArray:
-    """Rows (n, len(images), 2, 3) that a line's two points must be at right angles to in those images."""
-    normals = line_normals(rays)[:, list(images)]
-    return np.repeat(normals[..., None, :], 2, axis=-2)
