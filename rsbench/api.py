@@ -86,7 +86,7 @@ def simulate(
         seed: the same seed gives the same points and noise whatever the other arguments are.
 
     Returns:
-        ``correspondences``, and ``outliers`` with a mask for each of ``left``, ``right``, ``tracks`` and ``lines``.
+        ``correspondences``, and ``outliers`` with a mask for each of ``left``, ``right``, ``tracks``, ``lines``.
 
     Raises:
         ValueError: an argument out of its range, or a motion that leaves too few points in view.

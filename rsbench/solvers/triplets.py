@@ -37,8 +37,9 @@ View = tuple[Literal[0, 1], Side]
 _LEAST = 3
 _STEPS = 8
 _QUICK, _FULL = 10, 50
-_LONGEST = 100.0
-_PATTERNS: tuple[tuple[View, View, View], ...] = (
+LONGEST = 100.0
+"""Metres beyond which a motion is none."""
+PATTERNS: tuple[tuple[View, View, View], ...] = (
     ((1, "left"), (1, "right"), (0, "left")),
     ((1, "right"), (0, "left"), (0, "right")),
 )
@@ -95,7 +96,8 @@ def newton(triplets: Triplets) -> Pose:
         moved, rest = (Q @ X[..., None])[..., 0], X - d[..., None, None, :]
         P = np.where(back, (inverse @ rest[..., None])[..., 0], moved + d[..., None, None, :]) + offset
         by_turn = np.where(turned, inverse @ hat(rest), -hat(moved))
-        J = np.concatenate([by_turn, np.where(turned, -inverse, eye)], axis=-1)
+        by_shift = np.broadcast_to(np.where(turned, -inverse, eye), by_turn.shape)
+        J = np.concatenate([by_turn, by_shift], axis=-1)
         # c . P = 0, over the depth.
         A = (c @ J) / P[..., 2:, None]
         e = (c @ P[..., None])[..., 0] / P[..., 2:]
@@ -136,13 +138,13 @@ class TripletSolver(Solver):
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        tracks = _with_depths(correspondences.tracks)
+        tracks = with_depths(correspondences.tracks)
         if len(tracks) < _LEAST:
             return MotionEstimate.failed(f"{len(tracks)} tracks with positive disparities, need {_LEAST}")
         four = np.tile(tracks, (4, 1))
         with np.errstate(all="ignore"):
             pose = newton(Triplets.of(four, [view for view in _ALL for _ in tracks], rig))
-        start = _reported(pose)
+        start = motion_of(pose)
         return self._refined(start, tracks, rig, _FULL) if start.success else start
 
     def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
@@ -156,11 +158,11 @@ class TripletSolver(Solver):
     ) -> Iterable[list[MotionEstimate]]:
         def solve(tracks: FloatArray) -> Iterable[list[MotionEstimate]]:
             with np.errstate(all="ignore"):
-                found = [newton(Triplets.of(tracks, pattern, rig)) for pattern in _PATTERNS]
+                found = [newton(Triplets.of(tracks, pattern, rig)) for pattern in PATTERNS]
             each = (zip(*pose, strict=True) for pose in found)
-            return [[_reported(Pose(*one)) for one in poses] for poses in zip(*each, strict=True)]
+            return [[motion_of(Pose(*one)) for one in poses] for poses in zip(*each, strict=True)]
 
-        return propose_together(samples, _LEAST, _with_depths, solve)
+        return propose_together(samples, _LEAST, with_depths, solve)
 
     def improve(
         self,
@@ -170,7 +172,7 @@ class TripletSolver(Solver):
         shutter: RollingShutter,
         quick: bool = False,
     ) -> MotionEstimate:
-        tracks = _with_depths(correspondences.tracks)
+        tracks = with_depths(correspondences.tracks)
         if len(tracks) < _LEAST:
             return self.estimate(correspondences, rig, shutter)
         return self._refined(motion, tracks, rig, _QUICK if quick else _FULL)
@@ -178,18 +180,19 @@ class TripletSolver(Solver):
     def _refined(self, motion: MotionEstimate, tracks: FloatArray, rig: StereoRig, most: int) -> MotionEstimate:
         still = RollingShutter(height=rig.camera.height, readout_ratio=0.0)
         packed = pack(Correspondences(tracks=tracks), rig, still)
-        end = levenberg_marquardt(packed.normal_equations, packed.theta(motion.w, motion.d), most, _LONGEST)
+        end = levenberg_marquardt(packed.normal_equations, packed.theta(motion.w, motion.d), most, LONGEST)
         w, d = packed.motion(end.theta)
-        return _reported(Pose(so3.exp(w), d))
+        return motion_of(Pose(so3.exp(w), d))
 
 
-def _with_depths(tracks: FloatArray) -> FloatArray:
+def with_depths(tracks: FloatArray) -> FloatArray:
     """Tracks (m, 8) with a positive disparity in both frames, of (n, 8)."""
     near = with_depth(tracks)
     return near[near[:, 4] - near[:, 6] > 0.0]
 
 
-def _reported(pose: Pose) -> MotionEstimate:
+def motion_of(pose: Pose) -> MotionEstimate:
+    """The estimate that a motion is; a failure where it is not finite."""
     if not (np.all(np.isfinite(pose.R)) and np.all(np.isfinite(pose.t))):
         return MotionEstimate.failed("the points leave the motion open")
     return MotionEstimate(w=so3.log(pose.R), d=pose.t, success=True, metric=True)

@@ -1,8 +1,8 @@
 """Errors of straight lines in the four images of a global shutter, and their normal equations.
 
 A 3-D line has four unknowns. Here they are where it passes the two ends that the left camera saw at time 0, in
-that image across the line that was seen, and the inverse depths there: in pixels, the images of the line are nearly
-linear in them at any distance. An error is the distance of an observed end from the line's image. For a given
+that image across the line that was seen, and the inverse depths there: its images are nearly linear in them at any
+distance. An error is the distance of an observed end from the line's image. For a given
 motion the four are eliminated by Gauss-Newton steps, each line alone; what is left of its eight errors has four
 degrees of freedom.
 """
