@@ -15,7 +15,7 @@ has no depth, and is left out. Lines that are all parallel leave the shift along
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple, final
@@ -26,7 +26,7 @@ import scipy
 from rsbench.arguments import check_number, check_whole
 from rsbench.core import so3
 from rsbench.core.correspondences import BoolArray, Correspondences
-from rsbench.core.rig import FRAMES, SIDES, StereoRig
+from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -43,11 +43,19 @@ from rsbench.solvers.engine.line_errors import (
 from rsbench.solvers.engine.optimise import levenberg_marquardt
 from rsbench.solvers.engine.packed import Packed, inverse_definite, pack
 from rsbench.solvers.engine.stereo_points import stereo_points
-from rsbench.solvers.triplets import LONGEST, PATTERNS, Triplets, motion_of, newton, point_rows, with_depths
+from rsbench.solvers.triplets import (
+    ALL,
+    LONGEST,
+    PATTERNS,
+    Triplets,
+    View,
+    motion_of,
+    newton,
+    point_rows,
+    with_depths,
+)
 
 _LEAST = 3
-_IMAGES = {(frame, side): 2 * frame + k for frame in FRAMES for k, side in enumerate(SIDES)}
-_ALL = ((1, "left"), (1, "right"), (0, "left"), (0, "right"))
 _QUICK, _FULL = 5, 50
 _SIGMAS = 2.5
 _TRACK_FREEDOM = 5
@@ -80,11 +88,11 @@ class _Features(NamedTuple):
             np.swapaxes(np.concatenate([seen, normals]), 0, 1),
         )
 
-    def triplets(self, chosen: IntArray, views: tuple[tuple[int, str], ...], rig: StereoRig) -> Triplets:
+    def triplets(self, chosen: IntArray, views: Sequence[View], rig: StereoRig) -> Triplets:
         """Of features (..., n), each known in the frame that its view is not of."""
         frames = np.array([frame for frame, _ in views])
-        images = np.array([_IMAGES[view] for view in views])
-        offsets = np.array([rig.offset("left" if side == "left" else "right") for _, side in views])
+        images = np.array([2 * frame + SIDES.index(side) for frame, side in views])
+        offsets = np.array([rig.offset(side) for _, side in views])
         return Triplets(
             self.X[1 - frames, chosen],
             self.c[images, chosen][..., None, :],
@@ -236,7 +244,7 @@ class LineTripletSolver(Solver):
 
     def _of_all(self, problem: _Problem) -> MotionEstimate:
         every = np.arange(problem.num_data[0])
-        views = tuple(view for view in _ALL for _ in every)
+        views = [view for view in ALL for _ in every]
         with np.errstate(all="ignore"):
             start = motion_of(newton(problem.features.triplets(np.tile(every, 4), views, problem.rig)))
         return problem.descent(start, np.ones(len(every), dtype=np.bool_), _FULL) if start.success else start

@@ -44,7 +44,7 @@ PATTERNS: tuple[tuple[View, View, View], ...] = (
     ((1, "right"), (0, "left"), (0, "right")),
 )
 """The third images of the points of a sample: two and one of a frame, one and two."""
-_ALL: tuple[View, ...] = ((1, "left"), (1, "right"), (0, "left"), (0, "right"))
+ALL: tuple[View, ...] = ((1, "left"), (1, "right"), (0, "left"), (0, "right"))
 _COLUMNS: dict[View, int] = {(0, "left"): 0, (0, "right"): 2, (1, "left"): 4, (1, "right"): 6}
 
 
@@ -143,7 +143,7 @@ class TripletSolver(Solver):
             return MotionEstimate.failed(f"{len(tracks)} tracks with positive disparities, need {_LEAST}")
         four = np.tile(tracks, (4, 1))
         with np.errstate(all="ignore"):
-            pose = newton(Triplets.of(four, [view for view in _ALL for _ in tracks], rig))
+            pose = newton(Triplets.of(four, [view for view in ALL for _ in tracks], rig))
         start = motion_of(pose)
         return self._refined(start, tracks, rig, _FULL) if start.success else start
 

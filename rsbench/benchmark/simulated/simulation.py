@@ -241,7 +241,7 @@ def _exact_lines(
         depth = _depths(options, places[:, 2], camera.unproject(pixels))
         ends = back_project(rig, shutter, motion, "left", 0, pixels, depth).reshape(-1, 2, 3)
         rows = pixels[:, 1].reshape(-1, 2)
-        seen = []
+        seen = list[FloatArray]()
         for k, (frame, side) in enumerate(product(FRAMES, SIDES)):
             share = _SLIDE * draws[:, 6 + 2 * k : 8 + 2 * k]
             # From either end towards the other.

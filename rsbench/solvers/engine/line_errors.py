@@ -158,4 +158,4 @@ def _solve(A: FloatArray, b: FloatArray) -> FloatArray:
     diagonal = np.arange(N.shape[-1])
     N[:, diagonal, diagonal] *= 1.0 + _HELD
     N[:, diagonal, diagonal] += 1e-300
-    return np.asarray(np.linalg.solve(N, At @ b))
+    return np.linalg.solve(N, At @ b).astype(np.float64)
