@@ -1,8 +1,8 @@
 """Straight edges of a stereo rig over two frames: OpenCV's LSD, SIFT descriptors along them, mutual check, loops.
 
 LSD runs at the scale of the image: at OpenCV's default, 0.8, it reports every segment an eighth of a pixel too far
-left and up (measured 0.118, 0.126 px; 0.002, 0.001 px at scale 1). Positions then follow this package's convention,
-centre of the top-left pixel (0, 0). LSD directs a segment by which of its sides is brighter, and so are matches.
+left and up (measured 0.118, 0.126 px; 0.002, 0.001 px at scale 1). Positions then follow this package's
+convention, centre of the top-left pixel (0, 0). LSD directs a segment by which of its sides is brighter, and so are matches.
 
 R. Grompone von Gioi, J. Jakubowicz, J.-M. Morel, G. Randall, LSD: a Line Segment Detector, IPOL 2012.
 """
@@ -151,8 +151,8 @@ def match_lines(
 ) -> FloatArray:
     """Lines (n, 16) of ``Correspondences`` in the four images (H, W[, 3]) of a rig over two frames.
 
-    Their four matches close the loop L0-R0-R1-L1-L0. There may be none. Raises ValueError when the images differ in
-    size or are of another type.
+    Their four matches close the loop L0-R0-R1-L1-L0. There may be none. Raises ValueError when the images differ
+    in size or are of another type.
     """
     options = options or LineOptions()
     images = {"left_0": left_0, "right_0": right_0, "left_1": left_1, "right_1": right_1}
