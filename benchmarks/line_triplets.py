@@ -4,9 +4,9 @@
     python benchmarks/line_triplets.py --data DATA --scene corridor        # its global-shutter frames, `gs/`
 
 Simulated: as many points as lines in four images, 30 % wrong, the motions of the paper. On frames: points by SIFT,
-lines by ``rsbench.vision.lines``, of the images that a global shutter would have seen, which have no photon noise; a
-matched line is right when the median of nine points on it, from the true depth and motion, is within 1.5 px of the
-line in each of the other three images. Medians with exact 95 % intervals.
+lines by ``rsbench.vision.lines``, of the images that a global shutter would have seen, which have no photon noise. A
+matched line is right when nine points on it, from the true depth and motion, are within 1.5 px (their median) of
+the line in each of the other three images. Medians with exact 95 % intervals.
 """
 
 # ruff: noqa: E402
@@ -126,7 +126,8 @@ def told(table: pd.DataFrame) -> str:
         for key in kinds:
             values = group[key].to_numpy(float)
             cells.append(in_words(float(np.median(values)), *median_interval(values)))
-        lines.append(f"| {' | '.join([*cells, f'{group["ms_both"].median():.0f}'])} |")
+        cells.append(f"{group['ms_both'].median():.0f}")
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

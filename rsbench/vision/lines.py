@@ -2,7 +2,8 @@
 
 LSD runs at the scale of the image: at OpenCV's default, 0.8, it reports every segment an eighth of a pixel too far
 left and up (measured 0.118, 0.126 px; 0.002, 0.001 px at scale 1). Positions then follow this package's
-convention, centre of the top-left pixel (0, 0). LSD directs a segment by which of its sides is brighter, and so are matches.
+convention, centre of the top-left pixel (0, 0). LSD directs a segment by
+which of its sides is brighter, and so are matches.
 
 R. Grompone von Gioi, J. Jakubowicz, J.-M. Morel, G. Randall, LSD: a Line Segment Detector, IPOL 2012.
 """
