@@ -4,7 +4,7 @@
     python benchmarks/line_triplets.py --data DATA --scene corridor        # its global-shutter frames, `gs/`
 
 Simulated: as many points as lines in four images, 30 % wrong, the motions of the paper. On frames: points by SIFT,
-lines by ``rsbench.vision.lines``, of the images that a global shutter would have seen, which have no photon noise. A
+lines by ``rsbench.vision.lines``, of the images that a global shutter would have seen, without photon noise. A
 matched line is right when nine points on it, from the true depth and motion, are within 1.5 px (their median) of
 the line in each of the other three images. Medians with exact 95 % intervals.
 """

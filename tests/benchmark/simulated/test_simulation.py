@@ -131,3 +131,28 @@ def test_a_motion_that_loses_the_scene_is_refused() -> None:
 def test_random_motion_has_the_given_magnitudes() -> None:
     motion = random_motion(np.random.default_rng(0), 0.1, 0.4, "twist")
     np.testing.assert_allclose([np.linalg.norm(motion.w), np.linalg.norm(motion.d)], [0.1, 0.4], rtol=1e-12)
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.8])
+def test_lines_are_straight_where_the_shutter_is_global(ratio: float) -> None:
+    """Points of one line in all four images: its four planes meet in it; noise is of the ends alone."""
+    shutter = RollingShutter(height=900, readout_ratio=ratio)
+    options = SimulationOptions(lines=40, tracks=5)
+    c = simulate(RIG, shutter, MOTION, options, np.random.default_rng(1)).correspondences
+    assert c.lines.shape == (40, 16)
+    rays = RIG.camera.unproject(c.lines.reshape(40, 4, 2, 2))
+    planes = np.cross(rays[..., 0, :], rays[..., 1, :])
+    R, t = MOTION.body_from_world(1.0)
+    poses = [np.column_stack([Q, o + RIG.offset(s)]) for Q, o in ((np.eye(3), 0.0 * t), (R, t)) for s in SIDES]
+    in_world = np.stack([planes[:, k] @ pose for k, pose in enumerate(poses)], axis=1)
+    in_world /= np.linalg.norm(in_world, axis=2, keepdims=True)
+    third = np.linalg.svd(in_world, compute_uv=False)[:, 2]
+    assert np.max(third) < 1e-9 if ratio == 0.0 else np.median(third) > 1e-5
+    # Ends are other points in each image: those of frame 0 differ in row between the cameras.
+    assert np.median(np.abs(c.lines[:, 1] - c.lines[:, 5])) > 1.0
+    few = simulate(RIG, shutter, MOTION, replace(options, lines=7), np.random.default_rng(1)).correspondences
+    np.testing.assert_array_equal(few.lines, c.lines[:7])
+    wrong = simulate(RIG, shutter, MOTION, replace(options, outlier_ratio=0.25), np.random.default_rng(1))
+    moved = np.any(wrong.correspondences.lines != c.lines, axis=1)
+    assert np.array_equal(moved, wrong.outliers["lines"]) and np.count_nonzero(moved) == 10
+    np.testing.assert_array_equal(wrong.correspondences.lines[:, :8], c.lines[:, :8])
