@@ -65,7 +65,6 @@ def simulate(
     *,
     pairs: int = 100,
     tracks: int = 100,
-    lines: int = 0,
     noise_px: float = 0.3,
     outlier_ratio: float = 0.0,
     depth: tuple[float, float] = (2.0, 10.0),
@@ -78,7 +77,6 @@ def simulate(
         rig, shutter, motion: what sees, how it reads, how it moves.
         pairs: matches over time of each camera, with points of their own.
         tracks: points seen in all four images.
-        lines: straight lines seen in all four images, each by two ends.
         noise_px: standard deviation of every pixel coordinate.
         outlier_ratio: share of matches whose pixels in frame 1 are wrong, by up to 80 px.
         depth: range of the points' depths in frame 0, metres.
@@ -86,7 +84,7 @@ def simulate(
         seed: the same seed gives the same points and noise whatever the other arguments are.
 
     Returns:
-        ``correspondences``, and ``outliers`` with a mask for each of ``left``, ``right``, ``tracks``, ``lines``.
+        ``correspondences``, and ``outliers`` with a mask for each of ``left``, ``right`` and ``tracks``.
 
     Raises:
         ValueError: an argument out of its range, or a motion that leaves too few points in view.
@@ -95,13 +93,7 @@ def simulate(
     from rsbench.benchmark.simulated.simulation import simulate as simulate_points
 
     options = SimulationOptions(
-        pairs=pairs,
-        tracks=tracks,
-        lines=lines,
-        noise_px=noise_px,
-        outlier_ratio=outlier_ratio,
-        depth=depth,
-        shape=shape,
+        pairs=pairs, tracks=tracks, noise_px=noise_px, outlier_ratio=outlier_ratio, depth=depth, shape=shape
     )
     arguments.check_rows(rig, shutter)
     arguments.check_whole("seed", seed, 0)

@@ -121,6 +121,21 @@ def test_one_set_alone_is_a_problem(name: str) -> None:
         assert len(getattr(problem.correspondences, other)) == (other == name)
 
 
+def test_straight_lines_are_read_and_solved_alone() -> None:
+    s = simulate(RIG, SHUTTER.at_once(), MOTION, SimulationOptions(lines=20), np.random.default_rng(0))
+    lines = s.correspondences.lines
+    data = content(left=None, right=None, tracks=[], readout_ratio=0.0, lines=lines.tolist())
+    problem = parse_problem(json.dumps(data), "here")
+    np.testing.assert_array_equal(problem.correspondences.lines, lines)
+    with SolverRunner() as runner:
+        answer = solve_problem(problem, load_solver_entry("gs-stereo-triplets-lines"), RobustOptions(), runner)
+    assert answer["success"] and np.abs(np.subtract(answer["w"], MOTION.w)).max() < 1e-9
+    with pytest.raises(
+        RsbenchError, match=r"here: lines\[0\] = \[1.0\]: must be 16 numbers in pixels: xl0a, yl0a, xl0b"
+    ):
+        parse_problem(json.dumps(data | {"lines": [[1.0]]}), "here")
+
+
 def test_a_name_is_kept_and_else_it_is_the_files(tmp_path: Path) -> None:
     path = tmp_path / "walk.json"
     path.write_text(json.dumps(content()))

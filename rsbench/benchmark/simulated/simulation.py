@@ -91,7 +91,7 @@ class Simulation:
     shutter: RollingShutter
     motion: Motion
     outliers: dict[str, np.ndarray]
-    """Per set (``left``, ``right``, ``tracks``, ``lines``), which matches are outliers."""
+    """Per set (``left``, ``right``, ``tracks``, and ``lines`` where there are any), which matches are outliers."""
 
 
 def random_direction(rng: np.random.Generator) -> FloatArray:
@@ -138,10 +138,11 @@ def simulate(
         outliers[name] = _displace(noisy[name], options, wrong)
     noisy["gyro"] = _gyro(motion, options, rng.spawn(1)[0])
     noisy["gravity"] = _gravity(motion, options, rng.spawn(1)[0])
-    scene, noise, wrong = rng.spawn(3)
-    exact = _exact_lines(rig, shutter, motion, options, scene)
-    noisy["lines"] = exact + options.noise_px * noise.standard_normal(exact.shape)
-    outliers["lines"] = _displace(noisy["lines"], options, wrong)
+    if options.lines:
+        scene, noise, wrong = rng.spawn(3)
+        exact = _exact_lines(rig, shutter, motion, options, scene)
+        noisy["lines"] = exact + options.noise_px * noise.standard_normal(exact.shape)
+        outliers["lines"] = _displace(noisy["lines"], options, wrong)
     return Simulation(
         correspondences=Correspondences(**noisy),
         rig=rig,
