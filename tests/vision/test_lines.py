@@ -60,7 +60,7 @@ def wall(seed: int) -> NDArray[np.uint8]:
 
 def homographies() -> list[FloatArray]:
     """From pixels of the wall to those of left 0, right 0, left 1, right 1."""
-    pose, out = MOTION.body_from_world(1.0), []
+    pose, out = MOTION.body_from_world(1.0), list[FloatArray]()
     to_wall = np.array([[1 / PX_PER_M, 0, -MIDDLE / PX_PER_M], [0, 1 / PX_PER_M, -MIDDLE / PX_PER_M], [0, 0, 1.0]])
     lean = np.array([[1.0, 0, 0], [0, 1.0, 0], [0.15, -0.1, 4.0]])  # a plane that leans, x and y as they are
     for frame, side in itertools.product((0, 1), SIDES):
@@ -74,9 +74,10 @@ def homographies() -> list[FloatArray]:
 def test_matched_lines_are_one_line_and_give_the_motion() -> None:
     picture, H = wall(1), homographies()
     images = [cv2.warpPerspective(picture, h, (480, 480), flags=cv2.INTER_AREA) for h in H]
-    lines = match_lines(*(np.asarray(image, dtype=np.uint8) for image in images))
+    l0, r0, l1, r1 = (np.asarray(image, dtype=np.uint8) for image in images)
+    lines = match_lines(l0, r0, l1, r1)
     assert len(lines) >= 15
-    seen, off = lines.reshape(-1, 4, 2, 2), []
+    seen, off = lines.reshape(-1, 4, 2, 2), list[FloatArray]()
     back = cv2.perspectiveTransform(seen[:, 0], np.linalg.inv(H[0]))
     for k in (1, 2, 3):
         p = cv2.perspectiveTransform(back, H[k])
@@ -92,11 +93,12 @@ def test_matched_lines_are_one_line_and_give_the_motion() -> None:
 
 def test_images_without_edges_have_no_lines() -> None:
     blank = np.full((120, 160), 90, dtype=np.uint8)
-    assert detect_lines(blank).shape == (0, 4) and match_lines(*[blank] * 4).shape == (0, 16)
+    assert detect_lines(blank).shape == (0, 4) and match_lines(blank, blank, blank, blank).shape == (0, 16)
     edge = half_plane(80.0, 80.0, 0.1)
-    assert match_lines(edge, *[np.full_like(edge, 9)] * 3).shape == (0, 16)
+    other = np.full_like(edge, 9)
+    assert match_lines(edge, other, other, other).shape == (0, 16)
     # No disparity: no line in front of the rig.
-    assert match_lines(*[edge] * 4).shape == (0, 16)
+    assert match_lines(edge, edge, edge, edge).shape == (0, 16)
 
 
 def test_wrong_arguments_are_refused() -> None:
