@@ -37,12 +37,15 @@ from rsbench.core.rig import FRAMES, SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.solvers.line_triplets import LineTripletSolver
+from rsbench.solvers.engine.line_errors import usable_lines
+from rsbench.solvers.line_triplets import Features, LineTripletSolver
+from rsbench.solvers.triplets import PATTERNS, newton
 from rsbench.vision.features import match_stereo_frames
 from rsbench.vision.lines import match_lines
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 COUNTS, NOISE_PX, OUTLIERS = (10, 30, 100), 0.3, 0.3
+MOTIONS, FOUND = ((2, 0.3), (5, 0.5), (15, 1.0)), 1e-6
 RIGHT_PX = 1.5
 _ACROSS, _DOWN = (-2, -1, 0, 1, 2), (-1, 0, 1)
 """Pixels about a point of an edge, of which the nearest surface has the edge."""
@@ -72,6 +75,27 @@ def simulated(trials: int) -> Iterable[dict[str, object]]:
         options = SimulationOptions(tracks=count, lines=count, noise_px=NOISE_PX, outlier_ratio=OUTLIERS)
         s = simulate(RIG, still, motion, options, np.random.default_rng(seed))
         yield {"of": f"{count} + {count} simulated", **errors(s.correspondences, RIG, motion)}
+
+
+def minimal(trials: int) -> str:
+    """A Markdown table: share of exact samples of points and lines whose motion is found from no motion."""
+    still = RollingShutter(height=RIG.camera.height, readout_ratio=0.0)
+    kinds = [(3 - lines, lines) for lines in range(4)]
+    out = [f"| motion | {' | '.join(f'{p} + {n}' for p, n in kinds)} |", "| --- " * 5 + "|"]
+    for degrees, metres in MOTIONS:
+        found: dict[tuple[int, int], list[bool]] = {kind: [] for kind in kinds}
+        for seed, (points, lines) in product(range(trials), kinds):
+            motion = random_motion(np.random.default_rng([13, seed]), np.deg2rad(degrees), metres)
+            options = SimulationOptions(tracks=points, lines=20)
+            c = simulate(RIG, still, motion, options, np.random.default_rng(seed)).correspondences
+            steep = c.lines[usable_lines(c.lines, RIG)][:lines]
+            features, true = Features.of(c.tracks, steep, RIG), motion.body_from_world(1.0)
+            pose = newton(features.triplets(np.arange(3), PATTERNS[seed % 2], RIG))
+            off = max(np.abs(pose.R - true.R).max(), np.abs(pose.t - true.t).max())
+            found[points, lines].append(bool(off < FOUND))
+        cells = [in_words(np.mean(each), *share_interval(sum(each), len(each))) for each in found.values()]
+        out.append(f"| {degrees} deg, {metres} m | {' | '.join(cells)} |")
+    return "\n".join(out)
 
 
 def right_lines(s: Sequence, lines: FloatArray) -> BoolArray:
@@ -140,6 +164,8 @@ def main() -> None:
     rows = simulated(options.trials) if options.data is None else rendered(options.data, options.scene)
     table = pd.DataFrame(list(rows))
     sys.stdout.write(f"\n{told(table)}\n")
+    if options.data is None:
+        sys.stdout.write(f"\npoints + lines of a sample, found\n\n{minimal(options.trials)}\n")
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ _MANY = 10
 """Inliers of a kind from which its noise is told."""
 
 
-class _Features(NamedTuple):
+class Features(NamedTuple):
     """Points, then lines: what either frame knows of each, and what each image sees of it."""
 
     X: FloatArray
@@ -77,7 +77,8 @@ class _Features(NamedTuple):
     """(4, n, 2, 3) by image what they are at right angles to."""
 
     @classmethod
-    def of(cls, tracks: FloatArray, lines: FloatArray, rig: StereoRig) -> _Features:
+    def of(cls, tracks: FloatArray, lines: FloatArray, rig: StereoRig) -> Features:
+        """Of tracks (m, 8) with depth in both frames and lines (n, 16) that are usable."""
         points = np.stack([stereo_points(tracks[:, at:], rig) for at in (0, 4)])
         rays = line_rays(lines, rig)
         normals = np.repeat(line_normals(rays)[:, :, None], 2, axis=2)
@@ -105,7 +106,7 @@ class _Features(NamedTuple):
 class _Problem:
     """Points and lines of a rig: what RANSAC estimates a motion from, and least squares improves it on."""
 
-    features: _Features
+    features: Features
     points: Packed
     lines: LineErrors
     rig: StereoRig
@@ -116,7 +117,7 @@ class _Problem:
     def of(cls, tracks: FloatArray, lines: FloatArray, rig: StereoRig, noise_px: float) -> _Problem:
         still = RollingShutter(height=rig.camera.height, readout_ratio=0.0)
         return cls(
-            features=_Features.of(tracks, lines, rig),
+            features=Features.of(tracks, lines, rig),
             points=pack(Correspondences(tracks=tracks), rig, still),
             lines=LineErrors.of(lines, rig),
             rig=rig,

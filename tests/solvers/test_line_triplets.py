@@ -22,7 +22,8 @@ from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.line_errors import LineErrors, line_rays, stereo_ends, usable_lines
 from rsbench.solvers.engine.registry import load_solver, load_solver_entry
-from rsbench.solvers.line_triplets import LineTripletSolver
+from rsbench.solvers.line_triplets import Features, LineTripletSolver
+from rsbench.solvers.triplets import PATTERNS, newton
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 GLOBAL = RollingShutter(height=900, readout_ratio=0.0)
@@ -61,15 +62,14 @@ def test_three_exact_features_of_any_kind_give_the_motion(tracks: int, lines: in
 @pytest.mark.parametrize(("size", "least"), [(1.0, 0.9), (2.5, 0.75)])
 def test_minimal_samples_find_the_motion_from_none(size: float, least: float) -> None:
     """Each pattern of third images, three lines and mixed: the share that ends at the truth."""
-    from rsbench.solvers.line_triplets import _Problem
-
     found = list[float]()
     for seed, lines in itertools.product(range(15), (1, 3)):
         s = trial(seed, 3 - lines, 16, size=size)
         c = steep(s, lines)
-        problem = _Problem.of(c.tracks, c.lines, RIG, 1.0)
-        (models,) = problem.generate(np.array([[0, 1, 2]]))
-        found += [float(np.abs(model.w - s.motion.w).max()) for model in models] + [np.inf] * (2 - len(models))
+        features = Features.of(c.tracks, c.lines, RIG)
+        for views in PATTERNS:
+            pose = newton(features.triplets(np.arange(3), views, RIG))
+            found.append(float(np.abs(pose.R - s.motion.body_from_world(1.0).R).max()))
     assert np.mean(np.array(found) < 1e-9) >= least
 
 
