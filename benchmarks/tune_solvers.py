@@ -52,9 +52,9 @@ _LEAST_GAIN = 1e-3
 """Of AUC@5: less is no reason, and two problems that change can have it beyond a bootstrap's interval."""
 CARDS = (
     *("gs-5pt-opencv", "gs-8pt", "gs-p3p", "gs-poselib", "gs-poselib-stereo", "gs-stereo-pnp"),
-    *("gs-stereo-triplets", "gs-upright-3pt", "gs-upright-4pt", "rs-12param", "rs-dai-linear", "rs-dai-uniform"),
-    *("rs-gyro-5pt", "rs-gyro-stereo", "rs-r6p", "rs-r6p-single", "rs-stereo-linear"),
-    *("rs-zhuang-8pt", "rs-zhuang-9pt"),
+    *("gs-stereo-triplets", "gs-stereo-triplets-lines", "gs-upright-3pt", "gs-upright-4pt"),
+    *("rs-12param", "rs-dai-linear", "rs-dai-uniform", "rs-gyro-5pt", "rs-gyro-stereo"),
+    *("rs-r6p", "rs-r6p-single", "rs-stereo-linear", "rs-zhuang-8pt", "rs-zhuang-9pt"),
 )
 
 
