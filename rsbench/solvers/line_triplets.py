@@ -195,8 +195,8 @@ class _Problem:
 class LineTripletSolver(Solver):
     """Samples of three points or lines in three images each; a card of it says ``robust = "own"``."""
 
-    threshold_px: float = 1.25
-    """Largest error of an inlier, as of the house's loop, which then follows the noise of either kind."""
+    threshold_px: float = 0.625
+    """Largest error of an inlier, of a pair's as in the house's loop; it then follows the noise of either kind."""
     confidence: float = 0.999
     max_iterations: int = 1000
 

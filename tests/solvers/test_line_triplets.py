@@ -117,7 +117,8 @@ def test_with_points_alone_it_is_the_solver_of_points() -> None:
     for seed in range(6):
         s = trial(seed, 100, 0, 0.3, 0.3)
         one = estimate_motion(s.correspondences, RIG, GLOBAL, points, RobustOptions(), rng).estimate
-        two = estimate_motion(s.correspondences, RIG, GLOBAL, SOLVER, RobustOptions(), rng, "own").estimate
+        same = LineTripletSolver(threshold_px=RobustOptions().threshold_px)
+        two = estimate_motion(s.correspondences, RIG, GLOBAL, same, RobustOptions(), rng, "own").estimate
         # A fiftieth of the noise's error: either may keep a match at the threshold.
         assert rotation_error(one.w, two.w) < np.radians(2e-3) and translation_error(one.d, two.d) < np.radians(
             0.02
