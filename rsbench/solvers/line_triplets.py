@@ -56,6 +56,8 @@ from rsbench.solvers.triplets import (
 )
 
 _LEAST = 3
+_SAMPLES = 10
+"""At least, as in the house's loop."""
 _QUICK, _FULL = 5, 50
 _SIGMAS = 2.5
 _TRACK_FREEDOM = 5
@@ -201,9 +203,9 @@ class LineTripletSolver(Solver):
     max_iterations: int = 1000
 
     def __post_init__(self) -> None:
-        check_number("threshold_px", self.threshold_px, 0.0)
-        check_number("confidence", self.confidence, 0.0, 1.0)
-        check_whole("max_iterations", self.max_iterations, 1)
+        check_number("threshold_px", self.threshold_px, 1e-6)
+        check_number("confidence", self.confidence, 1e-6, 1.0 - 1e-9)
+        check_whole("max_iterations", self.max_iterations, _SAMPLES)
 
     spec = SolverSpec(
         needs=frozenset({"tracks"}),
@@ -235,7 +237,10 @@ class LineTripletSolver(Solver):
         for factor in (1.0, _SECOND_TRY):
             wider = replace(problem, noise=factor * problem.noise)
             options = RansacOptions(
-                threshold=_SIGMAS, confidence=self.confidence, max_iterations=self.max_iterations
+                threshold=_SIGMAS,
+                confidence=self.confidence,
+                min_iterations=_SAMPLES,
+                max_iterations=self.max_iterations,
             )
             found = ransac(wider, options, np.random.default_rng(0))
             if found.model is not None:

@@ -215,3 +215,9 @@ def test_lines_pass_the_lens_the_loop_and_the_runner() -> None:
         for given in (seen, Correspondences(lines=seen.lines)):
             found = runner.robust(entry, given, rig, GLOBAL, RobustOptions(), rng).estimate
             assert found.success and max(errors(found.w, found.d, s)) < 1e-5
+
+
+@pytest.mark.parametrize("wrong", [{"threshold_px": 0.0}, {"confidence": 1.0}, {"max_iterations": 3}])
+def test_parameters_that_no_search_can_have_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        LineTripletSolver(**wrong)  # pyrefly: ignore[bad-argument-type]
