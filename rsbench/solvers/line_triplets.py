@@ -66,6 +66,8 @@ _REFITS = 5
 _NOISE_STEPS = 8
 _RANGE = (0.2, 4.0)
 """Times the threshold, between which it follows the noise."""
+_MAX_DIRECTION_SIGMA = 0.5
+"""Share of the length of d: radians, as in the refined solvers."""
 _MANY = 10
 """Inliers of a kind from which its noise is told."""
 
@@ -175,9 +177,11 @@ class _Problem:
         with np.errstate(all="ignore"):
             end = levenberg_marquardt(evaluate, points.theta(model.w, model.d), most, LONGEST)
         w, d = points.motion(end.theta)
-        if not np.all(np.isfinite(end.H)) or inverse_definite(end.H) is None:
+        covariance = inverse_definite(end.H) if np.all(np.isfinite(end.H)) else None
+        if covariance is None:
             return MotionEstimate.failed("the points and lines leave the motion open, as parallel lines do")
-        return motion_of(Pose(so3.exp(w), d))
+        distance = float(np.median(np.linalg.norm(self.features.X[0, :, 0], axis=-1)))
+        return _with_direction(motion_of(Pose(so3.exp(w), d)), covariance, distance)
 
     def told(self, model: MotionEstimate, least: float, most: float) -> _Problem:
         """With the noise that the errors of a motion's inliers show, of each kind by itself where it has many."""
@@ -269,6 +273,19 @@ class LineTripletSolver(Solver):
                 return found
             model, before = found, inliers
         return model
+
+
+def _with_direction(motion: MotionEstimate, covariance: FloatArray, distance: float) -> MotionEstimate:
+    """The motion, and whether the direction of d is known, by the covariance (6, 6) of (w, d).
+
+    Of lines that are nearly parallel d runs along them, farther than to what is seen, at the distance, metres.
+    """
+    length = float(np.linalg.norm(motion.d))
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
+    if not motion.success or sigma <= _MAX_DIRECTION_SIGMA * min(length, distance):
+        return motion
+    why = f"d is {length:.2g} m long and known to {sigma:.2g} m"
+    return replace(motion, direction_known=False, reason=f"the direction of d is not determined: {why}")
 
 
 @cache
