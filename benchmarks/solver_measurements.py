@@ -6,7 +6,8 @@
 Each solver gets the least information that it can use fully, and exact or noisy matches of the motion model
 that it declares, of the point of the rig that it declares. The bound is that of the same matches with six
 unknowns; a gyroscope's solvers are compared with that of a known rotation, those with gravity with that of
-two known angles. The degenerate suite is sweeps/degenerate.toml with all solvers.
+two known angles. Affine frames are exact, and what they tell is not in the bound. The degenerate suite is
+sweeps/degenerate.toml with all solvers.
 """
 
 # ruff: noqa: E402
@@ -60,7 +61,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.files import write_json, write_table
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.robust_motion import RobustOptions
-from rsbench.solvers.engine.base import SENSORS, MotionEstimate
+from rsbench.solvers.engine.base import BESIDE, MotionEstimate
 from rsbench.solvers.engine.registry import list_solvers, load_solver_entry
 from rsbench.solvers.engine.warm_up import warm_up
 
@@ -124,6 +125,7 @@ def _trial(asked: Asked, seed: int, size: float, count: int, noise: tuple[tuple[
         tracks=count if asked.linked else 0,
         gyro_rate=GYRO_RATE,
         gravity=True,
+        affine=not asked.linked,
         **dict(noise),  # pyrefly: ignore[bad-argument-type]
     )
     return simulate(asked.rig, SHUTTER, motion, options, np.random.default_rng(seed))
@@ -131,7 +133,7 @@ def _trial(asked: Asked, seed: int, size: float, count: int, noise: tuple[tuple[
 
 def given(e: Entrant, s: Simulation) -> Correspondences:
     """What the solver gets: its matches, and the sensors that it needs."""
-    sensed = {name: getattr(s.correspondences, name) for name in SENSORS if name in e.solver.spec.needs}
+    sensed = {name: getattr(s.correspondences, name) for name in BESIDE if name in e.solver.spec.needs}
     return replace(given_matches(s, e.information), **sensed)
 
 
@@ -203,7 +205,9 @@ def sample_ms(e: Entrant) -> float:
     names = ("left", "right", "stereo_0", "stereo_1", "tracks")
     samples = []
     for _ in range(SAMPLES):
-        sets = {name: rng.choice(getattr(c, name), sizes.get(name, 0), replace=False) for name in names}
+        chosen = {name: rng.choice(len(getattr(c, name)), sizes.get(name, 0), replace=False) for name in names}
+        sets = {name: getattr(c, name)[chosen[name]] for name in names}
+        sets["affine"] = c.affine[chosen["left"]] if len(c.affine) else c.affine
         samples.append(replace(c, **sets))
     list(e.solver.propose_all(samples[:1], RIG, SHUTTER))
     start = time.process_time()

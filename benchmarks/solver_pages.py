@@ -19,7 +19,7 @@ import pandas as pd
 from rsbench.benchmark.statistics import share_interval
 from rsbench.cards import list_cards
 from rsbench.dataset.files import write_bytes
-from rsbench.solvers.engine.base import SENSORS
+from rsbench.solvers.engine.base import BESIDE
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 
 ROOT = Path(__file__).parents[1]
@@ -43,7 +43,7 @@ m. Each section says how many trials it has: shares of 10 of 10 and 20 of 20 are
   given, with a 95 % interval (median error over that of errors at the bound): 1 is best. A bias counts too, and
   one failure, which errs 180 deg, is most of a root mean square. The bound has six unknowns: what velocities or
   an acceleration that a solver leaves free cost is in its factor. Gyroscope and gravity are exact here, and
-  known to the bound.
+  known to the bound; affine frames are exact, and unknown to it.
 - **Time**: of the processor: a minimal sample, and a whole robust estimate from 200 matches with 30 % outliers.
   "Alone" means that the solver has a robust loop of its own, to which budgets of samples do not apply.
 - **Success**: share of robust estimates within {e_R} deg and {e_T} deg, at 0, 30 and 50 % outliers and at most
@@ -66,7 +66,7 @@ SETS = {
     "right": "of the right camera",
     "stereo": "left-right matches at both times",
     "tracks": "tracks through all four images",
-    **SENSORS,
+    **BESIDE,
 }
 OUTLIERS = ("0%", "30%", "50%")
 

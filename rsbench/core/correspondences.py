@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.lens import inverse_2x2
 from rsbench.core.rig import Side
 from rsbench.core.so3 import FloatArray
 
@@ -18,7 +19,8 @@ numbers, below the noise of keypoints and the distance between two of them."""
 BEYOND_PX = float(np.nextafter(JOIN_TOLERANCE_PX, 1.0))
 
 _TRACK_HALF: dict[Side, list[int]] = {"left": [0, 1, 4, 5], "right": [2, 3, 6, 7]}
-_COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8, "lines": 16}
+SET_COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8, "lines": 16}
+"""The sets of matches, and how many numbers a match of each has: pixels, two and two."""
 
 
 def _none(columns: int) -> FloatArray:
@@ -46,6 +48,10 @@ class Correspondences:
     lines: FloatArray = field(default_factory=lambda: _none(16))
     """(n, 16) two ends xa, ya, xb, yb in left 0, right 0, left 1, right 1: one straight line in all four images.
     The ends of one image are no points of another: the line alone is the same."""
+    affine: FloatArray = field(default_factory=lambda: _none(4))
+    """(n, 4) dx1/dx0, dx1/dy0, dy1/dx0, dy1/dy0: the affine frame of each row of ``left``, how the pixels around a
+    point of frame 0 lie in frame 1, to first order; of the images as they are, which a rolling shutter has
+    distorted. Empty where it is not known."""
     gyro: FloatArray = field(default_factory=lambda: _none(4))
     """(n, 4) tau, w: what a gyroscope says of the rotation between the rows, dR/dtau = [w]x R, rad per period."""
 
@@ -53,10 +59,12 @@ class Correspondences:
     """(n, 4) tau, g: which way things fall at that time, in the axes of the body as it is then; of any length."""
 
     def __post_init__(self) -> None:
-        for name, columns in _COLUMNS.items():
+        for name, columns in SET_COLUMNS.items():
             object.__setattr__(self, name, _matches(getattr(self, name), name, columns))
-        for name in ("gyro", "gravity"):
+        for name in ("affine", "gyro", "gravity"):
             object.__setattr__(self, name, _matches(getattr(self, name), name, 4))
+        if len(self.affine) not in (0, len(self.left)):
+            raise ValueError(f"affine has {len(self.affine)} rows and left {len(self.left)}: one each, or none")
         flat = np.flatnonzero(~np.any(self.gravity[:, 1:], axis=1))
         if len(flat):
             raise ValueError(f"gravity[{flat[0]}] has no direction: gx, gy, gz are 0")
@@ -84,13 +92,37 @@ def without_lens(correspondences: Correspondences, camera: PinholeCamera) -> Cor
     if camera.lens is None:
         return correspondences
     sets = {}
-    for name, columns in _COLUMNS.items():
+    for name, columns in SET_COLUMNS.items():
         rows: FloatArray = getattr(correspondences, name)
         sets[name] = camera.ideal_pixels(rows.reshape(-1, columns // 2, 2)).reshape(rows.shape)
         lost = np.flatnonzero(np.any(np.isnan(sets[name]), axis=1))
         if len(lost):
             raise ValueError(f"{name}[{lost[0]}] = {rows[lost[0]].tolist()}: the lens shows no ray at this pixel")
-    return Correspondences(**sets, gyro=correspondences.gyro, gravity=correspondences.gravity)
+    return replace(correspondences, **sets, affine=_ideal_affine(correspondences, camera))
+
+
+def lens_affine(affine: FloatArray, left: FloatArray, camera: PinholeCamera) -> FloatArray:
+    """Affine frames (n, 4) of pixels of the image from those of ideal pixels; none of none.
+
+    Args:
+        left: (n, 4) the matches, in pixels of the image.
+    """
+    if len(affine) == 0:
+        return affine
+    by_0, by_1 = _ideal_by_pixels(left, camera)
+    return (inverse_2x2(by_1) @ affine.reshape(-1, 2, 2) @ by_0).reshape(-1, 4)
+
+
+def _ideal_affine(correspondences: Correspondences, camera: PinholeCamera) -> FloatArray:
+    """The inverse of ``lens_affine``."""
+    if len(correspondences.affine) == 0:
+        return correspondences.affine
+    by_0, by_1 = _ideal_by_pixels(correspondences.left, camera)
+    return (by_1 @ correspondences.affine.reshape(-1, 2, 2) @ inverse_2x2(by_0)).reshape(-1, 4)
+
+
+def _ideal_by_pixels(left: FloatArray, camera: PinholeCamera) -> tuple[FloatArray, FloatArray]:
+    return camera.ideal_by_pixel(left[:, :2]), camera.ideal_by_pixel(left[:, 2:])
 
 
 def track_pairs(tracks: FloatArray, side: Side) -> FloatArray:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core import so3
+from rsbench.core.lens import inverse_2x2
 from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.se3 import Pose, transform
@@ -227,6 +228,38 @@ def back_project(
     x_in_cam = np.asarray(depth, dtype=np.float64)[..., None] * rig.camera.unproject(p)
     R, t = rig.cam_from_world(motion, shutter.pixel_time(p, frame, side), side)
     return (np.swapaxes(R, -1, -2) @ (x_in_cam - t)[..., None])[..., 0]
+
+
+def pixel_moves(
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    side: Side,
+    tau: FloatArray,
+    points: FloatArray,
+    along: FloatArray,
+) -> FloatArray:
+    """Derivative (n, 2, 2) of the pixels that see points (n, 3) at tau (n,), by steps along two ways (n, 3, 2).
+
+    That of the implicit row equation q = proj(pose(time(q)) X): (1 - v r')^-1 J, with J the derivative of the
+    projection at that time, v the velocity of the pixel and r the derivative of the time by the pixel.
+    """
+    camera = rig.camera
+    R, t = rig.cam_from_world(motion, tau, side)
+    turned = (R @ points[..., None])[..., 0]
+    w_rate, t_rate = motion.velocity(tau)
+    velocity = camera.velocity(turned + t, so3.cross(w_rate, turned) + t_rate)
+    steps = R @ along
+    by_plane = np.stack([camera.velocity(turned + t, steps[..., j]) for j in range(2)], axis=-1)
+    return inverse_2x2(np.eye(2) - velocity[:, :, None] * shutter.rate(side)) @ by_plane
+
+
+def plane_basis(normals: FloatArray) -> FloatArray:
+    """(n, 3, 2) two orthonormal vectors on planes with normals (n, 3); any two of a plane without one."""
+    least = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    first = so3.cross(normals, least)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    return np.stack([first, so3.cross(normals, first)], axis=-1)
 
 
 def row_poses(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int) -> Pose:

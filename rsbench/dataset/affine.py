@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from rsbench.core import so3
 from rsbench.core.lens import inverse_2x2
+from rsbench.core.projection import pixel_moves, plane_basis
 from rsbench.core.rig import View
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
@@ -80,7 +80,7 @@ def make_affine(geometry: Geometry, tracks: Tracks, rays: Meets) -> AffineFrames
 
 def jacobians_of(geometry: Geometry, tracks: Tracks, normals: FloatArray) -> FloatArray:
     """``AffineFrames.jacobians`` (n, v, 2, 2) of tracks on planes with these normals (n, 3)."""
-    along = _plane_basis(normals)
+    along = plane_basis(normals)
     views = enumerate(track_views(geometry.frames))
     moves = [_moves(geometry, view, tracks, k, along) for k, view in views]
     by_plane = np.stack(moves, axis=1)
@@ -93,25 +93,9 @@ def jacobians_of(geometry: Geometry, tracks: Tracks, normals: FloatArray) -> Flo
 
 def _moves(geometry: Geometry, view: View, tracks: Tracks, k: int, along: FloatArray) -> FloatArray:
     """(n, 2, 2) derivative of the pixels of a frame by steps along two ways (n, 3, 2) from the points."""
-    (side, _), camera = view, geometry.rig.camera
     tau = np.where(np.isnan(tracks.tau[:, k]), 0.0, tracks.tau[:, k])
-    R, t = geometry.rig.cam_from_world(geometry.motion, tau, side)
-    turned = (R @ tracks.points[..., None])[..., 0]
-    w_rate, t_rate = geometry.motion.velocity(tau)
-    velocity = camera.velocity(turned + t, so3.cross(w_rate, turned) + t_rate)
-    steps = R @ along
-    by_plane = np.stack([camera.velocity(turned + t, steps[..., j]) for j in range(2)], axis=-1)
-    late = np.eye(2) - velocity[:, :, None] * geometry.shutter.rate(side)
-    moves = inverse_2x2(late) @ by_plane
+    moves = pixel_moves(geometry.rig, geometry.shutter, geometry.motion, view[0], tau, tracks.points, along)
     return np.where(np.isnan(tracks.tau[:, k])[:, None, None], np.nan, moves)
-
-
-def _plane_basis(normals: FloatArray) -> FloatArray:
-    """(n, 3, 2) two orthonormal vectors on planes with normals (n, 3); any two of a plane without one."""
-    least = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
-    first = so3.cross(normals, least)
-    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    return np.stack([first, so3.cross(normals, first)], axis=-1)
 
 
 def save_affine(path: Path, affine: AffineFrames) -> None:

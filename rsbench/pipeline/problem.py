@@ -28,6 +28,7 @@ COLUMNS = {
 _CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 _LINES = (".jsonl", ".ndjson")
 _BESIDE = {
+    "affine": "dx1/dx0, dx1/dy0, dy1/dx0, dy1/dy0",
     "gyro": "tau, wx, wy, wz",
     "gravity": "tau, gx, gy, gz",
     "lines": ", ".join(f"{xy}{image}{end}" for image in ("l0", "r0", "l1", "r1") for end in "ab" for xy in "xy"),
@@ -61,6 +62,7 @@ class _Content(Scanning):
     stereo_0: _Rows = ()
     stereo_1: _Rows = ()
     tracks: _Rows = ()
+    affine: _Rows = ()
     gyro: _Rows = ()
     gravity: _Rows = ()
     lines: _Rows = ()

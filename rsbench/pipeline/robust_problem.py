@@ -57,7 +57,10 @@ class RobustProblem:
         self.reasons: Counter[str] = Counter()
         """Why the solver gave no motion of a sample, in its own words."""
         self._sizes, self.linked = self._plan(linked)
+        self._affine = "affine" in self.spec.needs
         self._unlinked = {side: unlinked_pairs(correspondences, side) for side in SIDES}
+        if self._affine:  # tracks have no affine frames: such a solver is given the left matches alone
+            self._unlinked["left"] = np.full(len(correspondences.left), len(correspondences.affine) > 0)
         self.data = self._data()
         self.packed = self._packed()
 
@@ -83,11 +86,13 @@ class RobustProblem:
         pairs = {}
         for side in SIDES:
             own = getattr(given, side)[self._unlinked[side]]
-            pairs[side] = own if self.linked else np.concatenate([own, track_pairs(given.tracks, side)])
+            halves = track_pairs(given.tracks, side)[: 0 if self.linked or self._affine else None]
+            pairs[side] = np.concatenate([own, halves])
             if side not in self.spec.needs:
                 pairs[side] = pairs[side][:0]
         tracks = given.tracks if self.linked else given.tracks[:0]
-        return Correspondences(left=pairs["left"], right=pairs["right"], tracks=tracks)
+        affine = given.affine[: None if self._affine else 0]
+        return Correspondences(**pairs, tracks=tracks, affine=affine)
 
     def _packed(self) -> Packed:
         """The data under the shutter that the solver believes in, about the point whose motion it gives."""
@@ -134,6 +139,8 @@ class RobustProblem:
     def shortage(self) -> str:
         """What is missing for a minimal sample; empty when nothing is."""
         names = dict(zip(_GROUPS, ("left matches", "right matches", "tracks"), strict=True))
+        if self._affine:
+            names["left"] = "left matches with affine frames"
         if self._stereo:
             names["tracks"] = "matches over time with left-right matches at both ends"
         groups = zip(_GROUPS, self.num_data, self.sample_size, strict=True)
@@ -186,16 +193,21 @@ class RobustProblem:
 
     def _subset(self, indices: IntArray) -> Correspondences:
         left, right, _ = self.num_data
+        first = indices[indices < left]
         return self._handed(
-            self.data.left[indices[indices < left]],
+            self.data.left[first],
             self.data.right[indices[(indices >= left) & (indices < left + right)] - left],
             self.data.tracks[indices[indices >= left + right] - left - right],
+            self.data.affine[first] if self._affine else None,
         )
 
-    def _handed(self, left: FloatArray, right: FloatArray, tracks: FloatArray) -> Correspondences:
+    def _handed(
+        self, left: FloatArray, right: FloatArray, tracks: FloatArray, affine: FloatArray | None = None
+    ) -> Correspondences:
         """Matches as the solver wants them: tracks as they are, or as matches that end in left-right matches."""
         if not self._stereo:
-            return Correspondences(left=left, right=right, tracks=tracks, **self._sensed)
+            frames = {} if affine is None else {"affine": affine}
+            return Correspondences(left=left, right=right, tracks=tracks, **frames, **self._sensed)
         needs, halves = self.spec.needs, {side: track_pairs(tracks, side) for side in SIDES}
         return Correspondences(
             left=np.concatenate([halves["left"], left]) if "left" in needs else left,
@@ -231,6 +243,8 @@ class RobustProblem:
             if side in self.spec.needs:
                 out[side][own] = mask[: np.count_nonzero(own)]
                 halves = tracks if self.linked else mask[np.count_nonzero(own) :]
+                if self._affine:
+                    halves = np.zeros(len(self.given.tracks), dtype=np.bool_)
                 as_pairs &= self.linked | halves
             elif not self.linked:
                 continue

@@ -34,10 +34,14 @@ def eight_point(x0: FloatArray, x1: FloatArray) -> FloatArray | None:
     """
     T0, T1 = normalising_transform(x0[:, :2]), normalising_transform(x1[:, :2])
     rows = (x1 @ T1.T)[:, :, None] * (x0 @ T0.T)[:, None, :]
-    _, s, Vt = np.linalg.svd(rows.reshape(-1, 9), full_matrices=len(rows) < 9)
-    if not s[7] > _ROUNDING * s[0]:
-        return None
-    return T1.T @ Vt[-1].reshape(3, 3) @ T0
+    E = null_essential(rows.reshape(-1, 9))
+    return None if E is None else T1.T @ E @ T0
+
+
+def null_essential(rows: FloatArray) -> FloatArray | None:
+    """The matrix (3, 3) whose entries, row by row, homogeneous equations (m, 9) determine; None if they do not."""
+    _, s, Vt = np.linalg.svd(rows, full_matrices=len(rows) < 9)
+    return Vt[-1].reshape(3, 3) if s[7] > _ROUNDING * s[0] else None
 
 
 def decompose_essential(E: FloatArray, x0: FloatArray, x1: FloatArray) -> tuple[Pose, int]:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench import plugins
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import SET_COLUMNS, Correspondences
 from rsbench.core.rig import View
 from rsbench.errors import RsbenchError
 from rsbench.plugins import Entry, Kind, RunOptions
@@ -63,12 +62,12 @@ def find_correspondences(entry: FeatureEntry, images: Mapping[View, NDArray[np.u
         raise RsbenchError(f"{where}: must return Correspondences, got {type(found).__name__}")
     height, width = images["left", 0].shape[:2]
     most = np.array([width, height]) - 1.0 + _OUTSIDE_PX
-    for field in fields(found):
-        points = getattr(found, field.name).reshape(-1, 2)
+    for name in SET_COLUMNS:
+        points = getattr(found, name).reshape(-1, 2)
         outside = np.any((points < -_OUTSIDE_PX) | (points > most), axis=1)
         if np.any(outside):
             raise RsbenchError(
-                f"{where}: {field.name}: {np.count_nonzero(outside)} positions lie outside the {width} x {height} "
+                f"{where}: {name}: {np.count_nonzero(outside)} positions lie outside the {width} x {height} "
                 f"image, such as {points[outside][0].tolist()}"
             )
     return found

@@ -65,6 +65,8 @@ class MatchOptions:
     """Largest disparity of left-right matches, px; None is the image width."""
     drop_contradicted: bool = True
     """Drop a temporal match when its loop through the other camera ends elsewhere."""
+    affine: bool = False
+    """Give left matches affine frames: the similarity of the keypoints' sizes and orientations."""
 
     def __post_init__(self) -> None:
         check_ranges(self, _RANGES)
@@ -89,6 +91,9 @@ class Features:
     """(n, 2) px."""
     descriptors: NDArray[np.float32]
     """(n, 128), whole numbers from 0 to 255."""
+    frames: FloatArray
+    """(n, 2) what turns and scales the unit square into the keypoint's, as the first column of that matrix: its
+    diameter, px, times the cosine and the sine of its orientation, from x towards y."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,10 +115,13 @@ def detect(image: NDArray[Any], options: MatchOptions | None = None) -> Features
     )
     keypoints, descriptors = sift.detectAndCompute(grey_u8(image), None)
     if not keypoints:
-        return Features(points=np.zeros((0, 2)), descriptors=np.zeros((0, 128), dtype=np.float32))
+        empty = np.zeros((0, 2))
+        return Features(points=empty, descriptors=np.zeros((0, 128), dtype=np.float32), frames=empty)
     points = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
     order = np.lexsort((points[:, 0], points[:, 1]))
-    return Features(points=points[order], descriptors=descriptors[order])
+    size, angle = np.array([(k.size, np.deg2rad(k.angle)) for k in keypoints]).T[:, order]
+    frames = size[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return Features(points=points[order], descriptors=descriptors[order], frames=frames)
 
 
 def match(a: Features, b: Features, gate: Gate, options: MatchOptions | None = None) -> Indices:
@@ -169,11 +177,23 @@ def match_stereo_frames(
         left, right = _agreeing(left, right, stereo_0, stereo_1)
     return Correspondences(
         left=_positions((l0, l1), left),
+        affine=_similarities(l0.frames[left[:, 0]], l1.frames[left[:, 1]])[: None if options.affine else 0],
         right=_positions((r0, r1), right),
         stereo_0=_positions((l0, r0), stereo_0),
         stereo_1=_positions((l1, r1), stereo_1),
         tracks=_positions((l0, r0, l1, r1), tracks),
     )
+
+
+def _similarities(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Affine frames (m, 4) that turn and scale keypoints' frames a (m, 2) into b: quotients of complex numbers.
+
+    What a surface's slant does to its image is not in them.
+    """
+    first = a / np.sum(a * a, axis=1, keepdims=True)
+    c = np.sum(first * b, axis=1)
+    s = first[:, 0] * b[:, 1] - first[:, 1] * b[:, 0]
+    return np.stack([c, -s, s, c], axis=1)
 
 
 def close_loops(left: Indices, right: Indices, stereo_0: Indices, stereo_1: Indices) -> Indices:

@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import SET_COLUMNS, Correspondences, lens_affine
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.resample import resample
 from rsbench.vision.stereo_matcher import F32, MatcherEntry, find_disparities
 
-_SETS = ("left", "right", "stereo_0", "stereo_1", "tracks")
 _FAR = -1e6
 """Pixel of what the lens does not reach."""
 _WIDEST = 2.0
@@ -43,12 +42,14 @@ def with_lens(matches: Correspondences, camera: PinholeCamera) -> Correspondence
     """Matches of undistorted images in pixels of the distorted ones; those with an end outside are dropped."""
     if camera.lens is None:
         return matches
-    sets = {}
-    for name in _SETS:
+    sets, kept = dict[str, FloatArray](), dict[str, NDArray[np.bool_]]()
+    for name in SET_COLUMNS:
         rows = getattr(matches, name)
         ends = camera.lens_pixels(rows.reshape(len(rows), rows.shape[1] // 2, 2))
-        sets[name] = ends[np.all(camera.contains(ends), axis=1)].reshape(-1, rows.shape[1])
-    return replace(matches, **sets)
+        kept[name] = np.all(camera.contains(ends), axis=1)
+        sets[name] = ends[kept[name]].reshape(-1, rows.shape[1])
+    affine = matches.affine[kept["left"][: len(matches.affine)]]
+    return replace(matches, **sets, affine=lens_affine(affine, sets["left"], camera))
 
 
 def sensor_disparities(

@@ -27,7 +27,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.pipeline.robust_problem import _moment, _quantile
-from rsbench.solvers.engine.base import SENSORS, MatchSet, MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.engine.base import BESIDE, MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.registry import list_solvers, load_solver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
@@ -40,7 +40,13 @@ def simulation(
     rng = np.random.default_rng(seed)
     motion = random_motion(rng, np.radians(2.0), 0.3)
     options = SimulationOptions(
-        pairs=pairs, tracks=tracks, noise_px=noise, outlier_ratio=outliers, gyro_rate=GYRO_RATE, gravity=True
+        pairs=pairs,
+        tracks=tracks,
+        noise_px=noise,
+        outlier_ratio=outliers,
+        gyro_rate=GYRO_RATE,
+        gravity=True,
+        affine=True,
     )
     return simulate(RIG, SHUTTER, motion, options, rng)
 
@@ -229,7 +235,7 @@ def test_same_generator_same_bytes() -> None:
 @pytest.mark.parametrize("name", list_solvers())
 def test_too_few_matches_is_a_failure_with_a_reason(name: str) -> None:
     # Two matches and a gyroscope are enough, and three or four and the direction of gravity.
-    pairs, tracks = (1, 0) if SENSORS.keys() & load_solver(name).spec.needs else (2, 2)
+    pairs, tracks = (1, 0) if BESIDE.keys() & load_solver(name).spec.needs else (2, 2)
     s = simulation(pairs=pairs, tracks=tracks, outliers=0.0)
     result = run(s, name)
     assert not result.estimate.success and result.estimate.reason

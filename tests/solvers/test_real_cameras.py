@@ -50,7 +50,8 @@ def test_every_shipped_solver_takes_a_lens_or_says_why_not(name: str) -> None:
 
 def test_those_that_take_no_lens_are_few() -> None:
     refused = {name for name in list_cards("solvers") if load_solver(name).spec.refusal(RIG, SHUTTER)}
-    free = {"rs-12param", "rs-dai-linear", "rs-dai-uniform"}  # their coefficients are of rows of a pinhole camera
+    # Their coefficients are of rows of a pinhole camera.
+    free = {"rs-12param", "rs-12param-affine", "rs-dai-linear", "rs-dai-uniform"}
     assert refused == free | {"rs-stereo-iterated-metric", "rs-r6p", "rs-r6p-single"}
 
 

@@ -220,7 +220,7 @@ def test_the_key_follows_class_parameters_source_and_what_is_inside(tmp_path: Pa
     [
         ("shutter", "GS", "rolling, global"),
         ("reference_point", "Left", "body, left"),
-        ("needs", {"Left"}, "left, right, stereo, tracks, gyro, gravity"),
+        ("needs", {"Left"}, "left, right, stereo, tracks, affine, gyro, gravity"),
         ("needs", set(), "at least one"),
         ("minimum", {"right": 8}, "says nothing about left"),
         ("minimum", {"left": 0}, "above 0"),

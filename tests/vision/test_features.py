@@ -3,10 +3,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from rsbench.core.projection import back_project, rs_project
+from rsbench.core.rig import View
+from rsbench.vision.feature_matcher import find_correspondences, load_features
 from rsbench.vision.features import Gate, MatchOptions, close_loops, detect, match_stereo_frames
 from rsbench.vision.nearest import best_two
 
@@ -191,8 +195,31 @@ def test_gate_of_one_candidate_needs_a_small_distance() -> None:
 
     far = np.zeros((1, 128), dtype=np.float32)
     far[0, 0] = 255
-    a = Features(points=np.zeros((1, 2)), descriptors=np.zeros((1, 128), dtype=np.float32))
-    b = Features(points=np.zeros((1, 2)), descriptors=far)
+    at = np.zeros((1, 2))
+    a = Features(points=at, descriptors=np.zeros((1, 128), dtype=np.float32), frames=at)
+    b = Features(points=at, descriptors=far, frames=at)
     gate = Gate(dx=(-1.0, 1.0), dy=(-1.0, 1.0))
     assert len(match(a, b, gate, MatchOptions(max_distance=254.0))) == 0
     assert len(match(a, b, gate, MatchOptions(max_distance=256.0))) == 1
+
+
+def test_frames_of_keypoints_are_the_similarity_between_the_images() -> None:
+    """A picture turned by 20 degrees, 1.2 times as large; bins of SIFT are 10 degrees and a third of an octave."""
+    rng = np.random.default_rng(0)
+    picture = cv2.GaussianBlur(rng.uniform(0, 255, (400, 400)).astype(np.float32), (0, 0), 3.0)
+    picture = np.clip(128 + 8.0 * (picture - picture.mean()), 0, 255).astype(np.uint8)
+    turn = 1.2 * np.array([[np.cos(0.35), -np.sin(0.35)], [np.sin(0.35), np.cos(0.35)]])
+    shift = np.array([200.0, 200.0]) - turn @ [200.0, 200.0]
+    turned = cv2.warpAffine(picture, np.column_stack([turn, shift]), (400, 400), flags=cv2.INTER_CUBIC)
+    images: dict[View, NDArray[np.uint8]] = {
+        ("left", 0): picture,
+        ("right", 0): picture,
+        ("left", 1): turned,
+        ("right", 1): turned,
+    }
+    found = find_correspondences(load_features("sift-affine"), images)
+    right = np.linalg.norm(found.left[:, :2] @ turn.T + shift - found.left[:, 2:], axis=1) < 1.0
+    assert np.sum(right) > 100
+    np.testing.assert_allclose(np.median(found.affine[right], axis=0), turn.ravel(), atol=0.02)
+    assert np.median(np.abs(found.affine[right] - turn.ravel())) < 0.1
+    assert len(find_correspondences(load_features("sift"), images).affine) == 0

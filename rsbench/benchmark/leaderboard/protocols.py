@@ -22,6 +22,7 @@ KNOWLEDGE = {
     "time": "images of the other time",
     "gyro": "the angular rates of a gyroscope",
     "gravity": "the direction of gravity",
+    "affine": "the affine frames of matches over time of the left camera",
     "truth": "the truth: an oracle, which has no rank",
 }
 """What methods use, in the order of tables."""

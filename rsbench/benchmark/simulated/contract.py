@@ -23,7 +23,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 from rsbench.motions import make_motion
-from rsbench.solvers.engine.base import SENSORS, MotionEstimate
+from rsbench.solvers.engine.base import BESIDE, SENSORS, MotionEstimate
 from rsbench.solvers.engine.registry import SolverEntry
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
@@ -88,7 +88,14 @@ def own_problem(subject: Subject, size: float = 1.0, seed: int = 5, noise_px: fl
     except RsbenchError as error:
         raise BrokenContractError(str(error)) from error
     rate, upright = GYRO_RATE if "gyro" in subject.spec.needs else 0, "gravity" in subject.spec.needs
-    options = SimulationOptions(pairs=60, tracks=60, noise_px=noise_px, gyro_rate=rate, gravity=upright)
+    options = SimulationOptions(
+        pairs=60,
+        tracks=60,
+        noise_px=noise_px,
+        gyro_rate=rate,
+        gravity=upright,
+        affine="affine" in subject.spec.needs,
+    )
     return simulate(RIG, shutter, motion, options, np.random.default_rng(seed))
 
 
@@ -188,16 +195,17 @@ def ignores_the_order(subject: Subject) -> tuple[Verdict, str]:
     """The same matches in another order have the same motion."""
 
     def shuffled(c: Correspondences) -> Correspondences:
-        rng = np.random.default_rng(1)
-        return Correspondences(**{name: rng.permutation(matches) for name, matches in vars(c).items()})
+        # Of rows that belong together, the same order: of equally many from equal generators.
+        orders = {name: np.random.default_rng(1).permutation(len(matches)) for name, matches in vars(c).items()}
+        return Correspondences(**{name: matches[orders[name]] for name, matches in vars(c).items()})
 
     return _agree(subject, shuffled, np.ones(3), np.ones(3), "in another order")
 
 
 def mirrors(subject: Subject) -> tuple[Verdict, str]:
     """When x is mirrored, left and right change places, and d_x, w_y and w_z their sign."""
-    alone = subject.spec.needs - SENSORS.keys() == {"left"}
-    if subject.spec.reference_point == "left" and not alone:
+    alone = subject.spec.needs - BESIDE.keys() == {"left"}
+    if not alone and (subject.spec.reference_point == "left" or "affine" in subject.spec.needs):
         return "skipped", "the mirror image of the left camera is the right one"
     last = RIG.camera.width - 1
 
@@ -211,7 +219,10 @@ def mirrors(subject: Subject) -> tuple[Verdict, str]:
         left, right = flipped(c.left, same), flipped(c.right, same)
         sensed = {"gyro": c.gyro * [1.0, 1.0, -1.0, -1.0], "gravity": c.gravity * [1.0, -1.0, 1.0, 1.0]}
         if alone:  # with tracks, whose left halves are then those of the mirrored left camera
-            return Correspondences(left=left, right=right, tracks=flipped(c.tracks, [*range(8)]), **sensed)
+            frames = c.affine * [1.0, -1.0, -1.0, 1.0]
+            return Correspondences(
+                left=left, right=right, tracks=flipped(c.tracks, [*range(8)]), affine=frames, **sensed
+            )
         return Correspondences(
             left=right,
             right=left,
@@ -267,7 +278,7 @@ def fails_by_value(subject: Subject) -> tuple[Verdict, str]:
     for name, (c, shutter) in cases.items():
         sets = {
             "": c,
-            "pairs of ": _subset(c, "left", "right", *SENSORS),
+            "pairs of ": _subset(c, "left", "right", *BESIDE),
             "tracks of ": _subset(c, "tracks", *SENSORS),
         }
         for kind, matches in sets.items():
@@ -319,7 +330,9 @@ def degenerate_cases() -> dict[str, tuple[Correspondences, RollingShutter]]:
         w: FloatArray, d: FloatArray, shutter: RollingShutter = ROLLING, plane: bool = False
     ) -> Correspondences:
         shape: SceneShape = "plane" if plane else "box"
-        options = SimulationOptions(pairs=30, tracks=30, shape=shape, gyro_rate=GYRO_RATE, gravity=True)
+        options = SimulationOptions(
+            pairs=30, tracks=30, shape=shape, gyro_rate=GYRO_RATE, gravity=True, affine=True
+        )
         motion = make_motion("linear", w, d)
         return simulate(RIG, shutter, motion, options, np.random.default_rng(2)).correspondences
 
@@ -330,10 +343,12 @@ def degenerate_cases() -> dict[str, tuple[Correspondences, RollingShutter]]:
     wild = {
         name: rng.uniform(0, 899, (30, columns)) for name, columns in (("left", 4), ("right", 4), ("tracks", 8))
     }
-    far = {name: 1e7 * getattr(c, name) for name in ("left", "right", "tracks")}
-    first = {name: getattr(c, name)[[0] * 20] for name in ("left", "right", "tracks")}
-    two = {name: getattr(c, name)[:2] for name in ("left", "right", "tracks")}
-    zeros = {"left": np.zeros((20, 4)), "right": np.zeros((20, 4)), "tracks": np.zeros((20, 8))}
+    wild["affine"] = wild["right"] / 450.0
+    sets = ("left", "right", "tracks", "affine")
+    far = {name: 1e7 * getattr(c, name) for name in sets}
+    first = {name: getattr(c, name)[[0] * 20] for name in sets}
+    two = {name: getattr(c, name)[:2] for name in sets}
+    zeros = {name: 0.0 * rows for name, rows in first.items()}
     return {
         "no matches": (Correspondences(), ROLLING),
         "two matches": (Correspondences(**two), ROLLING),
@@ -343,7 +358,7 @@ def degenerate_cases() -> dict[str, tuple[Correspondences, RollingShutter]]:
         "a global shutter": (seen(W, D, GLOBAL), GLOBAL),
         "a plane": (seen(W, D, plane=True), ROLLING),
         "points on a line": (Correspondences(left=pair, right=pair, tracks=tracks), ROLLING),
-        "one camera": (Correspondences(left=c.left), ROLLING),
+        "one camera": (Correspondences(left=c.left, affine=c.affine), ROLLING),
         "the same match 20 times": (Correspondences(**first), ROLLING),
         "matches at (0, 0)": (Correspondences(**zeros), ROLLING),
         "negative disparity": (Correspondences(tracks=c.tracks[:, [2, 3, 0, 1, 6, 7, 4, 5]]), ROLLING),

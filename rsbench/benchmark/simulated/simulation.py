@@ -15,8 +15,17 @@ from numpy.typing import NDArray
 from rsbench.arguments import check_number, check_one_of, check_whole
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.lens import inverse_2x2
 from rsbench.core.motion import Motion
-from rsbench.core.projection import ROW_TOLERANCE_PX, ProjectionStatus, back_project, project_at, rs_project
+from rsbench.core.projection import (
+    ROW_TOLERANCE_PX,
+    ProjectionStatus,
+    back_project,
+    pixel_moves,
+    plane_basis,
+    project_at,
+    rs_project,
+)
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -26,6 +35,10 @@ SceneShape = Literal["box", "plane"]
 GYRO_RATE = 20
 """Samples of a gyroscope in a frame period, where a solver wants any: 600 Hz at 30 frames a second."""
 
+_MOST_SLANT = np.deg2rad(60.0)
+"""Between the normal of a patch and the ray on which frame 0 sees it."""
+_TILT = (0.3, -0.2)
+"""Of the plane in the axes of the camera that sees it: what its inverse depth gains along the ray, in shares."""
 _DOWN = np.array([0.2, 0.9, -0.3]) / np.sqrt(0.94)
 """The way things fall, in the axes of the body at time 0."""
 
@@ -61,6 +74,10 @@ class SimulationOptions:
     """Whether the direction of gravity is given, at the start of either frame."""
     gravity_noise_deg: float = 0.0
     """Standard deviation of each of its two angles, degrees."""
+    affine: bool = False
+    """Whether the left matches have affine frames: of patches of all slants up to 60 degrees, or of the plane."""
+    affine_noise: float = 0.0
+    """Standard deviation of the noise on every number of an affine frame, as a share of the frame's size."""
     shape: SceneShape = "box"
     """Points at random depths, or on one slanted plane in the middle of the range."""
 
@@ -76,6 +93,7 @@ class SimulationOptions:
         check_number("gyro_bias_deg", self.gyro_bias_deg, 0.0)
         check_number("gyro_delay", self.gyro_delay, -10.0, 10.0)
         check_number("gravity_noise_deg", self.gravity_noise_deg, 0.0)
+        check_number("affine_noise", self.affine_noise, 0.0)
         check_one_of("shape", self.shape, get_args(SceneShape))
         near, far = self.depth
         if not 0.0 < near <= far < np.inf:
@@ -130,8 +148,11 @@ def simulate(
     counts = {"left": options.pairs, "right": options.pairs, "tracks": options.tracks}
     views: dict[str, tuple[Side, ...]] = {"left": ("left",), "right": ("right",), "tracks": ("left", "right")}
     noisy, outliers = dict[str, FloatArray](), dict[str, NDArray[np.bool_]]()
+    patches = np.zeros((0, 2, 2)), np.zeros((0, 3))
     for (name, count), scene, noise, wrong in zip(counts.items(), scenes, noises, wrongs, strict=True):
-        exact = _exact(rig, shutter, motion, options, scene, count, views[name])
+        exact, points = _exact(rig, shutter, motion, options, scene, count, views[name])
+        if name == "left":
+            patches = exact[:, 0], points
         # (n, views, frames, 2) -> xl0, yl0, xr0, yr0, xl1, ...
         matches = np.swapaxes(exact, 1, 2).reshape(len(exact), 4 * len(views[name]))
         noisy[name] = matches + options.noise_px * noise.standard_normal(matches.shape)
@@ -143,6 +164,7 @@ def simulate(
         exact = _exact_lines(rig, shutter, motion, options, scene)
         noisy["lines"] = exact + options.noise_px * noise.standard_normal(exact.shape)
         outliers["lines"] = _displace(noisy["lines"], options, wrong)
+    noisy["affine"] = _affine(rig, shutter, motion, options, *patches, rng.spawn(1)[0])
     return Simulation(
         correspondences=Correspondences(**noisy),
         rig=rig,
@@ -173,6 +195,44 @@ def _gravity(motion: Motion, options: SimulationOptions, rng: np.random.Generato
     return np.column_stack([tau, (so3.exp(across) @ down[..., None])[..., 0]])
 
 
+def _affine(
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    options: SimulationOptions,
+    pixels: FloatArray,
+    points: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Affine frames (n, 4) of patches at points (n, 3) that the left camera sees at (n, 2 frames, 2).
+
+    An outlier's is that of the point which it was.
+    """
+    if not options.affine or len(points) == 0:
+        return np.zeros((0, 4))
+    tau = [shutter.pixel_time(pixels[:, frame], frame, "left") for frame in (0, 1)]
+    R, t = rig.cam_from_world(motion, tau[0], "left")
+    back = np.swapaxes(R, -1, -2)
+    if options.shape == "plane":
+        normals = back @ [*_TILT, 1.0]
+        normals /= np.sqrt(np.sum(normals**2, axis=1, keepdims=True))
+    else:
+        rays = points + (back @ t[..., None])[..., 0]
+        normals = _slanted(rays / np.sqrt(np.sum(rays**2, axis=1, keepdims=True)), rng)
+    along = plane_basis(normals)
+    moves = [pixel_moves(rig, shutter, motion, "left", each, points, along) for each in tau]
+    A = (moves[1] @ inverse_2x2(moves[0])).reshape(-1, 4)
+    size = np.sqrt(0.5 * np.sum(A * A, axis=1, keepdims=True))
+    return A + options.affine_noise * size * rng.standard_normal(A.shape)
+
+
+def _slanted(rays: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Unit normals (n, 3) of patches that unit rays (n, 3) meet, slanted every way."""
+    slant, way = rng.uniform(size=(2, len(rays))) * [[_MOST_SLANT], [2.0 * np.pi]]
+    axis = np.sum(plane_basis(rays) * np.stack([np.cos(way), np.sin(way)], axis=1)[:, None], axis=2)
+    return (so3.exp(slant[:, None] * axis) @ rays[..., None])[..., 0]
+
+
 def _displace(matches: FloatArray, options: SimulationOptions, rng: np.random.Generator) -> np.ndarray:
     """Move the frame-1 pixels of some matches, in place; returns which."""
     draws = rng.uniform(-1.0, 1.0, (len(matches), 3))
@@ -193,10 +253,10 @@ def _exact(
     rng: np.random.Generator,
     count: int,
     sides: tuple[Side, ...],
-) -> FloatArray:
-    """Noise-free pixels (count, views, 2 frames, 2) of points that every view sees once."""
+) -> tuple[FloatArray, FloatArray]:
+    """Noise-free pixels (count, views, 2 frames, 2) of points (count, 3) that every view sees once."""
     camera = rig.camera
-    found = [np.zeros((0, len(sides), 2, 2))]
+    found, places = [np.zeros((0, len(sides), 2, 2))], [np.zeros((0, 3))]
     total = 0
     for _ in range(60):
         if total >= count:
@@ -212,10 +272,11 @@ def _exact(
         stacked = np.stack([np.stack(row, axis=1) for row in views], axis=1)
         seen = np.all(np.isfinite(stacked), axis=(1, 2, 3))
         found.append(stacked[seen])
+        places.append(points[seen])
         total += int(np.count_nonzero(seen))
     if total < count:
         raise ValueError(f"the motion leaves only {total} of {count} points in view; use a slower one")
-    return np.concatenate(found)[:count]
+    return np.concatenate(found)[:count], np.concatenate(places)[:count]
 
 
 _SLIDE = 0.2
@@ -320,4 +381,4 @@ def _depths(options: SimulationOptions, draws: FloatArray, rays: FloatArray) -> 
         return near + (far - near) * draws
     # A plane n.X = 1, tilted so that the depth changes over the image.
     middle = 0.5 * (near + far)
-    return middle / (1.0 + 0.3 * rays[:, 0] - 0.2 * rays[:, 1])
+    return middle / (1.0 + _TILT[0] * rays[:, 0] + _TILT[1] * rays[:, 1])

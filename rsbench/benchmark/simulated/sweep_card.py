@@ -33,6 +33,7 @@ Axis = Literal[
     "gyro_bias_deg",
     "gyro_delay",
     "gravity_noise_deg",
+    "affine_noise",
 ]
 Vector = tuple[float, float, float]
 
@@ -75,7 +76,8 @@ class Setting:
     gyro_bias_deg: float = 0.0
     gyro_delay: float = 0.0
     gravity_noise_deg: float = 0.0
-    """Of the sensors that solvers are given which need them: as ``SimulationOptions`` has them."""
+    affine_noise: float = 0.0
+    """Of the sensors and affine frames that solvers are given which need them: see ``SimulationOptions``."""
 
     def __post_init__(self) -> None:
         for name in ("rotation_deg", "translation", "noise_px", "outlier_px"):
@@ -134,11 +136,13 @@ class Setting:
             gyro_delay=self.gyro_delay,
             gravity=True,
             gravity_noise_deg=self.gravity_noise_deg,
+            affine=True,
+            affine_noise=self.affine_noise,
         )
 
     def exact(self) -> Setting:
         """The setting of the same matches without noise and with the truth for the solver."""
-        told = replace(self, noise_px=0.0, readout_ratio_error=0.0)
+        told = replace(self, noise_px=0.0, readout_ratio_error=0.0, affine_noise=0.0)
         return replace(told, gyro_noise_deg=0.0, gyro_bias_deg=0.0, gyro_delay=0.0, gravity_noise_deg=0.0)
 
     def changed(self, changes: Mapping[str, Any], where: str) -> Setting:

@@ -21,7 +21,7 @@ from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_solver import GuardedSolver, SolverRunner
 from rsbench.pipeline.isolation import EntryFailure
 from rsbench.pipeline.robust_motion import RobustOptions
-from rsbench.solvers.engine.base import SENSORS, MotionEstimate, Solver
+from rsbench.solvers.engine.base import BESIDE, MotionEstimate, Solver
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 
 Arrays = dict[str, NDArray[Any]]
@@ -62,7 +62,7 @@ def enter(entry: SolverEntry) -> Entrant:
         return Entrant(entry=entry, information="tracks")
     if "stereo" in needs:
         return Entrant(entry=entry, information="linked pairs")
-    alone = needs - SENSORS.keys() == {"left"}
+    alone = needs - BESIDE.keys() == {"left"}
     return Entrant(entry=entry, information="left pairs" if alone else "left and right pairs")
 
 
@@ -198,7 +198,7 @@ def _timed(
 ) -> tuple[MotionEstimate, float]:
     """An answer and its seconds: of the processor, since solvers have one thread and others shall not count."""
     matches, rig, shutter = given_matches(simulation, e.information), setting.rig(), setting.told_shutter()
-    sensed = {name: getattr(simulation.correspondences, name) for name in SENSORS if name in e.solver.spec.needs}
+    sensed = {name: getattr(simulation.correspondences, name) for name in BESIDE if name in e.solver.spec.needs}
     matches = replace(matches, **sensed)
     if not robust:
         return runner.bare(e.entry, matches, rig, shutter)

@@ -24,9 +24,12 @@ from rsbench.core.so3 import FloatArray
 from rsbench.errors import RsbenchError
 from rsbench.motions import check_parameters
 
-MatchSet = Literal["left", "right", "stereo", "tracks", "gyro", "gravity"]
-"""Matches; and samples of other sensors, which are given whole and no part of RANSAC's samples."""
+MatchSet = Literal["left", "right", "stereo", "tracks", "affine", "gyro", "gravity"]
+"""Matches; affine frames of the left ones, a row each; and samples of other sensors, which are given whole and no
+part of RANSAC's samples."""
 SENSORS: Mapping[MatchSet, str] = {"gyro": "samples of a gyroscope", "gravity": "directions of gravity"}
+"""Samples of other sensors."""
+BESIDE: Mapping[MatchSet, str] = {"affine": "affine frames of left matches", **SENSORS}
 """What is no set of matches."""
 
 
@@ -152,7 +155,7 @@ class SolverSpec:
         for name, least in self.minimum.items():
             if counts.get(name, 0) < least:
                 return MotionEstimate.failed(
-                    f"{counts.get(name, 0)} {SENSORS.get(name, f'{name} matches')}, need {least}"
+                    f"{counts.get(name, 0)} {BESIDE.get(name, f'{name} matches')}, need {least}"
                 )
         return None
 

@@ -56,6 +56,10 @@ class FreeVelocitySolver(Solver):
         """Other motions to descend from, of the same rows."""
         return []
 
+    def matches_of(self, correspondences: Correspondences) -> FloatArray:
+        """The matches (n, 4) that it uses, or (n, 8) with their affine frames."""
+        return temporal_pairs(correspondences, "left")
+
     @property
     def spec(self) -> SolverSpec:
         reference, assumes = self.about
@@ -76,13 +80,13 @@ class FreeVelocitySolver(Solver):
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        return self._estimated(temporal_pairs(correspondences, "left"), rig, [])
+        return self._estimated(self.matches_of(correspondences), rig, [])
 
     def _estimated(self, matches: FloatArray, rig: StereoRig, near: list[FreeMotion]) -> MotionEstimate:
         """From the linear solutions, those of smaller models, and motions from the first row that may be near."""
-        found = self._linear(matches, rig)
+        found = self.from_equations(matches, rig)
         if self.refinement == "none" or len(matches) < self.least:
-            return _best_of(found, matches, rig)
+            return first_of(found, matches, rig)
         middle = self.starts(Rows.of(matches, rig.camera, rig.camera.cy))
         middle += [] if isinstance(found, str) else found
         if isinstance(found, str) and not (middle or near):
@@ -96,8 +100,8 @@ class FreeVelocitySolver(Solver):
         return _reported(self._refined(gentle[best][0], rows, _FULL)[0], rows)
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
-        matches = temporal_pairs(sample, "left")
-        return [_best_of(self._linear(matches, rig), matches, rig)]
+        matches = self.matches_of(sample)
+        return [first_of(self.from_equations(matches, rig), matches, rig)]
 
     def improve(
         self,
@@ -109,7 +113,7 @@ class FreeVelocitySolver(Solver):
     ) -> MotionEstimate:
         if self.refinement == "none":
             return self.estimate(correspondences, rig, shutter)
-        matches = temporal_pairs(correspondences, "left")
+        matches = self.matches_of(correspondences)
         rows = Rows.of(matches, rig.camera, 0.0)
         least = self.sample_sizes(correspondences)["left"]
         if len(rows.x) < least:
@@ -124,9 +128,10 @@ class FreeVelocitySolver(Solver):
     def _refined(self, start: FreeMotion, rows: Rows, most: int) -> tuple[FreeMotion, float]:
         return refine(start, rows, turning=self.turning, most=most)
 
-    def _linear(self, matches: FloatArray, rig: StereoRig) -> list[FreeMotion] | str:
+    def from_equations(self, matches: FloatArray, rig: StereoRig) -> list[FreeMotion] | str:
         """The linear solutions, s = 0 at the principal point: with most points in front first, by their errors."""
-        short = self.spec.shortage({"left": len(matches)})
+        frames = len(matches) if matches.shape[1] > 4 else 0
+        short = self.spec.shortage({"left": len(matches), "affine": frames})
         if short is not None:
             return short.reason
         rows = Rows.of(matches, rig.camera, rig.camera.cy)
@@ -142,8 +147,11 @@ class FreeVelocitySolver(Solver):
 def without_velocities(rows: Rows) -> FreeMotion | None:
     """R and t of one essential matrix for all rows, of the eight-point algorithm; None where there are more."""
     E = eight_point(rows.x, rows.y)
-    if E is None:
-        return None
+    return None if E is None else at_rest_of(E, rows)
+
+
+def at_rest_of(E: FloatArray, rows: Rows) -> FreeMotion:
+    """R and t of an essential matrix (3, 3), those with more points in front; no velocities."""
     U, _, Vt = np.linalg.svd(E)
     R = U @ QUARTER @ Vt
     motion = FreeMotion(R * np.sign(np.linalg.det(R)), U[:, 2], *np.zeros((4, 3)))
@@ -161,7 +169,7 @@ def _turn(motion: FreeMotion, camera: PinholeCamera) -> float:
     return max(float(np.linalg.norm(w)) for w in (motion.w0, motion.w1)) * camera.height / camera.fy
 
 
-def _best_of(found: list[FreeMotion] | str, matches: FloatArray, rig: StereoRig) -> MotionEstimate:
+def first_of(found: list[FreeMotion] | str, matches: FloatArray, rig: StereoRig) -> MotionEstimate:
     """The first of linear solutions, as it is."""
     if isinstance(found, str):
         return MotionEstimate.failed(found)

@@ -74,12 +74,15 @@ class Rows(NamedTuple):
     s0: FloatArray
     s1: FloatArray
     camera: PinholeCamera
+    affine: FloatArray
+    """(n, 4) of ``Correspondences.affine``, or (n, 0)."""
 
     @classmethod
     def of(cls, matches: FloatArray, camera: PinholeCamera, first: float) -> Rows:
-        """Of matches (n, 4), with s = 0 at the row ``first``."""
-        x, y = camera.unproject(matches[:, :2]), camera.unproject(matches[:, 2:])
-        return cls(x, y, (matches[:, 1] - first) / camera.fy, (matches[:, 3] - first) / camera.fy, camera)
+        """Of matches (n, 4), or (n, 8) with affine frames, with s = 0 at the row ``first``."""
+        x, y = camera.unproject(matches[:, :2]), camera.unproject(matches[:, 2:4])
+        s0, s1 = (matches[:, 1] - first) / camera.fy, (matches[:, 3] - first) / camera.fy
+        return cls(x, y, s0, s1, camera, matches[:, 4:])
 
     def packed(self) -> FloatArray:
         """(n, 6) as the kernels take them."""
@@ -88,7 +91,7 @@ class Rows(NamedTuple):
 
 def constraint(motion: FreeMotion, rows: Rows) -> tuple[FloatArray, FloatArray]:
     """y^T [T]x R x (n,) and its derivatives (n, 4) by the pixels: a row that moves is another pose too."""
-    x, y, s0, s1, camera = rows
+    x, y, s0, s1, camera, _ = rows
     R, T = motion.between(s0, s1)
     p, Rv0 = (R @ x[:, :, None])[:, :, 0], R @ motion.v0
     gradient = epipolar_gradient(hat(T) @ R, x, y, camera)

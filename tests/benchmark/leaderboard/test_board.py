@@ -37,7 +37,7 @@ from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.isolation import Outcome
 from rsbench.report.board_page import build_site
-from rsbench.solvers.engine.base import SENSORS
+from rsbench.solvers.engine.base import BESIDE
 from rsbench.solvers.engine.registry import load_solver_entry
 
 ROOT = Path(__file__).parents[3]
@@ -393,4 +393,4 @@ def test_protocols_are_documented() -> None:
     for protocol in PROTOCOLS.values():
         cells = f"| `{protocol.track}` | `{protocol.id}` | {protocol.given} | {', '.join(protocol.allowed)} |"
         assert cells in text
-    assert all(f"`{name}`" in text for name in KNOWLEDGE if name not in SENSORS)
+    assert all(f"`{name}`" in text for name in KNOWLEDGE if name not in BESIDE)
