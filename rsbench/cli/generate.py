@@ -107,13 +107,14 @@ def generate(
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.files import check_out
     from rsbench.dataset.generation import generate_dataset, steps_of
-    from rsbench.dataset.object_store import open_store, path_or_url, shown
+    from rsbench.dataset.object_store import path_or_url, shown
+    from rsbench.dataset.store_home import store_for
     from rsbench.renderers.backend import start_backend
 
     crew, place = chosen_workers(workers, scheduler), shared_path(path_or_url(out), scheduler)
     dataset = _chosen(load_dataset_card(card, trajectory, tuple(seed or ())), sequence, shard, channels)
     if not estimate:
-        _ = check_out(place) if isinstance(place, Path) else open_store(place)
+        _ = check_out(place) if isinstance(place, Path) else store_for(place, crew)
     backend = start_backend()
     if backend.message:
         typer.echo(backend.message, err=True)

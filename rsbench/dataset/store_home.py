@@ -217,17 +217,25 @@ def _read_lines(path: Path) -> dict[str, str]:
     return lines
 
 
+def store_for(url: str, workers: Workers) -> Store:
+    """The store of a URL, if so many can write there.
+
+    Raises:
+        RsbenchError: see ``Store``; or processes of a store in this process's memory.
+    """
+    if url.startswith("memory:") and workers != 1:
+        raise RsbenchError(f"--out {url}: lives in one process: without --workers and --scheduler")
+    return open_store(url)
+
+
 @contextmanager
 def store_home(url: str, workers: Workers, rehash: bool) -> Iterator[StoreHome]:
     """A store, to which no other command of this user on this machine sends a dataset; ``rehash`` reads all of it.
 
     Raises:
-        RsbenchError: see ``Store`` and ``workplace``; or processes of a store in this process's memory.
+        RsbenchError: see ``store_for`` and ``workplace``.
     """
-    if url.startswith("memory:") and workers != 1:
-        raise RsbenchError(f"--out {url}: lives in one process: without --workers and --scheduler")
-    store = open_store(url)
-    hidden = cache_of(url)
+    store, hidden = store_for(url, workers), cache_of(url)
     with workplace(hidden, hidden):
         target = StoreTarget(url, None if isinstance(workers, Cluster) else hidden / WORK)
         yield StoreHome(store, hidden, target, rehash)
