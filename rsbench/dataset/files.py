@@ -253,7 +253,9 @@ def read_pose_table(path: Path) -> FloatArray:
 
 
 def save_matches(path: Path, matches: Correspondences) -> None:
-    save_arrays(path, {name: getattr(matches, name) for name in MATCH_SETS})
+    """The sets of every matcher, and what few give where this one does."""
+    rare = {name: rows for name in ("lines", "affine") if len(rows := getattr(matches, name))}
+    save_arrays(path, {name: getattr(matches, name) for name in MATCH_SETS} | rare)
 
 
 def load_matches(path: Path) -> Correspondences:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run_here
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, simulate
 from rsbench.core import so3
@@ -18,6 +20,7 @@ from rsbench.core.projection import back_project, rs_project
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.dataset.files import load_matches
 from rsbench.errors import RsbenchError
 from rsbench.pipeline.problem import EXAMPLE, parse_problem, problem_record, read_problem
 from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
@@ -189,3 +192,16 @@ def test_a_problem_holds_affine_frames() -> None:
         parse_problem(json.dumps(record | {"affine": [[1.0]]}), "here")
     with pytest.raises(RsbenchError, match="here: affine has 1 rows and left"):
         parse_problem(json.dumps(record | {"affine": frames[:1]}), "here")
+
+
+def test_evaluate_gives_it_the_frames_of_a_matcher_that_has_them(smoke_dataset: Path, tmp_path: Path) -> None:
+    run = run_here(
+        *("-q", "evaluate", smoke_dataset, "--out", tmp_path / "out"),
+        *("--features", "sift-affine", "--solver", "rs-12param-affine"),
+    )
+    assert run.returncode == 0, run.stderr
+    for folder in (tmp_path / "out/predictions").iterdir():
+        matches = load_matches(folder / "matches.npz")
+        assert len(matches.affine) == len(matches.left) > 0
+        (record,) = (json.loads(path.read_text()) for path in (folder / "motion").glob("rs-12param-affine.json"))
+        assert record["success"], record["reason"]
