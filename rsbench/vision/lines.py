@@ -10,17 +10,20 @@ R. Grompone von Gioi, J. Jakubowicz, J.-M. Morel, G. Randall, LSD: a Line Segmen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.arguments import check_ranges
-from rsbench.core.correspondences import BoolArray
+from rsbench.core.correspondences import BoolArray, Correspondences
+from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
-from rsbench.vision.features import ROW_TOLERANCE_PX, Indices, close_loops
+from rsbench.vision.feature_matcher import FeatureMatcher
+from rsbench.vision.features import ROW_TOLERANCE_PX, Indices, MatchOptions, close_loops, match_stereo_frames
 from rsbench.vision.images import grey_u8
 
 _BLUR_PX = 0.75
@@ -66,6 +69,16 @@ class LineOptions:
 
     def __post_init__(self) -> None:
         check_ranges(self, _RANGES)
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class SiftLineMatcher(MatchOptions, FeatureMatcher):
+    """SIFT features, and straight lines with the defaults of ``LineOptions``."""
+
+    def match(self, images: Mapping[View, NDArray[np.uint8]]) -> Correspondences:
+        four = images["left", 0], images["right", 0], images["left", 1], images["right", 1]
+        return replace(match_stereo_frames(*four, self), lines=match_lines(*four))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,7 +17,9 @@ from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.dataset.files import load_matches, save_matches
 from rsbench.solvers.line_triplets import LineTripletSolver
+from rsbench.vision.feature_matcher import find_correspondences, load_features
 from rsbench.vision.lines import LineOptions, detect_lines, match_lines
 
 RIG = StereoRig(camera=PinholeCamera.centred(480, 480, 480.0), baseline=0.3)
@@ -107,3 +110,15 @@ def test_wrong_arguments_are_refused() -> None:
         match_lines(blank, blank, blank, np.zeros((40, 41), dtype=np.uint8))
     with pytest.raises(ValueError, match="min_length"):
         LineOptions(min_length=0.0)
+
+
+def test_a_matcher_finds_lines_beside_points_and_they_are_stored(tmp_path: Path) -> None:
+    picture = wall(2)
+    shown = [cv2.warpPerspective(picture, h, (480, 480), flags=cv2.INTER_AREA) for h in homographies()]
+    l0, r0, l1, r1 = (np.asarray(image, dtype=np.uint8) for image in shown)
+    images = {("left", 0): l0, ("right", 0): r0, ("left", 1): l1, ("right", 1): r1}
+    found = find_correspondences(load_features("sift-lines"), images)  # pyrefly: ignore[bad-argument-type]
+    assert len(found.tracks) > 20 and len(found.lines) > 10
+    np.testing.assert_array_equal(found.lines, match_lines(l0, r0, l1, r1))
+    save_matches(tmp_path / "matches.npz", found)
+    np.testing.assert_array_equal(load_matches(tmp_path / "matches.npz").lines, found.lines)
