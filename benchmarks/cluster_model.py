@@ -172,7 +172,7 @@ def _handed(jobs: int = 2000) -> float:
     from rsbench.pipeline.crew import Cluster
     from rsbench.pipeline.isolated_jobs import run_jobs
 
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as cluster:
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0", host="127.0.0.1") as cluster:
         there = Cluster(address=cluster.scheduler_address)
         for todo in ([0.0], list(map(float, range(jobs)))):  # the first one starts the children
             begun = time.process_time()

@@ -42,7 +42,7 @@ def children(count: int, cluster: bool) -> Iterator[Workers]:
     if cluster:
         from distributed import LocalCluster
 
-        with LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None) as started:
+        with LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0") as started:
             yield Cluster(address=started.scheduler_address)
         return
 

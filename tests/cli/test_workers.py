@@ -27,7 +27,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def address() -> Iterator[str]:
     from distributed import LocalCluster
 
-    options: Any = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "host": "127.0.0.1"}
+    options: Any = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0", "host": "127.0.0.1"}
     with LocalCluster(**options) as cluster:
         yield cluster.scheduler_address
 

@@ -96,7 +96,7 @@ def test_a_cluster_sends_the_same_bytes(
 ) -> None:
     from distributed import LocalCluster
 
-    with LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=None, host="127.0.0.1") as cluster:
+    with LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=":0", host="127.0.0.1") as cluster:
         run = run_here("generate", card, "--out", "s3://data/far", "--scheduler", cluster.scheduler_address)
     assert run.returncode == 0, run.stderr
     assert stored(bucket, "far") == dataset
