@@ -9,6 +9,7 @@ altogether is started again before the next run.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
 import subprocess
@@ -32,6 +33,7 @@ MOST = 2
 """Kills of one run among those who work for it: a job that dies three times is given up, as it should be."""
 SEQUENCES = 6
 _MARK = "RSBENCH_ATTACK"
+_PARENT_DEATH = 1  # PR_SET_PDEATHSIG of prctl
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +78,14 @@ class Cluster:
     def _start(self, *arguments: str) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "dask", *arguments, "--scheduler-file", str(self.file)]
         with (self.folder / f"{arguments[0]}.log").open("ab") as log:
-            return subprocess.Popen(command, stdout=log, stderr=log, cwd=self.folder, start_new_session=True)
+            return subprocess.Popen(
+                command,
+                stdout=log,
+                stderr=log,
+                cwd=self.folder,
+                start_new_session=True,
+                preexec_fn=_end_with_parent,
+            )
 
     def close(self) -> None:
         started = [*self.machines, *([self.scheduler] if self.scheduler else [])]
@@ -251,6 +260,11 @@ def _tree(pid: int) -> list[int]:
     for member in found:
         found += [other for other, parent in parents.items() if parent == member]
     return found
+
+
+def _end_with_parent() -> None:
+    """In a child: no cluster outlives an attack that is killed."""
+    ctypes.CDLL(None).prctl(_PARENT_DEATH, signal.SIGKILL)
 
 
 def _processes() -> list[int]:

@@ -11,40 +11,19 @@ import cv2
 import numpy as np
 import pytest
 import scipy
+from carla_frames import FPS, HEIGHT, SEEN, WIDTH, V, W, skew, write, write_carla, write_image
 from commands import run_here
-from hypothesis import assume, given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.se3 import Pose
 from rsbench.dataset.importing.carla import read_carla
 from rsbench.dataset.importing.check import agreements
 from rsbench.dataset.importing.colmap import read_colmap
 from rsbench.dataset.importing.euroc import read_euroc
 from rsbench.dataset.importing.formats import read_others
-from rsbench.dataset.importing.sight_check import epipolar_distance, sights
 from rsbench.dataset.importing.stereo import read_kitti, read_middlebury
 from rsbench.errors import RsbenchError
 
 Array = NDArray[Any]
-WIDTH, HEIGHT, FPS = 160, 120, 10
-W, V = np.array([0.3, -0.5, 0.4]), np.array([1.6, 0.3, 1.2])
-"""rad/s and m/s: 4 deg and 20 cm a frame."""
-
-
-def skew(w: Array) -> Array:
-    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
-
-
-def write(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-
-
-def write_image(path: Path, pixels: Array) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), pixels)
 
 
 def only_row(path: Path) -> dict[str, str]:
@@ -54,46 +33,6 @@ def only_row(path: Path) -> dict[str, str]:
 
 
 # Carla-RS
-
-WALLS = ((np.array([0.5, 0.1, 1.0]), 6.0), (np.array([-0.6, -0.2, 1.0]), 6.5))
-"""n . X = c of two walls that meet in a corner, which is seen from within."""
-
-
-def see(frame: int) -> tuple[Array, Array, Array]:
-    """z, length of the ray and grey of every pixel, each row from its own pose."""
-    blots = cv2.GaussianBlur(np.random.default_rng(3).uniform(size=(600, 600)), (0, 0), 2.0)
-    blots = (255 * (blots - blots.min()) / np.ptp(blots)).astype(np.uint8)
-    z, lengths, grey = np.zeros((3, HEIGHT, WIDTH))
-    x = (np.arange(WIDTH) - (WIDTH - 1) / 2) / (WIDTH / 2)
-    for row in range(HEIGHT):
-        t = (frame + row / HEIGHT) / FPS
-        rays = np.stack([x, np.full(WIDTH, (row - (HEIGHT - 1) / 2) / (WIDTH / 2)), np.ones(WIDTH)], axis=1)
-        R, place = scipy.linalg.expm(skew(W * t)), V * t
-        turned = rays @ R.T
-        depths = np.array([(c - n @ place) / (turned @ n) for n, c in WALLS])
-        depths[depths <= 0.0] = np.inf
-        wall, z[row] = np.argmin(depths, axis=0), np.min(depths, axis=0)
-        lengths[row] = z[row] * np.linalg.norm(rays, axis=1)
-        points = place + z[row][:, None] * turned
-        where = np.stack([40 * points[:, 0] + 300 * wall, 40 * points[:, 1] + 300], axis=1).astype(np.float32)
-        grey[row] = cv2.remap(blots, where[None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)[0]
-    return z, lengths, grey
-
-
-SEEN = [see(frame) for frame in (0, 1)]
-
-
-def write_carla(
-    root: Path, *, sign: float = 1.0, suffix: str = ".depth", row_ms: float = 1e3 / FPS / HEIGHT
-) -> Path:
-    folder = root / "seq_0"
-    values = " ".join(f"{sign * value:f}" for value in (*W, *V))
-    write(folder / "gt_vel.log", f"# Ground truth velocity in camera frame\n# wx, wy, wz, x, y, z\n{values}\n")
-    write(root / "rs_calib.txt", f"#Rolling shutter\nFPS: {FPS}\nROW_READOUT_TIME(ms): {row_ms:.8f}\n")
-    for frame, (_, lengths, grey) in enumerate(SEEN):
-        write_image(folder / f"{frame:04d}_rs.png", grey.astype(np.uint8))
-        np.savetxt(folder / f"{frame:04d}_rs{suffix}", lengths, fmt="%.6f")
-    return root
 
 
 def test_carla_has_velocities_of_the_camera_and_distances_along_rays(tmp_path: Path) -> None:
@@ -317,68 +256,6 @@ def test_colmap(tmp_path: Path) -> None:
     np.testing.assert_allclose(first.cameras["left"].project(moved), theirs - 0.5, atol=1e-6)
     assert (second.cameras["left"].fy, second.cameras["left"].cx) == (50.0, 31.5)
     assert not first.shutters
-
-
-def write_points(folder: Path, shift: float = 0.0) -> Path:
-    """A model of one camera, two images and 40 points, each image ``shift`` m beside where it says."""
-    write(folder / "cameras.txt", "1 PINHOLE 640 480 500 510 320 240\n")
-    rng = np.random.default_rng(3)
-    points = rng.uniform([-1.0, -1.0, 4.0], [1.0, 1.0, 6.0], (40, 3))
-    write(
-        folder / "points3D.txt", "".join(f"{7 + k} {x} {y} {z} 0 0 0 0.5\n" for k, (x, y, z) in enumerate(points))
-    )
-    text = ""
-    for number, x in enumerate((0.0, 0.3)):
-        at = points + np.array([x + shift, 0.0, 0.0])
-        seen = at[:, :2] / at[:, 2:] * [500, 510] + [320, 240]
-        rest = "".join(f" {u} {v} {7 + k}" for k, (u, v) in enumerate(seen))
-        text += f"{number + 1} 1 0 0 0 {x} 0 0 1 {number}.png\n3.5 4.5 -1{rest}\n"
-    write(folder / "images.txt", text)
-    for number in range(2):
-        write_image(folder / "images" / f"{number}.png", np.zeros((480, 640), dtype=np.uint8))
-    return folder
-
-
-def test_colmap_points_are_seen_where_its_poses_say(tmp_path: Path) -> None:
-    found = list(sights(read_colmap(write_points(tmp_path))[0]))
-    assert [(each.count, each.fault) for each in found] == [(40, ""), (40, "")]
-    assert max(each.typical for each in found) < 1e-9  # the half pixel of the corner on both sides
-
-
-def test_colmap_images_that_stand_elsewhere_are_faults(tmp_path: Path) -> None:
-    run = run_here("verify", write_points(tmp_path, shift=0.1), "--from", "colmap")
-    assert run.returncode == 1 and run.stderr.count("points of left image") == 2
-
-
-# Matches
-
-
-def test_matches_of_rolling_frames_lie_where_poses_of_their_rows_say(tmp_path: Path) -> None:
-    (right,) = sights(read_carla(write_carla(tmp_path / "right"))[0])
-    (still,) = sights(read_carla(write_carla(tmp_path / "still", row_ms=0.0))[0])
-    assert right.count > 100 and right.share > 0.95 and right.typical < 0.15  # features err by a tenth of a pixel
-    assert still.typical > 3.0 * right.typical
-
-
-seconds, thirds = st.floats(-0.2, 0.2), st.floats(-1.0, 1.0)
-
-
-@given(w=st.tuples(seconds, seconds, seconds), t=st.tuples(thirds, thirds, thirds), seed=st.integers(0, 100))
-def test_exact_matches_are_on_their_half_of_the_line(
-    w: tuple[float, float, float], t: tuple[float, float, float], seed: int
-) -> None:
-    """With the other sign of the translation they are as far from it as they moved since infinity."""
-    assume(np.linalg.norm(t) > 0.05)
-    camera = PinholeCamera.centred(640, 480, 500.0)
-    points = np.random.default_rng(seed).uniform([-2.0, -2.0, 3.0], [2.0, 2.0, 8.0], (20, 3))
-    pose = Pose(scipy.linalg.expm(skew(np.array(w))), np.array(t))
-    there, far = points @ pose.R.T + pose.t, points @ pose.R.T
-    matches = np.concatenate([camera.project(points), camera.project(there)], axis=1)
-    # 1e-6: where the epipole is near, both sides of the quotient are rounding of small numbers.
-    assert np.max(epipolar_distance(pose, matches, camera, camera)) < 1e-6
-    moved = np.linalg.norm(camera.project(there) - camera.project(far), axis=1)
-    found = epipolar_distance(Pose(pose.R, -pose.t), matches, camera, camera)
-    np.testing.assert_allclose(found, moved, rtol=1e-6, atol=1e-6)
 
 
 # What is wrong
