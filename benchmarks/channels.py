@@ -17,9 +17,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from rsbench.cards import load_card
+from rsbench.components.cards import load_card
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.beside import beside
 from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.channels import CHANNELS
 from rsbench.dataset.generation import build_scene, render_camera
@@ -28,6 +27,7 @@ from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Viewpoint
+from rsbench.storage.background_writer import beside
 
 Times = tuple[float, float]
 

@@ -113,7 +113,7 @@ def child(what: str, scene: str) -> list[float]:
 def _scene_seconds(scene: str) -> float:
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import build_scene
-    from rsbench.dataset.stage import Stage
+    from rsbench.dataset.posed_scenes import Stage
 
     sequence = next(each for each in load_dataset_card(CARD).sequence if each.scene == scene)
     begun = time.process_time()
@@ -125,7 +125,7 @@ def _sequence(scene: str) -> tuple[float, float]:
     """Seconds of the processor and bytes of a sequence: the mean of an ideal and of a real one, kernels warm."""
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import generate_dataset
-    from rsbench.dataset.workplace import files_below
+    from rsbench.storage.work_folder import files_below
 
     card = load_dataset_card(CARD)
     names = [each.name for each in card.sequence if each.scene == scene and "moderate-slow-wide" in each.name]
@@ -141,9 +141,9 @@ def _sequence(scene: str) -> tuple[float, float]:
 def _command_alone() -> tuple[float, float]:
     """Seconds, for each of many made-up sequences of as many files: when it is finished, and in the manifest."""
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.files import sha256, write_json
-    from rsbench.dataset.homes import folder_home
+    from rsbench.dataset.destinations import folder_home
     from rsbench.dataset.layout import files_of
+    from rsbench.storage.files import sha256, write_json
 
     card = load_dataset_card(CARD)
     with tempfile.TemporaryDirectory() as folder:
@@ -169,8 +169,8 @@ def _handed(jobs: int = 2000) -> float:
     """Seconds of the processor for a job that does nothing, with distributed; the scheduler is in this process."""
     from distributed import LocalCluster
 
-    from rsbench.pipeline.crew import Cluster
-    from rsbench.pipeline.isolated_jobs import run_jobs
+    from rsbench.jobs.process_jobs import run_jobs
+    from rsbench.jobs.workers import Cluster
 
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0", host="127.0.0.1") as cluster:
         there = Cluster(address=cluster.scheduler_address)

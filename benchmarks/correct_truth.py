@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.cards import load_card
+from rsbench.components.cards import load_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.projection import back_project, project_at, rs_project_near
 from rsbench.core.rig import Side

@@ -35,12 +35,12 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, VIEWS, View
 from rsbench.dataset.card import CameraCard, load_dataset_card
-from rsbench.dataset.files import write_bytes, write_json, write_table
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_matches, solve_frames
 from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.storage.files import write_bytes, write_json, write_table
 from rsbench.vision.plane_sweep import SweepMatcher, sweep_depths
 from rsbench.vision.stereo_matcher import find_disparities, load_matcher
 

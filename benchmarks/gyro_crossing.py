@@ -26,7 +26,7 @@ from rsbench.benchmark.simulated.sweep_card import load_sweep
 from rsbench.benchmark.simulated.sweep_summary import read_card, score_trials
 from rsbench.benchmark.statistics import bootstrap_interval, in_words, typical_interval
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.files import write_json, write_table
+from rsbench.storage.files import write_json, write_table
 
 SWEEPS = ("gyro-bias", "gyro-noise", "gyro-delay")
 FRAMES_PER_S = 30.0

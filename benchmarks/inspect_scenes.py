@@ -21,6 +21,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.capture.inspection import conclude, inspect_window
+from rsbench.capture.scan_reading import Reading
 from rsbench.core.rig import SIDES, VIEWS, Side, StereoRig, View
 from rsbench.core.shutter import Scanning
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
@@ -29,8 +31,6 @@ from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.dataset.sequence import read_dataset
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_matches_of_rig
-from rsbench.pipeline.inspection import conclude, inspect_window
-from rsbench.pipeline.scan_reading import Reading
 
 SCENES = {
     "castle": 1.0,

@@ -31,8 +31,8 @@ from rsbench.benchmark.simulated.simulation import SimulationOptions, random_mot
 from rsbench.benchmark.statistics import in_words, median_interval, share_interval
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import BoolArray, Correspondences
-from rsbench.core.metrics import rotation_error, translation_error
 from rsbench.core.motion import Motion
+from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import FRAMES, SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray

@@ -17,19 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_direction, simulate
+from rsbench.capture.model_choice import MODELS, choose_model
+from rsbench.capture.model_fit import ACCELERATION_SIGMA
+from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.metrics import rotation_error, translation_error
 from rsbench.core.motion import Motion
+from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.spline_motion import PRESETS
 from rsbench.dataset.sequence import read_dataset
-from rsbench.motions import make_motion
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_motion, match_frames
-from rsbench.pipeline.model_choice import MODELS, choose_model
-from rsbench.pipeline.model_fit import ACCELERATION_SIGMA
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)

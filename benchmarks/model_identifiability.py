@@ -14,14 +14,14 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
+from rsbench.capture.model_fit import CANDIDATES, Candidate, Errors, ModelFit, fit_model
+from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.motions import make_motion
-from rsbench.pipeline.model_fit import CANDIDATES, Candidate, Errors, ModelFit, fit_model
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)

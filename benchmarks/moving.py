@@ -20,15 +20,15 @@ from render_rs_vs_gs import boxes
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion
-from rsbench.core.moving import MovingObject, poses_of
+from rsbench.core.moving_objects import MovingObject, poses_of
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.renderers.backend import set_threads, start_backend
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import Frame, render
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.scenes.bodies import Body, with_moving
 from rsbench.scenes.model import Scene
+from rsbench.scenes.moving_objects import Body, with_moving
 
 BODIES = tuple(
     Body(box=(0.8, 0.8, 0.8), position=(x, 0.3, 4.0), attitude_deg=(0.0, 20.0 * number, 0.0), texture_seed=number)

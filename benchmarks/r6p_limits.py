@@ -26,12 +26,12 @@ from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.metrics import translation_error
+from rsbench.core.pose_errors import translation_error
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.files import write_json, write_table
 from rsbench.solvers.r6p import R6pSolver, Resection, RowPose, errors, linear_pose
+from rsbench.storage.files import write_json, write_table
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.3)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)

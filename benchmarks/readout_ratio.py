@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
+from rsbench.capture.readout import estimate_readout_ratio
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.sequence import read_dataset
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import match_frames, referee
-from rsbench.pipeline.readout import estimate_readout_ratio
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 ALLOWED = 0.02

@@ -45,8 +45,8 @@ def make_up(card: Path, out: Path) -> None:
     from rsbench.dataset import generation
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.layout import RELATIVE_FILES
-    from rsbench.dataset.stage import Built
-    from rsbench.renderers import passage, scene
+    from rsbench.dataset.posed_scenes import Built
+    from rsbench.renderers import clearance, scene
 
     def render(*arguments: Any) -> Iterator[None]:
         side, frame, folder = arguments[4:7]
@@ -59,7 +59,7 @@ def make_up(card: Path, out: Path) -> None:
     nothing = SimpleNamespace(viewpoints={"default": None}, seen_from=lambda *place: place)
     vars(generation)["build_scene"] = lambda name: Built(nothing, "0" * 64)  # pyrefly: ignore[bad-argument-type]
     vars(generation)["render_camera"] = render
-    vars(passage)["obstacle"] = lambda *moving: ""
+    vars(clearance)["obstacle"] = lambda *moving: ""
     vars(scene)["MitsubaScene"] = lambda scene: SimpleNamespace(glossy=False)
     generation.generate_dataset(load_dataset_card(str(card)), out)
 
@@ -68,7 +68,7 @@ def resume(card: Path, out: Path | str, rehash: bool) -> None:
     """In a process of its own: resume, and print seconds and the largest memory, MB."""
     from rsbench.dataset import generation
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.stage import Built
+    from rsbench.dataset.posed_scenes import Built
 
     vars(generation)["build_scene"] = lambda name: Built(None, "0" * 64)  # pyrefly: ignore[bad-argument-type]
     start, processor = time.perf_counter(), time.process_time()

@@ -31,9 +31,9 @@ PLACE = "data/many"
 
 def fill(card: Path, put: Callable[[str, bytes], object]) -> None:
     """Put the objects of a complete dataset; no dataset.json, as if the run was killed just before."""
-    from rsbench.cards import load_card
+    from rsbench.components.cards import load_card
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.plans import of_scene, plans_of, wanted_files
+    from rsbench.dataset.sequence_identity import of_scene, plans_of, wanted_files
     from rsbench.renderers.options import RendererOptions
 
     dataset, digest = load_dataset_card(str(card)), hashlib.sha256(b"x").hexdigest()

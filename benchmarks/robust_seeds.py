@@ -29,12 +29,12 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.metrics import rotation_error, translation_error
+from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import SIDES, VIEWS
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.vision.feature_matcher import find_correspondences, load_features
 
 Image = NDArray[np.uint8]

@@ -30,8 +30,8 @@ import numpy as np
 
 from rsbench.dataset import generation
 from rsbench.dataset.card import load_dataset_card
-from rsbench.pipeline.crew import Cluster, Workers
-from rsbench.pipeline.isolated_jobs import finished_jobs
+from rsbench.jobs.process_jobs import finished_jobs
+from rsbench.jobs.workers import Cluster, Workers
 
 SCENES = ("castle", "poles", "room")
 

@@ -20,11 +20,11 @@ from itertools import chain, combinations, product
 from pathlib import Path
 from typing import TypeVar
 
-from rsbench.cards import card_path, read_toml
+from rsbench.components.cards import card_path, read_toml
 from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.verification import SequenceReport, verify_dataset
 from rsbench.renderers.backend import set_threads, start_backend
+from rsbench.verification import SequenceReport, verify_dataset
 
 T = TypeVar("T")
 Labels = tuple[str, ...]
@@ -125,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     start_backend()
     set_threads(1)  # so that its seconds are those of one CPU
     say(HEADER)
-    names = chosen.cards or sorted(path.stem for path in (ROOT / "datasets").glob("*.toml"))
+    names = chosen.cards or sorted(path.stem for path in (ROOT / "cards" / "datasets").glob("*.toml"))
     return int(sum([tried(name, chosen) for name in names]) > 0)
 
 

@@ -22,14 +22,14 @@ import numpy as np
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences, track_pairs
-from rsbench.core.metrics import rotation_error, translation_error
+from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.five_point import five_point
 from rsbench.solvers.engine.minimal import solve_triples
 from rsbench.solvers.engine.packed import pack, pack_pairs
 from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 
 CAMERA = PinholeCamera.centred(900, 900, 810.0)
 RIG = StereoRig(camera=CAMERA, baseline=0.6)

@@ -7,7 +7,7 @@ Each solver gets the least information that it can use fully, and exact or noisy
 that it declares, of the point of the rig that it declares. The bound is that of the same matches with six
 unknowns; a gyroscope's solvers are compared with that of a known rotation, those with gravity with that of
 two known angles. Affine frames are exact, and what they tell is not in the bound. The degenerate suite is
-sweeps/degenerate.toml with all solvers.
+cards/sweeps/degenerate.toml with all solvers.
 """
 
 # ruff: noqa: E402
@@ -54,16 +54,16 @@ from rsbench.benchmark.simulated.trials import Entrant, enter, given_matches
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.metrics import rotation_error, translation_error
+from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.files import write_json, write_table
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.pipeline.robust_motion import RobustOptions
 from rsbench.solvers.engine.base import BESIDE, MotionEstimate
 from rsbench.solvers.engine.registry import list_solvers, load_solver_entry
+from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.storage.files import write_json, write_table
 
 FOLDER = Path(__file__).parents[1] / "results/solvers"
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)

@@ -17,10 +17,10 @@ import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.statistics import share_interval
-from rsbench.cards import list_cards
-from rsbench.dataset.files import write_bytes
+from rsbench.components.cards import list_cards
 from rsbench.solvers.engine.base import BESIDE
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.storage.files import write_bytes
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs/solvers.md"

@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 
 import rsbench
-from rsbench.cards import card_path
+from rsbench.components.cards import card_path
 
 DATASET = """
 name = "own"

@@ -20,14 +20,14 @@ import numpy as np
 
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.metrics import rotation_error, translation_error
+from rsbench.core.errors import RsbenchError
+from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, read_frame
 from rsbench.pipeline.frame_motion import match_frames, solve_frames
-from rsbench.pipeline.sliding import estimate_sequence_readout
+from rsbench.pipeline.sequence_correction import estimate_sequence_readout
 
 Step = tuple[FloatArray, FloatArray]
 """Rotation (3, 3) and translation (3,), metres, of the body from one frame to the next."""

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rsbench.core.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from rsbench.api import (
         correct,
@@ -24,15 +26,13 @@ if TYPE_CHECKING:
     )
     from rsbench.core.camera import PinholeCamera
     from rsbench.core.correspondences import Correspondences
+    from rsbench.core.errors import RsbenchError
     from rsbench.core.motion import AcceleratedMotion, LinearMotion, TwistMotion
     from rsbench.core.rig import StereoRig
     from rsbench.core.shutter import RollingShutter
     from rsbench.core.spline_motion import SplineMotion
-    from rsbench.errors import RsbenchError
     from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
     from rsbench.solvers.engine.registry import list_solvers, load_solver
-
-__version__ = "0.1.0"
 
 __all__ = [
     "AcceleratedMotion",
@@ -69,7 +69,7 @@ _HOMES = {
     "MotionEstimate": "rsbench.solvers.engine.base",
     "PinholeCamera": "rsbench.core.camera",
     "RollingShutter": "rsbench.core.shutter",
-    "RsbenchError": "rsbench.errors",
+    "RsbenchError": "rsbench.core.errors",
     "Solver": "rsbench.solvers.engine.base",
     "SolverSpec": "rsbench.solvers.engine.base",
     "SplineMotion": "rsbench.core.spline_motion",

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rsbench import arguments
+from rsbench.components import arguments
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.projection import RSProjection, rs_project
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
     from rsbench.benchmark.simulated.simulation import Simulation
     from rsbench.dataset.sequence import Sequence
-    from rsbench.dataset.verification import Rerender, SequenceReport
     from rsbench.pipeline.chain import CorrectedFrames
-    from rsbench.pipeline.robust_motion import RobustEstimate
     from rsbench.solvers.engine.base import MotionEstimate, Solver
     from rsbench.solvers.engine.registry import SolverEntry
+    from rsbench.solvers.engine.robust_motion import RobustEstimate
+    from rsbench.verification import Rerender, SequenceReport
 
 AnyPath: TypeAlias = str | PathLike[str]
 Image: TypeAlias = NDArray[Any]
@@ -127,8 +127,8 @@ def estimate_motion(
         RsbenchError: no such solver.
         ValueError: an argument of another type or out of its range.
     """
-    from rsbench.pipeline.robust_motion import RobustOptions
-    from rsbench.pipeline.robust_motion import estimate_motion as estimate_robustly
+    from rsbench.solvers.engine.robust_motion import RobustOptions
+    from rsbench.solvers.engine.robust_motion import estimate_motion as estimate_robustly
 
     if not isinstance(correspondences, Correspondences):
         raise ValueError(f"correspondences: must be rsbench.Correspondences, got {type(correspondences).__name__}")
@@ -165,8 +165,8 @@ def pose_errors(
         ValueError: no such reference point.
     """
     from rsbench.benchmark import scoring
-    from rsbench.pipeline.robust_motion import RobustEstimate
     from rsbench.solvers.engine.base import MotionEstimate
+    from rsbench.solvers.engine.robust_motion import RobustEstimate
 
     if not isinstance(found, RobustEstimate | MotionEstimate):
         raise ValueError(f"found: must be what estimate_motion returned or a MotionEstimate, got {type(found)}")
@@ -329,7 +329,7 @@ def verify(
         rerender: rows to render again where the scene can be built here: "no", "auto" (seconds) or "all".
         scenes: cards of scenes that are not rsbench's own, and mesh files of objects that move.
     """
-    from rsbench.dataset.verification import verify_dataset
+    from rsbench.verification import verify_dataset
 
     return verify_dataset(Path(folder), stride, rerender=rerender, scenes=[Path(path) for path in scenes])
 

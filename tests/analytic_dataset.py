@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import rsbench
-from rsbench.cards import load_card
+from rsbench.components.cards import load_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses
@@ -17,10 +17,10 @@ from rsbench.core.rig import StereoRig, views_of
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
-from rsbench.dataset.files import sha256, write_depth, write_json, write_png, write_poses
 from rsbench.dataset.layout import Shutter, picture_file, relative_files
 from rsbench.dataset.sequence import UNITS, sequence_manifest
 from rsbench.renderers.options import RendererOptions
+from rsbench.storage.files import sha256, write_depth, write_json, write_png, write_poses
 
 PLANES = ((np.array([0.05, 1.0, -0.15]), 1.2), (np.array([0.1, 0.05, 1.0]), 9.0))
 """Normal n and offset c of n . X = c, world frame."""

@@ -21,7 +21,11 @@ from rsbench.dataset.channels import (
     PixelClass,
     matches_file,
 )
-from rsbench.dataset.files import (
+from rsbench.dataset.match_truth import Arranged, labelled
+from rsbench.dataset.matches import MatchClass, Matching, save_matches
+from rsbench.dataset.sequence import read_sequence
+from rsbench.renderers.image import to_srgb8
+from rsbench.storage.files import (
     read_depth,
     read_exr,
     read_grey_png,
@@ -31,11 +35,7 @@ from rsbench.dataset.files import (
     write_png,
     write_png16,
 )
-from rsbench.dataset.match_truth import Arranged, labelled
-from rsbench.dataset.matches import MatchClass, Matching, save_matches
-from rsbench.dataset.sequence import read_sequence
-from rsbench.reading import load_arrays
-from rsbench.renderers.image import to_srgb8
+from rsbench.storage.untrusted_files import load_arrays
 
 
 def values_of(file: str, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> Callable[[Path], None]:

@@ -1,7 +1,7 @@
 """The command line in this process: all that a new one would show, without the second or two of its start.
 
 New processes are for what needs one: packages beside it, signals, the terminal, what is imported, and what
-children print. That every command starts in one: tests/test_installed_wheel.py and tests/strangers.
+children print. That every command starts in one: tests/test_installed_wheel.py and tests/third_party.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import NoReturn
 
 import pytest
 
-from rsbench.cli import console, faults, main
+from rsbench.cli import console, crash_log, main
 
 
 def run_here(*arguments: object, text: str = "", **environment: str) -> subprocess.CompletedProcess[str]:
@@ -28,7 +28,7 @@ def run_here(*arguments: object, text: str = "", **environment: str) -> subproce
     out, err, code = io.StringIO(), io.StringIO(), 0
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         patch.setattr(sys, "argv", words)
-        patch.setattr(faults, "describe", _raise)
+        patch.setattr(crash_log, "describe", _raise)
         patch.setattr(sys, "stdin", io.StringIO(text))
         for name, value in environment.items():
             patch.setenv(name, value)

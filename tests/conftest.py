@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rsbench.imports import import_untried
+from rsbench.components.imports import import_untried
 
 if TYPE_CHECKING:
     from rsbench.scenes.model import Light, Scene
@@ -110,11 +110,11 @@ def built_scene() -> Callable[[str], Scene]:
 @pytest.fixture(scope="module")
 def scenes_once(built_scene: Callable[[str], Scene], give_back: Callable[[], None]) -> Iterator[None]:
     """Sequences of one scene of ours, seen from one place, share it in the renderer: loading it takes seconds."""
-    from rsbench.cards import card_path
+    from rsbench.components.cards import card_path
     from rsbench.dataset import generation
-    from rsbench.dataset.verification import rerender
     from rsbench.renderers import scene
     from rsbench.scenes.load import load_scene
+    from rsbench.verification import rerender
 
     made = scene.MitsubaScene
     kept: dict[tuple[str, Light], scene.MitsubaScene] = {}
@@ -144,7 +144,7 @@ def scenes_once(built_scene: Callable[[str], Scene], give_back: Callable[[], Non
 
 @pytest.fixture(scope="session")
 def smoke_dataset(tmp_path_factory: pytest.TempPathFactory, built_scene: Callable[[str], Scene]) -> Path:
-    """The dataset of datasets/smoke.toml, rendered once per test run, by whichever process needs it first."""
+    """The dataset of the card ``smoke``, rendered once per test run, by whichever process needs it first."""
     # Imported here, so that a broken part does not stop the tests of the others.
     from rsbench.dataset import generation
     from rsbench.dataset.card import load_dataset_card

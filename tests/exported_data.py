@@ -17,8 +17,8 @@ from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.export.exporter import export_dataset
-from rsbench.export.seen_views import Images
+from rsbench.interop.writers.exporter import export_dataset
+from rsbench.interop.writers.image_poses import Images
 
 WIDTH, HEIGHT = 64, 49
 """Row 24 is the middle of the readout."""

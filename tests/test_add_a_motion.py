@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from commands import sweep_card
 
-from rsbench.cards import read_toml
+from rsbench.components.cards import read_toml
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "add-a-motion.md"
 SWEEP = sweep_card(
@@ -88,12 +88,12 @@ def test_what_it_cannot_be_is_one_line(site: Path, setting: str, words: str) -> 
 
 def test_a_class_beside_the_card_needs_no_package(site: Path, tmp_path: Path) -> None:
     (tmp_path / "ease_motion.py").write_text((site / "ease_motion.py").read_text())
-    card = (Path(__file__).parents[1] / "datasets" / "smoke.toml").read_text()
+    card = (Path(__file__).parents[1] / "cards" / "datasets" / "smoke.toml").read_text()
     card = card.replace("[motion]\n", '[motion]\nmodel = "ease_motion:EaseMotion"\nparameters = { c = 0.5 }\n')
     (tmp_path / "eased.toml").write_text(card)
     code = f"""
 from rsbench.dataset.card import load_dataset_card
-from rsbench.motions import motion_record, read_motion
+from rsbench.components.motion_models import motion_record, read_motion
 card = load_dataset_card({str(tmp_path / "eased.toml")!r})
 record = motion_record(card.motion_of(card.sequence[0]))
 assert record["model"] == "ease_motion:EaseMotion", record

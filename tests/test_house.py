@@ -22,10 +22,10 @@ from rsbench.benchmark.simulated.contract import CHECKS, check_solver
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.benchmark.studies.claims import CLAIMS
 from rsbench.benchmark.studies.correction_methods import METHODS
-from rsbench.cards import CardKind, list_cards, load_card, read_toml
+from rsbench.components.cards import CardKind, list_cards, load_card, read_toml
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.metrics import rotation_error, translation_error
 from rsbench.core.motion import LinearMotion
+from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import load_dataset_card

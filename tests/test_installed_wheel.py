@@ -83,7 +83,7 @@ def test_the_sample_rig_is_that_of_the_castle(installed: Path, tmp_path: Path) -
     rig = tomllib.loads(
         Path(_run(["rsbench", "docs", "rig.toml"], tmp_path, installed).strip()).read_text("utf-8")
     )
-    card = tomllib.loads((ROOT / "datasets" / "paper.toml").read_text("utf-8"))
+    card = tomllib.loads((ROOT / "cards" / "datasets" / "paper.toml").read_text("utf-8"))
     assert (rig["baseline"], rig["readout_ratio"]) == (card["baseline"], card["readout_ratio"])
     assert rig["camera"] == {"fx": 1384.6, "fy": 1384.6, "cx": 449.5, "cy": 449.5}
     assert (card["camera"]["focal"], card["camera"]["width"], card["camera"]["height"]) == (1384.6, 900, 900)

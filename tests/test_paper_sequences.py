@@ -12,17 +12,17 @@ import pytest
 
 from rsbench.benchmark.images.evaluation import open_evaluation, read_scores
 from rsbench.benchmark.images.plan import EvaluationOptions
-from rsbench.cards import load_card
+from rsbench.components.cards import load_card
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.projection import row_poses
 from rsbench.core.se3 import Pose
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.verification import verify_dataset
 from rsbench.renderers import scene as renderer_scene
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import render
 from rsbench.scenes.model import Scene
+from rsbench.verification import verify_dataset
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 SCENES = ("castle", "room")

@@ -22,7 +22,7 @@ from rsbench.benchmark.simulated.simulation import Simulation
 from rsbench.core.projection import RSProjection
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.frame_motion import NoMotionError
-from rsbench.pipeline.robust_motion import RobustEstimate
+from rsbench.solvers.engine.robust_motion import RobustEstimate
 
 NAMES = [
     "AcceleratedMotion",

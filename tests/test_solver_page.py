@@ -10,7 +10,7 @@ import pandas as pd
 import programs
 import pytest
 
-from rsbench.cards import list_cards
+from rsbench.components.cards import list_cards
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/solvers.md").read_text("utf-8")

@@ -16,13 +16,13 @@ from typing import Any, Literal, final
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench import plugins
+from rsbench.components import plugins
+from rsbench.components.plugins import Entry, Kind, RunOptions
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
-from rsbench.plugins import Entry, Kind, RunOptions
 
 
 @final

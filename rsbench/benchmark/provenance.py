@@ -12,9 +12,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from rsbench import __version__
-from rsbench.dataset.files import sha256
-from rsbench.plugins import own_source_version
+from rsbench.components.plugins import own_source_version
+from rsbench.core.version import __version__
+from rsbench.storage.files import sha256
 
 _NUMERIC = ("numpy", "scipy", "opencv-python-headless", "numba", "poselib")
 """Packages whose version may change the last digit of a prediction."""

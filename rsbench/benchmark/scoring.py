@@ -12,9 +12,10 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rsbench import plugins
 from rsbench.benchmark.metric_plugins import METRICS, Case, MetricEntry
-from rsbench.core.metrics import (
+from rsbench.components import plugins
+from rsbench.core.errors import RsbenchError
+from rsbench.core.pose_errors import (
     WORST_ANGLE,
     WORST_SCALE,
     rotation_error,
@@ -24,7 +25,6 @@ from rsbench.core.metrics import (
 )
 from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
 
 WORST_POSE = {"e_R_deg": 180.0, "e_T_deg": 180.0, "e_s": WORST_SCALE}
 """What a failed motion scores, by the name of each error."""

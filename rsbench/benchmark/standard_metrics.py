@@ -19,8 +19,8 @@ from rsbench.benchmark.metric_plugins import (
     PoseMetric,
 )
 from rsbench.benchmark.scoring import WORST_POSE, pose_errors
-from rsbench.errors import RsbenchError
-from rsbench.vision.legacy_quality import flip
+from rsbench.core.errors import RsbenchError
+from rsbench.vision.published_quality import flip
 from rsbench.vision.quality import psnr, ssim
 from rsbench.vision.stereo_depth import depth_metrics
 

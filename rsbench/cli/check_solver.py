@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rsbench.cli.kinds import complete
+from rsbench.cli.component_kinds import complete
 
 EPILOG = """[bold]Examples[/bold]
 

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsbench.cli.kinds import named
+from rsbench.cli.component_kinds import named
 
 if TYPE_CHECKING:
+    from rsbench.capture.readout import ReadoutEstimate
     from rsbench.core.rig import StereoRig
     from rsbench.core.shutter import RollingShutter
     from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import FrameSource, RigCard
-    from rsbench.pipeline.readout import ReadoutEstimate
-    from rsbench.pipeline.sliding import CorrectedMoment
+    from rsbench.pipeline.sequence_correction import CorrectedMoment
     from rsbench.vision.corrector import CorrectorEntry
 
 EPILOG = """[bold]Examples[/bold]
@@ -123,7 +123,7 @@ def _given(
     frames: list[Path] | None, rig: Path | None, out: Path | None, left: Path | None, right: Path | None
 ) -> _Given:
     """Raises RsbenchError for another combination of arguments."""
-    from rsbench.errors import RsbenchError
+    from rsbench.core.errors import RsbenchError
     from rsbench.pipeline.footage import read_rig_card
 
     rendered = frames is not None and len(frames) == 1 and frames[0].is_dir()
@@ -147,10 +147,10 @@ def _given(
 
 def _of_sequence(folder: Path, out: Path) -> _Given:
     """The rolling-shutter frames of a sequence of a dataset."""
+    from rsbench.core.errors import RsbenchError
     from rsbench.core.rig import SIDES
     from rsbench.dataset.layout import picture_file
     from rsbench.dataset.sequence import read_dataset_manifest, read_sequence
-    from rsbench.errors import RsbenchError
     from rsbench.pipeline.footage import rig_card_of
 
     if not (folder / "sequence.json").is_file():
@@ -169,8 +169,8 @@ def _of_sequence(folder: Path, out: Path) -> _Given:
 def _options(
     features: str, solver: str, matcher: str, corrector: str, fill: bool, **others: Any
 ) -> CorrectionOptions:
+    from rsbench.capture.model_choice import check_asked
     from rsbench.pipeline.correction_options import CorrectionOptions
-    from rsbench.pipeline.model_choice import check_asked
     from rsbench.solvers.engine.registry import load_solver_entry
     from rsbench.vision.feature_matcher import load_features
     from rsbench.vision.stereo_matcher import load_matcher
@@ -191,8 +191,8 @@ def _corrector(name: str, fill: bool) -> CorrectorEntry:
     """The corrector; ``--no-fill`` turns the filling of ours off."""
     from dataclasses import replace
 
-    from rsbench.errors import RsbenchError
-    from rsbench.plugins import component_key
+    from rsbench.components.plugins import component_key
+    from rsbench.core.errors import RsbenchError
     from rsbench.vision.corrector import load_corrector
     from rsbench.vision.correctors import FusionCorrector
 
@@ -206,7 +206,7 @@ def _corrector(name: str, fill: bool) -> CorrectorEntry:
 
 
 def _target_row(target: str, height: int) -> float:
-    from rsbench.errors import RsbenchError
+    from rsbench.core.errors import RsbenchError
 
     named = {"first": 0.0, "middle": (height - 1) / 2, "last": height - 1.0}
     if target in named:
@@ -260,7 +260,7 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
 
 
 def _sized(card: RigCard, image: Any) -> StereoRig:
-    from rsbench.errors import RsbenchError
+    from rsbench.core.errors import RsbenchError
 
     height, width = image.shape[:2]
     try:
@@ -330,7 +330,7 @@ def _correct_sequence(
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.corrected_frames import fresh_folder, rig_record, write_record
     from rsbench.pipeline.chain import check_cameras
-    from rsbench.pipeline.sliding import correct_sequence, estimate_sequence_readout
+    from rsbench.pipeline.sequence_correction import correct_sequence, estimate_sequence_readout
 
     rig = _sized(card, next(iter(left)))
     options = replace(options, target_row=_target_row(target, rig.camera.height))

@@ -20,8 +20,8 @@ def docs(
     name: Annotated[str | None, typer.Argument(help="A document or example; its path is printed.")] = None,
 ) -> None:
     """List the documents and examples that come with rsbench, or print where one of them is."""
-    from rsbench.cards import choices
-    from rsbench.errors import RsbenchError
+    from rsbench.components.cards import choices
+    from rsbench.core.errors import RsbenchError
 
     documents = list_documents()
     if name is not None:
@@ -40,7 +40,7 @@ def docs(
 
 def list_documents() -> dict[str, Path]:
     """Paths by name, sorted: documents without their ending, examples with it."""
-    from rsbench.cards import shipped_folder
+    from rsbench.components.cards import shipped_folder
 
     documents = {path.stem: path for path in shipped_folder("docs", "_docs").glob("*.md") if path.stem != "index"}
     examples = shipped_folder("examples", "_docs/examples").glob("*.*")

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rsbench.cli.clusters import Scheduler, chosen_workers, results_at, shared_path
-from rsbench.cli.kinds import complete
+from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at, shared_path
+from rsbench.cli.component_kinds import complete
 
 if TYPE_CHECKING:
     from rsbench.benchmark.images.plan import EvaluationOptions
-    from rsbench.pipeline.crew import Workers
+    from rsbench.jobs.workers import Workers
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -119,12 +119,12 @@ def evaluate(
 
 def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, seed: int) -> None:
     """Depth of pairs with disparities, and motion of one camera with poses: two tables."""
-    from rsbench.benchmark.others import depth_scores, pose_scores
+    from rsbench.benchmark.recordings import depth_scores, pose_scores
     from rsbench.cli.console import print_table
-    from rsbench.dataset.files import check_out, write_table
-    from rsbench.dataset.importing.formats import read_others
-    from rsbench.dataset.mirror import name_of
-    from rsbench.errors import RsbenchError
+    from rsbench.core.errors import RsbenchError
+    from rsbench.interop.readers.formats import read_others
+    from rsbench.storage.files import check_out, write_table
+    from rsbench.storage.mirror import name_of
     from rsbench.vision.stereo_matcher import load_matcher
 
     check_out(out)
@@ -170,8 +170,8 @@ def evaluate_dataset(
     from rsbench.benchmark.images.evaluation import open_evaluation
     from rsbench.benchmark.images.plan import EvaluationOptions
     from rsbench.cli.console import print_table, progress_bar
-    from rsbench.dataset.mirror import name_of
     from rsbench.report.evaluation_page import summary_tables, write_report
+    from rsbench.storage.mirror import name_of
 
     evaluation = open_evaluation(folder, out, options or EvaluationOptions(solvers=tuple(every_solver())))
     with progress_bar(f"evaluating {folder.name}", evaluation.steps) as advance:

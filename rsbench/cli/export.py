@@ -22,7 +22,7 @@ EPILOG = """[bold]Examples[/bold]
 
 
 class Target(StrEnum):
-    """Formats; tests hold them equal to ``rsbench.export.exporter.FORMATS``."""
+    """Formats; tests hold them equal to ``rsbench.interop.writers.exporter.FORMATS``."""
 
     COLMAP = "colmap"
     TUM = "tum"
@@ -55,7 +55,7 @@ def export(
 ) -> None:
     """Write a dataset for COLMAP, evo and others; what a format cannot hold is refused or told, never bent."""
     from rsbench.cli.console import late_progress, say
-    from rsbench.export.exporter import export_dataset
+    from rsbench.interop.writers.exporter import export_dataset
 
     with late_progress(f"exporting to {to}") as advance:
         told = export_dataset(

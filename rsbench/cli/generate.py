@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rsbench.cli.clusters import Scheduler, chosen_workers, shared_path
-from rsbench.cli.kinds import complete
+from rsbench.cli.cluster_options import Scheduler, chosen_workers, shared_path
+from rsbench.cli.component_kinds import complete
 
 if TYPE_CHECKING:
     from rsbench.dataset.card import DatasetCard
@@ -105,11 +105,11 @@ def generate(
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.files import check_out
     from rsbench.dataset.generation import generate_dataset, steps_of
-    from rsbench.dataset.object_store import path_or_url, shown
-    from rsbench.dataset.store_home import store_for
+    from rsbench.dataset.store_destination import store_for
     from rsbench.renderers.backend import start_backend
+    from rsbench.storage.files import check_out
+    from rsbench.storage.object_store import path_or_url, shown
 
     crew, place = chosen_workers(workers, scheduler), shared_path(path_or_url(out), scheduler)
     dataset = _chosen(load_dataset_card(card, trajectory, tuple(seed or ())), sequence, shard, channels)
@@ -145,7 +145,7 @@ def _chosen(
 
 def _part(word: str) -> tuple[int, int]:
     """Of ``2/5``: 2 and 5."""
-    from rsbench.errors import RsbenchError
+    from rsbench.core.errors import RsbenchError
 
     part, slash, parts = word.partition("/")
     if not (slash and part.isdecimal() and parts.isdecimal()):
@@ -156,8 +156,8 @@ def _part(word: str) -> tuple[int, int]:
 def _estimated(dataset: DatasetCard, full_frames: bool) -> str:
     """What it will take, in one line."""
     from rsbench.cli.console import progress_bar
-    from rsbench.dataset.estimate import estimate_dataset
-    from rsbench.errors import RsbenchError
+    from rsbench.core.errors import RsbenchError
+    from rsbench.dataset.cost_estimate import estimate_dataset
 
     if full_frames:
         raise RsbenchError("--estimate: not with --full-frames, of which one frame takes as long as hundreds")

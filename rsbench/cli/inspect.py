@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from rsbench.cli.kinds import named
-from rsbench.errors import RsbenchError
+from rsbench.cli.component_kinds import named
+from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
+    from rsbench.capture.inspection import Inspection, Window
     from rsbench.core.rig import StereoRig
     from rsbench.core.shutter import RollingShutter
     from rsbench.pipeline.footage import FrameSource
-    from rsbench.pipeline.inspection import Inspection, Window
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -74,7 +74,7 @@ def inspect(
     json: Annotated[bool, typer.Option("--json", help="One JSON object per line and rig.")] = False,
 ) -> None:
     """Tell which camera rolls, from which side of the image it reads, and how fast."""
-    from rsbench.pipeline.inspection import MODELS, conclude
+    from rsbench.capture.inspection import MODELS, conclude
     from rsbench.solvers.engine.kernel_type import load_kernel
 
     options = _Options(tuple(motion_model or MODELS), windows, features, seed)
@@ -119,7 +119,7 @@ def _cases(
 def _of_problems(path: Path, options: _Options) -> Iterator[_Case | RsbenchError]:
     import sys
 
-    from rsbench.pipeline.inspection import inspect_window
+    from rsbench.capture.inspection import inspect_window
     from rsbench.pipeline.problem import read_problems
 
     for problem in read_problems(str(path), sys.stdin):
@@ -180,11 +180,11 @@ def _frame_windows(left: FrameSource, right: FrameSource, rig: StereoRig, option
     """Of successive frames, evenly over the sequence."""
     from itertools import pairwise
 
+    from rsbench.capture.inspection import inspect_window
     from rsbench.core.shutter import Scanning
     from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import check_alike
     from rsbench.pipeline.frame_motion import find_matches_of_rig
-    from rsbench.pipeline.inspection import inspect_window
     from rsbench.pipeline.isolated_parts import Isolation
     from rsbench.vision.feature_matcher import load_features
 
@@ -240,7 +240,7 @@ def _record(case: _Case, found: Inspection) -> dict[str, Any]:
 
 
 def _said(shutter: RollingShutter | None) -> dict[str, Any] | None:
-    from rsbench.pipeline.scan_reading import reading_of
+    from rsbench.capture.scan_reading import reading_of
 
     if shutter is None:
         return None

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rsbench.cli.clusters import Scheduler, chosen_workers, results_at
-from rsbench.cli.kinds import complete
+from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
+from rsbench.cli.component_kinds import complete
 from rsbench.cli.leaderboard_run import load_cards, predict
 from rsbench.cli.leaderboard_tracks import (
     Data,
@@ -20,7 +20,7 @@ from rsbench.cli.leaderboard_tracks import (
     split_of,
     write_frames_of,
 )
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -69,7 +69,7 @@ def export(
     """Write the inputs of a track for any language; of a public split the truth too."""
     from rsbench.benchmark.leaderboard.exporting import check_place, write_inputs
     from rsbench.cli.console import progress_bar
-    from rsbench.dataset.workplace import workplace
+    from rsbench.storage.work_folder import workplace
 
     split = split_of(track, data, seed_file, secret)
     check_place(split, out)
@@ -91,7 +91,7 @@ def template(
     """Print a file of predictions that is in order: fill in your own."""
     from rsbench.benchmark.leaderboard.picture_oracles import write_template
     from rsbench.benchmark.leaderboard.submissions import template_text
-    from rsbench.dataset.files import write_bytes
+    from rsbench.storage.files import write_bytes
 
     split = split_of(track, data, seed_file)
     if out is None:

@@ -10,7 +10,7 @@ from rsbench.cli.leaderboard_tracks import problems_of, write_frames_of
 if TYPE_CHECKING:
     from rsbench.benchmark.leaderboard.running import Limits
     from rsbench.benchmark.leaderboard.splits import Split
-    from rsbench.pipeline.crew import Workers
+    from rsbench.jobs.workers import Workers
 
 
 def load_cards(cards: list[str], split: Split) -> None:
@@ -34,7 +34,7 @@ def predict(
     from rsbench.benchmark.leaderboard.picture_running import run_picture_cards
     from rsbench.benchmark.leaderboard.running import prepare_inputs, run_cards, steps_of
     from rsbench.cli.console import progress_bar
-    from rsbench.dataset.workplace import workplace
+    from rsbench.storage.work_folder import workplace
 
     steps = len(split.truths) if split.protocol.pictures else steps_of(entry, split, limits)
     with workplace(board) as hidden, progress_bar(f"running {split.name}", steps) as advance:

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from rsbench.cli.kinds import complete
+from rsbench.cli.component_kinds import complete
 from rsbench.cli.leaderboard_tracks import Workers
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 
 _Seed = Annotated[
     Path, typer.Option("--seed-file", metavar="FILE", help="Secret text, 16 characters or more, drawn at random.")
@@ -34,7 +34,7 @@ def publish(
     from rsbench.benchmark.leaderboard.protocols import protocol_of_track
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.generation import steps_of
-    from rsbench.dataset.secret import read_secret, secret_card
+    from rsbench.dataset.secret_split import read_secret, secret_card
 
     protocol, text = protocol_of_track(track), read_secret(seed_file)
     if track == "points":
@@ -68,7 +68,7 @@ def score(
     from rsbench.benchmark.leaderboard.publishing import announced_split, read_announcement
     from rsbench.benchmark.leaderboard.submissions import check_submission
     from rsbench.benchmark.provenance import provenance
-    from rsbench.dataset.secret import read_secret
+    from rsbench.dataset.secret_split import read_secret
 
     announced = read_announcement(published)
     protocol, text = protocol_of_id(announced.protocol), read_secret(seed_file)

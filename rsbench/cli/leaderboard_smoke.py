@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsbench.cli.kinds import complete
+from rsbench.cli.component_kinds import complete
 
 if TYPE_CHECKING:
     from rsbench.benchmark.leaderboard.smoke import Job
@@ -59,7 +59,7 @@ def smoke(
     from rsbench.benchmark.leaderboard.smoke import read_scores, run_smoke
     from rsbench.benchmark.leaderboard.smoke_tracks import hashes_of_frames
     from rsbench.cli.console import progress_bar
-    from rsbench.dataset.files import check_out
+    from rsbench.storage.files import check_out
 
     jobs = _jobs(track, entry)
     tracks = list(dict.fromkeys(job.track for job in jobs))
@@ -89,7 +89,7 @@ def _jobs(tracks: Sequence[str] | None, entries: Sequence[str] | None) -> list[J
     from rsbench.benchmark.leaderboard.protocols import PROTOCOLS, protocol_of_track
     from rsbench.benchmark.leaderboard.smoke import Job
     from rsbench.benchmark.leaderboard.smoke_tracks import ENTRIES
-    from rsbench.errors import RsbenchError
+    from rsbench.core.errors import RsbenchError
 
     chosen = [protocol_of_track(track).track for track in dict.fromkeys(tracks or PROTOCOLS)]
     jobs, taken = list[Job](), set[str]()
@@ -111,7 +111,7 @@ def _jobs(tracks: Sequence[str] | None, entries: Sequence[str] | None) -> list[J
 
 def _check_stored(stored: Path, tracks: Sequence[str]) -> None:
     from rsbench.benchmark.leaderboard.smoke import file_of
-    from rsbench.errors import RsbenchError
+    from rsbench.core.errors import RsbenchError
 
     for track in tracks:
         if not (stored / file_of(track)).is_file():
@@ -146,7 +146,7 @@ def _frames(data: Path | None, tracks: Sequence[str], problems: int | None) -> I
 def _store(stored: Path, found: dict[str, Any], frames: dict[str, str]) -> None:
     from rsbench.benchmark.leaderboard.smoke import file_of, record_of
     from rsbench.benchmark.provenance import provenance
-    from rsbench.dataset.files import write_json, write_table
+    from rsbench.storage.files import write_json, write_table
 
     stored.mkdir(parents=True, exist_ok=True)
     for track, table in found.items():
@@ -176,7 +176,7 @@ def _compare(stored: Path, found: dict[str, Any], known: dict[str, Any], frames:
 
 def own_solvers() -> list[str]:
     """Names of the solvers that come with rsbench and need no more than ``points`` gives, each once."""
-    from rsbench.plugins import offers
+    from rsbench.components.plugins import offers
     from rsbench.solvers.engine.base import BESIDE
     from rsbench.solvers.engine.registry import SOLVERS, load_solver_entry
 

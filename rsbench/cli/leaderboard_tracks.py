@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
     from rsbench.benchmark.leaderboard.splits import Split

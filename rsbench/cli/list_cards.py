@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsbench.cli.kinds import complete_kind
+from rsbench.cli.component_kinds import complete_kind
 
 if TYPE_CHECKING:
-    from rsbench.plugins import Kind, Offer
+    from rsbench.components.plugins import Kind, Offer
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -29,10 +29,10 @@ def list_(
     """List scenes, solvers, datasets and so on, with the cards to copy and edit, and who they come from."""
     import json as json_module
 
-    from rsbench.cards import choices
+    from rsbench.cli.component_kinds import kind_names
     from rsbench.cli.console import print_rows, say
-    from rsbench.cli.kinds import kind_names
-    from rsbench.errors import RsbenchError
+    from rsbench.components.cards import choices
+    from rsbench.core.errors import RsbenchError
 
     kinds = kind_names()
     if kind is not None and kind not in kinds:
@@ -54,7 +54,7 @@ def list_(
 
 
 def _kinds(kinds: list[str]) -> list[dict[str, Any]]:
-    from rsbench.cli.kinds import names_of
+    from rsbench.cli.component_kinds import names_of
 
     return [{"kind": kind, "names": names_of(kind)} for kind in kinds]
 
@@ -64,10 +64,10 @@ def entries(kind: str) -> list[dict[str, Any]]:
 
     What an installed package offers is loaded, to tell whether it can be; its faults are its own.
     """
-    from rsbench import plugins
-    from rsbench.cards import list_cards
-    from rsbench.cli.kinds import component_kind
-    from rsbench.plugins import Offer
+    from rsbench.cli.component_kinds import component_kind
+    from rsbench.components import plugins
+    from rsbench.components.cards import list_cards
+    from rsbench.components.plugins import Offer
 
     described = component_kind(kind)
     if described is not None:
@@ -77,9 +77,9 @@ def entries(kind: str) -> list[dict[str, Any]]:
 
 
 def _row(kind: Kind[Any, Any] | None, offer: Offer) -> dict[str, Any]:
-    from rsbench import plugins
-    from rsbench.cards import read_toml
-    from rsbench.errors import RsbenchError
+    from rsbench.components import plugins
+    from rsbench.components.cards import read_toml
+    from rsbench.core.errors import RsbenchError
 
     description, broken = "", ""
     if offer.path is not None:

@@ -9,16 +9,15 @@ from typing import Annotated
 
 import typer
 
-from rsbench import __version__
 from rsbench.cli import (
     check_solver,
     correct,
+    crash_log,
     demo,
     docs,
     doctor,
     evaluate,
     export,
-    faults,
     generate,
     inspect,
     leaderboard,
@@ -30,8 +29,9 @@ from rsbench.cli import (
     view,
 )
 from rsbench.cli import list_cards as cards
-from rsbench.cli.stopping import stoppable
-from rsbench.errors import RsbenchError
+from rsbench.cli.signals import stoppable
+from rsbench.core.errors import RsbenchError
+from rsbench.core.version import __version__
 
 app = typer.Typer(
     name="rsbench",
@@ -117,7 +117,7 @@ def run() -> None:
         # A folder without permission, wherever it is met; or what has no name, as a full disk behind stdout.
         if isinstance(error, OSError) and (place := error.filename or _NAMELESS.get(error.errno or 0)):
             _fail(f"{place}: {error.strerror or error}")
-        _fail(faults.describe(error), faults.EXIT_CODE)
+        _fail(crash_log.describe(error), crash_log.EXIT_CODE)
 
 
 def _wrongly_used(error: typer.TyperException) -> None:

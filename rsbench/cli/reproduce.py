@@ -95,7 +95,7 @@ def reproduce(
     width: Annotated[int | None, typer.Option(help="Of real: width of the images; default: the card's.")] = None,
 ) -> None:
     """Make the committed results again: render or simulate what is missing, run, score, draw."""
-    from rsbench.dataset.files import check_out
+    from rsbench.storage.files import check_out
 
     check_out(out)
     targets = _ORDER if target is Target.everything else (target,)
@@ -111,7 +111,7 @@ def reproduce(
 def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds: int, width: int | None) -> None:
     from contextlib import ExitStack
 
-    from rsbench.dataset.workplace import workplace
+    from rsbench.storage.work_folder import workplace
 
     with ExitStack() as stack:
         for name in _FOLDERS.get(target, (target.value,)):

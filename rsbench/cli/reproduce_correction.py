@@ -25,9 +25,9 @@ def fig4(out: Path, data: Path) -> None:
     from rsbench.benchmark.studies.correction_summary import numbers_table
     from rsbench.benchmark.studies.fig4_panels import load_panels, make_panels, save_panels
     from rsbench.cli.console import progress_bar
-    from rsbench.dataset.files import write_json, write_table
     from rsbench.dataset.sequence import read_sequence
     from rsbench.report.fig4 import draw_fig4
+    from rsbench.storage.files import write_json, write_table
 
     folder = out / "fig4"
     folder.mkdir(parents=True, exist_ok=True)
@@ -56,9 +56,9 @@ def correction(out: Path, data: Path, workers: int | None = None) -> None:
     from rsbench.benchmark.studies.correction_study import study_dataset
     from rsbench.benchmark.studies.correction_summary import by_scene, summarise, summarise_bands
     from rsbench.cli.console import progress_bar
-    from rsbench.dataset.files import write_json, write_table
     from rsbench.dataset.sequence import read_dataset
     from rsbench.report.correction_page import write_study
+    from rsbench.storage.files import write_json, write_table
 
     folder = out / "correction"
     folder.mkdir(parents=True, exist_ok=True)
@@ -93,9 +93,9 @@ def sgm(out: Path, data: Path) -> None:
     from rsbench.benchmark.provenance import dataset_record, provenance
     from rsbench.benchmark.studies.sgm_timing import TIMINGS, compare
     from rsbench.cli.console import progress_bar
-    from rsbench.dataset.files import read_png, write_json, write_table
     from rsbench.dataset.sequence import read_sequence
     from rsbench.report.sgm_page import write_sgm_page
+    from rsbench.storage.files import read_png, write_json, write_table
 
     folder = out / "sgm"
     folder.mkdir(parents=True, exist_ok=True)
@@ -130,12 +130,12 @@ def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
     from rsbench.benchmark.provenance import dataset_record, provenance
     from rsbench.benchmark.studies import real_cameras
     from rsbench.cli.console import progress_bar
+    from rsbench.core.errors import RsbenchError
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.files import write_json, write_table
     from rsbench.dataset.generation import generate_dataset, steps_of
-    from rsbench.errors import RsbenchError
     from rsbench.renderers.backend import start_backend
     from rsbench.report.real_page import write_real_page
+    from rsbench.storage.files import write_json, write_table
 
     if seeds < real_cameras.FEWEST_SEEDS:
         raise RsbenchError(f"--seeds {seeds}: must be at least {real_cameras.FEWEST_SEEDS}")
@@ -195,15 +195,15 @@ def _generate(card: str, data: Path) -> None:
 
 def _render_right(card: str, name: str, timing: Timing, path: Path) -> None:
     from rsbench.benchmark.studies.sgm_timing import right_row_poses
-    from rsbench.cards import load_card
+    from rsbench.components.cards import load_card
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.files import write_png
     from rsbench.renderers.backend import start_backend
     from rsbench.renderers.image import to_srgb8
     from rsbench.renderers.options import RendererOptions
     from rsbench.renderers.render import render
     from rsbench.renderers.scene import MitsubaScene
     from rsbench.scenes.load import load_scene
+    from rsbench.storage.files import write_png
 
     dataset = load_dataset_card(card)
     sequence = next(one for one in dataset.sequence if one.name == name)

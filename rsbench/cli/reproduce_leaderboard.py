@@ -43,7 +43,7 @@ def entries_of_frames() -> dict[str, list[str]]:
     ``readout`` has those that look for a ratio: the maximum-likelihood ones of both cameras, which it takes alone.
     """
     from rsbench.cli.leaderboard_smoke import own_solvers
-    from rsbench.plugins import Kind, offers
+    from rsbench.components.plugins import Kind, offers
     from rsbench.vision.corrector import CORRECTORS, load_corrector
     from rsbench.vision.stereo_matcher import STEREO_MATCHERS
 
@@ -63,9 +63,9 @@ def publish(board: Path, out: Path) -> None:
     """Write a board's site, and by what command and code each entry was made."""
     from rsbench.benchmark.leaderboard.board import entries_of, splits_of
     from rsbench.benchmark.provenance import provenance
-    from rsbench.dataset.files import write_json
-    from rsbench.reading import read_json
     from rsbench.report.board_page import build_site
+    from rsbench.storage.files import write_json
+    from rsbench.storage.untrusted_files import read_json
 
     page = build_site(board, out / "site", problem_pages=False)
     made = {

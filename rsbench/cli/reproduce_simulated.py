@@ -22,8 +22,8 @@ def fig3(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.benchmark.provenance import provenance
     from rsbench.benchmark.simulated.sweep_card import load_sweep
     from rsbench.benchmark.simulated.trial_errors import errors_of_rows
-    from rsbench.dataset.files import save_arrays, write_bytes, write_json, write_table
     from rsbench.report.fig3 import SWEEPS, draw_fig3, fig3_page, setting_table
+    from rsbench.storage.files import save_arrays, write_bytes, write_json, write_table
 
     folder = out / "fig3"
     folder.mkdir(parents=True, exist_ok=True)
@@ -49,8 +49,8 @@ def fig3(out: Path, data: Path, workers: int | None) -> None:
 def sweeps(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.benchmark.provenance import provenance
     from rsbench.benchmark.simulated.sweep_card import load_sweep
-    from rsbench.dataset.files import write_bytes, write_json, write_table
     from rsbench.report.sweep_pages import sweeps_page
+    from rsbench.storage.files import write_bytes, write_json, write_table
 
     folder = out / "sweeps"
     folder.mkdir(parents=True, exist_ok=True)
@@ -71,9 +71,9 @@ def claims(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.benchmark.simulated.sweep_card import load_sweep
     from rsbench.benchmark.studies.claims import best_readings, judge_claims
     from rsbench.benchmark.studies.readings import LITERAL, readings_of, write_cards
-    from rsbench.dataset.files import write_bytes, write_json, write_table
     from rsbench.report.claims_page import claims_page
     from rsbench.report.fig3 import SWEEPS
+    from rsbench.storage.files import write_bytes, write_json, write_table
 
     fig3(out, data, workers)
     folder, home, command = out / "claims", data / "simulated", "rsbench reproduce claims"
@@ -98,8 +98,8 @@ def _claim_tables(
 ) -> dict[str, dict[str, pd.DataFrame]]:
     """Summaries of the sweeps of Figure 3 by the matches per camera, with the readings of the paper's solver."""
     from rsbench.benchmark.studies.readings import APART
-    from rsbench.dataset.files import write_table
     from rsbench.report.fig3 import SWEEPS, read_summaries
+    from rsbench.storage.files import write_table
 
     hundred = read_summaries(fig3_folder, SWEEPS)
     tables: dict[str, dict[str, pd.DataFrame]] = {"100 + 100": {}, "9 + 9": {}}
@@ -135,9 +135,9 @@ def readings(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.benchmark.simulated.sweep_card import load_sweep
     from rsbench.benchmark.studies.claims import GLOBAL, holding_settings, judge_settings
     from rsbench.benchmark.studies.readings import LITERAL, settings_card, write_cards
-    from rsbench.dataset.files import write_bytes, write_json, write_table
     from rsbench.report.fig3 import SWEEPS
     from rsbench.report.readings_page import readings_page
+    from rsbench.storage.files import write_bytes, write_json, write_table
 
     folder, home, command = out / "readings", data / "simulated", "rsbench reproduce readings"
     folder.mkdir(parents=True, exist_ok=True)
@@ -158,8 +158,8 @@ def readings(out: Path, data: Path, workers: int | None) -> None:
 def image_claims(out: Path) -> None:
     """The claims about images, from the results that ``out`` holds."""
     from rsbench.benchmark.studies.image_claims import judge_image_claims
-    from rsbench.dataset.files import write_bytes
     from rsbench.report.claims_page import image_claims_page
+    from rsbench.storage.files import write_bytes
 
     text, page = image_claims_page(judge_image_claims(out)), out / "claims" / "images.md"
     page.parent.mkdir(parents=True, exist_ok=True)

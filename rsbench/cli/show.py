@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsbench.cli.kinds import complete_any, complete_kind
+from rsbench.cli.component_kinds import complete_any, complete_kind
 
 if TYPE_CHECKING:
-    from rsbench.plugins import Kind, Offer
+    from rsbench.components.plugins import Kind, Offer
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -75,9 +75,9 @@ def _text(value: object) -> str:
 
 def _kinds_of(name: str, kind: str | None) -> list[str]:
     """Kinds in which to look a name up."""
-    from rsbench.cards import choices
-    from rsbench.cli.kinds import kind_names, names_of
-    from rsbench.errors import RsbenchError
+    from rsbench.cli.component_kinds import kind_names, names_of
+    from rsbench.components.cards import choices
+    from rsbench.core.errors import RsbenchError
 
     kinds = kind_names()
     if kind is not None:
@@ -96,10 +96,10 @@ def _kinds_of(name: str, kind: str | None) -> list[str]:
 
 def _about(name: str, kind: str) -> dict[str, Any]:
     """All that can be said of one component or card."""
-    from rsbench import plugins
-    from rsbench.cards import card_path, read_toml
-    from rsbench.cli.kinds import component_kind
-    from rsbench.parameters import parameters_of
+    from rsbench.cli.component_kinds import component_kind
+    from rsbench.components import plugins
+    from rsbench.components.cards import card_path, read_toml
+    from rsbench.components.parameters import parameters_of
 
     described = component_kind(kind)
     if described is None:
@@ -144,8 +144,8 @@ def _plain(value: object) -> object:
 
 def _about_class(kind: Kind[Any, Any], name: str) -> dict[str, Any]:
     """A class that no card describes: other cards name it, and set its parameters."""
-    from rsbench import plugins
-    from rsbench.parameters import parameters_of
+    from rsbench.components import plugins
+    from rsbench.components.parameters import parameters_of
 
     cls = plugins.load_class(kind, name, Path())
     return {
@@ -157,7 +157,7 @@ def _about_class(kind: Kind[Any, Any], name: str) -> dict[str, Any]:
 
 
 def _offer(kind: Kind[Any, Any], name: str) -> Offer:
-    from rsbench import plugins
+    from rsbench.components import plugins
 
     return next(offer for offer in plugins.offers(kind) if offer.name == name)
 

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rsbench.cli.clusters import Scheduler, chosen_workers, results_at
-from rsbench.cli.kinds import complete
+from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
+from rsbench.cli.component_kinds import complete
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from rsbench.benchmark.simulated.sweep_card import SweepCard
-    from rsbench.pipeline.crew import Workers
+    from rsbench.jobs.workers import Workers
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -67,7 +67,7 @@ def simulate(
 ) -> None:
     """Simulate points seen by a moving rolling-shutter rig, solve for its motion, and tabulate the errors."""
     from rsbench.benchmark.simulated.sweep_card import load_sweep, with_options
-    from rsbench.dataset.mirror import name_of
+    from rsbench.storage.mirror import name_of
 
     card = with_options(load_sweep(sweep), solver, trials, seed)
     if change:
@@ -94,7 +94,7 @@ def run_and_summarise(
     from rsbench.benchmark.simulated.run_sweep import run_sweep, sweep_steps
     from rsbench.benchmark.simulated.sweep_summary import summarise_sweep
     from rsbench.cli.console import progress_bar
-    from rsbench.dataset.files import write_json
+    from rsbench.storage.files import write_json
 
     with progress_bar(f"simulating {card.name}", sweep_steps(card)) as advance:
         run_sweep(
@@ -143,7 +143,7 @@ def _changes(assignments: list[str]) -> dict[str, object]:
     """FIELD=VALUE pairs; values as in a card, plain words may lack their quotes."""
     import tomllib
 
-    from rsbench.errors import RsbenchError
+    from rsbench.core.errors import RsbenchError
 
     changes: dict[str, object] = {}
     for text in assignments:

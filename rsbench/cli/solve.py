@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsbench.cli.kinds import named
-from rsbench.errors import RsbenchError
+from rsbench.cli.component_kinds import named
+from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rsbench.pipeline.answer import Extra
-    from rsbench.pipeline.robust_motion import RobustOptions
     from rsbench.solvers.engine.registry import SolverEntry
+    from rsbench.solvers.engine.robust_motion import RobustOptions
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -182,7 +182,7 @@ def _row(answer: dict[str, Any]) -> dict[str, str]:
 
 
 def _extras(text: str, json: bool) -> list[Extra]:
-    from rsbench.cards import choices
+    from rsbench.components.cards import choices
     from rsbench.pipeline.answer import EXTRAS
 
     names = [name.strip() for name in text.split(",") if name.strip()]
@@ -195,7 +195,7 @@ def _extras(text: str, json: bool) -> list[Extra]:
 
 
 def _options(threshold_px: float | None) -> RobustOptions:
-    from rsbench.pipeline.robust_motion import RobustOptions
+    from rsbench.solvers.engine.robust_motion import RobustOptions
 
     if threshold_px is None:
         return RobustOptions()
@@ -205,7 +205,7 @@ def _options(threshold_px: float | None) -> RobustOptions:
 
 
 def _check_model(motion_model: str | None, entries: list[SolverEntry]) -> None:
-    from rsbench.pipeline.model_choice import check_asked
+    from rsbench.capture.model_choice import check_asked
 
     for entry in entries if motion_model is not None else []:
         check_asked(str(motion_model), entry)

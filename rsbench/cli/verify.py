@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from rsbench.cli.kinds import complete
+from rsbench.cli.component_kinds import complete
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -59,9 +59,9 @@ def _verify_ours(folder: Path, stride: int, rerender: Rerender, scenes: Sequence
     import pandas as pd
 
     from rsbench.cli.console import print_table, progress_bar, say
-    from rsbench.dataset.files import read_json
-    from rsbench.dataset.verification import verification_steps, verify_dataset
-    from rsbench.dataset.verification.structure import DATASET
+    from rsbench.storage.files import read_json
+    from rsbench.verification import verification_steps, verify_dataset
+    from rsbench.verification.structure import DATASET
 
     with progress_bar("verifying", verification_steps(read_json(folder / "dataset.json"))) as advance:
         reports = verify_dataset(folder, stride, advance, rerender=rerender.value, scenes=scenes)
@@ -92,9 +92,9 @@ def _verify_ours(folder: Path, stride: int, rerender: Rerender, scenes: Sequence
 def _verify_others(folder: Path, layout: str) -> None:
     """Files, sizes, depth and matches under poses and row times, and disparities, as far as a layout has them."""
     from rsbench.cli.console import late_progress, print_rows, say
-    from rsbench.dataset.importing.check import agreements, disparity_faults, file_faults
-    from rsbench.dataset.importing.formats import read_others
-    from rsbench.dataset.importing.sight_check import NEAR_PX, sights
+    from rsbench.interop.readers.check import agreements, disparity_faults, file_faults
+    from rsbench.interop.readers.formats import read_others
+    from rsbench.interop.readers.sight_check import NEAR_PX, sights
 
     recordings, faults = read_others(folder, layout), list[str]()
     depths, seen = list[list[str]](), list[list[str]]()

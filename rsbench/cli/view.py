@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rsbench.cli.kinds import complete
+from rsbench.cli.component_kinds import complete
 
 if TYPE_CHECKING:
     from rsbench.dataset.sequence import Sequence
-    from rsbench.export.seen_matches import Scene
+    from rsbench.interop.writers.match_colours import Scene
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -43,9 +43,9 @@ def view(
 ) -> None:
     """Rig, poses of all lines, depth as points, images and matches, over time. Needs rsbench[view]."""
     from rsbench.cli.console import late_progress
-    from rsbench.dataset.files import check_out
-    from rsbench.errors import RsbenchError
-    from rsbench.export.exporter import chosen_sequences
+    from rsbench.core.errors import RsbenchError
+    from rsbench.interop.writers.exporter import chosen_sequences
+    from rsbench.storage.files import check_out
 
     if find_spec("rerun") is None:
         raise RsbenchError("the viewer is not installed: pip install 'rsbench[view]'")
@@ -71,7 +71,7 @@ def _has_screen() -> bool:
 
 def _show(scene: Scene, save: Path | None, advance: Callable[[str], None]) -> None:
     """To the viewer, or to a file that appears when it is whole."""
-    from rsbench.export.rerun_scene import open_viewer, write_recording
+    from rsbench.interop.writers.rerun_scene import open_viewer, write_recording
 
     if save is None:
         open_viewer(scene, advance)
@@ -86,7 +86,7 @@ def _show(scene: Scene, save: Path | None, advance: Callable[[str], None]) -> No
 
 
 def _scene(sequence: Sequence, points: int, features: str) -> Scene:
-    from rsbench.export.seen_matches import Scene, found_strips, labelled_strips
+    from rsbench.interop.writers.match_colours import Scene, found_strips, labelled_strips
 
     labelled = "matches" in sequence.channels
     strips = labelled_strips(sequence) if labelled else found_strips(sequence, features)

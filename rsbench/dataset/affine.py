@@ -18,19 +18,19 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from rsbench.core.errors import RsbenchError
 from rsbench.core.lens import inverse_2x2
 from rsbench.core.projection import pixel_moves, plane_basis
 from rsbench.core.rig import View
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.files import save_arrays
 from rsbench.dataset.tracks import Tracks, track_views
-from rsbench.errors import RsbenchError
-from rsbench.reading import load_arrays
+from rsbench.storage.files import save_arrays
+from rsbench.storage.untrusted_files import load_arrays
 
 if TYPE_CHECKING:  # which reads affine frames
-    from rsbench.dataset.shots import Geometry
-    from rsbench.renderers.segments import Surfaces
+    from rsbench.dataset.views import Geometry
+    from rsbench.renderers.visibility import Surfaces
 
 
 class Meets(Protocol):

@@ -9,8 +9,11 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-from rsbench.cards import card_path, parse_card, read_toml
+from rsbench.components.cards import card_path, parse_card, read_toml
+from rsbench.components.imports import search
+from rsbench.components.shutters import with_shutters
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.core.lens import Lens
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, StereoRig
@@ -20,16 +23,13 @@ from rsbench.dataset.imu import Imu
 from rsbench.dataset.layout import MOST_FRAMES, MOST_TWINS
 from rsbench.dataset.matches import Matching
 from rsbench.dataset.motion_card import MotionCard as MotionCard
-from rsbench.dataset.movers import MovingCard, check_moving, drawn
+from rsbench.dataset.moving_objects import MovingCard, check_moving, drawn
 from rsbench.dataset.sequence import sequence_manifest
-from rsbench.dataset.shots import GivenGeometry
 from rsbench.dataset.trajectory import TrajectoryCard, parts_along
-from rsbench.errors import RsbenchError
-from rsbench.imports import search
-from rsbench.reading import check_name, check_size
+from rsbench.dataset.views import GivenGeometry
 from rsbench.renderers.electrons import Sensor, check_brightness
 from rsbench.scenes.model import Start
-from rsbench.shutters import with_shutters
+from rsbench.storage.untrusted_files import check_name, check_size
 
 Twin = Literal["first", "middle", "last"]
 
@@ -367,7 +367,7 @@ def load_dataset_card(
         trajectory: file along which the rig moves, in place of the card's motions.
         seeds: in place of the card's.
 
-    Raises RsbenchError as ``rsbench.cards.load_card``, or where the file of a trajectory is wrong.
+    Raises RsbenchError as ``rsbench.components.cards.load_card``, or where the file of a trajectory is wrong.
     """
     path = card_path("datasets", name_or_path)
     card = read_dataset_card(path)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.affine import AffineFrames, read_affine
@@ -27,14 +28,13 @@ from rsbench.dataset.channels import (
     radiance_file,
     surface_file,
 )
-from rsbench.dataset.files import read_exr, read_grey_png, read_json
 from rsbench.dataset.imu import IMU_MANIFEST, ImuSamples, read_imu
 from rsbench.dataset.layout import frames_of
 from rsbench.dataset.matches import LabelledMatches, read_matches
 from rsbench.dataset.timing import MANIFEST, read_timing_table, table_file
 from rsbench.dataset.tracks import Tracks, read_tracks
-from rsbench.errors import RsbenchError
-from rsbench.reading import inside
+from rsbench.storage.files import read_exr, read_grey_png, read_json
+from rsbench.storage.untrusted_files import inside
 
 
 @dataclass(frozen=True, kw_only=True)

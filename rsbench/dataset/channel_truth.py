@@ -17,8 +17,8 @@ from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import Layer, PixelClass
 from rsbench.dataset.row_search import Landed, find
-from rsbench.dataset.shots import FAR, Geometry, Shot, seen_from, times_at
-from rsbench.renderers.segments import Surfaces
+from rsbench.dataset.views import FAR, Geometry, Shot, seen_from, times_at
+from rsbench.renderers.visibility import Surfaces
 
 Blocked = Callable[[FloatArray, FloatArray, FloatArray | None], NDArray[np.bool_]]
 """Whether something stands before points (n, 3) seen from eyes (n, 3), world frame, metres; at times (n,), given

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.beside import Later, begun
 from rsbench.dataset.channel_truth import (
     PairTruth,
     Rays,
@@ -31,11 +30,12 @@ from rsbench.dataset.channels import (
     radiance_file,
     surface_file,
 )
-from rsbench.dataset.files import write_exr, write_png, write_png16
-from rsbench.dataset.movers import numbers_of
-from rsbench.dataset.shots import Geometry, Shot
+from rsbench.dataset.moving_objects import numbers_of
+from rsbench.dataset.views import Geometry, Shot
 from rsbench.renderers.render import Frame
-from rsbench.renderers.segments import Surfaces
+from rsbench.renderers.visibility import Surfaces
+from rsbench.storage.background_writer import Later, begun
+from rsbench.storage.files import write_exr, write_png, write_png16
 
 _BRIGHTEST = float(np.finfo(np.float16).max)
 

@@ -6,10 +6,10 @@ from collections.abc import Collection, Iterable
 from enum import IntEnum
 from typing import Literal, NamedTuple, get_args
 
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES, View, views_of
 from rsbench.dataset.imu import IMU_FILES
 from rsbench.dataset.timing import timing_files
-from rsbench.errors import RsbenchError
 
 PairChannel = Literal["disparity", "flow", "gs_flow"]
 """Where each pixel of a rolling-shutter frame lies in another picture: of the other camera at the same time

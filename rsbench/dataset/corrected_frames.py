@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.capture.readout import ReadoutEstimate
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.dataset.files import read_json, read_png, write_depth, write_json, write_png
-from rsbench.dataset.workplace import HIDDEN, WORK, files_below, named, remove, strangers, workplace
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import FoundMotion, referee
-from rsbench.pipeline.readout import ReadoutEstimate
+from rsbench.storage.files import read_json, read_png, write_depth, write_json, write_png
+from rsbench.storage.work_folder import HIDDEN, WORK, files_below, named, remove, strangers, workplace
 from rsbench.vision.fusion import Fused, Origin
 
 MASK_VALUES = {

@@ -16,32 +16,32 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench import __version__
-from rsbench.cards import load_card
-from rsbench.core.moving import poses_of
+from rsbench.components.cards import load_card
+from rsbench.core.errors import RsbenchError
+from rsbench.core.moving_objects import poses_of
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.se3 import Pose
-from rsbench.dataset.beside import Later, beside
+from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channel_writer import write_channels
-from rsbench.dataset.files import sha256, write_depth, write_json, write_mask, write_png, write_poses
-from rsbench.dataset.homes import Target, home_at
+from rsbench.dataset.destinations import Target, home_at
 from rsbench.dataset.layout import clean_file, files_of
 from rsbench.dataset.manifest import Files
 from rsbench.dataset.matches import Matching
-from rsbench.dataset.plans import Plan, of_scene, plans_of, with_gloss
+from rsbench.dataset.posed_scenes import Build, Built, Stage
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence_channels import write_sequence_channels
-from rsbench.dataset.shots import Geometry, Shot, image_seed
-from rsbench.dataset.stage import Build, Built, Stage
-from rsbench.dataset.workplace import files_below
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.crew import Cluster, Workers
-from rsbench.pipeline.isolated_jobs import finished_jobs
-from rsbench.pipeline.isolation import EntryFailure
+from rsbench.dataset.sequence_identity import Plan, of_scene, plans_of, with_gloss
+from rsbench.dataset.views import Geometry, Shot, image_seed
+from rsbench.jobs.isolation import EntryFailure
+from rsbench.jobs.process_jobs import finished_jobs
+from rsbench.jobs.workers import Cluster, Workers
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene
+from rsbench.storage.background_writer import Later, beside
+from rsbench.storage.files import sha256, write_depth, write_json, write_mask, write_png, write_poses
+from rsbench.storage.work_folder import files_below
 from rsbench.vision.feature_matcher import load_features
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ def _render_sequence(
 ) -> Iterator[None]:
     """Render into a folder of the workplace and place it when complete; yields after each step."""
     from rsbench.renderers.backend import start_backend
-    from rsbench.renderers.passage import obstacle
+    from rsbench.renderers.clearance import obstacle
 
     backend, (mitsuba_scene, digest) = start_backend(), stage.set_for(sequence)
     if words := obstacle(mitsuba_scene, *card.geometry_of(sequence)):
@@ -226,8 +226,8 @@ def render_camera(
     ``later``.
     """
     from rsbench.renderers.image import to_srgb8
-    from rsbench.renderers.segments import SceneRays
-    from rsbench.renderers.sensed import sensed_rows
+    from rsbench.renderers.sensor_frame import sensed_rows
+    from rsbench.renderers.visibility import SceneRays
 
     geometry, sensor = card.geometry_of(sequence), card.sensor_of(sequence)
     rig, shutter, motion, _, things = geometry

@@ -16,17 +16,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.cards import parse_card
-from rsbench.core.inertial import STANDARD_GRAVITY, inertial
+from rsbench.components.cards import parse_card
+from rsbench.core.errors import RsbenchError
+from rsbench.core.imu import STANDARD_GRAVITY, inertial
 from rsbench.core.motion import Motion
 from rsbench.core.rig import views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.files import write_bytes, write_json
-from rsbench.errors import RsbenchError
-from rsbench.reading import inside, read_text
 from rsbench.renderers.electrons import Sensor
 from rsbench.scenes.model import Start, Viewpoint
+from rsbench.storage.files import write_bytes, write_json
+from rsbench.storage.untrusted_files import inside, read_text
 
 IMU_MANIFEST, MEASURED, TRUE = "imu/imu.json", "imu/measured.csv", "imu/true.csv"
 IMU_FILES = (IMU_MANIFEST, MEASURED, TRUE)

@@ -9,14 +9,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from rsbench import __version__
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES
+from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard
-from rsbench.dataset.files import write_json
-from rsbench.dataset.hashes import HashedFile
 from rsbench.dataset.sequence import FORMAT, UNITS
-from rsbench.errors import RsbenchError
-from rsbench.reading import read_bytes
+from rsbench.storage.file_hashes import HashedFile
+from rsbench.storage.files import write_json
+from rsbench.storage.untrusted_files import read_bytes
 
 Files = dict[str, HashedFile]
 """The files of a sequence by their paths below its folder, in the order of dataset.json."""

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.files import save_arrays
-from rsbench.errors import RsbenchError
-from rsbench.reading import load_arrays
+from rsbench.storage.files import save_arrays
+from rsbench.storage.untrusted_files import load_arrays
 
 MATCHED: dict[str, tuple[View, View]] = {
     "left": (("left", 0), ("left", 1)),

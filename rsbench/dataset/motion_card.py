@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from rsbench.components.motion_models import drawn_parameters, fixed_endpoint, make_motion, motion_model
 from rsbench.core.motion import Motion
-from rsbench.motions import drawn_parameters, fixed_endpoint, make_motion, motion_model
 
 Vector = tuple[float, float, float]
 Axis = Vector | str

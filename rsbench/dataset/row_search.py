@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.compiled import compiled
+from rsbench.components.compiled import compiled
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import ProjectionStatus, rs_project
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray, hat
-from rsbench.dataset.shots import Geometry, Shot
-from rsbench.errors import RsbenchError
+from rsbench.dataset.views import Geometry, Shot
 
 _SAME = 1e-11
 """Largest difference of entries of a pose: of rotations, and metres."""

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.cards import card_path
-from rsbench.dataset.files import read_json, write_json
-from rsbench.errors import RsbenchError
-from rsbench.scenes.bodies import Body, MeshFile
-from rsbench.scenes.kept import built_key
+from rsbench.components.cards import card_path
+from rsbench.core.errors import RsbenchError
 from rsbench.scenes.load import read_scene_card
 from rsbench.scenes.model import Scene, SceneMesh
+from rsbench.scenes.moving_objects import Body, MeshFile
+from rsbench.scenes.scene_cache import built_key
+from rsbench.storage.files import read_json, write_json
 
 
 def scene_hash(scene: Scene) -> str:

@@ -12,17 +12,18 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.cards import parse_card
+from rsbench.components.cards import parse_card
+from rsbench.components.motion_models import motion_record, read_motion
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import LaterMotion, Motion
-from rsbench.core.moving import MovingObject
+from rsbench.core.moving_objects import MovingObject
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig, views_of
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channel_reader import ChannelReader
 from rsbench.dataset.channels import check_channels
-from rsbench.dataset.files import read_depth, read_grey_png, read_json, read_mask, read_png, read_poses
 from rsbench.dataset.imu import Imu
 from rsbench.dataset.layout import (
     MOST_FRAMES,
@@ -34,11 +35,10 @@ from rsbench.dataset.layout import (
     picture_file,
 )
 from rsbench.dataset.matches import Matching
-from rsbench.dataset.movers import MovingManifest, check_moving, numbers_of
-from rsbench.errors import RsbenchError
-from rsbench.motions import motion_record, read_motion
-from rsbench.reading import check_name, check_size, inside
+from rsbench.dataset.moving_objects import MovingManifest, check_moving, numbers_of
 from rsbench.renderers.electrons import Sensor, check_brightness
+from rsbench.storage.files import read_depth, read_grey_png, read_json, read_mask, read_png, read_poses
+from rsbench.storage.untrusted_files import check_name, check_size, inside
 
 FORMAT = 1
 CONVENTIONS, WITH_LENS, OF_FRAMES, WITH_MOVING = 1, 2, 3, 4

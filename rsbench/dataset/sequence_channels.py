@@ -10,12 +10,12 @@ from rsbench.core.rig import VIEWS, views_of
 from rsbench.dataset.affine import make_affine, save_affine
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channels import AFFINE, INSTANCE_TABLE, MATCHER, matches_file
-from rsbench.dataset.files import read_depth, read_png, write_json
 from rsbench.dataset.imu import Imu, draw_samples, gravity_of, sample_times_ns, write_imu
 from rsbench.dataset.matches import Matching, save_matches
-from rsbench.dataset.shots import GivenGeometry, Shot
 from rsbench.dataset.timing import write_timing
 from rsbench.dataset.tracks import make_tracks, write_tracks
+from rsbench.dataset.views import GivenGeometry, Shot
+from rsbench.storage.files import read_depth, read_png, write_json
 
 if TYPE_CHECKING:
     from rsbench.renderers.scene import MitsubaScene
@@ -33,7 +33,7 @@ def write_sequence_channels(
         scene: what is seen.
         record: what sequence.json says of it.
     """
-    from rsbench.renderers.segments import SceneRays
+    from rsbench.renderers.visibility import SceneRays
 
     shutter, period, sensor = card.shutter_for(sequence), card.period_of(sequence), card.sensor_of(sequence)
     motion, seed = card.motion_of(sequence), f"{card.seed_of(sequence)}/{sequence.name}"

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.shutter import RollingShutter
-from rsbench.dataset.files import write_bytes, write_json
-from rsbench.errors import RsbenchError
-from rsbench.reading import read_text
 from rsbench.renderers.electrons import Sensor
+from rsbench.storage.files import write_bytes, write_json
+from rsbench.storage.untrusted_files import read_text
 
 MANIFEST = "timing.json"
 COLUMNS = "row,time_ns,exposure_start_ns,exposure_end_ns"

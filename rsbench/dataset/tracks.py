@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import ProjectionStatus, back_project, rs_project
 from rsbench.core.rig import SIDES, View
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import TRACKS, PixelClass
-from rsbench.dataset.files import save_arrays
-from rsbench.errors import RsbenchError
-from rsbench.reading import load_arrays
+from rsbench.storage.files import save_arrays
+from rsbench.storage.untrusted_files import load_arrays
 
 if TYPE_CHECKING:  # which reads tracks
-    from rsbench.dataset.shots import Geometry
+    from rsbench.dataset.views import Geometry
 
 IN_ALL = 2048
 """Points drawn from the pixels of all frames, of each as many."""

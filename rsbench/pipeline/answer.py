@@ -7,13 +7,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rsbench.core.joining import join_stereo
+from rsbench.capture.model_choice import settle_model
+from rsbench.core.track_building import join_stereo
 from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.pipeline.model_choice import settle_model
 from rsbench.pipeline.problem import Problem
-from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions
 from rsbench.solvers.engine.registry import SolverEntry
+from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions
 
 Answer = dict[str, Any]
 Extra = Literal["covariance", "noise", "inliers"]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
-from rsbench.motions import make_motion
 from rsbench.solvers.engine.base import MotionEstimate, SolverSpec
 
 

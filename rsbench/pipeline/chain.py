@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rsbench.capture.readout import ReadoutEstimate
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, StereoRig, View
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import (
     Images,
@@ -29,7 +30,6 @@ from rsbench.pipeline.frame_depth import (
     timed_pairs,
 )
 from rsbench.pipeline.frame_motion import FoundMotion, match_frames, solve_frames, solve_shutter
-from rsbench.pipeline.readout import ReadoutEstimate
 from rsbench.vision.corrector import CorrectionProblem, find_corrected_rows
 from rsbench.vision.fusion import Fused, Origin, inpaint
 from rsbench.vision.stereo_matcher import needs_motion, refuse_motion

@@ -6,9 +6,9 @@ import hashlib
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from rsbench.pipeline.robust_motion import RobustOptions
-from rsbench.plugins import Entry
+from rsbench.components.plugins import Entry
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.corrector import CorrectorEntry, load_corrector
 from rsbench.vision.feature_matcher import FeatureEntry, load_features
 from rsbench.vision.stereo_matcher import MatcherEntry, load_matcher
@@ -27,7 +27,7 @@ class CorrectionOptions:
     corrector: CorrectorEntry = field(default_factory=lambda: load_corrector("fusion"))
     robust: RobustOptions = field(default_factory=RobustOptions)
     motion_model: str | None = None
-    """``auto`` or a model to use instead of the solver's, see ``rsbench.pipeline.model_choice``."""
+    """``auto`` or a model to use instead of the solver's, see ``rsbench.capture.model_choice``."""
     target_row: float = 0.0
     """The time of this row of the frame is the time of its corrected image."""
     depth_from_motion: bool = True

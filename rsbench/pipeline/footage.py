@@ -15,14 +15,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.cards import parse_card, read_toml
+from rsbench.components.cards import parse_card, read_toml
+from rsbench.components.shutters import with_shutter
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.core.lens import Lens
 from rsbench.core.rig import StereoRig, View
 from rsbench.core.shutter import RollingShutter, Scanning
-from rsbench.errors import RsbenchError
-from rsbench.reading import check_image_size, check_size, read_bytes
-from rsbench.shutters import with_shutter
+from rsbench.storage.untrusted_files import check_image_size, check_size, read_bytes
 
 _SMALLEST = 32
 """Pixels of the shorter side; below that there is nothing to match."""

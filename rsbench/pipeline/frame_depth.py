@@ -14,6 +14,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.vision.images import eight_bit
 from rsbench.vision.motion_sweep import depth_from_motion
 from rsbench.vision.moving_stereo import moving_disparities
 from rsbench.vision.sky import sky_mask
@@ -23,8 +24,6 @@ from rsbench.vision.timed_depth import timed_depth
 from rsbench.vision.undistortion import sensor_disparities
 
 Images = Mapping[View, NDArray[Any]]
-_BRIGHT = 99.9
-"""Percentile of a 16-bit image that becomes white for matching."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -218,12 +217,3 @@ def metres(disparity: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32
     """Metres (H, W): inf where there is no disparity, 0 where it is unknown."""
     depth = np.where(np.isnan(disparity), 0.0, rig.depth(disparity))
     return np.nan_to_num(depth, nan=np.inf, posinf=np.inf).astype(np.float32)
-
-
-def eight_bit(images: list[NDArray[Any]]) -> list[NDArray[np.uint8]]:
-    """Images for matching; 16-bit ones are brought to 8 bits by one factor, for they may use few of their bits."""
-    if images[0].dtype == np.uint8:
-        return images
-    top = max(float(np.percentile(image, _BRIGHT)) for image in images)
-    scale = np.float32(255.0 / max(top, 1.0))
-    return [np.clip(image * scale + np.float32(0.5), 0.0, 255.0).astype(np.uint8) for image in images]

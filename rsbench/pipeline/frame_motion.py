@@ -6,24 +6,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rsbench.capture.model_choice import ModelChoice, settle_model
+from rsbench.capture.readout import LEAST_BACKWARDS, ReadoutEstimate, estimate_readout_ratio, runs_backwards
+from rsbench.capture.rectification import RefusedFramesError, check_rig, without_offset
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_depth import Images, eight_bit
+from rsbench.pipeline.frame_depth import Images
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.pipeline.model_choice import ModelChoice, settle_model
-from rsbench.pipeline.readout import LEAST_BACKWARDS, ReadoutEstimate, estimate_readout_ratio, runs_backwards
-from rsbench.pipeline.rectification import RefusedFramesError, check_rig, without_offset
-from rsbench.pipeline.robust_motion import RobustEstimate, estimate_motion
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.registry import SolverEntry
+from rsbench.solvers.engine.robust_motion import RobustEstimate, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.vision.feature_matcher import find_correspondences
 from rsbench.vision.features import SiftMatcher
+from rsbench.vision.images import eight_bit
 from rsbench.vision.undistortion import undistorted, with_lens
 
 _FEWEST_MATCHES = 12

@@ -16,15 +16,15 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.components.plugins import Entry, Kind
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig, View
 from rsbench.core.shutter import RollingShutter
-from rsbench.errors import RsbenchError
+from rsbench.jobs.isolation import IsolatedWorker
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.isolated_solver import entrys_own
-from rsbench.pipeline.isolation import IsolatedWorker
-from rsbench.plugins import Entry, Kind
 from rsbench.vision.corrector import (
     CORRECTORS,
     CorrectionProblem,

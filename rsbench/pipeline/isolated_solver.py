@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.isolation import (
+from rsbench.jobs.isolation import (
     NO_ANSWER,
     THREAD_VARIABLES,
     EntryFailure,
@@ -31,10 +31,10 @@ from rsbench.pipeline.isolation import (
     use_one_thread,
 )
 from rsbench.pipeline.problem import EXAMPLE, read_problem
-from rsbench.pipeline.robust_motion import RobustEstimate, RobustOptions, estimate_motion
-from rsbench.pipeline.robust_problem import MatchCount
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
+from rsbench.solvers.engine.robust_problem import MatchCount
 from rsbench.solvers.engine.warm_up import warm_up
 
 if TYPE_CHECKING:

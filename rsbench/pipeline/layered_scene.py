@@ -14,12 +14,12 @@ from typing import final
 
 import numpy as np
 
-from rsbench.arguments import check_whole
+from rsbench.components.arguments import check_whole
+from rsbench.components.motion_models import make_motion
 from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.rig import FRAMES, SIDES, Side, View
 from rsbench.core.so3 import FloatArray
-from rsbench.motions import make_motion
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.vision.correction import WarpOptions
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec

@@ -13,16 +13,16 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
+from rsbench.pipeline.baseline_motions import solved_alone
 from rsbench.pipeline.frame_depth import Images
-from rsbench.pipeline.robust_motion import RobustOptions
-from rsbench.pipeline.simpler_motions import solved_alone
+from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.zhuang import ZhuangSolver
+from rsbench.vision.baseline_depths import monocular_depth
 from rsbench.vision.correction import WarpOptions
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
 from rsbench.vision.correctors import FusionCorrector
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.fusion import Fused
-from rsbench.vision.simpler_depths import monocular_depth
 
 
 def depth_alone(

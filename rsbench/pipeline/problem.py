@@ -10,13 +10,13 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from rsbench.cards import choices, parse_card, shipped_folder
+from rsbench.components.cards import choices, parse_card, shipped_folder
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
-from rsbench.errors import RsbenchError
-from rsbench.reading import FILE_BYTES, check_amount, load_arrays, parse_json, read_text
+from rsbench.storage.untrusted_files import FILE_BYTES, check_amount, load_arrays, parse_json, read_text
 
 COLUMNS = {
     "left": "x0, y0, x1, y1",

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from rsbench.errors import RsbenchError
-from rsbench.imports import signals_later
-from rsbench.renderers import llvm, verdicts
+from rsbench.components.imports import signals_later
+from rsbench.core.errors import RsbenchError
+from rsbench.renderers import llvm, probe_cache
 
 Preference = Literal["auto", "llvm", "cuda", "scalar"]
 
@@ -184,10 +184,10 @@ def probe_cuda(timeout: float = 120.0) -> llvm.Verdict:
     devices = ",".join(sorted(glob.glob("/dev/nvidia[0-9]*")))
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "all")
     key = f"cuda|{driver}|{status.st_mtime_ns}|{status.st_size}|{devices}|{visible}"
-    known = verdicts.recall(key)
+    known = probe_cache.recall(key)
     if known is not None:
         return llvm.Verdict(ok=True, version=known)
     verdict = llvm.run_child(_CUDA_PROBE, [], {}, timeout)
     if verdict.ok:
-        verdicts.remember(key, verdict.version)
+        probe_cache.remember(key, verdict.version)
     return verdict

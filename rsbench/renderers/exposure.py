@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rsbench.core.so3 import FloatArray
-from rsbench.renderers.subpixel import golden_step
+from rsbench.renderers.pixel_samples import golden_step
 
 LEAST_INSTANTS = 64
 """A blur of 64 px is then drawn without gaps."""

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
-from rsbench.renderers.carried import Placed, first_surface, hidden, level
 from rsbench.renderers.gloss import Coat, is_glossy
+from rsbench.renderers.moving_objects import Placed, first_surface, hidden, level
 from rsbench.renderers.scene import MitsubaScene
 
 

@@ -20,9 +20,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rsbench.caches import cpu_key
-from rsbench.imports import lifeline
-from rsbench.renderers import verdicts
+from rsbench.components.imports import lifeline
+from rsbench.renderers import probe_cache
+from rsbench.storage.caches import cpu_key
 
 MINIMUM_VERSION = 17
 """15 and 16 abort on CPUs with AVX-512 ("Cannot select ... fminimum"); 14 lacks opaque pointers."""
@@ -70,7 +70,7 @@ assert abs(float(dr.sum(z)[0]) - float(sum(list(y)))) < 1e-2
 print("version", *version)
 """
 
-_BOUND = "from rsbench.imports import end_with; end_with({line})\n"
+_BOUND = "from rsbench.components.imports import end_with; end_with({line})\n"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,7 +173,7 @@ def probe(candidate: Candidate, timeout: float = 60.0) -> Verdict:
         return Verdict(ok=False, reason=f"cannot be opened ({error.strerror})")
     drjit = importlib.metadata.version("drjit")
     key = f"llvm|{path}|{status.st_mtime_ns}|{status.st_size}|{drjit}|{cpu_key()}"
-    known = verdicts.recall(key)
+    known = probe_cache.recall(key)
     if known is not None:
         return Verdict(ok=True, version=known)
     with tempfile.TemporaryDirectory(prefix="rsbench-probe-") as scratch:
@@ -182,7 +182,7 @@ def probe(candidate: Candidate, timeout: float = 60.0) -> Verdict:
     if verdict.ok and int(verdict.version.split(".")[0]) < MINIMUM_VERSION:
         return Verdict(ok=False, reason=f"is LLVM {verdict.version}; {MINIMUM_VERSION} or newer is needed")
     if verdict.ok:
-        verdicts.remember(key, verdict.version)
+        probe_cache.remember(key, verdict.version)
     return verdict
 
 

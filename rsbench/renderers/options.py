@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 
 Method = Literal["single-pass", "stitched"]
 Integrator = Literal["sunsky", "path"]

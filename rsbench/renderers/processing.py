@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.renderers.electrons import Mosaic, Sensor, filters
 from rsbench.renderers.image import to_srgb8
 

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
-from rsbench.renderers.hits import Hits
 from rsbench.renderers.options import RendererOptions
+from rsbench.renderers.ray_hits import Hits
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.renderers.sensor import make_sensor, object_tables, pose_table
 
@@ -205,6 +205,6 @@ def _tracer() -> ModuleType | Any:
         from rsbench.renderers import wavefront
 
         return wavefront
-    from rsbench.renderers import onebyone
+    from rsbench.renderers import scalar_tracing
 
-    return onebyone
+    return scalar_tracing

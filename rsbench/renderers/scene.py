@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.renderers.backend import start_backend
 from rsbench.scenes.environment import irradiance_map
 from rsbench.scenes.model import Environment, Light, Material, Scene, SceneMesh

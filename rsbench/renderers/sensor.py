@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import Pose, inverse
-from rsbench.errors import RsbenchError
 from rsbench.renderers.lens_rays import lens_rays
 
 PLUGIN = "rs_pinhole"

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.renderers.carried import depth_and_label, placed
 from rsbench.renderers.exposure import instant_of
 from rsbench.renderers.gloss import is_glossy
-from rsbench.renderers.hits import Hits
 from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
+from rsbench.renderers.moving_objects import depth_and_label, placed
 from rsbench.renderers.options import RendererOptions
+from rsbench.renderers.pixel_samples import facet_points, sky_ways, subpixel_grid
+from rsbench.renderers.ray_hits import Hits
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.renderers.subpixel import facet_points, sky_ways, subpixel_grid
 
 PACKET = 16
 """Lanes that are traced together at most (AVX-512)."""

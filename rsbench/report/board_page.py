@@ -18,13 +18,13 @@ from rsbench.benchmark.leaderboard.calibration import LEVELS, named_numbers
 from rsbench.benchmark.leaderboard.protocols import KNOWLEDGE, Score
 from rsbench.benchmark.leaderboard.standings import Standing
 from rsbench.benchmark.statistics import in_words
-from rsbench.dataset.files import write_bytes
 from rsbench.report.board_entry import entry_context
 from rsbench.report.board_figures import bar
 from rsbench.report.board_pictures import albums
 from rsbench.report.board_problems import matrix_context, problem_contexts
 from rsbench.report.board_splits import Board, read_split
 from rsbench.report.board_tables import as_csv, as_latex, as_markdown
+from rsbench.storage.files import write_bytes
 
 
 def build_site(board: Path, out: Path, data: Sequence[Path] = (), *, problem_pages: bool = True) -> Path:

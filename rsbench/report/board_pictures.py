@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rsbench.benchmark.leaderboard.splits import Split, dataset_split
-from rsbench.dataset.files import write_bytes
+from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import read_pairs
-from rsbench.errors import RsbenchError
 from rsbench.report.board_answers import ERRORS, Named, answer_images, true_images
 from rsbench.report.board_splits import Board
 from rsbench.report.pictures import encode_jpeg, shrink
+from rsbench.storage.files import write_bytes
 
 _LONGEST, _QUALITY = 400, 78
 """Px, and of JPEG: 10 to 35 kB."""

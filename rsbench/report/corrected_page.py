@@ -13,9 +13,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from numpy.typing import NDArray
 
 from rsbench.dataset.corrected_frames import MARKER
-from rsbench.dataset.files import read_json, write_bytes
 from rsbench.report import pictures
 from rsbench.report.pictures import Image
+from rsbench.storage.files import read_json, write_bytes
 from rsbench.vision.fusion import Fused, Origin
 
 _COLOURS = {

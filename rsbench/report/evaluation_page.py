@@ -16,14 +16,14 @@ from rsbench.benchmark.images.evaluation import read_headings, read_scores
 from rsbench.benchmark.images.predict import depth_of, load_disparities
 from rsbench.benchmark.images.store import read_record
 from rsbench.benchmark.statistics import median_and_quartiles
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import View
 from rsbench.dataset.corrected_frames import read_origin
-from rsbench.dataset.files import load_arrays, load_matches, read_json, read_png, write_bytes
 from rsbench.dataset.sequence import Sequence, read_pairs
-from rsbench.dataset.workplace import files_below, listed, named
-from rsbench.errors import RsbenchError
 from rsbench.report import pictures
 from rsbench.report.pictures import Image
+from rsbench.storage.files import load_arrays, load_matches, read_json, read_png, write_bytes
+from rsbench.storage.work_folder import files_below, listed, named
 from rsbench.vision.fusion import Origin
 
 _LONGEST = 640

@@ -12,8 +12,8 @@ import pandas as pd
 from rsbench.benchmark.simulated.sweep_card import Setting, SweepCard
 from rsbench.benchmark.studies.claim_rules import Centre
 from rsbench.benchmark.studies.claims import OURS, READINGS
-from rsbench.dataset.files import read_table
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
+from rsbench.storage.files import read_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core import so3
-from rsbench.errors import RsbenchError
-from rsbench.reading import check_amount, read_bytes
+from rsbench.core.errors import RsbenchError
 from rsbench.scenes.model import Environment, FloatArray, Light
+from rsbench.storage.untrusted_files import check_amount, read_bytes
 
 PIXELS = 1 << 23
 """Of a map: 4096 x 2048."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.scenes.model import FloatArray
 
 _TRANSFORM = "KHR_texture_transform"

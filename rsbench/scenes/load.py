@@ -8,13 +8,13 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from rsbench.cards import card_path, parse_card, read_toml
-from rsbench.errors import RsbenchError
-from rsbench.imports import blaming
-from rsbench.plugins import Kind, NoOptions, load_class, make_component
+from rsbench.components.cards import card_path, parse_card, read_toml
+from rsbench.components.imports import blaming
+from rsbench.components.plugins import Kind, NoOptions, load_class, make_component
+from rsbench.core.errors import RsbenchError
 from rsbench.scenes.environment import lit_by, read_environment
-from rsbench.scenes.kept import built_key, keep, kept_meshes
 from rsbench.scenes.model import Light, Scene, SceneBuilder, SceneMesh, Viewpoint
+from rsbench.scenes.scene_cache import built_key, keep, kept_meshes
 
 _FARTHEST = 1e9
 Rgb: TypeAlias = tuple[float, float, float]

@@ -15,13 +15,13 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from rsbench.errors import RsbenchError
-from rsbench.imports import in_words
-from rsbench.reading import FILE_BYTES, check_amount, check_size
+from rsbench.components.imports import in_words
+from rsbench.core.errors import RsbenchError
 from rsbench.scenes.gltf import TextureTransform
 from rsbench.scenes.mesh_limits import check_mesh_file
+from rsbench.scenes.mesh_placement import box_of, standing, surroundings
 from rsbench.scenes.model import ROUGHEST, SMOOTHEST, FloatArray, Material, SceneBuilder, SceneMesh
-from rsbench.scenes.staging import box_of, standing, surroundings
+from rsbench.storage.untrusted_files import FILE_BYTES, check_amount, check_size
 
 # Rows turn file axes into a right-handed frame with z up.
 _Z_UP = {

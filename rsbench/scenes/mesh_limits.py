@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from rsbench.errors import RsbenchError
-from rsbench.reading import FILE_BYTES, check_amount, parse_json, read_bytes
+from rsbench.core.errors import RsbenchError
 from rsbench.scenes.gltf import TextureTransform, check_extensions, texture_transforms
+from rsbench.storage.untrusted_files import FILE_BYTES, check_amount, parse_json, read_bytes
 
 PARTS = 1 << 12
 """Nodes, meshes, materials and so on, of each kind."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core import so3
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 
 FloatArray = NDArray[np.float64]
 SMOOTHEST, ROUGHEST = 0.05, 0.5

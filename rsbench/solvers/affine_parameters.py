@@ -21,7 +21,7 @@ from typing import final
 
 import numpy as np
 
-from rsbench.arguments import check_number
+from rsbench.components.arguments import check_number
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences

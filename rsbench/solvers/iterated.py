@@ -16,7 +16,7 @@ from typing import Literal, final
 
 import numpy as np
 
-from rsbench.arguments import check_whole
+from rsbench.components.arguments import check_whole
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig

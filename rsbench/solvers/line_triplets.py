@@ -23,15 +23,15 @@ from typing import NamedTuple, final
 import numpy as np
 import scipy
 
-from rsbench.arguments import check_number, check_whole
+from rsbench.components.arguments import check_number, check_whole
 from rsbench.core import so3
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.robust.ransac import IntArray, RansacOptions, ransac
 from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.engine.levenberg_marquardt import levenberg_marquardt
 from rsbench.solvers.engine.line_errors import (
     FREEDOM,
     LineErrors,
@@ -40,8 +40,8 @@ from rsbench.solvers.engine.line_errors import (
     stereo_ends,
     usable_lines,
 )
-from rsbench.solvers.engine.optimise import levenberg_marquardt
 from rsbench.solvers.engine.packed import Packed, inverse_definite, pack
+from rsbench.solvers.engine.ransac import IntArray, RansacOptions, ransac
 from rsbench.solvers.engine.stereo_points import stereo_points
 from rsbench.solvers.triplets import (
     ALL,

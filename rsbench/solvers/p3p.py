@@ -12,7 +12,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from rsbench.arguments import check_number, check_whole
+from rsbench.components.arguments import check_number, check_whole
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter

@@ -38,8 +38,8 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat
-from rsbench.robust.ransac import BoolArray, IntArray, RansacOptions, ransac
 from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.engine.ransac import BoolArray, IntArray, RansacOptions, ransac
 from rsbench.solvers.engine.stereo_points import FRAME_1, stereo_points, with_depth
 from rsbench.solvers.p3p import P3pSolver
 

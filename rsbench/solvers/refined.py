@@ -9,22 +9,22 @@ from typing import Any, Literal, final
 import cv2
 import numpy as np
 
-from rsbench.arguments import check_whole
+from rsbench.components.arguments import check_whole
+from rsbench.components.identity import source_version
+from rsbench.components.motion_models import motion_model
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.identity import source_version
-from rsbench.motions import motion_model
 from rsbench.solvers.eight_point import decompose_essential, eight_point
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.five_point import five_point
 from rsbench.solvers.engine.heavy_tails import heavy_tailed
 from rsbench.solvers.engine.kernel_type import load_kernel
+from rsbench.solvers.engine.levenberg_marquardt import Minimum, levenberg_marquardt
 from rsbench.solvers.engine.linear_systems import scaled_translation
 from rsbench.solvers.engine.minimal import solve_triples
-from rsbench.solvers.engine.optimise import Minimum, levenberg_marquardt
 from rsbench.solvers.engine.packed import Packed, pack
 from rsbench.solvers.iterated import solve_reduced
 

@@ -14,10 +14,10 @@ from typing import final
 import numpy as np
 
 from rsbench.core.correspondences import Correspondences, track_pairs, without_lens
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 

@@ -28,7 +28,7 @@ from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.optimise import levenberg_marquardt
+from rsbench.solvers.engine.levenberg_marquardt import levenberg_marquardt
 from rsbench.solvers.engine.packed import pack
 from rsbench.solvers.engine.stereo_points import propose_together, stereo_points, with_depth
 

@@ -29,7 +29,7 @@ from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.optimise import Minimum, levenberg_marquardt
+from rsbench.solvers.engine.levenberg_marquardt import Minimum, levenberg_marquardt
 from rsbench.solvers.engine.packed import Packed, inverse_definite, pack
 from rsbench.solvers.engine.poselib_adapter import MISSING, poselib_module
 

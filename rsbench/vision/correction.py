@@ -27,7 +27,7 @@ from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision import forward_warp
-from rsbench.vision.optics import optics_of
+from rsbench.vision.compiled_camera import optics_of
 from rsbench.vision.resample import Interpolation, resample
 
 _IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))

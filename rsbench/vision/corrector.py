@@ -11,18 +11,18 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench import plugins
-from rsbench.arguments import check_plain
+from rsbench.components import plugins
+from rsbench.components.arguments import check_plain
+from rsbench.components.plugins import Entry, Kind, RunOptions
 from rsbench.core import projection
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig, View
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
-from rsbench.plugins import Entry, Kind, RunOptions
 from rsbench.vision.fusion import Fused, Origin
 
 Knowledge = Literal["motion", "depth", "matches", "gyro"]

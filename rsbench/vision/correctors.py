@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from rsbench.core.rig import VIEWS, Side, View
 from rsbench.core.se3 import Pose
+from rsbench.vision.baseline_depths import plane_depth
 from rsbench.vision.correction import WarpOptions, warp_gain
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
+from rsbench.vision.frame_threads import side_by_side
 from rsbench.vision.fusion import Fused, Origin, SourceView, fuse
-from rsbench.vision.side_by_side import side_by_side
-from rsbench.vision.simpler_depths import plane_depth
 
 F32 = NDArray[np.float32]
 _NEAREST_SHARE = 0.999

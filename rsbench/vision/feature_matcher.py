@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench import plugins
+from rsbench.components import plugins
+from rsbench.components.plugins import Entry, Kind, RunOptions
 from rsbench.core.correspondences import SET_COLUMNS, Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import View
-from rsbench.errors import RsbenchError
-from rsbench.plugins import Entry, Kind, RunOptions
 
 _OUTSIDE_PX = 1.0
 """How far beyond the centre of the outermost pixel a sub-pixel position may lie."""

@@ -18,14 +18,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.arguments import check_ranges
+from rsbench.components.arguments import check_ranges
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
+from rsbench.vision.descriptor_search import best_two
 from rsbench.vision.feature_matcher import FeatureMatcher
+from rsbench.vision.frame_threads import side_by_side
 from rsbench.vision.images import grey_u8
-from rsbench.vision.nearest import best_two
-from rsbench.vision.side_by_side import side_by_side
 
 Indices = NDArray[np.int64]
 _MOST_FEATURES = 100_000

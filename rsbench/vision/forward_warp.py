@@ -18,8 +18,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.compiled import compiled
-from rsbench.vision.optics import Table, line_of, look, see
+from rsbench.components.compiled import compiled
+from rsbench.vision.compiled_camera import Table, line_of, look, see
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -17,13 +17,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.compiled import compiled
+from rsbench.components.compiled import compiled
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
+from rsbench.vision.compiled_camera import Table, across_lines, line_of, look, optics_of, see
 from rsbench.vision.correction import Corrected, WarpOptions, inverse_depth, relative_row_maps, warp
 from rsbench.vision.forward_warp import move
-from rsbench.vision.optics import Table, across_lines, line_of, look, optics_of, see
 from rsbench.vision.resample import resample
 from rsbench.vision.stereo_depth import known_beside
 

@@ -8,6 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+_BRIGHT = 99.9
+"""Percentile of a 16-bit image that becomes white for matching."""
+
 
 def grey_u8(image: NDArray[Any]) -> NDArray[np.uint8]:
     """Grey (H, W) uint8 of an image (H, W), (H, W, 1) or (H, W, 3) RGB, uint8 or uint16.
@@ -24,3 +27,12 @@ def grey_u8(image: NDArray[Any]) -> NDArray[np.uint8]:
     if grey.dtype == np.uint16:
         grey = np.rint(grey / 257.0)
     return np.ascontiguousarray(grey, dtype=np.uint8)
+
+
+def eight_bit(images: list[NDArray[Any]]) -> list[NDArray[np.uint8]]:
+    """Images for matching; 16-bit ones are brought to 8 bits by one factor, for they may use few of their bits."""
+    if images[0].dtype == np.uint8:
+        return images
+    top = max(float(np.percentile(image, _BRIGHT)) for image in images)
+    scale = np.float32(255.0 / max(top, 1.0))
+    return [np.clip(image * scale + np.float32(0.5), 0.0, 255.0).astype(np.uint8) for image in images]

@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from rsbench.components.motion_models import make_motion, model_name
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES
 from rsbench.core.se3 import compose, inverse
 from rsbench.core.so3 import FloatArray
-from rsbench.motions import make_motion, model_name
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.layer_fit import FEWEST
 from rsbench.vision.layers import Labelled, MovingCamera, planes_seen

@@ -21,14 +21,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.arguments import check_ranges
+from rsbench.components.arguments import check_ranges
 from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import FRAMES, Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.vision.likeness import Comparer
+from rsbench.vision.matching_cost import Comparer
 from rsbench.vision.other_view import F32, land_pixels, landing
 from rsbench.vision.resample import resample
 from rsbench.vision.semiglobal import aggregated

@@ -16,15 +16,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.compiled import compiled
+from rsbench.components.compiled import compiled
 from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.vision.compiled_camera import Table, across_lines, line_of
 from rsbench.vision.correction import inverse_depth
 from rsbench.vision.images import grey_u8
-from rsbench.vision.optics import Table, across_lines, line_of
 from rsbench.vision.other_view import Landing, land, landing, parallax_gain
 
 F32 = NDArray[np.float32]

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.compiled import compiled
+from rsbench.components.compiled import compiled
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
-from rsbench.vision.optics import Table, across_lines, line_of, look, optics_of, see
+from rsbench.vision.compiled_camera import Table, across_lines, line_of, look, optics_of, see
 
 F32 = NDArray[np.float32]
 _STEPS = 6

@@ -23,14 +23,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.arguments import check_ranges
-from rsbench.compiled import compiled
+from rsbench.components.arguments import check_ranges
+from rsbench.components.compiled import compiled
 from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.vision.images import grey_u8
-from rsbench.vision.likeness import Comparer
+from rsbench.vision.matching_cost import Comparer
 from rsbench.vision.other_view import Landing, land_pixels, landing, parallax_gain
 from rsbench.vision.semiglobal import aggregated, winners
 from rsbench.vision.stereo_matcher import F32, Cameras, MotionMatcher

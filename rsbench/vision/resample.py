@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.compiled import compiled
+from rsbench.components.compiled import compiled
 
 F32 = NDArray[np.float32]
 Interpolation = Literal["cubic", "linear"]

@@ -13,13 +13,13 @@ from typing import Any, Literal, final
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench import plugins
-from rsbench.arguments import check_ideal, check_plain
+from rsbench.components import plugins
+from rsbench.components.arguments import check_ideal, check_plain
+from rsbench.components.plugins import Entry, Kind, RunOptions
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, StereoRig, View
 from rsbench.core.shutter import RollingShutter
-from rsbench.errors import RsbenchError
-from rsbench.plugins import Entry, Kind, RunOptions
 
 F32 = NDArray[np.float32]
 Cameras = Literal["ideal", "any"]

@@ -23,19 +23,19 @@ import numpy as np
 from small_scenes import write_box_scene
 
 from attack.wet_castle import WET_CASTLE
-from rsbench.cards import card_path, list_cards
+from rsbench.components.cards import card_path, list_cards
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.core.lens import Lens
 from rsbench.core.shutter import Scan, Scanning
 from rsbench.dataset import generation
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.channels import CHANNELS, Channel, check_channels
-from rsbench.dataset.movers import TAKEN, MovingCard
-from rsbench.dataset.verification import rerender, verify_dataset
-from rsbench.errors import RsbenchError
+from rsbench.dataset.moving_objects import TAKEN, MovingCard
 from rsbench.renderers.electrons import Mosaic, Sensor
 from rsbench.scenes.load import load_scene, read_scene_card
 from rsbench.scenes.model import Scene
+from rsbench.verification import rerender, verify_dataset
 
 MODELS = ("linear", "twist", "accelerated", "spline")
 PER_DATASET = 3

@@ -153,7 +153,7 @@ def _broken_trees(loader: Loader, size: int, seed: int) -> list[bytes]:
 
 def _outcome(loader: Loader, data: bytes) -> tuple[str, str]:
     """How a loader takes an input: read, refused, or at fault."""
-    from rsbench.errors import RsbenchError
+    from rsbench.core.errors import RsbenchError
 
     loader.path.write_bytes(data)
     start = time.monotonic()

@@ -54,7 +54,7 @@ def loaders(inputs: Path, results: dict[str, Path], folder: Path) -> list[Loader
 def _cards(inputs: Path, folder: Path) -> Iterator[Loader]:
     from rsbench.benchmark.metric_plugins import load_metrics
     from rsbench.benchmark.simulated.sweep_card import load_sweep
-    from rsbench.cards import load_card
+    from rsbench.components.cards import load_card
     from rsbench.dataset.card import load_dataset_card
     from rsbench.pipeline.footage import read_rig_card
     from rsbench.renderers.options import RendererOptions
@@ -107,10 +107,10 @@ def _place(folder: Path, name: str) -> Path:
 
 
 def _datasets(inputs: Path, folder: Path) -> Iterator[Loader]:
-    from rsbench.dataset.files import load_arrays, load_matches, read_depth, read_png, read_poses
     from rsbench.dataset.sequence import read_dataset, read_sequence
     from rsbench.pipeline.footage import read_frame
     from rsbench.scenes.environment import read_environment
+    from rsbench.storage.files import load_arrays, load_matches, read_depth, read_png, read_poses
 
     data = folder / "data"
     shutil.copytree(inputs / "data", data)
@@ -141,7 +141,7 @@ def _datasets(inputs: Path, folder: Path) -> Iterator[Loader]:
 
 def _sky(path: Path) -> bytes:
     """A small environment map."""
-    from rsbench.dataset.files import write_exr
+    from rsbench.storage.files import write_exr
 
     light = np.random.default_rng(2).random((8, 16, 3), dtype=np.float32)
     if path.suffix == ".exr":
@@ -191,7 +191,7 @@ def _meshes(inputs: Path, folder: Path) -> Iterator[Loader]:
 def _problems(folder: Path) -> Iterator[Loader]:
     import numpy as np
 
-    from rsbench.errors import RsbenchError
+    from rsbench.core.errors import RsbenchError
     from rsbench.pipeline.problem import read_problems
 
     def read(path: Path) -> None:

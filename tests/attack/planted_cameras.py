@@ -36,16 +36,16 @@ from attack.planting import (
     times,
 )
 from attack.wet_castle import WET_CASTLE
-from rsbench.cards import load_card
+from rsbench.components.cards import load_card
 from rsbench.core.lens import Lens
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
-from rsbench.dataset.files import read_depth, read_png, write_depth, write_exr, write_png, write_poses
 from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.timing import write_timing
 from rsbench.renderers.options import RendererOptions
+from rsbench.storage.files import read_depth, read_png, write_depth, write_exr, write_png, write_poses
 
 Pixels = NDArray[Any]
 BROWN = Lens(model="brown-conrady", k1=-0.22, k2=0.05, p1=0.004)
@@ -60,7 +60,7 @@ CAMERAS: dict[str, dict[str, Any]] = {
     "glossy": {"scene": str(WET_CASTLE), "focal": 150.0},
     "frames": {"frames": 4, "channels": ("timing", "imu", "tracks", "affine", "matches")},
 }
-"""What differs from the cameras of datasets/smoke.toml, by name; ``thin`` sees hardly a flat place."""
+"""What differs from the cameras of cards/datasets/smoke.toml, by name; ``thin`` sees hardly a flat place."""
 
 
 def card_of(name: str) -> DatasetCard:

@@ -1,7 +1,7 @@
 """Faults planted into a copy of a sound dataset, each alone and with hashes made to fit: verify must name each.
 
 The fast sample of the test command and the long run of ``attack.verifying`` take the same table, ``FAULTS``. The
-dataset is that of datasets/smoke.toml, with the sequences "castle" and "room-twist".
+dataset is that of cards/datasets/smoke.toml, with the sequences "castle" and "room-twist".
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ from attack.planting import (
     written,
 )
 from attack.wet_castle import WET_CASTLE
-from rsbench.cards import load_card
+from rsbench.components.cards import load_card
 from rsbench.core.motion import TwistMotion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.files import sha256, write_depth, write_png
 from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene
+from rsbench.storage.files import sha256, write_depth, write_png
 
 
 def depth_faults() -> Iterator[Fault]:

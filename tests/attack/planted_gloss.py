@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from attack.planted_faults import depth_faults, image_faults
 from attack.planting import RNG, VICTIM, Fault, Plant, drop, image_of, manifest_of, removed, swapped
-from rsbench.dataset.files import read_mask, write_mask, write_png
 from rsbench.dataset.sequence import read_sequence
-from rsbench.dataset.shots import SHOTS, Shot
+from rsbench.dataset.views import SHOTS, Shot
+from rsbench.storage.files import read_mask, write_mask, write_png
 
 Mask = NDArray[np.bool_]
 BAND = slice(30, 66)

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attack.planting import RNG, VICTIM, Fault, Plant, image_of, manifest_of, put
-from rsbench.dataset.files import read_png, write_png
 from rsbench.dataset.sequence import read_sequence
 from rsbench.renderers.electrons import Sensor, expose
 from rsbench.renderers.image import linear_of_codes
 from rsbench.renderers.processing import compressed, processed, rows_needed
+from rsbench.storage.files import read_png, write_png
 
 CAMERA = Sensor(
     full_well=6000,

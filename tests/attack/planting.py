@@ -1,6 +1,6 @@
 """How faults are planted into a copy of a sound dataset, with hashes and lists made to fit, and are found.
 
-The dataset is that of datasets/smoke.toml, with the sequences "castle" and "room-twist".
+The dataset is that of cards/datasets/smoke.toml, with the sequences "castle" and "room-twist".
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from attack.wet_castle import WET_CASTLE
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.files import (
+from rsbench.dataset.sequence import Sequence, read_sequence, sequence_manifest
+from rsbench.dataset.timing import write_timing
+from rsbench.storage.files import (
     read_depth,
     read_json,
     read_png,
@@ -29,11 +31,9 @@ from rsbench.dataset.files import (
     write_png,
     write_poses,
 )
-from rsbench.dataset.sequence import Sequence, read_sequence, sequence_manifest
-from rsbench.dataset.timing import write_timing
-from rsbench.dataset.verification import verify_sequence
-from rsbench.dataset.verification.rerender import Again
-from rsbench.dataset.verification.structure import Listing, dataset_faults
+from rsbench.verification import verify_sequence
+from rsbench.verification.rerender import Again
+from rsbench.verification.structure import Listing, dataset_faults
 
 VICTIM, OTHER = "castle", "room-twist"
 Plant = Callable[[Path], None]

@@ -16,8 +16,8 @@ from small_scenes import SCENE, write_box_scene
 
 ROOT = Path(__file__).parents[2]
 LINKED = ("rsbench", "docs", "examples")
-KINDS = sorted({path.parent.name for path in ROOT.glob("*/*.toml")} - set(LINKED))
-"""Of cards, by their folders: whoever imports rsbench here attacks it with the cards of the whole checkout."""
+KINDS = ("cards", "renderers", "scenes", "solvers")
+"""Folders of cards: whoever imports rsbench here attacks it with the cards of the whole checkout."""
 CAMERA = {"width": 96, "height": 64, "focal": 80.0}
 RIG = "baseline = 0.3\nreadout_ratio = 0.8\n[camera]\nfx = 80.0\nfy = 80.0\ncx = 47.5\ncy = 31.5\n"
 SOLVERS = ("gs-8pt", "rs-stereo-linear", "rs-stereo-refined", "rs-stereo")
@@ -36,13 +36,13 @@ def make_checkout(folder: Path) -> Path:
             path.unlink()
     for path in (folder / "scenes").glob("*.toml"):
         write_box_scene(folder / "scenes", path.stem)
-    for path in (folder / "datasets").glob("*.toml"):
+    for path in (folder / "cards/datasets").glob("*.toml"):
         card = tomllib.loads(path.read_text("utf-8"))
         card |= {"camera": CAMERA, "renderer": "preview", "sequence": card["sequence"][:2]}
         if "seeds" in card:
             card["seeds"] = card["seeds"][:2]
         path.write_text(to_toml(card), "utf-8")
-    for path in (folder / "sweeps").glob("*.toml"):
+    for path in (folder / "cards/sweeps").glob("*.toml"):
         card = tomllib.loads(path.read_text("utf-8"))
         card |= {"trials": 2, "values": [card["values"][0], card["values"][-1]]}
         path.write_text(to_toml(card), "utf-8")

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from commands import assert_refused, run_here
 
+from rsbench.capture.readout import ReadoutEstimate
 from rsbench.cli.correct import _readout
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.corrected_frames import MASK_VALUES, fresh_folder
-from rsbench.dataset.files import read_depth, read_png, write_png
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.pipeline.readout import ReadoutEstimate
+from rsbench.storage.files import read_depth, read_png, write_png
 
 ORDER = ("left_0", "right_0", "left_1", "right_1")
 

@@ -15,8 +15,8 @@ from commands import assert_refused, run_here
 
 from rsbench.core.projection import rs_project
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.files import read_depth, read_png
 from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.storage.files import read_depth, read_png
 
 ORDER = ("left_0", "right_0", "left_1", "right_1")
 DISPARITY = 5.0

@@ -13,7 +13,7 @@ import pytest
 from commands import run_here, sweep_card
 from small_scenes import write_box_scene, write_small_card
 
-from rsbench.dataset.workplace import HIDDEN, WORK
+from rsbench.storage.work_folder import HIDDEN, WORK
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 

@@ -16,9 +16,9 @@ import pytest
 from commands import run_here
 
 from rsbench.cli import console
-from rsbench.cli.kinds import COMPONENTS, kind_names, names_of
+from rsbench.cli.component_kinds import COMPONENTS, kind_names, names_of
 from rsbench.cli.main import app
-from rsbench.parameters import parameters_of
+from rsbench.components.parameters import parameters_of
 from rsbench.solvers.engine.registry import list_solvers, load_solver_entry
 
 

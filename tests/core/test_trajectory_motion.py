@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rsbench.components.motion_models import make_motion, motion_record, read_motion
 from rsbench.core import so3
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.core.trajectory_motion import TrajectoryMotion, world_from_body
-from rsbench.motions import make_motion, motion_record, read_motion
 
 few = settings(max_examples=25, deadline=None, derandomize=True)
 

@@ -17,8 +17,8 @@ from rsbench.core.rig import StereoRig, View
 from rsbench.core.se3 import inverse, transform
 from rsbench.core.shutter import Scanning
 from rsbench.dataset.affine import AffineFrames, jacobians_of
-from rsbench.dataset.shots import Geometry, GivenGeometry
 from rsbench.dataset.tracks import Tracks, track_views
+from rsbench.dataset.views import Geometry, GivenGeometry
 
 TRACK_VIEWS = track_views(2)
 Array = NDArray[np.float64]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from small_scenes import write_small_card
 
+from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import DatasetCard, load_dataset_card
-from rsbench.errors import RsbenchError
 
 MOTION = '{ rotation_deg = %s, rotation_axis = "random", translation = 0.2, translation_axis = "random" }'
 GRID = f"""

@@ -17,7 +17,8 @@ from channel_faults import FAULTS
 from numpy.typing import NDArray
 from traced_truth import first_hit, look, rays, row_seeing, truth
 
-from rsbench.cards import parse_card
+from rsbench.components.cards import parse_card
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES, SIDES, VIEWS
 from rsbench.dataset.affine import jacobians_of
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
@@ -30,20 +31,19 @@ from rsbench.dataset.channels import (
     matches_file,
     named_channels,
 )
-from rsbench.dataset.files import read_grey_png, write_png
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.matches import MATCHED, MatchClass
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
-from rsbench.dataset.verification import Rerender, verify_dataset
-from rsbench.dataset.verification.content import Comparison, read_content
-from rsbench.dataset.verification.landing import Shot
-from rsbench.dataset.verification.rerender import Again
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.renderers.electrons import Sensor
 from rsbench.renderers.image import to_srgb8
 from rsbench.scenes.load import load_scene
+from rsbench.storage.files import read_grey_png, write_png
+from rsbench.verification import Rerender, verify_dataset
+from rsbench.verification.content import Comparison, read_content
+from rsbench.verification.reprojection import Shot
+from rsbench.verification.rerender import Again
 
 Array = NDArray[np.float64]
 SCENE = """
@@ -297,8 +297,8 @@ def test_a_sequence_without_channels_has_none(yard: Path, tmp_path: Path) -> Non
 
 def test_an_unknown_channel_is_passed_over(yard: Path, tmp_path: Path) -> None:
     """A dataset of a later version."""
-    from rsbench.dataset.files import read_json, write_json
     from rsbench.dataset.sequence import read_sequence
+    from rsbench.storage.files import read_json, write_json
 
     folder = tmp_path / "yard"
     folder.mkdir()

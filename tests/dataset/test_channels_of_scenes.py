@@ -8,7 +8,7 @@ import pytest
 
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.verification import verify_dataset
+from rsbench.verification import verify_dataset
 
 
 @pytest.mark.slow

@@ -20,13 +20,13 @@ from rsbench.core.rig import StereoRig, views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import Channel, channel_files
-from rsbench.dataset.files import read_json, write_json
 from rsbench.dataset.sequence import read_sequence
 from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.dataset.tracks import track_views
-from rsbench.dataset.verification import verify_dataset
-from rsbench.renderers import segments
-from rsbench.renderers.segments import Surfaces
+from rsbench.renderers import visibility
+from rsbench.renderers.visibility import Surfaces
+from rsbench.storage.files import read_json, write_json
+from rsbench.verification import verify_dataset
 
 RIG = StereoRig(camera=PinholeCamera.centred(96, 80, 110.0), baseline=0.3)
 SHUTTER = RollingShutter(height=80, readout_ratio=0.9)
@@ -73,7 +73,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in channel_files(CHANNELS, (), COUNT):
         (folder / name).parent.mkdir(exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(segments, "SceneRays", PlaneRays)
+        patch.setattr(visibility, "SceneRays", PlaneRays)
         write_sequence_channels(folder, card, card.sequence[0], None, own["scene"])  # pyrefly: ignore[bad-argument-type]
     own |= {key: card.manifest_of(card.sequence[0])[key] for key in ("channels", "imu", "matches")}
     own["files"] |= dict.fromkeys(channel_files(CHANNELS, (), COUNT), "")

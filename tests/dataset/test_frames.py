@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from rsbench.benchmark.images.evaluation import open_evaluation
 from rsbench.benchmark.images.plan import EvaluationOptions
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import AcceleratedMotion, LaterMotion, LinearMotion, Motion, TwistMotion
 from rsbench.core.projection import back_project, rs_project
 from rsbench.core.rig import FRAMES, SIDES, StereoRig, views_of
@@ -25,19 +26,18 @@ from rsbench.core.se3 import compose, inverse, transform
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
-from rsbench.dataset.beside import beside
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.channel_writer import write_channels
 from rsbench.dataset.channels import CHANNELS, STEP_PX, Layer, channel_files, pair_layers
-from rsbench.dataset.files import read_depth, read_png, write_depth, write_png
 from rsbench.dataset.layout import files_of, is_of_sequence
 from rsbench.dataset.sequence import read_dataset, read_pairs
-from rsbench.dataset.shots import Shot
-from rsbench.dataset.verification import verification_steps, verify_dataset
-from rsbench.errors import RsbenchError
+from rsbench.dataset.views import Shot
 from rsbench.renderers.electrons import Sensor
 from rsbench.renderers.render import Frame
-from rsbench.renderers.segments import Surfaces
+from rsbench.renderers.visibility import Surfaces
+from rsbench.storage.background_writer import beside
+from rsbench.storage.files import read_depth, read_png, write_depth, write_png
+from rsbench.verification import verification_steps, verify_dataset
 
 RIG = StereoRig(camera=PinholeCamera.centred(64, 54, 74.0), baseline=0.3)
 SHUTTER = RollingShutter(height=54, readout_ratio=0.9)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from rsbench.core.errors import RsbenchError
 from rsbench.dataset.corrected_frames import fresh_folder
-from rsbench.errors import RsbenchError
 
 
 def write(out: Path, text: str) -> None:
@@ -134,7 +134,7 @@ def test_a_kill_between_the_old_and_the_new_leaves_one_of_them(
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "rename", kill)
-        patch.setattr("rsbench.dataset.workplace._leave", lambda hidden, descriptor, fresh: os.close(descriptor))
+        patch.setattr("rsbench.storage.work_folder._leave", lambda hidden, descriptor, fresh: os.close(descriptor))
         patch.setattr("rsbench.dataset.corrected_frames.remove", stop)
         with pytest.raises(KilledError):
             write(out, "second")

@@ -19,14 +19,14 @@ import pytest
 from attack.planting import rehash
 from small_scenes import write_box_scene, write_small_card
 
+from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, load_dataset_card
-from rsbench.dataset.estimate import estimate_dataset
-from rsbench.dataset.files import read_png, sha256, write_png
+from rsbench.dataset.cost_estimate import estimate_dataset
 from rsbench.dataset.generation import generate_dataset, steps_of
 from rsbench.dataset.sequence import read_dataset
-from rsbench.dataset.verification import verify_dataset
-from rsbench.dataset.workplace import HIDDEN
-from rsbench.errors import RsbenchError
+from rsbench.storage.files import read_png, sha256, write_png
+from rsbench.storage.work_folder import HIDDEN
+from rsbench.verification import verify_dataset
 
 
 def bytes_of(folder: Path) -> dict[str, str]:

@@ -16,15 +16,15 @@ from PIL import Image
 from small_scenes import SCENE, write_small_card
 from trimesh.visual.material import PBRMaterial
 
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES
 from rsbench.dataset.card import DatasetCard, load_dataset_card
-from rsbench.dataset.estimate import estimate_dataset
-from rsbench.dataset.files import read_grey_png, read_json, read_mask, write_mask
+from rsbench.dataset.cost_estimate import estimate_dataset
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_sequence
-from rsbench.dataset.shots import SHOTS, Shot
-from rsbench.dataset.verification import verify_dataset
-from rsbench.errors import RsbenchError
+from rsbench.dataset.views import SHOTS, Shot
+from rsbench.storage.files import read_grey_png, read_json, read_mask, write_mask
+from rsbench.verification import verify_dataset
 
 Mask = NDArray[np.bool_]
 Vector = tuple[float, float, float]
@@ -157,7 +157,7 @@ def test_an_estimate_counts_masks(sound: Path, card: DatasetCard) -> None:
 
 
 def test_a_mask_holds_two_values(sound: Path, tmp_path: Path) -> None:
-    from rsbench.dataset.files import write_png
+    from rsbench.storage.files import write_png
 
     write_png(tmp_path / "mask.png", np.arange(12, dtype=np.uint8).reshape(3, 4))
     with pytest.raises(RsbenchError, match=r"mask.png: must hold 0 and 255 alone"):

@@ -16,7 +16,6 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
-from rsbench.dataset.files import write_json
 from rsbench.dataset.imu import (
     MARGIN_S,
     MEASURED,
@@ -30,8 +29,9 @@ from rsbench.dataset.imu import (
     write_imu,
 )
 from rsbench.dataset.sequence import read_sequence, sequence_manifest
-from rsbench.dataset.verification.imu_checks import imu_faults
 from rsbench.renderers.electrons import Sensor
+from rsbench.storage.files import write_json
+from rsbench.verification.imu_checks import imu_faults
 
 RIG = StereoRig(camera=PinholeCamera.centred(64, 48, 60.0), baseline=0.3)
 SHUTTER = RollingShutter(height=48, readout_ratio=0.9)

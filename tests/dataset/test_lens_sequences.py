@@ -16,21 +16,21 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.evaluation import open_evaluation, read_scores
 from rsbench.benchmark.images.plan import EvaluationOptions
-from rsbench.cards import parse_card
+from rsbench.components.cards import parse_card
 from rsbench.core.epipolar import rs_sampson_error
+from rsbench.core.errors import RsbenchError
 from rsbench.core.lens import Lens
 from rsbench.core.projection import back_project, rs_project_near
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, View
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.channels import Channel
-from rsbench.dataset.files import read_depth, read_png
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import Sequence, read_sequence
-from rsbench.dataset.verification import content, verify_dataset
-from rsbench.dataset.verification.poses import pose_faults
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.storage.files import read_depth, read_png
+from rsbench.verification import content, verify_dataset
+from rsbench.verification.poses import pose_faults
 from rsbench.vision.quality import psnr
 
 BARREL = Lens(model="brown-conrady", k1=-0.22, k2=0.05, p1=0.001)

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from small_scenes import write_box_scene
 
-from rsbench.cards import parse_card
+from rsbench.components.cards import parse_card
+from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import row_poses
 from rsbench.dataset.card import CameraCard, MotionCard, load_dataset_card
-from rsbench.dataset.files import read_json, write_json
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_dataset, read_sequence
-from rsbench.dataset.verification import verify_dataset
-from rsbench.dataset.verification.poses import pose_faults
-from rsbench.errors import RsbenchError
+from rsbench.storage.files import read_json, write_json
+from rsbench.verification import verify_dataset
+from rsbench.verification.poses import pose_faults
 
 COMMON = {"rotation_deg": 2.0, "rotation_axis": "random", "translation": 0.15, "translation_axis": "random"}
 POSES = [[0.01 * k, 0.02 * k, 0.0, 0.06 * k, 0.0, 0.01 * k * k] for k in range(7)]

@@ -17,29 +17,29 @@ from moving_truth import Thing, World, row_times, truth
 from numpy.typing import NDArray
 from traced_truth import Array, rays
 
-from rsbench.cards import parse_card
+from rsbench.components.cards import parse_card
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import LinearMotion
-from rsbench.core.moving import poses_of
+from rsbench.core.moving_objects import poses_of
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.channels import PAIR_CHANNELS, PairChannel, PixelClass
-from rsbench.dataset.files import read_grey_png, write_png
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.movers import NUMBER, SHADED, TAKEN, MovingCard
+from rsbench.dataset.moving_objects import NUMBER, SHADED, TAKEN, MovingCard
+from rsbench.dataset.posed_scenes import seen_scene
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.dataset.stage import seen_scene
-from rsbench.dataset.verification import verify_dataset
-from rsbench.dataset.verification.content import read_content
-from rsbench.dataset.verification.moving_checks import label_faults
-from rsbench.dataset.verification.twin_checks import read_twins
-from rsbench.errors import RsbenchError
+from rsbench.renderers.clearance import obstacle
 from rsbench.renderers.electrons import Sensor
 from rsbench.renderers.options import RendererOptions
-from rsbench.renderers.passage import obstacle
 from rsbench.renderers.render import render
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.load import load_scene
+from rsbench.storage.files import read_grey_png, write_png
+from rsbench.verification import verify_dataset
+from rsbench.verification.content import read_content
+from rsbench.verification.moving_checks import label_faults
+from rsbench.verification.twin_checks import read_twins
 
 SCENE = """
 name = "lot"

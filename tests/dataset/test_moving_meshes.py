@@ -17,18 +17,18 @@ from scipy.spatial.transform import Rotation
 from small_scenes import write_box_scene
 from traced_truth import Array, rays
 
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import views_of
 from rsbench.core.se3 import inverse, transform
 from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.channels import PairChannel, PixelClass
-from rsbench.dataset.files import read_grey_png, write_png
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.movers import NUMBER
+from rsbench.dataset.moving_objects import NUMBER
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.dataset.verification import verify_dataset
-from rsbench.dataset.verification.rerender import Again
-from rsbench.errors import RsbenchError
 from rsbench.scenes.load import load_scene
+from rsbench.storage.files import read_grey_png, write_png
+from rsbench.verification import verify_dataset
+from rsbench.verification.rerender import Again
 
 CARD = """
 name = "fair"

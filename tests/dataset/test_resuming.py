@@ -11,15 +11,16 @@ import pytest
 from commands import run_here
 from small_scenes import write_box_scene, write_small_card
 
-from rsbench.dataset import generation, hashes
+from rsbench.core.errors import RsbenchError
+from rsbench.dataset import generation
 from rsbench.dataset.card import DatasetCard, load_dataset_card
-from rsbench.dataset.files import sha256
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.hashes import FileHashes
 from rsbench.dataset.scene_hashes import SceneHashes, scene_key
-from rsbench.dataset.workplace import HIDDEN, workplace
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.isolated_jobs import LostJobsError
+from rsbench.jobs.process_jobs import LostJobsError
+from rsbench.storage import file_hashes
+from rsbench.storage.file_hashes import FileHashes
+from rsbench.storage.files import sha256
+from rsbench.storage.work_folder import HIDDEN, workplace
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +50,7 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         names.append(path.name)
         return sha256(path)
 
-    monkeypatch.setattr(hashes, "sha256", counted)
+    monkeypatch.setattr(file_hashes, "sha256", counted)
     return names
 
 
@@ -91,17 +92,17 @@ def test_a_change_that_keeps_size_and_time_is_seen(card: DatasetCard, copy: Path
 def test_a_cut_line_of_the_kept_hashes_costs_one_reading(tmp_path: Path, read: list[str]) -> None:
     (tmp_path / "x").write_text("x")
     (tmp_path / "y").write_text("y")
-    kept = FileHashes(tmp_path, tmp_path / "hashes.jsonl")
+    kept = FileHashes(tmp_path, tmp_path / "file_hashes.jsonl")
     first = [kept.of("x"), kept.of("y")]
     kept.flush()
-    whole = (tmp_path / "hashes.jsonl").read_bytes()
-    (tmp_path / "hashes.jsonl").write_bytes(whole[:-9])
+    whole = (tmp_path / "file_hashes.jsonl").read_bytes()
+    (tmp_path / "file_hashes.jsonl").write_bytes(whole[:-9])
     read.clear()
-    again = FileHashes(tmp_path, tmp_path / "hashes.jsonl")
+    again = FileHashes(tmp_path, tmp_path / "file_hashes.jsonl")
     assert [again.of("x"), again.of("y")] == first and read == ["y"]
     again.flush()
     read.clear()
-    last = FileHashes(tmp_path, tmp_path / "hashes.jsonl")
+    last = FileHashes(tmp_path, tmp_path / "file_hashes.jsonl")
     assert [last.of("x"), last.of("y"), last.of("none")] == [*first, None] and read == []
 
 
@@ -141,7 +142,7 @@ def test_a_scene_of_files_or_of_others_is_built_again(card: DatasetCard, tmp_pat
 
 
 def test_a_changed_card_is_another_scene(tmp_path: Path) -> None:
-    from rsbench.cards import card_path
+    from rsbench.components.cards import card_path
 
     text = card_path("scenes", "room").read_text()
     same, other = tmp_path / "same.toml", tmp_path / "other.toml"
@@ -234,4 +235,4 @@ def test_lost_jobs_end_a_command_with_code_1(monkeypatch: pytest.MonkeyPatch, tm
 
 def test_hidden_files_are_no_part_of_the_dataset(dataset: Path) -> None:
     listed = json.loads((dataset / "dataset.json").read_text())["files"]
-    assert not any(HIDDEN in path for path in listed) and (dataset / HIDDEN / "hashes.jsonl").is_file()
+    assert not any(HIDDEN in path for path in listed) and (dataset / HIDDEN / "file_hashes.jsonl").is_file()

@@ -15,20 +15,20 @@ from attack.planting import rehash
 from numpy.typing import NDArray
 from small_scenes import write_box_scene, write_small_card
 
-from rsbench.cards import parse_card
+from rsbench.components.cards import parse_card
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
-from rsbench.dataset.files import read_png, write_png
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_sequence
-from rsbench.dataset.verification import sensors, verify_dataset
-from rsbench.dataset.verification.content import read_content
-from rsbench.dataset.verification.image_checks import Picture
-from rsbench.dataset.verification.landing import Shot
-from rsbench.dataset.verification.sensors import sensor_faults
-from rsbench.errors import RsbenchError
 from rsbench.renderers.electrons import Sensor
 from rsbench.renderers.processing import compressed
+from rsbench.storage.files import read_png, write_png
+from rsbench.verification import sensors, verify_dataset
+from rsbench.verification.content import read_content
+from rsbench.verification.image_checks import Picture
+from rsbench.verification.reprojection import Shot
+from rsbench.verification.sensors import sensor_faults
 
 NOISY = Sensor(full_well=6000, gain=4, photon_noise=True, read_noise=2.5, bit_depth=10)
 

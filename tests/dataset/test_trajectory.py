@@ -13,16 +13,16 @@ from numpy.typing import ArrayLike
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.core import so3
+from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.core.trajectory_motion import world_from_body
 from rsbench.dataset.card import load_dataset_card
-from rsbench.dataset.files import read_json, write_json
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.trajectory import TrajectoryCard, parts_along, read_trajectory
-from rsbench.dataset.verification import verify_dataset
-from rsbench.errors import RsbenchError
 from rsbench.scenes.model import Viewpoint
+from rsbench.storage.files import read_json, write_json
+from rsbench.verification import verify_dataset
 
 RATE, COUNT = 40.0, 41
 """Poses of one second."""

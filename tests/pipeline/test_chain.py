@@ -10,23 +10,23 @@ import cv2
 import numpy as np
 import pytest
 
+from rsbench.components.plugins import wrap
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.dataset.sequence import Sequence
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.chain import Given, correct_four, uncorrected
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource
-from rsbench.pipeline.frame_depth import eight_bit
 from rsbench.pipeline.frame_motion import NoMotionError, match_frames, motion_of, solve_frames
-from rsbench.plugins import wrap
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.registry import load_solver_entry
 from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, Corrector, CorrectorSpec, load_corrector
 from rsbench.vision.feature_matcher import FEATURE_MATCHERS, FeatureMatcher
 from rsbench.vision.features import SiftMatcher
 from rsbench.vision.fusion import Fused, Origin
+from rsbench.vision.images import eight_bit
 from rsbench.vision.quality import psnr
 from rsbench.vision.stereo_matcher import load_matcher
 

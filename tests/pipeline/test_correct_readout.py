@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.correspondences import Correspondences
-from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
-from rsbench.pipeline.readout import (
+from rsbench.capture.readout import (
     ReadoutEstimate,
     combined,
     estimate_readout_ratio,
@@ -19,9 +15,13 @@ from rsbench.pipeline.readout import (
     select,
     truncated_losses,
 )
-from rsbench.pipeline.readout_profile import reversed_in_time
-from rsbench.pipeline.rectification import without_offset
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
+from rsbench.capture.readout_profile import reversed_in_time
+from rsbench.capture.rectification import without_offset
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.5)

@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.chain import correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, check_alike, read_frame, read_rig_card
 from rsbench.pipeline.frame_motion import NoMotionError, solve_frames
-from rsbench.pipeline.sliding import correct_sequence, estimate_sequence_readout
+from rsbench.pipeline.sequence_correction import correct_sequence, estimate_sequence_readout
 
 Folders = tuple[FrameSource, FrameSource]
 
@@ -132,7 +132,7 @@ def test_a_frame_without_motion_to_the_next_uses_the_motion_that_led_to_it(
             return solve_frames(*arguments)
         raise NoMotionError("nothing there")
 
-    monkeypatch.setattr("rsbench.pipeline.sliding.solve_frames", solve)
+    monkeypatch.setattr("rsbench.pipeline.sequence_correction.solve_frames", solve)
     sources = FrameSource(left.path), FrameSource(right.path)
     moments = list(correct_sequence(*sources, castle.rig, castle.shutter.readout_ratio, CorrectionOptions()))
     assert [bool(moment.frames) for moment in moments] == [True, True, False]

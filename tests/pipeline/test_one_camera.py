@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rsbench.components.plugins import wrap
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import TwistMotion
@@ -14,12 +15,11 @@ from rsbench.core.projection import rs_project
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.one_camera import ZhuangCorrector
-from rsbench.pipeline.robust_motion import RobustOptions
-from rsbench.plugins import wrap
+from rsbench.solvers.engine.robust_motion import RobustOptions
+from rsbench.vision.baseline_depths import monocular_depth
 from rsbench.vision.correction import correction_flow
 from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, find_corrected
 from rsbench.vision.fusion import Origin
-from rsbench.vision.simpler_depths import monocular_depth
 
 RIG = StereoRig(camera=PinholeCamera.centred(96, 96, 120.0), baseline=0.4)
 SHUTTER = RollingShutter(height=96, readout_ratio=0.8)

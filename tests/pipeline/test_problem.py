@@ -17,16 +17,16 @@ import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.core.lens import Lens
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.answer import EXTRAS, Answer, solve_problem
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import EXAMPLE, Problem, parse_problem, read_problem, read_problems
-from rsbench.pipeline.robust_motion import RobustOptions
 from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.solvers.engine.robust_motion import RobustOptions
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from small_scenes import write_box_scene
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.dataset.scene_hashes import scene_hash, scene_key
-from rsbench.errors import RsbenchError
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import render_global
 from rsbench.renderers.scene import MitsubaScene

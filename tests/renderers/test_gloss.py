@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.renderers.options import Integrator, RendererOptions
+from rsbench.renderers.pixel_samples import facet_points
 from rsbench.renderers.render import Frame, render, render_global
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.renderers.subpixel import facet_points
 from rsbench.scenes.model import Light, Material, Scene, SceneMesh
 
 FloatArray = NDArray[np.float64]

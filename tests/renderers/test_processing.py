@@ -11,12 +11,12 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from rsbench.dataset.verification.processing_checks import processing_fault, quality_steps
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.renderers import processing
 from rsbench.renderers.electrons import Mosaic, Sensor, expose
 from rsbench.renderers.image import to_srgb8
 from rsbench.renderers.processing import compressed, processed, rows_needed, shares_of_noise
+from rsbench.verification.processing_checks import processing_fault, quality_steps
 
 PATTERNS = [each for each in get_args(Mosaic) if each != "none"]
 NOISY = Sensor(full_well=6000, gain=4, photon_noise=True, read_noise=2.5, bit_depth=10)

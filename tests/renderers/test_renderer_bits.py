@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.renderers import wavefront
 from rsbench.renderers.options import Integrator, Method, RendererOptions
 from rsbench.renderers.render import render, render_global

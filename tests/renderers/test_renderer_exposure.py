@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import Pose
-from rsbench.errors import RsbenchError
 from rsbench.renderers.exposure import instant_count, instant_of, instant_times
 from rsbench.renderers.options import Integrator, RendererOptions
 from rsbench.renderers.render import render

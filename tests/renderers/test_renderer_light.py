@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.renderers.image import to_srgb8
 from rsbench.renderers.options import Integrator, RendererOptions
+from rsbench.renderers.pixel_samples import subpixel_grid
 from rsbench.renderers.render import render, render_global
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.renderers.subpixel import subpixel_grid
 from rsbench.scenes.model import Light, Material, Scene, SceneMesh
 
 CAMERA = PinholeCamera.centred(32, 24, 20.0)

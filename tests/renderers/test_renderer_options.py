@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from rsbench.cards import list_cards, load_card, parse_card
-from rsbench.errors import RsbenchError
+from rsbench.components.cards import list_cards, load_card, parse_card
+from rsbench.core.errors import RsbenchError
 from rsbench.renderers.options import RendererOptions
 
 

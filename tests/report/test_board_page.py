@@ -28,9 +28,9 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.dataset.files import read_depth, read_png, write_depth
 from rsbench.report.board_figures import ErrorLine, curves, drawable
 from rsbench.report.board_page import build_site
+from rsbench.storage.files import read_depth, read_png, write_depth
 
 SPLIT = small_split(30)
 ID = f"points-1--{SPLIT.name}"

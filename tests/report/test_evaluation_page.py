@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from rsbench.dataset.files import write_json
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.report.evaluation_page import write_report
+from rsbench.storage.files import write_json
 
 
 @pytest.mark.parametrize("name", ["../../victim", "a/b", "/victim"])

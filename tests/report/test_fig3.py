@@ -12,7 +12,7 @@ import pytest
 
 from rsbench.benchmark.simulated.sweep_card import load_sweep
 from rsbench.benchmark.studies.claims import READINGS
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.report import fig3
 from rsbench.report.fig3 import SWEEPS, draw_fig3, setting_table
 

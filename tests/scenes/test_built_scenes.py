@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rsbench.cards import card_path, list_cards
+from rsbench.components.cards import card_path, list_cards
+from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import load_dataset_card
-from rsbench.errors import RsbenchError
 from rsbench.scenes.load import BUILDERS, load_scene, read_scene_card
 from rsbench.scenes.model import Material, Scene
 from rsbench.scenes.palette import RECIPES

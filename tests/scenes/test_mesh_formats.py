@@ -14,7 +14,7 @@ import trimesh
 from mesh_scenes import GREEN, RED, load, textured_quad, uv_of
 from PIL import Image
 
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 
 
 def _edited(folder: Path, edit: Callable[[dict[str, Any]], None]) -> str:

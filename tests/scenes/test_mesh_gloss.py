@@ -10,8 +10,8 @@ from mesh_scenes import load, textured_quad
 from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
-from rsbench.errors import RsbenchError
-from rsbench.scenes.kept import _packed, _unpacked
+from rsbench.core.errors import RsbenchError
+from rsbench.scenes.scene_cache import _packed, _unpacked
 
 SHINY = 'file = "m.glb"\ngloss = "file"'
 

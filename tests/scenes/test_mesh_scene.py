@@ -13,7 +13,7 @@ import trimesh
 from mesh_scenes import BLUE, GREEN, RED, WHITE, colour_at, load, textured_quad, uv_of
 from PIL import Image
 
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 
 
 @pytest.mark.parametrize("suffix", ["glb", "obj"])

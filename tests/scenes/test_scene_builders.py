@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.scenes.load import _check_meshes, load_scene
 from rsbench.scenes.model import Material, SceneMesh
 

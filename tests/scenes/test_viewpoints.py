@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.scenes.load import LightCard
 from rsbench.scenes.model import Light, Material, Scene, SceneMesh, Viewpoint
 

@@ -14,19 +14,19 @@ from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.metrics import rotation_error, translation_error
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import LinearMotion
+from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.projection import back_project, rs_project
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.files import load_matches
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.problem import EXAMPLE, parse_problem, problem_record, read_problem
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.affine_parameters import AffineSolver, equations, jets
 from rsbench.solvers.engine.free_velocities import FreeMotion, Rows, constraint
 from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
+from rsbench.storage.files import load_matches
 
 CAMERA = PinholeCamera.centred(900, 900, 810.0)
 RIG = StereoRig(camera=CAMERA, baseline=0.6).about("left")

@@ -12,10 +12,10 @@ import pytest
 from commands import run_here
 
 from rsbench.benchmark.simulated.contract import CHECKS, RIG, D, Finding, W, check_solver, degenerate_cases
-from rsbench.benchmark.simulated.misreadings import misreading
-from rsbench.core.metrics import translation_of_offset
+from rsbench.benchmark.simulated.convention_errors import misreading
+from rsbench.core.errors import RsbenchError
+from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
 from rsbench.solvers.engine.registry import SolverEntry, list_solvers, load_solver_entry
 
 ALLOWED_WARNINGS = {
@@ -58,7 +58,7 @@ import os, sys, time
 from dataclasses import replace
 import numpy as np
 from rsbench.core import so3
-from rsbench.core.metrics import translation_of_offset
+from rsbench.core.pose_errors import translation_of_offset
 from rsbench.solvers.engine.base import MotionEstimate, Solver
 from rsbench.solvers.refined import RefinedSolver
 

@@ -11,8 +11,8 @@ from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.metrics import rotation_error, translation_error
 from rsbench.core.motion import LinearMotion
+from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat

@@ -10,11 +10,11 @@ import pytest
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.metrics import rotation_error, scale_error, translation_error, translation_of_offset
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import LinearMotion
+from rsbench.core.pose_errors import rotation_error, scale_error, translation_error, translation_of_offset
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.errors import RsbenchError
 from rsbench.solvers.engine.registry import load_solver
 from rsbench.solvers.scaled import FlowScaledSolver, scale_flow
 

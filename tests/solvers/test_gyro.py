@@ -12,13 +12,13 @@ from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.gyro_motion import GyroMotion
-from rsbench.core.metrics import rotation_error, scale_error, translation_error
 from rsbench.core.motion import AcceleratedMotion, LinearMotion
+from rsbench.core.pose_errors import rotation_error, scale_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.spline_motion import SplineMotion
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.gyro import GyroSolver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)

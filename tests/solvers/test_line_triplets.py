@@ -14,14 +14,14 @@ from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences, without_lens
 from rsbench.core.lens import Lens
-from rsbench.core.metrics import rotation_error, translation_error
+from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.line_errors import LineErrors, line_rays, stereo_ends, usable_lines
 from rsbench.solvers.engine.registry import load_solver, load_solver_entry
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.line_triplets import Features, LineTripletSolver
 from rsbench.solvers.triplets import PATTERNS, newton
 

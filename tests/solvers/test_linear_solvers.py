@@ -14,8 +14,8 @@ from rsbench.benchmark.simulated.simulation import SimulationOptions, random_mot
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.metrics import rotation_error, translation_error, translation_of_offset
 from rsbench.core.motion import LinearMotion
+from rsbench.core.pose_errors import rotation_error, translation_error, translation_of_offset
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat

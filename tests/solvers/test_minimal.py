@@ -12,8 +12,8 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
+from rsbench.solvers.engine.levenberg_marquardt import levenberg_marquardt
 from rsbench.solvers.engine.minimal import damped_step, solve_triples
-from rsbench.solvers.engine.optimise import levenberg_marquardt
 from rsbench.solvers.engine.packed import pack
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)

@@ -8,26 +8,26 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from rsbench import motions
 from rsbench.benchmark.simulated.bound import motion_bound
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
+from rsbench.components import motion_models
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import row_pair_pose, rs_sampson_error, rs_stereo_transfer
-from rsbench.core.metrics import rotation_error
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
+from rsbench.core.pose_errors import rotation_error
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine import kernel_type
 from rsbench.solvers.engine.kernel_type import MotionKernel, Moved, kernel_for, load_kernel
 from rsbench.solvers.engine.motion_kernels import linear_move, linear_translation_jacobian
 from rsbench.solvers.engine.packed import pack
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.vectors import times
 from rsbench.solvers.refined import RefinedSolver
 
@@ -99,10 +99,10 @@ CUBIC, DULL = f"{__name__}:CubicMotion", f"{__name__}:DullMotion"
 def importable(monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 
-    monkeypatch.setitem(motions.MOTIONS.built_in, "cubic", CUBIC)
-    monkeypatch.setitem(motions.MOTIONS.built_in, "dull", DULL)
+    monkeypatch.setitem(motion_models.MOTIONS.built_in, "cubic", CUBIC)
+    monkeypatch.setitem(motion_models.MOTIONS.built_in, "dull", DULL)
     monkeypatch.setitem(sys.modules, __name__, sys.modules.get(__name__) or __import__(__name__))
-    motions._built_in.cache_clear()
+    motion_models._built_in.cache_clear()
 
 
 def matches(motion: Motion, noise_px: float) -> Correspondences:
@@ -190,7 +190,7 @@ def test_a_kernel_that_breaks_the_contract_is_refused_when_it_is_made() -> None:
 def test_moves_and_their_derivatives_are_those_of_the_model(name: str, parameters: dict[str, float]) -> None:
     """In plain Python, where a kernel is an ordinary class: T, R, their rates, and their derivatives by theta."""
     kernel = load_kernel(name, parameters)
-    motion = motions.make_motion(name, W, D, parameters)
+    motion = motion_models.make_motion(name, W, D, parameters)
     theta, tau = kernel.theta(W, D), (0.37, 1.61)
 
     def pose(theta: FloatArray, tau: tuple[float, float]) -> tuple[FloatArray, FloatArray]:

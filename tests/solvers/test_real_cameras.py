@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
-from rsbench.cards import list_cards
+from rsbench.components.cards import list_cards
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences, without_lens
 from rsbench.core.lens import Lens
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.base import SolverSpec
 from rsbench.solvers.engine.registry import load_solver, load_solver_entry
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 
 LENS = Lens(model="brown-conrady", k1=-0.2, k2=0.04, p1=0.001, p2=-0.0005)

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.errors import RsbenchError
 from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.registry import SOLVERS, list_solvers, load_solver, load_solver_entry
 from rsbench.solvers.linear import LinearSolver
@@ -121,7 +121,7 @@ def entry(name: str, target: str) -> metadata.EntryPoint:
 
 def install(monkeypatch: pytest.MonkeyPatch, solver: object, *names: str) -> None:
     entries = [entry(name, f"package{k}:Solver") for k, name in enumerate(names)]
-    monkeypatch.setattr("rsbench.entry_points.points_of", lambda group, folders: entries)
+    monkeypatch.setattr("rsbench.components.entry_points.points_of", lambda group, folders: entries)
     monkeypatch.setattr(metadata.EntryPoint, "load", lambda self: solver)
 
 

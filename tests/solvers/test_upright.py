@@ -14,15 +14,15 @@ from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.metrics import rotation_error, scale_error, translation_error, translation_of_offset
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import LinearMotion
+from rsbench.core.pose_errors import rotation_error, scale_error, translation_error, translation_of_offset
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.problem import EXAMPLE, parse_problem, problem_record, read_problem
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.upright import Uprights, UprightSolver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)

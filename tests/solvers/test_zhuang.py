@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
+from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.metrics import rotation_error, translation_error, translation_of_offset
+from rsbench.core.pose_errors import rotation_error, translation_error, translation_of_offset
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.motions import make_motion
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.zhuang import Flow, Velocity, ZhuangSolver, accelerations, reprojection
 
 CAMERA = PinholeCamera.centred(900, 900, 810.0)

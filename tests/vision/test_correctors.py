@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsbench.cards import list_cards
+from rsbench.components.cards import list_cards
+from rsbench.components.plugins import wrap
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, View
-from rsbench.errors import RsbenchError
-from rsbench.plugins import wrap
 from rsbench.vision.corrector import (
     CORRECTORS,
     CorrectionProblem,

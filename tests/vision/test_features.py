@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from rsbench.core.projection import back_project, rs_project
 from rsbench.core.rig import View
+from rsbench.vision.descriptor_search import best_two
 from rsbench.vision.feature_matcher import find_correspondences, load_features
 from rsbench.vision.features import Gate, MatchOptions, close_loops, detect, match_stereo_frames
-from rsbench.vision.nearest import best_two
 
 Build = Callable[..., Any]
 Four = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]

@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
+from rsbench.components.plugins import wrap
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.metrics import translation_of_offset
 from rsbench.core.motion import LinearMotion
+from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.projection import rs_project
 from rsbench.core.rig import VIEWS
 from rsbench.core.se3 import Pose
 from rsbench.pipeline.layered_scene import LayersCorrector
-from rsbench.plugins import wrap
 from rsbench.vision.correction import correct_frame
 from rsbench.vision.corrector import (
     CORRECTORS,

@@ -17,10 +17,10 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.lens import Lens
 from rsbench.core.projection import back_project, project_at, row_poses, rs_project_near
 from rsbench.core.shutter import Scanning
+from rsbench.vision.compiled_camera import distort, optics_of
 from rsbench.vision.correction import correct_frame, correction_flow
 from rsbench.vision.fusion import Origin, SourceView, fuse
 from rsbench.vision.motion_sweep import depth_from_motion
-from rsbench.vision.optics import distort, optics_of
 from rsbench.vision.quality import psnr
 from rsbench.vision.stereo_depth import seen_by_other
 from rsbench.vision.stereo_matcher import load_matcher

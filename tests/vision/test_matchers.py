@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsbench.cards import list_cards
+from rsbench.components.cards import list_cards
+from rsbench.components.plugins import Entry, RunOptions
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.errors import RsbenchError
-from rsbench.plugins import Entry, RunOptions
 from rsbench.vision.feature_matcher import FeatureMatcher, find_correspondences, load_features
 from rsbench.vision.features import MatchOptions, SiftMatcher
 from rsbench.vision.plane_sweep import SweepMatcher

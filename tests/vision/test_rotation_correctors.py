@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rsbench.components.plugins import wrap
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import VIEWS, View
 from rsbench.dataset.imu import ImuSamples, gyro_samples, true_samples
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.plugins import wrap
 from rsbench.vision.correction import correction_flow
 from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, find_corrected, load_corrector
 from rsbench.vision.correctors import RotationCorrector

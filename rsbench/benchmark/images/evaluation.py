@@ -16,14 +16,14 @@ from rsbench.benchmark.images.score import AFTER, KEYS, TABLES, Row
 from rsbench.benchmark.images.sequence_jobs import Scores, SequenceJob, done_apart, isolated
 from rsbench.benchmark.metric_plugins import DepthCase, ImageCase, PoseCase
 from rsbench.benchmark.provenance import dataset_record, provenance
-from rsbench.dataset.files import read_json, read_table, write_json, write_table
-from rsbench.dataset.hashes import HASHES, FileHashes
+from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_pairs
-from rsbench.dataset.workplace import workplace
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.crew import Workers
+from rsbench.jobs.workers import Workers
 from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.storage.file_hashes import HASHES, FileHashes
+from rsbench.storage.files import read_json, read_table, write_json, write_table
+from rsbench.storage.work_folder import workplace
 
 _CASES = {"pose": PoseCase, "depth": DepthCase, "correction": ImageCase}
 

@@ -14,14 +14,14 @@ from typing import Any, NamedTuple, TypeVar
 from rsbench.benchmark.images.store import Artefact, identity_of, records_below
 from rsbench.benchmark.metric_plugins import MetricEntry, load_metrics
 from rsbench.benchmark.provenance import numeric_version
-from rsbench.cards import choices, list_cards
-from rsbench.dataset.files import sha256
+from rsbench.components.cards import choices, list_cards
+from rsbench.components.plugins import Entry, Kind
+from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.workplace import listed
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.plugins import Entry, Kind
 from rsbench.solvers.engine.registry import SOLVERS, SolverEntry, load_solver_entry
+from rsbench.storage.files import sha256
+from rsbench.storage.work_folder import listed
 from rsbench.vision.corrector import CORRECTORS, load_corrector
 from rsbench.vision.feature_matcher import load_features
 from rsbench.vision.stereo_matcher import STEREO_MATCHERS, MatcherEntry, load_matcher, needs_motion

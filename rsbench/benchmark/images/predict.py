@@ -20,21 +20,12 @@ from rsbench.benchmark.images.plan import NONE, HashOf, Places, Plan, Recipe, re
 from rsbench.benchmark.images.store import Artefact, read_record
 from rsbench.benchmark.seeds import generator
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side, StereoRig, View
 from rsbench.dataset.corrected_frames import write_origin
-from rsbench.dataset.files import (
-    MATCH_SETS,
-    load_arrays,
-    load_matches,
-    save_arrays,
-    save_matches,
-    sha256,
-    write_png,
-)
 from rsbench.dataset.imu import gyro_samples
 from rsbench.dataset.sequence import Sequence
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.frame_depth import (
@@ -47,10 +38,19 @@ from rsbench.pipeline.frame_depth import (
 )
 from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.pipeline.robust_motion import RobustEstimate
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.registry import SOLVERS, SolverEntry
+from rsbench.solvers.engine.robust_motion import RobustEstimate
 from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.storage.files import (
+    MATCH_SETS,
+    load_arrays,
+    load_matches,
+    save_arrays,
+    save_matches,
+    sha256,
+    write_png,
+)
 from rsbench.vision.corrector import CORRECTORS
 from rsbench.vision.stereo_matcher import STEREO_MATCHERS, MatcherEntry, needs_motion
 from rsbench.vision.timed_depth import timed_depth

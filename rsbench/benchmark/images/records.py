@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from rsbench.cards import parse_card
-from rsbench.errors import RsbenchError
+from rsbench.components.cards import parse_card
+from rsbench.core.errors import RsbenchError
 
 _Vector = tuple[float, float, float]
 

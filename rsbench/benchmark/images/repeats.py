@@ -9,13 +9,13 @@ from pathlib import Path
 
 from rsbench.benchmark.images.plan import EvaluationOptions, Plan, make_plan
 from rsbench.benchmark.images.predict import Bench, Step
-from rsbench.dataset.hashes import HASHES, FileHashes
+from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_pairs
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.crew import Workers
-from rsbench.pipeline.isolated_jobs import finished_jobs
+from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.jobs.process_jobs import finished_jobs
+from rsbench.jobs.workers import Workers
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.storage.file_hashes import HASHES, FileHashes
 
 Job = tuple[str, str, int]
 """Names of sequence and solver, and the number of the samples."""

@@ -21,14 +21,14 @@ from rsbench.benchmark.images.predict import depth_of, load_disparities, true_pa
 from rsbench.benchmark.images.store import read_seconds
 from rsbench.benchmark.metric_plugins import Case, DepthCase, ImageCase, MetricEntry, PoseCase
 from rsbench.benchmark.scoring import answered, score
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, Side, View
 from rsbench.dataset.corrected_frames import read_origin
-from rsbench.dataset.files import read_png
 from rsbench.dataset.sequence import Sequence
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Pairs
+from rsbench.storage.files import read_png
 from rsbench.vision.corrector import load_corrector
 from rsbench.vision.fusion import Origin
 from rsbench.vision.stereo_depth import seen_by_other

@@ -17,14 +17,14 @@ from rsbench.benchmark.images.plan import EvaluationOptions, Places, Plan, make_
 from rsbench.benchmark.images.predict import Bench
 from rsbench.benchmark.images.score import Row, Scorer
 from rsbench.benchmark.isolated_metric import isolated_metrics
-from rsbench.dataset.hashes import HASHES, FileHashes
+from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import read_pairs
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.crew import Workers
-from rsbench.pipeline.isolated_jobs import finished_jobs
+from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.jobs.process_jobs import finished_jobs
+from rsbench.jobs.workers import Workers
 from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.storage.file_hashes import HASHES, FileHashes
 
 
 @dataclass(frozen=True, kw_only=True)

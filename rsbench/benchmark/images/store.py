@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from rsbench.benchmark.images.records import is_whole
-from rsbench.dataset.files import read_json, write_json
-from rsbench.dataset.workplace import listed
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
+from rsbench.storage.files import read_json, write_json
+from rsbench.storage.work_folder import listed
 
 SECONDS = "seconds.json"
 """Times of a sequence's artefacts: no two runs agree on them, so no other file holds any."""

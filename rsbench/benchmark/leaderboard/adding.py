@@ -32,11 +32,11 @@ from rsbench.benchmark.leaderboard.picture_files import copy_files, find_picture
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import Submission, read_submission
 from rsbench.benchmark.provenance import numeric_version
-from rsbench.dataset.files import write_bytes, write_json, write_table
-from rsbench.dataset.workplace import WORK, remove, workplace
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.crew import Workers
-from rsbench.reading import read_bytes
+from rsbench.core.errors import RsbenchError
+from rsbench.jobs.workers import Workers
+from rsbench.storage.files import write_bytes, write_json, write_table
+from rsbench.storage.untrusted_files import read_bytes
+from rsbench.storage.work_folder import WORK, remove, workplace
 
 
 class _Taken(NamedTuple):

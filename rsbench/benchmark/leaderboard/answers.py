@@ -9,7 +9,7 @@ import numpy as np
 
 from rsbench.benchmark.leaderboard.protocols import Asks, protocol_of_id
 from rsbench.core.so3 import FloatArray
-from rsbench.reading import check_name
+from rsbench.storage.untrusted_files import check_name
 
 LARGEST = 1e9
 """Number of w and d: larger ones are no motions, and their squares overflow."""

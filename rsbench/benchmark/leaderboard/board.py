@@ -28,12 +28,12 @@ from rsbench.benchmark.leaderboard.picture_files import file_bytes
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS, protocol_of_id
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import SUBMISSION_BYTES, Submission, read_submission
-from rsbench.cards import parse_card
-from rsbench.dataset.files import read_table, write_json, write_table
-from rsbench.dataset.workplace import workplace
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.crew import Workers
-from rsbench.reading import NAME, read_bytes, read_json
+from rsbench.components.cards import parse_card
+from rsbench.core.errors import RsbenchError
+from rsbench.jobs.workers import Workers
+from rsbench.storage.files import read_table, write_json, write_table
+from rsbench.storage.untrusted_files import NAME, read_bytes, read_json
+from rsbench.storage.work_folder import workplace
 
 FORMAT = 1
 RUN = "rsbench leaderboard run"

@@ -21,10 +21,10 @@ from rsbench.benchmark.leaderboard.protocols import Protocol
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import truth_text
 from rsbench.benchmark.leaderboard.true_pictures import VIEW
-from rsbench.dataset.files import save_arrays, write_bytes, write_json
-from rsbench.dataset.workplace import HIDDEN, named
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.pipeline.problem import COLUMNS, Problem, problem_record
+from rsbench.storage.files import save_arrays, write_bytes, write_json
+from rsbench.storage.work_folder import HIDDEN, named
 
 RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "readout_ratio")
 """Columns of problems.csv after the name."""

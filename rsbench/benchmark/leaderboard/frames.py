@@ -6,16 +6,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.files import read_png, write_bytes
 from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence, read_pairs
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Images
 from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.problem import Problem
-from rsbench.reading import inside, read_bytes
+from rsbench.storage.files import read_png, write_bytes
+from rsbench.storage.untrusted_files import inside, read_bytes
 from rsbench.vision.feature_matcher import load_features
 
 FEATURES = "sift"

@@ -24,12 +24,12 @@ from rsbench.benchmark.leaderboard.scoring_workers import Row, last, named, rows
 from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.submissions import Submission
 from rsbench.benchmark.scoring import answered, pose_errors
+from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
-from rsbench.core.metrics import translation_of_offset
+from rsbench.core.errors import RsbenchError
+from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
-from rsbench.motions import make_motion
-from rsbench.pipeline.crew import Workers
+from rsbench.jobs.workers import Workers
 
 _TIMES = 33
 """Row times, from the first row of frame 0 to the last of frame 1, at which poses are compared."""

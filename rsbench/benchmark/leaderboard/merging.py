@@ -18,9 +18,9 @@ from rsbench.benchmark.leaderboard.board import (
     splits_of,
 )
 from rsbench.benchmark.leaderboard.picture_files import copy_files
-from rsbench.dataset.files import write_bytes, write_json
-from rsbench.dataset.workplace import WORK, workplace
-from rsbench.reading import read_bytes
+from rsbench.storage.files import write_bytes, write_json
+from rsbench.storage.untrusted_files import read_bytes
+from rsbench.storage.work_folder import WORK, workplace
 
 
 def merge(other: Path, board: Path) -> list[str]:

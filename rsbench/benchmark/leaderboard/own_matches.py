@@ -18,15 +18,15 @@ import pandas as pd
 from rsbench.benchmark.leaderboard.picture_files import check_own
 from rsbench.benchmark.leaderboard.splits import Truth
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.files import read_table
 from rsbench.dataset.match_truth import arranged, looks, seen_near
 from rsbench.dataset.matches import MATCHED
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.shots import FAR
-from rsbench.errors import RsbenchError
+from rsbench.dataset.views import FAR
 from rsbench.pipeline.problem import COLUMNS
+from rsbench.storage.files import read_table
 from rsbench.vision.undistortion import between_pixels
 
 FOLDER = "matches"

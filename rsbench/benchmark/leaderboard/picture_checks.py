@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.leaderboard.picture_files import read_answer_depth, read_answer_frame, strange_files
 from rsbench.benchmark.leaderboard.splits import Split, Truth
+from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
 
 _NEAR = 0.1
 """Relative error of depth below which another reading is near to the truth."""

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from rsbench.benchmark.leaderboard.protocols import Asks
 from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.true_pictures import Asked
-from rsbench.dataset.files import read_exr, write_bytes
-from rsbench.errors import RsbenchError
-from rsbench.reading import NAME, read_bytes
+from rsbench.core.errors import RsbenchError
+from rsbench.storage.files import read_exr, write_bytes
+from rsbench.storage.untrusted_files import NAME, read_bytes
 
 FOLDER = "pictures"
 """Beside the file of answers."""

@@ -24,7 +24,7 @@ from rsbench.benchmark.leaderboard.picture_parts import (
 from rsbench.benchmark.leaderboard.true_pictures import TruePictures
 from rsbench.core.rig import StereoRig
 from rsbench.vision.flow import dense_flow
-from rsbench.vision.legacy_quality import flip, ssim_deepunroll, ssim_uniform
+from rsbench.vision.published_quality import flip, ssim_deepunroll, ssim_uniform
 from rsbench.vision.quality import Picture, psnr_within, ssim_within
 from rsbench.vision.stereo_depth import depth_metrics
 

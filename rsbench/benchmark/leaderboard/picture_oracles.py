@@ -17,10 +17,10 @@ from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import submission_text, template_header, truth_text
 from rsbench.benchmark.leaderboard.true_pictures import VIEW, TruePictures
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.files import write_bytes, write_depth
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.reading import read_bytes
+from rsbench.storage.files import write_bytes, write_depth
+from rsbench.storage.untrusted_files import read_bytes
 
 Draw = Callable[[TruePictures, Path], None]
 """Writes the pictures of one problem into a folder."""

@@ -24,22 +24,22 @@ from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.submissions import submission_text
 from rsbench.benchmark.leaderboard.true_pictures import VIEW, Asked
 from rsbench.benchmark.provenance import numeric_version, processor
+from rsbench.components.plugins import Entry
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES
-from rsbench.dataset.files import write_bytes, write_depth, write_json
-from rsbench.dataset.workplace import remove
-from rsbench.errors import RsbenchError
+from rsbench.jobs.isolation import use_one_thread
+from rsbench.jobs.workers import Workers
 from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.crew import Workers
 from rsbench.pipeline.frame_depth import Images, metres, motion_disparities
 from rsbench.pipeline.frame_motion import find_matches_of_rig, match_frames, solve_frames
 from rsbench.pipeline.isolated_parts import Isolation
-from rsbench.pipeline.isolation import use_one_thread
 from rsbench.pipeline.problem import Problem
-from rsbench.plugins import Entry
-from rsbench.reading import check_name, read_json
 from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.storage.files import write_bytes, write_depth, write_json
+from rsbench.storage.untrusted_files import check_name, read_json
+from rsbench.storage.work_folder import remove
 from rsbench.vision.corrector import demand_corrected, load_corrector
 from rsbench.vision.fusion import Origin
 from rsbench.vision.stereo_matcher import load_matcher, needs_motion

@@ -9,8 +9,8 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
 
-from rsbench.cards import choices
-from rsbench.errors import RsbenchError
+from rsbench.components.cards import choices
+from rsbench.core.errors import RsbenchError
 
 KNOWLEDGE = {
     "left": "matches over time of the left camera",

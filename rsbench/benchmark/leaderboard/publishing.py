@@ -17,16 +17,16 @@ from rsbench.benchmark.leaderboard.exporting import check_place, write_inputs
 from rsbench.benchmark.leaderboard.frames import bare_problems, matched_problems, write_frames
 from rsbench.benchmark.leaderboard.protocols import Protocol
 from rsbench.benchmark.leaderboard.splits import Split, dataset_split, truth_of
-from rsbench.cards import card_path, parse_card
+from rsbench.components.cards import card_path, parse_card
+from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import DatasetCard
-from rsbench.dataset.files import sha256, write_json
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.secret import Secret, secret_card, write_scenes
+from rsbench.dataset.secret_split import Secret, secret_card, write_scenes
 from rsbench.dataset.sequence import Sequence, read_dataset_manifest, sequence_of
-from rsbench.dataset.workplace import HIDDEN, files_below, workplace
-from rsbench.errors import RsbenchError
-from rsbench.reading import read_json
 from rsbench.scenes.load import read_scene_card
+from rsbench.storage.files import sha256, write_json
+from rsbench.storage.untrusted_files import read_json
+from rsbench.storage.work_folder import HIDDEN, files_below, workplace
 
 ANNOUNCEMENT = "announcement.json"
 SCENES, DATA = "scenes", "data"

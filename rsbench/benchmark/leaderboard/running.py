@@ -25,22 +25,22 @@ from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import submission_text
 from rsbench.benchmark.provenance import numeric_version, processor
 from rsbench.benchmark.simulated.trials import Information, enter
-from rsbench.core.joining import join_stereo
-from rsbench.dataset.files import sha256, write_bytes, write_json
-from rsbench.errors import RsbenchError
+from rsbench.capture.readout import estimate_readout_ratio
+from rsbench.core.errors import RsbenchError
+from rsbench.core.track_building import join_stereo
+from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.jobs.process_jobs import finished_jobs, run_jobs
+from rsbench.jobs.workers import Workers
 from rsbench.pipeline.answer import Extra, solve_problem
-from rsbench.pipeline.crew import Workers
 from rsbench.pipeline.frame_motion import check_readout
-from rsbench.pipeline.isolated_jobs import finished_jobs, run_jobs
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.pipeline.problem import Problem, parse_problem
-from rsbench.pipeline.readout import estimate_readout_ratio
-from rsbench.pipeline.robust_motion import RobustOptions
-from rsbench.reading import check_name, parse_json, read_json, read_text
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.engine.warm_up import warm_up
 from rsbench.solvers.refined import RefinedSolver
+from rsbench.storage.files import sha256, write_bytes, write_json
+from rsbench.storage.untrusted_files import check_name, parse_json, read_json, read_text
 
 _EXTRAS: tuple[Extra, ...] = ("covariance",)
 Job = TypeVar("Job")

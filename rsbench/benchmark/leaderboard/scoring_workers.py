@@ -25,13 +25,13 @@ from rsbench.benchmark.leaderboard.protocols import Asks
 from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.submissions import Submission
 from rsbench.benchmark.leaderboard.true_pictures import TruePictures
-from rsbench.dataset.files import write_bytes
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.crew import Workers
-from rsbench.pipeline.isolated_jobs import run_jobs
-from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
-from rsbench.pipeline.plain_data import decode, encode
-from rsbench.reading import read_bytes
+from rsbench.core.errors import RsbenchError
+from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.jobs.plain_data import decode, encode
+from rsbench.jobs.process_jobs import run_jobs
+from rsbench.jobs.workers import Workers
+from rsbench.storage.files import write_bytes
+from rsbench.storage.untrusted_files import read_bytes
 
 Row = dict[str, Any]
 

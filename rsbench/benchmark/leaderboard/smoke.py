@@ -19,11 +19,11 @@ from rsbench.benchmark.leaderboard.running import answer_problem, header_of, loa
 from rsbench.benchmark.leaderboard.smoke_tracks import metrics_of, track_scores
 from rsbench.benchmark.leaderboard.splits import PUBLIC_SEED, points_split, simulated_problem
 from rsbench.benchmark.leaderboard.submissions import read_submission, submission_text
-from rsbench.dataset.files import read_table, write_bytes
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.isolated_jobs import finished_jobs
+from rsbench.core.errors import RsbenchError
+from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.jobs.process_jobs import finished_jobs
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.storage.files import read_table, write_bytes
 
 PROBLEMS = 6
 """Of points; a minute for all solvers of ours."""

@@ -34,11 +34,11 @@ from rsbench.benchmark.leaderboard.running import (
 )
 from rsbench.benchmark.leaderboard.splits import Split, dataset_split
 from rsbench.benchmark.leaderboard.submissions import read_submission, submission_text, truth_text
-from rsbench.dataset.files import write_bytes
 from rsbench.dataset.sequence import read_dataset_manifest
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.storage.files import write_bytes
 from rsbench.vision.feature_matcher import load_features
 
 CARD = "leaderboard-smoke"

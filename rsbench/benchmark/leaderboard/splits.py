@@ -20,15 +20,15 @@ from rsbench.benchmark.leaderboard.true_pictures import TruePictures, true_pictu
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.simulation import Simulation, simulate
 from rsbench.benchmark.simulated.sweep_card import Setting
+from rsbench.components.motion_models import motion_record
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import LaterMotion, Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.sequence import Sequence, read_dataset_manifest, read_pairs
-from rsbench.errors import RsbenchError
-from rsbench.motions import motion_record
 from rsbench.pipeline.problem import Problem, problem_record
-from rsbench.reading import check_name, read_text
+from rsbench.storage.untrusted_files import check_name, read_text
 
 PUBLIC_SEED = 1
 """Of the split ``dev``: its truth is known to everybody."""

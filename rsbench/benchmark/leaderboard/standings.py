@@ -12,8 +12,8 @@ from rsbench.benchmark.leaderboard.board import Scored
 from rsbench.benchmark.leaderboard.calibration import Calibration, calibration, named_numbers
 from rsbench.benchmark.leaderboard.protocols import KNOWLEDGE, ORACLE, Protocol, protocol_of_id
 from rsbench.benchmark.leaderboard.ranking import Rank, better, ranks, scene_means, score_interval, ties
+from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -21,10 +21,10 @@ from rsbench.benchmark.leaderboard.picture_checks import check_pictures
 from rsbench.benchmark.leaderboard.picture_files import FOLDER
 from rsbench.benchmark.leaderboard.protocols import protocol_of_id
 from rsbench.benchmark.leaderboard.splits import Split
-from rsbench.benchmark.simulated.misreadings import misreading
-from rsbench.cards import choices, parse_card
-from rsbench.errors import RsbenchError
-from rsbench.reading import MB, parse_json, read_text
+from rsbench.benchmark.simulated.convention_errors import misreading
+from rsbench.components.cards import choices, parse_card
+from rsbench.core.errors import RsbenchError
+from rsbench.storage.untrusted_files import MB, parse_json, read_text
 
 SUBMISSION_BYTES = 16 * MB
 """Of a file of motions: 20 kB for each of 800 problems."""

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from rsbench.benchmark.images.predict import true_pairs
 from rsbench.benchmark.images.score import visible_pixels
 from rsbench.benchmark.leaderboard.protocols import Protocol
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, View
-from rsbench.dataset.files import sha256
 from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence, read_dataset_manifest
-from rsbench.errors import RsbenchError
-from rsbench.reading import inside
+from rsbench.storage.files import sha256
+from rsbench.storage.untrusted_files import inside
 from rsbench.vision.stereo_depth import seen_by_other
 
 VIEW: View = ("left", 1)

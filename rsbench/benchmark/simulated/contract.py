@@ -13,16 +13,16 @@ from typing import Literal
 import numpy as np
 
 from rsbench.benchmark.simulated.contract_subject import BrokenContractError, Subject
-from rsbench.benchmark.simulated.misreadings import misreading
+from rsbench.benchmark.simulated.convention_errors import misreading
 from rsbench.benchmark.simulated.simulation import GYRO_RATE, SceneShape, Simulation, SimulationOptions, simulate
+from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.metrics import rotation_error, scale_error, translation_error, translation_of_offset
+from rsbench.core.errors import RsbenchError
+from rsbench.core.pose_errors import rotation_error, scale_error, translation_error, translation_of_offset
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
-from rsbench.motions import make_motion
 from rsbench.solvers.engine.base import BESIDE, SENSORS, MotionEstimate
 from rsbench.solvers.engine.registry import SolverEntry
 

@@ -16,8 +16,8 @@ import numpy as np
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
+from rsbench.jobs.isolation import EntryFailure, IsolatedWorker, one_line
 from rsbench.pipeline.isolated_solver import checked_estimate
-from rsbench.pipeline.isolation import EntryFailure, IsolatedWorker, one_line
 from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 

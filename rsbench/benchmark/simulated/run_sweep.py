@@ -22,20 +22,20 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from rsbench import __version__
 from rsbench.benchmark.simulated.sweep_card import Cell, SweepCard
 from rsbench.benchmark.simulated.trials import Arrays, Entrant, enter, run_bounds, run_trials
-from rsbench.dataset.files import load_arrays, read_json, save_arrays, write_json
-from rsbench.dataset.workplace import listed, remove, workplace
-from rsbench.errors import RsbenchError
-from rsbench.identity import source_version
-from rsbench.motions import motion_model
-from rsbench.pipeline.crew import Workers
-from rsbench.pipeline.isolated_jobs import finished_jobs
+from rsbench.components.identity import source_version
+from rsbench.components.motion_models import motion_model
+from rsbench.core.errors import RsbenchError
+from rsbench.core.version import __version__
+from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.jobs.process_jobs import finished_jobs
+from rsbench.jobs.workers import Workers
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.pipeline.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.solvers.engine.registry import load_solver_entries
 from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.storage.files import load_arrays, read_json, save_arrays, write_json
+from rsbench.storage.work_folder import listed, remove, workplace
 
 FORMAT = 1
 CHUNK = 50

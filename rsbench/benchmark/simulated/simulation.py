@@ -12,7 +12,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.arguments import check_number, check_one_of, check_whole
+from rsbench.components.arguments import check_number, check_one_of, check_whole
+from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.lens import inverse_2x2
@@ -29,7 +30,6 @@ from rsbench.core.projection import (
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.motions import make_motion
 
 SceneShape = Literal["box", "plane"]
 GYRO_RATE = 20

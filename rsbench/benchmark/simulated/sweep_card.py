@@ -8,17 +8,17 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rsbench.arguments import check_whole
 from rsbench.benchmark.simulated.simulation import GYRO_RATE, SceneShape, SimulationOptions, random_direction, unit
-from rsbench.cards import card_path, load_card, parse_card
+from rsbench.components.arguments import check_whole
+from rsbench.components.cards import card_path, load_card, parse_card
+from rsbench.components.imports import search
+from rsbench.components.motion_models import drawn_parameters, fixed_endpoint, make_motion
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.errors import RsbenchError
-from rsbench.imports import search
-from rsbench.motions import drawn_parameters, fixed_endpoint, make_motion
-from rsbench.reading import check_name
+from rsbench.storage.untrusted_files import check_name
 
 Axis = Literal[
     "noise_px",
@@ -220,7 +220,7 @@ class SweepCard:
 
 
 def load_sweep(name_or_path: str) -> SweepCard:
-    """Sweep card by name or path; errors as ``rsbench.cards.load_card``."""
+    """Sweep card by name or path; errors as ``rsbench.components.cards.load_card``."""
     search(card_path("sweeps", name_or_path))
     return load_card(SweepCard, "sweeps", name_or_path)
 

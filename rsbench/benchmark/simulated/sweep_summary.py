@@ -16,10 +16,10 @@ from rsbench.benchmark.simulated.run_sweep import read_bounds, read_sweep, read_
 from rsbench.benchmark.simulated.sweep_card import Cell, SweepCard
 from rsbench.benchmark.simulated.trials import Arrays
 from rsbench.benchmark.statistics import average_interval, share_interval, typical_interval
-from rsbench.cards import parse_card
+from rsbench.components.cards import parse_card
+from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.files import write_table
-from rsbench.errors import RsbenchError
+from rsbench.storage.files import write_table
 
 SUCCESS_DEG = (1.0, 5.0)
 """A trial counts as solved when e_R and e_T are below these."""

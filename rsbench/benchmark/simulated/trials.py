@@ -15,14 +15,14 @@ from rsbench.benchmark.simulated.simulation import Simulation, simulate
 from rsbench.benchmark.simulated.sweep_card import Setting
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, track_pairs
-from rsbench.core.metrics import translation_of_offset
+from rsbench.core.errors import RsbenchError
+from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
+from rsbench.jobs.isolation import EntryFailure
 from rsbench.pipeline.isolated_solver import GuardedSolver, SolverRunner
-from rsbench.pipeline.isolation import EntryFailure
-from rsbench.pipeline.robust_motion import RobustOptions
 from rsbench.solvers.engine.base import BESIDE, MotionEstimate, Solver
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.solvers.engine.robust_motion import RobustOptions
 
 Arrays = dict[str, NDArray[Any]]
 Information = Literal["left pairs", "left and right pairs", "linked pairs", "tracks"]

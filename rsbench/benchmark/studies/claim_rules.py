@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 import pandas as pd
 
 from rsbench.benchmark.statistics import in_words, share_interval
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 
 MEASURES = ("e_R", "e_T")
 Centre = Literal["mean", "median"]

@@ -23,30 +23,30 @@ from numpy.typing import NDArray
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.standard_metrics import Flip, Psnr, Ssim
-from rsbench.benchmark.studies.asked_layers import asked_layers
-from rsbench.benchmark.studies.asked_rotations import asked_rotation
 from rsbench.benchmark.studies.correction_methods import METHODS, ON_REQUEST
-from rsbench.benchmark.studies.kept_rows import KeptRows, Row, Rows
+from rsbench.benchmark.studies.layer_methods import asked_layers
+from rsbench.benchmark.studies.resumable_rows import KeptRows, Row, Rows
+from rsbench.benchmark.studies.rotation_methods import asked_rotation
+from rsbench.capture.readout import select
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, VIEWS, Side, View
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
-from rsbench.errors import RsbenchError
+from rsbench.jobs.isolation import EntryFailure
+from rsbench.jobs.process_jobs import finished_jobs
+from rsbench.pipeline.baseline_motions import global_shutter_motion, monocular_motion, solved_alone
 from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Pairs, frame_pairs, known_depth
 from rsbench.pipeline.frame_motion import FoundMotion, NoMotionError, find_matches, find_motion
-from rsbench.pipeline.isolated_jobs import finished_jobs
-from rsbench.pipeline.isolation import EntryFailure
 from rsbench.pipeline.one_camera import ZhuangCorrector, depth_alone
-from rsbench.pipeline.readout import select
-from rsbench.pipeline.simpler_motions import global_shutter_motion, monocular_motion, solved_alone
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.vision.baseline_depths import plane_depth
 from rsbench.vision.correction import correction_flow
 from rsbench.vision.corrector import load_corrector
 from rsbench.vision.fusion import Fused, Origin
-from rsbench.vision.legacy_quality import flip, ssim_deepunroll, ssim_uniform
+from rsbench.vision.published_quality import flip, ssim_deepunroll, ssim_uniform
 from rsbench.vision.quality import psnr, ssim_within
-from rsbench.vision.simpler_depths import plane_depth
 
 Mask = NDArray[np.bool_]
 Depth = NDArray[np.float32]

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.studies.correction_study import WORST, Bench
 from rsbench.core.rig import Side
-from rsbench.dataset.files import load_arrays, read_json, save_arrays, write_json
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import uncorrected
+from rsbench.storage.files import load_arrays, read_json, save_arrays, write_json
 from rsbench.vision.correction import correct_frame
 from rsbench.vision.fusion import Origin
 from rsbench.vision.quality import psnr

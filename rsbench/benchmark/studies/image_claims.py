@@ -11,8 +11,8 @@ import pandas as pd
 
 from rsbench.benchmark.statistics import median_and_quartiles
 from rsbench.benchmark.studies.claim_rules import Check, verdict
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.isolation import one_line
+from rsbench.core.errors import RsbenchError
+from rsbench.jobs.isolation import one_line
 
 COINCIDES_DB, ACCURATE_PX, FAR_SHARE = 30.0, 0.1, 0.05
 PUBLISHED = ("rs-stereo-linear", "rs-stereo-linear-symmetric")

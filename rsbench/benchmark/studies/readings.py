@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rsbench.benchmark.simulated.sweep_card import SweepCard, Variant
-from rsbench.dataset.files import write_bytes
+from rsbench.storage.files import write_bytes
 
 SETTINGS: dict[str, tuple[Any, Any]] = {
     "depth": ((2.0, 10.0), (5.0, 50.0)),

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
-from rsbench.benchmark.studies.kept_rows import KeptRows, Row
+from rsbench.benchmark.studies.resumable_rows import KeptRows, Row
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import VIEWS, View
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.card import DatasetCard
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.chain import correct_frames, find_depth
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Pairs, frame_pairs

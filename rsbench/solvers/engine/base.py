@@ -17,12 +17,12 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from rsbench.components.motion_models import check_parameters
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
-from rsbench.motions import check_parameters
 
 MatchSet = Literal["left", "right", "stereo", "tracks", "affine", "gyro", "gravity"]
 """Matches; affine frames of the left ones, a row each; and samples of other sensors, which are given whole and no

@@ -16,7 +16,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.compiled import compiled
+from rsbench.components.compiled import compiled
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.vectors import cross, dot
 

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from rsbench.compiled import compiled
+from rsbench.components.compiled import compiled
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.vectors import (
     Vector,

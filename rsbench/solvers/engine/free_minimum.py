@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.compiled import compiled
+from rsbench.components.compiled import compiled
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.free_kernels import exponential, free_terms
 from rsbench.solvers.engine.generalised_essential import fill_coefficients

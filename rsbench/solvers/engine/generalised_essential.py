@@ -11,7 +11,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.compiled import compiled
+from rsbench.components.compiled import compiled
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.free_velocities import FreeMotion
 

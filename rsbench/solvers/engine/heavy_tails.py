@@ -22,8 +22,8 @@ import numpy as np
 import scipy  # loads scipy.special with its first use: as long as all else that a solver needs
 
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.each import Each, each_term
 from rsbench.solvers.engine.packed import Packed, inverse_definite
+from rsbench.solvers.engine.per_measurement import Each, each_term
 
 _FEWEST = 30
 """Measurements, five for each parameter: the scatter of fewer says little about their distribution."""

@@ -25,10 +25,10 @@ from numba.extending import (
     unbox,
 )
 
+from rsbench.components.motion_models import make_motion, motion_model
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.so3 import FloatArray
-from rsbench.errors import RsbenchError
-from rsbench.motions import make_motion, motion_model
 from rsbench.solvers.engine.vectors import Vector
 
 Moved = tuple[Vector, Vector, Vector, Vector, Vector]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.compiled import compiled
+from rsbench.components.compiled import compiled
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.kernel_type import MotionKernel
 from rsbench.solvers.engine.packed import Packed

@@ -10,7 +10,7 @@ from typing import final
 
 import numpy as np
 
-from rsbench.compiled import compiled
+from rsbench.components.compiled import compiled
 from rsbench.core import so3
 from rsbench.core.motion import AcceleratedMotion, LinearMotion, TwistMotion
 from rsbench.core.so3 import FloatArray

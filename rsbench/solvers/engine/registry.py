@@ -1,4 +1,4 @@
-"""Solvers by name: see ``rsbench.plugins``."""
+"""Solvers by name: see ``rsbench.components.plugins``."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from rsbench import plugins
-from rsbench.errors import RsbenchError
-from rsbench.plugins import Entry, Kind
+from rsbench.components import plugins
+from rsbench.components.plugins import Entry, Kind
+from rsbench.core.errors import RsbenchError
 from rsbench.solvers.engine.base import Solver, SolverSpec
 
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rsbench.compiled import compiled
+from rsbench.components.compiled import compiled
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.kernel_type import MotionKernel
 from rsbench.solvers.engine.kernels import BEHIND, NEAREST

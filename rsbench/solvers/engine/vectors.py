@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from rsbench.compiled import compiled
+from rsbench.components.compiled import compiled
 from rsbench.core.so3 import FloatArray
 
 Vector = tuple[float, float, float]

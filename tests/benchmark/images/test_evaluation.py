@@ -13,9 +13,9 @@ from evaluations import QUICK, cell, contents, evaluate, remade, times
 
 from rsbench.benchmark.images.evaluation import columns_of, open_evaluation, read_scores
 from rsbench.benchmark.images.score import TABLES
-from rsbench.dataset import hashes
-from rsbench.dataset.workplace import workplace
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
+from rsbench.storage import file_hashes
+from rsbench.storage.work_folder import workplace
 
 
 def solvers_of(out: Path) -> set[str]:
@@ -33,7 +33,7 @@ def test_two_runs_write_the_same_bytes(smoke_dataset: Path, evaluated: Path, tmp
 def test_a_repeated_run_makes_nothing_and_reads_no_data_again(
     smoke_dataset: Path, copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hashes, "sha256", lambda path: pytest.fail(f"{path} is read again"))
+    monkeypatch.setattr(file_hashes, "sha256", lambda path: pytest.fail(f"{path} is read again"))
     before = times(copy)
     evaluate(smoke_dataset, copy)
     assert remade(before, copy) == set()
@@ -189,7 +189,7 @@ def test_columns_are_the_planned_ones(smoke_dataset: Path, evaluated: Path) -> N
 
 
 def test_each_match_is_counted_once(evaluated: Path) -> None:
-    from rsbench.dataset.files import load_matches
+    from rsbench.storage.files import load_matches
 
     pose = read_scores(evaluated, "pose")
     for sequence in ("castle", "room-twist"):

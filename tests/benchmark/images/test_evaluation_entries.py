@@ -10,10 +10,10 @@ import pytest
 from evaluations import cell, evaluate, remade, times
 
 from rsbench.benchmark.images.evaluation import read_scores
-from rsbench.dataset.files import read_png
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.report.evaluation_page import summary_tables
 from rsbench.solvers.eight_point import EightPointSolver
+from rsbench.storage.files import read_png
 
 STRANGER = """
 import os, sys, time

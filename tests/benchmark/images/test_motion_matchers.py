@@ -10,13 +10,13 @@ import pytest
 from evaluations import evaluate
 
 from rsbench.benchmark.images.evaluation import read_scores
+from rsbench.components.plugins import wrap
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, View
-from rsbench.dataset.files import read_json
 from rsbench.dataset.sequence import read_dataset
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.plugins import wrap
+from rsbench.storage.files import read_json
 from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, Corrector, CorrectorSpec
 from rsbench.vision.fusion import Fused
 from rsbench.vision.stereo_matcher import load_matcher

@@ -11,9 +11,9 @@ import pytest
 from rsbench.benchmark.images.predict import load_disparities
 from rsbench.benchmark.images.store import Artefact, read_seconds, records_below
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
-from rsbench.dataset.files import read_table, save_arrays, write_json
-from rsbench.errors import RsbenchError
+from rsbench.storage.files import read_table, save_arrays, write_json
 
 DEPTH = {"matcher": "sgm", "entry": "sgm", "timed": False, "success": True, "reason": ""}
 

@@ -12,9 +12,9 @@ from rsbench.benchmark.images.plan import EvaluationOptions, Places, Plan, Recip
 from rsbench.benchmark.images.predict import Bench
 from rsbench.benchmark.images.score import Row, Scorer
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.files import MATCH_SETS, save_arrays
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.storage.files import MATCH_SETS, save_arrays
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,12 @@ from rsbench.benchmark.images.evaluation import open_evaluation, read_scores
 from rsbench.benchmark.images.plan import EvaluationOptions
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.statistics import median_and_quartiles
-from rsbench.dataset.files import load_matches, read_json
+from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import read_sequence
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.robust_motion import RobustOptions, estimate_motion
 from rsbench.report.evaluation_page import summary_tables
 from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
+from rsbench.storage.files import load_matches, read_json
 
 SOLVER = "rs-stereo-linear"
 """Its answer depends on the samples most."""

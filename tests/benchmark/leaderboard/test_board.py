@@ -32,13 +32,13 @@ from rsbench.benchmark.leaderboard.splits import (
 )
 from rsbench.benchmark.leaderboard.standings import standings, table
 from rsbench.benchmark.leaderboard.submissions import read_submission
-from rsbench.dataset.files import load_arrays
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
+from rsbench.jobs.isolation import Outcome
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.pipeline.isolation import Outcome
 from rsbench.report.board_page import build_site
 from rsbench.solvers.engine.base import BESIDE
 from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.storage.files import load_arrays
 
 ROOT = Path(__file__).parents[3]
 SPLIT = small_split()

@@ -18,8 +18,8 @@ from rsbench.benchmark.leaderboard.adding import add
 from rsbench.benchmark.leaderboard.picture_oracles import write_truth
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import check_submission
-from rsbench.dataset.files import write_depth, write_exr, write_png
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
+from rsbench.storage.files import write_depth, write_exr, write_png
 
 
 def _png(

@@ -14,7 +14,7 @@ from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.board import entries_of
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.splits import dataset_split
-from rsbench.pipeline.isolation import Outcome
+from rsbench.jobs.isolation import Outcome
 
 METHODS = """
 import time

@@ -17,10 +17,10 @@ from rsbench.benchmark.leaderboard.picture_oracles import write_truth
 from rsbench.benchmark.leaderboard.picture_parts import PARTINGS, WINDOW, columns, texture
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import read_submission
-from rsbench.dataset.files import read_depth, read_png, read_table, write_depth, write_png
 from rsbench.report.board_entry import entry_context
 from rsbench.report.board_pictures import albums
 from rsbench.report.board_splits import read_split
+from rsbench.storage.files import read_depth, read_png, read_table, write_depth, write_png
 
 RIG, _, _ = PLANES
 ROWS, TEXTURE = PARTINGS

@@ -16,7 +16,7 @@ from rsbench.benchmark.leaderboard.picture_oracles import write_truth
 from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.submissions import check_submission
-from rsbench.dataset.files import read_depth
+from rsbench.storage.files import read_depth
 
 RIG, _, _ = PLANES
 

@@ -26,9 +26,9 @@ from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.splits import Split, dataset_split
 from rsbench.benchmark.leaderboard.standings import standings
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import LinearMotion
-from rsbench.dataset.files import read_depth, read_png, write_depth, write_png
-from rsbench.errors import RsbenchError
+from rsbench.storage.files import read_depth, read_png, write_depth, write_png
 
 RIG, SHUTTER, MOTION = PLANES
 

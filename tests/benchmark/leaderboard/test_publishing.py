@@ -29,14 +29,14 @@ from rsbench.benchmark.leaderboard.publishing import (
     read_announcement,
 )
 from rsbench.benchmark.leaderboard.submissions import read_submission, truth_text
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import views_of
 from rsbench.dataset.card import DatasetCard
-from rsbench.dataset.files import sha256, write_json, write_png
-from rsbench.dataset.hashes import HashedFile
 from rsbench.dataset.manifest import write_manifest
-from rsbench.dataset.secret import Secret, secret_card
-from rsbench.dataset.shots import image_seed
-from rsbench.errors import RsbenchError
+from rsbench.dataset.secret_split import Secret, secret_card
+from rsbench.dataset.views import image_seed
+from rsbench.storage.file_hashes import HashedFile
+from rsbench.storage.files import sha256, write_json, write_png
 
 TEXT = "f3b1 a secret that nobody guesses"
 SECRET = Secret(TEXT)

@@ -17,10 +17,10 @@ from rsbench.benchmark.leaderboard.picture_oracles import write_oracles, write_t
 from rsbench.benchmark.leaderboard.scoring_workers import _serve
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import read_submission
-from rsbench.dataset.files import read_png, write_depth, write_png
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.isolation import EntryFailure
-from rsbench.pipeline.plain_data import decode, encode
+from rsbench.core.errors import RsbenchError
+from rsbench.jobs.isolation import EntryFailure
+from rsbench.jobs.plain_data import decode, encode
+from rsbench.storage.files import read_png, write_depth, write_png
 
 
 def test_two_processes_give_the_bytes_of_one(splits: dict[str, Split], tmp_path: Path) -> None:

@@ -23,10 +23,10 @@ from rsbench.benchmark.leaderboard.splits import (
     simulated_problem,
 )
 from rsbench.benchmark.leaderboard.submissions import read_submission
+from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import rs_project
-from rsbench.dataset.files import load_arrays
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.problem import Problem, read_problems
+from rsbench.storage.files import load_arrays
 
 
 def test_problems_are_of_their_truth() -> None:

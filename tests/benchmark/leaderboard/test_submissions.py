@@ -13,7 +13,7 @@ from leaderboards import Line, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission, template_text
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 
 SPLIT = small_split()
 TRUTH = truth_lines(SPLIT)

@@ -7,15 +7,15 @@ import pytest
 
 from rsbench.benchmark.simulated.bound import Bound, Views, motion_bound, root_information
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
+from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.metrics import rotation_error, translation_error
 from rsbench.core.motion import LinearMotion, Motion
+from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.projection import ProjectionStatus, back_project, rs_project
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.motions import make_motion
 from rsbench.solvers.engine.packed import pack
 from rsbench.solvers.refined import RefinedSolver
 

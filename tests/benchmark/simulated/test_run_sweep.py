@@ -19,13 +19,13 @@ from rsbench.benchmark.simulated.sweep_card import Setting, SweepCard, Variant
 from rsbench.benchmark.simulated.sweep_summary import failure_reasons, summarise_sweep
 from rsbench.benchmark.simulated.trials import Arrays, enter, run_bounds, run_trials
 from rsbench.core.epipolar import rs_sampson_error
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import LinearMotion
-from rsbench.dataset.files import load_arrays, read_json, save_arrays, write_json
-from rsbench.dataset.workplace import workplace
-from rsbench.errors import RsbenchError
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.solvers.eight_point import EightPointSolver
 from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.storage.files import load_arrays, read_json, save_arrays, write_json
+from rsbench.storage.work_folder import workplace
 
 SETTING = Setting(
     width=900,

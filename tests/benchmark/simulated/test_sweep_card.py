@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.sweep_card import SweepCard, load_sweep, with_options
-from rsbench.cards import list_cards, parse_card
-from rsbench.errors import RsbenchError
+from rsbench.components.cards import list_cards, parse_card
+from rsbench.core.errors import RsbenchError
 from rsbench.solvers.engine.registry import list_solvers
 
 SETTING: dict[str, Any] = {

@@ -43,7 +43,7 @@ from rsbench.benchmark.studies.claims import (
     judge_settings,
 )
 from rsbench.benchmark.studies.readings import LITERAL
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.report.claims_page import claims_page
 from rsbench.report.readings_page import readings_page
 

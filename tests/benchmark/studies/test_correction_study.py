@@ -21,12 +21,12 @@ from rsbench.benchmark.studies.correction_summary import (
     summarise_bands,
     verdict,
 )
-from rsbench.benchmark.studies.kept_rows import Rows
+from rsbench.benchmark.studies.resumable_rows import Rows
+from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_sequence
-from rsbench.errors import RsbenchError
-from rsbench.pipeline.robust_motion import RobustEstimate
 from rsbench.report.correction_page import study_page, write_study
 from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.engine.robust_motion import RobustEstimate
 
 Tables = tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]
 

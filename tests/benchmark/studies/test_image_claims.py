@@ -18,7 +18,7 @@ from rsbench.benchmark.studies.image_claims import (
     sgm_is_accurate,
     stereo_corrects_better,
 )
-from rsbench.errors import RsbenchError
+from rsbench.core.errors import RsbenchError
 from rsbench.report.claims_page import image_claims_page
 
 ROOT = Path(__file__).parents[3]

@@ -16,8 +16,8 @@ from rsbench.benchmark.studies.real_cameras import (
     sized,
     summarise,
 )
+from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import load_dataset_card
-from rsbench.errors import RsbenchError
 from rsbench.report.real_page import real_page
 
 

@@ -1,0 +1,120 @@
+"""Where the comparison of readings starts: a motion, and by how much the cameras' times differ over the image.
+
+A point that moves by v_y rows per frame period lies dt v_y rows apart in two cameras that see it dt apart. So the
+row differences of left-right matches show, by least squares, how the times of the two cameras differ. With that
+taken back, the matches are nearly those of cameras that read together, and a robust search finds the motion.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rsbench.capture.scan_reading import Reading, reading_line
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter, Scan
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
+from rsbench.solvers.refined import RefinedSolver
+
+COARSE: tuple[tuple[Scan, float], ...] = (
+    ("top", 0.0),
+    ("top", 0.5),
+    ("bottom", 0.5),
+    ("left", 0.5),
+    ("right", 0.5),
+)
+"""Shutters of cameras that read together, under which a motion is looked for: between them points err little."""
+_SAMPLES, _ROUNDS = 400, 6
+_NOISE_PX, _TIME_SIGMA = 0.5, 0.5
+"""Expected noise of a row difference, and expected size of a difference of times, frame periods."""
+_LEAST_PX = 0.1
+
+
+class Lag(NamedTuple):
+    """Time of the left camera less that of the right one at one place, frame periods."""
+
+    line: FloatArray
+    """(3,) constant, per image width, per image height."""
+    H: FloatArray
+    """(3, 3) how well the matches determine it: inverse covariance."""
+
+    def at(self, pixels: FloatArray, rig: StereoRig) -> FloatArray:
+        """(n,) at pixels (n, 2)."""
+        return _columns(pixels, rig) @ self.line
+
+
+def find_lag(tracks: FloatArray, rig: StereoRig) -> Lag:
+    """From tracks (n, 8) with outliers; 0 where nothing moves across the rows."""
+    prior = np.eye(3) / _TIME_SIGMA**2
+    if len(tracks) < 3:
+        return Lag(np.zeros(3), prior)
+    moved = 0.5 * (tracks[:, 5] - tracks[:, 1] + tracks[:, 7] - tracks[:, 3])
+    A = np.concatenate([moved[:, None] * _columns(tracks[:, k : k + 2], rig) for k in (0, 4)])
+    e = np.concatenate([tracks[:, 1] - tracks[:, 3], tracks[:, 5] - tracks[:, 7]])
+    line, H = _sampled(A, e), prior
+    for _ in range(_ROUNDS):
+        left = e - A @ line
+        scale = max(1.4826 * float(np.median(np.abs(left))), _LEAST_PX)
+        weights = 1.0 / (1.0 + (left / (2.0 * scale)) ** 2) ** 2 / scale**2
+        H = (A * weights[:, None]).T @ A + prior
+        line = np.asarray(np.linalg.solve(H, A.T @ (weights * e)), dtype=np.float64)
+    return Lag(line, H)
+
+
+def _sampled(A: FloatArray, e: FloatArray) -> FloatArray:
+    """The line of the smallest median error, of those through three row differences and of none."""
+    rng = np.random.default_rng(0)
+    chosen = rng.integers(0, len(e), (_SAMPLES, 4))
+    ridge = (_NOISE_PX / _TIME_SIGMA) ** 2 * np.eye(3)
+    normal = np.swapaxes(A[chosen], 1, 2) @ A[chosen] + ridge
+    lines = np.linalg.solve(normal, np.swapaxes(A[chosen], 1, 2) @ e[chosen][..., None])[..., 0]
+    lines = np.concatenate([np.zeros((1, 3)), np.clip(lines, -2.0, 2.0)])
+    errors = np.median(np.abs(e[:, None] - A @ lines.T), axis=0)
+    return np.asarray(lines[np.argmin(errors)])
+
+
+def _columns(pixels: FloatArray, rig: StereoRig) -> FloatArray:
+    size = np.array([rig.camera.width, rig.camera.height])
+    return np.column_stack([np.ones(len(pixels)), pixels / size])
+
+
+def with_lag_taken(matches: Correspondences, lag: Lag, rig: StereoRig) -> Correspondences:
+    """The matches as the right camera would have had them at the left one's times, to first order."""
+    tracks, right = matches.tracks.copy(), matches.right.copy()
+    moved = tracks[:, 6:8] - tracks[:, 2:4]
+    tracks[:, 2:4] += lag.at(tracks[:, 0:2], rig)[:, None] * moved
+    tracks[:, 6:8] += lag.at(tracks[:, 4:6], rig)[:, None] * moved
+    moved = right[:, 2:4] - right[:, 0:2]
+    right[:, 0:2] += lag.at(right[:, 0:2], rig)[:, None] * moved
+    right[:, 2:4] += lag.at(right[:, 2:4], rig)[:, None] * moved
+    return Correspondences(left=matches.left, right=right, tracks=tracks)
+
+
+def find_start(
+    matches: Correspondences, rig: StereoRig, solver: RefinedSolver, options: RobustOptions, seed: int
+) -> tuple[RobustEstimate | None, Lag]:
+    """The motion that explains most matches, of those under ``COARSE``; None when there is none."""
+    lag = find_lag(matches.tracks, rig)
+    taken = with_lag_taken(matches, lag, rig)
+    camera, found = rig.camera, list[RobustEstimate]()
+    for scan, ratio in COARSE:
+        shutter = RollingShutter(height=camera.height, width=camera.width, readout_ratio=ratio, scan=scan)
+        with np.errstate(invalid="ignore", over="ignore"):
+            result = estimate_motion(taken, rig, shutter, solver, options, np.random.default_rng(seed))
+        if result.estimate.success:
+            found.append(result)
+    best = max(found, key=lambda each: (each.inlier_count / each.threshold_px, each.inlier_count), default=None)
+    return best, lag
+
+
+def first_shutter(reading: Reading, lag: Lag) -> FloatArray:
+    """Ratio and delay (2,) of a reading that fit a lag best; a ratio of 0.5 where the cameras read alike."""
+    if reading.together:
+        return np.array([0.5 if reading.rolls else 0.0, -lag.line[0]])
+    by_ratio = reading_line(reading, "left") - reading_line(reading, "right")
+    A = np.column_stack([by_ratio, [-1.0, 0.0, 0.0]])
+    ratio, delay = np.linalg.solve(A.T @ lag.H @ A + 1e-9 * np.eye(2), A.T @ lag.H @ lag.line)
+    return np.array([np.clip(ratio, 0.1, 1.0), np.clip(delay, -0.9, 0.9)])

@@ -1,0 +1,87 @@
+"""Options of commands whose work can be done by many machines, or whose results can go to a store."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import typer
+
+if TYPE_CHECKING:
+    from rsbench.jobs.workers import Workers
+
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Dask scheduler whose workers do it, in place of --workers: tcp://host:8786 or a file.json. "
+        "All paths must be the same there (rsbench docs cluster).",
+    ),
+]
+
+
+def chosen_workers(workers: int | None, scheduler: str | None, default: int = 1) -> Workers:
+    """Processes here, or a cluster.
+
+    Raises:
+        RsbenchError: both are given, distributed is not installed, or there is no such scheduler file.
+    """
+    if scheduler is None:
+        return workers or default
+    from rsbench.core.errors import RsbenchError
+    from rsbench.jobs.workers import Cluster
+
+    if workers is not None:
+        raise RsbenchError(
+            f"--workers {workers}: the cluster of --scheduler {scheduler} has its own; give one of both"
+        )
+    if find_spec("distributed") is None:  # before scenes are built
+        raise RsbenchError("--scheduler needs distributed: pip install 'rsbench[cluster]'")
+    if not scheduler.endswith(".json"):
+        return Cluster(address=scheduler)
+    if not Path(scheduler).is_file():  # for which distributed would wait without end
+        raise RsbenchError(
+            f"--scheduler {scheduler}: no such file; make it with: dask scheduler --scheduler-file {scheduler}"
+        )
+    return Cluster(address=str(Path(scheduler).resolve()))
+
+
+_Place = TypeVar("_Place", Path, Path | str)
+
+
+def shared_path(path: _Place, scheduler: str | None) -> _Place:
+    """A path as the machines of a cluster, which work in other folders, must be told it; a URL is what it was."""
+    if scheduler is None or isinstance(path, str):
+        return path
+    from rsbench.storage.work_folder import refuse_url
+
+    refuse_url(path)
+    return path.resolve()
+
+
+@contextmanager
+def results_at(out: str, scheduler: str | None) -> Iterator[Path]:
+    """The folder into which a command writes what is for ``out``: that folder, or one whose files go to that URL.
+
+    Raises:
+        RsbenchError: a URL that cannot be taken, or one with a cluster; see ``mirrored``.
+    """
+    from rsbench.core.errors import RsbenchError
+    from rsbench.storage.object_store import path_or_url, shown
+
+    place = path_or_url(out)
+    if isinstance(place, Path):
+        yield shared_path(place, scheduler)
+        return
+    if scheduler is not None:
+        raise RsbenchError(
+            f"{shown(place)}: not with --scheduler, whose jobs write into a folder that all machines see: give a "
+            "folder, or --workers"
+        )
+    from rsbench.storage.mirror import mirrored
+
+    with mirrored(place) as folder:
+        yield folder

@@ -1,0 +1,122 @@
+"""Ctrl-C and SIGTERM: every command ends within two seconds, says how to go on, and exits with 130 or 143.
+
+The signal raises ``Stopped`` in the main thread, so that everything is closed in order. The main thread may be
+deep in a computation that does not come back to Python for seconds: then a thread that is woken by the same signal
+ends the process. Its children end with it, whatever they do (``rsbench.jobs.isolation``). SIGHUP is left to
+the system, which ends the process without a word.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
+
+_PATIENCE_S = 1.0
+_SPEECH_S = 0.3
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_RESUMES = "the same command resumes where it stopped"
+_ADVICE = {
+    "generate": _RESUMES,
+    "evaluate": _RESUMES,
+    "simulate": _RESUMES,
+    "reproduce": _RESUMES,
+    "demo": _RESUMES,
+    "correct": "--out is as it was before",
+    "export": "--out is as it was before",
+    "solve": "nothing is kept; what was answered stays answered",
+}
+"""How to go on, by command."""
+_SHOW_CURSOR = "\x1b[?25h"
+
+
+class Stopped(BaseException):
+    """The process was asked to end; no ``KeyboardInterrupt``, which typer answers in words of its own."""
+
+
+def end_at_once(number: int, frame: FrameType | None = None) -> NoReturn:
+    """A handler for the time in which nothing has begun that must be closed."""
+    with contextlib.suppress(OSError):
+        os.write(2, f"{_words()}\n".encode())
+    os._exit(128 + number)
+
+
+@contextmanager
+def stoppable() -> Iterator[None]:
+    """The whole of a command, in the main thread."""
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+    # Ignored from the start, as of a background process of a shell without job control, it stays so.
+    ours = [number for number, handler in before.items() if handler != signal.SIG_IGN]
+    received: list[int] = []
+
+    def stop(number: int, frame: FrameType | None) -> NoReturn:
+        received.append(number)
+        for each in _SIGNALS:
+            signal.signal(each, signal.SIG_IGN)  # a second one must not disturb the closing
+        raise Stopped
+
+    with _watched():
+        try:
+            for number in ours:
+                signal.signal(number, stop)
+            yield
+        except BaseException:
+            # What a signal interrupts may turn it into an error of its own, as the import of a module does.
+            if not received:
+                raise
+            _say()
+            sys.exit(128 + received[0])
+        finally:
+            for number in ours:
+                signal.signal(number, before[number])
+
+
+@contextmanager
+def _watched() -> Iterator[None]:
+    """With a thread that ends the process when the main thread does not heed a signal."""
+    if os.name != "posix":
+        yield
+        return
+    hook, (reader, writer) = sys.unraisablehook, os.pipe()
+    os.set_blocking(writer, False)
+    done = threading.Event()
+    threading.Thread(target=_watch, args=(reader, done), daemon=True).start()
+    wakeup = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    # ``Stopped`` raised where Python can pass nothing on, as in a destructor, is left to the thread.
+    sys.unraisablehook = lambda problem: None if problem.exc_type is Stopped else hook(problem)
+    try:
+        yield
+    finally:
+        done.set()
+        sys.unraisablehook = hook
+        signal.set_wakeup_fd(wakeup)
+        os.close(writer)
+
+
+def _watch(reader: int, done: threading.Event) -> None:
+    """End the process where the main thread does not."""
+    with open(reader, "rb", buffering=0) as stream:
+        while byte := stream.read(1):
+            if byte[0] in _SIGNALS and not done.wait(_PATIENCE_S):
+                speaker = threading.Thread(target=_say, daemon=True)
+                speaker.start()
+                speaker.join(_SPEECH_S)  # whoever should read it may have stopped reading
+                os._exit(128 + byte[0])
+
+
+def _say() -> None:
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # nobody may be left to read it
+        cursor = _SHOW_CURSOR if sys.stderr.isatty() else ""
+        sys.stderr.write(f"{cursor}{_words()}\n")
+        sys.stderr.flush()
+
+
+def _words() -> str:
+    command = next((word for word in sys.argv[1:] if not word.startswith("-")), "")
+    return "; ".join(filter(None, ("interrupted", _ADVICE.get(command))))

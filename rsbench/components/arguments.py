@@ -1,0 +1,134 @@
+"""Checks of what people hand to the public functions: one line with the argument, its value and what may be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
+from rsbench.core.rig import FRAMES, SIDES, StereoRig, View
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+
+_IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16))
+
+
+def check_one_of(name: str, value: object, allowed: Collection[object]) -> None:
+    """Raises ValueError unless ``value`` is one of ``allowed``."""
+    if value not in allowed:
+        raise ValueError(f"{name} = {value!r}: must be one of {', '.join(map(repr, allowed))}")
+
+
+def check_number(name: str, value: float, least: float, most: float = math.inf) -> None:
+    """Raises ValueError unless ``value`` is a finite number from ``least`` to ``most``."""
+    if not (math.isfinite(value) and least <= value <= most):
+        allowed = f"at least {least:g}" if math.isinf(most) else f"from {least:g} to {most:g}"
+        raise ValueError(f"{name} = {value!r}: must be a number {allowed}")
+
+
+def check_times(readout_ratio: float | None, target_row: float, rig: StereoRig) -> None:
+    """Raises ValueError unless the ratio (None: unknown) and the row of an image are in their ranges."""
+    if readout_ratio is not None:
+        check_number("readout_ratio", readout_ratio, 0.0, 1.0)
+    check_number("target_row", target_row, 0.0, rig.camera.height - 1.0)
+
+
+def gyro_samples(samples: ArrayLike | None) -> FloatArray | None:
+    """Samples (n, 4) as ``Correspondences`` has them; raises ValueError as it does."""
+    return None if samples is None else Correspondences(gyro=np.asarray(samples, dtype=np.float64)).gyro
+
+
+def check_whole(name: str, value: object, least: int, most: float = math.inf) -> None:
+    """Raises ValueError unless ``value`` is a whole number from ``least`` to ``most``."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
+        allowed = f"of at least {least}" if math.isinf(most) else f"from {least} to {most}"
+        raise ValueError(f"{name} = {value!r}: must be a whole number {allowed}")
+
+
+def check_ranges(component: object, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Raises ValueError unless the numbers of these names lie from the first to the second; None may be."""
+    for name, (least, most) in ranges.items():
+        value = getattr(component, name)
+        if value is not None and not least <= value <= most:
+            raise ValueError(f"{name} = {value!r}: must lie in [{least:g}, {most:g}]")
+
+
+def check_ideal(rig: StereoRig, what: str) -> None:
+    """Raises RsbenchError where cameras have a lens, which ``what`` does not take."""
+    if rig.camera.lens is not None:
+        raise RsbenchError(
+            f"camera.lens = {rig.camera.lens.model!r}: {what} takes images without distortion; undistort first"
+        )
+
+
+def check_plain(rig: StereoRig, shutter: RollingShutter, what: str) -> None:
+    """Raises RsbenchError for cameras with a lens or another scan, which ``what`` does not take."""
+    check_ideal(rig, what)
+    if not shutter.plain:
+        s = shutter.scanning
+        raise RsbenchError(
+            f"scan = {s.scan!r}, right_scan = {s.right_scan!r}, right_delay = {s.right_delay}: {what} takes rows "
+            "from the top, read by both cameras at once"
+        )
+
+
+def check_rows(rig: StereoRig, shutter: RollingShutter) -> None:
+    """Raises ValueError unless the shutter reads as many rows and columns as the cameras have."""
+    if shutter.width not in (None, rig.camera.width):
+        raise ValueError(
+            f"shutter.width = {shutter.width}: must be that of the camera, {rig.camera.width} columns"
+        )
+    if shutter.height != rig.camera.height:
+        raise ValueError(
+            f"shutter.height = {shutter.height}: must be that of the camera, {rig.camera.height} rows"
+        )
+
+
+def world_points(points: ArrayLike) -> FloatArray:
+    """Points (..., 3) as float64; raises ValueError on another shape."""
+    array = np.asarray(points, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != 3:
+        raise ValueError(f"points: must have shape (..., 3), got {array.shape}")
+    return array
+
+
+def four_images(images: Sequence[NDArray[Any]], rig: StereoRig | None = None) -> dict[View, NDArray[Any]]:
+    """Images left 0, right 0, left 1, right 1 by side and frame.
+
+    Raises:
+        ValueError: not four, not uint8 or uint16, not alike, or not of the size of the rig's cameras.
+    """
+    if len(images) != 4:
+        raise ValueError(f"images: got {len(images)}; four are needed: left 0, right 0, left 1, right 1")
+    views: dict[View, NDArray[Any]] = {}
+    for (side, frame), image in zip(((s, f) for f in FRAMES for s in SIDES), images, strict=True):
+        views[side, frame] = check_image(f"image {side} {frame}", image, rig)
+    first = views["left", 0]
+    for (side, frame), image in views.items():
+        if image.shape != first.shape or image.dtype != first.dtype:
+            what = f"{image.dtype} {image.shape}, but image left 0 is {first.dtype} {first.shape}"
+            raise ValueError(f"image {side} {frame}: is {what}; all must be alike")
+    return views
+
+
+def check_image(name: str, image: NDArray[Any], rig: StereoRig | None) -> NDArray[Any]:
+    """The image; raises ValueError unless it is (H, W) or (H, W, 3), uint8 or uint16, of the cameras' size."""
+    if not isinstance(image, np.ndarray) or image.dtype not in _IMAGE_TYPES:
+        kind = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
+        raise ValueError(f"{name}: must be an array of uint8 or uint16, got {kind}")
+    if image.ndim != 2 and not (image.ndim == 3 and image.shape[2] == 3):
+        raise ValueError(f"{name}: must have shape (H, W) or (H, W, 3), got {image.shape}")
+    if rig is not None and image.shape[:2] != (rig.camera.height, rig.camera.width):
+        size = f"{image.shape[1]} x {image.shape[0]}"
+        raise ValueError(f"{name}: is {size} pixels, the rig's cameras {rig.camera.width} x {rig.camera.height}")
+    return image
+
+
+def names(given: str | Iterable[str]) -> tuple[str, ...]:
+    """One name or many."""
+    return (given,) if isinstance(given, str) else tuple(given)

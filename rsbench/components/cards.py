@@ -1,0 +1,217 @@
+"""Cards: the TOML files that users read, copy, edit and compare, parsed into frozen dataclasses.
+
+A card is named (``castle``), and looked up among the cards that come with rsbench, or is a path
+(``my/castle.toml``). Parsing is strict: unknown keys, wrong types and numbers that are not finite are refused
+in one line that names the file, the field, the value and what is allowed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import functools
+import json
+import math
+import os
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from rsbench.core.errors import RsbenchError
+from rsbench.storage.untrusted_files import CARD_BYTES, read_text
+
+T = TypeVar("T")
+CardKind = Literal[
+    "scenes",
+    "renderers",
+    "solvers",
+    "datasets",
+    "sweeps",
+    "matchers",
+    "features",
+    "correctors",
+    "metrics",
+    "shutters",
+]
+
+Extra = Literal["forbid", "ignore"]
+_LONGEST = 100
+"""Characters of a value in a message."""
+_DEEPEST = 64
+"""Levels of tables and arrays."""
+_UNKNOWN_KEY = ("unexpected_keyword_argument", "extra_forbidden")
+
+
+def list_cards(kind: CardKind) -> dict[str, Path]:
+    """Names of the cards of one kind that come with rsbench, sorted, with their files."""
+    return {path.stem: path for path in sorted(_card_folder(kind).glob("*.toml"), key=lambda path: path.stem)}
+
+
+def card_path(kind: CardKind, name_or_path: str | Path) -> Path:
+    """File of a card: a value with a separator or ending in ``.toml`` is a path, anything else a name.
+
+    Raises:
+        RsbenchError: no such file, or no card of that name.
+    """
+    value = os.fspath(name_or_path)
+    if value.endswith(".toml") or "/" in value or os.sep in value:
+        path = Path(value)
+        if not path.is_file() and path == Path(kind, path.name):  # where cards of this kind were in 0.1
+            path = list_cards(kind).get(path.stem, path)
+        if not path.is_file():
+            raise RsbenchError(f"{kind} card {value}: no such file")
+        return path
+    cards = list_cards(kind)
+    if value not in cards:
+        raise RsbenchError(f"{kind} card {value!r} does not exist{choices(value, cards)}; a path ends in .toml")
+    return cards[value]
+
+
+def load_card(cls: type[T], kind: CardKind, name_or_path: str | Path) -> T:
+    """Find, read and parse a card into the dataclass ``cls``.
+
+    Raises:
+        RsbenchError: see ``card_path``, ``read_toml`` and ``parse_card``.
+    """
+    path = card_path(kind, name_or_path)
+    return parse_card(cls, read_toml(path), str(path))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Content of a TOML file.
+
+    Raises:
+        RsbenchError: the file cannot be read, or is not TOML (with the line and column).
+    """
+    text = read_text(path, CARD_BYTES)
+    try:
+        return tomllib.loads(text)
+    except ValueError as error:  # not TOML, or a number of thousands of digits
+        raise RsbenchError(f"{path}: not valid TOML: {error}") from error
+    except RecursionError as error:
+        raise RsbenchError(f"{path}: not valid TOML: nested too deeply") from error
+
+
+def parse_card(cls: type[T], data: Mapping[str, Any], where: str, *, extra: Extra = "forbid") -> T:
+    """Turn the tables of a card, or what JSON holds, into the dataclass ``cls``.
+
+    Types are strict (no text for a number, no truth value for a number; a whole number may stand for a real
+    one), numbers are finite, and a key that no field has is refused at every level of nesting. A
+    ``ValueError`` or ``RsbenchError`` from a ``__post_init__`` becomes part of the one-line message.
+
+    Args:
+        cls: a dataclass whose fields are scalars, ``Literal``s, tuples, dicts and further dataclasses.
+        data: what ``tomllib`` or ``json`` read.
+        where: the file, for messages.
+        extra: "ignore" passes over keys that no field has, as a reader of files of later versions must.
+
+    Raises:
+        RsbenchError: one line with ``where``, the dotted field, the value and what is allowed.
+    """
+    card: tuple[T]
+    check_values(data, where)
+    try:
+        # Strict JSON validation reads arrays as tuples and tables as dataclasses, as TOML means them.
+        card = _adapter(cls, extra).validate_json(json.dumps([data], default=str))
+    except ValidationError as error:
+        raise RsbenchError(f"{where}: {_first_problem(cls, error)}") from None
+    except RsbenchError as error:
+        raise RsbenchError(f"{where}: {error}") from error
+    return card[0]
+
+
+@functools.lru_cache(maxsize=64)
+def _adapter(cls: type, extra: Extra) -> TypeAdapter[Any]:
+    """Kept, for it takes a hundred times as long to make as to use.
+
+    pydantic takes no settings for a standard dataclass itself, but hands those of a container down to it.
+    """
+    config = ConfigDict(extra=extra, strict=True, allow_inf_nan=False)
+    return TypeAdapter(tuple[cls], config=config)
+
+
+def check_values(data: Mapping[str, Any], where: str) -> None:
+    """Refuse numbers that are not finite, however deep they lie, and what lies too deep.
+
+    Fields typed ``Any`` would let them pass.
+
+    Raises:
+        RsbenchError: one line with ``where`` and the dotted field.
+    """
+    todo: list[tuple[Any, tuple[object, ...]]] = [(data, ())]
+    while todo:
+        values, keys = todo.pop()
+        if len(keys) > _DEEPEST:
+            raise RsbenchError(
+                f"{where}: {'.'.join(map(str, keys[:3]))}...: nested more than {_DEEPEST} levels deep"
+            )
+        for key, value in values.items() if isinstance(values, Mapping) else enumerate(values):
+            if isinstance(value, (Mapping, list, tuple)):
+                todo.append((value, (*keys, key)))
+            elif isinstance(value, float) and not math.isfinite(value):
+                field = ".".join(map(str, (*keys, key)))
+                raise RsbenchError(f"{where}: {field} = {value}: numbers must be finite")
+
+
+def choices(value: str, names: Iterable[str]) -> str:
+    """End of a message about an unknown name: the nearest name, then the names that exist."""
+    known = sorted(names)
+    near = difflib.get_close_matches(value, known, n=1)
+    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    return f"{hint}; there are: {', '.join(known) or 'none'}"
+
+
+def shipped_folder(in_checkout: str, in_wheel: str) -> Path:
+    """A folder that comes with rsbench: below the top of a checkout, or in the package data of a wheel."""
+    package = Path(str(resources.files("rsbench")))
+    checkout = package.parent
+    return checkout / in_checkout if (checkout / "pyproject.toml").is_file() else package / in_wheel
+
+
+def _card_folder(kind: CardKind) -> Path:
+    folder = kind if kind in ("scenes", "renderers", "solvers") else f"cards/{kind}"
+    return shipped_folder(folder, f"_cards/{kind}")
+
+
+def _first_problem(cls: type, error: ValidationError) -> str:
+    """One problem of many; a misspelt key first, for it also causes the 'required' ones."""
+    problems = error.errors(include_url=False)
+    problem = next((item for item in problems if item["type"] in _UNKNOWN_KEY), problems[0])
+    location = problem["loc"][1:]
+    field = ".".join(str(part) for part in location)
+    if problem["type"] in _UNKNOWN_KEY:
+        return f"unknown key {field!r}{choices(str(location[-1]), _keys_at(cls, location[:-1]))}"
+    if problem["type"].startswith("missing"):
+        return f"{field!r} is required"
+    message = problem["msg"].removeprefix("Value error, ")
+    if not field:
+        return message
+    whole = problem["type"] == "value_error" and isinstance(problem["input"], dict)
+    value = "" if whole else f" = {_short(problem['input'])}"
+    return f"{field}{value}: {message[:1].lower()}{message[1:]}"
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+
+
+def _keys_at(kind: Any, location: Sequence[int | str]) -> list[str]:
+    """Field names of the dataclass found by walking ``location`` down from the type ``kind``."""
+    if get_origin(kind) in (Union, UnionType):
+        return [key for option in get_args(kind) for key in _keys_at(option, location)]
+    if dataclasses.is_dataclass(kind):
+        hints = get_type_hints(kind)
+        if not location:
+            return [field.name for field in dataclasses.fields(kind) if field.init]
+        if location[0] in hints:
+            return _keys_at(hints[str(location[0])], location[1:])
+        # A union adds the name of the option that was tried to the location.
+        return _keys_at(kind, location[1:]) if location[0] == getattr(kind, "__name__", "") else []
+    inner = [option for option in get_args(kind) if option is not Ellipsis]
+    return _keys_at(inner[-1], location[1:]) if inner and location else []

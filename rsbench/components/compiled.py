@@ -1,0 +1,195 @@
+"""Compiled functions: one decorator for the whole package, and where their machine code is kept.
+
+Compiling takes tens of seconds on a slow machine, so it is done once per installation and kept on disk: in
+``NUMBA_CACHE_DIR`` where the user set it, else in the user's cache folder, else in a temporary folder. There each
+version of the compiled sources has a folder of its own: Numba looks only at the file of the function that it
+loads, not at those of the functions which that one calls. Each signature of a function has a file of its own, so
+that processes which compile at the same time write the same, and none spoils what another wrote.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import logging
+import re
+import tempfile
+import time
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar, overload
+
+from numba import config, njit
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+
+from rsbench.storage.caches import temporary, user_cache
+
+F = TypeVar("F", bound=Callable[..., object])
+
+_LOGGER = logging.getLogger("rsbench")
+_WORTH_SAYING_S = 1.0
+_KEPT_DAYS = 30
+_VERSION = re.compile(r"[0-9a-f]{16}")
+"""Names of the folders of versions."""
+_MARKS = (b"@compiled", b"MotionKernel")
+"""What files with compiled code hold; all of them decide the version."""
+
+
+@overload
+def compiled(function: F) -> F: ...
+@overload
+def compiled(**options: Any) -> Callable[[F], F]: ...
+def compiled(function: F | None = None, **options: Any) -> F | Callable[[F], F]:
+    """Compile at the first call, once per installation; ``options`` are those of ``numba.njit``."""
+    if function is None:
+        return functools.partial(_compiled, options=options)
+    return _compiled(function, {})
+
+
+def _compiled(function: F, options: dict[str, Any]) -> F:
+    dispatcher = njit(nogil=True, **options)(function)
+    dispatcher._cache = _KernelCache(function)
+    out: F = dispatcher
+    return out
+
+
+class _Locator:
+    """Names a function in the cache; where the cache is, ``cache_folder`` alone says."""
+
+    def __init__(self, py_func: Callable[..., object], py_file: str) -> None:
+        self._py_file = py_file
+        self._line = py_func.__code__.co_firstlineno
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., object], py_file: str) -> _Locator:
+        return cls(py_func, py_file)
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+
+class _Implementation(CompileResultCacheImpl):
+    _locator_classes = (_Locator,)
+
+
+class _KernelCache(FunctionCache):
+    """Numba's cache of one function, with one index per signature; a file that cannot be read is made again."""
+
+    def __init__(self, py_func: Callable[..., object]) -> None:
+        self._name, self._py_func = repr(py_func), py_func
+        self._impl = _Implementation(py_func)
+        self.enable()
+
+    @property
+    def cache_path(self) -> str:
+        return str(cache_folder() or "")
+
+    def flush(self) -> None:
+        """Nothing: another version of the sources has another folder."""
+
+    def _file(self, sig: tuple[Any, ...], key: Any) -> IndexDataCacheFile | None:
+        folder = cache_folder()
+        # The code of a foreign type is not among the sources that the folder stands for.
+        if folder is None or not self._enabled or any(getattr(kind, "foreign", False) for kind in sig):
+            return None
+        signature = hashlib.sha256(repr(key).encode()).hexdigest()[:16]
+        return IndexDataCacheFile(str(folder), f"{self._impl.filename_base}-{signature}", source_version())
+
+    def _load_overload(self, sig: tuple[Any, ...], target_context: Any) -> Any:
+        key = self._index_key(sig, target_context.codegen())
+        file = self._file(sig, key)
+        found = None
+        if file is not None:
+            try:
+                found = file.load(key)
+                found = None if found is None else self._impl.rebuild(target_context, found)
+            except Exception:  # half a file, or one of another Numba: whatever it raises, compiling mends it
+                found = None
+        if found is None:
+            _STOPWATCH.begin()
+        return found
+
+    def _save_overload(self, sig: tuple[Any, ...], data: Any) -> None:
+        _STOPWATCH.end()
+        key = self._index_key(sig, data.codegen)
+        file = self._file(sig, key)
+        if file is None or not self._impl.check_cachable(data):
+            return
+        try:
+            file.save(key, self._impl.reduce(data))
+        except OSError as error:  # a full disk
+            _LOGGER.debug("compiled code not kept: %s", error)
+
+
+class _Stopwatch:
+    """Says in one line that kernels are being compiled, when it takes so long that somebody may wonder."""
+
+    def __init__(self) -> None:
+        self.depth, self.started, self.seconds, self.said = 0, 0.0, 0.0, False
+
+    def begin(self) -> None:
+        """A function is compiled; those that it calls are, inside."""
+        now = time.perf_counter()
+        if self.depth == 0:
+            self.started = now
+        elif not self.said and self.seconds + now - self.started > _WORTH_SAYING_S:
+            self.said = True
+            _LOGGER.warning("rsbench: compiling, once per installation: up to a minute")
+        self.depth += 1
+
+    def end(self) -> None:
+        self.depth = max(0, self.depth - 1)
+        if self.depth == 0:
+            self.seconds += time.perf_counter() - self.started
+
+
+_STOPWATCH = _Stopwatch()
+
+
+@functools.cache
+def source_version() -> str:
+    """Hash of all sources of rsbench that hold compiled code."""
+    package = Path(str(resources.files("rsbench")))
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        text = path.read_bytes()
+        if any(mark in text for mark in _MARKS):
+            digest.update(path.relative_to(package).as_posix().encode() + b"\0" + text + b"\0")
+    return digest.hexdigest()
+
+
+@functools.cache
+def cache_folder() -> Path | None:
+    """Folder of the compiled code of these sources, made if missing; None where nothing can be written."""
+    for base in (_asked_for(), user_cache(), temporary()):
+        if base is None:
+            continue
+        folder = base / "kernels" / source_version()[:16]
+        try:
+            new = not folder.is_dir()
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError:
+            continue
+        if new:
+            _remove_old(folder)
+        return folder
+    return None
+
+
+def _asked_for() -> Path | None:
+    return Path(config.CACHE_DIR) if config.CACHE_DIR else None
+
+
+def _remove_old(folder: Path) -> None:
+    """Code of other versions that nobody has added to for a month; nothing else, wherever the cache was put."""
+    oldest = time.time() - _KEPT_DAYS * 86400
+    for other in folder.parent.iterdir():
+        with contextlib.suppress(OSError):  # another process removed it first
+            if other == folder or not _VERSION.fullmatch(other.name) or other.lstat().st_mtime > oldest:
+                continue
+            for file in [] if other.is_symlink() else [*other.glob("*.nbi"), *other.glob("*.nbc")]:
+                file.unlink()
+            other.rmdir()

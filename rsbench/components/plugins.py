@@ -1,0 +1,359 @@
+"""Components by name: cards that come with rsbench, a user's card, or an installed package's entry point.
+
+Every kind of component is found in the same way. A name is that of a card, of an entry point, or of a class of
+rsbench's own that needs no card; a value that ends in ``.toml`` is the path of a card. A card says
+``class = "package.module:Class"``, may say ``description``, sets ``parameters``, and may set the options of its
+kind. A name that two packages claim is an error of whoever uses that name, and of nobody else; what a package
+raises is told in one line, with its name.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import inspect
+import os
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from pydantic.errors import PydanticUserError
+
+from rsbench.components.cards import CardKind, card_path, check_values, choices, list_cards, parse_card, read_toml
+from rsbench.components.entry_points import entry_points_by_name, package_of
+from rsbench.components.identity import component_key, own_source_version, source_version
+from rsbench.components.imports import blaming, import_target, in_words, try_import
+from rsbench.core.errors import RsbenchError
+
+__all__ = [
+    "Entry",
+    "Kind",
+    "Offer",
+    "RunOptions",
+    "blame",
+    "component_key",
+    "description_of",
+    "list_names",
+    "load_class",
+    "load_entry",
+    "make_component",
+    "offers",
+    "own_source_version",
+    "source_version",
+    "wrap",
+]
+
+Component = TypeVar("Component")
+Options = TypeVar("Options")
+_OWN = ("class", "description", "parameters")
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """Of a kind whose cards set nothing beside the parameters."""
+
+
+def _anything_goes(component: Any) -> None:
+    pass
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """What a card may say of how its component is run."""
+
+    time_limit_s: float = 300.0
+    """Wall-clock time for one problem, after which a component of another package has failed."""
+
+    def __post_init__(self) -> None:
+        if not self.time_limit_s > 0.0:
+            raise ValueError(f"time_limit_s = {self.time_limit_s}: must be a positive number of seconds")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind(Generic[Component, Options]):
+    """One kind of component."""
+
+    singular: str
+    """Its name in messages, such as ``solver``."""
+    cards: CardKind | None = None
+    """Folder of its cards; None when the classes are named in cards of something else."""
+    group: str = ""
+    """Group of its entry points; by default ``rsbench.<folder of its cards>``."""
+    base: type[Component]
+    """Contract: what classes must be below of."""
+    options: type[Options]
+    """Dataclass of what a card may set beside the parameters; without values it must be valid."""
+    built_in: Mapping[str, str] = field(default_factory=dict)
+    """Names of rsbench's own classes that need no card, as ``package.module:Class``."""
+    check: Callable[[Component], None] = _anything_goes
+    """Raises ValueError when what a component declares cannot be right."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "group", self.group or f"rsbench.{self.cards}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Entry(Generic[Component, Options]):
+    """A component under the name by which tables, files and seeds know it."""
+
+    name: str
+    path: Path | None
+    """Its card; None for an entry point."""
+    description: str
+    component: Component
+    options: Options
+    parameters: dict[str, Any] = field(default_factory=dict)
+    """As the card gives them."""
+    key: str
+    """Hash of class, source, parameters and the components inside: equal keys give equal answers."""
+
+    @property
+    def built_in(self) -> bool:
+        """Whether the class, and that of the component inside it, is rsbench's own: it may run in this process."""
+        part: object = self.component
+        while part is not None:
+            if type(part).__module__.partition(".")[0] != "rsbench":
+                return False
+            part = getattr(part, "inner", None)
+        return True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Offer:
+    """A name, before anything is loaded."""
+
+    name: str
+    origin: str
+    """``rsbench``, or the package that claims the name."""
+    path: Path | None = None
+    """Its card."""
+    point: metadata.EntryPoint | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Content:
+    class_: str
+    description: str = ""
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+
+def blame(kind: Kind[Any, Any], entry: Entry[Any, Any]) -> AbstractContextManager[None]:
+    """Run a component's code: what another package's raises becomes one line that names the component.
+
+    Raises:
+        RsbenchError: its kind, its name and what it raised. Errors in our own code pass as they are.
+    """
+    if entry.built_in:
+        return contextlib.nullcontext()
+    return blaming(f"{kind.singular} {entry.name!r}", "failed")
+
+
+def wrap(kind: Kind[Component, Options], component: Component) -> Entry[Component, Options]:
+    """The entry of a component that was made without a card; its class names it."""
+    return Entry(
+        name=type(component).__name__,
+        path=None,
+        description="",
+        component=component,
+        options=kind.options(),
+        key=component_key(component, {}),
+    )
+
+
+def list_names(kind: Kind[Any, Any]) -> list[str]:
+    """Names of all components of a kind, sorted; a clash of names is not an error here."""
+    return sorted({offer.name for offer in offers(kind)})
+
+
+def offers(kind: Kind[Any, Any]) -> list[Offer]:
+    """Every claim to a name of a kind, sorted by name: two of one name are a clash. Loads nothing."""
+    cards = list_cards(kind.cards) if kind.cards is not None else {}
+    own = [Offer(name=name, origin="rsbench", path=path) for name, path in cards.items()]
+    own += [Offer(name=name, origin="rsbench") for name in kind.built_in if name not in cards]
+    installed = [
+        Offer(name=name, origin=package_of(point), point=point)
+        for name, points in entry_points_by_name(kind.group).items()
+        for point in points
+    ]
+    return sorted([*own, *installed], key=lambda offer: offer.name)
+
+
+def load_entry(kind: Kind[Component, Options], name_or_path: str | Path) -> Entry[Component, Options]:
+    """A component by the name of a card or entry point, or by the path of a card.
+
+    Raises:
+        RsbenchError: no such component, two of that name, or its card or class is wrong: one line that names
+            the card or the entry point.
+    """
+    text = os.fspath(name_or_path)
+    if kind.cards is not None and (text.endswith(".toml") or "/" in text or os.sep in text):
+        return _from_card(kind, card_path(kind.cards, name_or_path))
+    offer = _only_offer(kind, text, "; a path ends in .toml" if kind.cards is not None else "")
+    if offer.path is not None:
+        return _from_card(kind, offer.path)
+    cls, where = _offered_class(kind, offer)
+    component = make_component(kind, cls, {}, where)
+    return Entry(
+        name=text,
+        path=None,
+        description=_first_paragraph(cls),
+        component=component,
+        options=kind.options(),
+        key=component_key(component, {}),
+    )
+
+
+def load_class(kind: Kind[Component, Any], name: str, card: Path | None = None) -> type[Component]:
+    """The class that a card names: by the name of a class of rsbench's own or of an entry point, or as
+    ``package.module:Class``, where the module may lie beside the card (without one, in the current folder).
+
+    Raises:
+        RsbenchError: no such class, two of that name, or it cannot be loaded or is not of this kind.
+    """
+    card_is = f"{card}: " if card is not None else ""
+    if ":" in name:
+        where, folder = f"{card_is}{kind.singular} = {name!r}", card.parent if card is not None else Path.cwd()
+        return _checked(kind, import_target(name, folder, where), str(card) if card is not None else where)
+    return _offered_class(kind, _only_offer(kind, name, "", card_is))[0]
+
+
+def description_of(kind: Kind[Any, Any], offer: Offer) -> str:
+    """What the class of an offer without a card says of itself first.
+
+    Raises:
+        RsbenchError: its name is that of another too, it cannot be loaded or is not of this kind.
+    """
+    _only_offer(kind, offer.name, "")
+    return _first_paragraph(_offered_class(kind, offer)[0])
+
+
+def _first_paragraph(cls: type) -> str:
+    return " ".join((inspect.getdoc(cls) or "").partition("\n\n")[0].split())
+
+
+def _only_offer(kind: Kind[Any, Any], name: str, advice: str, where: str = "") -> Offer:
+    everything = offers(kind)
+    found = [offer for offer in everything if offer.name == name]
+    if len(found) > 1:
+        owners = " and of ".join(_owner(offer) for offer in found)
+        raise RsbenchError(f"{where}{kind.singular} {name!r}: is the name of {owners}; rename one of them")
+    if not found:
+        known = choices(name, {offer.name for offer in everything})
+        raise RsbenchError(f"{where}{kind.singular} {name!r} does not exist{known}{advice}")
+    return found[0]
+
+
+def _offered_class(kind: Kind[Component, Any], offer: Offer) -> tuple[type[Component], str]:
+    """The class of an offer without a card, and how messages call it."""
+    if offer.point is None:
+        return _checked(kind, import_target(kind.built_in[offer.name], None, offer.name), offer.name), offer.name
+    where = f"entry point {kind.group}:{offer.name} ({_owner(offer)})"
+    with blaming(where, "cannot be loaded"):
+        try_import(offer.point.module)
+        cls = offer.point.load()
+    return _checked(kind, cls, where), where
+
+
+def _from_card(kind: Kind[Component, Options], path: Path) -> Entry[Component, Options]:
+    data = read_toml(path)
+    known = [*_OWN, *(option.name for option in dataclasses.fields(kind.options))]  # pyrefly: ignore[bad-argument-type]
+    for key in data:
+        if key not in known:
+            raise RsbenchError(f"{path}: unknown key {key!r}{choices(key, known)}")
+    if "class" not in data:
+        raise RsbenchError(f"{path}: 'class' is required")
+    content = parse_card(
+        _Content, {("class_" if key == "class" else key): data[key] for key in _OWN if key in data}, str(path)
+    )
+    options = parse_card(kind.options, {key: data[key] for key in data if key not in _OWN}, str(path))
+    cls = _checked(
+        kind, import_target(content.class_, path.parent, f"{path}: class = {content.class_!r}"), str(path)
+    )
+    component = make_component(kind, cls, content.parameters, str(path))
+    return Entry(
+        name=path.stem,
+        path=path,
+        description=content.description,
+        component=component,
+        options=options,
+        parameters=content.parameters,
+        key=component_key(component, content.parameters),
+    )
+
+
+def _owner(offer: Offer) -> str:
+    if offer.point is not None:
+        return f"{offer.point.value} of {offer.origin}"
+    return f"the card {offer.name}.toml of rsbench" if offer.path is not None else "rsbench's own"
+
+
+# Classes
+
+
+def _checked(kind: Kind[Component, Any], cls: object, where: str) -> type[Component]:
+    if not (isinstance(cls, type) and issubclass(cls, kind.base)) or inspect.isabstract(cls):
+        base = f"{kind.base.__module__}.{kind.base.__qualname__}"
+        missing = ", ".join(sorted(getattr(cls, "__abstractmethods__", ()))) if isinstance(cls, type) else ""
+        lacks = f"; it lacks {missing}" if missing and issubclass(cls, kind.base) else ""  # pyrefly: ignore[bad-argument-type]
+        raise RsbenchError(
+            f"{where}: {cls!r} is not a {kind.singular}: it must be a concrete subclass of {base}{lacks}"
+        )
+    return cls
+
+
+def make_component(
+    kind: Kind[Component, Any], cls: type[Component], parameters: Mapping[str, Any], where: str
+) -> Component:
+    """An object of the class with the parameters of a card.
+
+    Args:
+        kind: whose ``check`` it must pass.
+        cls: a dataclass, whose fields are checked strictly, or any class.
+        parameters: by name.
+        where: card or entry point, for messages.
+
+    Raises:
+        RsbenchError: an unknown or wrong parameter, or whatever the class raises: one line.
+    """
+    check_values(parameters, f"{where}: parameters")
+    if _has_dataclass_init(cls):
+        component = _blamed_parse(cls, parameters, where)
+    else:
+        known = inspect.signature(cls).parameters
+        for key in parameters:
+            if key not in known and all(p.kind is not p.VAR_KEYWORD for p in known.values()):
+                raise RsbenchError(f"{where}: parameters: unknown key {key!r}{choices(key, known)}")
+        with blaming(where, "parameters"):
+            component = cls(**parameters)
+    with blaming(where, "declares what cannot be"):
+        kind.check(component)
+    return component
+
+
+def _has_dataclass_init(cls: type) -> bool:
+    """Whether the constructor is that which ``@dataclass`` writes, on this class or one above it."""
+    owner = next(parent for parent in cls.__mro__ if "__init__" in vars(parent))
+    params = vars(owner).get("__dataclass_params__")
+    return params is not None and bool(params.init)
+
+
+def _blamed_parse(cls: type[Component], parameters: Mapping[str, Any], where: str) -> Component:
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            return parse_card(cls, parameters, f"{where}: parameters")
+    except (RsbenchError, RecursionError):
+        raise
+    except PydanticUserError as error:
+        if not parameters:
+            with blaming(where, "parameters"):
+                return cls()
+        raise RsbenchError(
+            f"{where}: parameters: the fields of {cls.__name__} must have types that a card can hold "
+            f"(numbers, texts, tuples, dataclasses): {str(error).partition(chr(10))[0]}"
+        ) from error
+    except (Exception, SystemExit) as error:  # the constructor's own
+        raise RsbenchError(f"{where}: parameters: {in_words(error)}") from error

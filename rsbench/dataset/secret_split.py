@@ -1,0 +1,164 @@
+"""Datasets that nobody can foresee: of a card, with scenes, motions, noise, order and names from a secret text.
+
+Whoever has the text draws the same card again. What is drawn for one purpose tells nothing of what is drawn for
+another, nor of the text: all are hashes of it, each with a word of its own before it. A text is announced by such
+a hash too, which is not the seed of anything.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from itertools import product
+from pathlib import Path
+
+from rsbench.components.cards import card_path
+from rsbench.core.errors import RsbenchError
+from rsbench.dataset.card import DatasetCard, MotionCard, SequenceCard, Variation, read_dataset_card
+from rsbench.scenes.load import read_scene_card
+from rsbench.storage.untrusted_files import read_text
+
+SHORTEST = 16
+"""Characters of a secret: shorter ones could be tried."""
+_LEAST = 0.7
+"""Of the card's rotation, translation and readout ratio a secret share is taken: what a card says, all know."""
+_BITS = 62
+"""Of seeds, which TOML and others hold as 64 bits with a sign."""
+_SEED = re.compile(r"^seed *=.*\n", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Secret:
+    """A text that nobody can guess."""
+
+    text: str = field(repr=False)
+
+    def digest(self, *words: object) -> bytes:
+        """32 bytes for a purpose."""
+        purpose = "/".join(("rsbench", *map(str, words)))
+        return hashlib.sha256(f"{purpose}\n{self.text}".encode()).digest()
+
+    def number(self, *words: object) -> int:
+        """A seed for a purpose."""
+        return int.from_bytes(self.digest("number", *words), "big") >> (256 - _BITS)
+
+    def share(self, *words: object) -> float:
+        """A number in [0, 1) for a purpose."""
+        return int.from_bytes(self.digest("share", *words)[:6], "big") / 2**48
+
+    @property
+    def commitment(self) -> str:
+        """Announces the text without telling it: SHA-256 in hex digits."""
+        return self.digest("commitment").hex()
+
+
+def read_secret(path: Path) -> Secret:
+    """The text of a file, without white space around it.
+
+    Raises:
+        RsbenchError: the file cannot be read, or its text is too short to be a secret.
+    """
+    text = read_text(path, 4096).strip()
+    if len(text) < SHORTEST:
+        raise RsbenchError(
+            f"{path}: holds {len(text)} characters: a secret seed needs {SHORTEST}, drawn at random"
+        )
+    return Secret(text)
+
+
+def secret_card(name_or_path: str, secret: Secret, scenes: Path | None = None) -> DatasetCard:
+    """A card of which every sequence has a motion and noise of its own, and a name without meaning.
+
+    Each combination of the card's sequences, grid and seeds is there, in a secret order. Sequences do not share a
+    motion, as they do in the card; rotation, translation and readout ratio are 0.7 to 1 times the card's.
+
+    Args:
+        name_or_path: of a card whose motions are random.
+        secret: from which all is drawn.
+        scenes: folder of the scenes that ``write_scenes`` wrote; without it the card keeps the names of its own,
+            and is good for its motions alone.
+
+    Raises:
+        RsbenchError: the card cannot be read, or something that a split must hide is fixed in it.
+    """
+    path = card_path("datasets", name_or_path)
+    card = read_dataset_card(path)
+    if card.trajectory is not None:
+        raise RsbenchError(f"{path}: trajectory: everybody who has the file knows the motion; take random axes")
+    try:
+        made = [_drawn(each, secret) for each in _single(card, secret)]
+    except ValueError as error:
+        raise RsbenchError(f"{path}: {error}") from error
+    made.sort(key=lambda sequence: secret.digest("order", sequence.name))
+    if scenes is not None:
+        made = [replace(each, scene=str(scenes / f"{_scene(each.scene).stem}.toml")) for each in made]
+    digits = len(str(len(made) - 1))
+    named = tuple(replace(each, name=f"s{number:0{digits}d}") for number, each in enumerate(made))
+    return replace(card, name=f"{card.name}-test", sequence=named, grid={}, seeds=())
+
+
+def write_scenes(name_or_path: str, secret: Secret, folder: Path) -> list[Path]:
+    """Write the scene cards of a dataset card with secret seeds into a folder: other textures and other details.
+
+    Raises:
+        RsbenchError: a card cannot be read, or its scene is the same with any seed.
+    """
+    cards = {_scene(each.scene) for each in read_dataset_card(card_path("datasets", name_or_path)).sequence}
+    written = []
+    for path in sorted(cards, key=lambda card: card.stem):
+        if not read_scene_card(path)[1].closed:
+            raise RsbenchError(
+                f"scene {path.stem}: is not built from a seed, so it cannot be hidden; take another"
+            )
+        text = _SEED.sub("", read_text(path), count=1)
+        folder.mkdir(parents=True, exist_ok=True)
+        written.append(folder / f"{path.stem}.toml")
+        written[-1].write_text(f"seed = {secret.number('scene', path.stem)}\n{text}", encoding="utf-8")
+    return written
+
+
+def _scene(name: str) -> Path:
+    return card_path("scenes", name)
+
+
+def _single(card: DatasetCard, secret: Secret) -> Iterator[DatasetCard]:
+    """The card with one sequence, combination of the grid and secret seed each."""
+    for sequence, number in product(card.sequence, range(max(len(card.seeds), 1))):
+        for values in product(*(axis.items() for axis in card.grid.values())):
+            seed = secret.number("sequence", sequence.name, *(label for label, _ in values), number)
+            grid: dict[str, dict[str, Variation]] = {
+                name: {label: value} for name, (label, value) in zip(card.grid, values, strict=True)
+            }
+            yield replace(card, sequence=(replace(sequence, seed=None),), grid=grid, seeds=(seed,))
+
+
+def _motion(single: DatasetCard) -> MotionCard | None:
+    """What the card says of the motion of its one sequence."""
+    (sequence,) = single.sequence
+    own = [value.motion for axis in single.grid.values() for value in axis.values() if value.motion is not None]
+    return own[-1] if own else sequence.motion or single.motion
+
+
+def _drawn(single: DatasetCard, secret: Secret) -> SequenceCard:
+    """The one sequence of a card, drawn, of secret size; ValueError for what is not random."""
+    stated = _motion(single)
+    (sequence,) = single.expanded().sequence
+    if stated is None or (stated.rotation_axis, stated.translation_axis) != ("random", "random"):
+        raise ValueError(f'{single.sequence[0].name}: motion: a secret split needs both axes to be "random"')
+    if sequence.moving:
+        raise ValueError(f"{single.sequence[0].name}: moving: the card tells where its objects are; take others")
+    motion = sequence.motion or stated
+    assert motion.rotation_deg is not None and motion.translation is not None
+    ratio = single.readout_ratio if sequence.readout_ratio is None else sequence.readout_ratio
+
+    def less(name: str, value: float) -> float:
+        return value * (_LEAST + (1.0 - _LEAST) * secret.share(name, sequence.name))
+
+    rotation, translation = less("rotation", motion.rotation_deg), less("translation", motion.translation)
+    return replace(
+        sequence,
+        motion=replace(motion, rotation_deg=rotation, translation=translation),
+        readout_ratio=less("readout", ratio),
+    )

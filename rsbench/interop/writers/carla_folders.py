@@ -1,0 +1,140 @@
+"""The layout of Carla-RS (Liu, Cui, Larsson, Pollefeys, Deep Shutter Unrolling Network, CVPR 2020).
+
+As its generator writes it (ethliup/UnrealCV, ``capture_rolling_shutter.py``): each camera's frames are a folder
+with gt_vel.log, wx wy wz x y z of the camera in its own axes at the first row, rad/s and m/s: the pose of a row
+that is read t seconds later is ``camera_0 from camera_t`` = (exp(w t), v t). The loader of DeepUnrollNet negates
+them. Depth is text, radial: along the ray, not z.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core import so3
+from rsbench.core.rig import SIDES, Side
+from rsbench.core.se3 import Pose, compose, inverse
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.layout import picture_file
+from rsbench.dataset.sequence import Sequence
+from rsbench.interop.writers import row_motion_error
+from rsbench.interop.writers.image_poses import (
+    CORNER_PX,
+    Images,
+    View,
+    about_movers,
+    camera_velocity,
+    first_pose,
+    number,
+    numbers,
+    refuse,
+    write_lines,
+)
+from rsbench.interop.writers.surface_points import Points
+from rsbench.storage.files import write_bytes
+from rsbench.storage.untrusted_files import inside, read_bytes
+
+ABOUT = (
+    "SEQUENCE/seq_left and seq_right, each with NNNN_rs.png, NNNN_gs_f.png (the twin of the first row), "
+    "NNNN_gs_m.png (of row height // 2, where the dataset has that twin), NNNN_rs.depth and NNNN_gs_f.depth"
+    " (text, metres along the ray, 0 = no surface) and gt_vel.log (rad/s and m/s of the camera in its own "
+    "axes at its first row); SEQUENCE/rs_calib.txt and intrinsics.txt, whose pixels have (0, 0) in the "
+    "corner of the image. The loader of DeepUnrollNet takes .png with img_ext, and negates the velocities. "
+    "There are no masks and no flow."
+)
+LAW = "constant velocities from the first row of the first frame on"
+_NAME = "carla-rs"
+_LOADED = 10
+
+
+def check(sequence: Sequence, images: Images) -> None:
+    """Raises RsbenchError for a lens or a scan that the layout does not know."""
+    if sequence.rig.camera.lens is not None:
+        refuse(sequence, _NAME, "its cameras have no lens", "choose other sequences")
+    if {sequence.shutter.scan_of(side) for side in SIDES} != {"top"}:
+        refuse(sequence, _NAME, "its rows are read from the top", "choose other sequences")
+
+
+def write(sequence: Sequence, root: Path, images: Images) -> dict[str, Any]:
+    """The files of one sequence in a folder of its name below ``root``; what has to be said of them."""
+    folder = root / sequence.name
+    for side in SIDES:
+        place = folder / f"seq_{side}"
+        place.mkdir(parents=True)
+        velocity = " ".join(number(each) for each in np.concatenate(first_velocity(sequence, side)))
+        write_lines(
+            place / "gt_vel.log", ["# Ground truth velocity in camera frame", "# wx, wy, wz, x, y, z", velocity]
+        )
+        for frame in range(sequence.frames):
+            _write_frame(sequence, View(side, frame), place)
+    _write_calibration(sequence, folder)
+    views = [View(side, frame) for side in SIDES for frame in range(sequence.frames)]
+    error = row_motion_error.largest_error(sequence, views, lambda view, points: _seen(sequence, view, points))
+    told = row_motion_error.told(error, LAW)
+    if sequence.frames > _LOADED:
+        told.append(f"the loader of DeepUnrollNet takes the first {_LOADED} of {sequence.frames} frames")
+    if sequence.shutter.right_delay:
+        told.append("the two cameras are sequences of their own: that one is late is not said")
+    return {"largest_row_error_px": error, "told": told + about_movers(sequence)}
+
+
+def first_velocity(sequence: Sequence, side: Side) -> tuple[FloatArray, FloatArray]:
+    """Angular and linear velocity (3,) of a camera in its own axes at the first row of frame 0, rad/s and m/s."""
+    linear, angular = camera_velocity(sequence, side, float(sequence.shutter.start(0, side)))
+    return angular, linear
+
+
+def _write_frame(sequence: Sequence, view: View, place: Path) -> None:
+    middle = sequence.shutter.lines(view.side) // 2
+    names = {"rs": picture_file("rs", view.side, view.frame), "gs_f": picture_file("gs", view.side, view.frame)}
+    if middle in sequence.twins:
+        names["gs_m"] = picture_file("gs", view.side, view.frame, middle)
+    for name, file in names.items():
+        write_bytes(place / f"{view.frame:04d}_{name}.png", read_bytes(inside(sequence.folder, file)))
+    for name, depth in (
+        ("rs", sequence.depth("rs", view.side, view.frame)),
+        ("gs_f", sequence.depth("gs", view.side, view.frame)),
+    ):
+        write_bytes(place / f"{view.frame:04d}_{name}.depth", _text(radial(sequence, depth)))
+
+
+def radial(sequence: Sequence, depth: NDArray[np.float32]) -> FloatArray:
+    """Distances (H, W) along the rays of depths z (H, W)."""
+    camera = sequence.rig.camera
+    return depth * np.linalg.norm(camera.unproject(camera.pixel_grid()), axis=-1)
+
+
+def _text(values: FloatArray) -> bytes:
+    """As ``np.savetxt``, with the nine digits of a float32."""
+    stream = io.StringIO()
+    np.savetxt(stream, values, fmt="%.9g")
+    return stream.getvalue().encode()
+
+
+def _write_calibration(sequence: Sequence, folder: Path) -> None:
+    camera, shutter = sequence.rig.camera, sequence.shutter
+    delay_ms = 1e3 * shutter.readout_ratio * sequence.frame_period_s / shutter.lines("left")
+    rows = ["#Rolling shutter camera intrinsic parameters", f"FPS: {number(1.0 / sequence.frame_period_s)}"]
+    rows += [f"ROW_READOUT_TIME(ms): {number(delay_ms)}", f"RESOLUTION_H: {camera.height}"]
+    write_lines(folder / "rs_calib.txt", [*rows, f"RESOLUTION_W: {camera.width}"])
+    values = numbers([camera.fx, camera.fy, camera.cx + CORNER_PX, camera.cy + CORNER_PX])
+    lines = ["# Camera intrinsic parameters", "", "numCameras 2", ""]
+    for k in range(2):
+        lines += [f"devName cam{k}", "# resolution: nCols, nRows", f"resolution {camera.width} {camera.height}"]
+        lines += ["# K: fx fy cx cy with pinhole camera model", f"K {values}", ""]
+    write_lines(folder / "intrinsics.txt", lines)
+
+
+def _seen(sequence: Sequence, view: View, points: Points) -> FloatArray:
+    """Pixels (n, 2) that the law of Carla-RS gives."""
+    w, v = first_velocity(sequence, view.side)
+    shutter = sequence.shutter
+    tau = shutter.line_time(points.pixels[:, 1], view.frame, view.side) - shutter.start(0, view.side)
+    seconds = (sequence.frame_period_s * tau)[:, None]
+    moved = inverse(Pose(so3.exp(seconds * w), seconds * v))
+    start = first_pose(sequence, View(view.side, 0))
+    return row_motion_error.seen_by(sequence, compose(moved, start), points.world)

@@ -1,0 +1,358 @@
+"""Other people's code in a child process: it may raise, exit, crash, hang or print, and fails alone.
+
+A worker starts its child with the first call and keeps it for the next ones. A call that takes longer than its
+limit, or whose child ends, is a failed ``Outcome`` with the reason; the child is killed with all processes of its
+group, and a fresh one serves the next call. What the child prints is captured. The child ends with its parent,
+even if the parent is killed. This is protection against mistakes, not against malice: the code runs as the user,
+and a process that leaves the group survives. Memory is limited where that is asked, by looking ten times a second
+at what the child uses (address space, which a system can limit, is reserved by compilers and BLAS far beyond it).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from multiprocessing.reduction import ForkingPickler
+from types import TracebackType
+from typing import Any, BinaryIO, NoReturn
+
+from rsbench.components.imports import end_with, ending, import_untried
+from rsbench.jobs.plain_data import decode, encode, receive, send
+
+THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+"""Of a process that computes with as many threads as they say."""
+START_LIMIT_S = 300.0
+"""Loading a module, and compiling what it needs, once."""
+NO_ANSWER = "gave no valid answer"
+_POLL_S = 0.1
+_KEPT_BYTES = 8192
+_LONGEST_REASON = 300
+_POSIX = os.name == "posix"
+_COMMAND = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
+    "from rsbench.jobs.isolation import serve_parent; serve_parent(int(sys.argv[2]))"
+)
+Server = Callable[..., object]
+"""Answers one call, in the child: picklable arguments in, plain data out (see ``plain_data``)."""
+
+
+class EntryFailure(Exception):  # noqa: N818  it is no error of ours
+    """Raised in a child where other people's code is at fault; the message is the reason of the failure."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome:
+    """What became of one call."""
+
+    value: Any
+    """The answer, already decoded; None after a failure."""
+    reason: str
+    """Why there is none; empty after a success."""
+    output: str
+    """The end of what the child has printed so far."""
+    ended: bool = False
+    """Whether the process has ended by itself, or was killed by others: not what the call was about, perhaps."""
+
+    @property
+    def success(self) -> bool:
+        return not self.reason
+
+
+class Cancelled(Exception):  # noqa: N818
+    """Raised by a call whose worker was told to stop."""
+
+
+class IsolatedWorker:
+    """A child process that answers calls, one at a time, of any thread; use as a context manager."""
+
+    def __init__(
+        self,
+        factory: Callable[..., Server],
+        *arguments: object,
+        classes: tuple[type, ...] = (),
+        start_limit_s: float = START_LIMIT_S,
+        environment: Mapping[str, str] | None = None,
+        cancel: threading.Event | None = None,
+        memory_mb: float | None = None,
+    ) -> None:
+        """
+        Args:
+            factory: a function of a module of rsbench; called in the child with ``arguments``, returns what
+                answers the calls. Both raise ``EntryFailure`` where the entry is at fault.
+            arguments: picklable.
+            classes: the dataclasses that answers may hold.
+            start_limit_s: time for ``factory``.
+            environment: variables that the child has besides those of this process.
+            cancel: once set, perhaps by another thread, calls end with ``Cancelled``.
+            memory_mb: what the child may use; where the system does not tell what it does, nothing is limited.
+        """
+        self._memory_mb = memory_mb
+        self._start = (factory, arguments)
+        self._classes = {cls.__name__: cls for cls in classes}
+        self._start_limit_s = start_limit_s
+        self._environment = {**os.environ, **(environment or {})}
+        self._cancel = cancel or threading.Event()
+        self._child: _Child | None = None
+        self._one_call = threading.Lock()
+
+    def call(self, *arguments: object, limit_s: float) -> Outcome:
+        """The child's answer, or why there is none.
+
+        Raises:
+            RuntimeError: rsbench's own code in the child is at fault.
+            Cancelled: see ``cancel``.
+        """
+        with self._one_call:  # the answers to two would be mixed up
+            try:
+                if self._child is None:
+                    self._child = _Child(self._environment)
+                    started = self._exchange(self._start, self._start_limit_s)
+                    if not started.success:
+                        self.close()
+                        return replace(started, reason=f"did not start: {started.reason}")
+                return self._exchange(arguments, limit_s)
+            except BaseException:
+                self.close()  # an answer that nobody waits for must not be taken for the next one
+                raise
+
+    def close(self) -> None:
+        """End the child."""
+        if self._child is not None:
+            self._child.kill()
+            self._child = None
+
+    def __enter__(self) -> IsolatedWorker:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: object, trace: TracebackType | None) -> None:
+        self.close()
+
+    def _exchange(self, message: object, limit_s: float) -> Outcome:
+        assert self._child is not None
+        child = self._child
+        data, reason = child.exchange(bytes(ForkingPickler.dumps(message)), limit_s, self._cancel, self._memory_mb)
+        value = None
+        if data is not None:
+            value, reason = self._read(data)
+        else:
+            self.close()
+            last = child.output.strip().rpartition("\n")[2]
+            reason += f"; it last printed: {_short(last)}" if last else ""
+        ended = data is None and not child.overdue
+        return Outcome(value=value, reason=reason, output=child.output, ended=ended)
+
+    def _read(self, data: bytes) -> tuple[Any, str]:
+        """Value and reason of a message of the child."""
+        try:
+            message = decode(data, self._classes)
+        except ValueError as error:
+            return None, f"{NO_ANSWER}: {one_line(error)}"
+        if not (isinstance(message, tuple) and len(message) == 3 and isinstance(message[2], str)):
+            return None, NO_ANSWER
+        status, value, reason = message
+        if status == "bug":
+            raise RuntimeError(f"in a child process:\n{reason}")
+        return value, reason
+
+
+class _Child:
+    """The process, its pipes, and the threads that read them."""
+
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        self.overdue = False
+        """Whether an answer has not come in time, or took too much memory."""
+        self._printed = b""
+        self._lifeline: int | None = None
+        lifeline_end = -1
+        if _POSIX:
+            lifeline_end, self._lifeline = os.pipe()
+        try:
+            self._process = subprocess.Popen(
+                [
+                    sys.executable,
+                    "-u",
+                    "-c",
+                    _COMMAND,
+                    json.dumps([str(entry) for entry in sys.path]),
+                    str(lifeline_end),
+                ],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                start_new_session=True,  # its own process group; a terminal's Ctrl-C is the parent's alone
+                env=environment,
+                pass_fds=(lifeline_end,) if _POSIX else (),
+            )
+        finally:
+            if _POSIX:
+                os.close(lifeline_end)
+        self._answers: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._readers = [
+            threading.Thread(target=read, daemon=True) for read in (self._read_answers, self._read_output)
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    @property
+    def output(self) -> str:
+        return self._printed.decode("utf-8", errors="replace")
+
+    def exchange(
+        self, request: bytes, limit_s: float, cancel: threading.Event, memory_mb: float | None
+    ) -> tuple[bytes | None, str]:
+        """The answer to a request, or None and what became of the process."""
+        # A child that does not read must not hold up its parent.
+        threading.Thread(target=self._send, args=(request,), daemon=True).start()
+        end = time.monotonic() + limit_s
+        while (left := end - time.monotonic()) > 0.0:
+            if cancel.is_set():
+                raise Cancelled
+            if memory_mb is not None and self._used_mb() > memory_mb:
+                self.overdue = True
+                return None, f"used more than {memory_mb:g} MB of memory"
+            ended = self._process.poll() is not None  # its own children may keep the pipe open
+            try:
+                answer = self._answers.get(timeout=0.0 if ended else min(left, _POLL_S))
+            except queue.Empty:
+                if ended:
+                    return None, self._ending()
+                continue
+            return (answer, "") if answer is not None else (None, self._ending())
+        self.overdue = True
+        return None, f"took longer than {limit_s:g} s"
+
+    def _used_mb(self) -> float:
+        """Memory of the process; 0 where the system does not tell."""
+        try:
+            with open(f"/proc/{self._process.pid}/statm", "rb") as file:
+                pages = int(file.read().split()[1])
+        except (OSError, ValueError, IndexError):
+            return 0.0
+        return pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
+
+    def kill(self) -> None:
+        """End the process and its group, and wait for that."""
+        if _POSIX:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.kill()
+        self._process.wait()
+        if self._lifeline is not None:
+            os.close(self._lifeline)
+            self._lifeline = None
+        for reader in self._readers:
+            reader.join(_POLL_S)  # at once, unless a process that has left the group holds the pipe
+        for stream, reader in zip((self._process.stdout, self._process.stderr), self._readers, strict=True):
+            if not reader.is_alive() and stream is not None:
+                stream.close()
+        with contextlib.suppress(OSError, ValueError):
+            if self._process.stdin is not None:
+                self._process.stdin.close()
+
+    def _ending(self) -> str:
+        """How the process has ended; it is given a moment to do so."""
+        try:
+            code = self._process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            return "closed its connection"
+        self._readers[1].join(_POLL_S)  # its last words
+        return ending(code)
+
+    def _send(self, request: bytes) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError, ValueError):  # the child is gone, which the reader tells
+            send(self._process.stdin, request)  # pyrefly: ignore[bad-argument-type]
+
+    def _read_answers(self) -> None:
+        stream: Any = self._process.stdout
+        with contextlib.suppress(OSError, ValueError):
+            while (answer := receive(stream)) is not None:
+                self._answers.put(answer)
+        self._answers.put(None)
+
+    def _read_output(self) -> None:
+        stream: Any = self._process.stderr
+        with contextlib.suppress(OSError, ValueError):
+            while part := stream.read1(_KEPT_BYTES):
+                self._printed = (self._printed + part)[-_KEPT_BYTES:]
+
+
+def one_line(error: BaseException) -> str:
+    """An exception in one short line."""
+    return _short(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
+
+
+def _short(text: str) -> str:
+    text = " ".join(text.split())
+    return text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]} ..."
+
+
+# In the child
+
+
+def use_one_thread() -> None:
+    """For OpenCV what ``THREAD_VARIABLES`` are for the others."""
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
+def serve_parent(lifeline: int) -> NoReturn:
+    """Answer the parent until it is gone."""
+    if lifeline >= 0:
+        end_with(lifeline)  # elsewhere than on Linux ``_listen`` does it, as soon as Python runs
+    import_untried()
+    requests, answers = _take_streams()
+    waiting: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(requests, waiting), daemon=True).start()
+    server: Server = _start
+    while True:
+        data = waiting.get()
+        message: tuple[str, object, str]
+        try:
+            value = server(*ForkingPickler.loads(data))
+            if server is _start:
+                server, value = value, None  # pyrefly: ignore[bad-assignment]
+            message = ("answer", value, "")
+            reply = encode(message)
+        except EntryFailure as error:
+            reply = encode(("failed", None, _short(str(error))))
+        except Exception:
+            reply = encode(("bug", None, traceback.format_exc()))
+        send(answers, reply)
+
+
+def _start(factory: Callable[..., Server], arguments: tuple[object, ...]) -> Server:
+    return factory(*arguments)
+
+
+def _take_streams() -> tuple[BinaryIO, BinaryIO]:
+    """Streams to the parent, out of the way of whatever reads standard input or prints."""
+    requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
+    os.dup2(2, 1)
+    return requests, answers
+
+
+def _listen(requests: BinaryIO, waiting: queue.SimpleQueue[bytes]) -> None:
+    while (data := receive(requests)) is not None:
+        waiting.put(data)
+    _end_group()
+
+
+def _end_group() -> NoReturn:
+    if _POSIX:
+        os.killpg(os.getpgrp(), signal.SIGKILL)
+    os._exit(1)

@@ -1,0 +1,240 @@
+"""A sliding window of two frames over a sequence: every frame is corrected with the motion to the next one."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.capture.readout import ReadoutEstimate, combined
+from rsbench.capture.rectification import RefusedFramesError
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
+from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.pipeline.chain import Given, check_cameras, correct_known, find_depth
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.footage import FrameSource, check_alike
+from rsbench.pipeline.frame_depth import Images, Pairs, frame_pair
+from rsbench.pipeline.frame_motion import (
+    FoundMotion,
+    NoMotionError,
+    check_readout,
+    find_readout,
+    match_frames,
+    solve_frames,
+)
+from rsbench.vision.fusion import Fused
+from rsbench.vision.stereo_matcher import needs_motion
+
+_JUDGED = 3
+"""First windows whose rig is looked at; when all of them are refused, so is the sequence."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Window:
+    """What was found for two consecutive frames; ``found`` is None and ``reason`` says why when no motion was."""
+
+    images: Images
+    pairs: Pairs | None
+    """With depth from the other camera; None when the corrector needs none, or it is found with the motion."""
+    found: FoundMotion | None
+    reason: str = ""
+    matches: Correspondences | None = None
+    """None when the corrector needs none, or they were refused."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CorrectedMoment:
+    """Both images of one time of a sequence."""
+
+    number: int
+    images: dict[Side, NDArray[Any]]
+    """As they were read."""
+    frames: dict[Side, Fused]
+    """Corrected; empty when a motion was needed and not found, or the corrector found no correction."""
+    found: FoundMotion | None
+    reason: str
+    """Why no motion leads from here to the next frame, or why there is no correction; empty when neither is so, or
+    when this is the last frame."""
+
+
+def estimate_sequence_readout(
+    left: FrameSource,
+    right: FrameSource,
+    rig: StereoRig,
+    options: CorrectionOptions,
+    disparity_offset: float | None = None,
+) -> ReadoutEstimate:
+    """Readout ratio and disparity offset of a sequence, from all of its windows.
+
+    Args:
+        disparity_offset: see ``solve_frames``.
+
+    Raises:
+        RefusedFramesError: the first windows cannot be what they are said to be, or time runs backwards.
+        NoMotionError: the windows do not determine the ratio.
+    """
+    estimates, refusals = list[ReadoutEstimate](), _Refusals(left)
+    for number, images in enumerate(_window_images(left, right)):
+        try:
+            matches = match_frames(images, rig, options, judge_rig=number < _JUDGED)
+        except RefusedFramesError as error:
+            refusals.add(number, error)
+            continue
+        estimate = find_readout(matches, rig, options, disparity_offset)
+        if estimate is not None and np.isfinite(estimate.sigma):
+            estimates.append(estimate)
+    refusals.end(number + 1)
+    if not estimates:
+        raise NoMotionError("no window of the sequence determines the readout ratio: put it into the rig's card")
+    found = combined(estimates)
+    check_readout(found)
+    return found
+
+
+def correct_sequence(
+    left: FrameSource,
+    right: FrameSource,
+    rig: StereoRig,
+    readout_ratio: float,
+    options: CorrectionOptions,
+    disparity_offset: float = 0.0,
+    scanning: Scanning | None = None,
+) -> Iterator[CorrectedMoment]:
+    """Every frame of a sequence corrected, in order; the last one with the motion from the one before.
+
+    A frame from which no motion leads to the next uses the motion that led to it; without either it is given
+    back uncorrected. Both say why.
+
+    Args:
+        disparity_offset: what a disparity is too large by, px.
+        scanning: how the cameras read their lines; None: rows from the top, both at once.
+
+    Raises:
+        RefusedFramesError: the first three windows, or all, cannot be what they are said to be.
+        RsbenchError: frames that differ in size, or cannot be read; cameras that the options do not take.
+    """
+    scanning = scanning or Scanning()
+    check_cameras(rig, scanning, options, readout_ratio, disparity_offset)
+    shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
+    last: Window | None = None
+    number = -1
+    for number, window in enumerate(_windows(left, right, rig, shutter, options, disparity_offset)):
+        yield _moment(number, 0, [window] if last is None else [window, last], rig, shutter, options)
+        last = window
+    if last is not None:
+        yield _moment(number + 1, 1, [last], rig, shutter, options)
+
+
+class _Refusals:
+    """Windows that were refused; when these are all that were seen first, or all, so is the sequence."""
+
+    def __init__(self, source: FrameSource) -> None:
+        self._source, self._count = source, 0
+        self._last: RefusedFramesError | None = None
+
+    def add(self, number: int, error: RefusedFramesError) -> None:
+        """Window ``number`` was refused."""
+        self._count, self._last = self._count + 1, error
+        if number + 1 == _JUDGED:
+            self.end(_JUDGED)
+
+    def end(self, windows: int) -> None:
+        """There are no more than ``windows``."""
+        if self._last is not None and self._count == windows:
+            raise RefusedFramesError(self._last.reason, f"{self._source.path}, frames 0 to {windows}")
+
+
+def _window_images(left: FrameSource, right: FrameSource) -> Iterator[Images]:
+    for pair in itertools.pairwise(_both(left, right)):
+        yield {(side, frame): both[side] for frame, both in enumerate(pair) for side in SIDES}
+
+
+def _windows(
+    left: FrameSource,
+    right: FrameSource,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    options: CorrectionOptions,
+    offset: float,
+) -> Iterator[Window]:
+    needs, refusals, second = options.corrector.component.spec.needs, _Refusals(left), None
+    number = -1
+    for number, images in enumerate(_window_images(left, right)):
+        pairs = None
+        if "depth" in needs and shutter.rows_together and not needs_motion(options.matcher):
+            first = second or frame_pair(images["left", 0], images["right", 0], rig, options, offset)
+            second = frame_pair(images["left", 1], images["right", 1], rig, options, offset)
+            pairs = first, second
+        found, reason, matches = None, "", None
+        if needs & {"motion", "matches"}:
+            try:
+                judged, scanning = number < _JUDGED, shutter.scanning
+                matches = match_frames(images, rig, options, scanning, judge_rig=judged)
+                if "motion" in needs:
+                    found, _, _ = solve_frames(matches, rig, shutter.readout_ratio, options, offset, scanning)
+            except NoMotionError as error:
+                reason = str(error)
+            except RefusedFramesError as error:
+                refusals.add(number, error)
+                reason = error.reason
+        yield Window(images=images, pairs=pairs, found=found, reason=reason, matches=matches)
+    refusals.end(number + 1)
+
+
+def _moment(
+    number: int,
+    frame: int,
+    windows: list[Window],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    options: CorrectionOptions,
+) -> CorrectedMoment:
+    """Frame 0 or 1 of the first window; as frame 1 of the second one when only that knows a motion."""
+    here, needs = windows[0], options.corrector.component.spec.needs
+    images = {side: here.images[side, frame] for side in SIDES}
+    places = list(zip(windows, (frame, 1), strict=False))
+    if "motion" in needs:
+        places = [(window, place) for window, place in places if window.found is not None]
+    elif "matches" in needs:
+        places = [(window, place) for window, place in places if window.matches is not None]
+    if not places:
+        return CorrectedMoment(number=number, images=images, frames={}, found=None, reason=here.reason)
+    window, place = places[0]
+    motion = None if window.found is None else window.found.motion
+    pairs = window.pairs
+    if "depth" in needs:
+        pairs = find_depth(window.images, rig, shutter, motion, options, pairs)
+    views = tuple((side, place) for side in SIDES)
+    offset = 0.0 if window.found is None else window.found.disparity_offset
+    known = Given(matches=window.matches, motion=motion, pairs=pairs)
+    fused = correct_known(window.images, known, rig, shutter, options, views, offset)
+    for (side, _), each in fused.items():
+        if not each.success:
+            why = f"{side}: {each.reason}"
+            return CorrectedMoment(number=number, images=images, frames={}, found=window.found, reason=why)
+    frames = {side: fused[side, place] for side in SIDES}
+    return CorrectedMoment(
+        number=number, images=images, frames=frames, found=window.found, reason=here.reason if frame == 0 else ""
+    )
+
+
+def _both(left: FrameSource, right: FrameSource) -> Iterator[dict[Side, NDArray[Any]]]:
+    """Left and right image of every time, all alike."""
+    first: NDArray[Any] | None = None
+    number = -1
+    for number, (a, b) in enumerate(itertools.zip_longest(left, right)):
+        if a is None or b is None:
+            shorter, longer = (left, right) if a is None else (right, left)
+            raise RsbenchError(f"{shorter.path}: has {number} frames, fewer than {longer.path}")
+        first = a if first is None else first
+        check_alike({f"{left.path}, frame 0": first, f"{left.path}, frame {number}": a})
+        check_alike({f"{left.path}, frame {number}": a, f"{right.path}, frame {number}": b})
+        yield {"left": a, "right": b}
+    if number < 1:
+        raise RsbenchError(f"{left.path}: has {number + 1} frames; at least 2 are needed")

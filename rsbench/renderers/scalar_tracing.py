@@ -1,0 +1,109 @@
+"""Tracing ray by ray with ``scalar_rgb``, where no LLVM works: slow, and free of any compiler.
+
+The same formulas as the wavefront, sample for sample; only rounding differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.renderers.exposure import instant_of
+from rsbench.renderers.gloss import is_glossy
+from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
+from rsbench.renderers.moving_objects import Placed, depth_and_label, placed
+from rsbench.renderers.options import RendererOptions
+from rsbench.renderers.pixel_samples import facet_points, sky_ways, subpixel_grid
+from rsbench.renderers.ray_hits import Hits
+from rsbench.renderers.scene import MitsubaScene
+
+Float32Array = NDArray[np.float32]
+
+
+def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]) -> Hits:
+    """What the rays through pixel centres meet."""
+    import mitsuba as mi
+
+    depth, labels, gloss = result = Hits.none(len(rows), camera.width)
+    for place, row in enumerate(rows):
+        for column in range(camera.width):
+            pose = column if sensor.columns else row
+            ray = mi.Ray3f(*sensor.row_ray(float(column), float(row), pose))
+            if scene.objects:
+                found = depth_and_label(scene, ray, True, placed(scene, sensor, pose))
+                depth[place, column], labels[place, column], bsdf = found
+            else:
+                hit = scene.scene.ray_intersect_preliminary(ray)
+                depth[place, column] = hit.t if hit.is_valid() else 0.0
+                bsdf = hit.shape.bsdf() if hit.is_valid() else None
+            gloss[place, column] = bsdf is not None and is_glossy(bsdf, True)
+    return result
+
+
+def radiance_rows(
+    scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
+) -> Float32Array:
+    """Linear RGB (rows, width, 3): the mean over the sub-pixel grid (a box filter)."""
+    trace = _sunsky if options.integrator == "sunsky" else _path
+    grid = subpixel_grid(options.samples).tolist()
+    result = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
+    for place, row in enumerate(rows):
+        for column in range(camera.width):
+            total = np.zeros(3, dtype=np.float32)
+            for number, (dx, dy) in enumerate(grid):
+                pixel, pose = row * camera.width + column, column if sensor.columns else row
+                if sensor.instants > 1:
+                    instant = instant_of(options.seed, pixel, number, options.samples, sensor.instants)
+                    pose += sensor.lines * int(instant)
+                origin, direction = sensor.row_ray(column + dx, row + dy, pose)
+                objects = placed(scene, sensor, pose)
+                light = trace(scene, origin, direction, options, pixel, number, objects)
+                total += np.asarray(light, dtype=np.float32)
+            result[place, column] = total / np.float32(options.samples)
+    return result
+
+
+def _sunsky(
+    scene: MitsubaScene,
+    origin: Any,
+    direction: Any,
+    options: RendererOptions,
+    pixel: int,
+    sample: int,
+    objects: list[Placed],
+) -> Any:
+    import drjit as dr
+    import mitsuba as mi
+
+    ways = [mi.Vector3f(*way) for way in _ways(options.samples, options.sky_rays)[sample]]
+    facet = mi.Point2f(facet_points(options.samples)[sample].tolist()) if scene.glossy else None
+    return sunsky_radiance(scene, mi.Ray3f(origin, dr.normalize(direction)), True, ways, objects, facet)
+
+
+@cache
+def _ways(samples: int, rays: int) -> Any:
+    return sky_ways(samples, rays).tolist() if rays else [[]] * samples
+
+
+def _path(
+    scene: MitsubaScene,
+    origin: Any,
+    direction: Any,
+    options: RendererOptions,
+    pixel: int,
+    sample: int,
+    objects: list[Placed],
+) -> Any:
+    import drjit as dr
+    import mitsuba as mi
+
+    sampler = lane_sampler()
+    sampler.seed_lanes(options.seed, pixel, sample)
+    ray = mi.RayDifferential3f(origin, dr.normalize(direction))
+    radiance, _, _ = path_integrator(options.max_depth).sample(scene.scene, sampler, ray)
+    return radiance

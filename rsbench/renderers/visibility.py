@@ -1,0 +1,171 @@
+"""Rays between eyes and points of our own choice: what stands between them, and what surface is met."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.components.compiled import compiled
+from rsbench.core.moving_objects import MovingObject
+from rsbench.core.se3 import inverse, transform
+from rsbench.core.so3 import FloatArray
+from rsbench.renderers.scene import MitsubaScene
+from rsbench.renderers.sensor import LEAST_COMPONENT
+
+REACH = 1.0 - 1e-4
+"""Share of the way to the point that must be free. The rest is the point's own surface: rays and points are
+rounded to float32, so a ray that grazes a surface meets it a little early."""
+
+
+class Surfaces(NamedTuple):
+    """What rays (n,) meet first."""
+
+    normals: NDArray[np.float32]
+    """(n, 3) of the triangles, towards the eye, world frame; 0 where nothing is met."""
+    instances: NDArray[np.uint16]
+    """(n,) numbers of meshes from 1, in the order of ``MitsubaScene.instances``; 0 where nothing is met."""
+
+
+@dataclass(frozen=True)
+class SceneRays:
+    """Rays through a scene; eyes and points (n, 3) are in its frame, metres."""
+
+    scene: MitsubaScene
+    objects: Sequence[MovingObject] = ()
+    """Those of the scene that move; without them, only what stands still is there."""
+
+    def blocked(self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None) -> NDArray[np.bool_]:
+        """Whether (n,) a surface stands before the points, at times (n,): where objects move, these are needed."""
+        found = blocked(self.scene.scene, eyes, points)
+        for scene, each in zip(self.scene.objects, self._objects(tau), strict=False):
+            left = np.flatnonzero(~found)
+            own = inverse(each.world_from_object(_at(tau, left)))
+            found[left] = blocked(scene, transform(own, eyes[left]), transform(own, points[left]))
+        return found
+
+    def share(self, eyes: FloatArray, points: FloatArray) -> FloatArray:
+        """Share (n,) of the way to the points, or beyond them, at which the first surface is met; inf: at none.
+
+        Of what stands still.
+        """
+        hits = [self.scene.scene.ray_intersect_preliminary(ray, coherent=True) for ray in _rays(eyes, points)]
+        met = np.concatenate([np.atleast_1d(np.array(hit.t, dtype=np.float64)) for hit in hits])
+        return np.where(np.isfinite(met), met, np.inf)
+
+    def surfaces(self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None) -> Surfaces:
+        """What is met on the way to the points and beyond; ``tau`` as of ``blocked``."""
+        met = _met(self.scene.scene, eyes, points)
+        for scene, each in zip(self.scene.objects, self._objects(tau), strict=False):
+            pose = each.world_from_object(_at(tau, slice(None)))
+            own = inverse(pose)
+            other = _met(scene, transform(own, eyes), transform(own, points))
+            nearer = other.distance < met.distance
+            turned = (pose.R @ other.normals[..., None])[..., 0].astype(np.float32)
+            met.normals[nearer], met.instances[nearer] = turned[nearer], other.instances[nearer]
+            met.distance[nearer] = other.distance[nearer]
+        return Surfaces(met.normals, met.instances)
+
+    def _objects(self, tau: FloatArray | None) -> Sequence[MovingObject]:
+        if self.objects and tau is None:
+            raise ValueError("objects move: rays need times")
+        return self.objects
+
+
+class _Met(NamedTuple):
+    normals: NDArray[np.float32]
+    instances: NDArray[np.uint16]
+    distance: NDArray[np.float32]
+    """(n,) in units of the way to the points."""
+
+
+def _at(tau: FloatArray | None, chosen: Any) -> FloatArray:
+    return np.asarray(tau)[chosen]
+
+
+def blocked(scene: Any, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
+    """See ``SceneRays.blocked``, of one scene of Mitsuba."""
+    found = [np.zeros(0, dtype=np.bool_)]
+    for ray in _rays(eyes, points):
+        ray.maxt = REACH
+        found.append(np.atleast_1d(np.array(scene.ray_test(ray, coherent=True), dtype=np.bool_)))
+    return np.concatenate(found)
+
+
+def _met(scene: Any, eyes: FloatArray, points: FloatArray) -> _Met:
+    """See ``SceneRays.surfaces``, of one scene of Mitsuba."""
+    import drjit as dr
+    import mitsuba as mi
+
+    found = []
+    for ray in _rays(eyes, points):
+        hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True)
+        dr.eval(hit.n, hit.t, hit.shape)  # together: asked for one by one, each traces the rays again
+        normals, ways = (np.array(each, dtype=np.float32).reshape(3, -1) for each in (hit.n, ray.d))
+        numbers, distance = _numbers(scene, hit), np.atleast_1d(np.array(hit.t, dtype=np.float32))
+        found.append((_towards_eyes(normals, ways, numbers), numbers, distance))
+    return _Met(*(each[0] if len(each) == 1 else np.concatenate(each) for each in zip(*found, strict=True)))
+
+
+def _numbers(scene: Any, hit: Any) -> NDArray[np.uint16]:
+    import drjit as dr
+    import mitsuba as mi
+
+    if not _wide():
+        return np.array([_number(hit.shape) if hit.is_valid() else 0], dtype=np.uint16)
+    keys = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
+    table = np.zeros(np.max(keys) + 1, dtype=np.uint16)
+    table[keys] = [_number(shape) for shape in scene.shapes()]
+    return table[np.array(dr.reinterpret_array(mi.UInt32, hit.shape))]
+
+
+def _number(shape: Any) -> int:
+    return 1 + int(str(shape.id()).removeprefix("mesh"))
+
+
+def _wide() -> bool:
+    """Whether the backend traces arrays of rays."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return bool(dr.is_jit_v(mi.Float))
+
+
+def _rays(eyes: FloatArray, points: FloatArray) -> list[Any]:
+    """Rays whose parameter is 1 at the points: one array of all of them, or each alone."""
+    import mitsuba as mi
+
+    origins, ways = np.zeros((2, 3, len(points)), dtype=np.float32)
+    _fill_rays(eyes, points, origins, ways)
+    if _wide():
+        return [mi.Ray3f(mi.Point3f(origins), mi.Vector3f(ways))]
+    return [mi.Ray3f(o, d) for o, d in zip(origins.T.tolist(), ways.T.tolist(), strict=True)]
+
+
+@compiled
+def _fill_rays(
+    eyes: FloatArray, points: FloatArray, origins: NDArray[np.float32], ways: NDArray[np.float32]
+) -> None:
+    """Origins and ways (3, n) in one pass: NumPy's, a component at a time, takes as long as tracing them."""
+    for n in range(points.shape[0]):
+        for k in range(3):
+            way = np.float32(points[n, k] - eyes[n, k])
+            origins[k, n] = eyes[n, k]
+            ways[k, n] = np.float32(0.0) if abs(way) < LEAST_COMPONENT else way  # NaN stays
+
+
+@compiled
+def _towards_eyes(
+    normals: NDArray[np.float32], ways: NDArray[np.float32], numbers: NDArray[np.uint16]
+) -> NDArray[np.float32]:
+    """Normals (n, 3) of those (3, n) that are met by ways (3, n); 0 where the number (n,) is."""
+    out = np.zeros((numbers.size, 3), np.float32)
+    for n in np.flatnonzero(numbers):
+        along = normals[0, n] * ways[0, n] + normals[1, n] * ways[1, n] + normals[2, n] * ways[2, n]
+        sign = np.float32(-1.0) if along > 0 else np.float32(1.0)
+        for k in range(3):
+            out[n, k] = sign * normals[k, n] + np.float32(0.0)  # no -0
+    return out

@@ -1,0 +1,302 @@
+"""Files of a dataset: exact, deterministic bytes, written so that a killed run leaves no half file."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import io
+import json
+import os
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
+from rsbench.core.se3 import Pose
+from rsbench.core.so3 import FloatArray
+from rsbench.storage.untrusted_files import check_image_size, check_size, read_bytes, read_text
+from rsbench.storage.untrusted_files import load_arrays as load_arrays
+from rsbench.storage.untrusted_files import read_json as read_json
+from rsbench.storage.work_folder import refuse_url
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MATCH_SETS = ("left", "right", "stereo_0", "stereo_1", "tracks")
+_SET = 255
+"""In a mask."""
+POSE_COLUMNS = "row,tau,qw,qx,qy,qz,tx,ty,tz"
+
+
+def sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write through a temporary file in the same folder, so the name never holds half of it.
+
+    Raises:
+        RsbenchError: one line with the file, the bytes that it needs, the reason and a remedy.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        partial.unlink(missing_ok=True)  # of a run that was killed; a link there leads elsewhere
+        with partial.open("xb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(partial, path)
+    except OSError as error:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        remedy = "make room there and run the same command again" if full else "choose another --out"
+        raise RsbenchError(f"{path}: cannot be written, {len(data)} bytes: {error.strerror}; {remedy}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+
+
+def check_out(out: Path) -> None:
+    """See that a folder of results can be made or written: before minutes of work, not after. Leaves nothing.
+
+    Raises:
+        RsbenchError: it cannot.
+    """
+    refuse_url(out)
+    try:
+        place = next(path for path in (out, *out.absolute().parents) if path.exists() or path.is_symlink())
+        tempfile.TemporaryFile(dir=place).close()
+    except OSError as error:
+        raise RsbenchError(f"{out}: cannot be written: {error.strerror}; choose another --out") from error
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    write_bytes(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """8-bit image (H, W, 3) RGB or (H, W)."""
+    pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    ok, data = cv2.imencode(".png", pixels)
+    if not ok:
+        raise ValueError(f"cannot encode an image of shape {image.shape} and type {image.dtype}")
+    write_bytes(path, data.tobytes())
+
+
+def read_png(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+    """RGB image (H, W, 3) uint8.
+
+    Args:
+        path: of an image file.
+        size: width and height that it must have; without them, it is of at most ``reading.PIXELS``.
+
+    Raises:
+        RsbenchError: missing, not an image or of another size.
+    """
+    data = read_bytes(path)
+    check_image_size(data, path, size)
+    pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
+    if pixels is None:
+        raise RsbenchError(f"{path}: cannot be decoded as an image")
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def write_png16(path: Path, image: NDArray[np.uint16]) -> None:
+    """16-bit image (H, W)."""
+    write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
+
+
+def read_grey_png(path: Path, size: tuple[int, int] | None = None, bits: Literal[8, 16] = 8) -> NDArray[Any]:
+    """Image (H, W) uint8 or uint16 of one channel; ``size`` as of ``read_png``.
+
+    Raises:
+        RsbenchError: missing, no such image or of another size.
+    """
+    data = read_bytes(path)
+    check_image_size(data, path, size)
+    pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype != np.dtype(f"uint{bits}") or pixels.ndim != 2:
+        raise RsbenchError(f"{path}: must be a grey image of {bits} bits")
+    return np.asarray(pixels)
+
+
+def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
+    """Grey PNG of 8 bits: 255 where the mask (H, W) is set, 0 elsewhere."""
+    write_png(path, np.where(mask, np.uint8(_SET), np.uint8(0)))
+
+
+def read_mask(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
+    """Mask (H, W); ``size`` as of ``read_png``.
+
+    Raises:
+        RsbenchError: as of ``read_grey_png``, or values other than 0 and 255.
+    """
+    values = read_grey_png(path, size)
+    if not np.isin(values, (0, _SET)).all():
+        raise RsbenchError(f"{path}: must hold 0 and {_SET} alone")
+    return np.asarray(values > 0)
+
+
+def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
+    """float32 channel Z (H, W), metres, 0 = no surface; lossless ZIP."""
+    write_exr(path, {"Z": depth})
+
+
+def write_exr(path: Path, channels: Mapping[str, NDArray[np.float32]], half: bool = False) -> None:
+    """float32 channels (H, W) by name, or float16 where ``half``; lossless ZIP."""
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    kind = np.float16 if half else np.float32
+    pixels = {name: np.ascontiguousarray(each, dtype=kind) for name, each in channels.items()}
+    content = io.BytesIO()  # OpenEXR does not tell of a full disk in one way, write_bytes does
+    with OpenEXR.File(header, pixels) as file:
+        file.write(content)
+    write_bytes(path, content.getvalue())
+
+
+def read_depth(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
+    """Channel Z (H, W) float32, metres, 0 = no surface; ``size`` as of ``read_png``.
+
+    Raises:
+        RsbenchError: see ``read_exr``; or negative or non-finite depth.
+    """
+    depth = read_exr(path, ("Z",), size)[..., 0]
+    if not np.all(np.isfinite(depth)) or np.any(depth < 0):
+        raise RsbenchError(f"{path}: depth must be finite and not negative (0 = no surface)")
+    return depth
+
+
+def read_exr(
+    path: Path, names: tuple[str, ...], size: tuple[int, int] | None = None, half: bool = False
+) -> NDArray[np.float32]:
+    """Channels (H, W, channels) float32 in the order of ``names``; ``size`` as of ``read_png``.
+
+    Raises:
+        RsbenchError: missing, damaged, of another size, or with anything but these float32 channels in scanlines,
+            or float16 ones where ``half``.
+    """
+    import OpenEXR
+
+    data = read_bytes(path)
+    try:
+        with OpenEXR.File(io.BytesIO(data), header_only=True) as file:
+            _check_exr_header([part.header for part in file.parts], path, names, size)
+        with OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:
+            pixels = [np.array(file.channels()[name].pixels) for name in names]
+    except RsbenchError:
+        raise
+    except Exception as error:  # OpenEXR raises plain RuntimeError, ValueError and others for damaged files
+        raise RsbenchError(f"{path}: damaged or not an EXR file ({str(error).splitlines()[0]})") from error
+    for name, each in zip(names, pixels, strict=True):
+        if each.dtype != (np.float16 if half else np.float32) or each.ndim != 2:
+            raise RsbenchError(f"{path}: must hold a float{16 if half else 32} channel {name}")
+    return np.stack(pixels, axis=-1).astype(np.float32, copy=False)
+
+
+def _check_exr_header(
+    headers: list[dict[str, Any]], path: Path, names: tuple[str, ...], size: tuple[int, int] | None
+) -> None:
+    """Before pixels are decoded: one part, these channels, and not more of them than there should be."""
+    import OpenEXR
+
+    found = sorted(channel.name for header in headers for channel in header["channels"])
+    if len(headers) != 1 or headers[0]["type"] != OpenEXR.scanlineimage or found != sorted(names):
+        of = "one channel, Z," if names == ("Z",) else f"the channels {', '.join(names)}"
+        raise RsbenchError(f"{path}: must hold one part of scanlines with {of} of float32")
+    first, last = headers[0]["dataWindow"]
+    width, height = (int(end) - int(start) + 1 for start, end in zip(first, last, strict=True))
+    check_size(path, (width, height), size)
+
+
+def write_poses(path: Path, tau: FloatArray, poses: Pose) -> None:
+    """One line per row: tau and ``cam_from_world`` as unit quaternion and translation, exact decimal numbers."""
+    table = np.concatenate([tau[:, None], so3.quaternion(poses.R), poses.t], axis=1)
+    lines = [f"{row}," + ",".join(repr(float(x)) for x in values) for row, values in enumerate(table)]
+    write_bytes(path, ("\n".join([POSE_COLUMNS, *lines]) + "\n").encode())
+
+
+def read_poses(path: Path) -> tuple[FloatArray, Pose]:
+    """Row times (H,) and ``cam_from_world`` of every row.
+
+    Raises:
+        RsbenchError: missing or not in the format of ``write_poses``.
+    """
+    table = read_pose_table(path)
+    return table[:, 1], Pose(so3.from_quaternion(table[:, 2:6]), table[:, 6:9])
+
+
+def read_pose_table(path: Path) -> FloatArray:
+    """The numbers (H, 9) of a file of poses as they stand there, in the order of ``POSE_COLUMNS``.
+
+    Raises:
+        RsbenchError: see ``read_poses``.
+    """
+    lines = read_text(path).splitlines()
+    try:
+        table = np.array([[float(x) for x in line.split(",")] for line in lines[1:]])
+    except ValueError as error:
+        raise RsbenchError(f"{path}: not a table of numbers: {error}") from error
+    if not lines or lines[0] != POSE_COLUMNS or table.ndim != 2 or table.shape[1] != 9:
+        raise RsbenchError(f"{path}: must have the columns {POSE_COLUMNS}")
+    if not np.all(np.isfinite(table)) or not np.array_equal(table[:, 0], np.arange(len(table))):
+        raise RsbenchError(f"{path}: rows must be numbered 0, 1, ... with finite numbers")
+    return table
+
+
+def save_matches(path: Path, matches: Correspondences) -> None:
+    """The sets of every matcher, and what few give where this one does."""
+    rare = {name: rows for name in ("lines", "affine") if len(rows := getattr(matches, name))}
+    save_arrays(path, {name: getattr(matches, name) for name in MATCH_SETS} | rare)
+
+
+def load_matches(path: Path) -> Correspondences:
+    """Raises RsbenchError as ``load_arrays``, and for arrays that are no matches."""
+    try:
+        return Correspondences(**load_arrays(path))
+    except (TypeError, ValueError) as error:
+        raise RsbenchError(f"{path}: {error}") from error
+
+
+def save_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    """Compressed npz, written atomically."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def read_table(
+    path: Path, columns: Iterable[str] = (), numbers: Iterable[str] = (), **options: Any
+) -> pd.DataFrame:
+    """A CSV file; ``options`` are those of ``pandas.read_csv``.
+
+    Raises:
+        RsbenchError: it cannot be read, is no table, lacks one of the ``columns`` or ``numbers``, or holds
+            something else among the numbers.
+    """
+    import pandas as pd
+
+    try:
+        table = pd.read_csv(io.StringIO(read_text(path)), **options)
+    except ValueError as error:  # of pandas, all that a damaged table is
+        raise RsbenchError(f"{path}: not a table: {' '.join(str(error).split())}") from error
+    for name in (*columns, *numbers):
+        if name not in table:
+            raise RsbenchError(f"{path}: lacks the column {name!r}")
+    for name in numbers if len(table) else ():
+        if not pd.api.types.is_numeric_dtype(table[name]) or pd.api.types.is_bool_dtype(table[name]):
+            raise RsbenchError(f"{path}: the column {name!r} must hold numbers")
+    return table
+
+
+def write_table(path: Path, frame: pd.DataFrame) -> None:
+    """CSV with enough digits to compare runs and few enough to read."""
+    write_bytes(path, frame.to_csv(index=False, float_format="%.6g", lineterminator="\n").encode())

@@ -1,0 +1,234 @@
+"""Results on a store: a command works in a folder of this machine, and its files go there as they come to be.
+
+The folder lies in the user's cache. ``sent.json`` beside it says what was sent or brought, and what is about to
+be: so a later command knows whether the folder is ahead of the store, or others have changed the store since.
+
+Files are sent in the order in which they were written, so that the store is as the folder was a moment ago: what
+says of others that they are complete comes after them. Of the hidden folder of a command, what a later run can use
+goes there too: another machine goes on from it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import stat
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from rsbench.core.errors import RsbenchError
+from rsbench.storage.file_hashes import HASHES
+from rsbench.storage.files import read_json, write_json
+from rsbench.storage.object_store import Store, cache_of, open_store
+from rsbench.storage.work_folder import HIDDEN, LOCK, WORK, files_below, remove, workplace
+
+_BEAT_S = 30.0
+_BROUGHT = 64
+"""Files that are asked for together."""
+_MARK = f"{HIDDEN}/{LOCK}"
+"""Makes the hidden folder one of rsbench's: empty at the store, where nothing can be locked."""
+_OF_THIS_MACHINE = (_MARK, HASHES)
+_urls: dict[Path, str] = {}
+"""Of the folders that are open in this process."""
+
+
+class _Known(NamedTuple):
+    """A file of the folder and its object, when they were last the same."""
+
+    here: str
+    """Time and size; empty: removed here, to be removed there."""
+    there: str
+    """Size and token; empty: being sent."""
+
+
+class _Mirror:
+    def __init__(self, store: Store, hidden: Path) -> None:
+        self.folder = hidden / "results"
+        self._store, self._work, self._record = store, hidden / WORK, hidden / "sent.json"
+        self._known: dict[str, _Known] = {}
+        try:
+            self._known = {path: _Known(*known) for path, known in read_json(self._record).items()}
+        except (RsbenchError, TypeError):  # none yet, or damaged: nobody knows what the folder holds
+            remove(self.folder)
+
+    def bring(self) -> None:
+        """Make the folder what the store is; or, where it has gone on from there, add what it lacks."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        here, there = self._here(), self._there()
+        if self._is_ahead(here, there):
+            wanted = there.keys() - self._known.keys() - here.keys()
+        else:
+            same = {path for path in there if self._known.get(path) == (here.get(path), there[path])}
+            for path in here.keys() - same:
+                self._drop(path)
+            wanted = there.keys() - same
+            self._known = {path: self._known[path] for path in same}
+        self._save()
+        due = sorted(wanted)
+        for first in range(0, len(due), _BROUGHT):
+            self._download(due[first : first + _BROUGHT], there)
+        if (self.folder / HIDDEN).is_dir():
+            (self.folder / _MARK).touch()
+        (self._work / LOCK).touch()
+        self._store.upload({_MARK: self._work / LOCK})  # before minutes of work: whether it can be written
+
+    def send(self) -> None:
+        """Make the store what the folder is. What is about to be done is written down first."""
+        here = self._here()
+        due = [path for path, now in here.items() if not self._is_sent(path, now)]
+        gone = sorted(self._known.keys() - here.keys())
+        if not due and not gone:
+            return
+        self._known |= {path: _Known(here[path], "") for path in due}
+        self._known |= {path: _Known("", self._known[path].there) for path in gone}
+        self._save()
+        self._remove(path for path in gone if not _is_hidden(path))  # old results must not be among new ones
+        for path in due:
+            self._upload(path)
+        self._remove(path for path in gone if _is_hidden(path))  # the results that were made of it are there now
+        there = self._there()
+        self._known |= {path: _Known(here[path], there[path]) for path in due if path in there}
+        for path in {*gone, *(path for path in due if path not in there)}:
+            del self._known[path]
+        self._save()
+
+    def keep_sending(self, done: threading.Event) -> None:
+        """What fails is tried again; the last time, it is told."""
+        while not done.wait(_BEAT_S):
+            with contextlib.suppress(RsbenchError, OSError):
+                self.send()
+
+    def finish(self) -> None:
+        try:
+            self.send()
+            if not any(map(_is_hidden, self._known)):
+                self._store.remove(_MARK)
+        except RsbenchError as error:
+            raise RsbenchError(
+                f"{error}; results are kept in {self.folder}: the same command sends them"
+            ) from error
+
+    def _is_ahead(self, here: dict[str, str], there: dict[str, str]) -> bool:
+        """Whether nobody else changed the store, or removed files here, since it was last as the folder was."""
+        return all(
+            (known.there in ("", there.get(path)) or (not known.here and path not in there))
+            and (not known.here or path in here)
+            for path, known in self._known.items()
+        )
+
+    def _is_sent(self, path: str, now: str) -> bool:
+        known = self._known.get(path)
+        return known is not None and known.here == now and known.there != ""
+
+    def _here(self) -> dict[str, str]:
+        """Time and size of each file of the folder, from the first to the last that was written."""
+        found: list[tuple[int, bool, str, int]] = []
+        for path in filter(_travels, files_below(self.folder)):
+            state = (self.folder / path).lstat()
+            if stat.S_ISREG(state.st_mode):
+                found.append((state.st_mtime_ns, path.endswith(".json"), path, state.st_size))
+        return {path: f"{time} {size}" for time, _, path, size in sorted(found)}
+
+    def _there(self) -> dict[str, str]:
+        return {path: listed.state for path, listed in self._store.listing().items() if _travels(path)}
+
+    def _save(self) -> None:
+        write_json(self._record, dict(self._known))
+
+    def _download(self, paths: list[str], there: dict[str, str]) -> None:
+        """Each is there whole, or not at all."""
+        partial = {path: self._work / str(number) for number, path in enumerate(paths)}
+        self._store.download(partial)
+        for path, file in partial.items():
+            (self.folder / path).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(file, self.folder / path)
+            state = (self.folder / path).lstat()
+            self._known[path] = _Known(f"{state.st_mtime_ns} {state.st_size}", there[path])
+        self._save()
+
+    def _upload(self, path: str) -> None:
+        try:
+            self._store.upload({path: self.folder / path})
+        except RsbenchError:
+            if (self.folder / path).exists():  # else the command has removed it meanwhile
+                raise
+
+    def _remove(self, paths: Iterable[str]) -> None:
+        for path in paths:
+            self._store.remove(path)
+
+    def _drop(self, path: str) -> None:
+        """Remove a file here, with the folders that are empty then: to a command they may be damaged results."""
+        (self.folder / path).unlink()
+        with contextlib.suppress(OSError):
+            for parent in Path(path).parents[:-1]:
+                (self.folder / parent).rmdir()
+
+
+def _is_hidden(path: str) -> bool:
+    return path.startswith(f"{HIDDEN}/")
+
+
+def _travels(path: str) -> bool:
+    """Whether a file is for others too: complete, no lock or the like, and of a name that is a path anywhere."""
+    *_, name = parts = path.split("/")
+    own = path in _OF_THIS_MACHINE or path.startswith(f"{HIDDEN}/{WORK}/")
+    plain = not {"", ".", ".."}.intersection(parts) and not re.search(r"[\\:]", path)
+    return plain and not own and not (name.startswith(".") and name.endswith(".partial"))
+
+
+@contextmanager
+def mirrored(url: str) -> Iterator[Path]:
+    """A folder of this machine in which a command works as in any, with the results that the store has.
+
+    Its files are sent while the command works, and when it ends, however it ends. The store is changed in nothing
+    else: what others have there stays.
+
+    Raises:
+        RsbenchError: see ``Store`` and ``workplace``; or the store refused results, which are kept here then.
+    """
+    store, hidden = open_store(url), cache_of(url)
+    with contextlib.ExitStack() as stack:
+        with _called(hidden, store.url):
+            stack.enter_context(workplace(hidden, hidden))
+        mirror, done = _Mirror(store, hidden), threading.Event()
+        mirror.bring()
+        thread = threading.Thread(target=mirror.keep_sending, args=(done,), daemon=True)
+        thread.start()
+        _urls[mirror.folder] = store.url
+        try:
+            with _called(mirror.folder, store.url):
+                yield mirror.folder
+        except BaseException:
+            done.set()
+            thread.join()
+            with contextlib.suppress(RsbenchError, OSError):  # why the command ended is what must be told
+                mirror.finish()
+            raise
+        finally:
+            del _urls[mirror.folder]
+        done.set()
+        thread.join()
+        mirror.finish()
+
+
+@contextmanager
+def _called(folder: Path, url: str) -> Iterator[None]:
+    """Errors name the URL in place of the folder."""
+    try:
+        yield
+    except RsbenchError as error:
+        error.args = (str(error).replace(str(folder), url),)
+        raise
+
+
+def name_of(path: Path) -> str:
+    """The absolute path of a result, or its URL where it goes to a store."""
+    for folder, url in _urls.items():
+        if path.is_relative_to(folder):
+            return f"{url}/{path.relative_to(folder).as_posix()}"
+    return str(path.resolve())

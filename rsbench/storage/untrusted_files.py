@@ -1,0 +1,235 @@
+"""Reading what others wrote: sizes are known before anything is decoded, and names lead nowhere else.
+
+A small file can unfold to more than a machine holds. What no dataset states has a limit here, and the variable
+``RSBENCH_LIMITS`` is a factor that raises all of them. Faults are one line.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import os
+import re
+import zipfile
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.errors import RsbenchError
+
+LIMITS = "RSBENCH_LIMITS"
+"""Variable of the environment: what all limits are multiplied by."""
+MB = 1 << 20
+CARD_BYTES = MB
+"""Of a TOML card: its reader takes seconds for a MB."""
+FILE_BYTES = 256 * MB
+"""Of any other file that is read at once, and of the arrays in an npz file."""
+PIXELS = 1 << 21
+"""Of one frame, 1920 x 1080 and a little more: correcting four takes 0.5 to 0.7 kB for each."""
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,119}")
+"""Names that become folders: of sequences, in cards and in what they were rendered to."""
+_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?|.*\.", re.IGNORECASE)
+"""What Windows takes for a device, with any ending, and names whose last dot it drops."""
+_KINDS = "biufU"
+_IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM")
+
+
+def check_amount(where: object, what: str, amount: int, limit: int) -> None:
+    """Refuse more than a limit.
+
+    Raises:
+        RsbenchError: one line with the amount, the limit and the variable that raises it.
+    """
+    factor = _factor()
+    if amount > limit * factor:
+        needed = math.ceil(amount / limit)
+        raise RsbenchError(
+            f"{where}: {what}: {amount} is more than {round(limit * factor)}; if meant, set {LIMITS}={needed}"
+        )
+
+
+def _factor() -> float:
+    text = os.environ.get(LIMITS) or "1"
+    with contextlib.suppress(ValueError):
+        if math.isfinite(factor := float(text)) and factor > 0.0:
+            return factor
+    raise RsbenchError(f"{LIMITS} = {text!r}: must be a positive number, by which all limits are multiplied")
+
+
+# Names and paths
+
+
+def check_name(name: str) -> None:
+    """Raises ValueError unless a name can be that of a folder on every system, and of nothing else."""
+    if not NAME.fullmatch(name):
+        raise ValueError(
+            f"name = {name!r}: must be a folder's name: a letter or digit, then at most 119 letters, digits, "
+            "'.', '_' and '-'"
+        )
+    if _DEVICE.fullmatch(name):
+        raise ValueError(f"name = {name!r}: cannot be a folder's name on Windows: a device, or a dot at its end")
+
+
+def inside(folder: Path, relative: str) -> Path:
+    """A file or folder below ``folder``, by a path from data.
+
+    Raises:
+        RsbenchError: the path, or what a link makes of it, leads out of the folder.
+    """
+    path = folder / relative
+    try:
+        leads = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):  # a circle of links, a zero byte
+        leads = False
+    if not leads or ".." in Path(relative).parts:
+        raise RsbenchError(f"{folder}: {relative!r} leads out of the folder; copy there what it should hold")
+    return path
+
+
+# Content
+
+
+def read_bytes(path: Path, limit: int = FILE_BYTES) -> bytes:
+    """The content of a file of at most ``limit`` bytes.
+
+    Raises:
+        RsbenchError: it cannot be read or is larger.
+    """
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size  # 0 of a pipe
+            check_amount(path, "bytes", size, limit)
+            data = file.read(size + 1 if size else round(limit * _factor()) + 1)
+    except OSError as error:
+        raise RsbenchError(f"{path}: cannot be read: {error.strerror or error}") from error
+    check_amount(path, "bytes", len(data), limit)
+    return data
+
+
+def read_text(path: Path, limit: int = FILE_BYTES) -> str:
+    """The content of a file in UTF-8; errors as ``read_bytes``, and RsbenchError for another encoding."""
+    try:
+        return read_bytes(path, limit).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise RsbenchError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        RsbenchError: missing, unreadable, or not a JSON object.
+    """
+    return parse_json(read_text(path), path)
+
+
+def parse_json(text: str, where: object) -> dict[str, Any]:
+    """A JSON object in a text; errors as ``read_json``, with ``where`` in front."""
+    try:
+        content = json.loads(text, object_pairs_hook=_keyed)
+    except json.JSONDecodeError as error:
+        raise RsbenchError(
+            f"{where}: not valid JSON: {error.msg} at line {error.lineno} column {error.colno}"
+        ) from error
+    except ValueError as error:  # a number of thousands of digits, a key that stands there twice
+        raise RsbenchError(f"{where}: not valid JSON: {error}") from error
+    except RecursionError as error:
+        raise RsbenchError(f"{where}: not valid JSON: nested too deeply") from error
+    if not isinstance(content, dict):
+        raise RsbenchError(f"{where}: must hold a JSON object, holds a {type(content).__name__}")
+    return content
+
+
+def _keyed(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object, of whose two values for one key none is silently dropped."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        seen: set[str] = set()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))
+        raise ValueError(f"the key {twice[:100]!r} stands twice in one object")
+    return found
+
+
+def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of an npz file.
+
+    Raises:
+        RsbenchError: it cannot be read, is damaged, holds objects, or more bytes than ``FILE_BYTES``.
+    """
+    try:
+        with path.open("rb") as file:
+            return unpack_arrays(file, path)
+    except OSError as error:
+        raise RsbenchError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def unpack_arrays(file: BinaryIO, where: object, limit: int = FILE_BYTES) -> dict[str, NDArray[Any]]:
+    """The arrays of an open npz file, ``limit`` bytes at most; errors as ``load_arrays``, with ``where`` in front.
+
+    What the directory of the archive states is what is read at most: zipfile stops there, whatever the data are.
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            check_amount(where, "bytes of all arrays", sum(member.file_size for member in members), limit)
+            return {member.filename.removesuffix(".npy"): _array(archive, member) for member in members}
+    except RsbenchError:
+        raise
+    except Exception as error:  # zipfile, zlib and numpy raise what damaged bytes make them stumble over
+        raise RsbenchError(
+            f"{where}: not an npz file of plain arrays: {' '.join(str(error).split()) or type(error).__name__}"
+        ) from error
+
+
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    data = archive.read(member)
+    # numpy sets memory aside for what the array's own header states.
+    stream = io.BytesIO(data)
+    old = np.lib.format.read_magic(stream) == (1, 0)
+    shape, _, dtype = (np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0)(stream)
+    if dtype.kind not in _KINDS:
+        raise ValueError(f"{member.filename} holds {dtype}, not numbers, truth values or text")
+    if math.prod(shape) * dtype.itemsize > len(data):
+        raise ValueError(f"{member.filename} holds {len(data)} bytes, not {shape} of {dtype}")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+# Images
+
+
+def check_image_size(data: bytes, where: object, size: tuple[int, int] | None = None) -> None:
+    """Refuse an image by its header: of another size than ``size`` (width, height), or of more than ``PIXELS``.
+
+    Raises:
+        RsbenchError: that, or not a PNG, JPEG, TIFF, BMP, WebP or PNM file.
+    """
+    from PIL import Image
+
+    own, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # the limit is ours
+    try:
+        with Image.open(io.BytesIO(data), formats=_IMAGE_FORMATS) as image:
+            found = image.size
+    except Exception as error:  # Pillow raises what a damaged file makes it stumble over
+        raise RsbenchError(f"{where}: cannot be decoded as an image") from error
+    finally:
+        Image.MAX_IMAGE_PIXELS = own
+    check_size(where, found, size)
+
+
+def check_size(
+    where: object, found: tuple[int, int], size: tuple[int, int] | None = None, most: int = PIXELS
+) -> None:
+    """Refuse a size (width, height) that is not ``size``, or without one more than ``most`` pixels.
+
+    Raises:
+        RsbenchError: one line.
+    """
+    if size is None:
+        check_amount(where, f"{found[0]} x {found[1]} pixels", found[0] * found[1], most)
+    elif found != size:
+        raise RsbenchError(f"{where}: is {found[0]} x {found[1]} pixels, the camera {size[0]} x {size[1]}")

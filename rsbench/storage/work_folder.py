@@ -1,0 +1,235 @@
+"""A hidden folder in which one command at a time works for a folder of results.
+
+``.rsbench/lock`` is locked for as long as a command works there, and says whose command it is. Results come
+into being in ``.rsbench/work`` and are renamed when complete. What lies in the hidden folder is rsbench's own, and
+it is the only place where rsbench removes whole folders: what it finds elsewhere is moved there first, once every
+file of it is known to be rsbench's.
+
+The system frees the lock at the end of its process, however that ends. Where the file system has no locks, or does
+not pass them on to other hosts, the owner's record counts for ``_DEAD_S`` after its last sign of life.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import platform
+import re
+import shutil
+import stat
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NoReturn
+
+from rsbench.core.errors import RsbenchError
+
+HIDDEN = ".rsbench"
+"""Name of the hidden folder; it may be deleted when no command runs."""
+WORK = "work"
+"""Name of the folder in it for what is not complete; fresh for each command."""
+LOCK = "lock"
+"""Name of the file in it that is locked; without it the folder is not rsbench's."""
+_BEAT_S = 15.0
+_TRIES = 100
+_DEAD_S = 90.0
+"""NFS shows a time of change up to 60 s late."""
+
+
+@contextmanager
+def workplace(out: Path, hidden: Path | None = None) -> Iterator[Path]:
+    """Be the only command that writes to ``out``; yields the hidden folder, with a fresh folder ``WORK`` in it.
+
+    Args:
+        out: folder of the results, made if missing when the hidden folder lies in it.
+        hidden: ``out/.rsbench`` when None.
+
+    Raises:
+        RsbenchError: another command works there, or the folder cannot be written.
+    """
+    refuse_url(out)
+    hidden = out / HIDDEN if hidden is None else hidden
+    fresh = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
+    descriptor = _take(out, hidden)
+    done = threading.Event()
+    threading.Thread(target=_beat, args=(hidden / LOCK, done), daemon=True).start()
+    try:
+        remove(hidden / WORK)
+        (hidden / WORK).mkdir()
+        yield hidden
+    finally:
+        done.set()
+        _leave(hidden, descriptor, fresh)
+
+
+def refuse_url(out: Path) -> None:
+    """Raise RsbenchError for what was a URL before it became a path: it would be a folder of a strange name."""
+    if re.match(r"[a-z][a-z0-9+.-]+:/", out.as_posix()):
+        url = out.as_posix().replace(":/", "://", 1)
+        raise RsbenchError(f"{url}: is a URL, which this command does not take there; give a folder")
+
+
+def remove(path: Path) -> None:
+    """Remove what lies in a hidden folder, if it is there; a link is removed, not followed."""
+    if path.is_symlink() or path.is_file():
+        path.unlink()
+    elif path.exists():
+        shutil.rmtree(path)
+
+
+def strangers(folder: Path, ours: Callable[[str], bool]) -> list[str]:
+    """Paths below a folder that are no plain files of ours, sorted; relative, with slashes.
+
+    A link is a stranger whatever its name is; an empty folder is none.
+    """
+    found: list[str] = []
+    for place, folders, files in os.walk(folder, onerror=_raise):
+        here = Path(place).relative_to(folder)
+        links = [name for name in folders if (Path(place) / name).is_symlink()]
+        for name in [*files, *links]:
+            path = (here / name).as_posix()
+            if not ours(path) or not stat.S_ISREG((folder / path).lstat().st_mode):
+                found.append(path)
+    return sorted(found)
+
+
+def listed(folder: Path, suffix: str = "") -> list[Path]:
+    """What lies in a folder, sorted, of names with this end; nothing where there is no such folder.
+
+    Raises:
+        OSError: the folder cannot be listed; ``Path.glob`` passes over it in silence.
+    """
+    try:
+        return sorted(path for path in folder.iterdir() if path.name.endswith(suffix))
+    except FileNotFoundError:
+        return []
+
+
+def files_below(folder: Path) -> list[str]:
+    """Paths of all files below a folder, relative to it, with slashes, sorted.
+
+    Raises:
+        OSError: a folder cannot be listed; ``Path.rglob`` passes over it in silence.
+    """
+    walked = os.walk(folder, onerror=_raise)
+    paths = [Path(place, name).relative_to(folder).as_posix() for place, _, names in walked for name in names]
+    return sorted(paths)
+
+
+def _raise(error: OSError) -> NoReturn:
+    raise error
+
+
+def named(paths: list[str], most: int = 3) -> str:
+    """A few of the paths, and how many more there are."""
+    more = f" and {len(paths) - most} more" if len(paths) > most else ""
+    return ", ".join(paths[:most]) + more
+
+
+def _take(out: Path, hidden: Path) -> int:
+    """The descriptor of the locked file."""
+    for tries in range(_TRIES, 0, -1):
+        try:
+            hidden.mkdir(parents=True, exist_ok=True)
+            _refuse_foreign(hidden)
+            flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+            descriptor = os.open(hidden / LOCK, flags, 0o644)
+        except OSError as error:
+            gone = isinstance(error, FileNotFoundError | FileExistsError) and not hidden.is_file()
+            if gone and tries > 1:  # its last owner removed it meanwhile
+                continue
+            raise RsbenchError(f"{out}: cannot be written: {error.strerror}; choose another folder") from error
+        try:
+            _claim(out, descriptor)
+            if _is_at(hidden / LOCK, descriptor):
+                return descriptor
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
+    raise RsbenchError(f"{out}: other commands come and go there; choose another folder")
+
+
+def _refuse_foreign(hidden: Path) -> None:
+    names = {path.name for path in hidden.iterdir()}
+    if hidden.is_symlink() or (names and LOCK not in names):
+        raise RsbenchError(f"{hidden}: is not a folder that rsbench made; move it away or choose another folder")
+
+
+def _claim(out: Path, descriptor: int) -> None:
+    """Lock the file and write whose it is."""
+    held = _lock(descriptor)
+    owner, age = _owner(descriptor), time.time() - os.fstat(descriptor).st_mtime
+    other_host = owner.get("host", platform.node()) != platform.node()
+    if held is False or (owner and age < _DEAD_S and (held is None or other_host)):
+        seen = "" if held is False else f", seen there {max(age, 0.0):.0f} s ago"
+        who = f"process {owner.get('pid', '?')} on {owner.get('host', 'this machine')}"
+        raise RsbenchError(
+            f"{out}: {who} is at work there since {owner.get('since', 'just now')}{seen} "
+            f"({owner.get('command', 'rsbench')}); wait for it, or choose another folder"
+        )
+    record = {
+        "pid": os.getpid(),
+        "host": platform.node(),
+        "since": time.strftime("%Y-%m-%d %H:%M:%S %z"),
+        "command": " ".join([Path(sys.argv[0]).name.replace("__main__.py", "rsbench"), *sys.argv[1:]])[:200],
+    }
+    os.ftruncate(descriptor, 0)
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    os.write(descriptor, json.dumps(record).encode())
+
+
+def _lock(descriptor: int) -> bool | None:
+    """Whether the file is locked now, until its descriptor is closed; None where there are no locks."""
+    if sys.platform == "win32":
+        return None
+    import fcntl
+
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return False if error.errno in (errno.EWOULDBLOCK, errno.EACCES) else None
+    return True
+
+
+def _owner(descriptor: int) -> dict[str, Any]:
+    """What the file says; nothing when its owner was done, or has yet to write."""
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    try:
+        content = json.loads(os.read(descriptor, 4096))
+    except (ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _is_at(path: Path, descriptor: int) -> bool:
+    """Whether the open file is still the one of this name."""
+    try:
+        return os.path.samestat(path.lstat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+
+
+def _beat(lock: Path, done: threading.Event) -> None:
+    while not done.wait(_BEAT_S):
+        with contextlib.suppress(OSError):
+            os.utime(lock)
+
+
+def _leave(hidden: Path, descriptor: int, fresh: list[Path]) -> None:
+    """Free the lock; the hidden folder goes when it holds nothing that a later run can use, and ``fresh`` ones, of
+    which each holds the one before it, when they are empty."""
+    with contextlib.suppress(OSError):
+        remove(hidden / WORK)
+        os.ftruncate(descriptor, 0)
+        if [path.name for path in hidden.iterdir()] == [LOCK]:
+            (hidden / LOCK).unlink()
+            hidden.rmdir()
+        for folder in fresh:
+            folder.rmdir()
+    os.close(descriptor)

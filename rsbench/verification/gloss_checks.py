@@ -1,0 +1,167 @@
+"""Masks of glossy surfaces, of which comparisons of images leave out the pixels: nothing may hide behind them.
+
+Where the scene can be built, rays say where it is glossy, and the stored masks only have to agree. Elsewhere they
+are held against each other: a surface is glossy in all pictures or in none.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from rsbench.core.errors import RsbenchError
+from rsbench.core.version import __version__
+from rsbench.dataset.views import Shot, pairs_of
+from rsbench.verification.content import Content, spare_pixels
+from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, land
+from rsbench.verification.rerender import Again
+
+_OTHER, _FEW = 1e-3, 8
+"""Share and number of pixels that rounding on another processor may change, at edges."""
+_LEAST_LEFT = 0.05
+"""Share of the pixels with a surface that must be left to be compared, unless rays say that it is glossy."""
+_TRIED_PIXELS = 60_000
+
+
+def known_gloss(content: Content, again: Again | None) -> tuple[list[str], bool]:
+    """Faults of masks against rays, which take their place; and whether there were rays to ask."""
+    sequence = content.sequence
+    if again is None or not content.maps:
+        return [], not content.maps
+    try:
+        scene, digest = again.scene(sequence)
+        if not _is_ours(content, digest):
+            return [], False
+        if scene.glossy != sequence.glossy:
+            stated, made = (str(each).lower() for each in (sequence.glossy, scene.glossy))
+            return [finding("sequence.json", f"glossy = {stated}: its scene, built here, makes {made}")], True
+        if not scene.glossy:
+            return [], True
+        faults = list[str]()
+        for shot, each in content.maps.items():
+            gloss = again.whole(content, shot)[1].gloss
+            faults += _unlike(each, gloss)
+            content.maps[shot] = replace(each, gloss=gloss)
+    except RsbenchError:  # told where rows are rendered again
+        return [], False
+    return faults, True
+
+
+def _is_ours(content: Content, digest: str) -> bool:
+    """Whether a scene that was built here must be that of the sequence: of the same hash, or the same version."""
+    scene, made_by = (content.sequence.manifest.get(key) for key in ("scene", "made_by"))
+    same = isinstance(scene, dict) and scene.get("sha256") == digest
+    return same or (isinstance(made_by, dict) and made_by.get("rsbench") == __version__)
+
+
+def _unlike(stored: DepthMap, gloss: BoolArray) -> list[str]:
+    wrong = gloss if stored.gloss is None else gloss != stored.gloss
+    if np.sum(wrong) <= max(_OTHER * wrong.size, _FEW):
+        return []
+    what = f"{np.sum(wrong)} of {wrong.size} pixels of the mask differ from what rays meet"
+    return [finding(stored.shot.gloss, what, rows_of(np.any(wrong, axis=1)))]
+
+
+def gloss_faults(content: Content, fresh: Content, twins: Content) -> Iterator[str]:
+    """What masks cannot be, where there are no rays. Their maps are taken out of all, as of ``label_faults``.
+
+    Args:
+        content: of two frames, the whole sequence.
+        fresh: what was read of it last.
+        twins: at other rows than the first.
+    """
+    if not content.sequence.glossy:
+        return
+    for each in (*fresh.maps.values(), *twins.maps.values()):
+        yield from _by_itself(each)
+    for part in (content, twins):
+        yield from _dropped(part, {shot: _unlike_twin(content, each) for shot, each in part.maps.items()})
+    yield from _dropped(content, dict(_contradicted(content)))
+    for shot in fresh.maps.keys() - content.maps.keys():
+        del fresh.maps[shot]
+
+
+def _dropped(content: Content, faults: dict[Shot, str]) -> Iterator[str]:
+    for shot, fault in faults.items():
+        if fault:
+            del content.maps[shot]
+            yield fault
+
+
+def _by_itself(each: DepthMap) -> Iterator[str]:
+    gloss, solid = _of(each), each.depth > 0
+    empty = gloss & ~solid
+    if np.any(empty):
+        what = f"{np.sum(empty)} pixels of the mask show no surface"
+        yield finding(each.shot.gloss, what, rows_of(np.any(empty, axis=1)))
+    covered = cv2.dilate(gloss.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    left = float(np.sum(solid & ~covered) / max(np.sum(solid), 1))
+    if np.any(solid) and left < _LEAST_LEFT:
+        what = f"leaves {100 * left:.2g} % of the surfaces to be compared; its scene was not built (see --scene)"
+        yield finding(each.shot.gloss, what)
+
+
+def _unlike_twin(content: Content, own: DepthMap) -> str:
+    """The line of a global shutter that its rolling-shutter frame shares."""
+    source, shot = own.shot._replace(shutter="rs", row=0), own.shot
+    if shot == source or source not in content.maps:
+        return ""
+    shutter = content.sequence.shutter
+    axis, line = 1 - shutter.axis(shot.side), abs(shutter.first_line(shot.side) - shot.row)
+    unlike = np.take(_of(own), line, axis) != np.take(_of(content.maps[source]), line, axis)
+    if np.sum(unlike) <= spare_pixels(axis, unlike.size):
+        return ""
+    words = f"{'row' if axis == 0 else 'column'} {line} differs from {source.gloss}"
+    return finding(shot.gloss, f"{words}: {np.sum(unlike)} pixels at the same pose")
+
+
+def _contradicted(content: Content) -> Iterator[tuple[Shot, str]]:
+    """Masks that others contradict, in the order of how many pairs each alone explains."""
+    pairs = pairs_of((content.times[0], content.times[-1]))
+    there = [(one, other) for one, other in pairs if {one, other} <= content.maps.keys()]
+    wrong = {pair: _contradiction(content, *pair) for pair in there}
+    left = [pair for pair, rows in wrong.items() if np.any(rows)]
+    while left:
+        counts = Counter(shot for pair in left for shot in pair)
+        worst = max(counts, key=lambda shot: (counts[shot], sum(np.sum(wrong[p]) for p in left if shot in p)))
+        own = [pair for pair in left if worst in pair]
+        others = sorted({shot.gloss for pair in own for shot in pair} - {worst.gloss})
+        rows = [wrong[pair] for pair in own if pair[0] == worst]
+        words = rows_of(np.any(rows, axis=0)) if rows else ""
+        yield worst, finding(worst.gloss, f"marks other surfaces than {', '.join(others)}", words)
+        left = [pair for pair in left if worst not in pair]
+
+
+def _contradiction(content: Content, one: Shot, other: Shot) -> BoolArray:
+    """(H,) rows of a map in which even surfaces are marked, or not, as another map has it not."""
+    source, target = content.maps[one], content.maps[other]
+    stride = max(1, int(np.sqrt(source.depth.size / _TRIED_PIXELS)))
+    landing = land(content.sequence, source, target, stride)
+    with np.errstate(invalid="ignore"):
+        alike = (np.abs(landing.relative) <= DEPTH_TOLERANCE) & source.flat[::stride, ::stride]
+    x, y = np.rint(np.nan_to_num(landing.pixels)).astype(np.int64).reshape(-1, 2).T
+    height, width = target.depth.shape
+    place = np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)
+    (least, most), there = _span(source), _span(target)
+    least, most = least[::stride, ::stride], most[::stride, ::stride]
+    low, high = (each[place].reshape(least.shape) for each in there)
+    wrong = alike & ((least & ~high) | (~most & low))
+    rows = np.zeros(height, dtype=np.bool_)
+    if np.sum(wrong) > max(_FEW, _OTHER * np.sum(alike)):
+        rows[::stride][np.any(wrong, axis=1)] = True
+    return rows
+
+
+def _span(each: DepthMap) -> tuple[BoolArray, BoolArray]:
+    """(H, W) whether all of the 3 x 3 pixels around are glossy, and whether any is."""
+    gloss, around = _of(each).astype(np.uint8), np.ones((3, 3), np.uint8)
+    return cv2.erode(gloss, around) > 0, cv2.dilate(gloss, around) > 0
+
+
+def _of(each: DepthMap) -> BoolArray:
+    return np.zeros(each.depth.shape, dtype=np.bool_) if each.gloss is None else each.gloss

@@ -1,0 +1,107 @@
+"""What a wrong image is instead: candidates are tried against what its partners show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.dataset.sequence import Sequence
+from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.image_checks import (
+    CHANGES,
+    Likeness,
+    Picture,
+    band_of_row,
+    culprits,
+    difference,
+    noise_of,
+    show,
+)
+from rsbench.verification.reprojection import BoolArray, DepthMap, Shot, in_one_light, land
+
+Elsewhere = Callable[[Shot], Iterable[tuple[str, NDArray[np.uint8]]]]
+"""Names and images of other sequences that may have been exchanged with a shot's."""
+_TRIED_PIXELS = 20_000
+_PLAIN, _AS_LIKE = 0.7, 1.4
+"""A candidate must differ by at most this share of what the image as it is does, and by this factor of what sound
+pairs do."""
+_NEARLY = 1.25
+"""A change of the image itself that is nearly as like is what happened, not an exchange."""
+_NOISY, _NOISIER = 15.0, 3.0
+"""Codes of noise that few renderings have, and how many times as noisy as the others."""
+
+
+def likeness_faults(
+    sequence: Sequence,
+    maps: Mapping[Shot, DepthMap],
+    pictures: Mapping[Shot, Picture],
+    likenesses: list[Likeness],
+    elsewhere: Elsewhere,
+) -> Iterator[tuple[Shot, str]]:
+    """A finding for each image that the others contradict."""
+    guilty = list(culprits(likenesses))
+    suspects = {shot for shot, _ in guilty}
+    bands = band_of_row(sequence.shutter.height)
+    for shot, pairs in guilty:
+        unlike = np.any([each.unlike for each in pairs], axis=0)
+        others = sorted({(each.target if each.source == shot else each.source).image for each in pairs})
+        beyond = 100 * max(float(np.max(each.beyond[each.unlike])) for each in pairs)
+        what = (
+            f"shows other colours than {', '.join(others)} at the same surface, on up to {beyond:.3g} % of pixels"
+        )
+        partners = sorted((each for each in shot.partners() if each in maps), key=lambda each: each in suspects)
+        cause = "looks like noise" if _is_noise(pictures, shot, unlike[bands]) else ""
+        if partners and not cause:
+            cause = _cause(sequence, maps, pictures, shot, partners[0], likenesses, elsewhere)
+        yield shot, finding(shot.image, what, rows_of(unlike[bands]), cause)
+
+
+def _cause(
+    sequence: Sequence,
+    maps: Mapping[Shot, DepthMap],
+    pictures: Mapping[Shot, Picture],
+    shot: Shot,
+    partner: Shot,
+    likenesses: list[Likeness],
+    elsewhere: Elsewhere,
+) -> str:
+    """What turns the image into what the partner shows, as well as sound images are like each other."""
+    others = [(other.image, picture.colours) for other, picture in pictures.items() if other != shot]
+    others += [(name, image.astype(np.float32)) for name, image in elsewhere(shot)]
+    image = pictures[shot].colours
+    for name, colours in others:
+        if np.array_equal(image[1:], colours[1:]):
+            return f"the same as {name}"
+    height, width = image.shape[:2]
+    stride = max(1, int(np.sqrt(height * width / _TRIED_PIXELS)))
+    landing = land(sequence, maps[shot], maps[partner], stride)
+    landing = in_one_light(sequence, maps[shot], maps[partner], landing, stride)
+    y, x, shown = show(maps[shot], pictures[partner], landing, stride)
+    if len(y) == 0:
+        return ""
+    own = image[y, x]
+    candidates = [(change.words, change.undone(image, y, x)) for change in CHANGES]
+    gain = float(np.median(own) / max(1.0, float(np.median(shown))))
+    candidates.append((f"{gain:.3g} times as bright", own / max(gain, 1e-3)))
+    changes = len(candidates)
+    candidates += [(f"like {name}", colours[y, x]) for name, colours in others if colours.shape == image.shape]
+    costs = [float(np.mean(difference(colours, shown))) for _, colours in candidates]
+    best = int(np.argmin(costs))
+    changed = int(np.argmin(costs[:changes]))
+    best = changed if costs[changed] < _NEARLY * costs[best] else best
+    if best and costs[best] < min(_PLAIN * costs[0], _AS_LIKE * _usual(likenesses)):
+        return f"looks {candidates[best][0]}"
+    return ""
+
+
+def _is_noise(pictures: Mapping[Shot, Picture], shot: Shot, rows: BoolArray) -> bool:
+    usual = float(np.median([picture.noise for other, picture in pictures.items() if other != shot] or [0.0]))
+    return noise_of(pictures[shot].colours[rows]) > max(_NOISY, _NOISIER * usual)
+
+
+def _usual(likenesses: list[Likeness]) -> float:
+    """Mean difference, in codes, of the least unlike half of the pairs."""
+    costs = [float(np.average(each.costs[0], weights=each.pixels)) for each in likenesses if np.any(each.pixels)]
+    return float(np.median(sorted(costs)[: len(costs) // 2 + 1])) if costs else 0.0

@@ -1,0 +1,307 @@
+"""Images against each other: under diffuse light a surface has one colour, whichever frame shows it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.verification.findings import finding
+from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, Landing, Shot
+
+Colours = NDArray[np.float32]
+_BEYOND = 6.0
+"""8-bit codes by which a pixel may lie beyond the 3 x 3 pixels of another frame around its surface: rounding of
+both is 1, and the rest what the sub-pixel grids of two frames see of a texture finer than a pixel."""
+_NOISE_FACTOR = 4.0
+"""Standard deviations of a path-traced image's noise that are added to it."""
+_CAP = 30.0
+"""Largest difference of codes that counts, so that a few edges do not decide."""
+_BANDS, _LEAST_BAND = 12, 8
+"""Bands of rows that are judged by themselves, and their least height."""
+_LEAST_PIXELS = 60
+"""Pixels of a band below which it is not judged."""
+_UNLIKE, _UNLIKE_WHOLE = 0.5, 0.22
+"""Share of a band's pixels that lie beyond: sound data of one sample per pixel has up to 0.36;
+and of all pixels of a pair, where it has 0.17."""
+_BETTER, _GAIN = 0.8, 0.5
+"""A change of the image that brings the mean difference below 0.8 of what it was, and 0.5 codes down, is what was
+done to it: clean data has 1.4 at the least where there is texture. Below 0.8 of what one colour leaves, too: a
+part that is only darker, or has less noise, is nearer to noise than the right one is, but no nearer than that."""
+_LEAST_EVIDENCE = 3
+"""Bands of pairs, each direction by itself, below which an image is not blamed unless two partners disagree with
+it: a small one errs by chance."""
+_CHANCE = 3.0
+"""Standard errors of a band's gain by which chance may favour one of the changes."""
+_TILE, _BAD_IN_TILE = 16, 0.6
+_SAMPLES = 60_000
+
+_PERMUTATIONS = [order for order in permutations(range(3)) if order != (0, 1, 2)]
+
+
+@dataclass(frozen=True)
+class Change:
+    """Something that may have been done to an image: where a pixel's true colour stands in it."""
+
+    words: str
+    down: int = 0
+    right: int = 0
+    flip_x: bool = False
+    flip_y: bool = False
+    order: tuple[int, ...] = (0, 1, 2)
+
+    def undone(self, image: Colours, y: NDArray[np.int64], x: NDArray[np.int64]) -> Colours:
+        """Colours (n, 3) of pixels as they would be without it."""
+        height, width = image.shape[:2]
+        y = np.clip((height - 1 - y if self.flip_y else y) + self.down, 0, height - 1)
+        x = np.clip((width - 1 - x if self.flip_x else x) + self.right, 0, width - 1)
+        colours = image[y, x]
+        return colours if self.order == (0, 1, 2) else colours[:, list(self.order)]
+
+
+NOTHING = Change("")
+CHANGES = (
+    NOTHING,
+    *(Change("shifted by one row", down=by) for by in (-1, 1)),
+    *(Change("shifted by one column", right=by) for by in (-1, 1)),
+    Change("flipped left to right", flip_x=True),
+    Change("flipped upside down", flip_y=True),
+    Change("turned upside down", flip_x=True, flip_y=True),
+    *(Change("channels exchanged", order=order) for order in _PERMUTATIONS),
+)
+_SHIFTS = slice(1, 5)
+"""A path tracer's frame and its global-shutter twin, whose pixels have the same noise, cannot tell these: where
+the surface moves by about a pixel, the noise looks shifted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """An image in float32, and what its neighbourhoods span."""
+
+    shot: Shot
+    colours: Colours
+    """(H, W, 3) 8-bit codes."""
+    noise: float
+    """Standard deviation of what looks like noise in it, codes."""
+    low: Colours
+    """(H, W, 3) smallest of the 3 x 3 pixels around, less what noise may add; ``high`` likewise."""
+    high: Colours
+    noisy: bool = False
+    """Whether a path tracer made it, so that what looks like noise is."""
+
+    @classmethod
+    def of(cls, shot: Shot, image: NDArray[np.uint8], noisy: bool) -> Picture:
+        colours = image.astype(np.float32)
+        noise, around = noise_of(colours), np.ones((3, 3), np.uint8)
+        beyond = np.float32(_BEYOND + (_NOISE_FACTOR * noise if noisy else 0.0))
+        return cls(
+            shot,
+            colours,
+            noise,
+            cv2.erode(colours, around) - beyond,
+            cv2.dilate(colours, around) + beyond,
+            noisy,
+        )
+
+
+def noise_of(colours: Colours) -> float:
+    """Standard deviation of the noise, in codes: J. Immerkaer, Fast noise variance estimation, CVIU 1996,
+    with the median in place of the mean, which texture would raise."""
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
+    response = np.abs(cv2.filter2D(colours, cv2.CV_32F, kernel))[1:-1, 1:-1]
+    return float(np.median(response)) / 0.6745 / 6.0 if response.size else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Likeness:
+    """How an image looks like what another one shows of the same surface, by bands of rows."""
+
+    source: Shot
+    target: Shot
+    pixels: NDArray[np.float64]
+    """(B,) compared."""
+    beyond: NDArray[np.float64]
+    """(B,) share of them that the other frame's neighbourhood does not span."""
+    costs: NDArray[np.float64]
+    """(C, B) mean absolute difference of each of ``CHANGES``, codes."""
+    errors: NDArray[np.float64]
+    """(C, B) standard error of what each change gains over none."""
+    plain: NDArray[np.float64]
+    """(B,) what the best single colour would cost."""
+    refuted: BoolArray
+    """(C, B) changes of the source that this pair cannot tell, or that another partner clearly speaks against, see
+    ``heard``."""
+
+    @property
+    def judged(self) -> BoolArray:
+        return self.pixels >= _LEAST_PIXELS
+
+    @property
+    def better(self) -> NDArray[np.int64]:
+        """(B,) number of the change that explains a band better than none; 0 for none."""
+        costs = np.where(self.refuted, np.inf, self.costs)
+        best, bands = np.argmin(costs, axis=0), np.arange(costs.shape[1])
+        least, needed = costs[best, bands], np.maximum(_GAIN, _CHANCE * self.errors[best, bands])
+        typical = np.minimum(self.costs[0], self.plain)
+        decisive = (least < _BETTER * typical) & (least < self.costs[0] - needed)
+        return np.where(decisive, best, 0)
+
+    @property
+    def worse(self) -> BoolArray:
+        """(C, B) changes that make the likeness of a band worse, as clearly as ``better`` ones make it better."""
+        least, needed = self.costs[0], np.maximum(_GAIN, _CHANCE * self.errors)
+        clear = (least < _BETTER * self.costs) & (least < self.costs - needed)
+        return np.asarray(clear & self.judged)
+
+    @property
+    def unlike(self) -> BoolArray:
+        """(B,) bands in which the two images do not show the same."""
+        pixels = float(np.sum(self.pixels))
+        whole = pixels > 0 and float(np.sum(self.beyond * self.pixels)) > _UNLIKE_WHOLE * pixels
+        allowed = _UNLIKE_WHOLE if whole else _UNLIKE
+        return self.judged & ((self.beyond > allowed) | (self.better > 0))
+
+
+@dataclass(eq=False)
+class ImageVotes:
+    """(H, W) partners that see a pixel's surface, and those that see another colour there."""
+
+    seen: NDArray[np.uint8]
+    against: NDArray[np.uint8]
+
+    @classmethod
+    def none(cls, shape: tuple[int, int]) -> ImageVotes:
+        return cls(np.zeros(shape, np.uint8), np.zeros(shape, np.uint8))
+
+
+def band_of_row(height: int) -> NDArray[np.int64]:
+    """(H,) number of the band that a row belongs to."""
+    bands = max(1, min(_BANDS, height // _LEAST_BAND))
+    return np.arange(height) * bands // height
+
+
+def show(
+    surface: DepthMap, target: Picture, landing: Landing, stride: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Colours]:
+    """Rows and columns (n,) of the source that see one flat surface, or the sky, as the target does, and its
+    colours (n, 3) there; ``landing`` has every ``stride``-th pixel."""
+    even = surface.flat | (surface.depth == 0)
+    y, x = np.nonzero(even[::stride, ::stride] & (np.abs(landing.relative) <= DEPTH_TOLERANCE))
+    places = np.nan_to_num(landing.pixels)
+    shown = cv2.remap(target.colours, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return y * stride, x * stride, shown[y, x]
+
+
+def difference(colours: Colours, shown: Colours) -> Colours:
+    """(n,) mean absolute difference of channels, capped."""
+    return np.asarray(np.mean(np.minimum(np.abs(colours - shown), _CAP), axis=1))
+
+
+def compare(
+    source: Picture, target: Picture, surface: DepthMap, landing: Landing, votes: ImageVotes, stride: int = 1
+) -> Likeness:
+    """Compare the pixels that see one flat surface, or the sky, in both; ``landing`` has every ``stride``-th."""
+    y, x, shown = show(surface, target, landing, stride)
+    near = np.rint(landing.pixels[y // stride, x // stride]).astype(np.int64)
+    colours = source.colours[y, x]
+    height, width = surface.depth.shape
+    near_x, near_y = np.clip(near[:, 0], 0, width - 1), np.clip(near[:, 1], 0, height - 1)
+    spanned = (colours >= target.low[near_y, near_x]) & (colours <= target.high[near_y, near_x])
+    beyond = ~np.all(spanned, axis=1)
+    votes.seen[y, x] += 1
+    votes.against[y[beyond], x[beyond]] += 1
+    bands = band_of_row(height)
+    count = int(bands[-1]) + 1
+    pixels = np.bincount(bands[y], minlength=count)
+    share = np.bincount(bands[y], weights=beyond, minlength=count) / np.maximum(pixels, 1)
+    every = slice(None, None, max(1, len(y) // _SAMPLES))
+    costs = _costs(source.colours, y[every], x[every], shown[every], bands[y[every]], count)
+    refuted = np.zeros(costs[0].shape, dtype=np.bool_)
+    if source.noisy and source.shot[1:3] == target.shot[1:3]:
+        refuted[_SHIFTS] = True
+    return Likeness(source.shot, target.shot, pixels.astype(np.float64), share, *costs, refuted)
+
+
+def _costs(
+    image: Colours,
+    y: NDArray[np.int64],
+    x: NDArray[np.int64],
+    shown: Colours,
+    bands: NDArray[np.int64],
+    count: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Of the capped difference from ``shown`` (n, 3), means over the pixels of each band: (C, B) of each change,
+    (C, B) standard errors of its gain over none, (B,) of the band's middle colour."""
+    size = np.maximum(np.bincount(bands, minlength=count), 1)
+
+    def mean(values: Colours) -> NDArray[np.float64]:
+        return np.asarray(np.bincount(bands, weights=values, minlength=count) / size)
+
+    as_is = difference(image[y, x], shown)
+    costs, errors = list[NDArray[np.float64]](), list[NDArray[np.float64]]()
+    for change in CHANGES:
+        unlike = difference(change.undone(image, y, x), shown)
+        costs.append(mean(unlike))
+        spread = mean((as_is - unlike) ** 2) - (mean(as_is) - costs[-1]) ** 2
+        errors.append(np.sqrt(np.maximum(spread, 0.0) / size))
+    middle = np.zeros((count, 3), np.float32)
+    for band in np.unique(bands):
+        middle[band] = np.median(shown[bands == band], axis=0)
+    return np.stack(costs), np.stack(errors), mean(difference(middle[bands], shown))
+
+
+def heard(likenesses: list[Likeness]) -> list[Likeness]:
+    """The same, where no change of an image stands that another partner refutes: what is wrong with an image, all
+    see; but a texture finer than a pixel is another one from each place."""
+    result = []
+    for each in likenesses:
+        others = [other.worse for other in likenesses if other.source == each.source and other is not each]
+        result.append(replace(each, refuted=np.any([each.refuted, *others], axis=0)))
+    return result
+
+
+def culprits(likenesses: list[Likeness]) -> Iterator[tuple[Shot, list[Likeness]]]:
+    """Images in the order of how many disagreeing pairs each alone explains, with these pairs."""
+    left = [each for each in likenesses if np.any(each.unlike)]
+    while left:
+        counts = Counter(shot for each in left for shot in (each.source, each.target))
+        worst = max(counts, key=lambda shot: counts[shot])
+        pairs = [each for each in left if worst in (each.source, each.target)]
+        partners = {shot for each in pairs for shot in (each.source, each.target)} - {worst}
+        if len(partners) > 1 or sum(int(np.sum(each.unlike)) for each in pairs) >= _LEAST_EVIDENCE:
+            yield worst, pairs
+        left = [each for each in left if worst not in (each.source, each.target)]
+
+
+def tile_rows(votes: ImageVotes) -> BoolArray:
+    """(H,) rows of tiles in which most pixels look unlike what two partners show."""
+    seen, against = (np.asarray(each >= 2, dtype=np.int64) for each in (votes.seen, votes.against))
+    height = seen.shape[0]
+    rows, columns = np.arange(0, height, _TILE), np.arange(0, seen.shape[1], _TILE)
+    seen, against = (
+        np.add.reduceat(np.add.reduceat(each, rows, axis=0), columns, axis=1) for each in (seen, against)
+    )
+    spoilt = (seen >= _LEAST_PIXELS) & (against > _BAD_IN_TILE * seen)
+    return np.repeat(np.any(spoilt, axis=1), _TILE)[:height]
+
+
+def colour_fault(picture: Picture, others: Mapping[Shot, Picture]) -> str | None:
+    """An image of one colour, or of greys where others have colours."""
+    if np.ptp(picture.colours) == 0 and any(np.ptp(other.colours) > 0 for other in others.values()):
+        codes = ", ".join(f"{code:g}" for code in picture.colours[0, 0])
+        what = "black" if not np.any(picture.colours) else f"of one colour ({codes})"
+        return finding(picture.shot.image, f"the image is {what}", "all rows")
+    if _chroma(picture) == 0 and any(_chroma(other) > 1.0 for other in others.values()):
+        return finding(picture.shot.image, "the image is grey where others have colours", "all rows")
+    return None
+
+
+def _chroma(picture: Picture) -> float:
+    """Mean distance of the channels from their mean, codes."""
+    grey = np.mean(picture.colours, axis=2, keepdims=True)
+    return float(np.mean(np.abs(picture.colours - grey)))

@@ -1,0 +1,84 @@
+"""What is stored of a picture against rows of it that were rendered again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.image_checks import CHANGES, Picture
+from rsbench.verification.reprojection import DepthMap
+
+SAME_DEPTH = 2e-6
+"""Relative: rays in float32 on another processor; on the same one they have the same bits."""
+_OTHER_CODES, _FAR_CODES = 0.05, 0.005
+"""Shares of pixels that may differ at all, and by more than ``_NEAR``: rounding on another processor moves a
+sample across an edge now and then."""
+_NEAR = 2.0
+_OTHER_DEPTH = 0.005
+_OTHER_LABELS, _FEW_LABELS = 1e-3, 8
+"""Share and number of labels that rounding on another processor may change, at edges."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One file against its rows rendered again; ``fault`` is "" when they are alike."""
+
+    file: str
+    fault: str
+    same_bits: bool
+
+
+def label_checks(stored: DepthMap, rendered: NDArray[np.uint8], rows: list[int]) -> Iterator[Check]:
+    if stored.labels is None:
+        return
+    wrong, file = stored.labels[rows] != rendered, stored.shot.labels
+    what = f"{100 * np.mean(wrong):.2g} % of {wrong.size} labels differ from what is rendered again"
+    in_rows = np.isin(np.arange(len(stored.labels)), np.asarray(rows)[np.any(wrong, axis=1)])
+    bad = np.sum(wrong) > max(_OTHER_LABELS * wrong.size, _FEW_LABELS)
+    yield Check(file, finding(file, what, rows_of(in_rows)) if bad else "", not np.any(wrong))
+
+
+def depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]) -> Check:
+    depth, file = stored.depth[rows], stored.shot.depth
+    wrong = np.abs(depth - rendered) > SAME_DEPTH * np.maximum(depth, rendered)
+    share = float(np.mean(wrong))
+    if share <= _OTHER_DEPTH:
+        return Check(file, "", np.array_equal(depth, rendered))
+    both = wrong & (depth > 0) & (rendered > 0)
+    ratio = depth[both] / rendered[both] if np.any(both) else np.ones(1)
+    middle = float(np.median(ratio))
+    scaled = np.median(np.abs(ratio / middle - 1)) < 1e-6 and abs(middle - 1) > SAME_DEPTH
+    cause = f"looks scaled by {middle:.7g}" if scaled else ""
+    what = f"depth differs from what is rendered again on {100 * share:.3g} % of {wrong.size} pixels"
+    if np.any(both):
+        what += f", typically by {np.median(np.abs(ratio - 1)):.1e} of itself"
+    return Check(file, finding(file, what, _rows(wrong, rows, len(stored.depth)), cause), False)
+
+
+def image_check(file: str, stored: Picture, rendered: NDArray[np.uint8], rows: list[int], noisy: bool) -> Check:
+    truth = rendered.astype(np.float32)
+    difference = np.max(np.abs(stored.colours[rows] - truth), axis=-1)
+    far = difference > _NEAR + (4 * stored.noise if noisy else 0.0)
+    other = far if noisy else difference > 0
+    if np.mean(far) <= _FAR_CODES and np.mean(other) <= _OTHER_CODES:
+        return Check(file, "", not np.any(difference))
+    what = (
+        f"the image differs from what is rendered again on {100 * np.mean(other):.3g} % of {far.size} pixels, "
+        f"by up to {np.max(difference):g} codes"
+    )
+    y, x = (each.ravel() for each in np.meshgrid(rows, np.arange(truth.shape[1]), indexing="ij"))
+    costs = [np.mean(np.abs(change.undone(stored.colours, y, x) - truth.reshape(-1, 3))) for change in CHANGES]
+    best = int(np.argmin(costs))
+    cause = f"looks {CHANGES[best].words}" if best and costs[best] < 0.5 * costs[0] else ""
+    return Check(file, finding(file, what, _rows(other, rows, len(stored.colours)), cause), False)
+
+
+def _rows(wrong: NDArray[np.bool_], rows: list[int], height: int) -> str:
+    """Words for the rendered rows in which many pixels are wrong."""
+    flags = np.zeros(height, dtype=np.bool_)
+    flags[np.asarray(rows)[np.mean(wrong, axis=1) > _OTHER_DEPTH]] = True
+    return "all rows that were rendered" if np.sum(flags) == len(rows) else rows_of(flags)

@@ -1,0 +1,259 @@
+"""Where the surface that one picture of a sequence sees lies in another, and how well both agree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.moving_objects import numbers_of
+from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.views import FAR, PAIRS, SHOTS, Geometry, Seen, Shot, points_of, seen_by, seen_from
+
+__all__ = [
+    "DEPTH_TOLERANCE",
+    "FAR",
+    "PAIRS",
+    "SHOTS",
+    "BoolArray",
+    "DepthMap",
+    "Landing",
+    "Shot",
+    "land",
+    "relative_depth",
+]
+
+DEPTH_TOLERANCE = 1e-4
+"""Relative difference of two depths of one surface point that still agree."""
+FLATNESS = 2e-5
+"""Largest relative second difference of inverse depth (linear on planes by ideal pixels) of a locally flat
+surface: bilinear interpolation errs by an eighth of it along each axis, well under the tolerance; an edge bends
+far more."""
+_CHUNK_PIXELS = 1 << 17
+
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class DepthMap:
+    """A depth map, and where it is one flat surface."""
+
+    shot: Shot
+    depth: NDArray[np.float32]
+    """(H, W) metres, 0 = no surface."""
+    camera: PinholeCamera
+    labels: NDArray[np.uint8] | None = None
+    """(H, W) what moves there, see ``Sequence.labels``; None where nothing does."""
+    gloss: BoolArray | None = None
+    """(H, W) whether the surface is glossy; None where none is."""
+
+    @cached_property
+    def inverse(self) -> FloatArray:
+        """(H, W) 1 / m, NaN where there is no surface."""
+        solid = self.depth > 0
+        return np.where(solid, 1.0 / np.where(solid, self.depth, 1.0).astype(np.float64), np.nan)
+
+    @cached_property
+    def slope(self) -> FloatArray:
+        """(H, W, 2) derivative of inverse depth by the ideal pixel, as ``_Bending.by_ideal`` has it."""
+        by_pixel = np.stack([np.gradient(self.inverse, axis=axis) for axis in (1, 0)], axis=-1)
+        return np.asarray(np.einsum("hwij,hwi->hwj", _bending(self.camera).by_ideal, by_pixel))
+
+    @cached_property
+    def bends(self) -> tuple[FloatArray, ...]:
+        """Second differences of inverse depth: across (H, W-2), down (H-2, W), twist (H-1, W-1).
+
+        Without what a lens adds: it bends the pixels of a plane.
+        """
+        found = _second_differences(self.inverse)
+        if self.camera.lens is not None and min(self.depth.shape) > 1:
+            slopes = self.slope[:, 1:-1], self.slope[1:-1], self.slope[:-1, :-1]
+            lens = _bending(self.camera).differences
+            found = tuple(
+                each - np.sum(slope * bend, axis=-1) for each, slope, bend in zip(found, slopes, lens, strict=True)
+            )
+        return tuple(np.nan_to_num(np.abs(each), nan=np.inf) for each in found)
+
+    @cached_property
+    def flat(self) -> BoolArray:
+        """(H, W) pixels whose 3 x 3 neighbourhood is one flat surface, too wide to slip between pixels."""
+        flat = np.zeros(self.depth.shape, dtype=np.bool_)
+        flat[1:-1, 1:-1] = self._bend <= FLATNESS
+        return flat
+
+    @cached_property
+    def _bend(self) -> FloatArray:
+        """(H-2, W-2) relative second difference of inverse depth in 3 x 3 pixels, infinite beside no surface."""
+        across, down, _ = self.bends
+        with np.errstate(invalid="ignore"):
+            bend = np.maximum(_window_max(across, 3, 1), _window_max(down, 1, 3)) / self.inverse[1:-1, 1:-1]
+        return np.nan_to_num(bend, nan=np.inf)
+
+    def share_of_edges(self, jump: float) -> float:
+        """Share of the pixels with a surface around which inverse depth bends by more than ``jump`` of itself."""
+        solid = self.depth[1:-1, 1:-1] > 0
+        return float(np.mean(self._bend[solid] > jump)) if np.any(solid) else 0.0
+
+    @cached_property
+    def flat_blocks(self) -> BoolArray:
+        """(H-3, W-3) whether pixels [y, x] to [y + 3, x + 3] are one flat surface."""
+        across, down, twist = self.bends
+        bend = np.maximum.reduce([_window_max(across, 4, 2), _window_max(down, 2, 4), _window_max(twist, 3, 3)])
+        with np.errstate(invalid="ignore"):
+            return np.asarray(bend <= FLATNESS * self.inverse[1:-2, 1:-2])
+
+    @cached_property
+    def empty_blocks(self) -> BoolArray:
+        """(H-3, W-3) whether pixels [y, x] to [y + 3, x + 3] see no surface at all."""
+        return _window_max(self.depth, 4, 4) == 0
+
+
+class _Bending(NamedTuple):
+    """What a lens does to straight lines of pixels."""
+
+    ideal: FloatArray
+    """(H, W, 2) ideal pixels."""
+    by_ideal: FloatArray
+    """(H, W, 2, 2) [pixel, ideal]: turns central differences over pixels into a derivative by the ideal pixel."""
+    differences: tuple[FloatArray, ...]
+    """Second differences of ``ideal``, as ``DepthMap.bends``."""
+
+
+@lru_cache(maxsize=2)
+def _bending(camera: PinholeCamera) -> _Bending:
+    ideal = camera.ideal_pixels(camera.pixel_grid())
+    # Both sides of the equation are differences of the same pixels, so that it is exact on planes.
+    steps = np.stack([np.gradient(ideal, axis=axis) for axis in (1, 0)], axis=-2)
+    return _Bending(ideal, np.swapaxes(np.linalg.inv(steps), -1, -2), _second_differences(ideal))
+
+
+def _second_differences(values: FloatArray) -> tuple[FloatArray, ...]:
+    """Of (H, W, ...) across, down and twist, as ``DepthMap.bends``."""
+    return np.diff(values, 2, axis=1), np.diff(values, 2, axis=0), np.diff(np.diff(values, axis=0), axis=1)
+
+
+def _window_max(values: NDArray, rows: int, columns: int) -> NDArray:  # pyrefly: ignore[implicit-any-type-argument]
+    """Largest value (H - rows + 1, W - columns + 1) of each window."""
+    height, width = values.shape
+    tall = np.maximum.reduce([values[k : height - rows + 1 + k] for k in range(rows)])
+    return np.maximum.reduce([tall[:, k : width - columns + 1 + k] for k in range(columns)])
+
+
+class Landing(NamedTuple):
+    """Where the pixels of a source are seen in a target; all (h, w) of the source's pixels, strided."""
+
+    pixels: NDArray[np.float32]
+    """(h, w, 2) px in the target; NaN outside of it."""
+    relative: NDArray[np.float32]
+    """How far the source's surface lies behind (+) or before (-) the target's, of its depth. NaN where the target
+    is not one flat surface, -inf where it sees none; sky is at 0 in sky, NaN elsewhere."""
+
+
+def land(sequence: Sequence, source: DepthMap, target: DepthMap, stride: int = 1) -> Landing:
+    """Carry every ``stride``-th pixel of the source, in both directions, into the target."""
+    grid = sequence.rig.camera.pixel_grid()[::stride, ::stride]
+    depth = source.depth[::stride, ::stride].astype(np.float64)
+    pixels = np.full(grid.shape, np.nan, dtype=np.float32)
+    relative = np.full(depth.shape, np.nan, dtype=np.float32)
+    step = max(1, _CHUNK_PIXELS // grid.shape[1])
+    for first in range(0, len(grid), step):
+        rows = slice(first, first + step)
+        sky = depth[rows] == 0
+        numbers = None if source.labels is None else numbers_of(source.labels[::stride, ::stride][rows])
+        seen = seen_with(sequence, source.shot, target.shot, grid[rows], np.where(sky, FAR, depth[rows]), numbers)
+        pixels[rows] = seen.pixels
+        relative[rows] = relative_depth(target, seen.pixels, seen.depth, sky)
+    return Landing(pixels, relative)
+
+
+def seen_with(
+    geometry: Geometry,
+    source: Shot,
+    target: Shot,
+    pixels: FloatArray,
+    depth: FloatArray,
+    numbers: NDArray[np.uint8] | None,
+) -> Seen:
+    """Where a target sees what a source sees at pixels (..., 2) with depth (...).
+
+    ``numbers`` (...) of the objects that are seen, and move in between; 0 and None of what stands still.
+    """
+
+    def of(number: int, chosen: Any) -> Seen:
+        own = seen_from(geometry, number)
+        X = points_of(own, source, pixels[chosen], depth[chosen])
+        return seen_by(own, target, X, pixels[chosen][..., own.shutter.axis(target.side)])
+
+    seen = of(0, ...)
+    for number in () if numbers is None else np.unique(numbers[numbers > 0]):
+        chosen = numbers == number
+        for whole, part in zip(seen[:2], of(int(number), chosen)[:2], strict=True):
+            whole[chosen] = part
+    return seen
+
+
+def in_one_light(sequence: Sequence, source: DepthMap, target: DepthMap, landing: Landing, stride: int) -> Landing:
+    """The same without what colours do not tell: gloss, and what turns, or is shaded by what moves, at another
+    time."""
+    one_time = source.shot.side != target.shot.side and sequence.shutter.plain and source.camera.lens is None
+    changing = [_changing(each, one_time) for each in (source, target)]
+    if not np.any(changing):
+        return landing
+    own = cv2.dilate(changing[0], np.ones((3, 3), np.uint8))[::stride, ::stride] > 0
+    other = cv2.dilate(changing[1], np.ones((5, 5), np.uint8)) > 0
+    x, y = np.rint(np.nan_to_num(landing.pixels)).astype(np.int64).reshape(-1, 2).T
+    height, width = other.shape
+    there = other[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].reshape(own.shape)
+    return landing._replace(relative=np.where(own | there, np.float32(np.nan), landing.relative))
+
+
+def _changing(each: DepthMap, one_time: bool) -> NDArray[np.uint8]:
+    """(H, W) 1 where another picture may see another light on the same surface."""
+    found = np.zeros(each.depth.shape, dtype=np.uint8)
+    if each.labels is not None and not one_time:
+        found[each.labels > 0] = 1
+    if each.gloss is not None:
+        found[each.gloss] = 1
+    return found
+
+
+def relative_depth(target: DepthMap, pixels: FloatArray, z: FloatArray, sky: BoolArray) -> FloatArray:
+    """See ``Landing.relative``; of points (...) with depth ``z`` seen at ``pixels`` (..., 2) of the target."""
+    height, width = target.depth.shape
+    relative = np.full(z.shape, np.nan)
+    corner = np.floor(np.where(np.isfinite(pixels), pixels, -1.0)).astype(np.int64)
+    x0, y0 = corner[..., 0], corner[..., 1]
+    inner = (x0 >= 1) & (x0 < width - 2) & (y0 >= 1) & (y0 < height - 2)
+    block = y0[inner] - 1, x0[inner] - 1
+    flat, empty = np.zeros((2, *z.shape), dtype=np.bool_)
+    flat[inner], empty[inner] = target.flat_blocks[block], target.empty_blocks[block]
+    relative[empty] = np.where(sky[empty], 0.0, -np.inf)
+    flat &= ~sky
+    relative[flat] = z[flat] * _interpolated(target, pixels[flat], y0[flat], x0[flat]) - 1.0
+    return relative
+
+
+def _interpolated(
+    target: DepthMap, pixels: FloatArray, y0: NDArray[np.int64], x0: NDArray[np.int64]
+) -> FloatArray:
+    """Inverse depth (n,) at pixels (n, 2) between four that see one flat surface, the first of them y0, x0."""
+    share = pixels - np.stack([x0, y0], axis=-1)
+
+    def between(values: FloatArray) -> FloatArray:
+        """Bilinear, of (H, W, ...)."""
+        fx, fy = (each.reshape(-1, *[1] * (values.ndim - 2)) for each in share.T)
+        top = (1 - fx) * values[y0, x0] + fx * values[y0, x0 + 1]
+        bottom = (1 - fx) * values[y0 + 1, x0] + fx * values[y0 + 1, x0 + 1]
+        return np.asarray((1 - fy) * top + fy * bottom)
+
+    found = between(target.inverse)
+    if target.camera.lens is None:
+        return found
+    beside = target.camera.ideal_pixels(pixels) - between(_bending(target.camera).ideal)
+    return np.asarray(found + np.sum(target.slope[y0, x0] * beside, axis=-1))

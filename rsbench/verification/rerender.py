@@ -1,0 +1,343 @@
+"""Rows rendered again, where the scene can be built here: the only check that knows what is true."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import time
+from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Sequence as Many
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from rsbench.components.cards import list_cards, parse_card
+from rsbench.core.errors import RsbenchError
+from rsbench.core.moving_objects import poses_of
+from rsbench.core.projection import row_poses
+from rsbench.core.version import __version__
+from rsbench.dataset.channels import AFFINE, TRACKS, matches_file
+from rsbench.dataset.generation import render_shot
+from rsbench.dataset.layout import whole_frames
+from rsbench.dataset.scene_hashes import scene_hash
+from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.views import SHOTS, Shot, image_seed, shots_of
+from rsbench.renderers.options import RendererOptions
+from rsbench.scenes.load import load_scene, read_scene_card
+from rsbench.scenes.model import Start
+from rsbench.scenes.moving_objects import with_moving
+from rsbench.verification.affine_checks import affine_again
+from rsbench.verification.channel_checks import channels_again
+from rsbench.verification.content import Content, clean_picture
+from rsbench.verification.findings import finding
+from rsbench.verification.image_checks import Picture
+from rsbench.verification.match_checks import matches_again
+from rsbench.verification.mesh_files import with_files
+from rsbench.verification.rendered_checks import SAME_DEPTH, Check, depth_check, image_check, label_checks
+from rsbench.verification.stacks import stack_rows
+from rsbench.verification.surface_checks import surfaces_again
+from rsbench.verification.track_checks import tracks_again
+
+if TYPE_CHECKING:
+    from rsbench.renderers.render import Frame
+    from rsbench.renderers.scene import MitsubaScene
+    from rsbench.renderers.visibility import SceneRays
+
+Rerender = Literal["no", "auto", "all"]
+"""No row, some rows of every image where that takes seconds, or all rows."""
+_ALIKE = (": the same bits", ": the same but for rounding")
+"""Ends of the note where nothing differs."""
+_ROWS = 16
+"""Of an image, with ``auto``."""
+_COMPRESSED = 4
+"""Of the rows of a compressed frame one in so many: each takes 48 rows of the sensor."""
+_MOST_RAYS = 2e8
+"""Of a sequence, with ``auto``: fewer rows where the samples are many."""
+
+
+@dataclass(eq=False)
+class Again:
+    """Renders rows of sequences again; keeps the scene of the last one."""
+
+    mode: Rerender
+    scene_cards: Many[Path] = ()
+    """Of scenes that are not rsbench's own. What a dataset says of its scene is a name, and never opened."""
+    mesh_files: Many[Path] = ()
+    """Of objects that move, likewise."""
+    _built: tuple[tuple[object, ...], str, MitsubaScene] | None = field(default=None, init=False)
+
+    def is_right(self, content: Content, shot: Shot) -> bool:
+        """Whether a depth map is what its scene looks like, at every pixel: that takes but one ray for each."""
+        with contextlib.suppress(RsbenchError):  # told by ``check``
+            stored, rendered = content.maps[shot].depth, self.whole(content, shot)[1].depth
+            return bool(np.all(np.abs(stored - rendered) <= SAME_DEPTH * np.maximum(stored, rendered)))
+        return False
+
+    def shows(self, content: Content, shot: Shot) -> bool:
+        """Whether a picture, without its sensor, is what its scene looks like: all of it, with all samples."""
+        manifest, camera = content.sequence.manifest, content.sequence.rig.camera
+        with contextlib.suppress(RsbenchError):  # told by ``check``
+            options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
+            rows = list(range(camera.height))
+            if _rays_of(camera.width, options) * camera.height > _MOST_RAYS:
+                return False
+            scene, _ = self.scene(content.sequence)
+            check = _picture_check(content, _render(content, scene, options, shot, rows), options, shot, rows)
+            return check.same_bits or not (check.fault or _made_here(content))
+        return False
+
+    def cleared(self, content: Content, accused: Collection[str]) -> set[str]:
+        """Of files of channels those that are the same, bit for bit, when all of them is made again by rays."""
+        from rsbench.renderers.visibility import SceneRays
+
+        sequence, same = content.sequence, set[str]()
+        rows = list(range(sequence.rig.camera.height))
+        with contextlib.suppress(RsbenchError):
+            for shot in [each for each in shots_of(content.times) if each.shutter == "rs"]:
+                if any(f"/{shot.side}_{shot.frame}." in file for file in accused):
+                    scene, frame = self.whole(content, shot)
+                    for made in (channels_again, surfaces_again):
+                        checks = made(sequence, shot, rows, frame, SceneRays(scene, sequence.objects), ())
+                        same |= {file for file, _, alike in checks if alike}
+            scene, _ = self.scene(sequence)
+            for file, again in ((TRACKS, tracks_again), (AFFINE, affine_again)):
+                if file in accused:
+                    same |= {name for name, _, alike in again(sequence, SceneRays(scene), ()) if alike}
+            for first in content.times[:-1]:
+                if matches_file(first) in accused:
+                    checks = matches_again(sequence, first, SceneRays(scene), ())
+                    same |= {name for name, _, alike in checks if alike}
+        return same & set(accused)
+
+    def whole(self, content: Content, shot: Shot) -> tuple[MitsubaScene, Frame]:
+        """The scene of a sequence, and a whole frame of it, of one sample."""
+        manifest = content.sequence.manifest
+        options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
+        scene, _ = self.scene(content.sequence)
+        quick = replace(options, samples=1, integrator="sunsky")
+        return scene, _render(content, scene, quick, shot, list(range(content.sequence.rig.camera.height)))
+
+    def scene(self, sequence: Sequence) -> tuple[MitsubaScene, str]:
+        """The scene of a sequence in the renderer, and its hash."""
+        from rsbench.renderers.scene import MitsubaScene
+
+        record = _table(sequence.manifest, "scene")
+        name, viewpoint = record.get("name"), record.get("viewpoint")
+        cards = {read_scene_card(path)[0].name: path for path in self.scene_cards}
+        path = cards.get(str(name), list_cards("scenes").get(str(name)))
+        if path is None:
+            raise RsbenchError(f"the scene {name!r} is not one of rsbench's; name its card with --scene")
+        card, _ = read_scene_card(path)
+        if viewpoint not in card.viewpoints:
+            raise RsbenchError(f"the scene {name!r} has no viewpoint {viewpoint!r}")
+        for key, value in asdict(card.viewpoints[viewpoint]).items():
+            if list(value) != record.get(key):
+                raise RsbenchError(f"{key} of the viewpoint {viewpoint!r} is {list(value)}, not {record.get(key)}")
+        start = (
+            parse_card(Start, _table(record, "start"), "sequence.json: scene.start") if "start" in record else None
+        )
+        moving = with_files(sequence, self.mesh_files)
+        wanted = (path, path.stat().st_mtime_ns, viewpoint, start, moving)
+        if self._built is None or self._built[0] != wanted:
+            self._built = None  # a scene takes hundreds of MB: not two at a time
+            scene = load_scene(path)
+            seen = scene.seen_from(scene.viewpoints[viewpoint], start)
+            seen = with_moving(seen, moving) if moving else seen
+            self._built = (wanted, scene_hash(scene), MitsubaScene(seen))
+        return self._built[2], self._built[1]
+
+
+class Redone:
+    """Rows of one sequence rendered again, some frames after the other."""
+
+    def __init__(self, again: Again, sequence: Sequence) -> None:
+        self._sequence, self._checks = sequence, list[Check]()
+        self._begun, self._seconds, self._refusal = time.perf_counter(), 0.0, ""
+        try:
+            self._options = parse_card(
+                RendererOptions, _table(sequence.manifest, "renderer"), "sequence.json: renderer"
+            )
+            self._scene, self._digest = again.scene(sequence)
+        except RsbenchError as error:
+            self._refusal = f"no row rendered again: {error}"
+            return
+        self._rows = _rows_of(again.mode, sequence, self._options)
+        if not self._rows:
+            self._refusal = "no row rendered again: its renderer takes too many samples; --rerender all does it"
+        self._seconds = time.perf_counter() - self._begun
+
+    def add(self, content: Content, told: set[str]) -> None:
+        """Render again what was read, but for channels that are ``told`` already."""
+        if not self._refusal:
+            self._take(_checks(content, self._scene, self._options, self._rows, told))
+
+    def _take(self, checks: Iterator[Check]) -> None:
+        start = time.perf_counter()
+        self._checks += checks
+        self._seconds += time.perf_counter() - start
+
+    def end(self, told: set[str]) -> tuple[list[str], str]:
+        """Faults of files that are not ``told`` yet, and what was done or why not."""
+        if self._refusal:
+            return [], self._refusal
+        manifest, checks = self._sequence.manifest, self._checks
+        rays, pairs = _rays(self._scene), range(self._sequence.frames - 1)
+        of_matches = (each for first in pairs for each in matches_again(self._sequence, first, rays, told))
+        of_points = (made(self._sequence, rays, told) for made in (tracks_again, affine_again))
+        again = chain(*of_points, of_matches)
+        self._take(Check(*check) for check in again)
+        wrong = [check for check in checks if check.fault]
+        done = f"{len(self._rows)} rows of each image and depth map rendered again in {self._seconds:.1f} s"
+        if _table(manifest, "scene").get("sha256") != self._digest:
+            done += "; the scene built here has another sha256 than sequence.json says"
+            if wrong and _table(manifest, "made_by").get("rsbench") != __version__:
+                return [], f"{done}, and other images: another version of rsbench built it"
+        if wrong and len(wrong) == len(checks):
+            cause = "look at scene, motion, camera and renderer in sequence.json"
+            what = f"not one file is what its scene looks like when rendered again, {wrong[0].fault}"
+            return [finding("sequence.json", what, cause=cause)], done
+        same = all(check.same_bits for check in checks)
+        done += _ALIKE[0] if same else "" if wrong else _ALIKE[1]
+        return [check.fault for check in wrong if check.file not in told], done
+
+
+def _rays(scene: MitsubaScene) -> SceneRays:
+    from rsbench.renderers.visibility import SceneRays
+
+    return SceneRays(scene)
+
+
+def _rows_of(mode: Rerender, sequence: Sequence, options: RendererOptions) -> list[int]:
+    """One row of each of equal bands, drawn by the hash of the images: nobody knows them before they are."""
+    camera = sequence.rig.camera
+    if mode == "all":
+        return list(range(camera.height))
+    shots = len(SHOTS) * sequence.frames // 2
+    affordable = int(_MOST_RAYS / (shots * _rays_of(camera.width, options)))
+    count = min(_ROWS, camera.height, affordable)
+    digest = hashlib.sha256(repr(sequence.manifest.get("files")).encode()).digest()
+    rng = np.random.default_rng(int.from_bytes(digest[:8], "little"))
+    edges = np.linspace(0, camera.height, count + 1).astype(int)
+    return [int(rng.integers(low, high)) for low, high in pairwise(edges)]
+
+
+def _rays_of(pixels: int, options: RendererOptions) -> int:
+    return pixels * options.samples * (options.max_depth if options.integrator == "path" else 1)
+
+
+def _table(manifest: Mapping[str, Any], key: str) -> dict[str, Any]:
+    table = manifest.get(key)
+    if not isinstance(table, dict):
+        raise RsbenchError(f"sequence.json has no table {key!r}")
+    return table
+
+
+def _checks(
+    content: Content, scene: MitsubaScene, options: RendererOptions, rows: list[int], told: set[str]
+) -> Iterator[Check]:
+    from rsbench.renderers.visibility import SceneRays
+
+    own = shots_of(content.times)
+    twins = (each._replace(row=row) for row in content.sequence.twins for each in own if each.shutter == "gs")
+    for shot in (*own, *twins):
+        if shot not in content.maps and shot not in content.pictures:
+            continue
+        frame = _render(content, scene, options, shot, rows)
+        if shot in content.maps:
+            yield depth_check(content.maps[shot], frame.depth, rows)
+            yield from label_checks(content.maps[shot], frame.labels, rows)
+        if shot in content.pictures:
+            yield _picture_check(content, frame, options, shot, rows)
+        for made in (channels_again, surfaces_again):
+            again = made(content.sequence, shot, rows, frame, SceneRays(scene, content.sequence.objects), told)
+            yield from (Check(*check) for check in again)
+        if shot.shutter == "rs":
+            yield from _frame_checks(content, scene, options, shot, rows, told)
+
+
+def _picture_check(content: Content, frame: Frame, options: RendererOptions, shot: Shot, rows: list[int]) -> Check:
+    from rsbench.renderers.image import to_srgb8
+
+    noisy = options.integrator == "path" and not _made_here(content)
+    rendered = to_srgb8(frame.image, options.exposure)
+    return image_check(clean_picture(content.sequence, shot), content.pictures[shot], rendered, rows, noisy)
+
+
+def _frame_checks(
+    content: Content, scene: MitsubaScene, options: RendererOptions, shot: Shot, rows: list[int], told: set[str]
+) -> Iterator[Check]:
+    """What lies beside a clean rolling-shutter frame: what its sensor makes of it, and the stack of whole frames.
+
+    Each row of a sensor has random numbers of its own, and so its bits without the others; of an image that was
+    interpolated or compressed, with those around.
+    """
+    from rsbench.renderers.sensor_frame import sensed_rows
+
+    sequence, chosen, elsewhere = content.sequence, _of_image(content, options, shot), not _made_here(content)
+    with contextlib.suppress(RsbenchError):  # told already: a file that cannot be read
+        if sequence.sensor is not None and shot.image not in told:
+            seen = Picture.of(shot, sequence.image(*shot[:3]), noisy=False)
+            geometry = sequence.rig, sequence.shutter, sequence.motion
+            sensor = sequence.sensor.of(shot.side, shot.frame)
+            some = rows[::_COMPRESSED] if sensor.jpeg_quality and len(rows) < sequence.shutter.height else rows
+            sensed = sensed_rows(
+                scene,
+                *geometry,
+                sensor,
+                sequence.frame_period_s,
+                shot.side,
+                shot.frame,
+                chosen,
+                some,
+                sequence.objects,
+            )
+            yield image_check(shot.image, seen, sensed, some, elsewhere)
+    with contextlib.suppress(RsbenchError):
+        if whole_frames(sequence.manifest):
+            yield _stack_check(content, scene, chosen, shot, rows)
+
+
+def _stack_check(
+    content: Content, scene: MitsubaScene, chosen: RendererOptions, shot: Shot, rows: list[int]
+) -> Check:
+    """Of whole frames at the poses of some rows, other rows: each of these rows at the pose of another."""
+    from rsbench.renderers.image import to_srgb8
+    from rsbench.renderers.render import render
+
+    sequence, of = content.sequence, rows[::-1]
+    seen = Picture.of(shot, stack_rows(sequence, shot, rows, of), noisy=False)
+    R, t = (
+        each.copy() for each in row_poses(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame)
+    )
+    tau = sequence.shutter.line_times(shot.frame, shot.side).copy()
+    R[rows], t[rows], tau[rows] = R[of], t[of], tau[of]
+    frame = render(scene, sequence.rig.camera, R, t, chosen, objects=poses_of(sequence.objects, tau), rows=rows)
+    rendered = to_srgb8(frame.image, chosen.exposure)
+    noisy = chosen.integrator == "path" and not _made_here(content)
+    return image_check(f"gs_stack/{shot.side}_{shot.frame}", seen, rendered, rows, noisy)
+
+
+def _made_here(content: Content) -> bool:
+    """Whether the same versions and variant rendered it, so that even random numbers are the same."""
+    from rsbench.renderers.backend import start_backend
+
+    here = {"mitsuba": version("mitsuba"), "drjit": version("drjit"), "variant": start_backend().variant}
+    made_by = _table(content.sequence.manifest, "made_by")
+    return all(made_by.get(key) == value for key, value in here.items())
+
+
+def _of_image(content: Content, options: RendererOptions, shot: Shot) -> RendererOptions:
+    sequence = content.sequence
+    seed = image_seed(int(sequence.manifest.get("seed", 0)), sequence.name, shot.side, shot.frame)
+    return replace(options, seed=seed, method="single-pass", full_frames=False)
+
+
+def _render(content: Content, scene: MitsubaScene, options: RendererOptions, shot: Shot, rows: list[int]) -> Frame:
+    """Rows of a shot, with the bits that they have in the whole image."""
+    sequence = content.sequence
+    poses = row_poses(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame)
+    return render_shot(scene, sequence, shot, poses, _of_image(content, options, shot), rows=rows)

@@ -1,0 +1,267 @@
+"""Frames of a sensor that is not ideal, against clean twins: no more blur and noise than the sensor makes."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.errors import RsbenchError
+from rsbench.core.projection import back_project, project_at
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.moving_objects import SHADED, numbers_of
+from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.views import seen_from
+from rsbench.renderers.electrons import Sensor, expose, fall_off
+from rsbench.renderers.image import linear_of_codes
+from rsbench.renderers.processing import compressed, processed, rows_needed, shares_of_noise
+from rsbench.storage.untrusted_files import inside
+from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.image_checks import Picture
+from rsbench.verification.png_header import png_fault
+from rsbench.verification.processing_checks import processing_fault
+from rsbench.verification.reprojection import FAR, BoolArray, DepthMap, Shot
+
+_BEYOND_SIGMA, _BEYOND_SHARE, _ROW_SHARE = 5.0, 5e-3, 0.1
+"""Of Gaussian noise 6e-7 are beyond, of Poisson numbers in the dark more; and a blur sees what lies between the
+samples of a texture finer than a pixel, or behind a thin near edge, which the twin does not show. This share
+is for four samples, and grows with the distance between them."""
+_LEAST_VALUES, _VARIANCE_RANGE = 1000, (0.85, 1.2)
+"""The variance of 1000 values is known to 4.5 %; five times that, and what a smooth surface changes in a blur."""
+_COMPRESSED_RANGE, _BLOCKS_ALIKE = (0.5, 2.0), 10
+"""Of a compressed image over that of the clean twin after the same; its noise is that of blocks, not of values:
+both numbers are chosen, not measured."""
+_JPEG_REACH = 17
+"""Pixels over which JPEG spreads what it leaves out: a block of colours of half the resolution, and one more."""
+_MOST_BIAS = 0.75
+"""Of the mean, in sigma: where the twin is uneven by less than one sigma, its middle is off by half at most."""
+_FARTHER = 3
+_UNCLIPPED = (0.03, 0.75)
+_WHITE = 255.0
+
+
+def sensor_faults(
+    sequence: Sequence, maps: Mapping[Shot, DepthMap], pictures: Mapping[Shot, Picture], missing: Collection[str]
+) -> Iterator[str]:
+    """What the rolling-shutter frames of a sequence show that their sensor cannot have made of the clean twins."""
+    sensor = sequence.sensor
+    size = sequence.rig.camera.width, sequence.rig.camera.height
+    for shot in pictures:
+        if sensor is None or shot.shutter != "rs" or shot.image in missing or shot not in maps:
+            continue
+        try:
+            fault = png_fault(inside(sequence.folder, shot.image), shot.image, size)
+            if fault is None:
+                seen = sequence.image(*shot[:3])
+                own, spacing = sensor.of(shot.side, shot.frame), _spacing(sequence)
+                window = _window(sequence, own, maps[shot], spacing)
+                changing = _changing(sequence, own, maps[shot], spacing)
+                fault = _fault(own, seen, pictures[shot], window, spacing, changing)
+        except RsbenchError as error:
+            fault = str(error)
+        if fault:
+            yield fault
+
+
+def _spacing(sequence: Sequence) -> float:
+    """Pixels between the samples of the clean twin, which shows nothing that lies between."""
+    renderer = sequence.manifest.get("renderer")
+    samples = renderer.get("samples") if isinstance(renderer, dict) else None
+    return float(samples**-0.5) if isinstance(samples, int) and samples > 0 else 1.0
+
+
+def _changing(sequence: Sequence, sensor: Sensor, depth_map: DepthMap, spacing: float) -> BoolArray:
+    """(H, W) where no window holds while the row is exposed: an object that moves, or its shadow, or what a glossy
+    surface mirrors may be seen there."""
+    labels, gloss, found = depth_map.labels, depth_map.gloss, np.zeros(depth_map.depth.shape, dtype=np.bool_)
+    beside = int(sensor.mosaic != "none") + (_JPEG_REACH if sensor.jpeg_quality else 0)
+    if gloss is not None and sensor.exposure_s:
+        found |= _around(gloss, _window(sequence, sensor, depth_map, spacing), beside)
+    if labels is None or not sensor.exposure_s:
+        return found
+    numbers = range(1, len(sequence.moving) + 1)
+    windows = [_window(sequence, sensor, depth_map, spacing, number) for number in numbers]
+    # A shadow goes about as far as what throws it; where the sun is low, or the ground is near, farther.
+    farthest = tuple(_FARTHER * np.max(windows, axis=0))
+    masks = [numbers_of(labels) == number for number in numbers]
+    for own, window in zip((*masks, labels >= SHADED), (*windows, farthest), strict=True):
+        found |= _around(own, window, beside)
+    return found
+
+
+def _around(own: BoolArray, window: tuple[int, int], beside: int) -> BoolArray:
+    """(H, W) what lies within a window (x, y) of pixels, and some more."""
+    x, y = window
+    around = np.ones((2 * (y + beside) + 1, 2 * (x + beside) + 1), np.uint8)
+    return np.asarray(cv2.dilate(own.astype(np.uint8), around) > 0)
+
+
+def _window(
+    sequence: Sequence, sensor: Sensor, depth_map: DepthMap, spacing: float, number: int = 0
+) -> tuple[int, int]:
+    """How far (x, y) a surface may be, in whole pixels, from where the row's time sees it, while it is exposed.
+
+    Of the surfaces of an object, by its ``number``, or of what stands still.
+    """
+    shot, labels = depth_map.shot, depth_map.labels
+    grid = sequence.rig.camera.pixel_grid()[::4, ::4]
+    own = np.ones(grid.shape[:2], np.bool_) if labels is None else numbers_of(labels[::4, ::4]) == number
+    if not (sensor.exposure_s and np.any(own)):
+        return 0, 0
+    depth, grid = depth_map.depth[::4, ::4][own].astype(np.float64), grid[own]
+    rig, shutter, motion = seen_from(sequence, number)[:3]
+    X = back_project(rig, shutter, motion, shot.side, shot.frame, grid, np.where(depth > 0, depth, FAR))
+    half = 0.5 * sensor.exposure_s / sequence.frame_period_s
+    tau = shutter.pixel_time(grid, shot.frame, shot.side)
+    moved = [
+        np.abs(project_at(rig, motion, shot.side, tau + sign * half, X)[..., :2] - grid) for sign in (-1.0, 1.0)
+    ]
+    # One more: a pixel is an area, and thin near things lie between the points looked at; and between samples.
+    x, y = np.ceil(np.nanmax(np.stack(moved), axis=(0, 1))).astype(int) + 1 + int(spacing)
+    return int(x), int(y)
+
+
+def _fault(
+    sensor: Sensor,
+    image: NDArray[np.uint8],
+    picture: Picture,
+    window: tuple[int, int],
+    spacing: float = 0.5,
+    changing: BoolArray | None = None,
+) -> str | None:
+    """What is wrong with an image of ``picture``'s shot; ``window`` is how far (x, y) its blur may reach, px.
+
+    ``changing`` (H, W) where it may reach farther.
+    """
+    bounds = _Bounds.of(sensor, image, picture, window, spacing)
+    told = np.ones((*image.shape[:2], 1), np.bool_) if changing is None else ~changing[..., None]
+    return (
+        _beyond(bounds, image, picture.shot, spacing, told)
+        or processing_fault(image, sensor, picture.shot.image)
+        or _noise_fault(bounds, sensor, image, picture, told)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Bounds:
+    """What a sensor may show, linear values (H, W, 3) where white is 1."""
+
+    low: FloatArray
+    """The darkest and the brightest light that may come to a pixel."""
+    high: FloatArray
+    own: FloatArray
+    """Variance of the sensor's noise."""
+    rounded: FloatArray
+    """Variance by rounding, and by the noise of the twin."""
+    slack: FloatArray
+    inner: tuple[slice, slice]
+    """Pixels to which nothing comes from beyond the borders, which the twin does not show."""
+
+    @classmethod
+    def of(
+        cls,
+        sensor: Sensor,
+        image: NDArray[np.uint8],
+        picture: Picture,
+        window: tuple[int, int],
+        spacing: float,
+    ) -> _Bounds:
+        clean, beside = picture.colours, int(sensor.mosaic != "none")
+        height, width = clean.shape[:2]
+        x, y = window[0] + beside, window[1] + beside
+        around = np.ones((2 * y + 1, 2 * x + 1), np.uint8)
+        share = fall_off(sensor, width, height, np.arange(height))[..., None]
+        least, most = (way(clean, around) for way in (cv2.erode, cv2.dilate))
+        low = linear_of_codes(least) * share
+        # How bright white is, the twin does not say.
+        high = np.where(most < _WHITE, np.minimum(linear_of_codes(most) * share, 1.0), 1.0)
+        # A path tracer's noise is in both, and in each frame another; one sample of a pixel is a draw likewise.
+        traced = 12.0 * picture.noise**2 if picture.noisy or spacing >= 1.0 else 0.0
+        own = sensor.variance(high)
+        rounded = (1.0 + traced) * (_rounding(image) + share**2 * _rounding(clean))
+        unsure = own + rounded + 2.0 * share**2 * _sampling(clean, spacing)
+        if sensor.jpeg_quality:
+            unsure += cv2.dilate(_compression(sensor, clean), around)
+        own = own * shares_of_noise(sensor.mosaic, width, height)
+        inner = np.s_[y : height - y, x : width - x]
+        return cls(low, high, own, rounded, _BEYOND_SIGMA * np.sqrt(unsure), inner)
+
+
+def _beyond(bounds: _Bounds, image: NDArray[np.uint8], shot: Shot, spacing: float, told: BoolArray) -> str | None:
+    seen, inner = linear_of_codes(image), bounds.inner
+    beyond = told & ((seen < np.minimum(bounds.low, 1.0) - bounds.slack) | (seen > bounds.high + bounds.slack))
+    if not beyond[inner].size:
+        return None
+    many, rows = float(np.mean(beyond[inner])), np.zeros(len(image), dtype=np.bool_)
+    rows[inner[0]] = np.mean(beyond[inner], axis=(1, 2)) > _ROW_SHARE
+    if many <= _BEYOND_SHARE * max(1.0, 2.0 * spacing) and not np.any(rows):
+        return None
+    what = f"{100 * many:.2f} % of the values are beyond {_BEYOND_SIGMA:g} sigma of what {_twin(shot)} allows"
+    return finding(shot.image, what, rows_of(rows))
+
+
+def _noise_fault(
+    bounds: _Bounds, sensor: Sensor, image: NDArray[np.uint8], picture: Picture, told: BoolArray
+) -> str | None:
+    """Light and noise where the twin is smooth. Rounding is no noise: without any beside it, equal values are
+    rounded alike."""
+    low, high, shot = bounds.low, bounds.high, picture.shot
+    sigma = np.sqrt(bounds.own + bounds.rounded)
+    smooth = told & (high - low < sigma) & (low > _UNCLIPPED[0]) & (high < _UNCLIPPED[1])
+    smooth &= bounds.own > bounds.rounded
+    if sensor.mosaic != "none":
+        inside = np.zeros_like(smooth)
+        inside[bounds.inner] = True
+        smooth &= inside
+    if np.sum(smooth) < _LEAST_VALUES * (_BLOCKS_ALIKE if sensor.jpeg_quality else 1):
+        return None
+    beside = ((linear_of_codes(image) - 0.5 * (low + high)) / sigma)[smooth]
+    if abs(bias := float(np.mean(beside))) > _MOST_BIAS:
+        way = "brighter" if bias > 0 else "darker"
+        return finding(shot.image, f"is {way} than its sensor shows {_twin(shot)}, by {abs(bias):.2f} sigma")
+    ratio, (least, most) = float(np.var(beside)), _VARIANCE_RANGE
+    if sensor.jpeg_quality:
+        made = linear_of_codes(_made_of(picture.colours, sensor))
+        ratio /= float(np.var(((made - 0.5 * (low + high)) / sigma)[smooth]))
+        least, most = _COMPRESSED_RANGE
+    if least < ratio < most:
+        return None
+    what = f"its noise has {ratio:.2f} times the variance of the sensor's, seen beside {_twin(shot)}"
+    return finding(shot.image, what)
+
+
+def _twin(shot: Shot) -> str:
+    return f"rs_clean/{shot.side}_{shot.frame}.png"
+
+
+def _made_of(clean: NDArray[np.uint8] | NDArray[np.float32], sensor: Sensor) -> NDArray[np.uint8]:
+    """What the sensor makes of the light of a clean twin, with noise of its kind."""
+    rows = range(len(clean))
+    light = linear_of_codes(clean).astype(np.float32)
+    return processed(
+        expose(light, sensor, 0, len(clean), rows), sensor, len(clean), rows_needed(sensor, rows, len(clean)), rows
+    )
+
+
+def _compression(sensor: Sensor, clean: NDArray[np.uint8] | NDArray[np.float32]) -> FloatArray:
+    """Variance (H, W, 3) of linear values by JPEG, near each pixel: of the clean twin behind the same sensor."""
+    before = _made_of(clean, replace(sensor, jpeg_quality=0))
+    after = compressed(before, sensor.jpeg_quality)
+    error = (linear_of_codes(after) - linear_of_codes(before)) ** 2
+    return np.asarray(cv2.blur(error, (_JPEG_REACH, _JPEG_REACH)), dtype=np.float64)
+
+
+def _sampling(clean: NDArray[np.uint8] | NDArray[np.float32], spacing: float) -> FloatArray:
+    """Variance of linear values (...) that are means of 1 / spacing^2 samples of what the pixels around show."""
+    around = np.ones((3, 3), np.uint8)
+    least, most = (linear_of_codes(way(clean, around)) for way in (cv2.erode, cv2.dilate))
+    return np.asarray((spacing * (most - least)) ** 2 / 12.0, dtype=np.float64)
+
+
+def _rounding(codes: NDArray[np.uint8] | NDArray[np.float32]) -> FloatArray:
+    """Variance of the linear values (...) by rounding to codes."""
+    exact = codes.astype(np.float64)
+    return np.asarray((linear_of_codes(exact + 0.5) - linear_of_codes(exact - 0.5)) ** 2 / 12.0, dtype=np.float64)

@@ -1,0 +1,274 @@
+"""What dataset.json, its card, each sequence.json and the folders say of each other."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePosixPath
+from reprlib import repr as shortened
+from typing import Any
+
+from rsbench.components.cards import list_cards, load_card, parse_card
+from rsbench.core.errors import RsbenchError
+from rsbench.core.version import __version__
+from rsbench.dataset.card import DatasetCard, SequenceCard
+from rsbench.dataset.layout import RELATIVE_FILES, files_of
+from rsbench.dataset.sequence import FORMAT, UNITS, Sequence, sequence_manifest
+from rsbench.renderers.options import RendererOptions
+from rsbench.scenes.load import read_scene_card
+from rsbench.storage.files import read_json, sha256
+from rsbench.storage.untrusted_files import NAME, inside
+from rsbench.storage.work_folder import files_below
+from rsbench.verification.findings import finding
+
+DATASET = "dataset.json"
+_TEXTS = ("name", "description", "rsbench", "mitsuba")
+_MOST_NAMES = 5
+"""Files that one finding names."""
+_SAME = 1e-12
+"""Relative difference of two numbers that were computed from the same card: a thousand roundings."""
+
+
+@dataclass(frozen=True, eq=False)
+class Listing:
+    """A dataset as its dataset.json tells it, sorted once for all of its sequences."""
+
+    folder: Path
+    manifest: Mapping[str, Any]
+    card: DatasetCard | str
+    """The card, or the fault that it is none."""
+    names: tuple[str, ...]
+    """Of sequences that may be opened: folders in it, each once."""
+    files: Mapping[str, Mapping[str, object]]
+    """What ``files`` says of each sequence, by its name and the path below its folder."""
+    planned: Mapping[str, SequenceCard]
+    """Sequences of the card by name."""
+
+    @classmethod
+    def of(cls, folder: Path, manifest: Mapping[str, Any]) -> Listing:
+        card = _card_of(manifest)
+        names, files = manifest.get("sequences"), manifest.get("files")
+        good = [name for name in names if is_name(name)] if isinstance(names, list) else []
+        below: dict[str, dict[str, object]] = {name: {} for name in good}
+        for path, entry in files.items() if isinstance(files, dict) else ():
+            name, _, relative = path.partition("/")
+            if name in below and _stays_inside(path):
+                below[name][relative] = entry
+        made = {} if isinstance(card, str) else {sequence.name: sequence for sequence in card.sequence}
+        return cls(folder, manifest, card, tuple(below), below, made)
+
+
+def is_name(name: object) -> bool:
+    """Whether this is a name that a card may give to a sequence, and so no path."""
+    return isinstance(name, str) and NAME.fullmatch(name) is not None
+
+
+def dataset_faults(listing: Listing) -> Iterator[str]:
+    """What is wrong with dataset.json as a whole."""
+    manifest, card = listing.manifest, listing.card
+    if manifest.get("format") != FORMAT or isinstance(manifest.get("format"), bool):
+        yield finding(DATASET, f"format = {manifest.get('format')!r}: {FORMAT} is needed")
+    for key in _TEXTS:
+        if not isinstance(manifest.get(key), str):
+            yield finding(DATASET, f"{key} = {manifest.get(key)!r}: a text is needed")
+    if manifest.get("units") != UNITS:
+        yield finding(DATASET, f"units = {manifest.get('units')!r}: {UNITS} is needed")
+    yield from _name_faults(manifest.get("sequences"))
+    yield from _listing_faults(listing)
+    if isinstance(card, str):
+        yield card
+        return
+    for key, value in (("name", card.name), ("description", card.description)):
+        if manifest.get(key) != value:
+            yield finding(DATASET, f"{key} = {manifest.get(key)!r}, its card says {value!r}")
+    made = [sequence.name for sequence in card.sequence]
+    if manifest.get("sequences") != made:
+        yield finding(
+            DATASET, f"sequences = {shortened(manifest.get('sequences'))}, its card makes {shortened(made)}"
+        )
+
+
+def _name_faults(names: object) -> Iterator[str]:
+    if not isinstance(names, list) or not names:
+        yield finding(DATASET, f"sequences = {names!r}: a list of names is needed")
+        return
+    for name in names:
+        if not is_name(name):
+            yield finding(DATASET, f"sequences: {name!r} is not the name of a folder in it")
+    for name, count in Counter(map(str, names)).items():
+        if count > 1:
+            yield finding(DATASET, f"sequences: {name!r} stands there twice")
+
+
+def _listing_faults(listing: Listing) -> Iterator[str]:
+    """``files`` against the sequences and the disk; each file's content is looked at with its sequence."""
+    folder, files = listing.folder, listing.manifest.get("files")
+    if not isinstance(files, dict):
+        yield finding(DATASET, f"files = {files!r}: a table of paths is needed")
+        return
+    strange = [path for path in files if path.partition("/")[0] not in listing.files or not _stays_inside(path)]
+    if strange:
+        yield finding(DATASET, f"files lists what belongs to none of its sequences: {_some(strange)}")
+    there = {path for path in files_below(folder) if not _hidden(Path(path))}
+    extra = sorted(there - {DATASET, *files})
+    if extra:
+        yield finding(DATASET, f"lies there but is not listed in files: {_some(extra)}")
+
+
+def _stays_inside(path: str) -> bool:
+    return (
+        not {"", ".", ".."} & set(path.split("/")) and not PurePosixPath(path).is_absolute() and "\\" not in path
+    )
+
+
+def _hidden(path: Path) -> bool:
+    """Names with a dot in front belong to the system, or to a run at work: no reader opens them."""
+    return any(part.startswith(".") for part in path.parts)
+
+
+def _some(names: list[str]) -> str:
+    left = len(names) - _MOST_NAMES
+    return ", ".join(names[:_MOST_NAMES]) + (f" and {left} more" if left > 0 else "")
+
+
+def _card_of(manifest: Mapping[str, Any]) -> DatasetCard | str:
+    """The card of dataset.json, or the fault that it is none."""
+    card = manifest.get("card")
+    if not isinstance(card, dict):
+        return finding(DATASET, f"card = {card!r}: the card of the dataset is needed")
+    try:
+        return parse_card(DatasetCard, card, f"{DATASET}: card")
+    except RsbenchError as error:
+        return str(error)
+
+
+def file_faults(listing: Listing, name: str) -> Iterator[str]:
+    """Files of a sequence against both manifests: there, listed in both, and with the bytes that they say."""
+    folder, listed, below = listing.folder, listing.files[name], f"{name}/"
+    own, needed, fault = _own_files(folder / name)
+    if fault:
+        yield fault
+    for relative in sorted({"sequence.json", *needed, *own, *listed}):
+        entry = listed.get(relative)
+        if relative not in own and relative != "sequence.json" and not fault:
+            yield finding(f"{below}sequence.json", f"files does not list {relative}")
+        if entry is None:
+            yield finding(below + relative, "not listed in dataset.json")
+        else:
+            yield from _content_faults(folder, below + relative, entry, own.get(relative))
+
+
+def _own_files(folder: Path) -> tuple[dict[str, object], tuple[str, ...], str]:
+    """``files`` of a sequence.json, those that it must have, and what is wrong with them."""
+    try:
+        manifest = read_json(inside(folder, "sequence.json"))
+    except RsbenchError as error:
+        return {}, RELATIVE_FILES, str(error)
+    files, needed = manifest.get("files"), files_of(manifest)
+    if not isinstance(files, dict) or not files:
+        return (
+            {},
+            needed,
+            finding(f"{folder.name}/sequence.json", f"files = {files!r}: a table of sha256 is needed"),
+        )
+    strange = [path for path in files if not _stays_inside(path)]
+    if strange:
+        fault = finding(f"{folder.name}/sequence.json", f"files lists paths that leave it: {_some(strange)}")
+        return {path: digest for path, digest in files.items() if path not in strange}, needed, fault
+    return files, needed, ""
+
+
+def _content_faults(folder: Path, name: str, entry: object, own: object) -> Iterator[str]:
+    try:
+        path = inside(folder, name)
+    except RsbenchError as error:
+        yield str(error)
+        return
+    if not path.is_file():
+        yield finding(name, "missing")
+        return
+    if not isinstance(entry, dict) or not isinstance(entry.get("size"), int) or "sha256" not in entry:
+        yield finding(DATASET, f"files: {name} = {entry!r}: size and sha256 are needed")
+        return
+    size = path.stat().st_size
+    digest = sha256(path) if size == entry["size"] else ""
+    if digest != entry["sha256"]:
+        what = f"content differs from its checksum in {DATASET}"
+        yield finding(name, what if digest else f"{what}: {size} bytes, it says {entry['size']}")
+    elif own is not None and digest != own:
+        yield finding(name, f"content differs from its checksum in {name.partition('/')[0]}/sequence.json")
+
+
+def sequence_faults(sequence: Sequence, name: str, listing: Listing) -> Iterator[str]:
+    """What sequence.json says against itself, its folder and the card."""
+    file, manifest = "sequence.json", sequence.manifest
+    expected = sequence_manifest(
+        name=name,
+        rig=sequence.rig,
+        shutter=sequence.shutter,
+        motion=sequence.motion,
+        frame_period_s=sequence.frame_period_s,
+        frames=sequence.frames,
+        moves=bool(sequence.moving),
+    )
+    for key, value in expected.items():
+        if not _equal(manifest.get(key), value):
+            yield finding(file, f"{key} = {manifest.get(key)!r}, the rest of it makes {value!r}")
+    if not 0 < sequence.frame_period_s < math.inf:
+        yield finding(file, f"frame_period_s = {sequence.frame_period_s}: a positive number is needed")
+    made_by = manifest.get("made_by")
+    for key in ("rsbench", "mitsuba", "drjit", "variant"):
+        if not isinstance(made_by, dict) or not isinstance(made_by.get(key), str):
+            yield finding(file, f"made_by: {key} is missing")
+    if isinstance(listing.card, DatasetCard) and name in listing.planned:
+        yield from _card_faults(manifest, listing.card, listing.planned[name])
+
+
+def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: SequenceCard) -> Iterator[str]:
+    """sequence.json against what the card would make, as far as that is known without building the scene."""
+    made = manifest.get("made_by")
+    same_version = isinstance(made, dict) and made.get("rsbench") == __version__
+    planned = dict.fromkeys(("sensor", "channels", "imu", "twins", "frames", "moving")) | card.manifest_of(
+        sequence
+    )
+    planned["seed"] = card.seed_of(sequence)
+    start = None if sequence.start is None else asdict(sequence.start)
+    scene: dict[str, Any] = {"viewpoint": sequence.viewpoint, "start": start}
+    # The cards that come with another version may say other things.
+    if same_version and sequence.scene in list_cards("scenes"):
+        built_in, _ = read_scene_card(list_cards("scenes")[sequence.scene])
+        scene |= {"name": built_in.name}
+        if sequence.viewpoint in built_in.viewpoints:
+            scene |= asdict(built_in.viewpoints[sequence.viewpoint])
+    options: dict[str, Any] = {}
+    if same_version and card.renderer in list_cards("renderers"):
+        options = load_card(RendererOptions, "renderers", card.renderer).record
+        # `generate --full-frames` replaces these two.
+        options = {key: value for key, value in options.items() if key not in ("method", "full_frames")}
+    for key, value in planned.items():
+        if not _equal(manifest.get(key), value):
+            yield finding("sequence.json", f"{key} = {manifest.get(key)!r}, the card in {DATASET} makes {value!r}")
+    for table, wanted in (("scene", scene), ("renderer", options)):
+        stored = manifest.get(table)
+        if not isinstance(stored, dict):
+            yield finding("sequence.json", f"{table} = {stored!r}: a table is needed")
+            continue
+        for key, value in wanted.items():
+            if not _equal(stored.get(key), value):
+                what = f"{table}.{key} = {stored.get(key)!r}, the card in {DATASET} makes {value!r}"
+                yield finding("sequence.json", what)
+
+
+def _equal(stored: object, expected: object) -> bool:
+    """Equal as JSON holds it, numbers to rounding; a truth value is no number."""
+    if isinstance(expected, Mapping):
+        if not isinstance(stored, Mapping) or stored.keys() != expected.keys():
+            return False
+        return all(_equal(stored[key], value) for key, value in expected.items())
+    if isinstance(expected, (list, tuple)):
+        return isinstance(stored, list) and len(stored) == len(expected) and all(map(_equal, stored, expected))
+    if isinstance(expected, bool) or isinstance(stored, bool) or not isinstance(expected, int | float):
+        return type(stored) is type(expected) and stored == expected
+    return isinstance(stored, int | float) and math.isclose(stored, expected, rel_tol=_SAME, abs_tol=1e-15)

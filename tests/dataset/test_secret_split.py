@@ -1,0 +1,133 @@
+"""Cards drawn from a secret text: all that a split must hide is drawn, and nothing that is told tells it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rsbench.benchmark.leaderboard.splits import seed_of
+from rsbench.core.errors import RsbenchError
+from rsbench.dataset.card import DatasetCard, load_dataset_card
+from rsbench.dataset.secret_split import Secret, read_secret, secret_card, write_scenes
+from rsbench.scenes.load import load_scene, read_scene_card
+
+TEXT = "f3b1 a secret that nobody guesses"
+MOVING = """[[sequence.moving]]
+box = [1, 1, 1]
+position = [0, 0, 9]
+motion = { rotation_deg = 1, rotation_axis = "random", translation = 0.1, translation_axis = "random" }
+"""
+
+
+@pytest.fixture(scope="module")
+def drawn() -> DatasetCard:
+    return secret_card("standard", Secret(TEXT))
+
+
+def motions(card: DatasetCard) -> np.ndarray:
+    """(n, 6), in the order of the card."""
+    found = [card.motion_of(each) for each in card.sequence]
+    return np.array([np.concatenate([each.w, each.d]) for each in found])
+
+
+def test_a_text_draws_one_card_and_another_text_another(drawn: DatasetCard) -> None:
+    assert secret_card("standard", Secret(TEXT)) == drawn
+    other = secret_card("standard", Secret(f"{TEXT}."))
+    assert not {each.seed for each in other.sequence} & {each.seed for each in drawn.sequence}
+    assert not set(motions(other).ravel()) & set(motions(drawn).ravel())
+
+
+def test_every_combination_is_there_and_no_two_share_a_motion(drawn: DatasetCard) -> None:
+    """As many of each scene, stratum and sensor as the card has; a motion that eight share could be averaged."""
+    open_card = load_dataset_card("standard")
+
+    def kinds(card: DatasetCard) -> list[tuple[object, ...]]:
+        return sorted((each.scene, each.baseline or card.baseline, each.sensor is None) for each in card.sequence)
+
+    assert kinds(drawn) == kinds(open_card)
+    assert len(np.unique(motions(drawn), axis=0)) == len(drawn.sequence) == 216
+    assert len({each.seed for each in drawn.sequence}) == 216
+    axes = motions(drawn)[:, :3] / np.linalg.norm(motions(drawn)[:, :3], axis=1, keepdims=True)
+    # Of 216 directions on the sphere the mean is shorter than 4 / sqrt(3 * 216) but for one in 1e4 of all texts.
+    assert np.linalg.norm(axes.mean(axis=0)) < 4.0 / np.sqrt(3 * 216)
+
+
+def test_no_size_is_that_of_the_card(drawn: DatasetCard) -> None:
+    """Who knows that a rotation has 0.4, 2 or 6 deg would round to them."""
+    sizes = np.array([each.motion.rotation_deg for each in drawn.sequence if each.motion])
+    nearest = np.array([0.4, 2.0, 6.0])[np.searchsorted([0.4, 2.0], sizes - 1e-12)]
+    share = sizes / nearest
+    assert share.min() >= 0.7 and share.max() < 1.0
+    assert len(np.unique(share)) == 216
+    ratios = np.array([each.readout_ratio for each in drawn.sequence])
+    assert len(np.unique(ratios)) == 216
+    assert np.all((ratios < 0.3) & (ratios >= 0.21) | (ratios < 0.9) & (ratios >= 0.63))
+
+
+def test_names_and_order_tell_nothing(drawn: DatasetCard) -> None:
+    assert [each.name for each in drawn.sequence] == [f"s{number:03d}" for number in range(216)]
+    scenes = [each.scene for each in drawn.sequence]
+    # Of 215 neighbours one in nine is of one scene by chance: 24, with a deviation of 5.
+    assert sum(one == other for one, other in pairwise(scenes)) < 24 + 5 * 5
+
+
+def test_what_is_announced_is_no_seed(drawn: DatasetCard, tmp_path: Path) -> None:
+    secret, path = Secret(TEXT), tmp_path / "seed"
+    path.write_text(f"  {TEXT}\n")
+    assert read_secret(path) == secret
+    plain = hashlib.sha256(TEXT.encode()).hexdigest()
+    assert secret.commitment != plain and int(secret.commitment, 16) != seed_of(path)
+    told = int(secret.commitment, 16)
+    assert all(each.seed not in (told >> 194, told % 2**62, told) for each in drawn.sequence)
+    assert TEXT not in repr(secret)
+
+
+def test_scenes_are_others_in_the_same_places(tmp_path: Path) -> None:
+    paths = write_scenes("standard", Secret(TEXT), tmp_path)
+    assert len(paths) == 9
+    for path in paths:
+        own, open_one = read_scene_card(path)[0], read_scene_card(Path("scenes", path.name))[0]
+        assert own.seed != open_one.seed and replace(own, seed=open_one.seed) == open_one
+    card = secret_card("standard", Secret(TEXT), tmp_path)
+    assert {each.scene for each in card.sequence} == set(map(str, paths))
+
+
+def test_a_scene_of_a_secret_seed_can_be_built(tmp_path: Path) -> None:
+    """Its seed is within what builders, TOML and the cache of scenes take."""
+    path = next(each for each in write_scenes("standard", Secret(TEXT), tmp_path) if each.stem == "corridor")
+    own, open_one = load_scene(path), load_scene("corridor")
+    textures = [
+        [m.material.texture for m in each.meshes if m.material.texture is not None] for each in (own, open_one)
+    ]
+    assert len(textures[0]) and not all(map(np.array_equal, *textures))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ('rotation_axis = "random"', "rotation_axis = [1, 0, 0]"),
+        ('translation_axis = "random"', "translation_axis = [1, 0, 0]"),
+        ('scene = "poles"', f'scene = "poles"\n{MOVING}'),
+    ],
+)
+def test_a_card_that_tells_what_is_to_be_hidden_is_refused(change: str, words: str, tmp_path: Path) -> None:
+    text = Path("cards/datasets/poles.toml").read_text()
+    assert change in text
+    (tmp_path / "mine.toml").write_text(text.replace(change, words))
+    with pytest.raises(RsbenchError, match=r"mine\.toml: poles: mo(tion|ving): "):
+        secret_card(str(tmp_path / "mine.toml"), Secret(TEXT))
+
+
+def test_a_short_text_and_a_scene_without_a_seed_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "seed").write_text("12345\n")
+    with pytest.raises(RsbenchError, match=r"seed: holds 5 characters: a secret seed needs 16"):
+        read_secret(tmp_path / "seed")
+    card = tmp_path / "mine.toml"
+    card.write_text(Path("cards/datasets/poles.toml").read_text().replace('scene = "poles"', 'scene = "mesh"'))
+    with pytest.raises(RsbenchError, match="scene mesh: is not built from a seed"):
+        write_scenes(str(card), Secret(TEXT), tmp_path)

@@ -1,0 +1,281 @@
+"""Layouts of others, written here by hand as their own documents have them, and read in place.
+
+Truth: closed forms written with matrix exponentials and homogeneous matrices, not with rsbench's geometry.
+"""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import scipy
+from carla_frames import FPS, HEIGHT, SEEN, WIDTH, V, W, skew, write, write_carla, write_image
+from commands import run_here
+from numpy.typing import NDArray
+
+from rsbench.core.errors import RsbenchError
+from rsbench.interop.readers.carla import read_carla
+from rsbench.interop.readers.check import agreements
+from rsbench.interop.readers.colmap import read_colmap
+from rsbench.interop.readers.euroc import read_euroc
+from rsbench.interop.readers.formats import read_others
+from rsbench.interop.readers.stereo import read_kitti, read_middlebury
+
+Array = NDArray[Any]
+
+
+def only_row(path: Path) -> dict[str, str]:
+    with path.open(encoding="utf-8") as file:
+        (row,) = csv.DictReader(file)
+    return row
+
+
+# Carla-RS
+
+
+def test_carla_has_velocities_of_the_camera_and_distances_along_rays(tmp_path: Path) -> None:
+    (recording,) = read_carla(write_carla(tmp_path))
+    assert recording.shutters["left"].readout_ratio == pytest.approx(1.0)
+    assert recording.right_from_left is None  # one camera: no rig is made up
+    for frame in (0, 1):
+        np.testing.assert_allclose(recording.depths["left", frame](), SEEN[frame][0], atol=1e-6)  # six decimals
+    pose = recording.poses["left"](np.array([0.0, 0.7]))
+    t = 0.7 / FPS
+    world_from_camera = np.eye(4)
+    world_from_camera[:3, :3], world_from_camera[:3, 3] = scipy.linalg.expm(skew(W * t)), V * t
+    np.testing.assert_allclose(
+        np.column_stack([pose.R[1], pose.t[1]]), np.linalg.inv(world_from_camera)[:3], atol=1e-12
+    )
+
+
+def test_carla_agrees_with_itself(tmp_path: Path) -> None:
+    """1e-4: inverse depth is a plane in the image of one pose, and bends by the motion between two rows."""
+    (found,) = agreements(read_carla(write_carla(tmp_path))[0])
+    assert not found.fault
+    assert found.share > 0.99
+    assert found.typical < 1e-4
+    assert found.pixels > WIDTH * HEIGHT / 2
+
+
+@pytest.mark.parametrize(
+    "trap",
+    [{"sign": -1.0}, {"suffix": ".pdepth"}],
+    ids=["sign of the velocities", "radial taken for z"],
+)
+def test_carla_read_otherwise_does_not_agree(tmp_path: Path, trap: dict[str, Any]) -> None:
+    run = run_here("verify", write_carla(tmp_path, **trap), "--from", "carla-rs")
+    assert run.returncode == 1
+    assert "do not agree" in run.stderr
+
+
+def test_a_wrong_readout_leaves_differences(tmp_path: Path) -> None:
+    """Of points that change their row by a few: seen as differences, though below what is called a fault."""
+    right, wrong = (
+        next(agreements(read_carla(write_carla(tmp_path / f"{row_ms}", row_ms=row_ms))[0]))
+        for row_ms in (1e3 / FPS / HEIGHT, 0.0)
+    )
+    assert wrong.typical > 5.0 * right.typical
+
+
+def test_carla_is_verified_and_scored(tmp_path: Path) -> None:
+    folder = write_carla(tmp_path / "data")
+    run = run_here("verify", folder, "--from", "carla-rs")
+    assert run.returncode == 0, run.stderr
+    run = run_here("evaluate", folder, "--from", "carla-rs", "--out", tmp_path / "out")
+    assert run.returncode == 0, run.stderr
+    row = only_row(tmp_path / "out" / "scores" / "pose.csv")
+    assert float(row["e_R_deg"]) < 0.2  # of 4; SIFT in 160 x 120 px errs by a tenth of a pixel, 0.07 deg
+    assert float(row["e_T_deg"]) < 6.0
+    assert not (tmp_path / "out" / "scores" / "depth.csv").exists()  # of one camera there is none
+
+
+# Rectified stereo
+
+GRADIENT = np.linspace(8.0, 20.0, 60)[:, None] * np.ones(200)
+"""Disparities that grow from the first row to the last one: a flipped reading shows."""
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_middlebury(tmp_path: Path, order: str) -> None:
+    write(
+        tmp_path / "pipes" / "calib.txt",
+        "cam0=[400 0 90; 0 400 30; 0 0 1]\ncam1=[400 0 95; 0 400 30; 0 0 1]\ndoffs=5\nbaseline=160\n"
+        "width=200\nheight=60\nndisp=64\n",
+    )
+    for name in ("im0.png", "im1.png"):
+        write_image(tmp_path / "pipes" / name, np.full((60, 200), 128, dtype=np.uint8))
+    stored = GRADIENT.astype(f"{order}f4")
+    stored[3, 4] = np.inf
+    scale = -1.0 if order == "<" else 1.0
+    header = f"Pf\n200 60\n{scale}\n".encode()
+    (tmp_path / "pipes" / "disp0.pfm").write_bytes(header + stored[::-1].tobytes())
+    (recording,) = read_middlebury(tmp_path)
+    found = recording.disparities["left", 0]()
+    assert np.isnan(found[3, 4])
+    assert recording.right_from_left is not None
+    baseline, fx = -recording.right_from_left.t[0], recording.cameras["left"].fx
+    expected = 160e-3 * 400 / (GRADIENT[50, 7] + 5)  # z of their documents, in metres
+    assert baseline * fx / found[50, 7] == pytest.approx(expected, rel=1e-6)
+    assert not recording.shutters  # the layout says nothing of one
+
+
+def write_kitti(root: Path) -> Path:
+    noise = np.random.default_rng(0).uniform(0, 255, (120, 360)).astype(np.uint8)
+    texture = cv2.GaussianBlur(noise, (0, 0), 1.2)
+    for name, shift in (("image_2", 0), ("image_3", 16)):
+        write_image(root / name / "000000_10.png", texture[:, shift : shift + 320])
+    disparity = np.full((120, 320), 16 * 256, dtype=np.uint16)
+    disparity[:, :20] = 0
+    write_image(root / "disp_occ_0" / "000000_10.png", disparity)
+    rows = {"P_rect_02": "300 0 160 18 0 300 60 0 0 0 1 0", "P_rect_03": "300 0 160 -132 0 300 60 0 0 0 1 0"}
+    text = "calib_time: 09-Jan-2012 13:57:47\n" + "".join(f"{key}: {value}\n" for key, value in rows.items())
+    write(root / "calib_cam_to_cam" / "000000.txt", text)
+    return root
+
+
+def test_kitti(tmp_path: Path) -> None:
+    (recording,) = read_kitti(write_kitti(tmp_path / "data"))
+    assert recording.right_from_left is not None
+    np.testing.assert_allclose(recording.right_from_left.t, [-0.5, 0.0, 0.0])  # (18 + 132) / 300
+    found = recording.disparities["left", 0]()
+    assert np.all(np.isnan(found[:, :20]))
+    np.testing.assert_array_equal(found[:, 20:], 16.0)
+    assert set(recording.images) == {("left", 0), ("right", 0)}  # no picture of the next time was written
+    assert run_here("verify", tmp_path / "data", "--from", "kitti").returncode == 0
+    run = run_here("evaluate", tmp_path / "data", "--from", "kitti", "--out", tmp_path / "out")
+    assert run.returncode == 0, run.stderr
+    row = only_row(tmp_path / "out" / "scores" / "depth.csv")
+    assert float(row["bad_1px"]) < 0.02
+    assert float(row["coverage"]) > 0.9
+
+
+# EuRoC and TUM RS-VI
+
+BODY_FROM = {
+    0: np.array([[0.0, -1, 0, -0.02], [1, 0, 0, -0.06], [0, 0, 1, 0.01], [0, 0, 0, 1]]),
+    1: np.array([[0.0, -1, 0, -0.02], [1, 0, 0, 0.05], [0, 0, 1, 0.01], [0, 0, 0, 1]]),
+}
+START, PERIOD = 1403636579763555584, 50000000
+
+
+def body(t: float) -> Array:
+    """``world_from_body``, t in seconds: a turn at constant speed along a straight way."""
+    out = np.eye(4)
+    out[:3, :3] = scipy.linalg.expm(skew(np.array([0.4, -0.2, 0.7]) * t))
+    out[:3, 3] = np.array([1.0, 2.0, 3.0]) + np.array([0.5, -0.3, 0.2]) * t
+    return out
+
+
+def write_euroc(root: Path) -> Path:
+    stamps = [START + k * PERIOD for k in range(4)]
+    for k, T in BODY_FROM.items():
+        cam = root / "mav0" / f"cam{k}"
+        rows = ["".join(f"{value:g}, " for value in row).strip() for row in T]
+        data = "\n         ".join(rows).rstrip(",")
+        write(
+            cam / "sensor.yaml",
+            "#Default\nsensor_type: camera\ncomment: VI-Sensor\nT_BS:\n  cols: 4\n  rows: 4\n"
+            f"  data: [{data}]\nrate_hz: 20\nresolution: [64, 48]\ncamera_model: pinhole\n"
+            "intrinsics: [46.0, 45.5, 31.2, 24.1] #fu, fv, cu, cv\ndistortion_model: radial-tangential\n"
+            "distortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]\n",
+        )
+        seen = stamps[:3] if k == 0 else stamps[1:]
+        rows = "".join(f"{stamp},{stamp}.png\n" for stamp in seen)
+        write(cam / "data.csv", "#timestamp [ns],filename\n" + rows)
+        for stamp in seen:
+            write_image(cam / "data" / f"{stamp}.png", np.full((48, 64), 100, dtype=np.uint8))
+    rows = []
+    for k in range(-5, 60):  # every 2.5 ms, 1 ns beside the images
+        stamp = START + k * 2_500_000 + 1
+        T = body((stamp - START) * 1e-9)
+        q = scipy.spatial.transform.Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+        rows.append(f"{stamp}," + ",".join(f"{value:.12f}" for value in (*T[:3, 3], *q, 0.0, 0.0, 0.0)))
+    header = "#timestamp, p_RS_R_x [m], y, z, q_RS_w [], x, y, z, v\n"
+    write(root / "mav0" / "state_groundtruth_estimate0" / "data.csv", header + "\n".join(rows) + "\n")
+    return root
+
+
+def test_euroc(tmp_path: Path) -> None:
+    (recording,) = read_euroc(write_euroc(tmp_path))
+    assert recording.frames == 2  # two times at which both cameras saw something
+    assert recording.images["right", 0].name == f"{START + PERIOD}.png"
+    assert recording.frame_period_s == pytest.approx(0.05)
+    assert not recording.shutters
+    for side, k in (("left", 0), ("right", 1)):
+        pose = recording.poses[side](np.array([0.25]))
+        expected = np.linalg.inv(body(1.25 * PERIOD * 1e-9) @ BODY_FROM[k])
+        # 1e-9: twelve decimals; a time that was a float of nanoseconds would be off by 1e-7 m.
+        np.testing.assert_allclose(np.column_stack([pose.R[0], pose.t[0]]), expected[:3], atol=1e-9)
+    assert recording.right_from_left is not None
+    apart = np.linalg.inv(BODY_FROM[1]) @ BODY_FROM[0]
+    np.testing.assert_allclose(recording.right_from_left.t, apart[:3, 3], atol=1e-12)
+    camera = recording.cameras["left"]
+    assert camera.lens is not None
+    assert (camera.cx, camera.lens.k1, camera.lens.p2) == (31.2, -0.28, 1.8e-05)
+    assert np.all(np.isnan(recording.poses["left"](np.array([9.0])).t))  # where nothing is known, nothing is said
+    assert run_here("verify", tmp_path, "--from", "euroc").returncode == 0
+
+
+def test_tum_rsvi_has_its_line_delay(tmp_path: Path) -> None:
+    (recording,) = read_others(write_euroc(tmp_path), "tum-rsvi")
+    assert recording.shutters["left"].readout_ratio == 0.0
+    assert recording.shutters["right"].readout_ratio == pytest.approx(29.4737e-6 * 48 * 20)  # rows times rate
+
+
+# COLMAP
+
+
+def test_colmap(tmp_path: Path) -> None:
+    write(
+        tmp_path / "sparse" / "cameras.txt",
+        "# Camera list\n1 OPENCV 640 480 500 510 320 240 -0.1 0.02 0.001 -0.002\n"
+        "2 SIMPLE_PINHOLE 64 48 50 32 24\n",
+    )
+    turn = scipy.spatial.transform.Rotation.from_rotvec([0.1, -0.2, 0.3])
+    q = " ".join(f"{value:.12f}" for value in turn.as_quat(scalar_first=True))
+    write(
+        tmp_path / "sparse" / "images.txt",
+        f"# Image list\n2 {q} 0.1 0.2 0.3 1 b b.png\n\n"
+        "1 1 0 0 0 0 0 0 1 a.png\n10.5 20.5 -1\n3 1 0 0 0 0 0 0 2 c.png\n\n",
+    )
+    first, second = sorted(read_colmap(tmp_path / "sparse"), key=lambda each: each.name)
+    assert [first.images["left", k].name for k in (0, 1)] == ["a.png", "b b.png"]
+    X = np.array([0.4, -0.3, 2.0])
+    pose = first.poses["left"](np.array([0.0, 0.5, 1.0]))
+    moved = pose.R[2] @ X + pose.t[2]
+    np.testing.assert_allclose(moved, turn.as_matrix() @ X + [0.1, 0.2, 0.3], atol=1e-9)
+    assert np.all(np.isnan(pose.t[1]))  # between images nothing is known
+    x, y = moved[:2] / moved[2]
+    r2 = x * x + y * y
+    radial = 1 - 0.1 * r2 + 0.02 * r2**2
+    xd = x * radial + 2 * 0.001 * x * y - 0.002 * (r2 + 2 * x * x)
+    yd = y * radial + 0.001 * (r2 + 2 * y * y) - 2 * 0.002 * x * y
+    theirs = np.array([500 * xd + 320, 510 * yd + 240])  # counted from the corner of the image
+    np.testing.assert_allclose(first.cameras["left"].project(moved), theirs - 0.5, atol=1e-6)
+    assert (second.cameras["left"].fy, second.cameras["left"].cx) == (50.0, 31.5)
+    assert not first.shutters
+
+
+# What is wrong
+
+
+@pytest.mark.parametrize("layout", ["carla-rs", "colmap", "euroc", "kitti", "middlebury", "tum-rsvi"])
+def test_an_empty_folder_has_no_layout(tmp_path: Path, layout: str) -> None:
+    with pytest.raises(RsbenchError, match=r"holds no"):
+        read_others(tmp_path, layout)
+
+
+def test_a_layout_that_does_not_exist_is_named(tmp_path: Path) -> None:
+    run = run_here("verify", tmp_path, "--from", "kity")
+    assert run.returncode == 2
+    assert "kitti" in run.stderr
+
+
+def test_an_image_of_another_size_is_a_fault(tmp_path: Path) -> None:
+    write_euroc(tmp_path)
+    write_image(tmp_path / "mav0" / "cam1" / "data" / f"{START + PERIOD}.png", np.zeros((40, 64), dtype=np.uint8))
+    run = run_here("verify", tmp_path, "--from", "euroc")
+    assert run.returncode == 1
+    assert "64 x 40" in run.stderr

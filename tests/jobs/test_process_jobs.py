@@ -1,0 +1,100 @@
+"""Jobs over processes: all are done, each once, and all can be stopped."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from rsbench.core.errors import RsbenchError
+from rsbench.jobs.isolation import EntryFailure
+from rsbench.jobs.process_jobs import LostJobsError, finished_jobs, run_jobs
+
+ASK = "__import__('os').getpid()"
+
+
+def test_all_jobs_are_done_by_few_processes() -> None:
+    jobs = [float(k * k) for k in range(20)]
+    done = {job: outcome.value for job, outcome in run_jobs(functools.partial, jobs, 2, {}, math.sqrt)}
+    assert done == {float(k * k): float(k) for k in range(20)}
+    pids = {outcome.value for _, outcome in run_jobs(functools.partial, [ASK] * 6, 2, {}, eval)}
+    assert 1 <= len(pids) <= 2 and os.getpid() not in pids
+
+
+def test_the_environment_reaches_the_children() -> None:
+    given = {"RSBENCH_TEST_WORD": "yes"}
+    ((_, outcome),) = run_jobs(functools.partial, ["RSBENCH_TEST_WORD"], 1, given, os.getenv)
+    assert outcome.value == "yes" and "RSBENCH_TEST_WORD" not in os.environ
+
+
+def test_a_job_that_ends_its_process_is_tried_three_times_and_the_others_are_done(tmp_path: Path) -> None:
+    """Each try appends a letter; the shell's parent is the child that serves the job."""
+    note = tmp_path / "tries"
+    deadly, good = f"printf x >> {note}; kill -9 $PPID", "true"
+    outcomes = dict(run_jobs(functools.partial, [deadly, good], 1, {}, os.system))
+    assert outcomes[deadly].ended and outcomes[deadly].reason == "killed by signal 9 (SIGKILL)"
+    assert outcomes[good].value == 0 and note.read_text() == "xxx"
+
+
+def test_a_job_that_was_killed_once_is_done(tmp_path: Path) -> None:
+    mark = tmp_path / "mark"
+    ((_, outcome),) = run_jobs(
+        functools.partial, [f"test -e {mark} || {{ touch {mark}; kill -9 $PPID; }}"], 1, {}, os.system
+    )
+    assert outcome.success and outcome.value == 0
+
+
+def test_jobs_that_are_lost_are_named_when_the_others_are_done() -> None:
+    done = []
+    with pytest.raises(
+        LostJobsError, match=r"not done: kill -9 \$PPID \(killed by signal 9 \(SIGKILL\), 3 times\)"
+    ):
+        for job, value in finished_jobs(functools.partial, ["kill -9 $PPID", "true", "exit 3"], 1, {}, os.system):
+            done.append((job, os.waitstatus_to_exitcode(value)))
+    assert done == [("true", 0), ("exit 3", 3)]
+
+
+def test_a_job_that_takes_too_much_fails_alone(tmp_path: Path) -> None:
+    """Too long, too much memory, and an end of the process, which is not tried again; then one in order."""
+    note = tmp_path / "tries"
+    long = "__import__('time').sleep(1000)"
+    large = "len(b'x' * (900 << 20)) and __import__('time').sleep(1000)"
+    deadly = f"__import__('os').system('printf x >> {note}; kill -9 $PPID')"
+    limits = {long: 0.3, large: 60.0, deadly: 60.0, "7": 60.0}
+    jobs = run_jobs(functools.partial, list(limits), 1, {}, eval, seconds_of=limits.__getitem__, memory_mb=600.0)
+    found = {job: outcome for job, outcome in jobs}
+    assert found[long].reason == "took longer than 0.3 s"
+    assert found[deadly].reason == "killed by signal 9 (SIGKILL)" and note.read_text() == "x"
+    assert found["7"].value == 7
+    if Path("/proc/self/statm").exists():  # elsewhere memory has no limit
+        assert found[large].reason == "used more than 600 MB of memory"
+
+
+def refuse(job: str) -> None:
+    raise EntryFailure(f"{job} is wrong")
+
+
+def test_a_job_that_fails_ends_all_at_once() -> None:
+    with pytest.raises(RsbenchError, match=r"^job of 3 letters: abc is wrong$"):
+        list(
+            finished_jobs(functools.partial, ["abc"], 1, {}, refuse, name=lambda job: f"job of {len(job)} letters")
+        )
+
+
+def test_leaving_early_ends_everything_at_once() -> None:
+    jobs = [0.0, *[1000.0] * 9]
+    outcomes = run_jobs(functools.partial, jobs, 2, {}, time.sleep)
+    assert next(outcomes)[1].success
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        outcomes.throw(KeyboardInterrupt())
+    assert time.monotonic() - start < 30.0  # the jobs would take 1000
+
+
+def test_our_own_mistake_in_a_child_stops() -> None:
+    with pytest.raises(RuntimeError, match="in a child process"):
+        list(run_jobs(functools.partial, ["four"], 1, {}, math.sqrt))

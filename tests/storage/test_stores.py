@@ -1,0 +1,276 @@
+"""Datasets on a store in memory: the bytes of a folder, whatever is stopped, lost or refused there."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from commands import assert_refused, run_here
+from small_scenes import write_box_scene, write_small_card
+
+from rsbench.core.errors import RsbenchError
+from rsbench.dataset import generation
+from rsbench.dataset.card import DatasetCard, load_dataset_card
+from rsbench.dataset.generation import generate_dataset
+from rsbench.dataset.posed_scenes import Built
+from rsbench.dataset.store_destination import store_home
+from rsbench.renderers import clearance, scene
+from rsbench.storage.object_store import Store, path_or_url
+from rsbench.storage.work_folder import HIDDEN
+
+fsspec = pytest.importorskip("fsspec", reason="needs rsbench[cloud]")
+URL = "memory://bucket/small"
+
+
+@pytest.fixture(scope="module")
+def card(tmp_path_factory: pytest.TempPathFactory) -> DatasetCard:
+    folder = tmp_path_factory.mktemp("card")
+    return load_dataset_card(str(write_small_card(folder, [write_box_scene(folder, name) for name in "ab"])))
+
+
+@pytest.fixture(scope="module")
+def dataset(card: DatasetCard, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The files of a folder, which was rendered in the way of folders."""
+    out = tmp_path_factory.mktemp("stores") / "dataset"
+    generate_dataset(card, out)
+    paths = [path for path in out.rglob("*") if path.is_file() and HIDDEN not in path.parts]
+    return {path.relative_to(out).as_posix(): path.read_bytes() for path in paths}
+
+
+@pytest.fixture
+def memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """An empty store, and no memory of any other."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    store = fsspec.filesystem("memory")
+    store.store.clear()
+    yield store
+    store.store.clear()
+
+
+@pytest.fixture
+def quick(dataset: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames are those of the folder, and are not rendered again."""
+
+    def render(*arguments: Any) -> Iterator[None]:
+        side, frame, folder = arguments[4:7]
+        for path, data in dataset.items():
+            name, _, file = path.partition("/")
+            if folder.name.startswith(f"{name}.") and Path(file).stem == f"{side}_{frame}":
+                (folder / file).write_bytes(data)
+        yield
+        yield
+
+    hashes = {name: json.loads(dataset[f"{name}/sequence.json"])["scene"]["sha256"] for name in "ab"}
+    nothing: Any = SimpleNamespace(viewpoints={"default": None}, seen_from=lambda *place: None)
+    monkeypatch.setattr(generation, "build_scene", lambda name: Built(nothing, hashes[Path(name).stem]))
+    monkeypatch.setattr(generation, "render_camera", render)
+    monkeypatch.setattr(clearance, "obstacle", lambda *moving: "")
+    monkeypatch.setattr(scene, "MitsubaScene", lambda scene: SimpleNamespace(glossy=False))
+
+
+@pytest.fixture
+def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Paths of the objects that are read from now on."""
+    paths: list[str] = []
+    real = Store.read
+
+    def noted(self: Store, some: Iterable[str], *more: int, **options: int) -> Iterator[tuple[str, bytes]]:
+        some = list(some)
+        paths.extend(some)
+        return real(self, some, *more, **options)
+
+    monkeypatch.setattr(Store, "read", noted)
+    return paths
+
+
+def stored(memory: Any) -> dict[str, bytes]:
+    return {path.removeprefix("/bucket/small/"): memory.cat(path) for path in memory.find("/bucket/small")}
+
+
+# What is there, and what is read
+
+
+def test_a_store_gets_the_bytes_of_a_folder(card: DatasetCard, dataset: dict[str, bytes], memory: Any) -> None:
+    assert generate_dataset(card, URL) == ["a", "b"]
+    assert len(dataset) == 43 and stored(memory) == dataset
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_second_run_lists_and_reads_one_object(card: DatasetCard, memory: Any, read: list[str]) -> None:
+    generate_dataset(card, URL)
+    read.clear()
+    assert generate_dataset(card, URL) == [] and read == ["dataset.json"]
+    assert generate_dataset(card, URL, rehash=True) == [] and len(set(read)) == 43
+
+
+@pytest.mark.usefixtures("quick")
+def test_another_machine_reads_each_sequence_once(
+    card: DatasetCard, dataset: dict[str, bytes], memory: Any, read: list[str], tmp_path: Path
+) -> None:
+    generate_dataset(card, URL)
+    shutil.rmtree(tmp_path / "cache")
+    read.clear()
+    assert generate_dataset(card, URL) == []
+    assert sorted(read) == ["a/sequence.json", "b/sequence.json", "dataset.json", "dataset.json"]
+    shutil.rmtree(tmp_path / "cache")
+    memory.pipe("/bucket/small/a/rs/left_0.png", b"half")  # dataset.json knows its size
+    assert generate_dataset(card, URL) == ["a"] and stored(memory) == dataset
+
+
+@pytest.mark.usefixtures("quick", "memory")
+def test_nothing_but_what_a_later_run_can_use_stays_here(card: DatasetCard, tmp_path: Path) -> None:
+    generate_dataset(card, URL)
+    kept = [path.name for path in (tmp_path / "cache/rsbench/stores").rglob("*") if path.is_file()]
+    assert sorted(kept) == ["lock", "objects.jsonl"]
+
+
+# What is stopped
+
+
+class _Stop(BaseException):
+    """As Ctrl-C: no handler of errors takes it for one."""
+
+
+@pytest.mark.usefixtures("quick")
+def test_stopped_before_any_operation_it_goes_on_to_the_same_bytes(
+    card: DatasetCard, dataset: dict[str, bytes], memory: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each operation of a run that also mends a sequence; where a sequence.json is, all of its files are."""
+    kind, left = type(memory), [0]
+
+    def counted(real: Callable[..., Any]) -> Callable[..., Any]:
+        def operation(*arguments: Any, **options: Any) -> Any:
+            left[0] -= 1
+            if left[0] == 0:
+                raise _Stop
+            return real(*arguments, **options)
+
+        return operation
+
+    for name in ("put_file", "cat_file", "find", "rm_file"):
+        monkeypatch.setattr(kind, name, counted(getattr(kind, name)))
+    for stop in itertools.count(1):
+        memory.store.clear()
+        generate_dataset(card.only(["a"]), URL)
+        memory.pipe("/bucket/small/a/rs/left_0.png", b"half")
+        left[0] = stop
+        try:
+            assert generate_dataset(card, URL) == ["a", "b"]
+        except _Stop:
+            there = stored(memory)
+            for name in "ab":
+                if f"{name}/sequence.json" in there and there.get("a/rs/left_0.png") != b"half":
+                    assert {path for path in dataset if path.startswith(name)} <= set(there)
+        else:
+            break
+        generate_dataset(card, URL)
+        assert stored(memory) == dataset
+    assert stop > 40
+
+
+@pytest.mark.usefixtures("quick")
+def test_two_commands_do_not_send_to_one_store(card: DatasetCard, memory: Any) -> None:
+    with store_home(URL, 1, False), pytest.raises(RsbenchError, match=f"process {os.getpid()} on .* is at work"):
+        generate_dataset(card, URL)
+
+
+# What is damaged, or of others
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("what", ["gone", "cut", "changed"])
+def test_what_is_damaged_is_made_again(
+    what: str, card: DatasetCard, dataset: dict[str, bytes], memory: Any
+) -> None:
+    generate_dataset(card, URL)
+    path = "/bucket/small/b/poses/right_1.csv"
+    data = memory.cat(path)
+    memory.rm(path)
+    if what != "gone":
+        memory.pipe(path, data[:-7] if what == "cut" else data.replace(b"1", b"2"))
+    assert generate_dataset(card, URL, rehash=what == "changed") == ["b"]
+    assert stored(memory) == dataset
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_dataset_of_another_card_is_refused(card: DatasetCard, memory: Any) -> None:
+    generate_dataset(card, URL)
+    before = stored(memory)
+    with pytest.raises(
+        RsbenchError, match=r"^memory://bucket/small/a: holds a sequence of another card \(differs in"
+    ):
+        generate_dataset(replace(card, baseline=0.4), URL)
+    assert stored(memory) == before
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("whole", [True, False])
+def test_objects_of_others_are_not_written_over(whole: bool, card: DatasetCard, memory: Any) -> None:
+    if whole:
+        generate_dataset(card, URL)
+    memory.pipe("/bucket/small/a/thesis.tex", b"mine")
+    memory.pipe("/bucket/small/a/rs/left_0.png", b"mine")
+    before = stored(memory)
+    with pytest.raises(RsbenchError, match=r"small/a: .*thesis\.tex"):
+        generate_dataset(card, URL)
+    assert stored(memory) == before
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_manifest_that_cannot_be_read_is_named(card: DatasetCard, memory: Any) -> None:
+    memory.pipe("/bucket/small/a/sequence.json", b'{"files": [')
+    with pytest.raises(RsbenchError, match=r"small/a/sequence\.json: damaged, or not rsbench's: remove it"):
+        generate_dataset(card, URL)
+
+
+# What is no store
+
+
+def test_a_file_url_is_a_folder(tmp_path: Path) -> None:
+    assert path_or_url(f"file://{tmp_path}/x") == tmp_path / "x" and path_or_url("data/x") == Path("data/x")
+    assert path_or_url("s3://bucket/x/") == "s3://bucket/x"
+
+
+@pytest.mark.parametrize(
+    ("out", "words"),
+    [
+        ("file://data/x", "must be an absolute path, such as file:///data/x"),
+        ("nothing://bucket/x", "nothing://bucket/x: cannot open it: Protocol not known: nothing; choose another"),
+        ("simplecache::s3://bucket/x", "must be a plain URL, such as s3://bucket/folder"),
+        ("s3://", "must be a plain URL, such as s3://bucket/folder"),
+        ("s3://bucket/[x]", "must be a plain URL, such as s3://bucket/folder"),
+        ("ftp://me:secret@host::s3://x", "error: ftp://host::s3://x: must be"),
+    ],
+)
+def test_urls_that_cannot_be_taken_are_one_line(out: str, words: str) -> None:
+    result = run_here("generate", "smoke", "--out", out)
+    assert_refused(result, words)
+    assert "secret" not in result.stderr
+
+
+def test_other_commands_name_the_url_that_they_do_not_take() -> None:
+    for command in (("reproduce", "fig3"), ("leaderboard", "export", "points")):
+        assert_refused(run_here(*command, "--out", "s3://bucket/x"), "s3://bucket/x: is a URL, which this command")
+    assert not Path("s3:").exists()
+
+
+def test_without_its_packages_a_store_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gcsfs", None)
+    assert_refused(run_here("generate", "smoke", "--out", "gs://bucket/x"), "gcsfs", "install the package of this")
+    monkeypatch.setitem(sys.modules, "fsspec.core", None)
+    result = run_here("generate", "smoke", "--out", "s3://bucket/other")
+    assert_refused(result, "s3://bucket/other: needs fsspec: pip install 'rsbench[cloud]'")
+
+
+def test_a_store_in_memory_is_of_one_process(card: DatasetCard) -> None:
+    with pytest.raises(RsbenchError, match="lives in one process: without --workers and --scheduler"):
+        generate_dataset(card, URL, workers=2)

@@ -1,0 +1,254 @@
+"""What a dataset of somebody else may say: names and links that lead out, wrong types, files that unfold."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+from analytic_dataset import write_analytic_dataset
+from PIL import Image
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
+from rsbench.core.motion import LinearMotion
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.sequence import read_dataset, read_dataset_manifest
+from rsbench.storage.files import read_depth, write_bytes, write_depth, write_json
+
+RIG = StereoRig(camera=PinholeCamera.centred(24, 16, 20.0), baseline=0.3)
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    folder = tmp_path / "data"
+    write_analytic_dataset(
+        folder, RIG, RollingShutter(height=16, readout_ratio=0.9), LinearMotion([0, 0, 0], [1, 0, 0])
+    )
+    return folder
+
+
+def change(path: Path, field: str, value: object) -> None:
+    """Set a field of a JSON file, by its dotted name; ``...`` removes it."""
+    content = json.loads(path.read_text())
+    *parents, last = field.split(".")
+    table = content
+    for key in parents:
+        table = table[key]
+    if value is ...:
+        del table[last]
+    else:
+        table[last] = value
+    path.write_text(json.dumps(content))
+
+
+def refusal(read: Callable[[], Any]) -> str:
+    with pytest.raises(RsbenchError) as caught:
+        read()
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize(
+    ("sequences", "message"),
+    [
+        (["../other"], "name = '../other': must be a folder's name"),
+        (["/tmp"], "name = '/tmp': must be a folder's name"),
+        ([".."], "must be a folder's name"),
+        (["a/b"], "must be a folder's name"),
+        (["a\\b"], "must be a folder's name"),
+        (["planes\n"], "must be a folder's name"),
+        (["x" * 200], "must be a folder's name"),
+        (["planes", "planes"], "'planes' stands there twice"),
+        ([], "sequences = []: must name one at least"),
+        ([7], "sequences.0 = 7: input should be a valid string"),
+        ("planes", "sequences = 'planes': input should be a valid array"),
+        (None, "sequences = None"),
+        (..., "'sequences' is required"),
+    ],
+)
+def test_names_of_sequences_lead_nowhere_else(dataset: Path, sequences: object, message: str) -> None:
+    path = dataset / "dataset.json"
+    change(path, "sequences", sequences)
+    found = refusal(lambda: read_dataset(dataset))
+    assert found.startswith(f"{path}: ") and message in found
+
+
+def test_a_name_that_is_not_the_folders_is_refused(dataset: Path) -> None:
+    victim = dataset.parent / "victim"
+    for name in (str(victim), "../victim", "victim"):
+        change(dataset / "planes/sequence.json", "name", name)
+        assert f"name = {name!r}: must be" in refusal(lambda: read_dataset(dataset))
+
+
+@pytest.mark.parametrize("name", ["planes", "planes/sequence.json", "planes/rs", "planes/rs/left_0.png"])
+def test_links_that_lead_out_of_the_dataset_are_refused(dataset: Path, name: str) -> None:
+    inner = dataset / name
+    outer = dataset.parent / "outer"
+    inner.rename(outer)
+    inner.symlink_to(outer)
+    found = refusal(lambda: read_dataset(dataset)[0].image("rs", "left", 0))
+    assert "leads out of the folder; copy there" in found
+
+
+def test_links_within_a_dataset_are_followed(dataset: Path) -> None:
+    path = dataset / "planes/rs/left_0.png"
+    path.rename(dataset / "planes/kept.png")
+    path.symlink_to("../kept.png")
+    assert read_dataset(dataset)[0].image("rs", "left", 0).shape == (16, 24, 3)
+    path.unlink()
+    path.symlink_to(path)
+    assert "leads out" in refusal(lambda: read_dataset(dataset)[0].image("rs", "left", 0))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("name", 3, "name = 3: input should be a valid string"),
+        ("name", ..., "'name' is required"),
+        ("conventions", 2, "conventions = 2"),
+        ("format", True, "format = True"),
+        ("camera", [], "camera = []"),
+        ("camera.width", "24", "camera.width = '24'"),
+        ("camera.width", True, "camera.width = True"),
+        ("camera.width", 2_000_000_000, "camera: 2000000000 x 16 pixels"),
+        ("camera.fx", float("nan"), "camera.fx = nan: numbers must be finite"),
+        ("baseline", None, "baseline = None"),
+        ("baseline", "0.3", "baseline = '0.3'"),
+        ("frame_period_s", 0, "frame_period_s = 0.0: must be positive"),
+        ("frame_period_s", ..., "'frame_period_s' is required"),
+        ("row_time_s", {}, "row_time_s = {}"),
+        ("readout_time_s", ..., "'readout_time_s' is required"),
+        ("motion", "linear", "motion = 'linear'"),
+        ("motion.model", 1, "motion.model = 1"),
+        ("motion.model", "..:x", "motion model = '..:x': must be 'package.module:Class'"),
+        ("motion.w", [0, 0], "motion.w"),
+        ("motion.w", [0, 0, 1e999], "motion.w.2 = inf: numbers must be finite"),
+        ("motion.d", None, "motion.d = None"),
+        ("motion.parameters", {"k": 1}, "unknown parameter 'k'"),
+        ("files", ["a"], "files = ['a']"),
+        ("files", {"rs/left_0.png": 3}, "files.rs/left_0.png = 3"),
+    ],
+)
+def test_each_wrong_field_of_a_sequence_is_named(dataset: Path, field: str, value: object, message: str) -> None:
+    path = dataset / "planes/sequence.json"
+    change(path, field, value)
+    found = refusal(lambda: read_dataset(dataset))
+    assert found.startswith(f"{path}: ") and message in found
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"[]", b"null", b"\xff", b"{", b'{"format": ' + b"9" * 5000 + b"}", b"[" * 100_000]
+)
+def test_manifests_that_are_no_objects_are_refused(dataset: Path, content: bytes) -> None:
+    for path in (dataset / "dataset.json", dataset / "planes/sequence.json"):
+        before = path.read_bytes()
+        path.write_bytes(content)
+        assert refusal(lambda: read_dataset(dataset)).startswith(f"{path}: ")
+        path.write_bytes(before)
+
+
+def test_parameters_nested_too_deep_are_refused(dataset: Path) -> None:
+    deep: list[Any] = []
+    for _ in range(500):
+        deep = [deep]
+    change(dataset / "planes/sequence.json", "motion.parameters", {"poses": deep})
+    assert "nested more than" in refusal(lambda: read_dataset(dataset))
+
+
+def test_a_dataset_runs_no_code_that_lies_in_the_current_folder(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "planted_module.py").write_text("raise SystemExit('run')")
+    monkeypatch.chdir(tmp_path)
+    change(dataset / "planes/sequence.json", "motion.model", "planted_module:Motion")
+    assert "No module named 'planted_module'" in refusal(lambda: read_dataset(dataset))
+
+
+def test_a_reader_passes_over_keys_of_later_versions(dataset: Path) -> None:
+    for path in (dataset / "dataset.json", dataset / "planes/sequence.json"):
+        change(path, "flow", {"of": "tomorrow"})
+    assert [sequence.name for sequence in read_dataset(dataset)] == ["planes"]
+
+
+@pytest.mark.parametrize(
+    ("record", "message"),
+    [("x", "= 'x'"), ({"sha256": "x"}, "size' is required"), ({"sha256": "x", "size": "1"}, "size = '1'")],
+)
+def test_wrong_records_of_files_are_named(dataset: Path, record: object, message: str) -> None:
+    change(dataset / "dataset.json", "files", {"planes/a": record})
+    assert message in refusal(lambda: read_dataset_manifest(dataset))
+
+
+# Sizes
+
+
+def test_an_image_of_another_size_is_refused_before_it_is_decoded(dataset: Path) -> None:
+    path = dataset / "planes/rs/left_0.png"
+    Image.new("RGB", (4000, 3000)).save(path)
+    found = refusal(lambda: read_dataset(dataset)[0].image("rs", "left", 0))
+    assert found == f"{path}: is 4000 x 3000 pixels, the camera 24 x 16"
+    path.write_bytes(path.read_bytes()[:100])  # there is nothing to decode
+    assert refusal(lambda: read_dataset(dataset)[0].image("rs", "left", 0)) == found
+
+
+def test_a_depth_map_of_another_size_or_kind_is_refused(dataset: Path) -> None:
+    path = dataset / "planes/rs_depth/left_0.exr"
+
+    def read() -> None:
+        read_dataset(dataset)[0].depth("rs", "left", 0)
+
+    write_depth(path, np.ones((30, 40), np.float32))
+    assert refusal(read) == f"{path}: is 40 x 30 pixels, the camera 24 x 16"
+    z = np.ones((16, 24), np.float32)
+    for channels in ({"Y": z}, {"Z": z, "A": z}):
+        _write_exr(path, OpenEXR.scanlineimage, channels)
+        assert "one channel, Z" in refusal(read)
+    _write_exr(path, OpenEXR.scanlineimage, {"Z": z.astype(np.float16)})
+    assert "must hold a float32 channel Z" in refusal(read)
+
+
+def _write_exr(path: Path, kind: Any, channels: dict[str, Any]) -> None:
+    content = io.BytesIO()
+    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": kind}, channels) as file:
+        file.write(content)
+    path.write_bytes(content.getvalue())
+
+
+# A full disk
+
+
+def test_what_does_not_fit_is_one_line_and_leaves_what_was_there(tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    import signal
+
+    path, depth = tmp_path / "z.exr", np.random.default_rng(0).random((50, 60), dtype=np.float32)
+    write_depth(path, depth)
+    before = path.read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    heard = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+        found = [
+            refusal(lambda: write_depth(path, 2 * depth)),
+            refusal(lambda: write_json(path, {"a": "b" * 5000})),
+        ]
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, heard)
+    for message in found:
+        assert message.startswith(f"{path}: cannot be written, ") and "bytes: File too large; make room" in message
+    assert [file.name for file in tmp_path.iterdir()] == ["z.exr"] and path.read_bytes() == before
+    np.testing.assert_array_equal(read_depth(path), depth)
+
+
+def test_a_folder_that_is_gone_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "gone" / "x.json"
+    assert refusal(lambda: write_bytes(path, b"1")).startswith(f"{path}: cannot be written, 1 bytes: No such file")

@@ -1,0 +1,164 @@
+"""Verification against a dataset whose depth is known in closed form, sound and spoilt in every way."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic_dataset import write_analytic_dataset
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
+from rsbench.core.motion import LinearMotion, Motion, TwistMotion
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.sequence import read_dataset
+from rsbench.storage.files import read_depth, read_poses, sha256, write_depth
+from rsbench.verification import SequenceReport, verification_steps, verify_dataset
+
+RIG = StereoRig(camera=PinholeCamera.centred(96, 80, 110.0), baseline=0.3)
+SHUTTER = RollingShutter(height=80, readout_ratio=0.9)
+MOTION = LinearMotion([0.02, -0.03, 0.01], [0.1, -0.05, 0.2])
+
+
+def verify(folder: Path) -> SequenceReport:
+    return verify_dataset(folder)[-1]
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    write_analytic_dataset(tmp_path, RIG, SHUTTER, MOTION)
+    return tmp_path
+
+
+@pytest.mark.parametrize("motion", [MOTION, TwistMotion([0.05, 0.02, -0.04], [0.2, 0.1, 0.1])])
+def test_sound_dataset_has_no_faults(tmp_path: Path, motion: Motion) -> None:
+    write_analytic_dataset(tmp_path, RIG, SHUTTER, motion)
+    report = verify(tmp_path)
+    assert report.faults == ()
+    assert len(report.agreements) == 24
+    for agreement in report.agreements:
+        assert agreement.share == 1.0
+        # float32 depth holds 6e-8 relative; bilinear interpolation across rows adds about 1e-6.
+        assert agreement.p99 < 1e-5
+        assert agreement.compared > 0.5 * 96 * 80
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        LinearMotion([0.0, 0.0, 0.0], MOTION.d),
+        LinearMotion(-MOTION.w, MOTION.d),
+        LinearMotion(MOTION.w, -MOTION.d),
+        LinearMotion(MOTION.w, 1.01 * MOTION.d),
+    ],
+    ids=["no rotation", "rotation of the other sign", "translation of the other sign", "1 % of scale"],
+)
+def test_depth_of_another_motion_is_found(tmp_path: Path, wrong: Motion) -> None:
+    write_analytic_dataset(tmp_path, RIG, SHUTTER, MOTION, true_motion=wrong)
+    faults = verify(tmp_path).faults
+    assert any("pairs of depth maps disagree" in fault and "motion" in fault for fault in faults)
+
+
+def test_swapped_cameras_are_found(dataset: Path) -> None:
+    mirrored = StereoRig(camera=RIG.camera, baseline=0.301)
+    write_analytic_dataset(dataset / "other", mirrored, SHUTTER, MOTION)
+    manifest = json.loads((dataset / "other/planes/sequence.json").read_text())
+    manifest["baseline"] = 0.3
+    (dataset / "other/planes/sequence.json").write_text(json.dumps(manifest))
+    _update_checksum(dataset / "other", "planes/sequence.json")
+    assert verify(dataset / "other").faults
+
+
+def test_changed_missing_and_unlisted_files_are_found(dataset: Path) -> None:
+    changed = dataset / "planes/rs/left_0.png"
+    changed.write_bytes(changed.read_bytes()[:-1])
+    (dataset / "planes/gs_depth/right_1.exr").unlink()
+    faults = verify(dataset).faults
+    assert all("left_0.png" in fault or "right_1.exr" in fault for fault in faults)
+    assert any("rs/left_0.png" in fault and "checksum" in fault for fault in faults)
+    assert any("gs_depth/right_1.exr" in fault and "missing" in fault for fault in faults)
+
+
+def test_row_zero_must_equal_the_global_shutter_twin(dataset: Path) -> None:
+    path = dataset / "planes/gs_depth/left_0.exr"
+    depth = read_depth(path)
+    depth[0, 0] *= np.float32(1.001)
+    write_depth(path, depth)
+    _update_checksum(dataset, "planes/gs_depth/left_0.exr")
+    assert any("row 0 differs" in fault for fault in verify(dataset).faults)
+
+
+@pytest.mark.parametrize(("size", "found"), [(20, True), (4, True), (3, False)])
+def test_a_flaw_of_a_few_hundredths_of_the_picture_is_found(dataset: Path, size: int, found: bool) -> None:
+    """A square of the wall three tolerances too far, too little to be hidden: 5 % of the pixels, then 0.2 %."""
+    path = dataset / "planes/rs_depth/right_1.exr"
+    depth = read_depth(path)
+    depth[10 : 10 + size, 30 : 30 + size] *= np.float32(1 + 3e-4)
+    write_depth(path, depth)
+    _update_checksum(dataset, "planes/rs_depth/right_1.exr")
+    report = verify(dataset)
+    assert any("rs_depth/right_1.exr: rows 10-" in fault for fault in report.faults) == found
+    assert all(agreement.share > 0.9 for agreement in report.agreements)
+
+
+@pytest.mark.parametrize("damage", [b"", b"not an exr", None])
+def test_damaged_depth_file_is_one_clear_line(dataset: Path, damage: bytes | None) -> None:
+    path = dataset / "planes/rs_depth/left_0.exr"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2] if damage is None else damage)
+    with pytest.raises(RsbenchError, match=r"left_0\.exr: damaged or not an EXR file") as caught:
+        read_dataset(dataset)[0].depth("rs", "left", 0)
+    assert "\n" not in str(caught.value)
+
+
+def test_pose_file_round_trip_is_exact_to_rounding(dataset: Path) -> None:
+    tau, poses = read_poses(dataset / "planes/poses/right_1.csv")
+    expected = RIG.cam_from_world(MOTION, 1 + 0.9 * np.arange(80) / 80, "right")
+    np.testing.assert_array_equal(tau, SHUTTER.row_time(np.arange(80), 1))
+    np.testing.assert_allclose(poses.R, expected.R, atol=1e-14)
+    np.testing.assert_allclose(poses.t, expected.t, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("format", 2, "format = 2"),
+        ("baseline", -1.0, "baseline must be a positive"),
+        ("readout_ratio", 1.5, "readout_ratio must lie in"),
+        ("camera", {"width": 3}, "'camera.height' is required"),
+        ("motion", {"model": "warp", "w": [0, 0, 0], "d": [0, 0, 0]}, "'warp'"),
+    ],
+)
+def test_bad_manifest_is_named(dataset: Path, key: str, value: object, message: str) -> None:
+    path = dataset / "planes/sequence.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    with pytest.raises(RsbenchError, match=r"sequence\.json") as caught:
+        read_dataset(dataset)
+    assert message in str(caught.value)
+
+
+def test_folder_without_a_dataset_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RsbenchError, match="not a dataset"):
+        read_dataset(tmp_path)
+
+
+def test_progress_is_reported_to_the_last_step(dataset: Path) -> None:
+    steps: list[str] = []
+    verify_dataset(dataset, 4, steps.append)
+    assert len(steps) == verification_steps({"sequences": ["planes"]})
+
+
+def _update_checksum(folder: Path, relative: str) -> None:
+    own = folder / "planes/sequence.json"
+    manifest = json.loads(own.read_text())
+    if (name := relative.removeprefix("planes/")) != "sequence.json":
+        manifest["files"][name] = sha256(folder / relative)
+        own.write_text(json.dumps(manifest))
+        _update_checksum(folder, "planes/sequence.json")
+    path = folder / "dataset.json"
+    manifest = json.loads(path.read_text())
+    file = folder / relative
+    manifest["files"][relative] = {"sha256": sha256(file), "size": file.stat().st_size}
+    path.write_text(json.dumps(manifest))

@@ -1,0 +1,89 @@
+"""Verification that renders rows again: what no comparison of files with each other can show."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from attack.planting import rehash
+from small_scenes import write_box_scene, write_small_card
+
+from rsbench.dataset.card import load_dataset_card
+from rsbench.dataset.generation import generate_dataset
+from rsbench.storage.files import read_depth, read_png, write_depth, write_png
+from rsbench.verification import SequenceReport, verify_dataset
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with box.toml, a scene, and the dataset of one sequence in it."""
+    folder = tmp_path_factory.mktemp("rendered")
+    card = write_small_card(folder, [write_box_scene(folder, "box")])
+    generate_dataset(load_dataset_card(str(card)), folder / "dataset")
+    return folder
+
+
+def verified(sound: Path, dataset: Path, *, rerender: Any = "auto") -> SequenceReport:
+    return verify_dataset(dataset, 4, rerender=rerender, scenes=[sound / "box.toml"])[-1]
+
+
+def spoilt(sound: Path, folder: Path, change: Callable[[Path], None]) -> Path:
+    """A copy of the dataset, changed, with hashes that fit."""
+    shutil.copytree(sound / "dataset", folder / "dataset")
+    change(folder / "dataset/box")
+    rehash(folder / "dataset")
+    return folder / "dataset"
+
+
+def test_rows_of_sound_data_have_the_same_bits(sound: Path) -> None:
+    report = verified(sound, sound / "dataset", rerender="all")
+    assert report.faults == ()
+    assert "64 rows" in report.notes[0] and report.notes[0].endswith("the same bits")
+
+
+def test_what_a_dataset_says_of_its_scene_is_never_opened(sound: Path) -> None:
+    (report,) = verify_dataset(sound / "dataset", 4, rerender="auto")
+    assert report.faults == ()
+    assert "name its card with --scene" in report.notes[0]
+
+
+def test_a_common_scale_of_all_depth_is_found(sound: Path, tmp_path: Path) -> None:
+    def change(folder: Path) -> None:
+        for path in folder.glob("*_depth/*.exr"):
+            write_depth(path, read_depth(path) * np.float32(1.00002))
+
+    faults = verified(sound, spoilt(sound, tmp_path, change)).faults
+    assert len(faults) == 8
+    assert all("looks scaled by 1.00002" in fault for fault in faults)
+
+
+def test_a_blur_is_found(sound: Path, tmp_path: Path) -> None:
+    def change(folder: Path) -> None:
+        path = folder / "gs/left_1.png"
+        image = read_png(path)
+        blurred = cv2.GaussianBlur(image, (0, 0), 0.6)
+        blurred[0] = image[0]
+        write_png(path, blurred)
+
+    (fault,) = verified(sound, spoilt(sound, tmp_path, change)).faults
+    assert "gs/left_1.png" in fault and "rendered again" in fault
+
+
+def test_a_picture_of_other_light_is_one_finding(sound: Path, tmp_path: Path) -> None:
+    """All files are consistent with each other; the exposure that sequence.json states is another."""
+
+    def change(folder: Path) -> None:
+        path = folder / "sequence.json"
+        manifest = json.loads(path.read_text())
+        manifest["renderer"]["exposure"] = 0.9
+        path.write_text(json.dumps(manifest))
+
+    faults = verified(sound, spoilt(sound, tmp_path, change)).faults
+    images = [fault for fault in faults if "the image differs from what is rendered again" in fault]
+    assert len(images) == 8
