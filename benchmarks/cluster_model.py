@@ -113,11 +113,11 @@ def child(what: str, scene: str) -> list[float]:
 def _scene_seconds(scene: str) -> float:
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import build_scene
-    from rsbench.dataset.posed_scenes import Stage
+    from rsbench.dataset.posed_scenes import PosedScenes
 
     sequence = next(each for each in load_dataset_card(CARD).sequence if each.scene == scene)
     begun = time.process_time()
-    Stage(build_scene).set_for(sequence)
+    PosedScenes(build_scene).set_for(sequence)
     return time.process_time() - begun
 
 
@@ -141,7 +141,7 @@ def _sequence(scene: str) -> tuple[float, float]:
 def _command_alone() -> tuple[float, float]:
     """Seconds, for each of many made-up sequences of as many files: when it is finished, and in the manifest."""
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.destinations import folder_home
+    from rsbench.dataset.destinations import folder_destination
     from rsbench.dataset.layout import files_of
     from rsbench.storage.files import sha256, write_json
 
@@ -155,12 +155,12 @@ def _command_alone() -> tuple[float, float]:
                 (out / sequence.name / name).write_text(name)
             listed = {name: sha256(out / sequence.name / name) for name in files}
             write_json(out / sequence.name / "sequence.json", {"files": listed})
-        with folder_home(out, rehash=False) as home:
+        with folder_destination(out, rehash=False) as destination:
             begun = time.perf_counter()
             for sequence in card.sequence:
-                made[sequence.name] = home.learned(sequence.name)
+                made[sequence.name] = destination.learned(sequence.name)
             between = time.perf_counter()
-            home.finish(card, made)
+            destination.finish(card, made)
             end = time.perf_counter()
     return (between - begun) / len(card.sequence), (end - between) / len(card.sequence)
 

@@ -99,7 +99,7 @@ def evaluate(
         return
     from rsbench.benchmark.images.plan import EvaluationOptions
 
-    crew, command = chosen_workers(workers, scheduler), f"rsbench evaluate {folder} --out {out}"
+    processes, command = chosen_workers(workers, scheduler), f"rsbench evaluate {folder} --out {out}"
     options = EvaluationOptions(
         solvers=tuple(solver or every_solver()),
         correction_solver=correct_with,
@@ -114,7 +114,7 @@ def evaluate(
         rehash=rehash,
     )
     with results_at(out, scheduler) as place:
-        evaluate_dataset(shared_path(folder, scheduler), place, options, command, crew)
+        evaluate_dataset(shared_path(folder, scheduler), place, options, command, processes)
 
 
 def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, seed: int) -> None:

@@ -111,10 +111,10 @@ def generate(
     from rsbench.storage.files import check_out
     from rsbench.storage.object_store import path_or_url, shown
 
-    crew, place = chosen_workers(workers, scheduler), shared_path(path_or_url(out), scheduler)
+    processes, place = chosen_workers(workers, scheduler), shared_path(path_or_url(out), scheduler)
     dataset = _chosen(load_dataset_card(card, trajectory, tuple(seed or ())), sequence, shard, channels)
     if not estimate:
-        _ = check_out(place) if isinstance(place, Path) else store_for(place, crew)
+        _ = check_out(place) if isinstance(place, Path) else store_for(place, processes)
     backend = start_backend()
     if backend.message:
         typer.echo(backend.message, err=True)
@@ -124,7 +124,7 @@ def generate(
     steps = steps_of(dataset) * len(dataset.sequence)
     with progress_bar(f"rendering {dataset.name}", steps) as advance:
         rendered = generate_dataset(
-            dataset, place, workers=crew, full_frames=full_frames, rehash=rehash, progress=advance
+            dataset, place, workers=processes, full_frames=full_frames, rehash=rehash, progress=advance
         )
     words = f"{len(dataset.sequence)} sequences, {len(rendered)} rendered now"
     typer.echo(f"{shown(str(place))}: {words}")

@@ -69,11 +69,11 @@ def export(
     """Write the inputs of a track for any language; of a public split the truth too."""
     from rsbench.benchmark.leaderboard.exporting import check_place, write_inputs
     from rsbench.cli.console import progress_bar
-    from rsbench.storage.work_folder import workplace
+    from rsbench.storage.work_folder import work_folder
 
     split = split_of(track, data, seed_file, secret)
     check_place(split, out)
-    with workplace(out), progress_bar(f"exporting {split.name}", len(split.truths)) as advance:
+    with work_folder(out), progress_bar(f"exporting {split.name}", len(split.truths)) as advance:
         if data is not None and "images" in split.protocol.allowed:
             write_frames_of(split, data, out)
         write_inputs(split, _counted(problems_of(split, data, seed_file), advance), out)
@@ -177,12 +177,12 @@ def run(
     from rsbench.benchmark.leaderboard.running import Limits
     from rsbench.benchmark.provenance import provenance
 
-    crew, split = chosen_workers(workers, scheduler), split_of(track, data, seed_file, secret)
+    processes, split = chosen_workers(workers, scheduler), split_of(track, data, seed_file, secret)
     if track == "pose-own":
         raise RsbenchError(f"track {track!r}: solvers of cards take given matches; run them on the track 'pose'")
     load_cards(entry, split)  # before anything is written
     with results_at(board, scheduler) as place:
-        files = predict(entry, split, place, data, seed_file, crew, Limits(time_limit, memory))
+        files = predict(entry, split, place, data, seed_file, processes, Limits(time_limit, memory))
         with _scoring(split) as step:
             add_all(
                 place,
@@ -190,7 +190,7 @@ def run(
                 split,
                 provenance(RUN),
                 replace=lambda method: made_by(place, split, method) == RUN,
-                workers=crew,
+                workers=processes,
                 step=step,
             )
         _show(place, split.protocol.id, split.name, None)

@@ -34,10 +34,10 @@ def predict(
     from rsbench.benchmark.leaderboard.picture_running import run_picture_cards
     from rsbench.benchmark.leaderboard.running import prepare_inputs, run_cards, steps_of
     from rsbench.cli.console import progress_bar
-    from rsbench.storage.work_folder import workplace
+    from rsbench.storage.work_folder import work_folder
 
     steps = len(split.truths) if split.protocol.pictures else steps_of(entry, split, limits)
-    with workplace(board) as hidden, progress_bar(f"running {split.name}", steps) as advance:
+    with work_folder(board) as hidden, progress_bar(f"running {split.name}", steps) as advance:
         place = hidden / "runs" / split.protocol.id / split.name
         place.mkdir(parents=True, exist_ok=True)
         prepare_inputs(

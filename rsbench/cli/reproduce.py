@@ -111,11 +111,11 @@ def reproduce(
 def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds: int, width: int | None) -> None:
     from contextlib import ExitStack
 
-    from rsbench.storage.work_folder import workplace
+    from rsbench.storage.work_folder import work_folder
 
     with ExitStack() as stack:
         for name in _FOLDERS.get(target, (target.value,)):
-            stack.enter_context(workplace(out / name))
+            stack.enter_context(work_folder(out / name))
         if target is Target.images:
             _images(out, data, seeds)
         elif target is Target.correction:

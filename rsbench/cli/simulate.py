@@ -73,9 +73,9 @@ def simulate(
     if change:
         card = card.with_setting(**_changes(change))
     command = f"rsbench simulate {sweep} --out {out}"
-    crew = chosen_workers(workers, scheduler, os.cpu_count() or 1)
+    processes = chosen_workers(workers, scheduler, os.cpu_count() or 1)
     with results_at(out, scheduler) as place:
-        table = run_and_summarise(card, place, crew, command, time_limit_s=time_limit, force=force)
+        table = run_and_summarise(card, place, processes, command, time_limit_s=time_limit, force=force)
         show(card, table)
         typer.echo(f"table: {name_of(place / 'summary.csv')}")
 

@@ -16,7 +16,7 @@ from rsbench.core.projection import row_poses
 from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import Layer, PixelClass
-from rsbench.dataset.row_search import Landed, find
+from rsbench.dataset.row_search import Reprojected, find
 from rsbench.dataset.views import FAR, Geometry, Shot, seen_from, times_at
 from rsbench.renderers.visibility import Surfaces
 
@@ -98,7 +98,7 @@ class SeenSurfaces:
 class Carried(NamedTuple):
     """The surfaces that the pixels of a source see, in another picture."""
 
-    landed: Landed
+    landed: Reprojected
     points: FloatArray
     """(H, W, 3) where they are when the target sees them, world frame, metres."""
 
@@ -126,7 +126,7 @@ def pair_truth(surfaces: SeenSurfaces, target: Shot, carried: Carried, blocked: 
 
 def _landed_with(
     surfaces: SeenSurfaces, target: Shot, number: int, chosen: NDArray[np.bool_], start: FloatArray
-) -> tuple[FloatArray, Landed]:
+) -> tuple[FloatArray, Reprojected]:
     """Where an object has its chosen points (n, 3) when the target sees them, world frame, and where it does."""
     geometry, thing = surfaces.geometry, surfaces.geometry.objects[number - 1]
     tau = times_at(geometry, surfaces.source, surfaces.grid[chosen])
@@ -135,7 +135,7 @@ def _landed_with(
     found = find(seen_from(geometry, number), target, X[:, None], start[chosen][:, None])
     there = thing.world_from_object(times_at(geometry, target, found.pixels[:, 0]))
     eyes = transform(there, found.eyes[:, 0])
-    return transform(there, X), Landed(found.pixels[:, 0], eyes, found.unsolved[:, 0])
+    return transform(there, X), Reprojected(found.pixels[:, 0], eyes, found.unsolved[:, 0])
 
 
 def surface_truth(surfaces: SeenSurfaces, rays: Rays) -> Surfaces:
@@ -148,7 +148,7 @@ def surface_truth(surfaces: SeenSurfaces, rays: Rays) -> Surfaces:
 
 
 def _classes(
-    surfaces: SeenSurfaces, target: Shot, landed: Landed, points: FloatArray, blocked: Blocked
+    surfaces: SeenSurfaces, target: Shot, landed: Reprojected, points: FloatArray, blocked: Blocked
 ) -> NDArray[np.uint8]:
     """(H, W) of ``PixelClass``; ``points`` (H, W, 3) where they are when the target sees them."""
     inside = np.isfinite(landed.pixels[..., 0])

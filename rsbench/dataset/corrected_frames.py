@@ -19,7 +19,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import FoundMotion, referee
 from rsbench.storage.files import read_json, read_png, write_depth, write_json, write_png
-from rsbench.storage.work_folder import HIDDEN, WORK, files_below, named, remove, strangers, workplace
+from rsbench.storage.work_folder import HIDDEN, WORK, files_below, named, remove, unknown_files, work_folder
 from rsbench.vision.fusion import Fused, Origin
 
 MASK_VALUES = {
@@ -53,7 +53,7 @@ def fresh_folder(out: Path, by: str = "rsbench correct") -> Iterator[Path]:
     place = out.resolve()
     if Path.cwd().is_relative_to(place):
         raise RsbenchError(f"--out {out}: this command runs there; choose a folder of its own, such as corrected")
-    with workplace(out, place.with_name(f".{place.name}{HIDDEN}")) as hidden:
+    with work_folder(out, place.with_name(f".{place.name}{HIDDEN}")) as hidden:
         old, fresh = hidden / "old", hidden / WORK / "new"
         if old.exists() and not place.exists():
             os.rename(old, place)
@@ -78,7 +78,7 @@ def _refuse_others(out: Path, place: Path, by: str) -> None:
         raise RsbenchError(f"{out}: exists and was not written by {by!r}; choose another --out")
     files = written.get("files")
     known = {_LIST, *files} if isinstance(files, list) else set()
-    if others := strangers(place, known.__contains__):
+    if others := unknown_files(place, known.__contains__):
         raise RsbenchError(
             f"{out}: holds {named(others)}, which {by!r} did not write; move it away or choose another --out"
         )

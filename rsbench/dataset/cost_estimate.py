@@ -17,7 +17,7 @@ from rsbench.dataset.generation import build_scene, render_camera, scene_name
 from rsbench.dataset.layout import files_of
 from rsbench.dataset.posed_scenes import place_of, seen_scene
 from rsbench.renderers.options import RendererOptions
-from rsbench.storage.background_writer import beside
+from rsbench.storage.background_writer import background_writer
 from rsbench.storage.work_folder import files_below
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def _of_kind(
         times, middle = list[float](), (card.frames - 1) // 2
         for _ in range(1 if warm else 2):
             begun = time.monotonic()
-            with beside() as later:
+            with background_writer() as later:
                 for _ in render_camera(
                     card, sequences[0], options, scene, SIDES[0], middle, Path(temporary), later
                 ):

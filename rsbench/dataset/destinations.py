@@ -1,4 +1,4 @@
-"""Where a dataset lies: a folder of this machine, or a store (``store_home``)."""
+"""Where a dataset lies: a folder of this machine, or a store (``store_destination``)."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from rsbench.dataset.sequence_identity import Plan, check_same, hashes_in, wante
 from rsbench.jobs.workers import Workers
 from rsbench.storage.file_hashes import HASHES, FileHashes
 from rsbench.storage.files import read_json, sha256
-from rsbench.storage.work_folder import HIDDEN, WORK, named, strangers, workplace
+from rsbench.storage.work_folder import HIDDEN, WORK, named, unknown_files, work_folder
 
 
 class Target(Protocol):
     """Where sequences go; picklable, for processes that make them."""
 
-    def workplace(self) -> Path:
+    def work_folder(self) -> Path:
         """A folder of this machine in which sequences come into being."""
         ...
 
@@ -33,7 +33,7 @@ class Target(Protocol):
         ...
 
 
-class Home(Protocol):
+class Destination(Protocol):
     """A place of a dataset in which this command alone works."""
 
     @property
@@ -65,19 +65,19 @@ class FolderTarget:
 
     out: Path
 
-    def workplace(self) -> Path:
+    def work_folder(self) -> Path:
         return self.out / HIDDEN / WORK
 
     def place(self, partial: Path, name: str) -> None:
         place = self.out / name
         if os.path.lexists(place):
-            _refuse_strangers(place, "it is to be replaced")
+            _refuse_unknown_files(place, "it is to be replaced")
             os.rename(place, partial.with_suffix(".old"))
         os.rename(partial, place)
 
 
-class FolderHome:
-    """A ``Home``."""
+class FolderDestination:
+    """A ``Destination``."""
 
     def __init__(self, out: Path, hidden: Path, rehash: bool) -> None:
         self.hidden, self.target = hidden, FolderTarget(out)
@@ -123,41 +123,41 @@ class FolderHome:
             if (found := files.get(name)) is None or found.sha256 != listed.get(name)
         ]
         if damaged:
-            _refuse_strangers(folder, f"{named(damaged)} differs from what was written")
+            _refuse_unknown_files(folder, f"{named(damaged)} differs from what was written")
             return None
         own = self._hashes.of(f"{sequence.name}/sequence.json")
         return {"sequence.json": own, **files} if own else None  # pyrefly: ignore[bad-return]
 
 
-def _refuse_strangers(folder: Path, why: str) -> None:
+def _refuse_unknown_files(folder: Path, why: str) -> None:
     """What is to be removed must be rsbench's own, to the last file."""
     if folder.is_symlink():
         raise RsbenchError(f"{folder}: {why}, and it is a link: move it away, then run the same command again")
-    if others := strangers(folder, is_of_sequence):
+    if others := unknown_files(folder, is_of_sequence):
         raise RsbenchError(
             f"{folder}: {why}, but {named(others)} is not rsbench's: move it away, then run the same command again"
         )
 
 
 @contextmanager
-def folder_home(out: Path, rehash: bool) -> Iterator[FolderHome]:
+def folder_destination(out: Path, rehash: bool) -> Iterator[FolderDestination]:
     """A folder, made if missing, in which this command alone works; ``rehash`` forgets the hashes that it keeps.
 
     Raises:
-        RsbenchError: see ``workplace``.
+        RsbenchError: see ``work_folder``.
     """
-    with workplace(out) as hidden:
-        yield FolderHome(out, hidden, rehash)
+    with work_folder(out) as hidden:
+        yield FolderDestination(out, hidden, rehash)
 
 
 @contextmanager
-def home_at(out: Path | str, workers: Workers, rehash: bool) -> Iterator[Home]:
-    """A folder, or the store of a URL, for a run of so many processes; see ``folder_home`` and ``store_home``."""
+def open_destination(out: Path | str, workers: Workers, rehash: bool) -> Iterator[Destination]:
+    """A folder, or the store of a URL, for a run of so many processes."""
     if isinstance(out, Path):
-        with folder_home(out, rehash) as folder:
+        with folder_destination(out, rehash) as folder:
             yield folder
     else:
-        from rsbench.dataset.store_destination import store_home
+        from rsbench.dataset.store_destination import store_destination
 
-        with store_home(out, workers, rehash) as store:
+        with store_destination(out, workers, rehash) as store:
             yield store

@@ -25,11 +25,11 @@ from rsbench.core.se3 import Pose
 from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channel_writer import write_channels
-from rsbench.dataset.destinations import Target, home_at
+from rsbench.dataset.destinations import Target, open_destination
 from rsbench.dataset.layout import clean_file, files_of
 from rsbench.dataset.manifest import Files
 from rsbench.dataset.matches import Matching
-from rsbench.dataset.posed_scenes import Build, Built, Stage
+from rsbench.dataset.posed_scenes import Build, Built, PosedScenes
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.dataset.sequence_identity import Plan, of_scene, plans_of, with_gloss
@@ -39,7 +39,7 @@ from rsbench.jobs.process_jobs import finished_jobs
 from rsbench.jobs.workers import Cluster, Workers
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene
-from rsbench.storage.background_writer import Later, beside
+from rsbench.storage.background_writer import Later, background_writer
 from rsbench.storage.files import sha256, write_depth, write_json, write_mask, write_png, write_poses
 from rsbench.storage.work_folder import files_below
 from rsbench.vision.feature_matcher import load_features
@@ -93,23 +93,23 @@ def generate_dataset(
     if "matches" in card.channels:
         load_features((card.matches or Matching()).features)  # before hours of rendering
     plans = plans_of(card, options)
-    with home_at(out, workers, rehash) as home:
+    with open_destination(out, workers, rehash) as destination:
         # Of this run alone, and the last one only: a scene takes hundreds of MB, and its card may change.
         build = lru_cache(maxsize=1)(build_scene)
-        scene_hashes = SceneHashes(home.hidden / "scenes.json", lambda name: build(name).sha256)
+        scene_hashes = SceneHashes(destination.hidden / "scenes.json", lambda name: build(name).sha256)
         made: dict[str, Files] = {}
-        for name, files in home.complete(card.sequence, plans, scene_hashes):
+        for name, files in destination.complete(card.sequence, plans, scene_hashes):
             made[name] = files
             _repeat(progress, name, steps_of(card))
         todo = [sequence for sequence in card.sequence if sequence.name not in made]
         done: Counter[str] = Counter()
         ordered = sorted(todo, key=scene_name)
-        for name, steps in _render_all(card, ordered, options, plans, build, home.target, workers):
+        for name, steps in _render_all(card, ordered, options, plans, build, destination.target, workers):
             done[name] += steps
             if done[name] == steps_of(card):
-                made[name] = home.learned(name)
+                made[name] = destination.learned(name)
             _repeat(progress, name, steps)
-        home.finish(card, made)
+        destination.finish(card, made)
     return [sequence.name for sequence in todo]
 
 
@@ -138,7 +138,7 @@ def _render_all(
 ) -> Iterator[tuple[str, int]]:
     """Names of sequences, with steps that were done; the last of a sequence is given when it is complete."""
     if workers == 1 or not todo:
-        stage = Stage(build)
+        stage = PosedScenes(build)
         for sequence in todo:
             for _ in _render_sequence(card, sequence, options, plans[sequence.name], stage, target):
                 yield sequence.name, 1
@@ -160,7 +160,7 @@ def _serve_renders(
 
     start_backend()
     set_threads(threads)
-    stage = Stage(lru_cache(maxsize=1)(build_scene))
+    stage = PosedScenes(lru_cache(maxsize=1)(build_scene))
 
     def render(job: tuple[SequenceCard, Plan]) -> None:
         sequence, plan = job
@@ -178,7 +178,7 @@ def _render_sequence(
     sequence: SequenceCard,
     options: RendererOptions,
     plan: Plan,
-    stage: Stage,
+    stage: PosedScenes,
     target: Target,
 ) -> Iterator[None]:
     """Render into a folder of the workplace and place it when complete; yields after each step."""
@@ -190,10 +190,10 @@ def _render_sequence(
         raise RsbenchError(f"sequence {sequence.name}: {words}; choose another motion, viewpoint or baseline")
     plan = with_gloss(plan, mitsuba_scene.glossy)
     # Of this try alone: another machine may not know yet that its run was killed.
-    partial = target.workplace() / f"{sequence.name}.{secrets.token_hex(4)}"
+    partial = target.work_folder() / f"{sequence.name}.{secrets.token_hex(4)}"
     for folder in {Path(name).parent for name in files_of(plan)}:
         (partial / folder).mkdir(parents=True, exist_ok=True)
-    with beside() as later:
+    with background_writer() as later:
         for side, frame in views_of(card.frames):
             yield from render_camera(card, sequence, options, mitsuba_scene, side, frame, partial, later)
         write_sequence_channels(partial, card, sequence, mitsuba_scene, plan["scene"])

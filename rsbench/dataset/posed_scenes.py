@@ -23,7 +23,7 @@ class Built(NamedTuple):
 Build = Callable[[str], Built]
 
 
-class Stage:
+class PosedScenes:
     """The scene of the last sequence in the renderer: sequences that are seen from one place share it."""
 
     def __init__(self, build: Build) -> None:

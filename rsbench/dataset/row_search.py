@@ -31,7 +31,7 @@ _MOST_STEPS = 12
 _SEEN, _NOT_SEEN, _UNSURE = 0, 1, 2
 
 
-class Landed(NamedTuple):
+class Reprojected(NamedTuple):
     """Where points (...) lie in a picture."""
 
     pixels: FloatArray
@@ -51,7 +51,7 @@ class _Table(NamedTuple):
     """Entries for each line; 0: one pose for all."""
 
 
-def find(geometry: Geometry, target: Shot, points: FloatArray, start: FloatArray) -> Landed:
+def find(geometry: Geometry, target: Shot, points: FloatArray, start: FloatArray) -> Reprojected:
     """Search the lines of a picture that see points (rows, n, 3), world frame, from lines (rows, n) near them.
 
     Raises:
@@ -62,7 +62,9 @@ def find(geometry: Geometry, target: Shot, points: FloatArray, start: FloatArray
     pixels, eyes = np.full((*start.shape, 2), np.nan), np.zeros(points.shape)
     status = np.zeros(start.shape, dtype=np.uint8)
     axis, lines = shutter.axis(target.side), shutter.lines(target.side)
-    land_rows(table.entries, table.per_line, _intrinsics(camera), axis, lines, points, start, pixels, eyes, status)
+    reproject_rows(
+        table.entries, table.per_line, _intrinsics(camera), axis, lines, points, start, pixels, eyes, status
+    )
     unsure = status == _UNSURE
     if np.any(unsure):
         found = rs_project(geometry.rig, shutter, geometry.motion, target.side, target.frame, points[unsure])
@@ -70,7 +72,7 @@ def find(geometry: Geometry, target: Shot, points: FloatArray, start: FloatArray
         times = np.where(np.isnan(found.tau), target.frame, found.tau)
         eyes[unsure] = inverse(geometry.rig.cam_from_world(geometry.motion, times, target.side)).t
         unsure[unsure] = found.status == ProjectionStatus.NOT_CONVERGED
-    return Landed(pixels, eyes, unsure)
+    return Reprojected(pixels, eyes, unsure)
 
 
 def _pose_table(geometry: Geometry, shot: Shot) -> _Table:
@@ -113,7 +115,7 @@ def _intrinsics(camera: PinholeCamera) -> FloatArray:
 
 
 @compiled
-def land_rows(
+def reproject_rows(
     table: FloatArray,
     per_line: float,
     camera: FloatArray,
@@ -125,7 +127,7 @@ def land_rows(
     eyes: FloatArray,
     status: NDArray[np.uint8],
 ) -> None:
-    """Fill what ``Landed`` has; NumPy: ``core.projection.rs_project``.
+    """Fill what ``Reprojected`` has; NumPy: ``core.projection.rs_project``.
 
     Each point starts where its two neighbours in the row landed would lead, with the slope found there. That no
     other row is heard keeps the bits of a row the same whatever rows are asked for with it.

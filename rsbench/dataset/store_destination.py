@@ -29,7 +29,7 @@ from rsbench.storage.caches import temporary
 from rsbench.storage.file_hashes import HashedFile
 from rsbench.storage.files import write_json
 from rsbench.storage.object_store import Listed, Store, cache_of, key_of, open_store
-from rsbench.storage.work_folder import WORK, files_below, named, remove, workplace
+from rsbench.storage.work_folder import WORK, files_below, named, remove, work_folder
 
 _OBJECTS = "objects.jsonl"
 _DATASET = "dataset.json"
@@ -48,8 +48,8 @@ class StoreTarget:
     work: Path | None
     """Workplace; None where each process has one of its own, for it may be on another machine."""
 
-    def workplace(self) -> Path:
-        return _own_workplace(key_of(self.url)) if self.work is None else self.work
+    def work_folder(self) -> Path:
+        return _own_work_folder(key_of(self.url)) if self.work is None else self.work
 
     def place(self, partial: Path, name: str) -> None:
         store = open_store(self.url)
@@ -75,7 +75,7 @@ class _Known(NamedTuple):
         return {file: HashedFile(self.sizes[file], 0, 0, digest) for file, digest in listed.items()}
 
 
-class StoreHome:
+class StoreDestination:
     """A ``Home``."""
 
     def __init__(self, store: Store, hidden: Path, target: StoreTarget, rehash: bool) -> None:
@@ -229,16 +229,16 @@ def store_for(url: str, workers: Workers) -> Store:
 
 
 @contextmanager
-def store_home(url: str, workers: Workers, rehash: bool) -> Iterator[StoreHome]:
+def store_destination(url: str, workers: Workers, rehash: bool) -> Iterator[StoreDestination]:
     """A store, to which no other command of this user on this machine sends a dataset; ``rehash`` reads all of it.
 
     Raises:
-        RsbenchError: see ``store_for`` and ``workplace``.
+        RsbenchError: see ``store_for`` and ``work_folder``.
     """
     store, hidden = store_for(url, workers), cache_of(url)
-    with workplace(hidden, hidden):
+    with work_folder(hidden, hidden):
         target = StoreTarget(url, None if isinstance(workers, Cluster) else hidden / WORK)
-        yield StoreHome(store, hidden, target, rehash)
+        yield StoreDestination(store, hidden, target, rehash)
 
 
 _kept = contextlib.ExitStack()
@@ -246,11 +246,11 @@ _kept = contextlib.ExitStack()
 
 
 @cache
-def _own_workplace(key: str) -> Path:
+def _own_work_folder(key: str) -> Path:
     """The first free one on this machine; its last owner may have been killed there."""
     base = (temporary() or Path(tempfile.mkdtemp())) / "stores" / key
     for number in range(_MOST_CHILDREN):
         place = base / str(number)
         with contextlib.suppress(RsbenchError):
-            return _kept.enter_context(workplace(place, place)) / WORK
+            return _kept.enter_context(work_folder(place, place)) / WORK
     raise RsbenchError(f"{base}: cannot be written; set TMPDIR to a folder that can")

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import Cancelled, IsolatedWorker, Outcome
-from rsbench.jobs.workers import Cluster, Crew
+from rsbench.jobs.workers import Cluster, WorkerProcesses
 
 Job = TypeVar("Job")
 _CONNECT_S = 30
@@ -26,7 +26,7 @@ _WATCH_S = 0.5
 
 
 def run_on_cluster(
-    cluster: Cluster, crew: Crew, jobs: Sequence[Job], seconds_of: Callable[[Job], float] | None
+    cluster: Cluster, processes: WorkerProcesses, jobs: Sequence[Job], seconds_of: Callable[[Job], float] | None
 ) -> Generator[tuple[Job, Outcome], None, None]:
     """Jobs with their outcomes, as they become ready; see ``run_jobs``.
 
@@ -34,7 +34,7 @@ def run_on_cluster(
         RsbenchError: there is no such scheduler, it has no worker, or distributed is not installed.
         RuntimeError: rsbench's own code in a child is at fault.
     """
-    content = bytes(ForkingPickler.dumps(crew))
+    content = bytes(ForkingPickler.dumps(processes))
     key = hashlib.sha256(content).hexdigest()
     with _connected(cluster) as client:
         from distributed import CancelledError, KilledWorker, as_completed
@@ -96,13 +96,13 @@ def _connected(cluster: Cluster) -> Iterator[Any]:
 class _Hired:
     """A child, the crew that it is of, and what stops it."""
 
-    crew: Crew
+    processes: WorkerProcesses
     cancel: threading.Event
     worker: IsolatedWorker
 
 
 @dataclass
-class _Crews:
+class _ClusterWorkers:
     """The children of this process: idle ones by the crew that they are of."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -118,8 +118,8 @@ class _Crews:
             hired.worker.close()
         if found is not None:
             return found
-        crew, cancel = ForkingPickler.loads(content), threading.Event()
-        return _Hired(crew, cancel, crew.hire(cancel))
+        processes, cancel = ForkingPickler.loads(content), threading.Event()
+        return _Hired(processes, cancel, processes.hire(cancel))
 
     def give_back(self, key: str, hired: _Hired) -> None:
         with self.lock:
@@ -132,7 +132,7 @@ class _Crews:
             hired.worker.close()
 
 
-_CREWS = _Crews()
+_CREWS = _ClusterWorkers()
 
 
 def _dismiss(key: str) -> None:
@@ -140,12 +140,12 @@ def _dismiss(key: str) -> None:
     _CREWS.dismiss(key)
 
 
-def _do(key: str, crew: bytes, job: object, limit_s: float) -> Outcome:
+def _do(key: str, processes: bytes, job: object, limit_s: float) -> Outcome:
     """One job in a child of this worker of the cluster."""
-    hired = _CREWS.take(key, crew)
+    hired = _CREWS.take(key, processes)
     with _watched(hired.cancel):
         try:
-            outcome = hired.crew.done_by(hired.worker, job, limit_s)
+            outcome = hired.processes.done_by(hired.worker, job, limit_s)
         except BaseException as error:
             hired.worker.close()
             if isinstance(error, Cancelled):  # nobody waits for it

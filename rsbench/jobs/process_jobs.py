@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.dask_jobs import run_on_cluster
 from rsbench.jobs.isolation import Cancelled, IsolatedWorker, Outcome, Server
-from rsbench.jobs.workers import TRIES, Cluster, Crew, Workers
+from rsbench.jobs.workers import TRIES, Cluster, WorkerProcesses, Workers
 
 Job = TypeVar("Job")
 _MOST_LOST = 10
@@ -87,7 +87,7 @@ def run_jobs(
         RsbenchError: the cluster cannot be reached.
         RuntimeError: rsbench's own code in a child is at fault.
     """
-    crew = Crew(
+    processes = WorkerProcesses(
         factory=factory,
         arguments=arguments,
         environment=environment,
@@ -95,13 +95,13 @@ def run_jobs(
         tries=TRIES if seconds_of is None and memory_mb is None else 1,
     )
     if isinstance(workers, Cluster):
-        yield from run_on_cluster(workers, crew, jobs, seconds_of)
+        yield from run_on_cluster(workers, processes, jobs, seconds_of)
     else:
-        yield from _run_here(workers, crew, jobs, seconds_of)
+        yield from _run_here(workers, processes, jobs, seconds_of)
 
 
 def _run_here(
-    workers: int, crew: Crew, jobs: Sequence[Job], seconds_of: Callable[[Job], float] | None
+    workers: int, processes: WorkerProcesses, jobs: Sequence[Job], seconds_of: Callable[[Job], float] | None
 ) -> Generator[tuple[Job, Outcome], None, None]:
     waiting: queue.SimpleQueue[Job] = queue.SimpleQueue()
     done: queue.SimpleQueue[_Done[Job]] = queue.SimpleQueue()
@@ -110,8 +110,8 @@ def _run_here(
         waiting.put(job)
 
     def work() -> None:
-        with crew.hire(cancel) as worker:
-            _work(crew, worker, waiting, done, seconds_of)
+        with processes.hire(cancel) as worker:
+            _work(processes, worker, waiting, done, seconds_of)
 
     threads = [threading.Thread(target=work, daemon=True) for _ in range(min(workers, len(jobs)))]
     try:
@@ -129,7 +129,7 @@ def _run_here(
 
 
 def _work(
-    crew: Crew,
+    processes: WorkerProcesses,
     worker: IsolatedWorker,
     waiting: queue.SimpleQueue[Job],
     done: queue.SimpleQueue[_Done[Job]],
@@ -142,7 +142,7 @@ def _work(
         except queue.Empty:
             return
         try:
-            outcome = crew.done_by(worker, job, math.inf if seconds_of is None else seconds_of(job))
+            outcome = processes.done_by(worker, job, math.inf if seconds_of is None else seconds_of(job))
         except Cancelled:
             return
         except BaseException as error:  # for whoever waits in the other thread

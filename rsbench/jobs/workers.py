@@ -26,7 +26,7 @@ Workers = int | Cluster
 
 
 @dataclass(frozen=True, kw_only=True)
-class Crew:
+class WorkerProcesses:
     """Child processes that serve the jobs of one run; picklable, as ``IsolatedWorker`` wants its arguments."""
 
     factory: Callable[..., Server]

@@ -28,7 +28,7 @@ from rsbench.vision.images import grey_u8
 from rsbench.vision.layer_fit import PlaneOptions, fronto_parallel
 from rsbench.vision.layer_motion import followed, on_layers, refined
 from rsbench.vision.layers import Labelled, LabelOptions, MovingCamera, label_pixels
-from rsbench.vision.other_view import F32
+from rsbench.vision.reprojection import F32
 
 _STILL_PX = 0.1
 """Matches that move by less, in the median, show no motion."""

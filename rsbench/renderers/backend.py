@@ -172,21 +172,21 @@ def driver_library() -> Path | None:
     return next((Path(name) for pattern in patterns for name in sorted(glob.glob(pattern))), None)
 
 
-def probe_cuda(timeout: float = 120.0) -> llvm.Verdict:
+def probe_cuda(timeout: float = 120.0) -> llvm.ProbeResult:
     """Whether ``cuda_ad_rgb`` can trace a ray here; costs nothing on a machine without an NVIDIA driver."""
     driver = driver_library()
     if driver is None:
-        return llvm.Verdict(ok=False, reason="no NVIDIA driver on this machine")
+        return llvm.ProbeResult(ok=False, reason="no NVIDIA driver on this machine")
     try:
         status = driver.stat()
     except OSError as error:
-        return llvm.Verdict(ok=False, reason=f"{driver} cannot be read ({error.strerror})")
+        return llvm.ProbeResult(ok=False, reason=f"{driver} cannot be read ({error.strerror})")
     devices = ",".join(sorted(glob.glob("/dev/nvidia[0-9]*")))
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "all")
     key = f"cuda|{driver}|{status.st_mtime_ns}|{status.st_size}|{devices}|{visible}"
     known = probe_cache.recall(key)
     if known is not None:
-        return llvm.Verdict(ok=True, version=known)
+        return llvm.ProbeResult(ok=True, version=known)
     verdict = llvm.run_child(_CUDA_PROBE, [], {}, timeout)
     if verdict.ok:
         probe_cache.remember(key, verdict.version)

@@ -85,7 +85,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verdict:
+class ProbeResult:
     """What became of a probe; ``version`` is empty unless the library is usable."""
 
     ok: bool
@@ -164,29 +164,29 @@ def _missing_links(library: Path) -> tuple[Path, ...]:
     return ()
 
 
-def probe(candidate: Candidate, timeout: float = 60.0) -> Verdict:
+def probe(candidate: Candidate, timeout: float = 60.0) -> ProbeResult:
     """Whether Dr.Jit works with the library, found out in a child process; good news is remembered on disk."""
     path = candidate.path
     try:
         status = path.stat()
     except OSError as error:
-        return Verdict(ok=False, reason=f"cannot be opened ({error.strerror})")
+        return ProbeResult(ok=False, reason=f"cannot be opened ({error.strerror})")
     drjit = importlib.metadata.version("drjit")
     key = f"llvm|{path}|{status.st_mtime_ns}|{status.st_size}|{drjit}|{cpu_key()}"
     known = probe_cache.recall(key)
     if known is not None:
-        return Verdict(ok=True, version=known)
+        return ProbeResult(ok=True, version=known)
     with tempfile.TemporaryDirectory(prefix="rsbench-probe-") as scratch:
         environ = {"DRJIT_LIBLLVM_PATH": str(path), "DRJIT_CACHE_DIR": scratch}
         verdict = run_child(_PROBE, [str(library) for library in candidate.preload], environ, timeout)
     if verdict.ok and int(verdict.version.split(".")[0]) < MINIMUM_VERSION:
-        return Verdict(ok=False, reason=f"is LLVM {verdict.version}; {MINIMUM_VERSION} or newer is needed")
+        return ProbeResult(ok=False, reason=f"is LLVM {verdict.version}; {MINIMUM_VERSION} or newer is needed")
     if verdict.ok:
         probe_cache.remember(key, verdict.version)
     return verdict
 
 
-def run_child(code: str, arguments: Sequence[str], environ: Mapping[str, str], timeout: float) -> Verdict:
+def run_child(code: str, arguments: Sequence[str], environ: Mapping[str, str], timeout: float) -> ProbeResult:
     """Run Python code in a child process; it passes by printing ``version ...`` as its last line, exit code 0.
 
     ``-P`` keeps the working directory out of the child's path; it finds modules where this process does. On Linux
@@ -208,16 +208,16 @@ def run_child(code: str, arguments: Sequence[str], environ: Mapping[str, str], t
                 pass_fds=(line,) if line >= 0 else (),
             )
     except subprocess.TimeoutExpired:
-        return Verdict(ok=False, reason=f"gave no answer within {timeout:g} s")
+        return ProbeResult(ok=False, reason=f"gave no answer within {timeout:g} s")
     except OSError as error:
-        return Verdict(ok=False, reason=f"child process did not start ({error})")
+        return ProbeResult(ok=False, reason=f"child process did not start ({error})")
     lines = done.stdout.strip().splitlines()
     if done.returncode == 0 and lines and lines[-1].startswith("version"):
-        return Verdict(ok=True, version=".".join(lines[-1].split()[1:]))
+        return ProbeResult(ok=True, version=".".join(lines[-1].split()[1:]))
     if done.returncode < 0:
-        return Verdict(ok=False, reason=f"killed its process (signal {-done.returncode})")
+        return ProbeResult(ok=False, reason=f"killed its process (signal {-done.returncode})")
     said = [line.strip() for line in done.stderr.splitlines() if line.strip()]
-    return Verdict(ok=False, reason=said[-1][:200] if said else f"exit code {done.returncode}")
+    return ProbeResult(ok=False, reason=said[-1][:200] if said else f"exit code {done.returncode}")
 
 
 def load(candidate: Candidate) -> None:

@@ -14,7 +14,7 @@ from rsbench.components.plugins import Kind, NoOptions, load_class, make_compone
 from rsbench.core.errors import RsbenchError
 from rsbench.scenes.environment import lit_by, read_environment
 from rsbench.scenes.model import Light, Scene, SceneBuilder, SceneMesh, Viewpoint
-from rsbench.scenes.scene_cache import built_key, keep, kept_meshes
+from rsbench.scenes.scene_cache import built_key, cached_meshes, keep
 
 _FARTHEST = 1e9
 Rgb: TypeAlias = tuple[float, float, float]
@@ -130,7 +130,7 @@ def load_scene(name_or_path: str | Path) -> Scene:
 def _built(builder: SceneBuilder, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
     """Meshes of a builder of ours, from the cache where they can be kept."""
     key = built_key(builder, seed)
-    meshes = None if key is None else kept_meshes(key)
+    meshes = None if key is None else cached_meshes(key)
     if meshes is None:
         meshes = tuple(builder.build(seed, folder))
         if key is not None:

@@ -49,7 +49,7 @@ def built_key(builder: SceneBuilder, seed: int) -> str | None:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def kept_meshes(key: str) -> tuple[SceneMesh, ...] | None:
+def cached_meshes(key: str) -> tuple[SceneMesh, ...] | None:
     """What ``keep`` stored under a key; None when there is nothing that can be read."""
     folder = _folder()
     if folder is None:

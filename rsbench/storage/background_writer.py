@@ -19,7 +19,7 @@ _WAITING = 8
 
 
 @contextmanager
-def beside() -> Iterator[Later]:
+def background_writer() -> Iterator[Later]:
     """Gives what hands work to other threads. At the end all of it is done.
 
     The first error is raised at the end, or when more work is handed over; results are kept by who asked alone.

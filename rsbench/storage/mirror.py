@@ -24,7 +24,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.storage.file_hashes import HASHES
 from rsbench.storage.files import read_json, write_json
 from rsbench.storage.object_store import Store, cache_of, open_store
-from rsbench.storage.work_folder import HIDDEN, LOCK, WORK, files_below, remove, workplace
+from rsbench.storage.work_folder import HIDDEN, LOCK, WORK, files_below, remove, work_folder
 
 _BEAT_S = 30.0
 _BROUGHT = 64
@@ -189,12 +189,12 @@ def mirrored(url: str) -> Iterator[Path]:
     else: what others have there stays.
 
     Raises:
-        RsbenchError: see ``Store`` and ``workplace``; or the store refused results, which are kept here then.
+        RsbenchError: see ``Store`` and ``work_folder``; or the store refused results, which are kept here then.
     """
     store, hidden = open_store(url), cache_of(url)
     with contextlib.ExitStack() as stack:
         with _called(hidden, store.url):
-            stack.enter_context(workplace(hidden, hidden))
+            stack.enter_context(work_folder(hidden, hidden))
         mirror, done = _Mirror(store, hidden), threading.Event()
         mirror.bring()
         thread = threading.Thread(target=mirror.keep_sending, args=(done,), daemon=True)

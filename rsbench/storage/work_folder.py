@@ -42,7 +42,7 @@ _DEAD_S = 90.0
 
 
 @contextmanager
-def workplace(out: Path, hidden: Path | None = None) -> Iterator[Path]:
+def work_folder(out: Path, hidden: Path | None = None) -> Iterator[Path]:
     """Be the only command that writes to ``out``; yields the hidden folder, with a fresh folder ``WORK`` in it.
 
     Args:
@@ -82,7 +82,7 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
 
 
-def strangers(folder: Path, ours: Callable[[str], bool]) -> list[str]:
+def unknown_files(folder: Path, ours: Callable[[str], bool]) -> list[str]:
     """Paths below a folder that are no plain files of ours, sorted; relative, with slashes.
 
     A link is a stranger whatever its name is; an empty folder is none.

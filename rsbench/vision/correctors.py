@@ -14,7 +14,7 @@ from rsbench.core.se3 import Pose
 from rsbench.vision.baseline_depths import plane_depth
 from rsbench.vision.correction import WarpOptions, warp_gain
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
-from rsbench.vision.frame_threads import side_by_side
+from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.fusion import Fused, Origin, SourceView, fuse
 
 F32 = NDArray[np.float32]
@@ -52,7 +52,7 @@ class FusionCorrector(Corrector):
             return fuse(sources, problem.rig.camera, problem.target_pose(view), self.warp)
 
         camera = problem.rig.camera
-        found = side_by_side(corrected, views, camera.width * camera.height, _FUSION_BYTES)
+        found = map_frames(corrected, views, camera.width * camera.height, _FUSION_BYTES)
         return dict(zip(views, found, strict=True))
 
     def _sources(self, problem: CorrectionProblem, view: View, poses: Mapping[View, Pose]) -> list[SourceView]:

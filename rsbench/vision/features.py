@@ -24,7 +24,7 @@ from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.descriptor_search import best_two
 from rsbench.vision.feature_matcher import FeatureMatcher
-from rsbench.vision.frame_threads import side_by_side
+from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.images import grey_u8
 
 Indices = NDArray[np.int64]
@@ -168,7 +168,7 @@ def match_stereo_frames(
         beside = Gate(dx=(-disparity, -np.finfo(np.float64).tiny), dy=(-tolerance, tolerance))
     # OpenCV, the BLAS and the compiled loop let go of the GIL.
     pixels = left_0.shape[0] * left_0.shape[1]
-    l0, r0, l1, r1 = side_by_side(lambda image: detect(image, options), images.values(), pixels, _DETECTION_BYTES)
+    l0, r0, l1, r1 = map_frames(lambda image: detect(image, options), images.values(), pixels, _DETECTION_BYTES)
     tasks = ((l0, l1, anywhere), (r0, r1, anywhere), (l0, r0, beside), (l1, r1, beside))
     with ThreadPoolExecutor() as pool:
         left, right, stereo_0, stereo_1 = pool.map(lambda t: match(t[0], t[1], t[2], options), tasks)

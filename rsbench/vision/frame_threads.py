@@ -13,7 +13,7 @@ _BYTES = 1e9
 """What frames that are worked on at once may take: correcting four of full HD stays below 2 GB."""
 
 
-def side_by_side(work: Callable[[T], R], items: Iterable[T], pixels: int, bytes_per_pixel: float) -> list[R]:
+def map_frames(work: Callable[[T], R], items: Iterable[T], pixels: int, bytes_per_pixel: float) -> list[R]:
     """``work`` on each item, by threads: no more than there are cores, and at least one.
 
     Args:

@@ -29,7 +29,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.layer_fit import FEWEST
 from rsbench.vision.layers import Labelled, MovingCamera, planes_seen
-from rsbench.vision.other_view import F32
+from rsbench.vision.reprojection import F32
 from rsbench.vision.resample import resample
 
 _GRID = 4

@@ -29,7 +29,7 @@ from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.matching_cost import Comparer
-from rsbench.vision.other_view import F32, land_pixels, landing
+from rsbench.vision.reprojection import F32, reproject_pixels, reprojection_of
 from rsbench.vision.resample import resample
 from rsbench.vision.semiglobal import aggregated
 from rsbench.vision.stereo_depth import known_beside
@@ -162,7 +162,7 @@ class _Pair:
         self._rhos = [camera.inverse_depths(planes, frame) for frame in FRAMES]
         axes = (camera.shutter.axis(camera.side),) * 2
         poses = [camera.row_poses(frame) for frame in FRAMES]
-        self._maps = [landing(camera.rig.camera, poses[f], poses[1 - f], axes) for f in FRAMES]
+        self._maps = [reprojection_of(camera.rig.camera, poses[f], poses[1 - f], axes) for f in FRAMES]
         self.costs = [np.zeros_like(rho) for rho in self._rhos]
         self._pixels = [np.zeros(rho.shape, dtype=np.int32) for rho in self._rhos]
         """(n, H, W) the other frame's pixel, counted along its rows, at which a layer lands; any if at none."""
@@ -177,7 +177,7 @@ class _Pair:
 
     def _landed(self, frame: int, rho: F32) -> tuple[F32, F32]:
         lines = np.indices(rho.shape, dtype=np.int32)[1 - self._camera.shutter.axis(self._camera.side)]
-        return land_pixels(self._maps[frame], rho, lines)
+        return reproject_pixels(self._maps[frame], rho, lines)
 
     def _unlike(self, comparer: Comparer, greys: tuple[F32, F32], frame: int, places: F32) -> F32:
         """0 to 1 (H, W), NaN outside: half by the windows around pixels, which tell them apart, and half by the

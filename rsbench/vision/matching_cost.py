@@ -26,7 +26,7 @@ class Comparer:
     def _box(self, values: NDArray[Any]) -> F32:
         return np.asarray(cv2.boxFilter(values, -1, self._window, borderType=cv2.BORDER_REFLECT))
 
-    def unlikeness(self, other: F32, places: F32, *, cubic: bool) -> F32:
+    def cost_of(self, other: F32, places: F32, *, cubic: bool) -> F32:
         """0 (alike) to 1 (H, W) of the other image (H, W) at places (H, W, 2) px; NaN where those are NaN."""
         return np.where(
             np.isnan(places[..., 0]), np.float32(np.nan), self.compared(self._seen(other, places, cubic))

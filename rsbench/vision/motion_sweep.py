@@ -25,7 +25,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.vision.compiled_camera import Table, across_lines, line_of
 from rsbench.vision.correction import inverse_depth
 from rsbench.vision.images import grey_u8
-from rsbench.vision.other_view import Landing, land, landing, parallax_gain
+from rsbench.vision.reprojection import Reprojection, parallax_gain, reproject, reprojection_of
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -58,7 +58,7 @@ def depth_from_motion(
     found = np.zeros_like(depths[0]), np.zeros_like(depths[1])
     poses = [row_poses(rig, shutter, motion, side, frame) for frame in (0, 1)]
     axes = (shutter.axis(side), shutter.axis(side))
-    maps = [landing(rig.camera, poses[frame], poses[1 - frame], axes) for frame in (0, 1)]
+    maps = [reprojection_of(rig.camera, poses[frame], poses[1 - frame], axes) for frame in (0, 1)]
     gain = parallax_gain(rig.camera, *maps)
     count = int(_REACH * max(depths[0].shape))
     unknown = [depth == 0.0 for depth in depths]
@@ -80,7 +80,7 @@ def _search(
     y: NDArray[np.int32],
     x: NDArray[np.int32],
     both: tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint32], NDArray[np.uint32]],
-    maps: Landing,
+    maps: Reprojection,
     count: int,
     step: float,
 ) -> F32:
@@ -149,7 +149,7 @@ def _fill_costs(
     count = len(A)
     for i in range(len(y)):
         # One step along the curve changes the line by one at most: its pose is that of the last landing.
-        u, v, _ = land(x[i], y[i], rho, lines[i], G, c, A, B, ideal, lens, columns)
+        u, v, _ = reproject(x[i], y[i], rho, lines[i], G, c, A, B, ideal, lens, columns)
         along = across_lines(there, u, v)
         if -count < along < 2 * count:
             lines[i] = min(max(int(along + 0.5), 0), count - 1)
@@ -198,7 +198,7 @@ def _keep_agreeing(
                 continue
             line, u, v, s = line_of(columns, x, y), np.nan, np.nan, np.nan
             for _ in range(6):
-                u, v, s = land(x, y, rho[y, x], line, G, c, A, B, ideal, lens, columns)
+                u, v, s = reproject(x, y, rho[y, x], line, G, c, A, B, ideal, lens, columns)
                 along = across_lines(there, u, v)
                 if not -lines < along < 2 * lines:
                     break

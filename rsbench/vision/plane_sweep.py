@@ -31,7 +31,7 @@ from rsbench.core.rig import VIEWS, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.vision.images import grey_u8
 from rsbench.vision.matching_cost import Comparer
-from rsbench.vision.other_view import Landing, land_pixels, landing, parallax_gain
+from rsbench.vision.reprojection import Reprojection, parallax_gain, reproject_pixels, reprojection_of
 from rsbench.vision.semiglobal import aggregated, winners
 from rsbench.vision.stereo_matcher import F32, Cameras, MotionMatcher
 
@@ -161,8 +161,8 @@ class _Scene:
         believed = shutter if options.rolling else shutter.at_once()
         poses = {view: row_poses(rig, believed, motion, *view) for view in VIEWS}
         axes = {view: believed.axis(view[0]) for view in VIEWS}
-        self.maps: dict[tuple[View, View], Landing] = {
-            (view, other): landing(rig.camera, poses[view], poses[other], (axes[view], axes[other]))
+        self.maps: dict[tuple[View, View], Reprojection] = {
+            (view, other): reprojection_of(rig.camera, poses[view], poses[other], (axes[view], axes[other]))
             for view in VIEWS
             for other in self._others(view)
         }
@@ -240,8 +240,8 @@ class _Scene:
         """
         costs = []
         for other, start in zip(self._others(view), lines, strict=True):
-            places, _ = land_pixels(self.maps[view, other], rho, start)
-            costs.append(comparer.unlikeness(self.greys[other], places, cubic=cubic))
+            places, _ = reproject_pixels(self.maps[view, other], rho, start)
+            costs.append(comparer.cost_of(self.greys[other], places, cubic=cubic))
         if len(costs) == 1:
             return costs[0]
         found = np.zeros_like(costs[0])
@@ -269,7 +269,7 @@ class _Scene:
         found = np.zeros(self.size, np.float32)
         for other, start in zip(self._others(view), lines, strict=True):
             maps = self.maps[view, other]
-            here, far = (land_pixels(maps, at, start)[0] for at in (rho, np.zeros_like(rho)))
+            here, far = (reproject_pixels(maps, at, start)[0] for at in (rho, np.zeros_like(rho)))
             # What is infinitely far may lie beside the image: then there is parallax enough.
             moved = np.linalg.norm(here - far, axis=-1)
             moved = np.where(np.isfinite(here[..., 0]), np.nan_to_num(moved, nan=np.inf), 0.0)
@@ -283,7 +283,7 @@ class _Scene:
             rho = rhos[view]
             agrees = np.zeros(self.size, np.bool_)
             for other in self._others(view):
-                places, factors = land_pixels(self.maps[view, other], rho, self._first_lines(view, other))
+                places, factors = reproject_pixels(self.maps[view, other], rho, self._first_lines(view, other))
                 seen = np.isfinite(places[..., 0])
                 nearest = np.rint(np.where(seen[..., None], places, 0.0)).astype(np.int64)
                 x, y = np.moveaxis(np.clip(nearest, 0, [self.size[1] - 1, self.size[0] - 1]), -1, 0)

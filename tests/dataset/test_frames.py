@@ -35,7 +35,7 @@ from rsbench.dataset.views import Shot
 from rsbench.renderers.electrons import Sensor
 from rsbench.renderers.render import Frame
 from rsbench.renderers.visibility import Surfaces
-from rsbench.storage.background_writer import beside
+from rsbench.storage.background_writer import background_writer
 from rsbench.storage.files import read_depth, read_png, write_depth, write_png
 from rsbench.verification import verification_steps, verify_dataset
 
@@ -229,7 +229,7 @@ def flowing(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         image, labels = np.zeros((54, 64, 3), np.float32), np.zeros((54, 64), np.uint8)
         gloss = np.zeros(labels.shape, np.bool_)
         seen = Frame(image=image, depth=whole.depth("rs", *view), labels=labels, gloss=gloss)
-        with beside() as later:
+        with background_writer() as later:
             write_channels(whole.folder, ["flow"], whole, Shot("rs", *view), seen, Open(), later)
     own = json.loads((whole.folder / "sequence.json").read_text()) | {"channels": ["flow"]}
     own["files"] |= dict.fromkeys(channel_files(["flow"], (), COUNT), "")

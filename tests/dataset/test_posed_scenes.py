@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from rsbench.dataset.card import SequenceCard
-from rsbench.dataset.posed_scenes import Built, Stage
+from rsbench.dataset.posed_scenes import Built, PosedScenes
 from rsbench.renderers import scene as renderer
 from rsbench.scenes.model import Start
 
@@ -22,7 +22,7 @@ def test_what_is_seen_from_one_place_is_loaded_once(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(renderer, "MitsubaScene", load)
     scene: Any = SimpleNamespace(viewpoints={"default": "d", "gate": "g"}, seen_from=lambda *place: place)
-    stage = Stage(lambda name: Built(scene, f"hash of {name}"))
+    stage = PosedScenes(lambda name: Built(scene, f"hash of {name}"))
     moved = Start(position=(0, 0, 1), quaternion=(1, 0, 0, 0))
     sequences = [
         SequenceCard(name="a", scene="castle"),

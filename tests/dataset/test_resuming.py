@@ -20,7 +20,7 @@ from rsbench.jobs.process_jobs import LostJobsError
 from rsbench.storage import file_hashes
 from rsbench.storage.file_hashes import FileHashes
 from rsbench.storage.files import sha256
-from rsbench.storage.work_folder import HIDDEN, workplace
+from rsbench.storage.work_folder import HIDDEN, work_folder
 
 
 @pytest.fixture(scope="module")
@@ -220,7 +220,7 @@ def test_stopped_between_the_old_and_the_new_it_goes_on(
 
 
 def test_two_commands_do_not_share_a_folder(card: DatasetCard, copy: Path) -> None:
-    with workplace(copy), pytest.raises(RsbenchError, match=f"process {os.getpid()} on .* is at work there"):
+    with work_folder(copy), pytest.raises(RsbenchError, match=f"process {os.getpid()} on .* is at work there"):
         generate_dataset(card, copy)
 
 

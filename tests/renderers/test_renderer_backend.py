@@ -22,7 +22,7 @@ import pytest
 from rsbench.core.errors import RsbenchError
 from rsbench.renderers import backend, diagnosis, llvm, probe_cache
 from rsbench.renderers.backend import Backend, start_backend
-from rsbench.renderers.llvm import Candidate, Verdict
+from rsbench.renderers.llvm import Candidate, ProbeResult
 
 RENDER = """
 import sys, time
@@ -138,17 +138,17 @@ def test_start_is_idempotent_and_refuses_a_second_variant(monkeypatch: pytest.Mo
 
 def test_preferences_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(llvm, "candidates", lambda: iter([Candidate(path=Path("/x/libLLVM.so"), source="system")]))
-    monkeypatch.setattr(llvm, "probe", lambda candidate: Verdict(ok=False, reason="is LLVM 14"))
-    monkeypatch.setattr(backend, "probe_cuda", lambda: Verdict(ok=True, version="12.4"))
+    monkeypatch.setattr(llvm, "probe", lambda candidate: ProbeResult(ok=False, reason="is LLVM 14"))
+    monkeypatch.setattr(backend, "probe_cuda", lambda: ProbeResult(ok=True, version="12.4"))
     assert backend._choose("auto")[0] == Backend(variant="cuda_ad_rgb")
     assert backend._choose("scalar")[0] == Backend(variant="scalar_rgb")
     with pytest.raises(RsbenchError, match=r"/x/libLLVM.so: is LLVM 14.*install LLVM 17"):
         backend._choose("llvm")
-    monkeypatch.setattr(backend, "probe_cuda", lambda: Verdict(ok=False, reason="no NVIDIA driver"))
+    monkeypatch.setattr(backend, "probe_cuda", lambda: ProbeResult(ok=False, reason="no NVIDIA driver"))
     with pytest.raises(RsbenchError, match="no NVIDIA driver"):
         backend._choose("cuda")
     assert backend._choose("auto")[0].variant == "scalar_rgb"
-    monkeypatch.setattr(llvm, "probe", lambda candidate: Verdict(ok=True, version="21.1.8"))
+    monkeypatch.setattr(llvm, "probe", lambda candidate: ProbeResult(ok=True, version="21.1.8"))
     chosen = backend._choose("auto")[0]
     assert (chosen.variant, chosen.llvm_version, chosen.message) == ("llvm_ad_rgb", "21.1.8", None)
 
@@ -264,9 +264,9 @@ def test_good_news_is_remembered_and_bad_news_is_not(monkeypatch: pytest.MonkeyP
     library.write_bytes(b"x")
     candidate = Candidate(path=library, source="system")
     answers = [
-        Verdict(ok=False, reason="busy"),
-        Verdict(ok=True, version="22.1.8"),
-        Verdict(ok=True, version="16.0.6"),
+        ProbeResult(ok=False, reason="busy"),
+        ProbeResult(ok=True, version="22.1.8"),
+        ProbeResult(ok=True, version="16.0.6"),
     ]
     monkeypatch.setattr(llvm, "run_child", lambda *arguments: answers.pop(0))
     assert not llvm.probe(candidate).ok

@@ -13,7 +13,7 @@ from rsbench.dataset.scene_hashes import scene_hash
 from rsbench.scenes import load, scene_cache
 from rsbench.scenes.load import load_scene, read_scene_card
 from rsbench.scenes.model import Material, SceneMesh
-from rsbench.scenes.scene_cache import built_key, keep, kept_meshes
+from rsbench.scenes.scene_cache import built_key, cached_meshes, keep
 
 KEY = "0123"
 
@@ -51,9 +51,9 @@ def _meshes() -> tuple[SceneMesh, ...]:
 
 def test_what_is_kept_is_the_same_to_the_last_bit(cache: Path) -> None:
     meshes = _meshes()
-    assert kept_meshes(KEY) is None
+    assert cached_meshes(KEY) is None
     keep(KEY, meshes)
-    found = kept_meshes(KEY)
+    found = cached_meshes(KEY)
     assert found is not None
     assert [mesh.name for mesh in found] == [mesh.name for mesh in meshes]
     assert found[0].material is found[1].material is not found[2].material
@@ -74,14 +74,14 @@ def test_a_damaged_file_is_nothing(cache: Path) -> None:
     whole = path.read_bytes()
     for at in range(0, len(whole), 97):
         path.write_bytes(whole[:at] + bytes([whole[at] ^ 0x10]) + whole[at + 1 :])
-        found = kept_meshes(KEY)
+        found = cached_meshes(KEY)
         # A bit of the archive's own fields that nobody reads, such as a date, may go unseen; no array may.
         if found is not None:
             for mesh, expected in zip(found, _meshes(), strict=True):
                 assert mesh.vertices.tobytes() == expected.vertices.tobytes()
                 assert mesh.faces.tobytes() == expected.faces.tobytes()
     path.write_bytes(whole[: len(whole) // 2])
-    assert kept_meshes(KEY) is None
+    assert cached_meshes(KEY) is None
 
 
 def test_only_the_latest_stay_and_what_was_abandoned_goes(cache: Path) -> None:
@@ -93,9 +93,9 @@ def test_only_the_latest_stay_and_what_was_abandoned_goes(cache: Path) -> None:
         keep(str(number), _meshes())
         os.utime(cache / f"{number}.npz", (number, number))
         if number > 0:
-            assert kept_meshes("0") is not None  # its use makes it the latest
+            assert cached_meshes("0") is not None  # its use makes it the latest
     assert len(list(cache.glob("*.npz"))) == scene_cache._MOST
-    assert kept_meshes("0") is not None and kept_meshes("1") is None
+    assert cached_meshes("0") is not None and cached_meshes("1") is None
     assert not old.exists() and young.exists()
 
 
@@ -104,7 +104,7 @@ def test_where_nothing_can_be_kept_scenes_are_built(monkeypatch: pytest.MonkeyPa
     for place in (None, tmp_path / "file"):
         monkeypatch.setattr(scene_cache, "user_cache", lambda place=place: place)
         keep(KEY, _meshes())
-        assert kept_meshes(KEY) is None
+        assert cached_meshes(KEY) is None
 
 
 def test_a_scene_is_built_once(cache: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

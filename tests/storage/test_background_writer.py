@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from rsbench.core.errors import RsbenchError
-from rsbench.storage.background_writer import begun, beside
+from rsbench.storage.background_writer import background_writer, begun
 from rsbench.storage.files import write_bytes
 
 
 def test_all_is_done_at_the_end() -> None:
     done: list[int] = []
-    with beside() as later:
+    with background_writer() as later:
         for k in range(50):
             later(done.append, k)
     assert sorted(done) == list(range(50))
@@ -24,7 +24,7 @@ def test_all_is_done_at_the_end() -> None:
 
 def test_the_first_error_is_raised(tmp_path: Path) -> None:
     """A full disk, say: the folder of the second file is missing."""
-    with pytest.raises(RsbenchError, match="lost"), beside() as later:
+    with pytest.raises(RsbenchError, match="lost"), background_writer() as later:
         for name in ("a", "lost/b", "c"):
             later(write_bytes, tmp_path / name, b"1")
     assert "a" in {path.name for path in tmp_path.iterdir()} <= {"a", "c"}
@@ -33,7 +33,7 @@ def test_the_first_error_is_raised(tmp_path: Path) -> None:
 def test_an_error_is_raised_when_more_is_handed_over() -> None:
     """Not when hours of rendering have been for nothing."""
     handed: list[int] = []
-    with pytest.raises(ValueError, match="invalid literal"), beside() as later:
+    with pytest.raises(ValueError, match="invalid literal"), background_writer() as later:
         for k in range(1000):
             later(int, "no number")
             handed.append(k)
@@ -42,7 +42,7 @@ def test_an_error_is_raised_when_more_is_handed_over() -> None:
 
 def test_results_are_not_kept() -> None:
     """A sequence of 30 frames would hold gigabytes."""
-    with beside() as later:
+    with background_writer() as later:
         results = [weakref.ref(later(_Large).result()) for _ in range(50)]
         later(int, "1").result()
         gc.collect()
@@ -58,7 +58,7 @@ def test_a_slow_disk_holds_the_renderer_up() -> None:
         assert go.wait(10.0)
         done.append(k)
 
-    with beside() as later:
+    with background_writer() as later:
         threading.Timer(0.2, go.set).start()
         for k in range(40):
             later(write, k)
@@ -71,7 +71,7 @@ class _Large:
 
 
 def test_an_error_of_who_hands_over_work_goes_on() -> None:
-    with pytest.raises(ZeroDivisionError), beside() as later:
+    with pytest.raises(ZeroDivisionError), background_writer() as later:
         later(int, "1")
         raise ZeroDivisionError
 
@@ -86,7 +86,7 @@ def test_results_come_in_order_and_few_are_ahead() -> None:
             ahead = max(ahead, begun_by_now - taken)
         return k * k
 
-    with beside() as later:
+    with background_writer() as later:
         for k, result in enumerate(begun(later, work, range(20))):
             assert result == k * k
             with lock:

@@ -27,7 +27,7 @@ from rsbench.storage import mirror
 from rsbench.storage.caches import user_cache
 from rsbench.storage.files import write_bytes
 from rsbench.storage.mirror import mirrored, name_of
-from rsbench.storage.work_folder import WORK, workplace
+from rsbench.storage.work_folder import WORK, work_folder
 
 fsspec = pytest.importorskip("fsspec", reason="needs rsbench[cloud]")
 URL = "memory://bucket/mine"
@@ -154,7 +154,7 @@ _RESULTS = {
 def _command(send: Callable[[], object], folder: Path) -> list[str]:
     """As the sweeps do it: chunks are kept hidden, and collected when all are there; returns what it makes."""
     made = []
-    with workplace(folder) as hidden:
+    with work_folder(folder) as hidden:
         write_bytes(folder / "plan.json", _RESULTS["plan.json"])
         for name in (name for name in _RESULTS if name.startswith("data/")):
             chunk = hidden / "chunks" / Path(name).name
@@ -248,7 +248,7 @@ def test_half_files_locks_and_odd_names_stay_where_they_are(memory: Any, open_mi
     odd = ("/bucket/mine/C:/x", "/bucket/mine/a\\b", "/bucket/mine/.x.partial", "/bucket/mine/.rsbench/work/x")
     for path in odd:
         memory.pipe(path, b"odd")
-    with mirrored(URL) as folder, workplace(folder) as hidden:
+    with mirrored(URL) as folder, work_folder(folder) as hidden:
         assert not list(folder.rglob("x")) and not list(folder.rglob("*.partial"))
         (hidden / WORK / "0.png").write_bytes(b"half")
         (hidden / "hashes.jsonl").write_bytes(b"of this machine")

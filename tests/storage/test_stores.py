@@ -22,7 +22,7 @@ from rsbench.dataset import generation
 from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.posed_scenes import Built
-from rsbench.dataset.store_destination import store_home
+from rsbench.dataset.store_destination import store_destination
 from rsbench.renderers import clearance, scene
 from rsbench.storage.object_store import Store, path_or_url
 from rsbench.storage.work_folder import HIDDEN
@@ -179,7 +179,10 @@ def test_stopped_before_any_operation_it_goes_on_to_the_same_bytes(
 
 @pytest.mark.usefixtures("quick")
 def test_two_commands_do_not_send_to_one_store(card: DatasetCard, memory: Any) -> None:
-    with store_home(URL, 1, False), pytest.raises(RsbenchError, match=f"process {os.getpid()} on .* is at work"):
+    with (
+        store_destination(URL, 1, False),
+        pytest.raises(RsbenchError, match=f"process {os.getpid()} on .* is at work"),
+    ):
         generate_dataset(card, URL)
 
 

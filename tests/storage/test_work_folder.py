@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from rsbench.core.errors import RsbenchError
-from rsbench.storage.work_folder import HIDDEN, WORK, files_below, listed, remove, strangers, workplace
+from rsbench.storage.work_folder import HIDDEN, WORK, files_below, listed, remove, unknown_files, work_folder
 
 HOLDS = """
 import sys, time
@@ -29,32 +29,32 @@ with workplace(Path(sys.argv[1])) as hidden:
 
 
 def test_it_is_empty_at_first_and_leaves_nothing(tmp_path: Path) -> None:
-    with workplace(tmp_path / "new/out") as hidden:
+    with work_folder(tmp_path / "new/out") as hidden:
         assert hidden == tmp_path / "new/out" / HIDDEN and list((hidden / WORK).iterdir()) == []
         (hidden / WORK / "half").write_text("half")
     assert list(tmp_path.iterdir()) == [], "folders that it made are empty"
     (tmp_path / "old").mkdir()
-    with workplace(tmp_path / "old/out"):
+    with work_folder(tmp_path / "old/out"):
         (tmp_path / "old/out/result").write_text("done")
-    with workplace(tmp_path / "old"):
+    with work_folder(tmp_path / "old"):
         pass
     assert files_below(tmp_path) == ["old/out/result"]
 
 
 def test_what_a_later_run_can_use_stays(tmp_path: Path) -> None:
-    with workplace(tmp_path) as hidden:
+    with work_folder(tmp_path) as hidden:
         (hidden / "hashes.jsonl").write_text("known")
-    with workplace(tmp_path) as hidden:
+    with work_folder(tmp_path) as hidden:
         assert (hidden / "hashes.jsonl").read_text() == "known" and list((hidden / WORK).iterdir()) == []
 
 
 def test_a_second_command_is_told_who_is_there(tmp_path: Path) -> None:
-    with workplace(tmp_path), pytest.raises(RsbenchError) as caught, workplace(tmp_path):
+    with work_folder(tmp_path), pytest.raises(RsbenchError) as caught, work_folder(tmp_path):
         pass
     message = str(caught.value)
     assert f"process {os.getpid()} on {platform.node()} is at work there since 20" in message
     assert "\n" not in message and "choose another folder" in message
-    with workplace(tmp_path):
+    with work_folder(tmp_path):
         pass
 
 
@@ -63,12 +63,12 @@ def test_the_place_of_a_killed_command_is_taken_at_once(tmp_path: Path) -> None:
     command = [sys.executable, "-c", HOLDS, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None and process.stdout.readline() == "in\n"
-        with pytest.raises(RsbenchError, match=f"process {process.pid} on "), workplace(tmp_path):
+        with pytest.raises(RsbenchError, match=f"process {process.pid} on "), work_folder(tmp_path):
             pass
         process.send_signal(signal.SIGKILL)
         process.wait()
     assert (tmp_path / HIDDEN / WORK / "half").exists()
-    with workplace(tmp_path) as hidden:
+    with work_folder(tmp_path) as hidden:
         assert list((hidden / WORK).iterdir()) == []
 
 
@@ -84,12 +84,12 @@ def test_a_command_on_another_host_counts_while_it_shows_signs_of_life(
     )
     os.utime(lock, (time.time() - age_s, time.time() - age_s))
     if free:
-        with workplace(tmp_path):
+        with work_folder(tmp_path):
             pass
         assert not lock.exists()
         return
     seen = r"process 17 on elsewhere .* since yesterday, seen there 1\d s ago"
-    with pytest.raises(RsbenchError, match=seen), workplace(tmp_path):
+    with pytest.raises(RsbenchError, match=seen), work_folder(tmp_path):
         pass
     assert "elsewhere" in lock.read_text()
 
@@ -101,7 +101,7 @@ def test_no_two_are_in_at_once(tmp_path: Path) -> None:
     def enter() -> None:
         for _ in range(100):
             try:
-                with workplace(tmp_path):
+                with work_folder(tmp_path):
                     inside[0] += 1
                     most[0] = max(most[0], inside[0])
                     entered[0] += 1
@@ -130,7 +130,7 @@ def test_a_hidden_folder_of_somebody_else_is_left_alone(tmp_path: Path, kind: st
         (out / HIDDEN).symlink_to(theirs)
     else:
         (out / HIDDEN).write_text("dear")
-    with pytest.raises(RsbenchError, match=r"not a folder that rsbench made|cannot be written"), workplace(out):
+    with pytest.raises(RsbenchError, match=r"not a folder that rsbench made|cannot be written"), work_folder(out):
         pass
     found = out / HIDDEN if kind == "file" else out / HIDDEN / "diary"
     assert found.read_text() == "dear"
@@ -140,10 +140,10 @@ def test_links_are_removed_and_not_followed(tmp_path: Path) -> None:
     theirs, out = tmp_path / "theirs", tmp_path / "out"
     theirs.mkdir()
     (theirs / "diary").write_text("dear")
-    with workplace(out) as hidden:
+    with work_folder(out) as hidden:
         (hidden / "hashes.jsonl").write_text("")
     (out / HIDDEN / WORK).symlink_to(theirs)
-    with workplace(out) as hidden:
+    with work_folder(out) as hidden:
         (hidden / WORK / "below").mkdir()
         (hidden / WORK / "below/link").symlink_to(theirs)
         (hidden / WORK / "file").symlink_to(theirs / "diary")
@@ -159,7 +159,7 @@ def test_strangers_are_all_that_is_not_a_plain_file_of_ours(tmp_path: Path) -> N
     (tmp_path / "linked").symlink_to(tmp_path / "a")
     (tmp_path / "away").symlink_to(tmp_path / "deep")
     (tmp_path / "empty").mkdir()
-    assert strangers(tmp_path, ours.__contains__) == ["away", "deep/note", "linked"]
+    assert unknown_files(tmp_path, ours.__contains__) == ["away", "deep/note", "linked"]
 
 
 def test_a_folder_that_cannot_be_listed_is_not_taken_for_an_empty_one(
@@ -174,7 +174,7 @@ def test_a_folder_that_cannot_be_listed_is_not_taken_for_an_empty_one(
     monkeypatch.setattr(os, "scandir", broken)
     monkeypatch.setattr(os, "listdir", broken)
     with pytest.raises(OSError, match="Input/output"):
-        strangers(tmp_path, lambda path: False)
+        unknown_files(tmp_path, lambda path: False)
     with pytest.raises(OSError, match="Input/output"):
         files_below(tmp_path)
     with pytest.raises(OSError, match="Input/output"):

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from rsbench.vision.frame_threads import side_by_side
+from rsbench.vision.frame_threads import map_frames
 
 
 @pytest.mark.parametrize(("pixels", "at_once"), [(10_000, 4), (2_000_000, 2), (50_000_000, 1)])
@@ -27,6 +27,6 @@ def test_no_more_than_the_memory_is_for(pixels: int, at_once: int, monkeypatch: 
             now -= 1
         return 2 * item
 
-    assert side_by_side(work, range(8), pixels, 200.0) == [0, 2, 4, 6, 8, 10, 12, 14]
+    assert map_frames(work, range(8), pixels, 200.0) == [0, 2, 4, 6, 8, 10, 12, 14]
     assert most <= at_once
     assert most == at_once or at_once > 1

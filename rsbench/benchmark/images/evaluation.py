@@ -23,7 +23,7 @@ from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.storage.file_hashes import HASHES, FileHashes
 from rsbench.storage.files import read_json, read_table, write_json, write_table
-from rsbench.storage.work_folder import workplace
+from rsbench.storage.work_folder import work_folder
 
 _CASES = {"pose": PoseCase, "depth": DepthCase, "correction": ImageCase}
 
@@ -57,7 +57,7 @@ class Evaluation:
             RsbenchError: the dataset is damaged, a stored prediction is of another entry of the same name, or
                 another command works in ``out``.
         """
-        with workplace(self.out):
+        with work_folder(self.out):
             hashes = FileHashes(self.dataset, self.out / HASHES, self.options.rehash)
             scored = self._here(hashes, step) if workers == 1 else self._apart(hashes, step, workers)
             found = [scored[sequence.name] for sequence in self.sequences]

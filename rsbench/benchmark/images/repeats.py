@@ -61,9 +61,9 @@ def repeat(
     if not todo:
         return
     hashes.flush()
-    crew = (os.cpu_count() or 1) if workers == 1 else workers
+    processes = (os.cpu_count() or 1) if workers == 1 else workers
     one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
-    with closing(finished_jobs(_serve, todo, crew, one_thread, dataset, out, options, name=_name)) as found:
+    with closing(finished_jobs(_serve, todo, processes, one_thread, dataset, out, options, name=_name)) as found:
         for (sequence, solver, _), _ in found:
             step(f"{sequence}: {solver}")
 

@@ -36,7 +36,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.jobs.workers import Workers
 from rsbench.storage.files import write_bytes, write_json, write_table
 from rsbench.storage.untrusted_files import read_bytes
-from rsbench.storage.work_folder import WORK, remove, workplace
+from rsbench.storage.work_folder import WORK, remove, work_folder
 
 
 class _Taken(NamedTuple):
@@ -100,7 +100,7 @@ def add_all(
     if not read and faults:
         raise faults[0]
     scored = list[Scored]()
-    with workplace(board) as hidden:
+    with work_folder(board) as hidden:
         open_board(board)
         entries = place(board, split.protocol.id, split.name) / "entries"
         taken = list[_Taken]()

@@ -33,7 +33,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.jobs.workers import Workers
 from rsbench.storage.files import read_table, write_json, write_table
 from rsbench.storage.untrusted_files import NAME, read_bytes, read_json
-from rsbench.storage.work_folder import workplace
+from rsbench.storage.work_folder import work_folder
 
 FORMAT = 1
 RUN = "rsbench leaderboard run"
@@ -255,7 +255,7 @@ def rescore(
     """
     changed: dict[str, list[str]] = {}
     _check_board(board)
-    with workplace(board):
+    with work_folder(board):
         folders = list(_folders(place(board, split.protocol.id, split.name) / "entries"))
         stored = [_stored(folder, split) for folder in folders]
         for folder, scores in zip(folders, mark_all(stored, split, workers, step), strict=True):

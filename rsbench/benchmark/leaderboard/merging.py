@@ -20,7 +20,7 @@ from rsbench.benchmark.leaderboard.board import (
 from rsbench.benchmark.leaderboard.picture_files import copy_files
 from rsbench.storage.files import write_bytes, write_json
 from rsbench.storage.untrusted_files import read_bytes
-from rsbench.storage.work_folder import WORK, workplace
+from rsbench.storage.work_folder import WORK, work_folder
 
 
 def merge(other: Path, board: Path) -> list[str]:
@@ -38,7 +38,7 @@ def merge(other: Path, board: Path) -> list[str]:
     ]
     told = {scored.folder.parents[1]: about_split(scored.folder.parents[1]) for scored, _ in theirs}
     copied = []
-    with workplace(board) as hidden:
+    with work_folder(board) as hidden:
         open_board(board)
         for scored, folder in theirs:
             refuse_another(folder, scored.predictions_sha256, scored.files)

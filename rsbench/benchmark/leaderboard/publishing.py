@@ -26,7 +26,7 @@ from rsbench.dataset.sequence import Sequence, read_dataset_manifest, sequence_o
 from rsbench.scenes.load import read_scene_card
 from rsbench.storage.files import sha256, write_json
 from rsbench.storage.untrusted_files import read_json
-from rsbench.storage.work_folder import HIDDEN, files_below, workplace
+from rsbench.storage.work_folder import HIDDEN, files_below, work_folder
 
 ANNOUNCEMENT = "announcement.json"
 SCENES, DATA = "scenes", "data"
@@ -121,7 +121,7 @@ def publish(
     if announced is not None:
         _check_same(announced, made, "card_sha256", "commitment", "fingerprint", "truth")
     check_place(split, out)
-    with workplace(out):
+    with work_folder(out):
         images = "images" in protocol.allowed
         if images:
             write_frames(data, out)

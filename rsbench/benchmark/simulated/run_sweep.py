@@ -35,7 +35,7 @@ from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.solvers.engine.registry import load_solver_entries
 from rsbench.solvers.engine.warm_up import warm_up
 from rsbench.storage.files import load_arrays, read_json, save_arrays, write_json
-from rsbench.storage.work_folder import listed, remove, workplace
+from rsbench.storage.work_folder import listed, remove, work_folder
 
 FORMAT = 1
 CHUNK = 50
@@ -124,7 +124,7 @@ def run_sweep(
             points in view; a worker was killed each time over the same trials.
     """
     step, plan = progress or (lambda word: None), _plan(card, entrants(card))
-    with workplace(out) as hidden:
+    with work_folder(out) as hidden:
         chunks = hidden / "chunks"
         if force:
             remove(chunks)

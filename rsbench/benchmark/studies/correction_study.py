@@ -25,7 +25,7 @@ from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.standard_metrics import Flip, Psnr, Ssim
 from rsbench.benchmark.studies.correction_methods import METHODS, ON_REQUEST
 from rsbench.benchmark.studies.layer_methods import asked_layers
-from rsbench.benchmark.studies.resumable_rows import KeptRows, Row, Rows
+from rsbench.benchmark.studies.resumable_rows import ResumableRows, Row, Rows
 from rsbench.benchmark.studies.rotation_methods import asked_rotation
 from rsbench.capture.readout import select
 from rsbench.core.errors import RsbenchError
@@ -94,7 +94,9 @@ def study_dataset(
     sequences = read_dataset(dataset)
     found: dict[str, Rows] = {}
     store = (
-        None if kept is None else KeptRows(folder=kept, dataset=dataset, seed=seed, solver=solver, others=others)
+        None
+        if kept is None
+        else ResumableRows(folder=kept, dataset=dataset, seed=seed, solver=solver, others=others)
     )
     if store is not None:
         found = {one.name: rows for one in sequences if (rows := store.read(one.name)) is not None}

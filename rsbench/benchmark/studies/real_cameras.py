@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
-from rsbench.benchmark.studies.resumable_rows import KeptRows, Row
+from rsbench.benchmark.studies.resumable_rows import ResumableRows, Row
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import VIEWS, View
@@ -82,7 +82,7 @@ def study(
 
 
 def _kept(sequence: Sequence, seeds: int, dataset: Path, folder: Path) -> tuple[list[Row], list[Row]]:
-    store = KeptRows(folder=folder, dataset=dataset, seed=seeds, solver=CorrectionOptions().solver.name)
+    store = ResumableRows(folder=folder, dataset=dataset, seed=seeds, solver=CorrectionOptions().solver.name)
     rows = store.read(sequence.name)
     if rows is None:
         rows = (*study_sequence(sequence, seeds), [])

@@ -21,7 +21,7 @@ Rows = tuple[list[Row], list[Row], list[Row]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class KeptRows:
+class ResumableRows:
     """A file for each sequence, current while code, packages, data, seed and solver are what they were."""
 
     folder: Path

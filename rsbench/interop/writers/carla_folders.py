@@ -26,7 +26,7 @@ from rsbench.interop.writers.image_poses import (
     CORNER_PX,
     Images,
     View,
-    about_movers,
+    about_moving_objects,
     camera_velocity,
     first_pose,
     number,
@@ -79,7 +79,7 @@ def write(sequence: Sequence, root: Path, images: Images) -> dict[str, Any]:
         told.append(f"the loader of DeepUnrollNet takes the first {_LOADED} of {sequence.frames} frames")
     if sequence.shutter.right_delay:
         told.append("the two cameras are sequences of their own: that one is late is not said")
-    return {"largest_row_error_px": error, "told": told + about_movers(sequence)}
+    return {"largest_row_error_px": error, "told": told + about_moving_objects(sequence)}
 
 
 def first_velocity(sequence: Sequence, side: Side) -> tuple[FloatArray, FloatArray]:

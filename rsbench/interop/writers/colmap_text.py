@@ -18,7 +18,7 @@ from rsbench.dataset.sequence import Sequence
 from rsbench.interop.writers.image_poses import (
     CORNER_PX,
     Images,
-    about_movers,
+    about_moving_objects,
     copy_image,
     first_pose,
     number,
@@ -55,7 +55,7 @@ def write(sequence: Sequence, root: Path, images: Images) -> dict[str, Any]:
     for view in views_in_time(sequence):
         copy_image(sequence, view, images, folder / "images" / view.name)
     told = [_ONE_POSE] if images == "rs" else []
-    return {"points": len(found.world), "told": told + about_movers(sequence)}
+    return {"points": len(found.world), "told": told + about_moving_objects(sequence)}
 
 
 def camera_line(identifier: int, camera: PinholeCamera) -> str:

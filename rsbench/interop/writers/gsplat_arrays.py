@@ -24,7 +24,7 @@ from rsbench.interop.writers import row_motion_error
 from rsbench.interop.writers.image_poses import (
     Images,
     View,
-    about_movers,
+    about_moving_objects,
     copy_image,
     corner_matrix,
     first_second,
@@ -70,10 +70,13 @@ def write(sequence: Sequence, root: Path, images: Images) -> dict[str, Any]:
         for view in views:
             copy_image(sequence, view, images, folder / "images" / view.name)
     if images == "gs":
-        return {"told": about_movers(sequence)}
+        return {"told": about_moving_objects(sequence)}
     views = [View(side, frame) for side in SIDES for frame in range(sequence.frames)]
     error = row_motion_error.largest_error(sequence, views, lambda view, points: _seen(sequence, view, points))
-    return {"largest_row_error_px": error, "told": row_motion_error.told(error, LAW) + about_movers(sequence)}
+    return {
+        "largest_row_error_px": error,
+        "told": row_motion_error.told(error, LAW) + about_moving_objects(sequence),
+    }
 
 
 def ends(sequence: Sequence, view: View) -> tuple[Pose, Pose]:

@@ -119,7 +119,7 @@ def refuse(sequence: Sequence, format_name: str, what: str, remedy: str) -> None
     raise RsbenchError(f"--to {format_name}: sequence {sequence.name}: {what}; {remedy}")
 
 
-def about_movers(sequence: Sequence) -> list[str]:
+def about_moving_objects(sequence: Sequence) -> list[str]:
     """What has to be said of objects that move, where a format knows a still world alone."""
     if not sequence.moving:
         return []

@@ -20,7 +20,7 @@ from rsbench.dataset.sequence import Sequence
 from rsbench.interop.writers.image_poses import (
     Images,
     View,
-    about_movers,
+    about_moving_objects,
     copy_image,
     first_pose,
     first_second,
@@ -77,7 +77,7 @@ def write(sequence: Sequence, root: Path, images: Images) -> dict[str, Any]:
     write_lines(root / "poses" / f"{sequence.name}.txt", [numbers(place[:3]) for place in places])
     told = [_ONE_POSE] if images == "rs" else []
     told += [f"{lost} disparities are too small or too large for the format, and unknown there"] if lost else []
-    return {"told": told + about_movers(sequence)}
+    return {"told": told + about_moving_objects(sequence)}
 
 
 def disparity_values(disparity: FloatArray) -> tuple[NDArray[np.uint16], int]:

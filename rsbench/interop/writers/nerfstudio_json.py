@@ -28,7 +28,7 @@ from rsbench.interop.writers.image_poses import (
     CORNER_PX,
     Images,
     View,
-    about_movers,
+    about_moving_objects,
     camera_velocity,
     copy_image,
     first_pose,
@@ -77,9 +77,12 @@ def write(sequence: Sequence, root: Path, images: Images) -> dict[str, Any]:
     content["frames"] = [_frame(sequence, view, images) for view in views]
     write_json(folder / "transforms.json", content)
     if images == "gs":
-        return {"told": about_movers(sequence)}
+        return {"told": about_moving_objects(sequence)}
     error = row_motion_error.largest_error(sequence, views, lambda view, points: _seen(sequence, view, points))
-    return {"largest_row_error_px": error, "told": row_motion_error.told(error, LAW) + about_movers(sequence)}
+    return {
+        "largest_row_error_px": error,
+        "told": row_motion_error.told(error, LAW) + about_moving_objects(sequence),
+    }
 
 
 def camera_fields(sequence: Sequence) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from rsbench.benchmark.images.evaluation import columns_of, open_evaluation, rea
 from rsbench.benchmark.images.score import TABLES
 from rsbench.core.errors import RsbenchError
 from rsbench.storage import file_hashes
-from rsbench.storage.work_folder import workplace
+from rsbench.storage.work_folder import work_folder
 
 
 def solvers_of(out: Path) -> set[str]:
@@ -40,7 +40,7 @@ def test_a_repeated_run_makes_nothing_and_reads_no_data_again(
 
 
 def test_two_evaluations_do_not_share_a_folder(smoke_dataset: Path, copy: Path) -> None:
-    with workplace(copy), pytest.raises(RsbenchError, match=f"process {os.getpid()} on .* is at work there"):
+    with work_folder(copy), pytest.raises(RsbenchError, match=f"process {os.getpid()} on .* is at work there"):
         evaluate(smoke_dataset, copy)
 
 

@@ -25,7 +25,7 @@ from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.solvers.eight_point import EightPointSolver
 from rsbench.solvers.engine.registry import load_solver_entry
 from rsbench.storage.files import load_arrays, read_json, save_arrays, write_json
-from rsbench.storage.work_folder import workplace
+from rsbench.storage.work_folder import work_folder
 
 SETTING = Setting(
     width=900,
@@ -130,7 +130,7 @@ def test_trials_of_others_are_neither_removed_nor_taken_for_ours(tmp_path: Path,
 
 
 def test_two_commands_do_not_share_a_folder(finished: Path) -> None:
-    with workplace(finished), pytest.raises(RsbenchError, match="is at work there"):
+    with work_folder(finished), pytest.raises(RsbenchError, match="is at work there"):
         run_sweep(CARD, finished)
 
 

@@ -24,7 +24,7 @@ _STEPS = 6
 """Of the search for the line that sees a point: each leaves of the error what a pixel moves in a line."""
 
 
-class Landing(NamedTuple):
+class Reprojection(NamedTuple):
     """Lines' maps of ideal pixels (x, y, 1) of inverse depth rho to another view's: A (G x + rho c) + rho B."""
 
     G: FloatArray
@@ -43,7 +43,9 @@ class Landing(NamedTuple):
     """Whether the other view's lines are columns."""
 
 
-def landing(camera: PinholeCamera, here: Pose, there: Pose, axes: tuple[int, int] = (1, 1)) -> Landing:
+def reprojection_of(
+    camera: PinholeCamera, here: Pose, there: Pose, axes: tuple[int, int] = (1, 1)
+) -> Reprojection:
     """From the view whose lines have the poses ``here`` to that of ``there``.
 
     Args:
@@ -55,17 +57,17 @@ def landing(camera: PinholeCamera, here: Pose, there: Pose, axes: tuple[int, int
     K, back = camera.ideal.K, np.swapaxes(here.R, -1, -2)
     centres = -(back @ here.t[..., None])[..., 0]
     G, A = back @ np.linalg.inv(K), K @ there.R
-    return Landing(G, centres, A, there.t @ K.T, *optics_of(camera, axes[0] == 0), axes[1] == 0)
+    return Reprojection(G, centres, A, there.t @ K.T, *optics_of(camera, axes[0] == 0), axes[1] == 0)
 
 
-def parallax_gain(camera: PinholeCamera, maps: Landing, back: Landing) -> float:
+def parallax_gain(camera: PinholeCamera, maps: Reprojection, back: Reprojection) -> float:
     """px, about, that a point of inverse depth 1 / m moves between two views; ``back`` maps the other way."""
     way = np.mean(back.c, axis=0) - np.mean(maps.c, axis=0)
     return max(camera.fx, camera.fy) * float(np.linalg.norm(way))
 
 
 @compiled(error_model="numpy", inline="always")
-def land(
+def reproject(
     x: int,
     y: int,
     rho: float,
@@ -110,7 +112,7 @@ def _seen_from(
 
 
 @compiled(error_model="numpy")
-def land_all(
+def reproject_all(
     rho: F32,
     lines: NDArray[np.int32],
     G: FloatArray,
@@ -157,8 +159,8 @@ def land_all(
             factors[y, x] = s if inside else np.nan
 
 
-def land_pixels(maps: Landing, rho: F32, lines: NDArray[Any]) -> tuple[F32, F32]:
-    """``land_all`` into new arrays."""
+def reproject_pixels(maps: Reprojection, rho: F32, lines: NDArray[Any]) -> tuple[F32, F32]:
+    """``reproject_all`` into new arrays."""
     places, factors = np.zeros((*rho.shape, 2), np.float32), np.zeros_like(rho)
-    land_all(rho, lines, *maps, places, factors)
+    reproject_all(rho, lines, *maps, places, factors)
     return places, factors
