@@ -1,4 +1,6 @@
-"""What the commands share: progress bars on stderr, tables on stdout, and silence where it is asked for."""
+"""What the commands share: progress bars on stderr, tables on stdout, and silence where it is asked for.
+
+Texts are printed as they are: what looks like rich's markup in them, ``[view]`` say, is no markup."""
 
 from __future__ import annotations
 
@@ -51,13 +53,13 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[str], None]]:
     )
 
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),  # names of files and sequences may have brackets
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[word]}"),
+        TextColumn("{task.fields[word]}", markup=False),
     )
     with Progress(*columns, console=Console(stderr=True), disable=_quiet) as progress:
         task = progress.add_task(label, total=total, word="")
@@ -77,10 +79,10 @@ def late_progress(label: str) -> Iterator[Callable[[str], None]]:
     from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        TextColumn("{task.fields[word]}"),
+        TextColumn("{task.fields[word]}", markup=False),
     )
     # Redirected, what a command prints would go where the bar is.
     progress = Progress(
@@ -139,7 +141,7 @@ def print_rows(
         )
         for k, width in zip(block, widths, strict=True):
             justify = "right" if columns[k] in right else "left"
-            table.add_column(columns[k], justify=justify, overflow="fold", width=width)
+            table.add_column(Text(columns[k]), justify=justify, overflow="fold", width=width)
         for row in texts:
             table.add_row(*(Text(row[k]) for k in block))
         console.print(table)
@@ -180,8 +182,14 @@ def _shared(least: Sequence[int], most: Sequence[int], room: int) -> Sequence[in
 def _empty_table(title: str) -> Table:
     from rich import box
     from rich.table import Table
+    from rich.text import Text
 
-    return Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    return Table(
+        title=Text(title, "table.title") if title else None,
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
 
 
 def _cell(value: Any, digits: int | None) -> str:

@@ -41,7 +41,10 @@ def view(
         typer.Option(help="Matches of data without the channel matches.", autocompletion=complete("features")),
     ] = "sift",
 ) -> None:
-    """Rig, poses of all lines, depth as points, images and matches, over time. Needs rsbench[view]."""
+    r"""Show a dataset in the Rerun viewer: rig, row poses, depth as points, images and matches over time.
+
+    Needs the extra of the viewer: pip install 'rsbench\[view]'
+    """
     from rsbench.cli.console import late_progress
     from rsbench.core.errors import RsbenchError
     from rsbench.interop.writers.exporter import chosen_sequences
