@@ -203,17 +203,19 @@ def test_links_between_documents_lead_somewhere() -> None:
     assert not broken
 
 
-def test_the_table_of_layers_has_the_layers_in_their_order() -> None:
+def test_the_table_of_packages_has_all_of_them_in_the_order_of_the_layers() -> None:
     contract = read_toml(ROOT / "pyproject.toml")["tool"]["importlinter"]["contracts"][0]
     layers = [re.findall(r"rsbench\.(\w+)", line) for line in contract["layers"]]
     text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
-    table = [
-        name for row in re.findall(r"^\| (`.*?`) \|", text, re.MULTILINE) for name in re.findall(r"`(\w+)`", row)
-    ]
-    order = {name: table.index(name) for names in layers for name in names}
-    assert len(order) == len(table)
+    rows = re.findall(r"^\| `(\w+)` \| .* \| ([a-z, ]+) \|$", text, re.MULTILINE)
+    packages = {path.parent.name for path in (ROOT / "rsbench").glob("*/__init__.py")} | {"api"}
+    assert {name for name, _ in rows} == packages == {name for names in layers for name in names}
+    order = {name: number for number, (name, _) in enumerate(rows)}
     for above, below in itertools.pairwise(layers):
         assert min(order[name] for name in above) > max(order[name] for name in below), (above, below)
+    height = {name: -number for number, names in enumerate(layers) for name in names}
+    for name, imported in rows[1:]:
+        assert all(height[other] < height[name] for other in imported.split(", ")), (name, imported)
 
 
 def test_the_conversion_to_the_papers_axes_holds() -> None:
