@@ -16,7 +16,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsbench.capture.readout_profile import Profile, in_order, measurements, ordered, reversed_in_time
+from rsbench.capture.readout_profile import (
+    LEAST_NOISE_PX,
+    Profile,
+    in_order,
+    measurements,
+    ordered,
+    reversed_in_time,
+)
 from rsbench.capture.rectification import row_pattern, without_offset
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
@@ -27,7 +34,6 @@ from rsbench.solvers.refined import RefinedSolver
 
 COARSE = (-1.0, -0.5, 0.0, 0.25, 0.5, 0.75, 1.0)
 """Ratios at which outliers are sorted out; between two of them the error of a match stays within its noise."""
-_LEAST_NOISE_PX = 0.02
 _CLEARLY = 5.0
 _EVIDENCE = 0.75
 """Squared errors in the opposite order over those in the given one, below which they count: at least 0.83 in real
@@ -191,7 +197,7 @@ class _Search:
         if not result.estimate.success:
             return None
         motion = in_order(result.estimate.w, result.estimate.d, ratio)
-        variance = max(result.estimate.noise_px or 0.0, _LEAST_NOISE_PX) ** 2
+        variance = max(result.estimate.noise_px or 0.0, LEAST_NOISE_PX) ** 2
         weight = variance / self.prior**2 if self.prior > 0.0 else np.inf
         return Profile(select(self.matches, result), self.rig, self.solver, motion, weight)
 

@@ -17,6 +17,8 @@ from rsbench.solvers.engine.levenberg_marquardt import Minimum, levenberg_marqua
 from rsbench.solvers.engine.packed import Packed, pack
 from rsbench.solvers.refined import RefinedSolver
 
+LEAST_NOISE_PX = 0.02
+"""What exact matches are taken for: those of equal images leave no errors, and tell nothing."""
 _REACH = 0.3
 _STEPS = np.array([0.02, 0.05])
 _ITERATIONS = 30
@@ -103,7 +105,7 @@ class Profile:
         if self._freedom <= 0 or not np.all(np.linalg.eigvalsh(H) > 0.0):
             return nothing
         inverse = np.linalg.inv(H)
-        noise = inverse * 2.0 * self._cost(*at) / self._freedom
+        noise = inverse * max(2.0 * self._cost(*at) / self._freedom, LEAST_NOISE_PX**2)
         scores = self._tile_scores(at, used)
         tiles = len(scores) / max(len(scores) - 1.0, 1.0)
         together = inverse @ (tiles * scores.T @ scores) @ inverse

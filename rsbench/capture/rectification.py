@@ -76,12 +76,15 @@ def row_pattern(stereo: FloatArray, rig: StereoRig) -> RowPattern | None:
         noise = max(1.4826 * float(np.median(left[keep])), _LEAST_PX)
         keep = near & (left < _SIGMAS * noise)
     smooth = columns[keep, :4] @ fit[:4]
-    variance = noise**2 * np.linalg.pinv(columns[keep].T @ columns[keep])[-1, -1]
+    # By leaving out one match after the other: a wrong one of large disparity may make up the coefficient alone.
+    hat = np.linalg.pinv(columns[keep])
+    leverage = np.einsum("ij,ji->i", columns[keep], hat)
+    left_out = hat[-1] * (difference - columns @ fit)[keep] / np.maximum(1.0 - leverage, 1e-6)
     excess = float(np.mean(smooth**2)) - 4.0 * noise**2 / len(smooth)
     return RowPattern(
         systematic_px=float(np.sqrt(max(excess, 0.0))),
         distortion=float(fit[-1]),
-        distortion_sigma=float(np.sqrt(variance)),
+        distortion_sigma=max(float(np.linalg.norm(left_out)), noise * float(np.linalg.norm(hat[-1]))),
         noise_px=noise,
     )
 

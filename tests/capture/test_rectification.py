@@ -62,3 +62,14 @@ def test_an_offset_is_taken_from_the_disparity_alone() -> None:
     np.testing.assert_allclose(moved.tracks[:, 0] - moved.tracks[:, 2], stereo[:, 0] - stereo[:, 2] - 0.6)
     np.testing.assert_allclose(moved.tracks[:, 0] + moved.tracks[:, 2], stereo[:, 0] + stereo[:, 2])
     np.testing.assert_allclose(moved.tracks[:, 0], moved.left[:, 0])
+
+
+def test_one_wrong_match_of_large_disparity_is_no_lens() -> None:
+    """Of 60 matches with disparities below 20 px one is wrong by 300 px along the row, and its row by 6 px."""
+    stereo = _matches(n=60)
+    stereo[:, 2] = stereo[:, 0] - np.random.default_rng(1).uniform(4.0, 20.0, 60)
+    judge_stereo(stereo, RIG, 1.5)
+    stereo[0] = [900.0, 80.0, 600.0, 86.0]
+    pattern = row_pattern(stereo, RIG)
+    assert pattern is not None and abs(pattern.distortion) < 5.0 * pattern.distortion_sigma
+    judge_stereo(stereo, RIG, 1.5)
