@@ -28,6 +28,7 @@ MOTIONS: Kind[Motion, NoOptions] = Kind(
     built_in={
         "linear": "rsbench.core.motion:LinearMotion",
         "twist": "rsbench.core.motion:TwistMotion",
+        "inertial": "rsbench.core.motion:InertialMotion",
         "accelerated": "rsbench.core.motion:AcceleratedMotion",
         "spline": "rsbench.core.spline_motion:SplineMotion",
         "trajectory": "rsbench.core.trajectory_motion:TrajectoryMotion",

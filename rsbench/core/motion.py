@@ -169,6 +169,44 @@ class TwistMotion(Motion):
 
 @final
 @dataclass(frozen=True, eq=False, init=False)
+class InertialMotion(Motion):
+    """A body that nothing pushes: constant velocity in the world and constant rate of turn.
+
+    The body's centre is at tau c in the world, c = -R(1)^T d, so
+
+        R(tau) = exp(tau [w]x),  t(tau) = -tau R(tau) c = tau exp((tau - 1) [w]x) d.
+    """
+
+    name: ClassVar[str] = "inertial"
+
+    def _ahead(self, tau: FloatArray) -> FloatArray:
+        """-R(tau) c (..., 3): the world's velocity as seen from the body; tau (..., 1)."""
+        return so3.exp((tau - 1.0) * self.w) @ self.d
+
+    def body_from_world(self, tau: ArrayLike) -> Pose:
+        tau = np.asarray(tau, dtype=np.float64)[..., None]
+        return Pose(so3.exp(tau * self.w), tau * self._ahead(tau))
+
+    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        tau = np.asarray(tau, dtype=np.float64)[..., None]
+        ahead = self._ahead(tau)
+        return np.broadcast_to(self.w, ahead.shape), ahead + tau * so3.cross(self.w, ahead)
+
+    def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        tau = np.asarray(tau, dtype=np.float64)[..., None]
+        turned = so3.cross(self.w, self._ahead(tau))
+        return np.zeros(turned.shape), 2.0 * turned + tau * so3.cross(self.w, turned)
+
+    def from_time(self, start: float) -> Motion:
+        return InertialMotion(self.w, so3.exp(start * self.w) @ self.d)
+
+    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
+        turn, speed = float(np.linalg.norm(self.w)), float(np.linalg.norm(self.d))
+        return turn, speed * (1.0 + max(abs(first), abs(last)) * turn)
+
+
+@final
+@dataclass(frozen=True, eq=False, init=False)
 class AcceleratedMotion(Motion):
     """Constant acceleration along the paper's path: R(tau) = exp(beta [w]x), t(tau) = beta d, with
 

@@ -11,13 +11,15 @@ from hypothesis import strategies as st
 from scipy.linalg import expm, logm
 
 from rsbench.core import so3
-from rsbench.core.motion import AcceleratedMotion, LinearMotion, Motion, TwistMotion
+from rsbench.core.motion import AcceleratedMotion, InertialMotion, LaterMotion, LinearMotion, Motion, TwistMotion
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import PRESETS, SplineMotion
 
-Model = type[LinearMotion] | type[TwistMotion] | type[AcceleratedMotion] | type[SplineMotion]
-MODELS: tuple[Model, ...] = (LinearMotion, TwistMotion, AcceleratedMotion, SplineMotion)
+Model = (
+    type[LinearMotion] | type[InertialMotion] | type[TwistMotion] | type[AcceleratedMotion] | type[SplineMotion]
+)
+MODELS: tuple[Model, ...] = (LinearMotion, TwistMotion, InertialMotion, AcceleratedMotion, SplineMotion)
 
 few = settings(max_examples=25, deadline=None, derandomize=True)
 vectors = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
@@ -53,6 +55,22 @@ def test_twist_motion_is_the_matrix_exponential_of_its_twist(w: FloatArray, d: F
 def test_twist_motion_is_a_one_parameter_group(w: FloatArray, d: FloatArray, s: float, t: float) -> None:
     motion = TwistMotion(w, d)
     np.testing.assert_allclose(_matrix(motion, s + t), _matrix(motion, s) @ _matrix(motion, t), rtol=0, atol=1e-13)
+
+
+@few
+@given(vectors, vectors, st.floats(-1.0, 2.0))
+def test_an_inertial_body_keeps_its_velocity_in_the_world_and_its_rate_of_turn(
+    w: FloatArray, d: FloatArray, start: float
+) -> None:
+    """Its centre -R^T t moves along a line at one speed; seen from a later time it does too."""
+    tau = np.linspace(-1.0, 2.0, 7)
+    for motion in (InertialMotion(w, d), InertialMotion(w, d).from_time(start)):
+        R, t = motion.body_from_world(tau)
+        centres = -np.einsum("nji,nj->ni", R, t)
+        np.testing.assert_allclose(centres, tau[:, None] * -(so3.exp(-w) @ motion.d), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(R, so3.exp(tau[:, None] * w), rtol=0, atol=1e-12)
+    later, general = InertialMotion(w, d).from_time(start), LaterMotion.of(InertialMotion(w, d), start)
+    np.testing.assert_allclose(_matrix(later, 0.7), _matrix(general, 0.7), rtol=0, atol=1e-12)
 
 
 def test_the_twist_is_the_matrix_logarithm_of_the_pose_after_one_period() -> None:
@@ -231,6 +249,7 @@ def test_no_speed_exceeds_the_bound(model: Model, w: FloatArray, d: FloatArray, 
     "motion",
     [
         TwistMotion([0.1, 0.2, 0.3], [0.3, 0.1, 0.2]),
+        InertialMotion([0.1, 0.2, 0.3], [0.3, 0.1, 0.2]),
         AcceleratedMotion([0.1, 0.2, 0.3], [0.3, 0.1, 0.2], acceleration=1.5),
         SplineMotion([0.1, 0.2, 0.3], [0.3, 0.1, 0.2], preset="drone", seed=8),
     ],

@@ -44,7 +44,7 @@ def test_no_step_from_a_singular_matrix() -> None:
         assert not damped_step(H, np.ones(6), 0.0, np.zeros(6))
 
 
-@pytest.mark.parametrize("model", ["linear", "twist", "accelerated"])
+@pytest.mark.parametrize("model", ["linear", "twist", "inertial", "accelerated"])
 def test_exact_samples_give_the_motion(model: str) -> None:
     s = trial(model, 0.0)
     packed = pack(s.correspondences, RIG, SHUTTER, model)

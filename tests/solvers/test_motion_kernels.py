@@ -112,7 +112,7 @@ def matches(motion: Motion, noise_px: float) -> Correspondences:
 
 @pytest.mark.parametrize("name", ["dull", "spline"])
 def test_a_model_without_a_kernel_is_refused_by_name(name: str) -> None:
-    words = rf"motion model '{name}' has no kernel.*: accelerated, cubic, linear, twist$"
+    words = rf"motion model '{name}' has no kernel.*: accelerated, cubic, inertial, linear, twist$"
     with pytest.raises(RsbenchError, match=words):
         RefinedSolver(motion_model=name)
     with pytest.raises(RsbenchError, match=words):
@@ -185,7 +185,14 @@ def test_a_kernel_that_breaks_the_contract_is_refused_when_it_is_made() -> None:
 
 @pytest.mark.parametrize(
     ("name", "parameters"),
-    [("linear", {}), ("twist", {}), ("accelerated", {}), ("accelerated", {"acceleration": 1.5}), ("cubic", {})],
+    [
+        ("linear", {}),
+        ("twist", {}),
+        ("inertial", {}),
+        ("accelerated", {}),
+        ("accelerated", {"acceleration": 1.5}),
+        ("cubic", {}),
+    ],
 )
 def test_moves_and_their_derivatives_are_those_of_the_model(name: str, parameters: dict[str, float]) -> None:
     """In plain Python, where a kernel is an ordinary class: T, R, their rates, and their derivatives by theta."""
@@ -233,6 +240,6 @@ def test_a_solver_may_assume_another_model_than_the_data_follow() -> None:
     c = matches(motion, noise_px=0.0)
     errors = [
         rotation_error(RefinedSolver(motion_model=name).estimate(c, RIG, SHUTTER).w, W)
-        for name in ("linear", "twist")
+        for name in ("linear", "twist", "inertial")
     ]
     assert all(1e-5 < error < 1e-2 for error in errors)

@@ -51,7 +51,7 @@ def assert_motion(estimate: MotionEstimate, motion: Motion, tolerance: float) ->
     np.testing.assert_allclose(estimate.d, motion.d, atol=tolerance)
 
 
-@pytest.mark.parametrize("model", ["linear", "twist", "accelerated"])
+@pytest.mark.parametrize("model", ["linear", "twist", "inertial", "accelerated"])
 @pytest.mark.parametrize("sets", ["pairs", "tracks", "both"])
 @given(seed=st.integers(0, 10_000), angle=st.floats(0.5, 6.0), distance=st.floats(0.1, 0.5))
 @example(seed=1838, angle=4.5, distance=0.1875)  # of a plane's motions, one is 5 px wrong, most of it in few pairs
@@ -70,7 +70,7 @@ def test_exact_on_exact_data(model: str, sets: str, seed: int, angle: float, dis
     assert estimate.metric and estimate.direction_known and not estimate.reason
 
 
-@pytest.mark.parametrize("model", ["linear", "twist", "accelerated"])
+@pytest.mark.parametrize("model", ["linear", "twist", "inertial", "accelerated"])
 def test_three_tracks_suffice(model: str) -> None:
     motion = make_motion(model, W, D)
     for seed in range(10):

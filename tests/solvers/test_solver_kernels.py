@@ -21,7 +21,7 @@ from rsbench.solvers.engine.packed import Packed, pack
 RIG = StereoRig(camera=PinholeCamera(width=900, height=700, fx=810.0, fy=760.0, cx=440.0, cy=355.0), baseline=0.5)
 SHUTTER = RollingShutter(height=700, readout_ratio=0.8)
 
-pytestmark = pytest.mark.parametrize("model", ["linear", "twist", "accelerated"])
+pytestmark = pytest.mark.parametrize("model", ["linear", "twist", "inertial", "accelerated"])
 
 
 def problem(model: str, noise_px: float, angle: float = 0.05) -> tuple[Correspondences, Motion, Packed]:

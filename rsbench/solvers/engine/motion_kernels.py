@@ -12,7 +12,7 @@ import numpy as np
 
 from rsbench.components.compiled import compiled
 from rsbench.core import so3
-from rsbench.core.motion import AcceleratedMotion, LinearMotion, TwistMotion
+from rsbench.core.motion import AcceleratedMotion, InertialMotion, LinearMotion, TwistMotion
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.kernel_type import MotionKernel, Moved, kernel_for
 from rsbench.solvers.engine.vectors import (
@@ -82,6 +82,63 @@ class LinearKernel(MotionKernel):
         T_v: FloatArray,
     ) -> None:
         linear_translation_jacobian(theta, tau0, R, A, tau1, T_w, T_v)
+
+
+@compiled
+def turned(phi: Vector, v: Vector) -> Vector:
+    """exp([phi]x) v."""
+    c0, c1, _, _, _ = coefficients(dot(phi, phi))
+    once = cross(phi, v)
+    return plus(plus(v, c0, once), c1, cross(phi, once))
+
+
+@final
+@kernel_for(InertialMotion)
+@dataclass(frozen=True)
+class InertialKernel(MotionKernel):
+    """Constant velocity in the world; v is that of the world in the body at time 0: T = a exp(tau1 w) v."""
+
+    def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+        w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
+        a = tau1 - tau0
+        rotate(w, a, R, A)
+        ahead = turned(times(tau1, w), v)
+        back = times(-1.0, ahead)
+        return times(a, ahead), back, plus(ahead, a, cross(w, ahead)), times(-1.0, w), w
+
+    def translation_jacobian(
+        self,
+        theta: FloatArray,
+        tau0: float,
+        tau1: float,
+        R: FloatArray,
+        A: FloatArray,
+        T_w: FloatArray,
+        T_v: FloatArray,
+    ) -> None:
+        a, phi = tau1 - tau0, times(tau1, (theta[0], theta[1], theta[2]))
+        ahead = turned(phi, (theta[3], theta[4], theta[5]))
+        _, c1, c2, _, _ = coefficients(dot(phi, phi))
+        for j in range(3):
+            e = (1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0)
+            once = cross(phi, e)
+            spin = plus(plus(e, c1, once), c2, cross(phi, once))  # column j of J(phi)
+            by_w, by_v = cross(spin, ahead), turned(phi, e)
+            for i in range(3):
+                T_w[i, j] = a * tau1 * by_w[i]
+                T_v[i, j] = a * by_v[i]
+
+    def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
+        return np.concatenate([w, so3.exp(-w) @ d], dtype=np.float64)
+
+    def motion(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return theta[:3], so3.exp(theta[:3]) @ theta[3:]
+
+    def motion_jacobian(self, theta: FloatArray) -> FloatArray:
+        out, (w, d) = np.eye(6), self.motion(theta)
+        out[3:, :3] = -so3.hat(d) @ so3.left_jacobian(w)
+        out[3:, 3:] = so3.exp(w)
+        return out
 
 
 @compiled
