@@ -1,6 +1,6 @@
 # make demo    render, solve, correct and score one sequence; ends with the path of its report
 # make test    format, lint, types, layers and every test
-# make attack  kills, failing files, mutated inputs, hostile surroundings, faults for verify: hours; see docs/reliability.md
+# make attack  kills, failing files, mutated inputs, hostile surroundings, faults for verify: hours; see docs/explanation/reliability.md
 # make docs    the documentation site, in build/docs; warnings are errors
 # make lock    renew constraints.txt from pyproject.toml (needs uv)
 # make clean   remove .venv and caches
@@ -32,7 +32,7 @@ test: $(STAMP)
 	wait $$types || { echo "types: failed, see above" >&2; exit 1; }; exit $$tests
 
 attack: $(STAMP)
-	@PYTHONPATH=tests $(BIN)/python -m attack --write docs/reliability.md
+	@PYTHONPATH=tests $(BIN)/python -m attack --write docs/explanation/reliability.md
 
 docs: $(STAMP)
 	@$(BIN)/sphinx-build -W --keep-going -q -b html docs build/docs

@@ -121,7 +121,7 @@ def tables(data: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def shown(crossings: pd.DataFrame) -> list[str]:
-    """Rows of Markdown, as docs/monocular.md has them: crossings of angles, of each pair of solvers."""
+    """Rows of Markdown for docs/explanation/monocular.md: crossings of angles, of each pair of solvers."""
     lines = []
     angles = crossings[crossings.measure != "e_s"]
     for (sweep, variant, measure), rows in angles.groupby(["sweep", "variant", "measure"], sort=False):

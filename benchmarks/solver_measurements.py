@@ -1,4 +1,4 @@
-"""What every solver does, in numbers: the tables that benchmarks/solver_pages.py makes docs/solvers.md from.
+"""What every solver does, in numbers: the tables behind docs/explanation/solvers.md (benchmarks/solver_pages.py).
 
     nice python benchmarks/solver_measurements.py                         # all: half an hour of a processor
     nice python benchmarks/solver_measurements.py --solver rs-dai-linear  # those rows; the others are kept

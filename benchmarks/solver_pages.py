@@ -1,4 +1,4 @@
-"""docs/solvers.md: a section for each solver, from its card, its class and the committed tables of measurements.
+"""docs/explanation/solvers.md: a section for each solver, from its card, class and committed measurements.
 
 python benchmarks/solver_measurements.py    # the tables in results/solvers: half an hour of a processor
 python benchmarks/solver_pages.py           # the page: a second
@@ -23,7 +23,7 @@ from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 from rsbench.storage.files import write_bytes
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs/solvers.md"
+PAGE = ROOT / "docs/explanation/solvers.md"
 REPOSITORY = "https://github.com/rsbench/rsbench/blob/main"
 HEAD = """# The solvers, one by one
 
@@ -48,14 +48,14 @@ m. Each section says how many trials it has: shares of 10 of 10 and 20 of 20 are
   "Alone" means that the solver has a robust loop of its own, to which budgets of samples do not apply.
 - **Success**: share of robust estimates within {e_R} deg and {e_T} deg, at 0, 30 and 50 % outliers and at most
   1000 samples; then at 50 % with equal budgets: at most {few} samples, and as many as take about {ms:.0f} ms.
-- **Degenerate**: what of [the suite]({repository}/sweeps/degenerate.toml) of 11 motions and scenes is not always
-  solved, without noise and with 0.3 px, as trials solved: within {solved_R} deg and {solved_T} deg,
+- **Degenerate**: what of [the suite]({repository}/cards/sweeps/degenerate.toml) of 11 motions and scenes is not
+  always solved, without noise and with 0.3 px, as trials solved: within {solved_R} deg and {solved_T} deg,
   or three times the bound where that is more. A direction that the matches leave open cannot be wrong. The rest
   are wrong answers, but for those that the solver itself called failures.
 
 Solvers of the left camera are scored on that camera's own motion. One robust estimate of each of the
 {solvers} solvers, of {many} matches per camera with 30 % outliers, takes {all_s:.0f} s together on that core.
-[How solvers are written](add-a-solver.md), [of one camera](monocular.md),
+[How solvers are written](../how-to/add-a-solver.md), [of one camera](monocular.md),
 [sweeps over noise, motion and scene]({repository}/results/sweeps/README.md).
 
 In the table, in this order: bias; noise factor of the root mean square; success at 0, 30 and 50 % outliers, at

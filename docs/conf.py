@@ -14,8 +14,10 @@ project = "rsbench"
 author = "The rsbench developers"
 version = release = rsbench.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["site"]
+myst_enable_extensions = ["colon_fence"]
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_title = f"rsbench {release}"
 html_copy_source = False
 html_show_sphinx = False

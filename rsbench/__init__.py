@@ -1,7 +1,7 @@
 """Rolling-shutter stereo: rendered ground truth, solvers, correction and scores.
 
 The names below are the public interface; everything else may change between versions. Each is imported when it
-is first used, so that ``import rsbench`` costs nothing. docs/api.md tells what they do.
+is first used, so that ``import rsbench`` costs nothing. docs/reference/api.md tells what they do.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The functions of ``import rsbench``: arrays in, arrays out, every option with a default.
 
 Images are (H, W) or (H, W, 3), uint8 or uint16; four images are in the order left 0, right 0, left 1, right 1.
-Angles are radians, lengths metres unless a name says otherwise; frames and times as in docs/conventions.md.
+Angles are radians, lengths metres unless a name says otherwise; frames and times: ``rsbench docs conventions``.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def pose_errors(
     *,
     reference_point: Literal["body", "left"] | None = None,
 ) -> dict[str, float]:
-    """Errors of an estimate against the true motion, as docs/conventions.md defines them.
+    """Errors of an estimate against the true motion, as docs/explanation/conventions.md defines them.
 
     Args:
         found: what ``estimate_motion`` returned, or a solver itself.
@@ -363,7 +363,7 @@ def evaluate(
         seeds: runs of each solver, with other RANSAC samples: one row each in ``pose``; seed: of every choice.
 
     Returns:
-        The tables ``pose``, ``depth``, ``correction``, ``failures`` and ``seconds``: see docs/score-files.md.
+        The tables ``pose``, ``depth``, ``correction``, ``failures`` and ``seconds``: ``rsbench docs score-files``.
 
     Raises:
         RsbenchError: not a dataset, or no such component.

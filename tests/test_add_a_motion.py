@@ -1,4 +1,4 @@
-"""The motion model of docs/add-a-motion.md as an installed package: nothing in rsbench changes for it."""
+"""The motion model of docs/how-to/add-a-motion.md as an installed package: nothing in rsbench changes for it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from commands import sweep_card
 
 from rsbench.components.cards import read_toml
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "add-a-motion.md"
+DOCUMENT = Path(__file__).parents[1] / "docs" / "how-to" / "add-a-motion.md"
 SWEEP = sweep_card(
     ["rs-stereo-ease.toml", "rs-stereo-refined"], noise_px=[0.0], trials=2, more='motion_model = "ease"\n'
 )

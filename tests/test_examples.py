@@ -50,14 +50,14 @@ def test_notebooks_use_public_names_alone(notebook: Path) -> None:
 def test_documents_and_examples_are_listed_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     documents = list_documents()
     assert {path for path in documents.values() if path.suffix == ".md"} == {
-        path for path in (ROOT / "docs").glob("*.md") if path.name != "index.md"
+        path for path in (ROOT / "docs").rglob("*.md") if path.name != "index.md"
     }
     assert documents["tour.ipynb"] == ROOT / "examples" / "tour.ipynb"
     docs()
     listed = capsys.readouterr().out
     assert all(name in listed for name in documents) and "A tour of rsbench" in listed
     docs("conventions")
-    assert capsys.readouterr().out == f"{ROOT / 'docs' / 'conventions.md'}\n"
+    assert capsys.readouterr().out == f"{ROOT / 'docs' / 'explanation' / 'conventions.md'}\n"
 
 
 def test_a_document_that_does_not_exist_is_named_with_the_nearest() -> None:

@@ -65,7 +65,7 @@ def test_committed_crossings_are_those_of_the_committed_medians(program: ModuleT
 
 
 def test_the_document_has_the_committed_crossings(program: ModuleType) -> None:
-    text = (ROOT / "docs/monocular.md").read_text("utf-8")
+    text = (ROOT / "docs/explanation/monocular.md").read_text("utf-8")
     rows = program.shown(pd.read_csv(FOLDER / "crossings.csv"))
     assert len(rows) == 8 and [row for row in rows if row not in text] == []
 

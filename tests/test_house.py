@@ -33,8 +33,9 @@ from rsbench.renderers.options import RendererOptions
 from rsbench.solvers.engine.registry import list_solvers, load_solver_entry
 
 ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
 SOURCES = sorted((ROOT / "rsbench").rglob("*.py"))
-DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
 MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_REPOSITORY_MB = 400, 45, 30
 
 in_checkout = pytest.mark.skipif(not (ROOT / ".git").exists(), reason="needs a git checkout")
@@ -197,7 +198,8 @@ def test_links_between_documents_lead_somewhere() -> None:
             path = ROOT / target.removeprefix(repository) if target.startswith(repository) else None
             if path is None and "://" not in target:
                 path = document.parent / target
-            leaves = document.parent.name == "docs" and ".." in target
+            leaves = path is not None and "://" not in target and DOCS in document.parents
+            leaves = leaves and DOCS not in path.resolve().parents
             if path is not None and (leaves or not path.exists()):
                 broken.append(f"{document.name}: {target}")
     assert not broken
@@ -219,21 +221,21 @@ def test_the_table_of_packages_has_all_of_them_in_the_order_of_the_layers() -> N
 
 
 def test_the_conversion_to_the_papers_axes_holds() -> None:
-    (code,) = _blocks(ROOT / "docs" / "conventions.md", "python")
+    (code,) = _blocks(ROOT / "docs" / "explanation" / "conventions.md", "python")
     exec(compile(code, "conventions.md", "exec"), {})  # asserts
 
 
 def test_the_dataset_is_read_as_documented(
     smoke_dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (code,) = _blocks(ROOT / "docs" / "dataset-format.md", "python")
+    (code,) = _blocks(ROOT / "docs" / "reference" / "dataset-format.md", "python")
     monkeypatch.chdir(smoke_dataset.parent)
     exec(compile(code.replace("data/smoke", str(smoke_dataset)), "dataset-format.md", "exec"), {})
     assert "(96, 128, 3)" in capsys.readouterr().out
 
 
 def test_every_key_of_a_dataset_is_documented(smoke_dataset: Path) -> None:
-    text = (ROOT / "docs" / "dataset-format.md").read_text("utf-8")
+    text = (ROOT / "docs" / "reference" / "dataset-format.md").read_text("utf-8")
     documented = set(re.findall(r"`(\w+)`", text))
     for manifest in (smoke_dataset / "dataset.json", next(smoke_dataset.glob("*/sequence.json"))):
         keys = set(re.findall(r'^  "(\w+)":', manifest.read_text("utf-8"), flags=re.MULTILINE))
@@ -242,8 +244,8 @@ def test_every_key_of_a_dataset_is_documented(smoke_dataset: Path) -> None:
 
 @pytest.fixture
 def documented_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The files of docs/add-a-solver.md in a folder on the import path."""
-    document = ROOT / "docs" / "add-a-solver.md"
+    """The files of docs/how-to/add-a-solver.md in a folder on the import path."""
+    document = ROOT / "docs" / "how-to" / "add-a-solver.md"
     for block in [*_blocks(document, "python"), *_blocks(document, "toml")]:
         name, content = re.fullmatch(r"# (\S+)\n(.*)", block, flags=re.DOTALL).groups()  # pyrefly: ignore[missing-attribute]
         (tmp_path / name).write_text(content, "utf-8")
@@ -274,7 +276,7 @@ def test_the_documented_solver_keeps_the_contract(documented_solver: Path) -> No
 
 
 def test_the_documented_checks_are_those_that_run() -> None:
-    text = (ROOT / "docs" / "add-a-solver.md").read_text("utf-8").partition("| check | fails when |")[2]
+    text = (ROOT / "docs" / "how-to" / "add-a-solver.md").read_text("utf-8").partition("| check | fails when |")[2]
     assert re.findall(r"^\| ([a-z ]+) \|", text, flags=re.MULTILINE) == list(CHECKS)
 
 
@@ -304,7 +306,7 @@ def test_the_wheel_carries_cards_documents_and_type_marker(tmp_path: Path) -> No
     }
     expected |= {str(path.relative_to(ROOT)) for path in SOURCES} | {"rsbench/py.typed"}
     expected |= {str(path.relative_to(ROOT)) for path in (ROOT / "rsbench").rglob("*.j2")}
-    expected |= {f"rsbench/_docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
+    expected |= {f"rsbench/_docs/{path.relative_to(DOCS)}" for path in DOCS.rglob("*.md")}
     expected |= {f"rsbench/_docs/examples/{path.name}" for path in (ROOT / "examples").iterdir() if path.is_file()}
     assert expected <= names
     assert any(name.endswith("licenses/LICENSE") for name in names)

@@ -68,7 +68,7 @@ def test_the_package_comes_from_the_wheel(installed: Path, tmp_path: Path) -> No
     where = _run([sys.executable, "-c", "import rsbench; print(rsbench.__file__)"], tmp_path, installed)
     assert Path(where.strip()) == installed / "rsbench" / "__init__.py"
     document = Path(_run(["rsbench", "docs", "conventions"], tmp_path, installed).strip())
-    assert document.read_bytes() == (ROOT / "docs" / "conventions.md").read_bytes()
+    assert document.read_bytes() == (ROOT / "docs" / "explanation" / "conventions.md").read_bytes()
     assert installed in document.parents
 
 

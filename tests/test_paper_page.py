@@ -1,4 +1,4 @@
-"""docs/paper.md: every function, test and result that it names is there, and every equation, figure and claim."""
+"""docs/explanation/paper.md names what exists, and every equation, figure and claim of the paper."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rsbench.benchmark.studies.claims import CLAIMS
 from rsbench.benchmark.studies.image_claims import IMAGE_CLAIMS
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "paper.md").read_text("utf-8")
+PAGE = (ROOT / "docs" / "explanation" / "paper.md").read_text("utf-8")
 ROWS = [
     [cell.strip() for cell in line.strip("|").split("|")]
     for line in PAGE.splitlines()

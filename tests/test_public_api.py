@@ -263,7 +263,7 @@ def test_wrong_arguments_are_named_in_one_line(call: Callable[[], object], messa
 
 
 def test_the_overview_has_every_name_with_its_parameters() -> None:
-    page = (Path(__file__).parents[1] / "docs" / "api.md").read_text("utf-8")
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "api.md").read_text("utf-8")
     cells = "\n".join(line.split("|")[1] for line in page.splitlines() if line.startswith("|"))
     named = dict(re.findall(r"`(\w+)(?:\(([\w, ]*)\))?`", cells))
     assert "`RsbenchError`" in page
@@ -275,7 +275,7 @@ def test_the_overview_has_every_name_with_its_parameters() -> None:
 
 
 def test_the_overview_s_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    page = (Path(__file__).parents[1] / "docs" / "api.md").read_text("utf-8")
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "api.md").read_text("utf-8")
     (code,) = re.findall(r"^```python\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE)
     exec(compile(code, "api.md", "exec"), {})
     assert "e_R_deg" in capsys.readouterr().out

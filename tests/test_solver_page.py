@@ -1,4 +1,4 @@
-"""docs/solvers.md says what the committed tables say, of every solver that comes with rsbench."""
+"""docs/explanation/solvers.md says what the committed tables say, of every solver that comes with rsbench."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from rsbench.components.cards import list_cards
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs/solvers.md").read_text("utf-8")
+PAGE = (ROOT / "docs/explanation/solvers.md").read_text("utf-8")
 ROWS = pd.read_csv(ROOT / "results/solvers/solvers.csv").to_dict("records")
 TABLE = {str(row["solver"]): row for row in ROWS}
 

@@ -47,7 +47,7 @@ def pose_errors(
     metric: ArrayLike = True,
     reference_point: str = "body",
 ) -> dict[str, FloatArray]:
-    """Errors (...) of estimated motions, as docs/conventions.md defines them; all arguments broadcast.
+    """Errors (...) of estimated motions, as docs/explanation/conventions.md defines them; all arguments broadcast.
 
     Args:
         w, d: (..., 3) estimated motion over one frame period, rad and m (or any length where not ``metric``).

@@ -42,9 +42,10 @@ def list_documents() -> dict[str, Path]:
     """Paths by name, sorted: documents without their ending, examples with it."""
     from rsbench.components.cards import shipped_folder
 
-    documents = {path.stem: path for path in shipped_folder("docs", "_docs").glob("*.md") if path.stem != "index"}
-    examples = shipped_folder("examples", "_docs/examples").glob("*.*")
-    return dict(sorted(documents.items())) | {path.name: path for path in sorted(examples)}
+    examples = shipped_folder("examples", "_docs/examples")
+    pages = shipped_folder("docs", "_docs").rglob("*.md")
+    documents = {path.stem: path for path in pages if path.stem != "index" and examples not in path.parents}
+    return dict(sorted(documents.items())) | {path.name: path for path in sorted(examples.glob("*.*"))}
 
 
 def _title(path: Path) -> str:

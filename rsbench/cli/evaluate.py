@@ -22,7 +22,7 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench evaluate data/paper --out results/paper --only gs-8pt --force  [dim](made again alone)[/dim]
 
-DIR gets [bold]predictions/[/bold], [bold]scores/*.csv[/bold] (docs/score-files.md), [bold]pictures/[/bold],
+DIR gets [bold]predictions/[/bold], [bold]scores/*.csv[/bold] (rsbench docs score-files), [bold]pictures/[/bold],
 [bold]report.html[/bold] and [bold]provenance.json[/bold]. What was predicted before, from the same data and
 components, is kept and scored; nothing is deleted."""
 

@@ -1,4 +1,4 @@
-"""The answer to a problem, as ``rsbench solve --json`` prints it: docs/problem-format.md."""
+"""The answer to a problem, as ``rsbench solve --json`` prints it: docs/reference/problem-format.md."""
 
 from __future__ import annotations
 

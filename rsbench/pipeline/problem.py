@@ -1,4 +1,4 @@
-"""Problems in files, for people with correspondences of their own; the format is docs/problem-format.md."""
+"""Problems in files, for people with correspondences of their own; format: docs/reference/problem-format.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/score-files.md against the files that evaluations and sweeps write."""
+"""docs/reference/score-files.md against the files that evaluations and sweeps write."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rsbench.benchmark.simulated.run_sweep import run_sweep
 from rsbench.benchmark.simulated.sweep_card import load_sweep
 from rsbench.benchmark.simulated.sweep_summary import summarise_sweep
 
-DOCUMENT = (Path(__file__).parents[2] / "docs" / "score-files.md").read_text("utf-8")
+DOCUMENT = (Path(__file__).parents[2] / "docs" / "reference" / "score-files.md").read_text("utf-8")
 
 
 def documented(section: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""The one scorer of motions, against poses chained by hand and the policy of docs/conventions.md."""
+"""The one scorer of motions, against poses chained by hand and the policy of docs/explanation/conventions.md."""
 
 from __future__ import annotations
 

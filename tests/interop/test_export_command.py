@@ -46,7 +46,7 @@ def test_every_format_is_written_whole_and_again_the_same(made: Path, tmp_path: 
 
 def test_the_commands_formats_are_those_that_there_are() -> None:
     assert [str(target) for target in Target] == list(FORMATS)
-    text = (Path(__file__).parents[2] / "docs/export.md").read_text("utf-8").partition("## ")[0]
+    text = (Path(__file__).parents[2] / "docs/how-to/export.md").read_text("utf-8").partition("## ")[0]
     assert [line.split("`")[1] for line in text.splitlines() if line.startswith("| `")] == list(FORMATS)
 
 

@@ -274,7 +274,7 @@ def test_answer_names_its_point_its_unit_and_counts_each_match_once(name: str) -
 
 
 def test_the_documented_keys_are_those_of_the_answer() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "problem-format.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "reference" / "problem-format.md").read_text()
     section = text[text.index("## An answer") : text.index("## The sample")]
     rows = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
     documented = [key for row in rows for key in re.findall(r"`(\w+)`", row)]
@@ -283,7 +283,7 @@ def test_the_documented_keys_are_those_of_the_answer() -> None:
 
 
 def test_the_documented_program_makes_the_sample(capsys: pytest.CaptureFixture[str]) -> None:
-    text = (Path(__file__).parents[2] / "docs" / "problem-format.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "reference" / "problem-format.md").read_text()
     program = text[text.index("```python\n") + 10 :].partition("```")[0]
     exec(compile(program, "problem-format.md", "exec"), {})
     assert capsys.readouterr().out == EXAMPLE.read_text()

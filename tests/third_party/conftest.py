@@ -1,4 +1,4 @@
-"""The packages of docs/extend.md, installed as anybody would, and a folder with its cards."""
+"""The packages of docs/how-to/extend.md, installed as anybody would, and a folder with its cards."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Section:
 
 
 def read_sections() -> dict[str, Section]:
-    """Sections of docs/extend.md by their headings; the last one is a command that all share."""
-    text = (ROOT / "docs" / "extend.md").read_text("utf-8")
+    """Sections of docs/how-to/extend.md by their headings; the last one is a command that all share."""
+    text = (ROOT / "docs" / "how-to" / "extend.md").read_text("utf-8")
     head, *parts, together = re.split(r"^## ", text, flags=re.MULTILINE)
     shared = re.findall(r"^rsbench .*", together, flags=re.MULTILINE)
     found = {}

@@ -1,4 +1,4 @@
-"""A stranger's single file adds a component: docs/extend.md, installed as packages, on the command line."""
+"""A stranger's single file adds a component: docs/how-to/extend.md, installed as packages, on the command line."""
 
 from __future__ import annotations
 

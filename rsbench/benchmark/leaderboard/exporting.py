@@ -1,6 +1,6 @@
 """Inputs for any language: CSV, npz and JSON of the same problems, and the truth of a public split.
 
-What is written is all that a method may know; docs/submit.md describes the files.
+What is written is all that a method may know; docs/how-to/submit.md describes the files.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ Step = Callable[[str], None]
 
 
 def mark(submission: Submission, split: Split, workers: Workers = 1) -> pd.DataFrame:
-    """One row for each problem, in the order of the split; the columns are those of docs/submit.md.
+    """One row for each problem, in the order of the split; the columns are those of docs/how-to/submit.md.
 
     Args:
         submission: what was answered.

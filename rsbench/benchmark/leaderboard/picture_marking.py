@@ -1,4 +1,4 @@
-"""Scores of depth maps and corrected frames, one row for each problem: formulas of docs/protocols.md.
+"""Scores of depth maps and corrected frames, one row for each problem: formulas of docs/reference/protocols.md.
 
 The formulas themselves are those of ``rsbench.vision``. What is unknown in a depth map is wrong there, and what a
 method did not draw is black: nobody gains by leaving out what is difficult.

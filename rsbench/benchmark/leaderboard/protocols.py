@@ -1,4 +1,4 @@
-"""The protocols of the leaderboard: what a method is given, what it may use, what is asked; docs/protocols.md.
+"""The protocols of the leaderboard: what a method is given, what it may use, what is asked (docs/reference).
 
 A protocol never changes: what would change scores is a protocol with another number.
 """

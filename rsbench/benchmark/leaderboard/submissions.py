@@ -1,7 +1,7 @@
 """Predictions of strangers: JSON lines, a header and an answer for each problem. Every fault is a line of its own.
 
 Nothing that stands there is believed: sizes are limited before anything is decoded, names are looked up among
-those of the split and are never paths, and numbers are finite. docs/submit.md is the format.
+those of the split and are never paths, and numbers are finite. docs/how-to/submit.md is the format.
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ ON_REQUEST = (
         knows="one image: lines along three orthogonal directions",
     ),
 )
-"""Methods that a study has when it is asked for them: docs/correctors.md compares them."""
+"""Methods that a study has when it is asked for them: docs/explanation/correctors.md compares them."""
 
 
 def methods_among(keys: Collection[str]) -> list[Method]:

@@ -351,7 +351,7 @@ def _found(attempts: dict[str, Attempt | None]) -> dict[str, Attempt]:
 
 
 def _worst_scores(image: NDArray[Any], extra: bool) -> dict[str, float]:
-    """What a failed method scores on an image: the rule of failures of docs/conventions.md."""
+    """What a failed method scores on an image: the rule of failures of docs/explanation/conventions.md."""
     scores = {f"{name}_{part}": WORST[name] for part in ("covered", "all") for name in ("psnr", "ssim")}
     scores |= {name: worst_flow(image) for name in ("flow_mean_px", "flow_median_px")}
     slow = {"flip_covered": "flip", "flip_all": "flip", "ssim_deepunroll": "ssim", "ssim_uniform": "ssim"}

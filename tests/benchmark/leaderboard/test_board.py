@@ -369,7 +369,7 @@ def test_frames_with_given_matches(smoke_dataset: Path, tmp_path: Path, monkeypa
 
 
 def test_the_documented_script_needs_no_rsbench(smoke_dataset: Path, tmp_path: Path) -> None:
-    text = (ROOT / "docs" / "submit.md").read_text("utf-8")
+    text = (ROOT / "docs" / "how-to" / "submit.md").read_text("utf-8")
     script = text.partition("```python\n# submit.py\n")[2].partition("```")[0]
     assert len(script.splitlines()) <= 22
     (tmp_path / "submit.py").write_text(script, "utf-8")
@@ -389,7 +389,7 @@ def test_the_documented_script_needs_no_rsbench(smoke_dataset: Path, tmp_path: P
 
 
 def test_protocols_are_documented() -> None:
-    text = (ROOT / "docs" / "protocols.md").read_text("utf-8")
+    text = (ROOT / "docs" / "reference" / "protocols.md").read_text("utf-8")
     for protocol in PROTOCOLS.values():
         cells = f"| `{protocol.track}` | `{protocol.id}` | {protocol.given} | {', '.join(protocol.allowed)} |"
         assert cells in text
