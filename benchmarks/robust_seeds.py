@@ -1,6 +1,6 @@
 """How far the robust loop is off on noisy frames, how far its seeds spread, and whether its stated errors say so.
 
-python benchmarks/robust_seeds.py DATASET... [--seeds 12] [--draws 1] [--cache FOLDER] [--solver rs-stereo]
+python benchmarks/robust_seeds.py DATASET... [--seeds 12] [--draws 1] [--cache FOLDER] [--solver rs-stereo-refined]
 
 Frames of rendered datasets get photon noise: the light that a pixel shows is drawn from a Poisson distribution
 and quantised again. The number of photons at full scale is that which gives the first image the PSNR asked for.
@@ -188,7 +188,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=1, help="of the noise, per sequence")
     parser.add_argument("--psnr", type=float, default=27.0, help="dB")
     parser.add_argument("--cache", type=Path, default=Path("build/noisy"))
-    parser.add_argument("--solver", default="rs-stereo")
+    parser.add_argument("--solver", default="rs-stereo-refined")
     arguments = parser.parse_args()
     heads = ("e_R", "e_T deg", "worst e_T", "sigmas", "NEES", "spread", "ms", "PoseLib")
     widths = (9, 9, 9, 8, 8, 8, 8, 8)

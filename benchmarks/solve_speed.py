@@ -156,7 +156,13 @@ def main() -> None:
     lines.append(
         f"{'robust pipeline':34s}" + "".join(f"{h:>12s}" for h in ("median ms", "p90 ms", "e_R deg", "e_T deg"))
     )
-    for name in ("rs-stereo", "rs-stereo-tracks", "rs-stereo-refined-pairs", "gs-poselib-stereo", "gs-8pt"):
+    for name in (
+        "rs-stereo-refined",
+        "rs-stereo-tracks",
+        "rs-stereo-refined-pairs",
+        "gs-poselib-stereo",
+        "gs-8pt",
+    ):
         lines.append(row(name, ours(name), cases))
     lines.append(row("PoseLib's own RANSAC, stereo rig", poselib_stereo, cases))
     lines += [f"{'minimal samples':34s}{'per second':>12s}", *minimal_rates(cases[0])]

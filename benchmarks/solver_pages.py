@@ -77,6 +77,7 @@ def page(folder: Path) -> str:
     given, machine = made["inputs"], made["machine"]
     equations = tomllib.loads(Path(__file__).with_name("solver_equations.toml").read_text("utf-8"))
     table = pd.read_csv(folder / "solvers.csv")
+    table = table[table["solver"].isin(list_cards("solvers"))]  # none under a former name
     head = HEAD.format(
         repository=REPOSITORY,
         date=made["date"],

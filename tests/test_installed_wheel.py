@@ -131,7 +131,7 @@ def test_the_readme_runs_as_printed(installed: Path, tmp_path: Path, smoke_datas
 
 _TRUTHS = """
 # Where the truth is known: simulated points at 0.3 px, and rendered frames that are corrected.
-assert errors_of("rs-stereo", data)["e_R_deg"] < 0.05 < errors_of("gs-8pt", data)["e_R_deg"]
+assert errors_of("rs-stereo-refined", data)["e_R_deg"] < 0.05 < errors_of("gs-8pt", data)["e_R_deg"]
 assert found.estimate.success and error < 0.05
 assert after.mean() < 0.5 * before.mean()
 assert len(plt.get_fignums()) == 2

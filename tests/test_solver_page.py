@@ -10,11 +10,15 @@ import pandas as pd
 import programs
 import pytest
 
-from rsbench.components.cards import list_cards
+from rsbench.components.cards import FORMER_NAMES, list_cards
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/explanation/solvers.md").read_text("utf-8")
-ROWS = pd.read_csv(ROOT / "results/solvers/solvers.csv").to_dict("records")
+ROWS = [
+    row
+    for row in pd.read_csv(ROOT / "results/solvers/solvers.csv").to_dict("records")
+    if row["solver"] not in FORMER_NAMES["solvers"]
+]
 TABLE = {str(row["solver"]): row for row in ROWS}
 
 

@@ -167,7 +167,7 @@ def check_asked(asked: str, entry: SolverEntry) -> None:
         spec = solver.spec
         known_to = f"solver {entry.name!r} knows only {spec.motion_model} motion and a {spec.shutter} shutter"
         known_to += "" if spec.metric else ", without a length"
-        raise RsbenchError(f"--motion-model {asked}: {known_to}; take rs-stereo")
+        raise RsbenchError(f"--motion-model {asked}: {known_to}; take rs-stereo-refined")
 
 
 def settle_model(

@@ -145,7 +145,6 @@ def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, seed: i
 
 _ON_REQUEST = (
     "rs-12param-affine",  # needs affine frames of matches
-    "rs-stereo",  # another name of rs-stereo-refined: one row of it is enough
     *("rs-12param", "rs-dai-linear", "rs-dai-uniform", "rs-mono-refined", "rs-zhuang-8pt", "rs-zhuang-9pt"),
     *("gs-p3p", "gs-stereo-triplets", "gs-stereo-triplets-lines", "rs-r6p", "rs-r6p-single"),
     *("gs-upright-3pt", "gs-upright-4pt", "rs-gyro-5pt", "rs-gyro-stereo"),  # need a sensor

@@ -40,7 +40,7 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench leaderboard submit mine.jsonl --board board
 
-  rsbench leaderboard run points --entry rs-stereo --entry gs-8pt --board board
+  rsbench leaderboard run points --entry rs-stereo-refined --entry gs-8pt --board board
 
   rsbench leaderboard show --board board
 

@@ -180,6 +180,5 @@ def own_solvers() -> list[str]:
     from rsbench.solvers.engine.base import BESIDE
     from rsbench.solvers.engine.registry import SOLVERS, load_solver_entry
 
-    # rs-stereo is another name of rs-stereo-refined.
-    own = [offer.name for offer in offers(SOLVERS) if offer.origin == "rsbench" and offer.name != "rs-stereo"]
+    own = [offer.name for offer in offers(SOLVERS) if offer.origin == "rsbench"]
     return [name for name in own if not BESIDE.keys() & load_solver_entry(name).solver.spec.minimum]

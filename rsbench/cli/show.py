@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 EPILOG = """[bold]Examples[/bold]
 
-  rsbench show rs-stereo
+  rsbench show rs-stereo-refined
 
   rsbench show castle --kind builders
 
@@ -55,7 +55,7 @@ def _print(about: dict[str, Any]) -> None:
     rows = [
         (key.replace("_", " "), _text(value))
         for key, value in about.items()
-        if key not in ("kind", "name", "parameters") and value not in (None, "")
+        if key not in ("kind", "name", "parameters") and value not in (None, "", [])
     ]
     print_rows(title, ("", ""), rows)
     if about["parameters"]:
@@ -76,7 +76,7 @@ def _text(value: object) -> str:
 def _kinds_of(name: str, kind: str | None) -> list[str]:
     """Kinds in which to look a name up."""
     from rsbench.cli.component_kinds import kind_names, names_of
-    from rsbench.components.cards import choices
+    from rsbench.components.cards import choices, current_name
     from rsbench.core.errors import RsbenchError
 
     kinds = kind_names()
@@ -87,7 +87,7 @@ def _kinds_of(name: str, kind: str | None) -> list[str]:
     if name.endswith(".toml"):
         raise RsbenchError(f"{name}: say of which kind it is: --kind {'|'.join(kinds)}")
     names = {each: names_of(each) for each in kinds}
-    found = [each for each in kinds if name in names[each]]
+    found = [each for each in kinds if current_name(each, name) in names[each]]
     if not found:
         everything = sorted({one for each in names.values() for one in each})
         raise RsbenchError(f"{name!r} does not exist{choices(name, everything)}")
@@ -98,7 +98,7 @@ def _about(name: str, kind: str) -> dict[str, Any]:
     """All that can be said of one component or card."""
     from rsbench.cli.component_kinds import component_kind
     from rsbench.components import plugins
-    from rsbench.components.cards import card_path, read_toml
+    from rsbench.components.cards import FORMER_NAMES, card_path, read_toml
     from rsbench.components.parameters import parameters_of
 
     described = component_kind(kind)
@@ -111,6 +111,7 @@ def _about(name: str, kind: str) -> dict[str, Any]:
     return {
         "kind": kind,
         "name": entry.name,
+        "formerly": sorted(former for former, now in FORMER_NAMES.get(kind, {}).items() if now == entry.name),
         "description": entry.description,
         "origin": _origin(described, entry.name) if entry.path is None else None,
         "card": entry.path.as_posix() if entry.path is not None else None,

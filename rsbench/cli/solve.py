@@ -22,7 +22,7 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench solve problem.json --solver rs-stereo-linear --json
 
-  rsbench solve problem.json --solver rs-stereo --solver gs-8pt
+  rsbench solve problem.json --solver rs-stereo-refined --solver gs-8pt
 
   rsbench solve problem.json --motion-model auto
 
@@ -38,7 +38,7 @@ More: [bold]rsbench docs problem-format[/bold]"""
 
 
 _MODEL = "Motion model: auto, which the matches prefer, or a name. Default: the solver's"
-_SOLVER = "Name of a solver (rsbench list solvers) or path of a card; repeatable. Default: rs-stereo"
+_SOLVER = "Name of a solver (rsbench list solvers) or path of a card; repeatable. Default: rs-stereo-refined"
 
 
 def solve(
@@ -76,7 +76,7 @@ def solve(
     from rsbench.solvers.engine.registry import load_solver_entries
 
     wanted, options, limit = _extras(extras, json), _options(threshold_px), _limit(time_limit)
-    entries = load_solver_entries(solver or ["rs-stereo"])
+    entries = load_solver_entries(solver or ["rs-stereo-refined"])
     _check_model(motion_model, entries)
     code = _tell(_answers(problems, entries, options, seed, wanted, limit, motion_model), json)
     if code:

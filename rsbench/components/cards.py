@@ -39,6 +39,9 @@ CardKind = Literal[
     "shutters",
 ]
 
+FORMER_NAMES: Mapping[str, Mapping[str, str]] = {"solvers": {"rs-stereo": "rs-stereo-refined"}}
+"""By kind, names that commands and files may still give, and what each is called now; no list shows them."""
+
 Extra = Literal["forbid", "ignore"]
 _LONGEST = 100
 """Characters of a value in a message."""
@@ -52,6 +55,11 @@ def list_cards(kind: CardKind) -> dict[str, Path]:
     return {path.stem: path for path in sorted(_card_folder(kind).glob("*.toml"), key=lambda path: path.stem)}
 
 
+def current_name(kind: str | None, name: str) -> str:
+    """What a component or card is called now, by its name of today or a former one."""
+    return FORMER_NAMES.get(kind or "", {}).get(name, name)
+
+
 def card_path(kind: CardKind, name_or_path: str | Path) -> Path:
     """File of a card: a value with a separator or ending in ``.toml`` is a path, anything else a name.
 
@@ -62,14 +70,14 @@ def card_path(kind: CardKind, name_or_path: str | Path) -> Path:
     if value.endswith(".toml") or "/" in value or os.sep in value:
         path = Path(value)
         if not path.is_file() and path == Path(kind, path.name):  # where cards of this kind were in 0.1
-            path = list_cards(kind).get(path.stem, path)
+            path = list_cards(kind).get(current_name(kind, path.stem), path)
         if not path.is_file():
             raise RsbenchError(f"{kind} card {value}: no such file")
         return path
-    cards = list_cards(kind)
-    if value not in cards:
+    cards, name = list_cards(kind), current_name(kind, value)
+    if name not in cards:
         raise RsbenchError(f"{kind} card {value!r} does not exist{choices(value, cards)}; a path ends in .toml")
-    return cards[value]
+    return cards[name]
 
 
 def load_card(cls: type[T], kind: CardKind, name_or_path: str | Path) -> T:

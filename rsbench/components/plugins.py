@@ -23,7 +23,16 @@ from typing import Any, Generic, TypeVar
 
 from pydantic.errors import PydanticUserError
 
-from rsbench.components.cards import CardKind, card_path, check_values, choices, list_cards, parse_card, read_toml
+from rsbench.components.cards import (
+    CardKind,
+    card_path,
+    check_values,
+    choices,
+    current_name,
+    list_cards,
+    parse_card,
+    read_toml,
+)
 from rsbench.components.entry_points import entry_points_by_name, package_of
 from rsbench.components.identity import component_key, own_source_version, source_version
 from rsbench.components.imports import blaming, import_target, in_words, try_import
@@ -198,7 +207,7 @@ def load_entry(kind: Kind[Component, Options], name_or_path: str | Path) -> Entr
     cls, where = _offered_class(kind, offer)
     component = make_component(kind, cls, {}, where)
     return Entry(
-        name=text,
+        name=offer.name,
         path=None,
         description=_first_paragraph(cls),
         component=component,
@@ -237,7 +246,7 @@ def _first_paragraph(cls: type) -> str:
 
 def _only_offer(kind: Kind[Any, Any], name: str, advice: str, where: str = "") -> Offer:
     everything = offers(kind)
-    found = [offer for offer in everything if offer.name == name]
+    found = [offer for offer in everything if offer.name in (name, current_name(kind.cards, name))]
     if len(found) > 1:
         owners = " and of ".join(_owner(offer) for offer in found)
         raise RsbenchError(f"{where}{kind.singular} {name!r}: is the name of {owners}; rename one of them")

@@ -20,7 +20,7 @@ KINDS = ("cards", "renderers", "scenes", "solvers")
 """Folders of cards: whoever imports rsbench here attacks it with the cards of the whole checkout."""
 CAMERA = {"width": 96, "height": 64, "focal": 80.0}
 RIG = "baseline = 0.3\nreadout_ratio = 0.8\n[camera]\nfx = 80.0\nfy = 80.0\ncx = 47.5\ncy = 31.5\n"
-SOLVERS = ("gs-8pt", "rs-stereo-linear", "rs-stereo-refined", "rs-stereo")
+SOLVERS = ("gs-8pt", "rs-stereo-linear", "rs-stereo-refined")
 
 
 def make_checkout(folder: Path) -> Path:

@@ -54,7 +54,7 @@ def test_each_model_is_recognised_and_gives_the_right_d(name: str) -> None:
     """Among outliers. The paper's model is wrong by several standard deviations there."""
     truth = make_motion(name, W, D, OWN.get(name, {}))
     given = matches(truth, tracks=150, outlier_ratio=0.2)
-    entry, rng = load_solver_entry("rs-stereo"), np.random.default_rng(0)
+    entry, rng = load_solver_entry("rs-stereo-refined"), np.random.default_rng(0)
     as_linear = estimate_motion(given, RIG, SHUTTER, entry.solver, RobustOptions(), rng)
     robust, choice = settle_model("auto", as_linear, entry, given, RIG, SHUTTER, RobustOptions(), rng)
     assert choice is not None and choice.used == name
@@ -186,8 +186,8 @@ def test_outliers_do_not_move_the_fit() -> None:
 def test_wrong_requests_are_one_line() -> None:
     given = matches(LinearMotion(W, D))
     for name, solver, words in (
-        ("twsit", "rs-stereo", "did you mean 'twist'"),
-        ("auto", "gs-8pt", "take rs-stereo"),
+        ("twsit", "rs-stereo-refined", "did you mean 'twist'"),
+        ("auto", "gs-8pt", "take rs-stereo-refined"),
         ("auto", "gs-stereo-tracks", "global shutter"),
     ):
         entry = load_solver_entry(solver)

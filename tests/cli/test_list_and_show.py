@@ -10,7 +10,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from commands import run_here
@@ -18,6 +18,7 @@ from commands import run_here
 from rsbench.cli import console
 from rsbench.cli.component_kinds import COMPONENTS, kind_names, names_of
 from rsbench.cli.main import app
+from rsbench.components.cards import FORMER_NAMES, CardKind, list_cards, read_toml
 from rsbench.components.parameters import parameters_of
 from rsbench.solvers.engine.registry import list_solvers, load_solver_entry
 
@@ -129,7 +130,7 @@ def test_every_name_of_every_kind_can_be_shown() -> None:
 
 
 def test_show_prints_for_people_and_for_programs(tmp_path: Path) -> None:
-    text = rsbench("show", "rs-stereo", COLUMNS="150").stdout
+    text = rsbench("show", "rs-stereo-refined", COLUMNS="150").stdout
     for word in ("needs", "left = 7, right = 7", "reference point", "iterations", "60", "time limit"):
         assert word in text
     both = answer("show", "castle")
@@ -257,3 +258,33 @@ def test_completion_offers_what_packages_offer(tmp_path: Path) -> None:
     # Which shell this is cannot be found out where there is none, as in CI: it is named instead.
     named = rsbench("--show-completion", "bash", _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1")
     assert "complete" in named.stdout
+
+
+# Former names
+
+
+def test_no_list_shows_a_former_name_and_each_leads_to_a_component_of_today() -> None:
+    for kind, names in FORMER_NAMES.items():
+        listed = names_of(kind)
+        assert not names.keys() & {*listed} and {*names.values()} <= {*listed}
+
+
+def test_a_former_name_stands_for_the_name_of_today(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = load_solver_entry("rs-stereo")
+    assert entry.name == "rs-stereo-refined" and entry.key == load_solver_entry("rs-stereo-refined").key
+    monkeypatch.chdir(tmp_path)  # no card lies here: as in another's folder, or with a wheel
+    assert load_solver_entry("solvers/rs-stereo.toml").name == "rs-stereo-refined"
+    assert "formerly" in rsbench("show", "rs-stereo", COLUMNS="150").stdout
+    about = answer("show", "rs-stereo")
+    assert (about["name"], about["formerly"]) == ("rs-stereo-refined", ["rs-stereo"])
+    assert answer("show", "rs-stereo-tracks")["formerly"] == []
+
+
+def test_no_two_cards_say_the_same() -> None:
+    """Class, parameters and options: what people read (description, use, comments) makes no second thing."""
+    for kind in get_args(CardKind):
+        said = {}
+        for name, path in list_cards(kind).items():
+            content = {k: v for k, v in read_toml(path).items() if k not in ("description", "use")}
+            same = said.setdefault(json.dumps(content, sort_keys=True, default=str), name)
+            assert same == name, f"{kind}: {same} and {name}"

@@ -77,12 +77,14 @@ def test_many_problems_and_two_solvers_give_one_line_each(tmp_path: Path) -> Non
     lines[1] = json.dumps(sample | {"baseline": -1.0})
     few = sample | {"name": "few"} | NOTHING
     many = "\n".join([*lines, json.dumps(few)])
-    result = solve("-", "--solver", "rs-stereo", "--solver", "gs-8pt", "--json", "--with", "noise", text=many)
+    result = solve(
+        "-", "--solver", "rs-stereo-refined", "--solver", "gs-8pt", "--json", "--with", "noise", text=many
+    )
     assert result.returncode == 2
     assert result.stderr == "rsbench: error: stdin:2: baseline must be a positive number of metres, got -1.0\n"
     found = answers(result)
     pairs = [(answer["name"], answer["solver"]) for answer in found]
-    assert pairs == [(name, solver) for name in ("p0", "p2", "few") for solver in ("rs-stereo", "gs-8pt")]
+    assert pairs == [(name, solver) for name in ("p0", "p2", "few") for solver in ("rs-stereo-refined", "gs-8pt")]
     assert [answer["success"] for answer in found] == [True] * 4 + [False] * 2
     assert all("noise_px" in answer and "covariance" not in answer for answer in found)
     # The same seed for each: neither the problems nor the solvers beside one change its answer.
@@ -95,14 +97,14 @@ def test_many_problems_and_two_solvers_give_one_line_each(tmp_path: Path) -> Non
 def test_a_problem_without_an_answer_is_exit_code_1(tmp_path: Path) -> None:
     sample = json.loads(EXAMPLE.read_text()) | NOTHING
     (tmp_path / "few.json").write_text(json.dumps(sample))
-    result = solve(tmp_path, EXAMPLE, "--solver", "rs-stereo", "--solver", "gs-8pt")
+    result = solve(tmp_path, EXAMPLE, "--solver", "rs-stereo-refined", "--solver", "gs-8pt")
     assert result.returncode == 1
-    rows = [line for line in result.stdout.splitlines() if "rs-stereo" in line or "gs-8pt" in line]
+    rows = [line for line in result.stdout.splitlines() if "rs-stereo-refined" in line or "gs-8pt" in line]
     assert ["/80" in row or "/60" in row for row in rows] == [False, False, True, True]
     quiet = run_here("--quiet", "solve", tmp_path, EXAMPLE)
     assert quiet.returncode == 1
     first, second = (line.split("\t") for line in quiet.stdout.splitlines())
-    assert first[1:4] == ["rs-stereo", "-", "-"] and second[3].endswith(" m") and second[5].endswith("/80")
+    assert first[1:4] == ["rs-stereo-refined", "-", "-"] and second[3].endswith(" m") and second[5].endswith("/80")
 
 
 @pytest.mark.parametrize(
@@ -178,4 +180,6 @@ def test_the_motion_model_is_chosen_and_said() -> None:
     assert answer["motion_model"] == choice["used"] == "twist" and choice["probability"]["linear"] > 0.2
     assert "model_choice" not in json.loads(run_here("solve", EXAMPLE, "--json").stdout)
     assert_refused(run_here("solve", EXAMPLE, "--motion-model", "twsit"), "did you mean 'twist'")
-    assert_refused(run_here("solve", EXAMPLE, "--motion-model", "auto", "--solver", "gs-8pt"), "take rs-stereo")
+    assert_refused(
+        run_here("solve", EXAMPLE, "--motion-model", "auto", "--solver", "gs-8pt"), "take rs-stereo-refined"
+    )

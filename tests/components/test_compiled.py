@@ -69,7 +69,7 @@ def test_where_nothing_can_be_written_functions_still_compile(tmp_path: Path) ->
     (tmp_path / "adds.py").write_text(textwrap.dedent(ADDS))
     code = f"""
         import sys; sys.path.insert(0, {str(tmp_path)!r})
-        from rsbench import compiled
+        from rsbench.components import compiled
         compiled._asked_for = compiled.user_cache = compiled.temporary = lambda: None
         import adds
         assert adds.quotient(3.0, 2.0) == 1.5
@@ -172,7 +172,7 @@ def test_a_warm_solver_compiles_nothing(name: str) -> None:
 
 def test_long_compiling_is_announced_in_one_line_and_once(tmp_path: Path) -> None:
     (tmp_path / "adds.py").write_text(textwrap.dedent(ADDS))
-    code = "from rsbench import compiled; compiled._WORTH_SAYING_S = 0.0" + USE.format(
+    code = "from rsbench.components import compiled; compiled._WORTH_SAYING_S = 0.0" + USE.format(
         folder=str(tmp_path)
     ).replace("\n    ", "\n")
     first, second = (child(code, NUMBA_CACHE_DIR=str(tmp_path / "cache")) for _ in range(2))

@@ -278,7 +278,7 @@ def test_the_documented_keys_are_those_of_the_answer() -> None:
     section = text[text.index("## An answer") : text.index("## The sample")]
     rows = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
     documented = [key for row in rows for key in re.findall(r"`(\w+)`", row)]
-    answer = answer_of(parse_problem(json.dumps(content()), "p.json"), "rs-stereo", extras=EXTRAS)
+    answer = answer_of(parse_problem(json.dumps(content()), "p.json"), "rs-stereo-refined", extras=EXTRAS)
     assert documented == list(answer)
 
 
@@ -290,7 +290,7 @@ def test_the_documented_program_makes_the_sample(capsys: pytest.CaptureFixture[s
 
 
 def test_the_sample_is_solved_near_its_truth() -> None:
-    answer = answer_of(read_problem(EXAMPLE), "rs-stereo", threshold_px=1.25)
+    answer = answer_of(read_problem(EXAMPLE), "rs-stereo-refined", threshold_px=1.25)
     # 0.2 px over 500 px of focal length, 70 points: a few times 1e-4 rad, 1 mm.
     np.testing.assert_allclose(answer["w"], [0.01, -0.02, 0.015], atol=5e-4)
     np.testing.assert_allclose(answer["d"], [0.08, -0.02, 0.12], atol=4e-3)
@@ -302,7 +302,7 @@ def test_left_right_matches_that_join_nothing_are_said() -> None:
     sets = {"left": tracks[:, [0, 1, 4, 5]], "stereo_0": tracks[:20, :4] + 1e-6, "stereo_1": tracks[10:, 4:]}
     changes = {name: rows.tolist() for name, rows in sets.items()}
     answer = answer_of(
-        parse_problem(json.dumps(content(right=None, tracks=None, **changes)), "p.json"), "rs-stereo"
+        parse_problem(json.dumps(content(right=None, tracks=None, **changes)), "p.json"), "rs-stereo-refined"
     )
     assert answer["stereo_alone"] == {"stereo_0": 10, "stereo_1": 10}
     assert answer["reason"].count("10 of 20 stereo_0 and 10 of 20 stereo_1 matches join no match over time") == 1
@@ -313,11 +313,11 @@ def test_extras_are_given_on_request() -> None:
     off = c.left + 0.0
     off[3] += [0, 0, 40, -40]
     problem = parse_problem(json.dumps(content(left=off.tolist(), stereo_0=c.tracks[:, :4].tolist())), "p.json")
-    answer = answer_of(problem, "rs-stereo", extras=EXTRAS)
+    answer = answer_of(problem, "rs-stereo-refined", extras=EXTRAS)
     assert answer["inlier_indices"]["left"] == [k for k in range(40) if k != 3]
     assert answer["inlier_indices"]["tracks"] == list(range(30))
     assert np.array(answer["covariance"]).shape == (6, 6) and answer["noise_px"] >= 0.0
-    assert "covariance" not in answer_of(problem, "rs-stereo", extras=["noise"])
+    assert "covariance" not in answer_of(problem, "rs-stereo-refined", extras=["noise"])
     assert answer_of(problem, "gs-8pt", extras=EXTRAS)["covariance"] is None
 
 
@@ -334,7 +334,7 @@ def test_seconds_hold_no_compilation() -> None:
     code = (
         "from rsbench.pipeline.answer import *; from rsbench.pipeline.problem import *\n"
         "from rsbench.solvers.engine.registry import load_solver_entry\n"
-        "problem, entry = read_problem(EXAMPLE), load_solver_entry('rs-stereo')\n"
+        "problem, entry = read_problem(EXAMPLE), load_solver_entry('rs-stereo-refined')\n"
         "with SolverRunner() as runner:\n"
         "    print([solve_problem(problem, entry, RobustOptions(), runner)['seconds'] for _ in range(5)])"
     )
@@ -355,9 +355,9 @@ def test_a_problem_may_have_a_lens_another_scan_and_a_late_camera() -> None:
     problem = parse_problem(json.dumps(data), "p.json")
     assert (problem.rig, problem.shutter) == (rig, shutter)
     with SolverRunner() as runner:
-        answer = solve_problem(problem, load_solver_entry("rs-stereo"), RobustOptions(), runner)
+        answer = solve_problem(problem, load_solver_entry("rs-stereo-refined"), RobustOptions(), runner)
         asked = solve_problem(
-            problem, load_solver_entry("rs-stereo"), RobustOptions(), runner, motion_model="auto"
+            problem, load_solver_entry("rs-stereo-refined"), RobustOptions(), runner, motion_model="auto"
         )
     # Exact matches: what is left is where the descent stops.
     np.testing.assert_allclose(answer["w"], MOTION.w, atol=1e-7)

@@ -57,7 +57,7 @@ def test_those_that_take_no_lens_are_few() -> None:
 
 def test_other_scans_and_delays_are_refused_by_name() -> None:
     takes = {name: load_solver(name).spec.refusal(RIG, LATE) for name in list_cards("solvers")}
-    assert not takes["rs-stereo"] and not takes["rs-stereo-linear"] and not takes["gs-8pt"]
+    assert not takes["rs-stereo-refined"] and not takes["rs-stereo-linear"] and not takes["gs-8pt"]
     assert takes["gs-stereo-tracks-scaled"] == (
         "it takes rows from the top that both cameras read at once, and no other scan or delay"
     )
@@ -89,6 +89,6 @@ def test_matches_where_a_lens_shows_nothing_are_named() -> None:
     with pytest.raises(ValueError, match=r"left\[5\] = \[10.0, 20.0, 3000.0, 40.0\]: the lens shows no ray"):
         without_lens(matches, rig.camera)
     found = estimate_motion(
-        matches, rig, SHUTTER, load_solver("rs-stereo"), RobustOptions(), np.random.default_rng(0)
+        matches, rig, SHUTTER, load_solver("rs-stereo-refined"), RobustOptions(), np.random.default_rng(0)
     )
     assert "left[5]" in found.estimate.reason and not found.estimate.success
