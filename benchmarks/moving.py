@@ -28,7 +28,7 @@ from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import Frame, render
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Scene
-from rsbench.scenes.moving_objects import Body, with_moving
+from rsbench.scenes.object_meshes import Body, with_moving
 
 BODIES = tuple(
     Body(box=(0.8, 0.8, 0.8), position=(x, 0.3, 4.0), attitude_deg=(0.0, 20.0 * number, 0.0), texture_seed=number)

@@ -23,7 +23,7 @@ from rsbench.dataset.imu import Imu
 from rsbench.dataset.layout import MOST_FRAMES, MOST_TWINS
 from rsbench.dataset.matches import Matching
 from rsbench.dataset.motion_card import MotionCard as MotionCard
-from rsbench.dataset.moving_objects import MovingCard, check_moving, drawn
+from rsbench.dataset.object_records import MovingCard, check_moving, drawn
 from rsbench.dataset.sequence import sequence_manifest
 from rsbench.dataset.trajectory import TrajectoryCard, parts_along
 from rsbench.dataset.views import GivenGeometry

@@ -30,7 +30,7 @@ from rsbench.dataset.channels import (
     radiance_file,
     surface_file,
 )
-from rsbench.dataset.moving_objects import numbers_of
+from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.views import Geometry, Shot
 from rsbench.renderers.render import Frame
 from rsbench.renderers.visibility import Surfaces

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rsbench.dataset.card import SequenceCard
 from rsbench.scenes.model import Scene
-from rsbench.scenes.moving_objects import with_moving
+from rsbench.scenes.object_meshes import with_moving
 
 if TYPE_CHECKING:
     from rsbench.renderers.scene import MitsubaScene

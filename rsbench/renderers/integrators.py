@@ -7,7 +7,7 @@ from functools import cache
 from typing import Any
 
 from rsbench.renderers.gloss import Coat, is_glossy
-from rsbench.renderers.moving_objects import Placed, first_surface, hidden, level
+from rsbench.renderers.object_tracing import Placed, first_surface, hidden, level
 from rsbench.renderers.scene import MitsubaScene
 
 

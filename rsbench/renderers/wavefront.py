@@ -18,7 +18,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.renderers.exposure import instant_of
 from rsbench.renderers.gloss import is_glossy
 from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
-from rsbench.renderers.moving_objects import depth_and_label, placed
+from rsbench.renderers.object_tracing import depth_and_label, placed
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.pixel_samples import facet_points, sky_ways, subpixel_grid
 from rsbench.renderers.ray_hits import Hits

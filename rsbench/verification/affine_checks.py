@@ -17,7 +17,7 @@ from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.tracks import Tracks, track_views
 from rsbench.dataset.views import Shot
 from rsbench.verification.findings import finding
-from rsbench.verification.reprojection import DepthMap
+from rsbench.verification.frame_comparison import DepthMap
 from rsbench.verification.surface_checks import FEW_BENT, LEVEL
 
 _UNIT = 1e-6

@@ -15,11 +15,11 @@ from rsbench.core.rig import FRAMES
 from rsbench.dataset.channel_truth import Rays, SeenSurfaces, carry, pair_truth, target_of
 from rsbench.dataset.channel_writer import pair_values
 from rsbench.dataset.channels import STEP_PX, Layer, PixelClass, pair_layers
-from rsbench.dataset.moving_objects import numbers_of
+from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import FAR, Shot
 from rsbench.verification.findings import finding, rows_of
-from rsbench.verification.reprojection import BoolArray, DepthMap, land
+from rsbench.verification.frame_comparison import BoolArray, DepthMap, land
 
 if TYPE_CHECKING:
     from rsbench.renderers.render import Frame

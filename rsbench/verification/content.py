@@ -20,10 +20,10 @@ from rsbench.storage.untrusted_files import inside
 from rsbench.verification import depth, image_checks
 from rsbench.verification.depth_causes import likely_cause
 from rsbench.verification.findings import DepthAgreement, finding, rows_of
+from rsbench.verification.frame_comparison import DepthMap, Shot, in_one_light, land
 from rsbench.verification.image_causes import Elsewhere as Elsewhere
 from rsbench.verification.image_causes import likeness_faults
 from rsbench.verification.png_header import png_fault
-from rsbench.verification.reprojection import DepthMap, Shot, in_one_light, land
 from rsbench.verification.thin_structures import roughly_alike
 
 Judge = Callable[[Shot], bool]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.verification.findings import DepthAgreement, finding
-from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, Landing, Shot
+from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Landing, Shot
 
 Bits = NDArray[np.uint8]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import near_shots
-from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, Shot, land
+from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Shot, land
 
 _TRIED_PIXELS = 20_000
 _PLAIN = 0.8

@@ -18,7 +18,7 @@ from rsbench.core.version import __version__
 from rsbench.dataset.views import Shot, pairs_of
 from rsbench.verification.content import Content, spare_pixels
 from rsbench.verification.findings import finding, rows_of
-from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, land
+from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, land
 from rsbench.verification.rerender import Again
 
 _OTHER, _FEW = 1e-3, 8

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rsbench.dataset.sequence import Sequence
 from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.frame_comparison import BoolArray, DepthMap, Shot, in_one_light, land
 from rsbench.verification.image_checks import (
     CHANGES,
     Likeness,
@@ -19,7 +20,6 @@ from rsbench.verification.image_checks import (
     noise_of,
     show,
 )
-from rsbench.verification.reprojection import BoolArray, DepthMap, Shot, in_one_light, land
 
 Elsewhere = Callable[[Shot], Iterable[tuple[str, NDArray[np.uint8]]]]
 """Names and images of other sequences that may have been exchanged with a shot's."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.verification.findings import finding
-from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, Landing, Shot
+from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Landing, Shot
 
 Colours = NDArray[np.float32]
 _BEYOND = 6.0

@@ -33,7 +33,7 @@ from rsbench.dataset.matches import MATCHED, LabelledMatches, MatchClass, Matchi
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import FAR, Shot
 from rsbench.verification.findings import finding
-from rsbench.verification.reprojection import DEPTH_TOLERANCE, DepthMap, relative_depth
+from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, DepthMap, relative_depth
 from rsbench.verification.track_checks import depths_around
 from rsbench.vision.feature_matcher import FEATURE_MATCHERS
 from rsbench.vision.features import SiftMatcher

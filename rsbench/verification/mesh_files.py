@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from rsbench.core.errors import RsbenchError
-from rsbench.dataset.moving_objects import MovingManifest
+from rsbench.dataset.object_records import MovingManifest
 from rsbench.dataset.scene_hashes import mesh_file_hash
 from rsbench.dataset.sequence import Sequence
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from rsbench.dataset.moving_objects import numbers_of
+from rsbench.dataset.object_records import numbers_of
 from rsbench.verification.content import Content, spare_pixels
 from rsbench.verification.findings import finding, rows_of
-from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, Shot, land
+from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Shot, land
 
 _LEAST = 8
 """So many labels may be wrong anywhere: at edges thinner than a pixel."""

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.frame_comparison import DepthMap
 from rsbench.verification.image_checks import CHANGES, Picture
-from rsbench.verification.reprojection import DepthMap
 
 SAME_DEPTH = 2e-6
 """Relative: rays in float32 on another processor; on the same one they have the same bits."""

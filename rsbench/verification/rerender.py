@@ -29,7 +29,7 @@ from rsbench.dataset.views import SHOTS, Shot, image_seed, shots_of
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene, read_scene_card
 from rsbench.scenes.model import Start
-from rsbench.scenes.moving_objects import with_moving
+from rsbench.scenes.object_meshes import with_moving
 from rsbench.verification.affine_checks import affine_again
 from rsbench.verification.channel_checks import channels_again
 from rsbench.verification.content import Content, clean_picture

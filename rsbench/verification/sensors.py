@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import back_project, project_at
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.moving_objects import SHADED, numbers_of
+from rsbench.dataset.object_records import SHADED, numbers_of
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import seen_from
 from rsbench.renderers.electrons import Sensor, expose, fall_off
@@ -20,10 +20,10 @@ from rsbench.renderers.image import linear_of_codes
 from rsbench.renderers.processing import compressed, processed, rows_needed, shares_of_noise
 from rsbench.storage.untrusted_files import inside
 from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.frame_comparison import FAR, BoolArray, DepthMap, Shot
 from rsbench.verification.image_checks import Picture
 from rsbench.verification.png_header import png_fault
 from rsbench.verification.processing_checks import processing_fault
-from rsbench.verification.reprojection import FAR, BoolArray, DepthMap, Shot
 
 _BEYOND_SIGMA, _BEYOND_SHARE, _ROW_SHARE = 5.0, 5e-3, 0.1
 """Of Gaussian noise 6e-7 are beyond, of Poisson numbers in the dark more; and a blur sees what lies between the

@@ -15,11 +15,11 @@ from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channel_truth import Rays, SeenSurfaces, surface_truth
 from rsbench.dataset.channels import INSTANCE_TABLE, surface_file
-from rsbench.dataset.moving_objects import numbers_of
+from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import Shot, points_of, seen_from, times_at
 from rsbench.verification.findings import finding, rows_of
-from rsbench.verification.reprojection import BoolArray, DepthMap, land
+from rsbench.verification.frame_comparison import BoolArray, DepthMap, land
 
 if TYPE_CHECKING:
     from rsbench.renderers.render import Frame

@@ -11,7 +11,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import Shot, Times
 from rsbench.verification.findings import finding
-from rsbench.verification.reprojection import DEPTH_TOLERANCE, DepthMap, land
+from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, DepthMap, land
 
 _TRIED_PIXELS = 20_000
 _AGREE, _LEAST = 0.8, 50

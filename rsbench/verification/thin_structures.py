@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.moving_objects import numbers_of
+from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.views import Geometry, Shot
-from rsbench.verification.reprojection import DepthMap, seen_with
+from rsbench.verification.frame_comparison import DepthMap, seen_with
 
 _NEAR = 5e-3
 """Relative difference of two depths that may be of one thin thing."""

@@ -17,7 +17,7 @@ from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.tracks import Tracks, look_for, points_at, track_views
 from rsbench.dataset.views import Shot
 from rsbench.verification.findings import finding
-from rsbench.verification.reprojection import BoolArray, DepthMap
+from rsbench.verification.frame_comparison import BoolArray, DepthMap
 
 _SAME, _SAME_PX = 1e-9, 1e-6
 """Relative distance of points, and px: roundings, and the 1e-9 px to which rows are solved over a small slope."""

@@ -12,7 +12,7 @@ from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import Shot
 from rsbench.verification.content import Content, clean_picture, read_shot, spare_pixels
 from rsbench.verification.findings import finding, rows_of
-from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, land
+from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, land
 
 _NEAR, _LEAST = 0.05, 100
 """Relative distance within which surfaces are one and the same, badly placed; beyond, one hides the other. And the

@@ -42,7 +42,7 @@ from rsbench.scenes.load import load_scene
 from rsbench.storage.files import read_grey_png, write_png
 from rsbench.verification import Rerender, verify_dataset
 from rsbench.verification.content import Comparison, read_content
-from rsbench.verification.reprojection import Shot
+from rsbench.verification.frame_comparison import Shot
 from rsbench.verification.rerender import Again
 
 Array = NDArray[np.float64]

@@ -26,7 +26,7 @@ from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.channels import PAIR_CHANNELS, PairChannel, PixelClass
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.moving_objects import NUMBER, SHADED, TAKEN, MovingCard
+from rsbench.dataset.object_records import NUMBER, SHADED, TAKEN, MovingCard
 from rsbench.dataset.posed_scenes import seen_scene
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.renderers.clearance import obstacle

@@ -26,8 +26,8 @@ from rsbench.renderers.processing import compressed
 from rsbench.storage.files import read_png, write_png
 from rsbench.verification import sensors, verify_dataset
 from rsbench.verification.content import read_content
+from rsbench.verification.frame_comparison import Shot
 from rsbench.verification.image_checks import Picture
-from rsbench.verification.reprojection import Shot
 from rsbench.verification.sensors import sensor_faults
 
 NOISY = Sensor(full_well=6000, gain=4, photon_noise=True, read_noise=2.5, bit_depth=10)

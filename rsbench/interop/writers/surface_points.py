@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rsbench.core.projection import ProjectionStatus, project_at, rs_project
 from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.moving_objects import numbers_of
+from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.sequence import Sequence
 from rsbench.interop.writers.image_poses import Images, View, first_pose, line_poses, views_in_time
 

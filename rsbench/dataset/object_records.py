@@ -16,7 +16,7 @@ from rsbench.components.motion_models import motion_record, read_motion
 from rsbench.core.moving_objects import MovingObject
 from rsbench.dataset.channels import CHANNELS, Channel
 from rsbench.dataset.motion_card import MotionCard
-from rsbench.scenes.moving_objects import MOST_MOVING, Body, MeshFile
+from rsbench.scenes.object_meshes import MOST_MOVING, Body, MeshFile
 
 TAKEN: tuple[Channel, ...] = ("disparity", "flow", "gs_flow", "timing", "normals", "instances", "imu", "hdr")
 """Channels that know of moving objects, or that these do not matter to."""

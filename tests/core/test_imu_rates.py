@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsbench.core import so3
-from rsbench.core.imu import STANDARD_GRAVITY, inertial
+from rsbench.core.imu_rates import STANDARD_GRAVITY, inertial
 from rsbench.core.motion import AcceleratedMotion, LinearMotion, Motion, TwistMotion
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray

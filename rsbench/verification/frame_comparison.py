@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.moving_objects import numbers_of
+from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import FAR, PAIRS, SHOTS, Geometry, Seen, Shot, points_of, seen_by, seen_from
 
