@@ -94,7 +94,7 @@ def test_the_import_brings_nothing_along() -> None:
     run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=60)
     brought = run.stdout.split()
     assert "rsbench" in brought
-    # Modules of the standard library may be there; numpy and our own parts but the version wait for their first use.
+    # The standard library may be there, and the version; numpy and our other parts wait for their first use.
     assert [name for name in brought if name.partition(".")[0] not in sys.stdlib_module_names] == [
         "rsbench",
         "rsbench.core",
