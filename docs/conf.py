@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import re
+import shutil
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from docutils import nodes
 
 import rsbench
 
@@ -55,7 +59,29 @@ def _name_aliases(
     return alias.sub(r"\1", signature or "") or None, alias.sub(r"\1", returns or "") or None
 
 
+_REPOSITORY = "https://github.com/rsbench/rsbench/"
+_BOARD = _REPOSITORY + "blob/main/results/leaderboard/site/"
+
+
+def _take_results_along(app: Sphinx, doctree: nodes.document) -> None:
+    """Documents name results by their address in the repository: they are also installed without it. The site has
+    copies of the pictures and of the leaderboard, and links to those."""
+    for image in doctree.findall(nodes.image):
+        image["uri"] = image["uri"].replace(f"{_REPOSITORY}raw/main/", "/../")
+    for link in doctree.findall(nodes.reference):
+        if link.get("refuri", "").startswith(_BOARD):
+            link["refuri"] = "leaderboard/" + link["refuri"].removeprefix(_BOARD)
+
+
+def _copy_leaderboard(app: Sphinx, exception: Exception | None) -> None:
+    site = Path(app.srcdir).parent / "results" / "leaderboard" / "site"
+    if exception is None and app.builder.format == "html" and site.is_dir():
+        shutil.copytree(site, Path(app.outdir) / "leaderboard", dirs_exist_ok=True)
+
+
 def setup(app: Sphinx) -> None:
+    app.connect("doctree-read", _take_results_along, priority=400)  # before images are collected
+    app.connect("build-finished", _copy_leaderboard)
     app.connect("autodoc-process-docstring", _keep_attribute, priority=400)
     app.connect("autodoc-process-docstring", _restore_attribute, priority=600)
     app.connect("autodoc-process-signature", _name_aliases)
