@@ -21,8 +21,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.inspection import conclude, inspect_window
-from rsbench.capture.scan_reading import Reading
+from rsbench.capture.estimate import conclude, examine
+from rsbench.capture.scans import Scans
 from rsbench.core.rig import SIDES, VIEWS, Side, StereoRig, View
 from rsbench.core.shutter import Scanning
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
@@ -61,25 +61,25 @@ Flip = Literal["", "upside down", "mirrored"]
 class Case(NamedTuple):
     """Frames whose reading is known."""
 
-    reading: Reading
+    scans: Scans
     images: Images
     rig: StereoRig
 
 
-DERIVED: dict[str, tuple[tuple[Reading, tuple[str, str], Flip], ...]] = {
+DERIVED: dict[str, tuple[tuple[Scans, tuple[str, str], Flip], ...]] = {
     "rows": (
-        (Reading("top", "top"), ("rs", "rs"), ""),
-        (Reading("bottom", "bottom"), ("rs", "rs"), "upside down"),
-        (Reading("global", "global"), ("gs", "gs"), ""),
-        (Reading("top", "global"), ("rs", "gs"), ""),
-        (Reading("global", "bottom"), ("gs", "rs"), "upside down"),
+        (Scans("top", "top"), ("rs", "rs"), ""),
+        (Scans("bottom", "bottom"), ("rs", "rs"), "upside down"),
+        (Scans("global", "global"), ("gs", "gs"), ""),
+        (Scans("top", "global"), ("rs", "gs"), ""),
+        (Scans("global", "bottom"), ("gs", "rs"), "upside down"),
     ),
     "columns": (
-        (Reading("left", "left"), ("rs", "rs"), ""),
-        (Reading("right", "right"), ("rs", "rs"), "mirrored"),
-        (Reading("global", "left"), ("gs", "rs"), ""),
+        (Scans("left", "left"), ("rs", "rs"), ""),
+        (Scans("right", "right"), ("rs", "rs"), "mirrored"),
+        (Scans("global", "left"), ("gs", "rs"), ""),
     ),
-    "opposite": ((Reading("top", "bottom"), ("rs", "rs"), ""),),
+    "opposite": ((Scans("top", "bottom"), ("rs", "rs"), ""),),
 }
 """Of each rendered sequence: the reading, which frames the left and the right camera show, how they are turned."""
 
@@ -100,7 +100,7 @@ def card(name: str, rotation: float, size: int, scenes: Sequence[str]) -> Datase
 
 def cases(sequence: Rendered, name: str) -> Iterator[Case]:
     rig, camera = sequence.rig, sequence.rig.camera
-    for reading, kinds, flip in DERIVED[name]:
+    for scans, kinds, flip in DERIVED[name]:
         shown = {
             (side, frame): sequence.image(kind, side, frame)  # pyrefly: ignore[bad-argument-type]
             for side, kind in zip(SIDES, kinds, strict=True)
@@ -116,7 +116,7 @@ def cases(sequence: Rendered, name: str) -> Iterator[Case]:
                 for (side, frame), image in shown.items()
             }
             other = replace(camera, cx=camera.width - 1 - camera.cx)
-        yield Case(reading, {view: shown[view] for view in VIEWS}, replace(rig, camera=other))
+        yield Case(scans, {view: shown[view] for view in VIEWS}, replace(rig, camera=other))
 
 
 def _other(side: Side) -> Side:
@@ -127,14 +127,14 @@ def row(name: str, case: Case, ratio: float) -> tuple[str, str, float]:
     """A line of the table; how the reading was named; the error of the ratio, NaN where that is not told."""
     options = CorrectionOptions()
     matches = find_matches_of_rig(case.images, case.rig, Scanning(scan="left"), options)
-    found = conclude([inspect_window(matches, case.rig)])
-    best, true = found.best, ratio if case.reading.rolls else 0.0
+    found = conclude([examine(matches, case.rig)])
+    best, true = found.likeliest, ratio if case.scans.rolls else 0.0
     error = abs(best.ratio - true) if found.told and best is not None else float("nan")
-    said = f"{best.reading.left}, {best.reading.right}" if best is not None and found.named else "cannot tell"
+    said = f"{best.scans.left}, {best.scans.right}" if best is not None and found.named else "cannot tell"
     value = "-" if best is None else f"{best.ratio:.3f} +- {best.sigma:.3f}{'' if found.told else ' (not told)'}"
-    right = best is not None and best.reading == case.reading
+    right = best is not None and best.scans == case.scans
     verdict = ("right" if right else "WRONG") if found.named else "cannot tell"
-    truth = f"{case.reading.left}, {case.reading.right}"
+    truth = f"{case.scans.left}, {case.scans.right}"
     cells = (name, truth, said, value, f"{found.used}/{found.matches}", f"{found.noise_px:.2f}", verdict)
     return f"| {' | '.join(cells)} |", verdict, error
 
@@ -161,7 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for case in cases(sequence, name):
                 line, verdict, error = row(sequence.name, case, sequence.shutter.readout_ratio)
                 verdicts.append(verdict)
-                errors += [error] if case.reading.rolls else []
+                errors += [error] if case.scans.rolls else []
                 sys.stdout.write(line + "\n")
                 sys.stdout.flush()
     told = np.array([error for error in errors if np.isfinite(error)])

@@ -12,7 +12,7 @@ from rsbench.cli.component_kinds import named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
-    from rsbench.capture.inspection import Inspection, Window
+    from rsbench.capture.estimate import Capture, Window
     from rsbench.core.rig import StereoRig
     from rsbench.core.shutter import RollingShutter
     from rsbench.pipeline.footage import FrameSource
@@ -74,7 +74,8 @@ def inspect(
     json: Annotated[bool, typer.Option("--json", help="One JSON object per line and rig.")] = False,
 ) -> None:
     """Tell which camera rolls, from which side of the image it reads, and how fast."""
-    from rsbench.capture.inspection import MODELS, conclude
+    from rsbench.capture.estimate import conclude
+    from rsbench.capture.hypotheses import MODELS
     from rsbench.solvers.engine.kernel_type import load_kernel
 
     options = _Options(tuple(motion_model or MODELS), windows, features, seed)
@@ -119,14 +120,15 @@ def _cases(
 def _of_problems(path: Path, options: _Options) -> Iterator[_Case | RsbenchError]:
     import sys
 
-    from rsbench.capture.inspection import inspect_window
+    from rsbench.capture.estimate import examine
+    from rsbench.capture.hypotheses import Known
     from rsbench.pipeline.problem import read_problems
 
     for problem in read_problems(str(path), sys.stdin):
         if isinstance(problem, RsbenchError):
             yield problem
             continue
-        window = inspect_window(problem.correspondences, problem.rig, models=options.models, seed=options.seed)
+        window = examine(problem.correspondences, problem.rig, Known(models=options.models), seed=options.seed)
         yield _Case(problem.name, iter([window]), problem.shutter)
 
 
@@ -180,7 +182,8 @@ def _frame_windows(left: FrameSource, right: FrameSource, rig: StereoRig, option
     """Of successive frames, evenly over the sequence."""
     from itertools import pairwise
 
-    from rsbench.capture.inspection import inspect_window
+    from rsbench.capture.estimate import examine
+    from rsbench.capture.hypotheses import Known
     from rsbench.core.shutter import Scanning
     from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import check_alike
@@ -202,17 +205,17 @@ def _frame_windows(left: FrameSource, right: FrameSource, rig: StereoRig, option
             }
             check_alike({f"{side} frame {number + frame}": image for (side, frame), image in images.items()})
             matches = find_matches_of_rig(images, rig, unknown, chain)  # pyrefly: ignore[bad-argument-type]
-            yield inspect_window(matches, rig, models=options.models, seed=options.seed)
+            yield examine(matches, rig, Known(models=options.models), seed=options.seed)
 
 
-def _record(case: _Case, found: Inspection) -> dict[str, Any]:
+def _record(case: _Case, found: Capture) -> dict[str, Any]:
     """What JSON says of one rig; what is not told is null."""
-    named, best = (found.best if known else None for known in (found.named, found.told))
+    named, best = (found.likeliest if known else None for known in (found.named, found.told))
     return {
         "name": case.name,
         "told": found.told,
-        "left": None if named is None else named.reading.left,
-        "right": None if named is None else named.reading.right,
+        "left": None if named is None else named.scans.left,
+        "right": None if named is None else named.scans.right,
         "readout_ratio": None if best is None else best.ratio,
         "readout_ratio_sigma": None if best is None else best.sigma,
         "right_delay": None if best is None else best.delay,
@@ -221,8 +224,8 @@ def _record(case: _Case, found: Inspection) -> dict[str, Any]:
         "reason": found.reason,
         "candidates": [
             {
-                "left": each.reading.left,
-                "right": each.reading.right,
+                "left": each.scans.left,
+                "right": each.scans.right,
                 "probability": each.probability,
                 "readout_ratio": each.ratio,
                 "readout_ratio_sigma": each.sigma,
@@ -240,12 +243,12 @@ def _record(case: _Case, found: Inspection) -> dict[str, Any]:
 
 
 def _said(shutter: RollingShutter | None) -> dict[str, Any] | None:
-    from rsbench.capture.scan_reading import reading_of
+    from rsbench.capture.scans import scans_of
 
     if shutter is None:
         return None
-    reading = reading_of(shutter)
-    return {"left": reading.left, "right": reading.right, "readout_ratio": shutter.readout_ratio}
+    scans = scans_of(shutter)
+    return {"left": scans.left, "right": scans.right, "readout_ratio": shutter.readout_ratio}
 
 
 def _print_json(answer: dict[str, Any]) -> None:

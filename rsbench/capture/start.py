@@ -1,4 +1,4 @@
-"""Where the comparison of readings starts: a motion, and by how much the cameras' times differ over the image.
+"""Where the comparison of scans starts: a motion, and by how much the cameras' times differ over the image.
 
 A point that moves by v_y rows per frame period lies dt v_y rows apart in two cameras that see it dt apart. So the
 row differences of left-right matches show, by least squares, how the times of the two cameras differ. With that
@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rsbench.capture.scan_reading import Reading, reading_line
+from rsbench.capture.hypotheses import Known
+from rsbench.capture.scans import Scans, line_of
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
@@ -31,6 +32,8 @@ _SAMPLES, _ROUNDS = 400, 6
 _NOISE_PX, _TIME_SIGMA = 0.5, 0.5
 """Expected noise of a row difference, and expected size of a difference of times, frame periods."""
 _LEAST_PX = 0.1
+_BEND, _FAR = 0.1, 40.0
+"""Error of a lag, frame periods, and squared deviations beyond which scans disagree with it."""
 
 
 class Lag(NamedTuple):
@@ -94,27 +97,59 @@ def with_lag_taken(matches: Correspondences, lag: Lag, rig: StereoRig) -> Corres
 
 
 def find_start(
-    matches: Correspondences, rig: StereoRig, solver: RefinedSolver, options: RobustOptions, seed: int
+    matches: Correspondences, rig: StereoRig, known: Known, options: RobustOptions, seed: int
 ) -> tuple[RobustEstimate | None, Lag]:
     """The motion that explains most matches, of those under ``COARSE``; None when there is none."""
     lag = find_lag(matches.tracks, rig)
     taken = with_lag_taken(matches, lag, rig)
     camera, found = rig.camera, list[RobustEstimate]()
-    for scan, ratio in COARSE:
+    for scan, ratio in _coarse(known):
         shutter = RollingShutter(height=camera.height, width=camera.width, readout_ratio=ratio, scan=scan)
         with np.errstate(invalid="ignore", over="ignore"):
-            result = estimate_motion(taken, rig, shutter, solver, options, np.random.default_rng(seed))
+            result = estimate_motion(taken, rig, shutter, RefinedSolver(), options, np.random.default_rng(seed))
         if result.estimate.success:
             found.append(result)
     best = max(found, key=lambda each: (each.inlier_count / each.threshold_px, each.inlier_count), default=None)
     return best, lag
 
 
-def first_shutter(reading: Reading, lag: Lag) -> FloatArray:
-    """Ratio and delay (2,) of a reading that fit a lag best; a ratio of 0.5 where the cameras read alike."""
-    if reading.together:
-        return np.array([0.5 if reading.rolls else 0.0, -lag.line[0]])
-    by_ratio = reading_line(reading, "left") - reading_line(reading, "right")
-    A = np.column_stack([by_ratio, [-1.0, 0.0, 0.0]])
+def _coarse(known: Known) -> list[tuple[Scan, float]]:
+    """Those of ``COARSE`` that are possible; where cameras read apart, all."""
+    starts = {scans.left for scans in known.scans}
+    possible = [(scan, ratio) for scan, ratio in COARSE if ("global" if ratio == 0.0 else scan) in starts]
+    if not all(scans.together for scans in known.scans) or not possible:
+        possible = list(COARSE)
+    known_ratio = known.ratio
+    return possible if known_ratio is None else [(s, known_ratio if r else 0.0) for s, r in possible]
+
+
+def first_shutter(scans: Scans, lag: Lag) -> FloatArray:
+    """Ratio and delay (2,) of a scans that fit a lag best; a ratio of 0.5 where the cameras read alike."""
+    if scans.together:
+        return np.array([0.5 if scans.rolls else 0.0, -lag.line[0]])
+    A = np.column_stack([_columns_of_lag(scans), [-1.0, 0.0, 0.0]])
     ratio, delay = np.linalg.solve(A.T @ lag.H @ A + 1e-9 * np.eye(2), A.T @ lag.H @ lag.line)
     return np.array([np.clip(ratio, 0.1, 1.0), np.clip(delay, -0.9, 0.9)])
+
+
+def largest_ratio(scans: Scans, lag: Lag) -> float:
+    """The largest readout ratio at which scans agree with a lag; 0: none does; 1: the cameras read alike.
+
+    A lag is of first order: flow that changes while it is read bends it by some hundredths.
+    """
+    if scans.together:
+        return 1.0
+    bend = _columns_of_lag(scans)
+    H = np.linalg.inv(np.linalg.inv(lag.H) + _BEND**2 * np.eye(3))
+    constant = np.array([1.0, 0.0, 0.0])
+    for ratio in np.arange(1.1, 0.0, -0.05):
+        off = lag.line - ratio * bend
+        off = off - constant * (constant @ H @ off) / H[0, 0]  # the delay that fits best
+        if float(off @ H @ off) <= _FAR:
+            return float(min(ratio, 1.0))
+    return 0.0
+
+
+def _columns_of_lag(scans: Scans) -> FloatArray:
+    """(3,) lag per readout ratio."""
+    return line_of(scans, "left") - line_of(scans, "right")

@@ -8,15 +8,16 @@ import scipy
 from commands import run_here
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-from rsbench.capture.inspection import Inspection, conclude, inspect_window
-from rsbench.capture.reading_evidence import Peak, _product
-from rsbench.capture.reading_fit import LEAST_RATIO
-from rsbench.capture.reading_start import find_lag, first_shutter
-from rsbench.capture.scan_reading import READINGS, Reading, TimedMatches, reading_line, reading_of
+from rsbench.capture.estimate import Capture, _product, conclude, examine
+from rsbench.capture.evidence import Peak
+from rsbench.capture.fit import CaptureFit
+from rsbench.capture.hypotheses import DELAY, LEAST_RATIO, Hypothesis, Known
+from rsbench.capture.scans import ALL_SCANS, Scans, TimedMatches, line_of, scans_of
+from rsbench.capture.start import find_lag, first_shutter
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.lens import Lens
-from rsbench.core.motion import LinearMotion
+from rsbench.core.motion import AcceleratedMotion, InertialMotion, LinearMotion, Motion, TwistMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.solvers.engine.packed import pack
@@ -40,17 +41,17 @@ def matches(
     return simulate(RIG, given, motion, options, np.random.default_rng(4)).correspondences
 
 
-def inspected(given: Correspondences) -> Inspection:
-    return conclude([inspect_window(given, RIG, models=("linear",))], max_sigma=0.03)
+def inspected(given: Correspondences) -> Capture:
+    return conclude([examine(given, RIG, Known(models=("linear",)))], max_sigma=0.03)
 
 
 @pytest.mark.parametrize(("scan", "right", "delay"), [("left", "left", 0.0), ("top", "right", 0.1)])
 def test_camera_direction_and_ratio_are_told(scan: Scan, right: Scan, delay: float) -> None:
     found = inspected(matches(shutter(scan, right, 0.7, delay)))
     assert found.told, found.reason
-    best = found.best
+    best = found.likeliest
     assert best is not None
-    assert best.reading == Reading(scan, right)
+    assert best.scans == Scans(scan, right)
     assert abs(best.ratio - 0.7) < 0.03  # what the command promises
     assert abs(best.ratio - 0.7) < 5.0 * best.sigma  # and what it says itself
     assert abs(best.delay - delay) < 5.0 * best.delay_sigma
@@ -59,9 +60,9 @@ def test_camera_direction_and_ratio_are_told(scan: Scan, right: Scan, delay: flo
 def test_a_global_shutter_is_told() -> None:
     found = inspected(matches(RollingShutter(height=480, readout_ratio=0.0)))
     assert found.told, found.reason
-    assert found.best is not None
-    assert found.best.reading == Reading("global", "global")
-    assert found.best.ratio == 0.0
+    assert found.likeliest is not None
+    assert found.likeliest.scans == Scans("global", "global")
+    assert found.likeliest.ratio == 0.0
 
 
 @pytest.mark.parametrize(
@@ -86,7 +87,7 @@ def test_what_moves_along_its_rows_does_not_show_their_readout() -> None:
     sideways = LinearMotion(w=[0.0, 0.0, 0.0], d=[0.25, 0.0, 0.0])
     found = inspected(matches(shutter("top", "top", 0.8), sideways, noise=0.2, tracks=40))
     assert not found.told
-    assert {(each.reading.left, each.reading.right) for each in found.candidates} >= {
+    assert {(each.scans.left, each.scans.right) for each in found.candidates} >= {
         ("global", "global"),
         ("top", "top"),
         ("bottom", "bottom"),
@@ -107,63 +108,111 @@ def test_times_are_those_of_the_shutter(lens: Lens | None, scan: Scan, right: Sc
     )
     expected = pack(given, rig, known)
     timed = TimedMatches(given, rig)
-    found = timed.packed(reading_of(known), 0.6, 0.05)
+    found = timed.packed(scans_of(known), np.array([0.6, 0.05, 0.0, 0.0]))
     np.testing.assert_allclose(found.pairs, expected.pairs, atol=1e-12)
     np.testing.assert_allclose(found.tracks, expected.tracks, atol=1e-12)
     some = np.arange(timed.count) % 2 == 0
-    halved = timed.subset(some).packed(reading_of(known), 0.6, 0.05)
+    halved = timed.subset(some).packed(scans_of(known), np.array([0.6, 0.05, 0.0, 0.0]))
     np.testing.assert_array_equal(halved.tracks, found.only(some).tracks)
     np.testing.assert_array_equal(halved.pairs, found.only(some).pairs)
 
 
 def test_a_global_camera_reads_everything_at_once() -> None:
     given = Correspondences(tracks=np.random.default_rng(1).uniform(100, 380, (6, 8)))
-    tracks = TimedMatches(given, RIG).packed(Reading("global", "top"), 0.6, 0.0).tracks
+    tracks = TimedMatches(given, RIG).packed(Scans("global", "top"), np.array([0.6, 0.0, 0.0, 0.0])).tracks
     np.testing.assert_array_equal(tracks[:, [0, 2], 2], np.tile([0.0, 1.0], (6, 1)))
     np.testing.assert_allclose(tracks[:, 1, 2], 0.6 * given.tracks[:, 3] / 480)
     assert not np.any(tracks[:, [0, 2], 7:9])
 
 
-@pytest.mark.parametrize("reading", [Reading("top", "bottom"), Reading("left", "right"), Reading("right", "top")])
-def test_row_differences_show_how_times_differ(reading: Reading) -> None:
+@pytest.mark.parametrize("scans", [Scans("top", "bottom"), Scans("left", "right"), Scans("right", "top")])
+def test_row_differences_show_how_times_differ(scans: Scans) -> None:
     """To 0.1: that the flow itself changes while it is read is left out, a few hundredths of it at 2 deg."""
-    assert reading.left != "global" and reading.right != "global"
-    scan, right = reading.left, reading.right
+    assert scans.left != "global" and scans.right != "global"
+    scan, right = scans.left, scans.right
     tracks = matches(shutter(scan, right, 0.7), noise=0.0).tracks
     lag = find_lag(tracks, RIG)
-    expected = 0.7 * (reading_line(reading, "left") - reading_line(reading, "right"))
+    expected = 0.7 * (line_of(scans, "left") - line_of(scans, "right"))
     np.testing.assert_allclose(lag.line, expected, atol=0.1)
-    np.testing.assert_allclose(first_shutter(reading, lag), [0.7, 0.0], atol=0.1)
+    np.testing.assert_allclose(first_shutter(scans, lag), [0.7, 0.0], atol=0.1)
+
+
+def _peak(value: float, at: float, information: float, delay: float = 0.0, delay_sigma: float = 1.0) -> Peak:
+    fit = CaptureFit(
+        hypothesis=Hypothesis(scans=Scans("top", "top"), motion_model="linear", delayed=True),
+        theta=np.zeros(6),
+        unknowns=np.array([at, delay, 0.0, 0.0]),
+        cost=0.0,
+        sigma=np.array([0.0, delay_sigma, 0.0, 0.0]),
+        occam=0.0,
+    )
+    return Peak(value=value, at=at, information=information, fit=fit, trade=np.zeros(10))
 
 
 @pytest.mark.parametrize(("at", "sigma"), [(0.5, 0.02), (0.03, 0.05), (1.3, 0.1), (-0.4, 0.3)])
 def test_evidence_is_the_integral_over_ratios(at: float, sigma: float) -> None:
     """Against quadrature of the same normal function."""
-    peak = Peak(value=3.0, at=at, information=sigma**-2.0, delay=0.0, delay_sigma=1.0)
     total, _ = scipy.integrate.quad(
         lambda ratio: np.exp(-0.5 * ((ratio - at) / sigma) ** 2),
         LEAST_RATIO,
         1.0,
         points=[min(max(at, 0.06), 0.99)],
     )
-    assert np.isclose(peak.log_evidence, 3.0 + np.log(total / (1.0 - LEAST_RATIO)), rtol=1e-6)
+    expected = 3.0 + np.log(total / (1.0 - LEAST_RATIO))
+    assert np.isclose(_peak(3.0, at, sigma**-2.0).log_evidence, expected, rtol=1e-6)
 
 
 def test_windows_are_multiplied() -> None:
-    """Two normal functions; their product at any ratio is that of the values, when they agree."""
-    peaks = [
-        Peak(value=1.0, at=0.50, information=400.0, delay=0.0, delay_sigma=0.1),
-        Peak(value=2.0, at=0.52, information=100.0, delay=0.2, delay_sigma=0.2),
-    ]
-    found = _product(peaks)
-    ratio = 0.6
-    expected = sum(peak.value - 0.5 * peak.information * (ratio - peak.at) ** 2 for peak in peaks)
-    assert np.isclose(found.value - 0.5 * found.information * (ratio - found.at) ** 2, expected)
-    assert np.isclose(found.delay, 0.04)  # weights 4 to 1
+    """Two normal functions: the evidence is the integral of their product over the ratios."""
+    peaks = [_peak(1.0, 0.50, 400.0, 0.0, 0.1), _peak(2.0, 0.52, 100.0, 0.2, 0.2)]
+    found = _product(peaks, 0.0)
+    total, _ = scipy.integrate.quad(
+        lambda ratio: np.exp(sum(p.value - 0.5 * p.information * (ratio - p.at) ** 2 for p in peaks)),
+        LEAST_RATIO,
+        1.0,
+        points=[0.5],
+    )
+    assert np.isclose(found.log_evidence, np.log(total / (1.0 - LEAST_RATIO)), rtol=1e-6)
+    assert np.isclose(found.mean[DELAY], 0.04)  # weights 4 to 1
+
+
+MOTIONS: dict[str, Motion] = {
+    "linear": LinearMotion(w=np.radians([1.0, -2.5, 1.2]), d=[0.2, -0.12, 0.18]),
+    "twist": TwistMotion(w=np.radians([1.0, -2.5, 1.2]), d=[0.2, -0.12, 0.18]),
+    "inertial": InertialMotion(w=np.radians([1.0, -2.5, 1.2]), d=[0.2, -0.12, 0.18]),
+    "accelerated": AcceleratedMotion(w=np.radians([1.0, -2.5, 1.2]), d=[0.2, -0.12, 0.18], acceleration=0.3),
+}
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_ratio_and_motion_model_are_found_together(name: str) -> None:
+    """Under a wrong model the ratio is off by many deviations: each motion is of one that the others are not."""
+    options = SimulationOptions(tracks=150, noise_px=0.1, outlier_ratio=0.2)
+    given = simulate(RIG, shutter("top", "top", 0.8), MOTIONS[name], options, np.random.default_rng(2))
+    alike = Known(scans=tuple(each for each in ALL_SCANS if each.together))
+    found = conclude([examine(given.correspondences, RIG, alike)], max_sigma=0.05)
+    best = found.likeliest
+    assert best is not None and found.told, found.reason
+    assert best.scans == Scans("top", "top")
+    assert abs(best.ratio - 0.8) < 4.0 * best.sigma
+    assert found.motion_model == name
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_what_is_known_is_not_looked_for(name: str) -> None:
+    """With ratio and scans known, the motion model is found alone."""
+    options = SimulationOptions(tracks=150, noise_px=0.1, outlier_ratio=0.2)
+    given = simulate(RIG, shutter("top", "top", 0.8), MOTIONS[name], options, np.random.default_rng(5))
+    known = Known(ratio=0.8, scans=(Scans("top", "top"),), delay=0.0)
+    found = conclude([examine(given.correspondences, RIG, known)])
+    best = found.likeliest
+    assert best is not None
+    np.testing.assert_allclose([best.ratio, best.sigma, best.delay], [0.8, 0.0, 0.0], atol=1e-12)
+    assert found.motion_model == name
 
 
 def test_all_readings_are_there_once() -> None:
-    assert len(set(READINGS)) == 25
+    assert len(set(ALL_SCANS)) == 25
 
 
 def test_the_command_answers_by_its_exit_code() -> None:

@@ -13,6 +13,7 @@ from rsbench.core.correspondences import BoolArray, Correspondences, unlinked_pa
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.motion_kernels import AcceleratedKernel
 from rsbench.solvers.engine.packed import Packed, pack
 
 Start = Literal["global", "top", "bottom", "left", "right"]
@@ -24,7 +25,7 @@ _ENDS: dict[Side, tuple[int, int]] = {"left": (0, 2), "right": (1, 3)}
 
 
 @dataclass(frozen=True, order=True)
-class Reading:
+class Scans:
     """Where each camera begins to read; those that roll share one readout ratio."""
 
     left: Start
@@ -53,19 +54,19 @@ class Reading:
         return f"left camera {words['left']}, right camera {words['right']}"
 
 
-GLOBAL = Reading("global", "global")
-READINGS = tuple(Reading(*starts) for starts in product(STARTS, STARTS))
+GLOBAL = Scans("global", "global")
+ALL_SCANS = tuple(Scans(*starts) for starts in product(STARTS, STARTS))
 """All 25."""
 
 
-def reading_of(shutter: RollingShutter) -> Reading:
-    """The reading of a known shutter."""
+def scans_of(shutter: RollingShutter) -> Scans:
+    """The scans of a known shutter."""
     if shutter.readout_ratio == 0.0:
         return GLOBAL
-    return Reading(shutter.scan_of("left"), shutter.scan_of("right"))
+    return Scans(shutter.scan_of("left"), shutter.scan_of("right"))
 
 
-def reading_line(reading: Reading, side: Side) -> FloatArray:
+def line_of(scans: Scans, side: Side) -> FloatArray:
     """Time (3,) of one camera's pixels per readout ratio: constant, per image width, per image height."""
     return np.array(
         {
@@ -74,7 +75,7 @@ def reading_line(reading: Reading, side: Side) -> FloatArray:
             "bottom": (1.0, 0.0, -1.0),
             "left": (0.0, 1.0, 0.0),
             "right": (1.0, -1.0, 0.0),
-        }[reading.start(side)]
+        }[scans.start(side)]
     )
 
 
@@ -93,9 +94,9 @@ class _Lines:
 
 
 class TimedMatches:
-    """Matches whose ends can be given the times of any reading.
+    """Matches whose ends can be given the times of any scans.
 
-    Every end has a time of its own here (``timed_tracks``), whatever the reading, so that all readings are judged
+    Every end has a time of its own here (``timed_tracks``), whatever the scans, so that all scans are judged
     by the same errors.
     """
 
@@ -148,18 +149,33 @@ class TimedMatches:
         }
         return other
 
-    def packed(self, reading: Reading, ratio: float, delay: float) -> Packed:
-        """The measurements as this reading times them, the right camera late by ``delay`` frame periods."""
+    def packed(self, scans: Scans, unknowns: FloatArray) -> Packed:
+        """The measurements as these scans time them.
+
+        Args:
+            scans: where each camera begins to read.
+            unknowns: (4,) readout ratio; frame periods by which the right camera is late; px by which disparities
+                are too large; the motion's acceleration, 0 of a model without one.
+        """
+        ratio, delay, offset, acceleration = map(float, unknowns)
         pairs, tracks = self._base.pairs.copy(), self._base.tracks.copy()
         for side in SIDES:
-            lines, late = self._lines[reading.start(side)], delay if side == "right" else 0.0
+            lines, late = self._lines[scans.start(side)], delay if side == "right" else 0.0
             mine = self.left if side == "left" else ~self.left
             pairs[mine, 4:6] = _FRAMES + late + ratio * lines.pairs[mine]
             pairs[mine, 15:17] = ratio * lines.slopes[mine]
             ends = list(_ENDS[side])
             tracks[:, ends, 2] = _FRAMES + late + ratio * lines.tracks[:, ends]
             tracks[:, ends, 7:9] = ratio * lines.track_slopes[:, ends]
-        return replace(self._base, pairs=pairs, tracks=tracks, h=0.0)
+            if offset:  # half of it is the left camera's, half the right one's
+                shift = (0.5 if side == "left" else -0.5) * offset / self._base.focal[0]
+                pairs[mine, 0] -= shift
+                pairs[mine, 2] -= shift
+                tracks[:, ends, 0] -= shift
+        kernel = self._base.kernel
+        if isinstance(kernel, AcceleratedKernel):
+            kernel = AcceleratedKernel(acceleration=acceleration)
+        return replace(self._base, pairs=pairs, tracks=tracks, h=0.0, kernel=kernel)
 
 
 def _late(rig: StereoRig, scan: Scan) -> RollingShutter:

@@ -1,0 +1,334 @@
+"""Hypotheses compared on the matches of one window: what each leaves of the errors, and how sharply."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from rsbench.capture.fit import BEYOND_RATIO, CaptureCost, CaptureFit, Likelihood, fit_capture
+from rsbench.capture.hypotheses import ACCELERATION, DELAY, LEAST_RATIO, OFFSET, RATIO, Hypothesis, Known
+from rsbench.capture.scans import GLOBAL, Scans, TimedMatches
+from rsbench.capture.start import Lag, first_shutter, largest_ratio
+from rsbench.core.correspondences import BoolArray, Correspondences
+from rsbench.core.rig import StereoRig
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.heavy_tails import heavy_tailed
+from rsbench.solvers.engine.per_measurement import each_term
+
+_SCREENED = 160
+"""Measurements by which most scans are put aside."""
+_CLOSE = 30.0
+"""Differences of the logarithm of the likelihood beyond which a hypothesis is put aside after that."""
+_MOST_SCALE, _FIRST_NU = 10.0, 4.0
+"""Scale of the errors, px, at most, and their tails, before their distribution is found."""
+_FALLS, _STEADY = 10, 0.9
+_UNSETTLED = 5.0
+"""Times as far off as that a hypothesis may be before it is fitted at the scale of the best one."""
+_ROUGHLY = 1e-2
+"""Of the squared scale: a decrease of the cost at which the screening stops."""
+_REACH = 10.0
+"""As in ``heavy_tails``."""
+_TILES = (6, 4)
+"""Columns and rows of tiles in which matches may err together."""
+_FIRST_REACH, _MOST_REACH, _LEAST_REACH = 0.02, 0.05, 0.001
+"""Differences of the ratio by which the sharpness of a maximum is measured: about two deviations."""
+_ROUNDS = 5
+_SMALL_RATIO, _FAR_BETTER = 0.3, 0.5
+"""Readout ratio that is nearly none, and errors over those of another fit that are far smaller."""
+_WIDE = 1.0
+"""Standard deviation of a ratio of which the matches say nothing."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Peak:
+    """Log-likelihood of a ratio, all else fitted: value - information (ratio - at)^2 / 2."""
+
+    value: float
+    at: float
+    """Where the parabola has its top, which may lie outside of what is possible."""
+    information: float
+    """0 of a ratio that is known, as of global shutters."""
+    fit: CaptureFit
+    """At the best ratio; its deviations are those at that ratio."""
+    trade: FloatArray
+    """(10,) derivative of motion and unknowns by the ratio, all else fitted; zeros where the ratio is known."""
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the ratio."""
+        return float(self.information**-0.5) if self.information > 0.0 else 0.0
+
+    @property
+    def log_evidence(self) -> float:
+        """Integral over ratios from ``LEAST_RATIO`` to 1, uniform before; the value where the ratio is known."""
+        if self.information == 0.0:
+            return self.value
+        ends = (np.array([LEAST_RATIO, 1.0]) - self.at) / self.sigma
+        if ends[0] > 0.0:  # so that neither logarithm is that of nearly 1
+            ends = -ends[::-1]
+        low, high = scipy.special.log_ndtr(ends)
+        mass = high + np.log1p(-np.exp(min(low - high, -1e-12)))
+        return self.value + float(
+            0.5 * np.log(2.0 * np.pi) + np.log(self.sigma) + mass - np.log(1.0 - LEAST_RATIO)
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WindowEvidence:
+    """What the matches of two times say of the hypotheses; those that are not here are out of the question."""
+
+    peaks: Mapping[Hypothesis, Peak]
+    lost: float
+    """Log-likelihood, below the best one's, of those."""
+    used: int
+    """Measurements that count: not so far off that they must be wrong."""
+    of: int
+    noise_px: float
+    dispersion: float
+    """Factor on all variances, for matches of one part of the image that err together."""
+
+
+def window_evidence(
+    matches: Correspondences,
+    rig: StereoRig,
+    known: Known,
+    motion: tuple[FloatArray, FloatArray],
+    lag: Lag,
+) -> WindowEvidence | None:
+    """All hypotheses, on matches with outliers, from a motion near the right one.
+
+    Most scans are put aside by some of the matches, under the first motion model. None for too few matches.
+    """
+    timed = {model: TimedMatches(matches, rig, model) for model in known.models}
+    first = timed[known.models[0]]
+    screened = _screened(timed, known, motion, lag)
+    if screened is None:
+        return None
+    fits, likelihood = screened
+    best = min(fits, key=lambda fit: fit.cost)
+    everything = np.ones(first.count, dtype=np.bool_)
+    full = _distribution(timed[best.hypothesis.motion_model], everything, best, likelihood.scale)
+    if full is None:
+        return None
+    near = _near(_fitted(timed, known, full, fits, known.delays), full.scale)
+    slopes = [_Slope(_cost(timed, full, known, fit.hypothesis), fit) for fit in near]
+    sharp = min(slopes, key=lambda slope: slope.best.cost)
+    dispersion = _dispersion(sharp, first.pixels[full.chosen]) if sharp.varies else 1.0
+    reference, unit = sharp.best.cost, full.scale**2 * dispersion
+    return WindowEvidence(
+        peaks={slope.best.hypothesis: slope.peak(reference, unit) for slope in slopes},
+        lost=_CLOSE,
+        used=int(np.count_nonzero(full.chosen)),
+        of=first.count,
+        noise_px=full.scale,
+        dispersion=dispersion,
+    )
+
+
+def _screened(
+    timed: Mapping[str, TimedMatches], known: Known, motion: tuple[FloatArray, FloatArray], lag: Lag
+) -> tuple[list[CaptureFit], Likelihood] | None:
+    """What some of the matches allow, and the distribution of their errors: first scans, then motion models."""
+    first = timed[known.models[0]]
+    some = np.arange(first.count) % max(first.count // _SCREENED, 1) == 0
+    theta = first.packed(GLOBAL, np.zeros(4)).theta(*motion)
+    found = dict[Scans, tuple[CaptureFit, float]]()
+    for scans in sorted(known.scans, key=lambda each: (each != GLOBAL, not each.together)):
+        if _is_excluded(scans, lag, found):
+            continue
+        hypothesis = Hypothesis(scans=scans, motion_model=known.models[0], delayed=known.delays[-1])
+        starts = [(theta, known.start(hypothesis, *first_shutter(scans, lag)))]
+        if GLOBAL in found:  # which any scans with a small ratio nearly are
+            still = found[GLOBAL][0]
+            starts.append((still.theta, known.start(hypothesis, LEAST_RATIO, float(still.unknowns[DELAY]))))
+        fits = (_settled(first, some, hypothesis, known, start) for start in starts)
+        found[scans] = min(fits, key=lambda each: each[1])
+    scale = min(each for _, each in found.values())
+    best = min((fit for fit, each in found.values() if each == scale), key=lambda fit: fit.cost)
+    likelihood = _distribution(first, some, best, scale)
+    if likelihood is None:
+        return None
+    judged = [_judged(timed, likelihood, known, fit) for fit, _ in found.values()]
+    near = _near(judged, likelihood.scale, _UNSETTLED * _CLOSE)
+    models = _fitted(timed, known, likelihood, near, known.delays[-1:])
+    best = min(models, key=lambda fit: fit.cost)
+    sharper = _distribution(timed[best.hypothesis.motion_model], some, best, likelihood.scale) or likelihood
+    judged = [_judged(timed, sharper, known, fit) for fit in models]
+    return _near(judged, sharper.scale, _UNSETTLED * _CLOSE), sharper
+
+
+def _is_excluded(scans: Scans, lag: Lag, found: Mapping[Scans, tuple[CaptureFit, float]]) -> bool:
+    """Whether the rows of left-right matches exclude scans, at all or but for ratios that are nearly none.
+
+    Those are excluded with the global shutter, where cameras that read alike fit far better.
+    """
+    most = largest_ratio(scans, lag)
+    if most <= 0.0 or most > _SMALL_RATIO or GLOBAL not in found:
+        return most <= 0.0
+    return min(each for _, each in found.values()) < _FAR_BETTER * found[GLOBAL][1]
+
+
+def _settled(
+    timed: TimedMatches,
+    some: BoolArray,
+    hypothesis: Hypothesis,
+    known: Known,
+    start: tuple[FloatArray, FloatArray],
+) -> tuple[CaptureFit, float]:
+    """A hypothesis at the scale of its own errors, which falls as it is fitted better; and that scale, px.
+
+    At a scale far below the errors that a wrong ratio leaves, matches would count the less the more they tell.
+    """
+    prior = known.prior(hypothesis)
+    cost = CaptureCost(timed, hypothesis, Likelihood(nu=_FIRST_NU, scale=_MOST_SCALE, chosen=some), prior)
+    scale = min(cost.typical_error(*start), _MOST_SCALE)
+    fit = None
+    for _ in range(_FALLS):
+        cost = CaptureCost(timed, hypothesis, Likelihood(nu=_FIRST_NU, scale=scale, chosen=some), prior)
+        fit = fit_capture(cost, *start, iterations=6, still=_ROUGHLY)
+        start = (fit.theta, fit.unknowns)
+        last, scale = scale, min(scale, cost.typical_error(*start))
+        if scale > _STEADY * last:
+            break
+    assert fit is not None
+    return fit, scale
+
+
+def _cost(
+    timed: Mapping[str, TimedMatches], likelihood: Likelihood, known: Known, hypothesis: Hypothesis
+) -> CaptureCost:
+    return CaptureCost(timed[hypothesis.motion_model], hypothesis, likelihood, known.prior(hypothesis))
+
+
+def _judged(
+    timed: Mapping[str, TimedMatches], likelihood: Likelihood, known: Known, fit: CaptureFit
+) -> CaptureFit:
+    """A fit with its cost under a common distribution of the errors."""
+    return replace(fit, cost=_cost(timed, likelihood, known, fit.hypothesis)(fit.theta, fit.unknowns))
+
+
+def _near(fits: Sequence[CaptureFit], scale: float, far: float = _CLOSE) -> list[CaptureFit]:
+    """Those whose log-likelihood is not far below the best one's."""
+    least = min(fit.cost for fit in fits)
+    return [fit for fit in fits if fit.cost - least <= far * scale**2]
+
+
+def _fitted(
+    timed: Mapping[str, TimedMatches],
+    known: Known,
+    likelihood: Likelihood,
+    fits: Sequence[CaptureFit],
+    delays: Sequence[bool],
+) -> list[CaptureFit]:
+    """Every motion model, with and without a late right camera, on the scans of fits, from the nearest of them."""
+    out = []
+    pairs = dict.fromkeys((fit.hypothesis.scans, fit.hypothesis.motion_model) for fit in fits)
+    if len(dict.fromkeys(model for _, model in pairs)) == 1:
+        pairs = dict.fromkeys(product(dict.fromkeys(scans for scans, _ in pairs), known.models))
+    for (scans, model), delayed in product(pairs, delays):
+        hypothesis = Hypothesis(scans=scans, motion_model=model, delayed=delayed)
+        of_scans = [fit for fit in fits if fit.hypothesis.scans == scans]
+        start = min(of_scans, key=lambda fit: (fit.hypothesis.motion_model != model, fit.cost))
+        unknowns = known.start(hypothesis, *start.unknowns[[RATIO, DELAY]])
+        unknowns[OFFSET] = start.unknowns[OFFSET]
+        unknowns[ACCELERATION] = start.unknowns[ACCELERATION] if model == start.hypothesis.motion_model else 0.0
+        motion = timed[start.hypothesis.motion_model].packed(scans, start.unknowns).motion(start.theta)
+        theta = timed[model].packed(scans, unknowns).theta(*motion)
+        cost = _cost(timed, likelihood, known, hypothesis)
+        out.append(fit_capture(cost, theta, unknowns, iterations=8, still=_ROUGHLY))
+    return out
+
+
+def _distribution(timed: TimedMatches, among: BoolArray, fit: CaptureFit, scale: float) -> Likelihood | None:
+    """Of the errors under one fit, of the chosen matches that are not wrong."""
+    packed = timed.subset(among).packed(fit.hypothesis.scans, fit.unknowns)
+    found = heavy_tailed(packed, fit.theta, scale)
+    if found is None:
+        return None
+    freedom = np.repeat([1.0, 5.0], [len(packed.pairs), len(packed.tracks)])
+    chosen = among.copy()
+    chosen[among] = each_term(packed, fit.theta).squares / freedom <= (_REACH * found.scale) ** 2
+    return Likelihood(nu=found.nu, scale=found.scale, chosen=chosen, trust=found.trust)
+
+
+class _Slope:
+    """The cost of a hypothesis about its minimum, as a function of the ratio, all else fitted to each."""
+
+    def __init__(self, cost: CaptureCost, start: CaptureFit) -> None:
+        self._cost, self.scale = cost, cost.likelihood.scale
+        self.varies = RATIO in cost.free
+        free = fit_capture(cost, start.theta, start.unknowns)
+        # Once more as those beside it are found, or a start that is less settled than they looks like a valley.
+        self.best = fit_capture(cost, free.theta, free.unknowns, hold_ratio=True)
+        self.least, self.at, self.curvature = self.best.cost, float(self.best.unknowns[RATIO]), 0.0
+        self._beside: tuple[CaptureFit, CaptureFit] = (self.best, self.best)
+        reach = _FIRST_REACH
+        for _ in range(_ROUNDS if self.varies else 0):
+            self._measure(reach)
+            sigma = cost.likelihood.scale / np.sqrt(max(self.curvature, 1e-12))
+            away = float(np.clip(self.at, LEAST_RATIO, BEYOND_RATIO)) - self.best.unknowns[RATIO]
+            fits = 0.5 * reach <= 2.0 * sigma <= 2.0 * reach or reach in (_LEAST_REACH, _MOST_REACH)
+            if fits and abs(away) <= reach:
+                break
+            if abs(away) > reach:
+                self.best = self._held(self.best.unknowns[RATIO] + away)
+            reach = float(np.clip(2.0 * sigma, _LEAST_REACH, _MOST_REACH))
+
+    def _measure(self, reach: float) -> None:
+        """Top and curvature of the parabola through three ratios, the best one and one on either side of it."""
+        ratio = float(self.best.unknowns[RATIO])
+        below, above = self._beside = (self._held(ratio - reach), self._held(ratio + reach))
+        slope = (above.cost - below.cost) / (2.0 * reach)
+        curvature = (above.cost - 2.0 * self.best.cost + below.cost) / reach**2
+        self.curvature = max(float(curvature), 1e-9)
+        away = float(np.clip(-slope / self.curvature, -_WIDE, _WIDE)) if curvature > 0.0 else 0.0
+        self.at = ratio + away
+        self.least = self.best.cost - 0.5 * self.curvature * away**2
+
+    def _held(self, ratio: float) -> CaptureFit:
+        unknowns = self.best.unknowns.copy()
+        unknowns[RATIO] = ratio
+        return fit_capture(self._cost, self.best.theta, unknowns, hold_ratio=True)
+
+    def peak(self, reference: float, unit: float) -> Peak:
+        """In units of the errors' variance, px^2."""
+        spread = float(np.sqrt(unit)) / self.scale
+        others = sum(k != RATIO for k in self._cost.free)
+        low, high = (np.concatenate([fit.theta, fit.unknowns]) for fit in self._beside)
+        apart = float(high[6 + RATIO] - low[6 + RATIO])
+        return Peak(
+            value=(reference - self.least) / unit + self.best.occam + others * float(np.log(spread)),
+            at=self.at,
+            information=self.curvature / unit + 1.0 / _WIDE**2 if self.varies else 0.0,
+            fit=replace(self.best, sigma=self.best.sigma * spread),
+            trade=(high - low) / apart if apart > 0.0 else np.zeros(10),
+        )
+
+    def scores(self) -> FloatArray:
+        """(n,) derivative of each measurement's cost by the ratio."""
+        low, high = self._beside
+        costs = [self._cost.each(fit.theta, fit.unknowns) for fit in (low, high)]
+        return (costs[1] - costs[0]) / float(high.unknowns[RATIO] - low.unknowns[RATIO])
+
+
+def _dispersion(slope: _Slope, pixels: FloatArray) -> float:
+    """How many times the variance of the ratio is what independent errors would give; at least 1."""
+    tiles, scores = _tiles(pixels), slope.scores()
+    used = np.unique(tiles)
+    together = np.bincount(tiles, weights=scores - np.mean(scores))
+    variance = float(np.sum(together**2)) * len(used) / max(len(used) - 1, 1) / slope.curvature
+    return max(variance / slope.scale**2, 1.0)
+
+
+def _tiles(points: FloatArray) -> NDArray[np.int64]:
+    """Number (n,) of the tile of the image that a point (n, 2) lies in: about as many points in every column."""
+    tile = np.zeros(len(points), dtype=np.int64)
+    for axis, count in enumerate(_TILES):
+        edges = np.quantile(points[:, axis], np.arange(1, count) / count)
+        tile = tile * count + np.searchsorted(edges, points[:, axis])
+    return tile

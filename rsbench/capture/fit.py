@@ -1,0 +1,203 @@
+"""Motion and shutter of largest likelihood under one hypothesis of how the cameras read and how the rig moves.
+
+The six parameters of the motion and the unknowns of the capture are found together by Newton's method. The
+motion's part of the equations is compiled; that of the other unknowns, at most four, is differences of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsbench.capture.hypotheses import LEAST_RATIO, RATIO, Hypothesis
+from rsbench.capture.scans import TimedMatches
+from rsbench.core.correspondences import BoolArray
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.heavy_tails import HeavyTailed
+
+BEYOND_RATIO = 1.2
+"""No ratio is beyond 1, but the top of what noise makes of one near 1 may be."""
+_MAX_TRANSLATION_M = 50.0
+_DIFFERENCE = np.array([0.002, 0.002, 0.02, 0.01])
+"""Of the unknowns: they move points by a fraction of their noise, far above rounding."""
+_LEAST = np.array([LEAST_RATIO, -1.0, -50.0, -0.45])
+_MOST = np.array([BEYOND_RATIO, 1.0, 50.0, 3.0])
+_LONGEST_STEP = np.array([0.4, 0.4, 2.0, 0.3])
+_LEAST_DAMPING, _LARGEST_DAMPING = 1e-8, 1e6
+"""A motion makes up for most of a wrong ratio: more damping than this would hold the ratio where it is."""
+_MOTION = 6
+_MEDIAN, _LEAST_SCALE_PX = 0.6, 0.02
+"""Median of squared normal errors, one or five together; and what exact matches are taken for."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Likelihood:
+    """Which measurements count, and the distribution of their errors (``heavy_tails``)."""
+
+    nu: float
+    scale: float
+    """px."""
+    chosen: BoolArray
+    """(n + m,) of the pairs and tracks."""
+    trust: FloatArray | None = None
+    """Weights of the chosen ones; None: 1."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CaptureFit:
+    """The best parameters under one hypothesis."""
+
+    hypothesis: Hypothesis
+    theta: FloatArray
+    """(6,) of the motion."""
+    unknowns: FloatArray
+    """(4,)."""
+    cost: float
+    """Negative logarithm of likelihood and prior, times the squared scale, px^2."""
+    sigma: FloatArray
+    """(4,) standard deviations of the unknowns; the ratio's is 0 where it was held."""
+    occam: float
+    """Logarithm of the volume of the posterior of the unknowns beside the ratio over that of their prior."""
+
+
+class CaptureCost:
+    """The cost of one hypothesis as a function of the motion and the unknowns.
+
+    Args:
+        prior: (4,) standard deviations of the unknowns about 0; 0 holds an unknown where it starts, and infinity
+            says nothing of it.
+    """
+
+    def __init__(
+        self, matches: TimedMatches, hypothesis: Hypothesis, likelihood: Likelihood, prior: FloatArray
+    ) -> None:
+        self.hypothesis, self.likelihood, self.prior = hypothesis, likelihood, prior
+        self._matches = matches.subset(likelihood.chosen)
+        self.free = [k for k in range(4) if prior[k] > 0.0]
+        self._weight = np.zeros(4)
+        self._weight[self.free] = (likelihood.scale / prior[self.free]) ** 2
+        count = self._matches.count
+        self._trust = np.ones(count) if likelihood.trust is None else likelihood.trust
+
+    def tailed(self, unknowns: FloatArray) -> HeavyTailed:
+        """The measurements at some unknowns (4,)."""
+        packed = self._matches.packed(self.hypothesis.scans, unknowns)
+        return HeavyTailed(**vars(packed), nu=self.likelihood.nu, scale=self.likelihood.scale, trust=self._trust)
+
+    def each(self, theta: FloatArray, unknowns: FloatArray) -> FloatArray:
+        """(n,) what each measurement adds."""
+        tailed = self.tailed(unknowns)
+        squares = np.concatenate([tailed.pair_residuals(theta) ** 2, tailed.track_squares(theta)])
+        factor = 0.5 * tailed.scale**2 * tailed.trust * (tailed.nu + tailed.freedom)
+        return np.asarray(factor * np.log1p(squares / (tailed.nu * tailed.scale**2)))
+
+    def typical_error(self, theta: FloatArray, unknowns: FloatArray) -> float:
+        """Scale of the errors, px, that their median shows: up to half of them may be wrong."""
+        tailed = self.tailed(unknowns)
+        squares = np.concatenate([tailed.pair_residuals(theta) ** 2, tailed.track_squares(theta)])
+        return max(float(np.sqrt(np.median(squares / tailed.freedom) / _MEDIAN)), _LEAST_SCALE_PX)
+
+    def __call__(self, theta: FloatArray, unknowns: FloatArray) -> float:
+        return float(np.sum(self.each(theta, unknowns))) + 0.5 * float(self._weight @ unknowns**2)
+
+    def local(self, theta: FloatArray, unknowns: FloatArray, free: list[int]) -> tuple[FloatArray, FloatArray]:
+        """Gradient and Hessian by theta and the free unknowns, these by differences."""
+        at, by_theta, H_theta = self.tailed(unknowns).normal_equations(theta)
+        size = _MOTION + len(free)
+        gradient, H = np.zeros(size), np.zeros((size, size))
+        gradient[:_MOTION], H[:_MOTION, :_MOTION] = by_theta, H_theta
+        steps, ahead = np.diag(_DIFFERENCE)[free], np.zeros(len(free))
+        for k, step in enumerate(steps):
+            size_k, place = float(np.sum(step)), _MOTION + k
+            above, g_above, _ = self.tailed(unknowns + step).normal_equations(theta)
+            below = float(np.sum(self.each(theta, unknowns - step)))
+            gradient[place] = (above - below) / (2.0 * size_k)
+            H[place, place] = (above - 2.0 * at + below) / size_k**2
+            H[:_MOTION, place] = H[place, :_MOTION] = (g_above - by_theta) / size_k
+            ahead[k] = above - at
+            for j in range(k):
+                both = float(np.sum(self.each(theta, unknowns + step + steps[j])))
+                mixed = (both - at - ahead[k] - ahead[j]) / (size_k * float(np.sum(steps[j])))
+                H[place, _MOTION + j] = H[_MOTION + j, place] = mixed
+        gradient[_MOTION:] += self._weight[free] * unknowns[free]
+        H[range(_MOTION, size), range(_MOTION, size)] += self._weight[free]
+        return gradient, H
+
+
+def fit_capture(
+    cost: CaptureCost,
+    theta: FloatArray,
+    unknowns: FloatArray,
+    *,
+    iterations: int = 20,
+    still: float = 1e-4,
+    hold_ratio: bool = False,
+) -> CaptureFit:
+    """Newton's method, damped, from a start (6,), (4,).
+
+    Args:
+        still: decrease of the cost, in squared scales of the errors, at which to stop.
+        hold_ratio: whether the ratio stays as it is.
+    """
+    free = [k for k in cost.free if k != RATIO or not hold_ratio]
+    unknowns = _within(unknowns, free)
+    now, damping = cost(theta, unknowns), _LEAST_DAMPING
+    gradient, H = cost.local(theta, unknowns, free)
+    for _ in range(iterations):
+        before = now
+        while damping < _LARGEST_DAMPING:
+            moved = _stepped(gradient, H, theta, unknowns, free, damping)
+            trial = cost(*moved)
+            if trial <= now:
+                (theta, unknowns), now = moved, trial
+                damping = max(0.1 * damping, _LEAST_DAMPING)
+                break
+            damping *= 10.0
+        if before - now < still * cost.likelihood.scale**2:
+            break
+        gradient, H = cost.local(theta, unknowns, free)
+    sigma = np.zeros(4)
+    covariance = cost.likelihood.scale**2 * np.linalg.pinv(H, hermitian=True)[_MOTION:, _MOTION:]
+    sigma[free] = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    others = [k for k, j in enumerate(free) if j != RATIO]
+    values = np.linalg.eigvalsh(covariance[np.ix_(others, others)]) if others else np.zeros(0)
+    volume = 0.5 * float(np.sum(np.log(np.maximum(values, 1e-30))))
+    return CaptureFit(
+        hypothesis=cost.hypothesis,
+        theta=theta,
+        unknowns=unknowns,
+        cost=now,
+        sigma=sigma,
+        occam=volume - float(np.sum(np.log(cost.prior[[free[k] for k in others]]))),
+    )
+
+
+def _stepped(
+    gradient: FloatArray, H: FloatArray, theta: FloatArray, unknowns: FloatArray, free: list[int], damping: float
+) -> tuple[FloatArray, FloatArray]:
+    """Where a damped Newton step leads; an unknown at its limit stays there."""
+    moves = np.ones(len(gradient), dtype=np.bool_)
+    for k, j in enumerate(free, start=_MOTION):
+        outwards = -gradient[k]
+        moves[k] = not (
+            (unknowns[j] <= _LEAST[j] and outwards < 0.0) or (unknowns[j] >= _MOST[j] and outwards > 0.0)
+        )
+    A, g = H[np.ix_(moves, moves)], gradient[moves]
+    size = np.sqrt(np.maximum(np.abs(np.diagonal(A)), 1e-12 * np.abs(A).max()) + 1e-300)
+    values, vectors = np.linalg.eigh(A / np.outer(size, size))
+    values = np.maximum(np.abs(values), 1e-9) + damping  # downhill, whatever the curvature
+    step = np.zeros(len(gradient))
+    step[moves] = -(vectors @ ((vectors.T @ (g / size)) / values)) / size
+    theta, unknowns = theta + step[:_MOTION], unknowns.copy()
+    unknowns[free] += np.clip(step[_MOTION:], -_LONGEST_STEP[free], _LONGEST_STEP[free])
+    length = float(np.linalg.norm(theta[3:]))
+    theta[3:] *= min(1.0, _MAX_TRANSLATION_M / max(length, _MAX_TRANSLATION_M))
+    return theta, _within(unknowns, free)
+
+
+def _within(unknowns: FloatArray, free: list[int]) -> FloatArray:
+    """With those that are free within their limits."""
+    out = unknowns.copy()
+    out[free] = np.clip(unknowns[free], _LEAST[free], _MOST[free])
+    return out

@@ -1,0 +1,68 @@
+"""What may be known of a capture, and what it may have been: the hypotheses that matches decide between."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsbench.capture.scans import ALL_SCANS, Scans
+from rsbench.core.so3 import FloatArray
+
+RATIO, DELAY, OFFSET, ACCELERATION = range(4)
+"""Places of the unknowns: readout ratio, delay of the right camera (frame periods), disparity offset (px), k."""
+LEAST_RATIO = 0.05
+"""Readout ratios below this are taken for a global shutter's."""
+MODELS = ("linear", "twist", "inertial", "accelerated")
+"""Motion models that are tried."""
+DELAY_SIGMA = 0.3
+"""Frame periods by which a right camera that is late or early is so: what is expected before matches are seen."""
+ACCELERATION_SIGMA = 0.2
+"""Standard deviation of k that is expected of motions that accelerate."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hypothesis:
+    """How the cameras read and how the rig moves, and which of the unknowns are free beside the motion."""
+
+    scans: Scans
+    motion_model: str
+    delayed: bool = False
+    """Whether the right camera may be late."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """What is known of a capture beforehand; None: it is looked for."""
+
+    ratio: float | None = None
+    scans: tuple[Scans, ...] = ALL_SCANS
+    """Those that are possible."""
+    delay: float | None = None
+    """Frame periods by which the right camera is late."""
+    offset: float = 0.0
+    """px by which disparities are too large."""
+    offset_sigma: float = 0.0
+    """Its standard deviation; 0: it is known."""
+    models: tuple[str, ...] = MODELS
+
+    def prior(self, hypothesis: Hypothesis) -> FloatArray:
+        """(4,) standard deviations of the unknowns, as ``CaptureCost`` takes them."""
+        ratio = np.inf if self.ratio is None and hypothesis.scans.rolls else 0.0
+        delay = DELAY_SIGMA if hypothesis.delayed else 0.0
+        acceleration = ACCELERATION_SIGMA if hypothesis.motion_model == "accelerated" else 0.0
+        return np.array([ratio, delay, self.offset_sigma, acceleration])
+
+    def start(self, hypothesis: Hypothesis, ratio: float, delay: float) -> FloatArray:
+        """(4,) unknowns of a hypothesis, of which these are guesses."""
+        out = np.array([ratio, delay if hypothesis.delayed else self.delay or 0.0, self.offset, 0.0])
+        if not hypothesis.scans.rolls:
+            out[RATIO] = 0.0
+        elif self.ratio is not None:
+            out[RATIO] = self.ratio
+        return out
+
+    @property
+    def delays(self) -> tuple[bool, ...]:
+        """Whether the right camera may be late."""
+        return (False, True) if self.delay is None else (False,)
