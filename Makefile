@@ -1,9 +1,11 @@
-# make demo    render, solve, correct and score one sequence; ends with the path of its report
-# make test    format, lint, types, layers and every test
-# make attack  kills, failing files, mutated inputs, hostile surroundings, faults for verify: hours; see docs/explanation/reliability.md
-# make docs    the documentation site, in build/docs; warnings are errors
-# make lock    renew constraints.txt from pyproject.toml (needs uv)
-# make clean   remove .venv and caches
+# make help       this list
+# make demo       render, solve, correct and score one sequence; ends with the path of its report
+# make test       format, lint, types, layers and every test
+# make attack     kills, failing files, mutated inputs, hostile surroundings, faults for verify: hours
+# make docs       the documentation site, in build/docs; warnings are errors
+# make reference  docs/reference/commands.md and cards.md from the code
+# make lock       renew constraints.txt from pyproject.toml (needs uv)
+# make clean      remove .venv and caches
 # Needs Python >= 3.11 with pip and venv. `make demo PYTHON=/path/to/python` chooses one.
 
 VENV := .venv
@@ -14,8 +16,12 @@ CANDIDATES = $(or $(PYTHON),python3 python3.14 python3.13 python3.12 python3.11)
 COMPILE := from rsbench.solvers.engine.warm_up import warm_up; warm_up(["linear", "twist"])
 SUITABLE := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: demo test attack docs lock clean
+.PHONY: help demo test attack docs reference lock clean
 .DELETE_ON_ERROR:
+.DEFAULT_GOAL := demo
+
+help:
+	@sed -n 's/^# \(make [a-z]* \)/\1/p' $(firstword $(MAKEFILE_LIST))
 
 demo: $(STAMP)
 	@$(BIN)/rsbench demo
@@ -37,6 +43,9 @@ attack: $(STAMP)
 docs: $(STAMP)
 	@$(BIN)/sphinx-build -W --keep-going -q -b html docs build/docs
 	@echo "site: $(CURDIR)/build/docs/index.html"
+
+reference: $(STAMP)
+	@$(BIN)/python -m rsbench.cli.reference
 
 # A venv without a working pip is what a killed `python -m venv` leaves: it is made anew.
 $(STAMP): constraints.txt pyproject.toml

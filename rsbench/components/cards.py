@@ -216,7 +216,8 @@ def _keys_at(kind: Any, location: Sequence[int | str]) -> list[str]:
     if dataclasses.is_dataclass(kind):
         hints = get_type_hints(kind)
         if not location:
-            return [field.name for field in dataclasses.fields(kind) if field.init]
+            own = [field.name for field in dataclasses.fields(kind) if field.init]
+            return [*own, *getattr(kind, "SHORTHANDS", ())]
         if location[0] in hints:
             return _keys_at(hints[str(location[0])], location[1:])
         # A union adds the name of the option that was tried to the location.

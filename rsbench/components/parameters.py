@@ -21,7 +21,7 @@ def parameters_of(cls: type, component: object = None) -> list[dict[str, Any]]:
         ``parameter``, ``type``, ``default``, ``value`` (as a card would write them; "" when there is none) and
         ``meaning`` of each.
     """
-    meanings = _field_docstrings(cls)
+    meanings = field_docstrings(cls)
     required = inspect.Parameter.empty
     rows = []
     for name, parameter in inspect.signature(cls).parameters.items():
@@ -32,8 +32,8 @@ def parameters_of(cls: type, component: object = None) -> list[dict[str, Any]]:
             {
                 "parameter": name,
                 "type": "" if parameter.annotation is required else _type_name(parameter.annotation),
-                "value": _as_in_a_card(getattr(component, name)) if hasattr(component, name) else "",
-                "default": "required" if default is required else _as_in_a_card(default),
+                "value": value_in_a_card(getattr(component, name)) if hasattr(component, name) else "",
+                "default": "required" if default is required else value_in_a_card(default),
                 "meaning": meanings.get(name, ""),
             }
         )
@@ -52,15 +52,18 @@ def _type_name(annotation: object) -> str:
     return annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
 
 
-def _as_in_a_card(value: object) -> Any:
+def value_in_a_card(value: object) -> Any:
+    """A value as a card would write it; None, which no card can write, is empty text."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: _as_in_a_card(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {field.name: value_in_a_card(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, (list, tuple)):
-        return [_as_in_a_card(item) for item in value]
+        return [value_in_a_card(item) for item in value]
+    if isinstance(value, dict):
+        return {key: value_in_a_card(item) for key, item in value.items()}
     return value if isinstance(value, bool | int | float | str) else "" if value is None else str(value)
 
 
-def _field_docstrings(cls: type) -> dict[str, str]:
+def field_docstrings(cls: type) -> dict[str, str]:
     """Texts below the fields of a class and of those above it, in one line each."""
     found: dict[str, str] = {}
     for parent in reversed(cls.__mro__[:-1]):

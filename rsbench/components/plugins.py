@@ -58,7 +58,6 @@ __all__ = [
 
 Component = TypeVar("Component")
 Options = TypeVar("Options")
-_OWN = ("class", "description", "parameters")
 
 
 @dataclass(frozen=True)
@@ -144,10 +143,19 @@ class Offer:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Content:
+class CardContent:
+    """A component's card: the class that does the work, and its parameters."""
+
     class_: str
+    """The class that does the work: ``package.module:Class``; the module may lie beside the card."""
     description: str = ""
+    """One line for ``rsbench list``."""
     parameters: dict[str, Any] = field(default_factory=dict)
+    """Parameters of the class: its fields, or the arguments of its constructor."""
+
+
+_OWN = tuple(each.name.rstrip("_") for each in dataclasses.fields(CardContent))
+"""Keys that every card of a component has."""
 
 
 def blame(kind: Kind[Any, Any], entry: Entry[Any, Any]) -> AbstractContextManager[None]:
@@ -276,7 +284,7 @@ def _from_card(kind: Kind[Component, Options], path: Path) -> Entry[Component, O
     if "class" not in data:
         raise RsbenchError(f"{path}: 'class' is required")
     content = parse_card(
-        _Content, {("class_" if key == "class" else key): data[key] for key in _OWN if key in data}, str(path)
+        CardContent, {("class_" if key == "class" else key): data[key] for key in _OWN if key in data}, str(path)
     )
     options = parse_card(kind.options, {key: data[key] for key in data if key not in _OWN}, str(path))
     cls = _checked(

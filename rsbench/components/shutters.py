@@ -9,19 +9,28 @@ from typing import Any
 from rsbench.components.cards import load_card
 from rsbench.core.errors import RsbenchError
 
+SHUTTER_KEY = {
+    "shutter": "Name of a shutter card or a path to one, in place of ``readout_ratio``: the readout time of a "
+    "real camera's mode over the frame period, which is the mode's unless ``frame_period_s`` is given."
+}
+"""Of the tables in which ``with_shutter`` replaces the key."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ShutterCard:
     """One mode of one camera; rows are read from the top, evenly."""
 
     description: str
+    """Camera and mode, for ``rsbench list shutters``."""
     readout_ms: float
-    """From the first row to the (missing) row after the last one."""
+    """Milliseconds from the first row to the (missing) row after the last one."""
     fps: float
     """Frames per second of the mode."""
     width: int
-    """Pixels of the mode's frames; the readout time is theirs, whatever the size of the images that take it."""
+    """Pixels of the mode's frames across; the readout time is theirs, whatever the size of the images that take
+    it."""
     height: int
+    """Pixels of the mode's frames down."""
     source: str
     """Where the readout time comes from."""
 

@@ -46,12 +46,20 @@ class Lens:
     """
 
     model: LensModel
+    """``brown-conrady``: radial and tangential distortion of ordinary lenses; ``kannala-brandt``: fisheye
+    lenses."""
     k1: float = 0.0
+    """First radial coefficient, as OpenCV has it."""
     k2: float = 0.0
+    """Second radial coefficient."""
     p1: float = 0.0
+    """First tangential coefficient; of ``brown-conrady`` alone."""
     p2: float = 0.0
+    """Second tangential coefficient; of ``brown-conrady`` alone."""
     k3: float = 0.0
+    """Third radial coefficient."""
     k4: float = 0.0
+    """Fourth radial coefficient; of ``kannala-brandt`` alone."""
 
     def __post_init__(self) -> None:
         if self.model not in get_args(LensModel):

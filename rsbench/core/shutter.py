@@ -21,9 +21,9 @@ class Scanning:
     """How cameras read their lines, as cards and files say it; each key may be left out."""
 
     scan: Scan = "top"
-    """The side at which reading begins; of both cameras, but for what the next says."""
+    """Side of the image at which the readout of both cameras begins; ``left`` and ``right`` read columns."""
     right_scan: Scan | None = None
-    """Of the right camera; None: as the left one."""
+    """Side at which the readout of the right camera begins. Absent: as the left camera's."""
     right_delay: float = 0.0
     """Frame periods by which the right camera is late, from -1 to 1."""
 

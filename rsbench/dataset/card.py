@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from rsbench.components.cards import card_path, parse_card, read_toml
 from rsbench.components.imports import search
-from rsbench.components.shutters import with_shutters
+from rsbench.components.shutters import SHUTTER_KEY, with_shutters
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.lens import Lens
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
@@ -23,113 +22,72 @@ from rsbench.dataset.imu import Imu
 from rsbench.dataset.layout import MOST_FRAMES, MOST_TWINS
 from rsbench.dataset.matches import Matching
 from rsbench.dataset.motion_card import MotionCard as MotionCard
-from rsbench.dataset.object_records import MovingCard, check_moving, drawn
+from rsbench.dataset.object_records import check_moving, drawn
 from rsbench.dataset.sequence import sequence_manifest
+from rsbench.dataset.sequence_card import CameraCard as CameraCard
+from rsbench.dataset.sequence_card import SequenceCard as SequenceCard
+from rsbench.dataset.sequence_card import Variation as Variation
 from rsbench.dataset.trajectory import TrajectoryCard, parts_along
 from rsbench.dataset.views import GivenGeometry
 from rsbench.renderers.electrons import Sensor, check_brightness
-from rsbench.scenes.model import Start
-from rsbench.storage.untrusted_files import check_name, check_size
+from rsbench.storage.untrusted_files import check_size
 
 Twin = Literal["first", "middle", "last"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraCard:
-    """A camera with a centred principal point."""
-
-    width: int
-    height: int
-    focal: float
-    """Pixels."""
-    lens: Lens | None = None
-    """None: an ideal one."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SequenceCard:
-    """One scene seen from one viewpoint under one motion."""
-
-    name: str
-    scene: str
-    """Name of a scene card, or a path to one."""
-    viewpoint: str = "default"
-    motion: MotionCard | None = None
-    """Replaces the dataset's motion."""
-    baseline: float | None = None
-    """Replaces the dataset's baseline, metres."""
-    readout_ratio: float | None = None
-    """Replaces the dataset's readout ratio, as the next two do."""
-    frame_period_s: float | None = None
-    sensor: Sensor | None = None
-    scale: float = 1.0
-    """Baseline and translation are multiplied by it: for what is larger or nearer than other scenes."""
-    seed: int | None = None
-    """Replaces the dataset's seed."""
-    moving: tuple[MovingCard, ...] = ()
-    """Objects that move by themselves."""
-    start: Start | None = None
-    """Of the body at time 0, where that is not at the viewpoint: made from a trajectory."""
-
-    def __post_init__(self) -> None:
-        check_name(self.name)
-        if not self.scale > 0.0:
-            raise ValueError(f"scale = {self.scale}: must be positive")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Variation:
-    """What one value of an axis of a grid sets in every sequence; what is left out stays."""
-
-    motion: MotionCard | None = None
-    viewpoint: str | None = None
-    baseline: float | None = None
-    readout_ratio: float | None = None
-    frame_period_s: float | None = None
-    sensor: Sensor | None = None
-    moving: tuple[MovingCard, ...] | None = None
-
-    def of(self, sequence: SequenceCard) -> SequenceCard:
-        """A sequence with it."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return replace(sequence, **{name: value for name, value in values.items() if value is not None})
-
-
-@dataclass(frozen=True, kw_only=True)
 class DatasetCard(Scanning):
-    """A dataset: one camera, rig and shutter, and its sequences."""
+    """A dataset: one camera, rig and shutter, and its sequences.
+
+    From a key to pixels: ``rig_of``, ``shutter_for``, ``motion_of`` and ``sensor_of`` of this class make the
+    objects of a sequence from its keys, and ``render_camera`` in rsbench/dataset/generation.py renders its frames
+    with them. There ``shutter.row_time`` gives the time of each image row, the motion the pose at that time, the
+    renderer the row seen from that pose, and the sensor turns it into digital numbers.
+    """
+
+    SHORTHANDS: ClassVar = SHUTTER_KEY
 
     name: str
+    """Name of the dataset."""
     description: str = ""
+    """One line for ``rsbench list datasets``."""
     camera: CameraCard
+    """Image size, focal length and lens of both cameras."""
     baseline: float
     """Full distance between the cameras, metres."""
     readout_ratio: float
+    """Readout time over frame period, 0 (global shutter) to 1: row y of frame k is exposed at the time k +
+    readout_ratio * y / height, in frame periods. Required, unless ``shutter`` is given."""
     frame_period_s: float = 0.1
+    """Seconds from one frame to the next."""
     frames: int = len(FRAMES)
-    """Of each camera."""
+    """Number of frames of each camera."""
     motion: MotionCard | None = None
-    """Required, unless each sequence has its own, from the grid too, or there is a trajectory."""
+    """Motion of the rig. Required, unless each sequence has its own, from the grid too, or there is a
+    trajectory."""
     trajectory: TrajectoryCard | None = None
-    """Moves the rig along the poses of a file instead."""
+    """File of poses along which the rig moves, in place of a motion."""
     renderer: str = "default"
     """Name of a renderer card, or a path to one."""
     sensor: Sensor | None = None
-    """Exposure and noise of the rolling-shutter frames; absent, an ideal sensor's."""
+    """Exposure and noise of the rolling-shutter frames. Absent: an ideal sensor."""
     channels: tuple[Channel, ...] = ()
-    """Of ground truth, beside images, depth and poses."""
+    """Channels of ground truth beside images, depth and poses."""
     twins: tuple[int | Twin, ...] = ()
-    """Rows, counted as they are read, whose poses global-shutter twins have beside that of the first."""
+    """Rows, counted in the order of the readout, at whose poses global-shutter images are rendered too; that of
+    the first row always is."""
     imu: Imu | None = None
-    """The sensor of the channel ``imu``; absent, one with the defaults."""
+    """Rates and errors of the channel ``imu``. Absent: the defaults."""
     matches: Matching | None = None
-    """Of the channel ``matches``; absent, the defaults."""
+    """Feature matcher of the channel ``matches``. Absent: the defaults."""
     seed: int = 0
+    """Seed of everything that is drawn at random."""
     seeds: tuple[int, ...] = ()
     """When given, every sequence is made once per seed under the name NAME-SEED; random axes change with it."""
     grid: dict[str, dict[str, Variation]] = field(default_factory=dict)
     """Axes of named values: every sequence is made once per combination, under the name NAME-VALUE-VALUE."""
     sequence: tuple[SequenceCard, ...] = ()
+    """The sequences, each a table ``[[sequence]]``; at least one."""
 
     def __post_init__(self) -> None:
         check_size("camera", (self.camera.width, self.camera.height))

@@ -47,22 +47,24 @@ class Imu:
     """
 
     rate_hz: float = 200.0
+    """Samples per second."""
     gyroscope_noise_density: float = 1.6968e-4
-    """White noise, rad/s/sqrt(Hz): a sample has it times sqrt(rate)."""
+    """White noise of the gyroscope, rad/s/sqrt(Hz): a sample has it times sqrt(rate)."""
     gyroscope_random_walk: float = 1.9393e-5
-    """Of the bias, rad/s^2/sqrt(Hz): from one sample to the next it walks by it times sqrt(1 / rate)."""
+    """Random walk of the gyroscope's bias, rad/s^2/sqrt(Hz): a step from one sample to the next has it times
+    sqrt(1 / rate)."""
     gyroscope_bias: float = 0.02
-    """Standard deviation of the bias at the first sample, rad/s."""
+    """Standard deviation of the gyroscope's bias at the first sample, rad/s."""
     accelerometer_noise_density: float = 2.0e-3
-    """m/s^2/sqrt(Hz)."""
+    """White noise of the accelerometer, m/s^2/sqrt(Hz)."""
     accelerometer_random_walk: float = 3.0e-3
-    """m/s^3/sqrt(Hz)."""
+    """Random walk of the accelerometer's bias, m/s^3/sqrt(Hz)."""
     accelerometer_bias: float = 0.1
-    """m/s^2."""
+    """Standard deviation of the accelerometer's bias at the first sample, m/s^2."""
     time_offset_s: float = 0.0
-    """Its clock less the camera's, at the time of row 0 of frame 0."""
+    """Seconds by which the IMU's clock is ahead of the camera's at the time of row 0 of frame 0."""
     clock_drift: float = 0.0
-    """Seconds that its clock gains in each of the camera's."""
+    """Seconds that the IMU's clock gains in each second of the camera's."""
 
     def __post_init__(self) -> None:
         for field in fields(self):

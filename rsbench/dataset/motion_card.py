@@ -22,14 +22,18 @@ class MotionCard:
     model: str = "linear"
     """Name of a motion model, or ``package.module:Class``."""
     parameters: dict[str, Any] = field(default_factory=dict)
-    """Of the model; absent ones have its defaults, or are drawn for each sequence (a shake's seed)."""
+    """Parameters of the motion model; absent ones have its defaults, or are drawn for each sequence (a shake's
+    seed)."""
     rotation_deg: float | None = None
-    """Required, as the axis and the translation are, unless the parameters alone fix the motion."""
+    """Angle of the rotation in one frame period, degrees. Required, as the axes and the translation are, unless
+    the parameters alone fix the motion."""
     rotation_axis: Axis | None = None
-    """Or ``"random"``: drawn for each sequence from its seed and name when the card is loaded."""
+    """Axis of the rotation (x right, y down, z forward), of any length; or ``"random"``: drawn for each sequence
+    from its seed and name when the card is loaded."""
     translation: float | None = None
-    """Metres."""
+    """Length of the translation in one frame period, metres."""
     translation_axis: Axis | None = None
+    """Direction of the translation, of any length; or ``"random"``."""
 
     def __post_init__(self) -> None:
         names = ("rotation_deg", "rotation_axis", "translation", "translation_axis")

@@ -29,6 +29,7 @@ class MovingCard(Body):
     """An object and how it moves: turned about its position and shifted, as the motion says of a body."""
 
     motion: MotionCard
+    """The object's own motion: it turns about its position and is shifted."""
 
     def scaled(self, by: float) -> MovingCard:
         """All lengths times a factor."""

@@ -31,17 +31,20 @@ class TrajectoryCard:
     """The rig goes along the poses of a file: each two frames, or as many as the card says, are a sequence."""
 
     file: str
-    """TUM's format: lines ``timestamp tx ty tz qx qy qz qw``, seconds and metres; relative to the card."""
+    """File of poses in TUM's format, relative to the card: lines ``timestamp tx ty tz qx qy qz qw``, seconds and
+    metres."""
     absolute: bool = False
-    """The poses are in the frame of the scene (z up); otherwise the first sequence starts at the viewpoint."""
+    """Whether the poses are in the frame of the scene (z up); otherwise the first sequence starts at the
+    viewpoint."""
     start_s: float = 0.0
     """Seconds from the first pose of the file to the first frame."""
     step: float | None = None
-    """Frame periods from one sequence to the next; None: as many as it has frames. One less, and two share one."""
+    """Frame periods from one sequence to the next. Absent: as many as a sequence has frames; with one less,
+    successive sequences share a frame."""
     pairs: int | None = None
-    """So many at most; None: all that the file holds."""
+    """Number of sequences, at most. Absent: all that the file holds."""
     longest_gap_s: float = 1.0
-    """Poses that are farther apart are refused: no spline knows what was between."""
+    """Longest time between two poses, seconds; files with longer gaps are refused."""
 
     def __post_init__(self) -> None:
         if not self.start_s >= 0.0:

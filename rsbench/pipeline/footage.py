@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.cards import parse_card, read_toml
-from rsbench.components.shutters import with_shutter
+from rsbench.components.shutters import SHUTTER_KEY, with_shutter
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.lens import Lens
@@ -37,24 +37,31 @@ class CameraCard:
     """Intrinsics of both cameras, pixels; the centre of the top-left pixel is (0, 0)."""
 
     fx: float
+    """Focal length across, pixels."""
     fy: float
+    """Focal length down, pixels."""
     cx: float
+    """Column of the principal point, pixels."""
     cy: float
+    """Row of the principal point, pixels."""
     lens: Lens | None = None
-    """None: images without distortion."""
+    """Distortion of the lens. Absent: images without distortion."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RigCard(Scanning):
     """What must be known of a rig to correct its frames; the size comes from the images."""
 
+    SHORTHANDS: ClassVar = SHUTTER_KEY
+
     camera: CameraCard
+    """Intrinsics of both cameras, which are the same."""
     baseline: float
     """Full distance between the cameras, metres."""
     readout_ratio: float | None = None
-    """Readout time over frame period, 0 to 1; estimated from the frames when absent."""
+    """Readout time over frame period, 0 to 1. Absent: estimated from the frames."""
     disparity_offset: float | None = None
-    """What matched disparities are too large by, px; when absent, estimated with the readout ratio, else 0."""
+    """Pixels by which matched disparities are too large; absent: estimated with the readout ratio, else 0."""
 
     def __post_init__(self) -> None:
         self.rig(1, 1)

@@ -62,14 +62,19 @@ class LayersCorrector(Corrector):
     motion_model: str = "linear"
     """Of the rows' poses: constant velocity over both frames, in place of a pose of each row."""
     planes: PlaneOptions = field(default_factory=PlaneOptions)
+    """Planes that are fitted."""
     labels: LabelOptions = field(default_factory=LabelOptions)
+    """Assignment of pixels to planes."""
     rounds: int = 3
     """Of layers and motion, at most; the first one that costs no less than the one before is the last."""
     use_other_frame: bool = True
     """Fill what the frame did not see from the other one of its camera."""
     robust: RobustOptions = field(default_factory=RobustOptions)
+    """RANSAC of the motion."""
     seed: int = 0
+    """Seed of the random samples."""
     warp: WarpOptions = field(default_factory=WarpOptions)
+    """How pixels are taken from the source image."""
 
     spec = CorrectorSpec(
         needs={"matches"},

@@ -49,8 +49,11 @@ class ZhuangCorrector(Corrector):
     acceleration: Literal["none", "constant"] = "none"
     """As of ``ZhuangSolver``."""
     robust: RobustOptions = field(default_factory=RobustOptions)
+    """RANSAC of the motion."""
     seed: int = 0
+    """Seed of the random samples."""
     warp: WarpOptions = field(default_factory=WarpOptions)
+    """How pixels are taken from the source image."""
 
     spec = CorrectorSpec(
         needs={"matches"},

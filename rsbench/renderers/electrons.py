@@ -45,34 +45,39 @@ class Sensor:
     """
 
     exposure_s: float = 0.0
-    """For how long a row collects light, in seconds; the middle of it is the row's time."""
+    """For how long a row collects light, seconds; the middle of it is the row's time. 0: an instant."""
     full_well: float = 6000.0
     """Electrons of a pixel that saturates at gain 1."""
     gain: float = 1.0
     """ISO over base ISO: white is ``full_well / gain`` electrons."""
     photon_noise: bool = False
+    """Whether the number of electrons is drawn from a Poisson distribution."""
     read_noise: float = 0.0
-    """Electrons, standard deviation."""
+    """Standard deviation of the noise of reading a pixel, electrons."""
     dark_current: float = 0.0
-    """Electrons per second; cameras take off its mean, its noise stays."""
+    """Electrons per second without light; the camera subtracts its mean, its noise stays."""
     bit_depth: int = 0
-    """Of the digital numbers; 0: they are not rounded."""
+    """Bits of the digital numbers; 0: they are not rounded."""
     vignetting: float = 0.0
     """Share of the light that the corners lose; it grows with the square of the distance from the centre."""
     brightness: tuple[float, ...] = (1.0, 1.0)
-    """Of each frame over that of the clean twin: what an automatic exposure does from frame to frame."""
+    """Brightness of each frame over that of the clean twin: what an automatic exposure does from frame to
+    frame."""
     right_brightness: float = 1.0
-    """Of the right camera over the left one."""
+    """Brightness of the right camera over the left one."""
     right_exposure_s: float | None = None
-    """Of the right camera; None: as the left one. So are the next."""
+    """Exposure of the right camera, seconds. Absent: as the left camera's."""
     right_gain: float | None = None
+    """Gain of the right camera. Absent: as the left camera's."""
     mosaic: Mosaic = "none"
-    """Colours of the filters before the first two pixels of the first two rows, repeated over the image; "none":
-    each pixel tells all three colours."""
+    """Colour filters before the first two pixels of the first two rows, repeated over the image; "none": each
+    pixel measures all three colours."""
     right_mosaic: Mosaic | None = None
+    """Colour filters of the right camera. Absent: as the left camera's."""
     jpeg_quality: int = 0
-    """Of the image that leaves the camera, 1 to 100; 0: it is not compressed."""
+    """JPEG quality of the image that leaves the camera, 1 to 100; 0: it is not compressed."""
     right_jpeg_quality: int | None = None
+    """JPEG quality of the right camera. Absent: as the left camera's."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():

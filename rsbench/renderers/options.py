@@ -22,20 +22,22 @@ class RendererOptions:
     """
 
     description: str = ""
+    """One line for ``rsbench list renderers``."""
     method: Method = "single-pass"
     """``single-pass``: every ray takes its row's pose; ``stitched``: one global-shutter image per row."""
     integrator: Integrator = "sunsky"
     """``sunsky``: sun with shadows and a hemisphere sky, free of noise; ``path``: global illumination."""
     samples: int = 16
-    """Per pixel, a perfect square: they lie on a stratified grid inside the pixel."""
+    """Samples per pixel, a perfect square: they lie on a stratified grid inside the pixel."""
     max_depth: int = 4
-    """Longest light path of ``path``: 2 = direct light only."""
+    """Longest light path of ``path``, 2 = direct light only."""
     exposure: float = 0.8
     """Multiplies the linear image before it becomes 8-bit sRGB; the same for every frame."""
     seed: int = 0
-    """Of the random numbers that ``path`` draws."""
+    """Seed of the random numbers that ``path`` draws."""
     sky_rays: int = 0
-    """Of ``sunsky``, from what each sample sees: whether surfaces hide the sky there; 0: nothing hides it."""
+    """Rays that ``sunsky`` sends from each seen point to find whether surfaces hide the sky there; 0: nothing
+    hides it."""
     full_frames: bool = False
     """``stitched`` renders every row of every global-shutter image, and not only the kept one."""
 

@@ -25,7 +25,9 @@ class CastleBuilder(SceneBuilder):
     closed = True
 
     wall_height: float = 6.5
+    """Height of the walls, metres, 3 to 15."""
     keep_height: float = 15.0
+    """Height of the keep, metres, 8 to 40."""
     trees: int = 26
     """Trees on the hills around the castle."""
 

@@ -25,15 +25,20 @@ class LightCard:
     """``Light`` with the sun given as people give it."""
 
     sun_azimuth_deg: float = 220.0
-    """Anticlockwise from +x, in the scene frame."""
+    """Direction of the sun in the scene frame, degrees anticlockwise from +x."""
     sun_elevation_deg: float = 45.0
+    """Height of the sun above the horizon, degrees: above 0, at most 90."""
     sun_irradiance: Rgb = (2.6, 2.4, 2.1)
+    """Linear RGB light of the sun on a surface that faces it."""
     sky_zenith: Rgb = (0.25, 0.45, 0.85)
+    """Linear RGB radiance of the sky overhead."""
     sky_horizon: Rgb = (0.75, 0.85, 0.95)
+    """Linear RGB radiance of the sky at the horizon."""
     environment: str = ""
-    """Lat-long .hdr or .exr file, relative to the card: sun and sky of the card only say how bright it is."""
+    """Lat-long .hdr or .exr file, relative to the card, that replaces sun and sky; these then say only how bright
+    it is."""
     environment_turn_deg: float = 0.0
-    """Anticlockwise from above; at 0 the middle of the map looks along +y."""
+    """Turn of the environment map, degrees anticlockwise from above; at 0 the middle of the map looks along +y."""
 
     def __post_init__(self) -> None:
         if not 0 < self.sun_elevation_deg <= 90:
@@ -59,14 +64,19 @@ class SceneCard:
     """What a scene card holds."""
 
     name: str
+    """Name of the scene, which is that of the card's file."""
     builder: str
     """Name of a scene builder, or ``package.module:Class``; the module may lie beside the card."""
     parameters: dict[str, Any] = field(default_factory=dict)
-    """Of the builder."""
+    """Parameters of the builder: the fields of its class."""
     viewpoints: dict[str, Viewpoint]
+    """Places to look from, by name; ``default`` is required."""
     description: str = ""
+    """One line for ``rsbench list scenes``."""
     seed: int = 0
+    """Seed of everything that the builder draws at random."""
     light: LightCard = field(default_factory=LightCard)
+    """Sun, sky or environment map."""
 
     def __post_init__(self) -> None:
         if "default" not in self.viewpoints:

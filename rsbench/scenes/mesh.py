@@ -40,13 +40,15 @@ class MeshBuilder(SceneBuilder):
     """A mesh file: which, and how its axes and units become the scene frame's."""
 
     file: str
-    """Relative to the card, or absolute."""
+    """Path of the mesh file, relative to the card, or absolute."""
     metres_per_unit: float = 1.0
+    """Metres of one unit of the file; ``size`` replaces it."""
     up_axis: Literal["x", "y", "z"] = "y"
     """The file's upward axis; glTF has y up."""
     heading_deg: float = 0.0
     """Turns the model anticlockwise about the vertical."""
     shading: Literal["flat", "smooth"] = "flat"
+    """Whether triangles are shaded flat or with the file's smooth normals."""
     transparent: Literal["refuse", "opaque"] = "refuse"
     """What becomes of surfaces that the file cuts out or blends by an alpha: only opaque ones can be rendered."""
     gloss: Literal["none", "file"] = "none"

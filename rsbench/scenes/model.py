@@ -101,7 +101,9 @@ class Viewpoint:
     """Where the rig's body stands at time 0: at ``eye``, looking at ``target``, the horizon level."""
 
     eye: tuple[float, float, float]
+    """Position of the rig's body at time 0, in the scene frame (z up), metres."""
     target: tuple[float, float, float]
+    """Point at which it looks, in the scene frame, metres."""
 
     def world_from_scene(self) -> tuple[FloatArray, FloatArray]:
         """Rotation (3, 3) and translation (3,) with ``X_world = R @ X_scene + t``.

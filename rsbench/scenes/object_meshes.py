@@ -29,13 +29,18 @@ class MeshFile:
     """A mesh file of the user, see ``scenes.mesh.MeshBuilder``."""
 
     file: str
-    """Relative to the dataset's card, or absolute; in a sequence.json the name alone."""
+    """Path of the mesh file, relative to the dataset's card, or absolute; in a sequence.json the name alone."""
     size: float | None = None
     """Longest edge of its box, metres; absent, as the file has it, times ``metres_per_unit``."""
     metres_per_unit: float = 1.0
+    """Metres of one unit of the file."""
     up_axis: Literal["x", "y", "z"] = "y"
+    """The file's upward axis; glTF has y up."""
     shading: Literal["flat", "smooth"] = "flat"
+    """Whether triangles are shaded flat or with the file's smooth normals."""
     transparent: Literal["refuse", "opaque"] = "refuse"
+    """What becomes of surfaces that are cut out or blended by an alpha: the file is refused, or they are rendered
+    opaque."""
 
     def __post_init__(self) -> None:
         if not Path(self.file).name:
@@ -78,18 +83,18 @@ class Body:
     """A rigid thing that moves."""
 
     position: Vector
-    """About which it turns, the middle of a box, or of that of a mesh file: in the world frame at time 0 (x right,
-    y down, z forward), m."""
+    """The point about which the object turns, the middle of the box or of the box around a mesh: in the world
+    frame at time 0 (x right, y down, z forward), metres."""
     instance: str = ""
-    """Name of a mesh of the scene: that mesh."""
+    """Name of a mesh of the scene that moves; give this, ``box`` or ``mesh``."""
     box: Vector | None = None
-    """Or the edges along x, y, z of a box, metres."""
+    """Edges along x, y, z of a textured box that moves, metres."""
     mesh: MeshFile | None = None
-    """Or a mesh file: upright, its x to the right."""
+    """Mesh file of an object that moves: upright, its x to the right."""
     attitude_deg: Vector = (0.0, 0.0, 0.0)
     """Rotation vector by which the box, or the mesh of a file, is turned at time 0."""
     texture_seed: int = 0
-    """Of the texture of the box."""
+    """Seed of the texture of the box."""
 
     def __post_init__(self) -> None:
         if [bool(self.instance), self.box is not None, self.mesh is not None].count(True) != 1:

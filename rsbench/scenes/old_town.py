@@ -28,6 +28,7 @@ class OldTownBuilder(SceneBuilder):
     closed = True
 
     street_width: float = 9.0
+    """Width of the street, metres, 6 to 14."""
     storeys: tuple[int, int] = (2, 3)
     """Least and greatest number of storeys of the houses."""
     stalls: int = 5

@@ -47,6 +47,7 @@ class GyroSolver(Solver):
     cameras_used: Literal["left", "both"] = "left"
     """The left camera's own translation without a length, or the rig's in metres."""
     refinement: Literal["none", "sampson"] = "sampson"
+    """``sampson``: least squares of the Sampson errors of all matches at the end; ``none``: without."""
 
     @property
     def spec(self) -> SolverSpec:

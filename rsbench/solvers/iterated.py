@@ -100,9 +100,11 @@ class IteratedSolver(Solver):
     """
 
     unknowns: Literal[9, 11, 15] = 15
+    """Unknowns of the linear system: 15; 11 without the products of w; 9 without w2 and w3 too."""
     scale: Literal["pairs", "tracks"] = "pairs"
     """Where the length of d comes from: the pairs, by the columns of the baseline, or left-right matches."""
     passes: int = 5
+    """Rounds of reweighted linear least squares."""
     max_translation_m: float = 50.0
     """Longest translation per frame period that counts as known length."""
 

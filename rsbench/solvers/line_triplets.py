@@ -204,7 +204,9 @@ class LineTripletSolver(Solver):
     threshold_px: float = 0.625
     """Largest error of an inlier, of a pair's as in the house's loop; it then follows the noise of either kind."""
     confidence: float = 0.999
+    """Probability with which RANSAC shall have seen a sample without outliers, 0 to 1."""
     max_iterations: int = 1000
+    """Samples that RANSAC draws, at most."""
 
     def __post_init__(self) -> None:
         check_number("threshold_px", self.threshold_px, 1e-6)

@@ -29,6 +29,7 @@ class OpenCvFivePointSolver(Solver):
     threshold_px: float = 1.0
     """Inlier threshold of OpenCV's own RANSAC, which it always runs."""
     confidence: float = 0.999
+    """Probability with which RANSAC shall have seen a sample without outliers, 0 to 1."""
 
     spec = SolverSpec(
         needs=frozenset({"left"}),

@@ -42,7 +42,9 @@ class P3pSolver(Solver):
     threshold_px: float = 4.0
     """Largest reprojection error of an inlier: beyond the noise of pixels and points, on a rolling shutter too."""
     confidence: float = 0.999
+    """Probability with which RANSAC shall have seen a sample without outliers, 0 to 1."""
     max_iterations: int = 1000
+    """Samples that RANSAC draws, at most."""
 
     def __post_init__(self) -> None:
         check_number("threshold_px", self.threshold_px, 0.0)

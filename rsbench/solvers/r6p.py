@@ -275,12 +275,15 @@ class R6pSolver(Solver):
     cameras_used: Literal["left", "both"] = "both"
     """Whose pixels of frame 1 count; minimal samples take the left camera's alone."""
     refinement: Literal["none", "reprojection"] = "reprojection"
+    """``reprojection``: least squares of the reprojection errors of all inliers at the end; ``none``: without."""
     start: Literal["p3p", "still"] = "p3p"
     """Whether R begins at the orientation that P3P gives of all matches, as published, or at frame 0's."""
     threshold_px: float = 4.0
     """Largest reprojection error of an inlier: beyond the noise of pixels and points."""
     confidence: float = 0.999
+    """Probability with which RANSAC shall have seen a sample without outliers, 0 to 1."""
     max_iterations: int = 1000
+    """Samples that RANSAC draws, at most."""
     lo_steps: int = 3
     """Refinements of each better sample; 0: of the last one alone."""
 

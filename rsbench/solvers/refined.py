@@ -68,6 +68,7 @@ class RefinedSolver(Solver):
     shutter: Literal["rolling", "global"] = "rolling"
     """Global: the same solver without readout, to see what the rolling shutter costs."""
     iterations: int = 60
+    """Steps of Levenberg and Marquardt, at most."""
     max_translation_m: float = 50.0
     """Longest translation per frame period; pairs alone may not bound it."""
     max_scale_sigma: float = 0.5

@@ -38,6 +38,7 @@ class WarpOptions:
     """How the source image becomes the target image."""
 
     interpolation: Interpolation = "cubic"
+    """Interpolation of colours between the source image's pixels."""
     tear_px: float = 0.2
     """Two neighbours are torn apart when a step of depth between them, which neither side's surface explains,
     moves them apart by more than this many px; so the mesh is at most this wrong between surfaces."""

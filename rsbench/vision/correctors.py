@@ -35,6 +35,7 @@ class FusionCorrector(Corrector):
     guess_depth: bool = True
     """Where no depth was found, take that of the farther neighbour in the row."""
     warp: WarpOptions = field(default_factory=WarpOptions)
+    """How pixels are taken from the source image."""
 
     spec = CorrectorSpec(
         needs={"motion", "depth"},
@@ -99,6 +100,7 @@ class RotationCorrector(Corrector):
     """Everything at infinity, which moves by the rotation alone: one homography per row."""
 
     warp: WarpOptions = field(default_factory=WarpOptions)
+    """How pixels are taken from the source image."""
 
     spec = CorrectorSpec(
         needs={"motion"},
@@ -117,6 +119,7 @@ class PlaneCorrector(Corrector):
     """Everything on the plane that fits the depth of the frame best: one homography per row."""
 
     warp: WarpOptions = field(default_factory=WarpOptions)
+    """How pixels are taken from the source image."""
 
     spec = CorrectorSpec(
         needs={"motion", "depth"},

@@ -51,7 +51,9 @@ class MatchOptions:
     max_features: int = 6000
     """Strongest features kept per image; 0 keeps all, 100 000 at most."""
     contrast_threshold: float = 0.04
+    """OpenCV's threshold of SIFT: fainter features are dropped."""
     edge_threshold: float = 10.0
+    """OpenCV's threshold of SIFT: features more edge-like than this are dropped."""
     ratio: float = 0.8
     """Best over second-best distance, at most."""
     max_distance: float = 300.0

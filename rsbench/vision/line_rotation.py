@@ -25,6 +25,7 @@ class LineOptions:
     threshold_px: float = 0.2
     """Root mean square by which the points of a curve may miss a line."""
     samples: int = 500
+    """Random samples of the search."""
     prior_deg: float = 3.0
     """What a component of the rotation in a frame period is expected to be, a standard deviation."""
 

@@ -40,6 +40,7 @@ class ManhattanOptions:
     least_share: float = 0.3
     """Of all points that must lie on lines along the directions."""
     samples: int = 500
+    """Random samples of the search."""
     prior_deg: float = 3.0
     """What a component of the rotation in a frame period is expected to be, a standard deviation."""
 

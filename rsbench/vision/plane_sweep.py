@@ -82,6 +82,7 @@ class SweepMatcher(MotionMatcher):
     consistency_px: float = 1.0
     """Largest difference of parallax to the depth of one other view, where that sees the pixel."""
     refine_rounds: int = 2
+    """Rounds in which depth is refined on the images, below the step of the planes; 0: none."""
 
     def __post_init__(self) -> None:
         if self.sources not in get_args(Sources):

@@ -31,6 +31,7 @@ class GyroCorrector(Corrector):
     """Everything at infinity, turned as a gyroscope says; what it has wrong (bias, noise, delay) stays wrong."""
 
     warp: WarpOptions = field(default_factory=WarpOptions)
+    """How pixels are taken from the source image."""
 
     spec = CorrectorSpec(
         needs={"gyro"},
@@ -85,8 +86,11 @@ class LinesCorrector(ImageRotationCorrector):
     """Turned such that curves become straight lines."""
 
     lines: LineOptions = field(default_factory=LineOptions)
+    """Search for the rotation from curves."""
     seed: int = 0
+    """Seed of the random samples."""
     warp: WarpOptions = field(default_factory=WarpOptions)
+    """How pixels are taken from the source image."""
 
     spec = CorrectorSpec(
         needs=set(),
@@ -111,8 +115,11 @@ class ManhattanCorrector(ImageRotationCorrector):
     """Turned such that lines run along three orthogonal directions."""
 
     manhattan: ManhattanOptions = field(default_factory=ManhattanOptions)
+    """Search for rotation and directions from curves."""
     seed: int = 0
+    """Seed of the random samples."""
     warp: WarpOptions = field(default_factory=WarpOptions)
+    """How pixels are taken from the source image."""
 
     spec = CorrectorSpec(
         needs=set(),

@@ -62,16 +62,21 @@ class SgmOptions:
     nearest_depth: float | None = None
     """Metres; None finds the range in the images, by matching them at a quarter of the size."""
     block_size: int = 5
+    """Side of the matched window, pixels, odd."""
     p1: int = 8
     """Penalty of a disparity step of 1, times block_size squared."""
     p2: int = 32
     """Penalty of larger steps, times block_size squared."""
     mode: Literal["sgbm", "hh", "3way", "hh4"] = "3way"
+    """Paths along which OpenCV sums costs: ``sgbm`` 5, ``hh`` 8, ``3way`` 3, ``hh4`` 4."""
     uniqueness_percent: int = 5
+    """Per cent by which the best cost must be below the second-best."""
     prefilter_cap: int = 31
+    """Largest horizontal derivative before matching, grey levels."""
     speckle_window: int = 100
     """Connected pieces of at most this many pixels are dropped; 0 keeps all."""
     speckle_range: int = 2
+    """Largest difference of disparity inside a connected piece, px."""
     consistency_px: float = 1.0
     """Largest difference between a pixel's disparity and that of its partner in the other image."""
     refine_iterations: int = 2

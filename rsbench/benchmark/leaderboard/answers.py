@@ -22,22 +22,33 @@ class Header:
     """The first line: which split it is about, what the method is and what it uses."""
 
     protocol: str
+    """Identifier of the track's protocol, as ``rsbench leaderboard template`` prints it."""
     split: str
+    """Name of the split that was solved."""
     method: str
+    """Name of the method on the board: letters, digits, dots, dashes and underscores."""
     uses: tuple[str, ...]
+    """What the method takes of what its protocol allows."""
     version: str = ""
+    """Version of the method."""
     description: str = ""
+    """What the method does."""
     authors: str = ""
+    """Who made the method."""
     paper: str = ""
+    """Where the method is published."""
     code: str = ""
+    """Where its code is."""
     licence: str = ""
+    """Licence of the code."""
     hardware: str = ""
+    """Machine on which the seconds were measured."""
     tuned_on: str = ""
     """Data by which its parameters were chosen."""
     motion_model: Literal["linear", "twist"] = "linear"
-    """That ``w`` and ``d`` are meant in, between the rows."""
+    """Motion model of the rows between the frames in which ``w`` and ``d`` are meant."""
     png_unit_m: float | None = None
-    """Metres of one step of depth maps that are PNG files."""
+    """Metres of one step of depth maps that are PNG files, above 0 and at most 1."""
 
     def __post_init__(self) -> None:
         try:
@@ -58,18 +69,27 @@ class Answer:
     """One motion or failure, as ``rsbench solve --json`` prints it."""
 
     name: str
-    """Of the problem."""
+    """Name of the problem."""
     success: bool = True
+    """Whether the method found an answer; a failure counts as the worst score."""
     reason: str = ""
+    """Why it failed."""
     w: Vector | None = None
+    """Rotation vector of one frame period, radians."""
     d: Vector | None = None
+    """Translation of one frame period; metres where ``metric`` is true."""
     metric: bool = False
+    """Whether the length of ``d`` is in metres."""
     reference_point: Literal["body", "left"] = "body"
+    """Point whose translation ``d`` is: the middle of the baseline or the left camera."""
     direction_known: bool = True
+    """Whether the direction of ``d`` means anything."""
     readout_ratio: float | None = None
-    """Where that is asked, instead of a motion."""
+    """Estimated readout ratio, 0 to 1, where the track asks it instead of a motion."""
     covariance: tuple[tuple[float, ...], ...] | None = None
+    """6 x 6 covariance of ``w`` and ``d``, symmetric."""
     seconds: float | None = None
+    """Seconds that the method took for the problem."""
 
     def __post_init__(self) -> None:
         ratio = self.readout_ratio

@@ -43,41 +43,54 @@ class Setting:
     """One simulated experiment; the paper leaves depth, points, rotation, translation and baseline open."""
 
     width: int
+    """Width of the images, pixels."""
     height: int
+    """Height of the images, pixels."""
     focal: float
-    """Pixels; the principal point is centred."""
+    """Focal length, pixels; the principal point is centred."""
     baseline: float
     """Full distance between the cameras, metres."""
     readout_ratio: float
+    """Readout time over frame period of the shutter that makes the images, 0 to 1."""
     points: int
     """Matches over time per camera, of points of its own; and tracks, for solvers that need all four images."""
     depth: tuple[float, float]
     """Range of depths in frame 0, metres, uniform."""
     rotation_deg: float
-    """Angle per frame period."""
+    """Angle of the rotation in one frame period, degrees."""
     translation: float
-    """Metres per frame period."""
+    """Length of the translation in one frame period, metres."""
     noise_px: float
     """Standard deviation of the noise on every pixel coordinate."""
     rotation_axis: Vector | None = None
-    """Need not be a unit vector; absent: drawn uniformly for every trial."""
+    """Axis of the rotation, of any length. Absent: drawn uniformly for every trial."""
     translation_axis: Vector | None = None
-    """Likewise."""
+    """Direction of the translation, of any length. Absent: drawn uniformly for every trial."""
     motion_model: str = "linear"
-    """Name of a motion model; what a solver assumes is its own affair."""
+    """Name of the motion model that makes the matches; solvers assume their own."""
     motion_parameters: dict[str, Any] = field(default_factory=dict)
-    """Of the motion model; absent ones have its defaults, or are drawn for every trial (a shake's seed)."""
+    """Parameters of the motion model; absent ones have its defaults, or are drawn for every trial (a shake's
+    seed)."""
     shape: SceneShape = "box"
+    """``box``: points at random depths; ``plane``: points on one slanted plane in the middle of the range."""
     outlier_ratio: float = 0.0
+    """Share of matches whose frame-1 pixels are replaced by others, 0 to below 1."""
     outlier_px: float = 80.0
+    """Outliers lie uniformly within this distance, per coordinate, of the truth, px."""
     readout_ratio_error: float = 0.0
-    """What the solver is told minus what is true."""
+    """Readout ratio that the solver is told minus the true one."""
     gyro_noise_deg: float = 0.0
+    """Standard deviation of a gyroscope's sample on each axis, degrees per frame period; of solvers that need
+    one."""
     gyro_bias_deg: float = 0.0
+    """Length of what is added to all gyroscope samples, degrees per frame period."""
     gyro_delay: float = 0.0
+    """Frame periods by which gyroscope samples say that they are later than they are."""
     gravity_noise_deg: float = 0.0
+    """Standard deviation of the two angles of the direction of gravity, degrees; of solvers that need it."""
     affine_noise: float = 0.0
-    """Of the sensors and affine frames that solvers are given which need them: see ``SimulationOptions``."""
+    """Standard deviation of the noise on every number of an affine frame, as a share of its size; of solvers that
+    need them."""
 
     def __post_init__(self) -> None:
         for name in ("rotation_deg", "translation", "noise_px", "outlier_px"):
@@ -159,7 +172,9 @@ class Variant:
     """The whole sweep once more, with some fields of the setting replaced."""
 
     name: str
+    """Name of the variant, in files and tables."""
     setting: dict[str, Any] = field(default_factory=dict)
+    """Fields of the setting with the values that they have in this variant."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,19 +192,25 @@ class SweepCard:
     """An experiment on simulated points."""
 
     name: str
+    """Name of the sweep, in files and tables."""
     description: str = ""
+    """One line for ``rsbench list sweeps``."""
     axis: Axis
     """The field of the setting that varies."""
     values: tuple[float, ...]
+    """Values of the field ``axis``, all different; each is an experiment of its own."""
     solvers: tuple[str, ...]
     """Solver cards, by name or path."""
     trials: int = 300
     """Repetitions per value, each with a scene, a motion and noise of its own."""
     seed: int = 0
+    """Seed of every trial's scene, motion and noise."""
     robust: bool = False
-    """Whether RANSAC goes round the solvers; without, they see all matches, as in the paper."""
+    """Whether solvers run inside RANSAC; without it they see all matches, as in the paper."""
     setting: Setting
+    """The experiment, but for the field that varies."""
     variant: tuple[Variant, ...] = (Variant(name="all"),)
+    """Repeats of the whole sweep with other settings; absent: one, of the setting as it is."""
 
     def __post_init__(self) -> None:
         check_name(self.name)

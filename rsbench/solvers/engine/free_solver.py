@@ -32,6 +32,7 @@ class FreeVelocitySolver(Solver):
     """Linear on the left camera's matches, then least squares of the Sampson error of the same model."""
 
     refinement: Literal["none", "sampson"] = "sampson"
+    """``sampson``: least squares of the Sampson errors of all matches at the end; ``none``: without."""
 
     @property
     @abstractmethod

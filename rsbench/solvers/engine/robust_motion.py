@@ -35,10 +35,15 @@ class RobustOptions:
     adapt_threshold: bool = True
     """Whether the threshold then follows the noise that the inliers show, between a fifth and four times it."""
     confidence: float = 0.999
+    """Probability with which RANSAC shall have seen a sample without outliers, 0 to 1."""
     min_iterations: int = 10
+    """Samples that RANSAC draws, at least."""
     max_iterations: int = 1000
+    """Samples that RANSAC draws, at most."""
     lo_steps: int = 3
+    """Refinements of each new best model, at thresholds that shrink from twice the threshold to it."""
     final_steps: int = 3
+    """Refinements at the end, until the inliers stay the same."""
 
     def ransac(self) -> RansacOptions:
         """As the loop wants it; checks the values."""
