@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import LinearMotion, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
@@ -35,29 +35,12 @@ def row_pair_pose(
     return Pose(R, t1 - (R @ t0[..., None])[..., 0])
 
 
-def rs_essential_matrix(
-    rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, y0: ArrayLike, y1: ArrayLike
-) -> FloatArray:
-    """Exact rolling-shutter essential matrix (..., 3, 3) of rows ``y0`` (frame 0) and ``y1`` (frame 1)."""
-    return essential_matrix(row_pair_pose(rig, shutter, motion, side, y0, y1))
-
-
 def epipolar_gradient(E: FloatArray, x0: FloatArray, x1: FloatArray, camera: PinholeCamera) -> FloatArray:
     """Derivative (..., 4) of ``x1^T E x0`` by the pixels (x0, y0, x1, y1); rays (..., 3) with z = 1."""
     line0 = (np.swapaxes(E, -1, -2) @ x1[..., None])[..., :2, 0]
     line1 = (E @ x0[..., None])[..., :2, 0]
     focal = np.array([camera.fx, camera.fy])
     return np.concatenate([line0 / focal, line1 / focal], axis=-1)
-
-
-def sampson_error(E: FloatArray, x0: FloatArray, x1: FloatArray, camera: PinholeCamera) -> FloatArray:
-    """Signed Sampson error in pixels (...) of rays (..., 3) with z = 1; independent of the scale of ``E``.
-
-    Zero where both the constraint and its gradient vanish. Hartley & Zisserman, 2nd ed., eq. 11.9.
-    """
-    value = np.einsum("...i,...ij,...j->...", x1, E, x0)
-    norm = np.linalg.norm(epipolar_gradient(E, x0, x1, camera), axis=-1)
-    return np.where(norm > 0.0, value / np.where(norm > 0.0, norm, 1.0), 0.0)
 
 
 def rs_constraint(
@@ -101,7 +84,8 @@ def rs_sampson_error(
 ) -> FloatArray:
     """Exact rolling-shutter Sampson error in pixels (n,) of matches (n, 4): x0, y0, x1, y1.
 
-    The distance to the nearest exact match, to first order; its sign is that of the constraint.
+    The distance to the nearest exact match, to first order; its sign is that of the constraint. Zero where both
+    the constraint and its gradient vanish. Hartley & Zisserman, 2nd ed., eq. 11.9.
     """
     value, gradient = rs_constraint(rig, shutter, motion, side, matches)
     norm = np.linalg.norm(gradient, axis=-1)
@@ -110,37 +94,6 @@ def rs_sampson_error(
 
 def _apply(R: FloatArray, x: FloatArray) -> FloatArray:
     return (R @ x[..., None])[..., 0]
-
-
-def rs_sampson_jacobian(
-    rig: StereoRig, shutter: RollingShutter, motion: LinearMotion, side: Side, matches: FloatArray
-) -> FloatArray:
-    """Derivative (n, 6) of ``rs_sampson_error`` by (w, d) for the paper's motion model.
-
-    Differentiates the denominator too (frozen weights shrink d towards its trivial zero); only the change of
-    the gradient's row-time terms is left out. Exact where the error is zero and for a global shutter.
-    """
-    x0, x1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
-    tau0, tau1 = shutter.pixel_time(matches[:, :2], 0, side), shutter.pixel_time(matches[:, 2:], 1, side)
-    a = tau1 - tau0
-    R = so3.exp(a[:, None] * motion.w)
-    offset = rig.offset(side)
-    Rt0 = _apply(R, tau0[:, None] * motion.d + offset)
-    T = tau1[:, None] * motion.d + offset - Rt0
-    # dR = [r_j]x R for the columns r_j of a J(a w); dT = -[r_j]x R t0 for w_j and (tau1 - tau0 R) e_j for d_j.
-    rotation_rate = np.swapaxes(a[:, None, None] * so3.left_jacobian(a[:, None] * motion.w), -1, -2)
-    T_by_w = -so3.cross(rotation_rate, Rt0[:, None])
-    E_by_w = hat(T_by_w) @ R[:, None] + hat(T)[:, None] @ hat(rotation_rate) @ R[:, None]
-    T_by_d = np.swapaxes(tau1[:, None, None] * np.eye(3) - tau0[:, None, None] * R, -1, -2)
-    E_by_d = hat(T_by_d) @ R[:, None]
-    dE = np.concatenate([E_by_w, E_by_d], axis=1)
-    dgradient = _by_pixels(epipolar_gradient(dE, x0[:, None], x1[:, None], rig.camera), rig.camera, matches)
-    value, gradient = rs_constraint(rig, shutter, motion, side, matches)
-    value = value[:, None]
-    dvalue = np.einsum("ni,nkij,nj->nk", x1, dE, x0)
-    norm = np.linalg.norm(gradient, axis=-1, keepdims=True)
-    norm = np.where(norm > 0.0, norm, np.inf)
-    return dvalue / norm - value / norm**3 * np.einsum("ni,nki->nk", gradient, dgradient)
 
 
 def ray_depths(pose: Pose, x0: FloatArray, x1: FloatArray) -> FloatArray:

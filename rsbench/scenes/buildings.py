@@ -1,4 +1,4 @@
-"""Houses and what they are made of: windows, doors, timber frames, roofs, chimneys, stairs.
+"""Houses and what they are made of: windows, doors, timber frames, roofs, chimneys.
 
 Fronts look towards -y with their middle at x = 0. Surfaces used: plaster_*, brick, stone, timber, planks, glass,
 tiles_*, iron, leaves.
@@ -159,13 +159,6 @@ def timber_frame(
                 z = height * rng.uniform(0.4, 0.6)
                 pieces.append(beam("timber", (left, -0.02, z), (right, -0.02, z), 0.13, 0.1))
     return pieces
-
-
-def stairs(surface: str, steps: int, width: float, run: float = 0.28, rise: float = 0.19) -> list[Piece]:
-    """Solid stairs that climb towards +y from the origin."""
-    return [
-        box(surface, (-width / 2, k * run, -0.2), (width / 2, steps * run, (k + 1) * rise)) for k in range(steps)
-    ]
 
 
 def house(rng: np.random.Generator, style: HouseStyle) -> list[Piece]:

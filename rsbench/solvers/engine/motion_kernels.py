@@ -52,7 +52,7 @@ def linear_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: F
 def linear_translation_jacobian(
     theta: FloatArray, tau0: float, R: FloatArray, A: FloatArray, tau1: float, T_w: FloatArray, T_v: FloatArray
 ) -> None:
-    """dT/dw_j = -tau0 [A_j]x R d and dT/dd = tau1 I - tau0 R. NumPy: ``epipolar.rs_sampson_jacobian``."""
+    """dT/dw_j = -tau0 [A_j]x R d and dT/dd = tau1 I - tau0 R."""
     Rv = apply(R, (theta[3], theta[4], theta[5]))
     for j in range(3):
         column = cross((A[0, j], A[1, j], A[2, j]), Rv)
