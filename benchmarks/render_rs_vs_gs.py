@@ -19,7 +19,6 @@ from dataclasses import replace
 
 import numpy as np
 import trimesh
-from rsbench.scenes.object_meshes import Body, with_moving
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.lens import Lens
@@ -33,6 +32,7 @@ from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import Frame, render, render_global
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Light, Material, Scene, SceneMesh
+from rsbench.scenes.object_meshes import Body, with_moving
 
 LENSES = (
     Lens(model="brown-conrady", k1=-0.28, k2=0.07, p1=0.002, p2=-0.001, k3=0.004),

@@ -22,14 +22,13 @@ from rsbench.benchmark.simulated.contract import CHECKS, check_solver
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.benchmark.studies.claims import CLAIMS
 from rsbench.benchmark.studies.correction_methods import METHODS
-from rsbench.components.cards import CardKind, list_cards, load_card, read_toml
+from rsbench.components.cards import CardKind, list_cards, read_toml
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import load_dataset_card
-from rsbench.renderers.options import RendererOptions
 from rsbench.solvers.engine.registry import list_solvers, load_solver_entry
 
 ROOT = Path(__file__).parents[1]
@@ -54,13 +53,16 @@ def _blocks(document: Path, language: str) -> list[str]:
 # Sizes
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_files_and_functions_are_short(path: Path) -> None:
-    text = path.read_text("utf-8")
-    assert text.count("\n") <= MAX_FILE_LINES
-    functions = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
-    long = {f.name: n for f in functions if (n := _own_lines(f)) > MAX_FUNCTION_LINES}
-    assert not long, f"functions above {MAX_FUNCTION_LINES} lines: {long}"
+def test_files_and_functions_are_short() -> None:
+    long: list[str] = []
+    for path in SOURCES:
+        text, name = path.read_text("utf-8"), path.relative_to(ROOT)
+        if (lines := text.count("\n")) > MAX_FILE_LINES:
+            long.append(f"{name}: {lines} lines")
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef) and (lines := _own_lines(node)) > MAX_FUNCTION_LINES:
+                long.append(f"{name}: {node.name}: {lines} lines")
+    assert not long, f"files above {MAX_FILE_LINES} lines, functions above {MAX_FUNCTION_LINES}: {long}"
 
 
 def _own_lines(function: ast.FunctionDef) -> int:
@@ -103,17 +105,9 @@ def test_nothing_points_at_one_machine_or_one_package_index() -> None:
     assert not found
 
 
-@pytest.mark.parametrize(
-    ("text", "bad"),
-    [
-        ("open('/home/" + "me/x')", True),
-        ("--extra-" + "index-url x", True),
-        ("the network/home/page", False),
-        ("https://github.com/rsbench/rsbench", False),
-    ],
-)
-def test_the_search_for_machine_paths_can_find_them(text: str, bad: bool) -> None:
-    assert bool(_FORBIDDEN.search(text)) == bad
+def test_the_search_for_machine_paths_can_find_them() -> None:
+    assert _FORBIDDEN.search("open('/home/" + "me/x')") and _FORBIDDEN.search("--extra-" + "index-url x")
+    assert not _FORBIDDEN.search("the network/home/page, https://github.com/rsbench/rsbench")
 
 
 @in_checkout
@@ -172,26 +166,11 @@ def test_there_are_cards_of_every_kind() -> None:
         assert list_cards(kind), f"no {kind} cards"
 
 
-@pytest.mark.parametrize("name", list_cards("renderers"))
-def test_renderer_cards_load(name: str) -> None:
-    assert load_card(RendererOptions, "renderers", name).description
-
-
-@pytest.mark.parametrize("name", list_cards("solvers"))
-def test_solver_cards_load(name: str) -> None:
-    assert load_solver_entry(name).description
-
-
-@pytest.mark.parametrize("name", list_cards("datasets"))
-def test_dataset_cards_load_and_name_cards_that_exist(name: str) -> None:
-    card = load_dataset_card(name)
-    assert card.renderer in list_cards("renderers")
-    assert {sequence.scene for sequence in card.sequence} <= set(list_cards("scenes"))
-
-
-@pytest.mark.parametrize("name", list_cards("scenes"))
-def test_scene_cards_name_themselves(name: str) -> None:
-    assert read_toml(list_cards("scenes")[name])["name"] == name
+def test_dataset_cards_name_cards_that_exist() -> None:
+    for name in list_cards("datasets"):
+        card = load_dataset_card(name)
+        assert card.renderer in list_cards("renderers"), name
+        assert {sequence.scene for sequence in card.sequence} <= set(list_cards("scenes")), name
 
 
 # Documents

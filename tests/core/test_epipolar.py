@@ -100,7 +100,7 @@ def test_constraint_and_its_gradient_are_those_of_the_world_frame(motion: Motion
 def _nearest_exact_match(motion: Motion, side: Side, match: FloatArray) -> FloatArray:
     """Shift (4,) to the nearest match on the constraint: it lies on the surface and along its normal there."""
     shift = np.zeros(4)
-    for _ in range(30):
+    for _ in range(8):  # the distance from the surface falls by more than a hundred in each
         normal = _numeric_gradient(motion, side, match + shift)
         value = _world_constraint(motion, side, match + shift)
         shift = -normal * (value - normal @ shift) / (normal @ normal)
@@ -108,8 +108,7 @@ def _nearest_exact_match(motion: Motion, side: Side, match: FloatArray) -> Float
     return shift
 
 
-@pytest.mark.parametrize("noise", [0.5, 0.05])
-@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize(("side", "noise"), [("left", 0.5), ("right", 0.05)])
 @pytest.mark.parametrize("motion", MOTIONS, ids=lambda motion: motion.name)
 def test_sampson_error_is_the_distance_to_the_nearest_exact_match(
     motion: Motion, side: Side, noise: float

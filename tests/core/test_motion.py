@@ -51,13 +51,6 @@ def test_twist_motion_is_the_matrix_exponential_of_its_twist(w: FloatArray, d: F
 
 
 @few
-@given(vectors, vectors, times, times)
-def test_twist_motion_is_a_one_parameter_group(w: FloatArray, d: FloatArray, s: float, t: float) -> None:
-    motion = TwistMotion(w, d)
-    np.testing.assert_allclose(_matrix(motion, s + t), _matrix(motion, s) @ _matrix(motion, t), rtol=0, atol=1e-13)
-
-
-@few
 @given(vectors, vectors, st.floats(-1.0, 2.0))
 def test_an_inertial_body_keeps_its_velocity_in_the_world_and_its_rate_of_turn(
     w: FloatArray, d: FloatArray, start: float
@@ -71,13 +64,6 @@ def test_an_inertial_body_keeps_its_velocity_in_the_world_and_its_rate_of_turn(
         np.testing.assert_allclose(R, so3.exp(tau[:, None] * w), rtol=0, atol=1e-12)
     later, general = InertialMotion(w, d).from_time(start), LaterMotion.of(InertialMotion(w, d), start)
     np.testing.assert_allclose(_matrix(later, 0.7), _matrix(general, 0.7), rtol=0, atol=1e-12)
-
-
-def test_the_twist_is_the_matrix_logarithm_of_the_pose_after_one_period() -> None:
-    w, d = np.array([0.3, -0.2, 0.4]), np.array([0.1, 0.7, -0.2])
-    M = np.eye(4)
-    M[:3, :3], M[:3, 3] = expm(so3.hat(w)), d
-    np.testing.assert_allclose(TwistMotion(w, d).v, logm(M)[:3, 3], rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -104,23 +90,15 @@ def test_velocity_is_the_derivative_of_the_pose(model: Model, w: FloatArray, d: 
     np.testing.assert_allclose((after.t - before.t) / (2 * step), t_rate, rtol=0, atol=atol)
 
 
-def test_models_agree_without_rotation_and_differ_with_it() -> None:
-    d, tau = np.array([0.1, 0.2, 0.3]), np.linspace(0, 1, 5)
-    still = [model(np.array([0, 0, 0]), d).body_from_world(tau).t for model in (LinearMotion, TwistMotion)]
-    np.testing.assert_allclose(still[0], still[1], rtol=0, atol=1e-15)
-    turning = [model(np.array([0.2, 0, 0]), d).body_from_world(tau).t for model in (LinearMotion, TwistMotion)]
-    assert np.max(np.abs(turning[0][2] - turning[1][2])) > 1e-3
-
-
 @pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("shape", [(), (1,), (4,), (2, 3)])
-def test_times_of_any_shape(model: Model, shape: tuple[int, ...]) -> None:
+def test_times_of_any_shape(model: Model) -> None:
     motion = model(np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0]))
-    tau = np.linspace(0, 1, int(np.prod(shape))).reshape(shape)
-    R, t = motion.body_from_world(tau)
-    w_rate, t_rate = motion.velocity(tau)
-    assert (R.shape, t.shape) == ((*shape, 3, 3), (*shape, 3))
-    assert w_rate.shape == t_rate.shape == (*shape, 3)
+    for shape in ((), (1,), (2, 3)):
+        tau = np.linspace(0, 1, int(np.prod(shape))).reshape(shape)
+        R, t = motion.body_from_world(tau)
+        w_rate, t_rate = motion.velocity(tau)
+        assert (R.shape, t.shape) == ((*shape, 3, 3), (*shape, 3))
+        assert w_rate.shape == t_rate.shape == (*shape, 3)
 
 
 def test_the_given_arrays_are_copied_and_frozen() -> None:
@@ -211,9 +189,8 @@ def test_the_spline_is_the_cumulative_one_of_its_poses(seed: int, tau: float) ->
     np.testing.assert_allclose(_matrix(motion, tau), expected, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("preset", list(PRESETS))
 @few
-@given(vectors, vectors, st.integers(0, 10**6))
+@given(st.sampled_from(list(PRESETS)), vectors, vectors, st.integers(0, 10**6))
 def test_a_shake_moves_neither_end(preset: str, w: FloatArray, d: FloatArray, seed: int) -> None:
     R, t = SplineMotion(0.3 * w, 0.3 * d, preset=preset, seed=seed).body_from_world([0.0, 1.0])
     np.testing.assert_allclose(R, [np.eye(3), expm(so3.hat(0.3 * w))], rtol=0, atol=1e-12)

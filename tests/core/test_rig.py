@@ -34,15 +34,6 @@ def test_cameras_of_one_time_are_a_rectified_pair(model: type[LinearMotion] | ty
     np.testing.assert_allclose(RIG.depth(disparity), left[:, 2], rtol=1e-11)
 
 
-def test_rotations_are_shared_and_centres_stay_a_baseline_apart() -> None:
-    motion = LinearMotion(np.array([0.3, -0.2, 0.1]), np.array([0.5, 0.1, 0.2]))
-    left, right = (RIG.cam_from_world(motion, [0.0, 0.4, 1.3], side) for side in SIDES)
-    np.testing.assert_array_equal(left.R, right.R)
-    np.testing.assert_allclose(left.t - right.t, np.tile([0.2, 0, 0], (3, 1)), rtol=0, atol=1e-15)
-    centres = inverse(left).t - inverse(right).t
-    np.testing.assert_allclose(np.linalg.norm(centres, axis=1), 0.2, rtol=1e-14)
-
-
 def test_a_rig_about_a_camera_has_that_camera_for_its_body() -> None:
     still = LinearMotion(np.zeros(3), np.zeros(3))
     for origin, centres in (("left", [0.0, 0.2]), ("right", [-0.2, 0.0]), ("middle", [-0.1, 0.1])):

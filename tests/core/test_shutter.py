@@ -26,18 +26,6 @@ def test_ratio_zero_is_a_global_shutter() -> None:
     np.testing.assert_array_equal(shutter.row_time(np.arange(7), 1), np.ones(7))
 
 
-def test_ratio_one_leaves_no_gap_between_frames() -> None:
-    shutter = RollingShutter(height=8, readout_ratio=1.0)
-    assert shutter.row_time(8, 0) == shutter.row_time(0, 1)
-
-
-def test_rows_and_frames_broadcast() -> None:
-    shutter = RollingShutter(height=10, readout_ratio=0.5)
-    times = shutter.row_time(np.arange(10)[None], np.arange(2)[:, None])
-    assert times.shape == (2, 10)
-    np.testing.assert_allclose(times[1] - times[0], 1.0, rtol=0, atol=1e-15)
-
-
 @pytest.mark.parametrize("ratio", [-0.1, 1.1, float("nan")])
 def test_ratios_outside_zero_to_one_are_refused(ratio: float) -> None:
     with pytest.raises(ValueError, match="readout_ratio"):

@@ -110,19 +110,20 @@ def nearest_surface(scene: Scene, view: str) -> float:
     return min(nearest, float(np.min(np.linalg.norm(foot[inside], axis=1), initial=np.inf)))
 
 
-@pytest.mark.parametrize("card", ["standard", "sweep-readout", "stress"])
-def test_no_seed_leads_a_camera_of_these_cards_into_a_wall(scene: Scene, name: str, card: str) -> None:
+def test_no_seed_leads_a_camera_of_these_cards_into_a_wall(scene: Scene, name: str) -> None:
     """A camera is never farther from the viewpoint than half the baseline and the whole way, wherever it turns."""
-    dataset = load_dataset_card(card)
-    for view in {sequence.viewpoint for sequence in dataset.sequence if sequence.scene == name}:
-        reach = max(
-            dataset.rig_of(sequence).baseline / 2
-            + (1 + dataset.shutter_for(sequence).readout_ratio)
-            * float(np.linalg.norm(dataset.motion_of(sequence).d))
-            for sequence in dataset.sequence
-            if (sequence.scene, sequence.viewpoint) == (name, view)
-        )
-        assert reach < nearest_surface(scene, view), view
+    reach: dict[str, float] = {}
+    for card in ("standard", "sweep-readout", "stress"):
+        dataset = load_dataset_card(card)
+        for sequence in dataset.sequence:
+            if sequence.scene == name:
+                way = (1 + dataset.shutter_for(sequence).readout_ratio) * np.linalg.norm(
+                    dataset.motion_of(sequence).d
+                )
+                own = dataset.rig_of(sequence).baseline / 2 + float(way)
+                reach[sequence.viewpoint] = max(own, reach.get(sequence.viewpoint, 0.0))
+    for view, farthest in reach.items():
+        assert farthest < nearest_surface(scene, view), view
 
 
 def first_hits(scene: Scene, view: str, rays: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -108,9 +108,9 @@ def test_where_nothing_can_be_kept_scenes_are_built(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_scene_is_built_once(cache: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    first = load_scene("poles")
-    monkeypatch.setattr("rsbench.scenes.poles.PolesBuilder.build", None)
-    second = load_scene("poles")
+    first = load_scene("corridor")
+    monkeypatch.setattr("rsbench.scenes.corridor.CorridorBuilder.build", None)
+    second = load_scene("corridor")
     assert scene_hash(first) == scene_hash(second)
-    card, builder = read_scene_card(Path(load.__file__).parents[2] / "scenes" / "poles.toml")
+    card, builder = read_scene_card(Path(load.__file__).parents[2] / "scenes" / "corridor.toml")
     assert built_key(builder, card.seed) != built_key(builder, card.seed + 1)

@@ -110,18 +110,17 @@ def palette() -> dict[str, Surface]:
         return paint_palette(RECIPES, 7)
 
 
-@pytest.mark.parametrize("name", sorted(RECIPES))
-def test_every_surface_paints_and_repeats(palette: dict[str, Surface], name: str) -> None:
-    surface = palette[name]
-    texture = surface.material.texture
-    assert texture is not None and texture.dtype == np.uint8 and texture.shape[2] == 3
-    assert 20 < texture.mean() < 235
-    # Enough contrast for a feature detector: a few grey levels from texel to texel and from stone to stone. Paint
-    # and sheet metal are weak on purpose, but not one colour.
-    weak = name.startswith("paint_") or name in ("enamel", "steel")
-    assert texture.mean(axis=2).std() > (1.5 if weak else 5.0)
-    if surface.repeat is not None:
-        assert max(seam_ratio(texture, 0), seam_ratio(texture, 1)) < 1.3
+def test_every_surface_paints_and_repeats(palette: dict[str, Surface]) -> None:
+    for name, surface in palette.items():
+        texture = surface.material.texture
+        assert texture is not None and texture.dtype == np.uint8 and texture.shape[2] == 3, name
+        assert 20 < texture.mean() < 235, name
+        # Enough contrast for a feature detector: a few grey levels from texel to texel and from stone to stone.
+        # Paint and sheet metal are weak on purpose, but not one colour.
+        weak = name.startswith("paint_") or name in ("enamel", "steel")
+        assert texture.mean(axis=2).std() > (1.5 if weak else 5.0), name
+        if surface.repeat is not None:
+            assert max(seam_ratio(texture, 0), seam_ratio(texture, 1)) < 1.3, name
 
 
 def test_a_texture_depends_on_seed_and_name_alone() -> None:

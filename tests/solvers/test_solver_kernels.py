@@ -24,9 +24,9 @@ SHUTTER = RollingShutter(height=700, readout_ratio=0.8)
 pytestmark = pytest.mark.parametrize("model", ["linear", "twist", "inertial", "accelerated"])
 
 
-def problem(model: str, noise_px: float, angle: float = 0.05) -> tuple[Correspondences, Motion, Packed]:
+def problem(model: str, noise_px: float) -> tuple[Correspondences, Motion, Packed]:
     rng = np.random.default_rng(3)
-    motion = random_motion(rng, angle, 0.3, model)
+    motion = random_motion(rng, 0.05, 0.3, model)
     options = SimulationOptions(pairs=40, tracks=40, noise_px=noise_px)
     c = simulate(RIG, SHUTTER, motion, options, rng).correspondences
     return c, motion, pack(c, RIG, SHUTTER, model)
@@ -86,12 +86,10 @@ def test_track_errors_are_those_of_the_best_point(model: str) -> None:
         assert square == pytest.approx(2 * best.cost, rel=0.01, abs=1e-4)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-4, 0.05, 0.5])
-def test_gradient_and_hessian_against_finite_differences(model: str, angle: float) -> None:
-    c, motion, _ = problem(model, noise_px=0.0, angle=0.05)
+def test_gradient_and_hessian_against_finite_differences(model: str) -> None:
+    c, motion, _ = problem(model, noise_px=0.0)
     for part in (Correspondences(left=c.left, right=c.right), Correspondences(tracks=c.tracks)):
         packed = pack(part, RIG, SHUTTER, model)
-        theta = packed.theta(motion.w * angle / 0.05, motion.d)
         # Move the measurements onto the motion: at zero residuals the Hessian is exact.
         shift = np.array([2.0, -3.0, 1.0, 4.0, -2.0, 3.0]) * 1e-6
         exact = packed.theta(motion.w, motion.d)
@@ -108,7 +106,9 @@ def test_gradient_and_hessian_against_finite_differences(model: str, angle: floa
             for e in np.eye(6)
         ]
         np.testing.assert_allclose(gradient, numeric, rtol=2e-4, atol=1e-4 * np.max(np.abs(gradient)))
-        assert np.all(np.isfinite(packed.normal_equations(theta)[2]))
+        for angle in (0.0, 1e-4, 0.5):
+            turned = packed.theta(motion.w * angle / 0.05, motion.d)
+            assert np.all(np.isfinite(packed.normal_equations(turned)[2]))
 
 
 def test_gradient_is_that_of_the_sampson_cost_under_noise(model: str) -> None:
