@@ -395,3 +395,19 @@ def test_corrections_shown_are_those_of_the_study() -> None:
                 low, high = (round(float(row[f"gain_{end}"]), 1) + 0.0 for end in ("low", "high"))  # no -0.0
                 expected += f" [{low:.1f}, {high:.1f}]"
             assert cell == expected, (title, stratum)
+
+
+def test_the_files_for_the_forge_are_yaml_and_name_what_exists() -> None:
+    import yaml
+
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text("utf-8"))["repos"]
+    assert [repo["repo"] for repo in hooks] == ["local"], "nothing is fetched"
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text("utf-8"))["jobs"]
+    matrix = jobs["tests"]["strategy"]["matrix"]
+    assert matrix["python"] == ["3.11", "3.12", "3.13", "3.14"] and len(matrix["os"]) == 3
+    targets = re.findall(r"make (\w+)", " ".join(step.get("run", "") for step in jobs["check"]["steps"]))
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    assert targets == ["test", "docs"] and all(f"\n{target}: " in makefile for target in targets)
+    forms = list((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"))
+    assert len(forms) == 2
+    assert all({"name", "description", "body"} <= set(yaml.safe_load(form.read_text("utf-8"))) for form in forms)
