@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 import rsbench
 from rsbench.cli.docs import docs, list_documents
@@ -92,3 +92,18 @@ def test_a_dataset_becomes_one_picture(
     for column, sequence in enumerate(rsbench.read_dataset(smoke_dataset)):
         np.testing.assert_array_equal(sheet[:, 128 * column : 128 * (column + 1)], sequence.image("rs", "left", 0))
     assert sheet.shape == (96, 3 * 128, 3) and not sheet[:, 2 * 128 :].any()
+
+
+def test_a_correction_becomes_a_moving_picture(smoke_dataset: Path, tmp_path: Path) -> None:
+    """Two frames: as photographed and corrected, then the truth in both places; the depth stands still."""
+    script = runpy.run_path(str(ROOT / "examples" / "before_after.py"))
+    (sequence, *_) = rsbench.read_dataset(smoke_dataset)
+    script["moving_picture"](sequence, tmp_path / "moving.gif")
+    with Image.open(tmp_path / "moving.gif") as moving:
+        shown = [np.asarray(frame.convert("RGB")).astype(float) for frame in ImageSequence.Iterator(moving)]
+    assert len(shown) == 2
+    width, head = script["WIDTH"], script["HEAD"]
+    starts = [column * (width + script["GAP"]) for column in range(3)]
+    before, after, depth = ([frame[head:, left : left + width] for frame in shown] for left in starts)
+    assert np.abs(after[0] - after[1]).mean() < 0.8 * np.abs(before[0] - before[1]).mean()
+    assert np.abs(before[1] - after[1]).mean() < 1.0 and np.abs(depth[0] - depth[1]).mean() < 1.0

@@ -318,6 +318,30 @@ def _table(name: str) -> list[dict[str, str]]:
     return list(csv.DictReader((ROOT / "results" / name).read_text("utf-8").splitlines()))
 
 
+def test_readme_is_short_and_shows_rows_of_the_results_pages() -> None:
+    readme = (ROOT / "README.md").read_text("utf-8")
+    assert readme.count("\n") <= 150
+    pages = {line for text in RESULTS.values() for line in text.splitlines()}
+    rows = [line for line in readme.splitlines() if line.startswith("|")]
+    assert len(rows) > 12 and set(rows) <= pages
+    assert (DOCS / "before-after.gif").stat().st_size < 1.5e6
+
+
+def test_badges_and_citation_tell_what_the_package_says() -> None:
+    readme = (ROOT / "README.md").read_text("utf-8")
+    project = read_toml(ROOT / "pyproject.toml")["project"]
+    (python,) = re.findall(r"badge/python-([\d.]+)%20or%20later", readme)
+    (licence,) = re.findall(r"badge/licence-(\w+)-", readme)
+    assert (f">={python}", licence) == (project["requires-python"], project["license"])
+    citation = (ROOT / "CITATION.cff").read_text("utf-8")
+    (entry,) = _blocks(ROOT / "README.md", "bibtex")
+    for bibtex, cff in (("title", "title"), ("version", "version"), ("url", "repository-code")):
+        (shown,) = re.findall(rf"^  {bibtex} *= \{{+(.*?)\}}+,?$", entry, re.MULTILINE)
+        (stated,) = re.findall(rf"^{cff}: \"?(.*?)\"?$", citation, re.MULTILINE)
+        assert shown == stated
+    assert rsbench.__version__ in entry
+
+
 def test_figures_shown_are_those_of_the_committed_results() -> None:
     published = {
         line for path in (ROOT / "results").rglob("*.md") for line in path.read_text("utf-8").splitlines()
@@ -372,8 +396,8 @@ def test_the_cost_of_estimated_motion_is_that_of_the_study() -> None:
         assert f"at most {figure}" in " ".join(RESULTS["results-correction.md"].split())
 
 
-def test_readme_card_is_one(tmp_path: Path) -> None:
-    (text,) = re.findall(r"^```toml\n(.*?)^```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL | re.MULTILINE)
+def test_the_documented_card_is_one(tmp_path: Path) -> None:
+    text, *_ = _blocks(DOCS / "how-to" / "make-data.md", "toml")
     (tmp_path / "mine.toml").write_text(text, "utf-8")
     card = load_dataset_card(str(tmp_path / "mine.toml"))
     assert card.camera.lens is not None and card.sensor is not None and "imu" in card.channels
