@@ -16,15 +16,16 @@ from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.storage.files import read_json
 from rsbench.verification import structure
 from rsbench.verification.content import images_elsewhere
-from rsbench.verification.findings import DepthAgreement, Progress, SequenceReport
+from rsbench.verification.findings import MISSING, DepthAgreement, Finding, Progress, SequenceReport, files_of
 from rsbench.verification.imu_checks import imu_faults
 from rsbench.verification.poses import pose_faults
 from rsbench.verification.rerender import Again, Rerender
 from rsbench.verification.timing_checks import timing_faults
-from rsbench.verification.walk import STEPS, Walk, file_of
+from rsbench.verification.walk import STEPS, Walk
 
 __all__ = [
     "DepthAgreement",
+    "Finding",
     "Rerender",
     "SequenceReport",
     "verification_steps",
@@ -66,7 +67,7 @@ def verify_dataset(
     step = progress or (lambda name: None)
     listing = structure.Listing.of(folder, manifest)
     faults = tuple(structure.dataset_faults(listing))
-    reports = [SequenceReport(name=structure.DATASET, faults=faults)] if faults else []
+    reports = [SequenceReport(name=structure.DATASET, findings=faults)] if faults else []
     again = None if rerender == "no" else Again(rerender, *_cards_and_files(scenes))
     return reports + [verify_sequence(listing, name, stride, step, again) for name in listing.names]
 
@@ -85,7 +86,7 @@ def verification_steps(manifest: Mapping[str, Any]) -> int:
 
 def _steps(listing: structure.Listing) -> int:
     """Of each sequence."""
-    frames = len(FRAMES) if isinstance(listing.card, str) else listing.card.frames
+    frames = len(FRAMES) if isinstance(listing.card, Finding) else listing.card.frames
     return 1 + STEPS * (frames - 1)
 
 
@@ -108,22 +109,25 @@ def verify_sequence(
             step(sequence)
 
     try:
-        missing = {fault.removesuffix(": missing").removeprefix(f"{name}/") for fault in faults}
+        missing = {each.file.removeprefix(f"{name}/") for each in faults if each.words == MISSING}
         sequence = read_sequence(listing.folder / name)
         faults += structure.sequence_faults(sequence, name, listing)
         faults += pose_faults(sequence)
-        faults += timing_faults(sequence, {*missing, *map(file_of, faults)})
-        faults += imu_faults(sequence, {*missing, *map(file_of, faults)})
+        faults += timing_faults(sequence, {*missing, *files_of(faults)})
+        faults += imu_faults(sequence, {*missing, *files_of(faults)})
         elsewhere = images_elsewhere(sequence, partial(_others, listing, name))
         walk = Walk(sequence, missing, elsewhere, stride, again, faults)
         walk.go(counted)
     except RsbenchError as error:
-        faults.append(str(error))
+        faults.append(Finding.of(error))
     for _ in range(steps):
         step(name)
     agreements, notes = ((), ()) if walk is None else (walk.agreements.values(), walk.notes)
     return SequenceReport(
-        name=name, faults=tuple(dict.fromkeys(faults)), agreements=tuple(agreements), notes=tuple(notes)
+        name=name,
+        findings=tuple(dict.fromkeys(faults)),
+        agreements=tuple(agreements),
+        notes=tuple(notes),
     )
 
 

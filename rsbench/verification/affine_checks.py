@@ -16,7 +16,7 @@ from rsbench.dataset.channels import AFFINE, TRACKS
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.tracks import Tracks, track_views
 from rsbench.dataset.views import Shot
-from rsbench.verification.findings import finding
+from rsbench.verification.findings import Finding
 from rsbench.verification.frame_comparison import DepthMap
 from rsbench.verification.surface_checks import FEW_BENT, LEVEL
 
@@ -29,7 +29,7 @@ _FEW_AGAIN, _FEW_LOST, _LEAST = 5e-3, 0.02, 4
 
 def affine_faults(
     sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str], times: tuple[int, ...] = FRAMES
-) -> Iterator[str]:
+) -> Iterator[Finding]:
     """What affine frames show that tracks, depth maps and motion cannot have made, but for files ``told``.
 
     Derivatives are looked at once, with frame 0 among these ``times``; normals with the maps that there are.
@@ -39,17 +39,17 @@ def affine_faults(
     try:
         affine, tracks = sequence.affine(), sequence.tracks()
     except RsbenchError as error:
-        yield str(error)
+        yield Finding.of(error)
         return
     if affine.jacobians.shape[:2] != tracks.tau.shape:
-        yield finding(AFFINE, f"is of {affine.jacobians.shape[:2]} points and views, tracks of {tracks.tau.shape}")
+        yield Finding(AFFINE, f"is of {affine.jacobians.shape[:2]} points and views, tracks of {tracks.tau.shape}")
         return
     if 0 in times:
         yield from _jacobian_faults(sequence, affine, tracks)
     lost = np.all(affine.normals == 0.0, axis=1)
     off = ~lost & (np.abs(np.linalg.norm(affine.normals, axis=1) - 1.0) > _UNIT)
     if np.any(off) or np.sum(lost) > max(_FEW_LOST * len(lost), _LEAST):
-        yield finding(AFFINE, f"{np.sum(off)} normals are not of length 1, and {np.sum(lost)} are 0")
+        yield Finding(AFFINE, f"{np.sum(off)} normals are not of length 1, and {np.sum(lost)} are 0")
         return
     for k, view in enumerate(track_views(sequence.frames)):
         shot, own = Shot("rs", *view), (tracks.sources == k) & ~lost
@@ -57,21 +57,24 @@ def affine_faults(
             yield from _normal_faults(sequence, maps[shot], affine.normals[own], tracks.pixels[own, k])
 
 
-def _jacobian_faults(sequence: Sequence, affine: AffineFrames, tracks: Tracks) -> Iterator[str]:
+def _jacobian_faults(sequence: Sequence, affine: AffineFrames, tracks: Tracks) -> Iterator[Finding]:
     made = jacobians_of(sequence, tracks, affine.normals)
     for k, (side, frame) in enumerate(track_views(sequence.frames)):
         own, stored = made[:, k], affine.jacobians[:, k]
-        file = f"{AFFINE}: {side}_{frame}"
+        name = f"{side}_{frame}"
         empty = np.any(np.isnan(stored), axis=(1, 2)) != np.any(np.isnan(own), axis=(1, 2))
         if np.any(empty):
-            yield finding(file, f"{np.sum(empty)} derivatives are there without a pixel, or lack with one")
+            yield Finding(
+                AFFINE, f"{np.sum(empty)} derivatives are there without a pixel, or lack with one", part=name
+            )
             continue
         size = np.maximum(np.max(np.abs(own), axis=(1, 2)), 1.0)[:, None, None]
         wrong = np.any(np.abs(stored - own) > _SAME * size, axis=(1, 2))
         if np.any(wrong):
             what = f"{np.sum(wrong)} of {len(own)} derivatives are not those of plane, motion and row times"
             typical = np.median(np.max(np.abs(stored - own)[wrong], axis=(1, 2)))
-            yield finding(file, f"{what}, typically by {typical:.2g}", cause=_cause(stored[wrong], own[wrong]))
+            cause = _cause(stored[wrong], own[wrong])
+            yield Finding(AFFINE, f"{what}, typically by {typical:.2g}", cause=cause, part=name)
 
 
 def _cause(stored: FloatArray, made: FloatArray) -> str:
@@ -83,7 +86,9 @@ def _cause(stored: FloatArray, made: FloatArray) -> str:
     return f"looks {best}" if near[best] > 0.8 else ""
 
 
-def _normal_faults(sequence: Sequence, depth: DepthMap, normals: FloatArray, pixels: FloatArray) -> Iterator[str]:
+def _normal_faults(
+    sequence: Sequence, depth: DepthMap, normals: FloatArray, pixels: FloatArray
+) -> Iterator[Finding]:
     """Normals (n, 3) at whole pixels (n, 2) stand upright on the surface around them, where it is flat."""
     x, y = pixels.astype(np.int64).T
     flat = depth.flat[y, x]
@@ -99,10 +104,12 @@ def _normal_faults(sequence: Sequence, depth: DepthMap, normals: FloatArray, pix
         bent |= np.abs(np.sum(step * normals, axis=-1)) > LEVEL * np.linalg.norm(step, axis=-1)
     if np.sum(bent) > max(FEW_BENT * len(x), _LEAST):
         what = f"{np.sum(bent)} of {len(x)} normals are not upright on the surface of {depth.shot.depth}"
-        yield finding(f"{AFFINE}: {depth.shot.side}_{depth.shot.frame}", what)
+        yield Finding(AFFINE, what, part=f"{depth.shot.side}_{depth.shot.frame}")
 
 
-def affine_again(sequence: Sequence, rays: Meets, told: Collection[str]) -> Iterator[tuple[str, str, bool]]:
+def affine_again(
+    sequence: Sequence, rays: Meets, told: Collection[str]
+) -> Iterator[tuple[str, Finding | None, bool]]:
     """As ``channel_checks.channels_again``, of affine frames: what rays meet at the points of the tracks."""
     if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(told):
         return
@@ -116,4 +123,4 @@ def affine_again(sequence: Sequence, rays: Meets, told: Collection[str]) -> Iter
     what = f"{np.sum(wrong)} of {len(wrong)} normals differ from what rays meet"
     names = ("normals", "jacobians")
     same = all(np.array_equal(getattr(made, k), getattr(stored, k), equal_nan=True) for k in names)
-    yield AFFINE, finding(AFFINE, what) if bad else "", same
+    yield AFFINE, Finding(AFFINE, what) if bad else None, same

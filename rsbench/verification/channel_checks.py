@@ -18,7 +18,7 @@ from rsbench.dataset.channels import STEP_PX, Layer, PixelClass, pair_layers
 from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import FAR, Shot
-from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.frame_comparison import BoolArray, DepthMap, land
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def channel_faults(
     stride: int = 1,
     times: tuple[int, ...] = FRAMES,
     new: tuple[int, ...] = FRAMES,
-) -> Iterator[str]:
+) -> Iterator[Finding]:
     """What the channels of a sequence show that its depth maps and motion cannot have made.
 
     Files that are ``told`` already, missing or wrong, are not looked at; a wrong depth map would accuse others. Of
@@ -84,7 +84,7 @@ def channel_faults(
                 if both <= {*times} and both & {*new} and not set(files) & set(told):
                     stored[shot] = _stored(sequence, layer, shot)
             except RsbenchError as error:
-                yield str(error)
+                yield Finding.of(error)
         for shot in stored:
             there = target_of(layer, shot, sequence.frames)
             used = {each for each in (shot, there) if each in maps and each.depth not in told}
@@ -101,8 +101,8 @@ def _stored(sequence: Sequence, layer: Layer, shot: Shot) -> _Stored:
 
 def channels_again(
     sequence: Sequence, shot: Shot, rows: list[int], frame: Frame, rays: Rays, told: Collection[str]
-) -> Iterator[tuple[str, str, bool]]:
-    """Rows of the channels of a frame made again: of each file its name, its fault or "", and whether all is same.
+) -> Iterator[tuple[str, Finding | None, bool]]:
+    """Rows of the channels of a frame made again: of each file its name, fault or None, and whether all is same.
 
     Args:
         sequence: holds them.
@@ -135,7 +135,7 @@ def channels_again(
             what = f"{_percent(wrong, everywhere)} differ from what is made again"
             bad = _many(wrong, everywhere, _FEW_AGAIN)
             in_rows = np.isin(np.arange(sequence.shutter.height), np.asarray(rows)[np.any(wrong, axis=1)])
-            yield file, finding(file, what, rows_of(in_rows)) if bad else "", same
+            yield file, Finding(file, what, rows_of(in_rows)) if bad else None, same
 
 
 def _pair_faults(
@@ -145,7 +145,7 @@ def _pair_faults(
     shot: Shot,
     stored: Mapping[Shot, _Stored],
     stride: int,
-) -> Iterator[str]:
+) -> Iterator[Finding]:
     derived = _derived(sequence, maps, layer, shot, stride)
     values, classes = stored[shot].values[::stride, ::stride], stored[shot].classes[::stride, ::stride]
     file = layer.values(shot.side, shot.frame)
@@ -156,11 +156,11 @@ def _pair_faults(
         size = np.median(np.max(np.abs(values - derived.values), axis=-1)[wrong & both])
         what = f"{_percent(wrong & both, both)} differ from what depth and motion make, typically by {size:.2g} px"
         cause = _cause(layer, shot, stored, derived, stride)
-        yield finding(file, what, _rows(wrong & both, stride, len(stored[shot].classes)), cause)
+        yield Finding(file, what, _rows(wrong & both, stride, len(stored[shot].classes)), cause)
     empty = np.isnan(values).any(axis=-1)
     if np.any(empty == known):
         what = f"{np.sum(empty & known)} pixels without a value and {np.sum(~empty & ~known)} with one too many"
-        yield finding(file, f"{what}, by {layer.mask(shot.side, shot.frame)}")
+        yield Finding(file, f"{what}, by {layer.mask(shot.side, shot.frame)}")
     there, sky = target_of(layer, shot, sequence.frames), maps[shot].depth[::stride, ::stride] == 0
     yield from _mask_faults(layer, shot, there, classes, sky, derived, stride)
 
@@ -173,7 +173,7 @@ def _mask_faults(
     sky: BoolArray,
     derived: _Derived,
     stride: int,
-) -> Iterator[str]:
+) -> Iterator[Finding]:
     file, height = layer.mask(shot.side, shot.frame), len(classes) * stride
     lost = np.isnan(derived.values[..., 0])
     everywhere = np.ones(classes.shape, dtype=np.bool_)
@@ -189,7 +189,7 @@ def _mask_faults(
     ):
         if many(wrong & among, among):
             rows = _rows(wrong & among, stride, height)
-            yield finding(file, f"{_percent(wrong & among, among)} are {words}", rows)
+            yield Finding(file, f"{_percent(wrong & among, among)} are {words}", rows)
 
 
 def _derived(sequence: Sequence, maps: Mapping[Shot, DepthMap], layer: Layer, shot: Shot, stride: int) -> _Derived:

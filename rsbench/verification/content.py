@@ -19,7 +19,7 @@ from rsbench.storage.files import read_png
 from rsbench.storage.untrusted_files import inside
 from rsbench.verification import depth, image_checks
 from rsbench.verification.depth_causes import likely_cause
-from rsbench.verification.findings import DepthAgreement, finding, rows_of
+from rsbench.verification.findings import DepthAgreement, Finding, rows_of
 from rsbench.verification.frame_comparison import DepthMap, Shot, in_one_light, land
 from rsbench.verification.image_causes import Elsewhere as Elsewhere
 from rsbench.verification.image_causes import likeness_faults
@@ -37,7 +37,7 @@ class Content:
     sequence: Sequence
     maps: dict[Shot, DepthMap] = field(default_factory=dict)
     pictures: dict[Shot, image_checks.Picture] = field(default_factory=dict)
-    faults: list[str] = field(default_factory=list)
+    faults: list[Finding] = field(default_factory=list)
     times: tuple[int, ...] = ()
     """Numbers of the frames that were read."""
 
@@ -74,7 +74,7 @@ def read_shot(content: Content, shot: Shot, missing: Collection[str]) -> None:
             gloss = sequence.gloss(*shot) if sequence.glossy else None
             content.maps[shot] = DepthMap(shot, sequence.depth(*shot), sequence.rig.camera, labels, gloss)
     except RsbenchError as error:
-        content.faults.append(str(error))
+        content.faults.append(Finding.of(error))
     file = clean_picture(sequence, shot)
     if file in missing:
         return
@@ -85,7 +85,7 @@ def read_shot(content: Content, shot: Shot, missing: Collection[str]) -> None:
             pixels = read_png(inside(sequence.folder, file), size)
             content.pictures[shot] = image_checks.Picture.of(shot, pixels, noisy)
     except RsbenchError as error:
-        content.faults.append(str(error))
+        content.faults.append(Finding.of(error))
 
 
 def clean_picture(sequence: Sequence, shot: Shot) -> str:
@@ -94,7 +94,7 @@ def clean_picture(sequence: Sequence, shot: Shot) -> str:
     return clean_file(shot.side, shot.frame) if blurred else shot.image
 
 
-def twin_faults(content: Content) -> Iterator[str]:
+def twin_faults(content: Content) -> Iterator[Finding]:
     """The first row of a rolling-shutter frame and of its global-shutter twin are the same rays and values.
 
     Where columns are read, it is the first column.
@@ -111,13 +111,13 @@ def twin_faults(content: Content) -> Iterator[str]:
             unlike = apart > _rounding(axis, 1.0)
             if np.sum(unlike) > spare_pixels(axis, unlike.size):
                 what = f"{np.sum(unlike)} pixels differ from the global-shutter twin at the same pose"
-                yield finding(clean_picture(content.sequence, shot), f"{line} differs from {twin.image}: {what}")
+                yield Finding(clean_picture(content.sequence, shot), f"{line} differs from {twin.image}: {what}")
         if {shot, twin} <= maps.keys():
             own, other = (np.take(maps[each].depth, [number], axis) for each in (shot, twin))
             if np.sum(np.abs(own - other) > _rounding(axis, 1e-6) * other) > spare_pixels(axis, own.size):
                 what = f"by up to {np.max(np.abs(own - other)):.3g} m at the same pose"
                 cause = _first_of_twin(maps[shot].depth, maps[twin].depth)
-                yield finding(shot.depth, f"{line} differs from {twin.depth}: {what}", cause=cause)
+                yield Finding(shot.depth, f"{line} differs from {twin.depth}: {what}", cause=cause)
 
 
 def _rounding(axis: int, most: float) -> float:
@@ -192,7 +192,7 @@ class Comparison:
 
     def faults(
         self, elsewhere: Elsewhere, is_right: Judge = lambda shot: False, shows: Judge = lambda shot: False
-    ) -> Iterator[str]:
+    ) -> Iterator[Finding]:
         """What the pairs show, each with its likely cause.
 
         ``is_right`` acquits a depth map that they accuse, ``shows`` an image.
@@ -200,11 +200,11 @@ class Comparison:
         wrong = self._wrong_maps(is_right)
         for shot, fault in wrong.items():
             cause = likely_cause(self.content.sequence, self.content.maps, shot, fault.rows)
-            yield finding(shot.depth, fault.what, rows_of(fault.rows), cause)
+            yield Finding(shot.depth, fault.what, rows_of(fault.rows), cause)
         yield from depth.pair_faults(self.agreements, wrong)
         yield from self._acquitted(list(self._image_faults(wrong.keys(), elsewhere)), shows)
 
-    def _acquitted(self, accused: list[tuple[Shot, str]], shows: Judge) -> Iterator[str]:
+    def _acquitted(self, accused: list[tuple[Shot, Finding]], shows: Judge) -> Iterator[Finding]:
         """Faults of images without those that are what is rendered again: fine things look different from each
         place. A partner that is not what is rendered again is then what was wrong."""
         judged = lru_cache(maxsize=None)(shows)
@@ -213,13 +213,13 @@ class Comparison:
                 yield fault
                 continue
             what = "others contradict it, and it is what is rendered again, all of it"
-            self.notes.append(finding(shot.image, what))
+            self.notes.append(str(Finding(shot.image, what)))
             pairs = {(each.source, each.target) for each in self.likenesses}
             for other in sorted(
                 {one for pair in pairs if shot in pair for one in pair} - {one for one, _ in accused}
             ):
                 if not judged(other):
-                    yield finding(other.image, f"shows other colours than {shot.image} at the same surface")
+                    yield Finding(other.image, f"shows other colours than {shot.image} at the same surface")
 
     def _wrong_maps(self, is_right: Judge) -> dict[Shot, depth.MapFault]:
         """Faults of maps; one without a flat place is none, where it is roughly what others see."""
@@ -228,17 +228,16 @@ class Comparison:
             right |= acquitted
             wrong = depth.map_faults(self.verdicts, right)
         for shot in right:
-            self.notes.append(
-                finding(shot.depth, "others contradict it, and it is what is rendered again, all of it")
-            )
+            what = "others contradict it, and it is what is rendered again, all of it"
+            self.notes.append(str(Finding(shot.depth, what)))
         for shot in [shot for shot, fault in wrong.items() if fault.uncompared]:
             if roughly_alike(self.content.sequence, self.content.maps, shot):
                 del wrong[shot]
                 what = "no place is flat enough to be compared with another frame; it is roughly what others see"
-                self.notes.append(finding(shot.depth, what))
+                self.notes.append(str(Finding(shot.depth, what)))
         return wrong
 
-    def _image_faults(self, blamed: Collection[Shot], elsewhere: Elsewhere) -> Iterator[tuple[Shot, str]]:
+    def _image_faults(self, blamed: Collection[Shot], elsewhere: Elsewhere) -> Iterator[tuple[Shot, Finding]]:
         """Images compared through depth that is in order; a wrong map would accuse its image too."""
         content, told = self.content, set()
         for shot, picture in content.pictures.items():
@@ -255,7 +254,7 @@ class Comparison:
             rows = image_checks.tile_rows(votes)
             if shot not in told and shot not in blamed and np.any(rows):
                 what = "a part of these rows shows other colours than two partners at the same surface"
-                yield shot, finding(shot.image, what, rows_of(rows))
+                yield shot, Finding(shot.image, what, rows_of(rows))
 
 
 def images_elsewhere(sequence: Sequence, others: Callable[[], Iterable[Sequence]]) -> Elsewhere:

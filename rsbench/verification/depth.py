@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.verification.findings import DepthAgreement, finding
+from rsbench.verification.findings import DepthAgreement, Finding
 from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Landing, Shot
 
 Bits = NDArray[np.uint8]
@@ -275,7 +275,7 @@ def _agree(agreement: DepthAgreement, spare: float = _SPARE_SHARE) -> bool:
     return few and not agreement.typical > _TYPICAL
 
 
-def pair_faults(pairs: Sequence[tuple[Shot, Shot, DepthAgreement]], blamed: Collection[Shot]) -> Iterator[str]:
+def pair_faults(pairs: Sequence[tuple[Shot, Shot, DepthAgreement]], blamed: Collection[Shot]) -> Iterator[Finding]:
     """Pairs that disagree though neither map is contradicted by all who see it."""
     for source, target, agreement in pairs:
         if _agree(agreement) or {source, target} & set(blamed):
@@ -285,4 +285,4 @@ def pair_faults(pairs: Sequence[tuple[Shot, Shot, DepthAgreement]], blamed: Coll
             f"{agreement.compared} visible pixels, and differs typically by {agreement.typical:.1e} of itself"
         )
         keys = _ACROSS if source.side != target.side else _OVER_TIME
-        yield finding(source.depth, what, cause=f"look at {keys} in sequence.json")
+        yield Finding(source.depth, what, cause=f"look at {keys} in sequence.json")

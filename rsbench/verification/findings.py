@@ -1,17 +1,51 @@
-"""What verification says: reports, and the words of a finding."""
+"""What verification says: findings as values, the line that is printed of each, and reports."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from rsbench.core.errors import RsbenchError
 
 Progress = Callable[[str], None]
 """Called with the name of the sequence after each step."""
 _MOST_RUNS = 3
 """Runs of rows that a finding names one by one."""
+
+
+MISSING = "missing"
+"""Words of the finding of a file that a manifest lists and that is not there."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One fault of a dataset. ``str`` makes the line that is printed of it."""
+
+    file: str
+    """Below the folder of the sequence; "" where ``words`` name it, being those of an error."""
+    words: str
+    """What is wrong, and by how much."""
+    rows: str = ""
+    """Where in the file, as ``rows_of`` says it."""
+    cause: str = ""
+    """What the file looks like instead."""
+    part: str = ""
+    """View, or pair of views, in a file that holds many."""
+    check: str = field(default="", compare=False)
+    """Name of the row of ``checks`` that found it."""
+
+    @classmethod
+    def of(cls, error: RsbenchError) -> Finding:
+        """That a file cannot be read; the error names it by its whole path."""
+        return cls("", str(error))
+
+    def __str__(self) -> str:
+        """``file: part: rows 3-9: words (cause)``."""
+        places = filter(None, (self.file, self.part, self.rows))
+        return ": ".join((*places, self.words)) + (f" ({self.cause})" if self.cause else "")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,16 +74,20 @@ class SequenceReport:
     """What verification found in one sequence, or in dataset.json where ``name`` is that."""
 
     name: str
-    faults: tuple[str, ...]
-    """One line each: file, rows, size of the fault and its likely cause."""
+    findings: tuple[Finding, ...]
     agreements: tuple[DepthAgreement, ...] = ()
     notes: tuple[str, ...] = ()
     """What could not be checked, and what was: no faults."""
 
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """One line of each finding: file, rows, size of the fault and its likely cause."""
+        return tuple(map(str, self.findings))
 
-def finding(file: str, what: str, rows: str = "", cause: str = "") -> str:
-    """``file: rows 3-9: what (cause)``."""
-    return f"{file}: {rows + ': ' if rows else ''}{what}{f' ({cause})' if cause else ''}"
+
+def files_of(findings: Iterable[Finding]) -> set[str]:
+    """Files that findings tell of."""
+    return {each.file for each in findings}
 
 
 def rows_of(flags: NDArray[np.bool_]) -> str:

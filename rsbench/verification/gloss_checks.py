@@ -17,7 +17,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
 from rsbench.dataset.views import Shot, pairs_of
 from rsbench.verification.content import Content, spare_pixels
-from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, land
 from rsbench.verification.rerender import Again
 
@@ -28,7 +28,7 @@ _LEAST_LEFT = 0.05
 _TRIED_PIXELS = 60_000
 
 
-def known_gloss(content: Content, again: Again | None) -> tuple[list[str], bool]:
+def known_gloss(content: Content, again: Again | None) -> tuple[list[Finding], bool]:
     """Faults of masks against rays, which take their place; and whether there were rays to ask."""
     sequence = content.sequence
     if again is None or not content.maps:
@@ -39,10 +39,10 @@ def known_gloss(content: Content, again: Again | None) -> tuple[list[str], bool]
             return [], False
         if scene.glossy != sequence.glossy:
             stated, made = (str(each).lower() for each in (sequence.glossy, scene.glossy))
-            return [finding("sequence.json", f"glossy = {stated}: its scene, built here, makes {made}")], True
+            return [Finding("sequence.json", f"glossy = {stated}: its scene, built here, makes {made}")], True
         if not scene.glossy:
             return [], True
-        faults = list[str]()
+        faults = list[Finding]()
         for shot, each in content.maps.items():
             gloss = again.whole(content, shot)[1].gloss
             faults += _unlike(each, gloss)
@@ -59,15 +59,15 @@ def _is_ours(content: Content, digest: str) -> bool:
     return same or (isinstance(made_by, dict) and made_by.get("rsbench") == __version__)
 
 
-def _unlike(stored: DepthMap, gloss: BoolArray) -> list[str]:
+def _unlike(stored: DepthMap, gloss: BoolArray) -> list[Finding]:
     wrong = gloss if stored.gloss is None else gloss != stored.gloss
     if np.sum(wrong) <= max(_OTHER * wrong.size, _FEW):
         return []
     what = f"{np.sum(wrong)} of {wrong.size} pixels of the mask differ from what rays meet"
-    return [finding(stored.shot.gloss, what, rows_of(np.any(wrong, axis=1)))]
+    return [Finding(stored.shot.gloss, what, rows_of(np.any(wrong, axis=1)))]
 
 
-def gloss_faults(content: Content, fresh: Content, twins: Content) -> Iterator[str]:
+def gloss_faults(content: Content, fresh: Content, twins: Content) -> Iterator[Finding]:
     """What masks cannot be, where there are no rays. Their maps are taken out of all, as of ``label_faults``.
 
     Args:
@@ -86,41 +86,41 @@ def gloss_faults(content: Content, fresh: Content, twins: Content) -> Iterator[s
         del fresh.maps[shot]
 
 
-def _dropped(content: Content, faults: dict[Shot, str]) -> Iterator[str]:
+def _dropped(content: Content, faults: dict[Shot, Finding | None]) -> Iterator[Finding]:
     for shot, fault in faults.items():
         if fault:
             del content.maps[shot]
             yield fault
 
 
-def _by_itself(each: DepthMap) -> Iterator[str]:
+def _by_itself(each: DepthMap) -> Iterator[Finding]:
     gloss, solid = _of(each), each.depth > 0
     empty = gloss & ~solid
     if np.any(empty):
         what = f"{np.sum(empty)} pixels of the mask show no surface"
-        yield finding(each.shot.gloss, what, rows_of(np.any(empty, axis=1)))
+        yield Finding(each.shot.gloss, what, rows_of(np.any(empty, axis=1)))
     covered = cv2.dilate(gloss.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     left = float(np.sum(solid & ~covered) / max(np.sum(solid), 1))
     if np.any(solid) and left < _LEAST_LEFT:
         what = f"leaves {100 * left:.2g} % of the surfaces to be compared; its scene was not built (see --scene)"
-        yield finding(each.shot.gloss, what)
+        yield Finding(each.shot.gloss, what)
 
 
-def _unlike_twin(content: Content, own: DepthMap) -> str:
+def _unlike_twin(content: Content, own: DepthMap) -> Finding | None:
     """The line of a global shutter that its rolling-shutter frame shares."""
     source, shot = own.shot._replace(shutter="rs", row=0), own.shot
     if shot == source or source not in content.maps:
-        return ""
+        return None
     shutter = content.sequence.shutter
     axis, line = 1 - shutter.axis(shot.side), abs(shutter.first_line(shot.side) - shot.row)
     unlike = np.take(_of(own), line, axis) != np.take(_of(content.maps[source]), line, axis)
     if np.sum(unlike) <= spare_pixels(axis, unlike.size):
-        return ""
+        return None
     words = f"{'row' if axis == 0 else 'column'} {line} differs from {source.gloss}"
-    return finding(shot.gloss, f"{words}: {np.sum(unlike)} pixels at the same pose")
+    return Finding(shot.gloss, f"{words}: {np.sum(unlike)} pixels at the same pose")
 
 
-def _contradicted(content: Content) -> Iterator[tuple[Shot, str]]:
+def _contradicted(content: Content) -> Iterator[tuple[Shot, Finding]]:
     """Masks that others contradict, in the order of how many pairs each alone explains."""
     pairs = pairs_of((content.times[0], content.times[-1]))
     there = [(one, other) for one, other in pairs if {one, other} <= content.maps.keys()]
@@ -133,7 +133,7 @@ def _contradicted(content: Content) -> Iterator[tuple[Shot, str]]:
         others = sorted({shot.gloss for pair in own for shot in pair} - {worst.gloss})
         rows = [wrong[pair] for pair in own if pair[0] == worst]
         words = rows_of(np.any(rows, axis=0)) if rows else ""
-        yield worst, finding(worst.gloss, f"marks other surfaces than {', '.join(others)}", words)
+        yield worst, Finding(worst.gloss, f"marks other surfaces than {', '.join(others)}", words)
         left = [pair for pair in left if worst not in pair]
 
 

@@ -13,7 +13,7 @@ from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import Shot
 from rsbench.renderers.image import linear_of_codes, to_srgb8
 from rsbench.verification.content import clean_picture
-from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.image_checks import Picture
 
 _CODE = 0.54
@@ -21,7 +21,7 @@ _CODE = 0.54
 _FEW, _LEAST = 1e-3, 8
 
 
-def hdr_faults(sequence: Sequence, pictures: Mapping[Shot, Picture], told: Collection[str]) -> Iterator[str]:
+def hdr_faults(sequence: Sequence, pictures: Mapping[Shot, Picture], told: Collection[str]) -> Iterator[Finding]:
     """What linear images show otherwise than the clean images, but for files ``told``."""
     renderer = sequence.manifest.get("renderer")
     exposure = renderer.get("exposure") if isinstance(renderer, dict) else None
@@ -34,7 +34,7 @@ def hdr_faults(sequence: Sequence, pictures: Mapping[Shot, Picture], told: Colle
         try:
             radiance = sequence.radiance(shot.side, shot.frame)
         except RsbenchError as error:
-            yield str(error)
+            yield Finding.of(error)
             continue
         light, codes = radiance * exposure, picture.colours
         dark = (codes > 0) & (light < linear_of_codes(codes - _CODE))
@@ -44,7 +44,7 @@ def hdr_faults(sequence: Sequence, pictures: Mapping[Shot, Picture], told: Colle
             what = f"{100 * np.mean(wrong):.3g} % of {wrong.size} pixels are not {image} before its rounding"
             rows = np.mean(wrong, axis=1)
             in_rows = rows_of(rows > 0.5 * np.max(rows))
-            yield finding(file, f"{what}, by up to {off:g} codes", in_rows, _cause(light, picture))
+            yield Finding(file, f"{what}, by up to {off:g} codes", in_rows, _cause(light, picture))
 
 
 def _cause(light: NDArray[np.float32], picture: Picture) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.dataset.sequence import Sequence
-from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.frame_comparison import BoolArray, DepthMap, Shot, in_one_light, land
 from rsbench.verification.image_checks import (
     CHANGES,
@@ -39,7 +39,7 @@ def likeness_faults(
     pictures: Mapping[Shot, Picture],
     likenesses: list[Likeness],
     elsewhere: Elsewhere,
-) -> Iterator[tuple[Shot, str]]:
+) -> Iterator[tuple[Shot, Finding]]:
     """A finding for each image that the others contradict."""
     guilty = list(culprits(likenesses))
     suspects = {shot for shot, _ in guilty}
@@ -55,7 +55,7 @@ def likeness_faults(
         cause = "looks like noise" if _is_noise(pictures, shot, unlike[bands]) else ""
         if partners and not cause:
             cause = _cause(sequence, maps, pictures, shot, partners[0], likenesses, elsewhere)
-        yield shot, finding(shot.image, what, rows_of(unlike[bands]), cause)
+        yield shot, Finding(shot.image, what, rows_of(unlike[bands]), cause)
 
 
 def _cause(

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.verification.findings import finding
+from rsbench.verification.findings import Finding
 from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Landing, Shot
 
 Colours = NDArray[np.float32]
@@ -290,14 +290,14 @@ def tile_rows(votes: ImageVotes) -> BoolArray:
     return np.repeat(np.any(spoilt, axis=1), _TILE)[:height]
 
 
-def colour_fault(picture: Picture, others: Mapping[Shot, Picture]) -> str | None:
+def colour_fault(picture: Picture, others: Mapping[Shot, Picture]) -> Finding | None:
     """An image of one colour, or of greys where others have colours."""
     if np.ptp(picture.colours) == 0 and any(np.ptp(other.colours) > 0 for other in others.values()):
         codes = ", ".join(f"{code:g}" for code in picture.colours[0, 0])
         what = "black" if not np.any(picture.colours) else f"of one colour ({codes})"
-        return finding(picture.shot.image, f"the image is {what}", "all rows")
+        return Finding(picture.shot.image, f"the image is {what}", "all rows")
     if _chroma(picture) == 0 and any(_chroma(other) > 1.0 for other in others.values()):
-        return finding(picture.shot.image, "the image is grey where others have colours", "all rows")
+        return Finding(picture.shot.image, "the image is grey where others have colours", "all rows")
     return None
 
 

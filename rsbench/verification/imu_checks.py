@@ -22,7 +22,7 @@ from rsbench.dataset.imu import (
     true_samples,
 )
 from rsbench.dataset.sequence import Sequence
-from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.findings import Finding, rows_of
 
 _SAME = 1e-9
 """Relative to 1 + the value: thousands of roundings."""
@@ -32,7 +32,7 @@ _SIGMAS = 6.0
 _KINDS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 6)}
 
 
-def imu_faults(sequence: Sequence, told: Collection[str]) -> Iterator[str]:
+def imu_faults(sequence: Sequence, told: Collection[str]) -> Iterator[Finding]:
     """What the inertial sensor shows that the motion cannot have made, but for files ``told``."""
     if "imu" not in sequence.channels:
         return
@@ -41,17 +41,17 @@ def imu_faults(sequence: Sequence, told: Collection[str]) -> Iterator[str]:
         gravity = gravity_of(scene if isinstance(scene, dict) else {})
         imu = sequence.imu
         if imu is None:
-            yield finding("sequence.json", "lacks 'imu', the sensor of the channel of this name")
+            yield Finding("sequence.json", "lacks 'imu', the sensor of the channel of this name")
             return
         if IMU_MANIFEST not in told:
             yield from _manifest_faults(sequence, imu, gravity)
         if not {MEASURED, TRUE} & set(told):
             yield from _sample_faults(sequence, imu, gravity, sequence.inertial())
     except RsbenchError as error:
-        yield str(error)
+        yield Finding.of(error)
 
 
-def _manifest_faults(sequence: Sequence, imu: Imu, gravity: FloatArray) -> Iterator[str]:
+def _manifest_faults(sequence: Sequence, imu: Imu, gravity: FloatArray) -> Iterator[Finding]:
     stored = sequence.imu_manifest()
     for key, value in imu_manifest(imu, gravity).items():
         own = stored.get(key)
@@ -59,19 +59,19 @@ def _manifest_faults(sequence: Sequence, imu: Imu, gravity: FloatArray) -> Itera
         if key == "gravity" and isinstance(own, list) and len(own) == 3 and all(isinstance(x, float) for x in own):
             same = bool(np.max(np.abs(np.array(own) - gravity)) <= _SAME * np.linalg.norm(gravity))
         if not same:
-            yield finding(IMU_MANIFEST, f"{key} = {own!r}, sequence.json makes {value!r}")
+            yield Finding(IMU_MANIFEST, f"{key} = {own!r}, sequence.json makes {value!r}")
 
 
-def _sample_faults(sequence: Sequence, imu: Imu, gravity: FloatArray, samples: ImuSamples) -> Iterator[str]:
+def _sample_faults(sequence: Sequence, imu: Imu, gravity: FloatArray, samples: ImuSamples) -> Iterator[Finding]:
     times = sample_times_ns(imu, sequence.shutter, sequence.frame_period_s, sequence.sensor, sequence.frames)
     if len(times) != len(samples.times_ns) or np.any(np.abs(times - samples.times_ns) > _NEAR_NS):
         covers = f"{len(times)} samples of {imu.rate_hz:g} Hz from {times[0]} to {times[-1]} ns"
-        yield finding(TRUE, f"time_ns is not that of {covers}")
+        yield Finding(TRUE, f"time_ns is not that of {covers}")
         return
     late = np.abs(samples.stamps_ns - stamps_of(imu, times)) > _NEAR_NS
     if np.any(late):
         off = np.max(np.abs(samples.stamps_ns - stamps_of(imu, times)))
-        yield finding(
+        yield Finding(
             MEASURED, f"stamp_ns differs by up to {off} ns from what offset and drift make", rows_of(late)
         )
     true = true_samples(sequence.motion, times, sequence.frame_period_s, gravity)
@@ -82,12 +82,12 @@ def _sample_faults(sequence: Sequence, imu: Imu, gravity: FloatArray, samples: I
         if np.any(wrong):
             what = f"{name} differs from what the motion makes, by up to {np.max(off):.3g}"
             cause = _cause(samples.true[:, columns], true[:, columns], upward[:, columns])
-            yield finding(TRUE, what, rows_of(wrong), cause)
+            yield Finding(TRUE, what, rows_of(wrong), cause)
             return
     yield from _noise_faults(imu, samples, upward)
 
 
-def _noise_faults(imu: Imu, samples: ImuSamples, upward: FloatArray) -> Iterator[str]:
+def _noise_faults(imu: Imu, samples: ImuSamples, upward: FloatArray) -> Iterator[Finding]:
     """Measured less true must be the bias and white noise; and the bias must walk."""
     noise, walk, start = deviations(imu)
     white = samples.measured - samples.true - samples.bias
@@ -101,7 +101,7 @@ def _noise_faults(imu: Imu, samples: ImuSamples, upward: FloatArray) -> Iterator
             told = _unlike(values[:, columns], float(sigma[columns][0]))
             if told:
                 shown = samples.measured[:, columns], samples.true[:, columns], upward[:, columns]
-                yield finding(file, f"{words} {told}", cause=_cause(*shown) if file == MEASURED else "")
+                yield Finding(file, f"{words} {told}", cause=_cause(*shown) if file == MEASURED else "")
 
 
 def _unlike(values: FloatArray, sigma: float) -> str:

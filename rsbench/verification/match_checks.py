@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict
+from functools import partial
 
 import cv2
 import numpy as np
@@ -32,7 +33,7 @@ from rsbench.dataset.match_truth import (
 from rsbench.dataset.matches import MATCHED, LabelledMatches, MatchClass, Matching, PairLabels
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import FAR, Shot
-from rsbench.verification.findings import finding
+from rsbench.verification.findings import Finding
 from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, DepthMap, relative_depth
 from rsbench.verification.track_checks import depths_around
 from rsbench.vision.feature_matcher import FEATURE_MATCHERS
@@ -47,12 +48,14 @@ _FEW_OTHERS, _LEAST = 0.02, 4
 """Of what is compared on flat surfaces, with what is matched again on another processor, and with other rays."""
 _AGREES_PX = 1e-3
 """Of places made again by rays: depth is rounded to float32."""
+Report = Callable[..., Finding]
+"""Makes findings of one pair of views, from their words."""
 _OURS = f"{SiftMatcher.__module__}:{SiftMatcher.__qualname__}"
 
 
 def match_faults(
     sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str], first: int = 0
-) -> Iterator[str]:
+) -> Iterator[Finding]:
     """What the labels of frame ``first`` and the next show that depth maps and motion cannot have made.
 
     But for files ``told``.
@@ -66,39 +69,39 @@ def match_faults(
     try:
         matches = sequence.matches(first)
     except RsbenchError as error:
-        yield str(error)
+        yield Finding.of(error)
         return
     for k, (name, views) in enumerate(MATCHED.items()):
         source, target = (at(view, first) for view in views)
-        part, file = matches.of_pair(k), f"{stored}: {name}"
+        part, found = matches.of_pair(k), partial(Finding, stored, part=name)
         outside = ~sequence.rig.camera.contains(part.pixels).all(axis=1)
         if np.any(outside):
-            yield finding(file, f"{np.sum(outside)} matches have a keypoint beside the images")
+            yield found(f"{np.sum(outside)} matches have a keypoint beside the images")
             continue
-        yield from _depth_faults(sequence, part, source, maps, told, file)
-        yield from _truth_faults(sequence, part, source, target, file)
-        yield from _class_faults(sequence, part, source, target, maps, told, matching.bound_px, file)
+        yield from _depth_faults(sequence, part, source, maps, told, found)
+        yield from _truth_faults(sequence, part, source, target, found)
+        yield from _class_faults(sequence, part, source, target, maps, told, matching.bound_px, found)
 
 
-def _record_faults(sequence: Sequence, matching: Matching, told: Collection[str]) -> Iterator[str]:
+def _record_faults(sequence: Sequence, matching: Matching, told: Collection[str]) -> Iterator[Finding]:
     """matcher.json against sequence.json, and against the card of the same name where this version wrote it."""
     if MATCHER in told:
         return
     try:
         record = sequence.matcher()
     except RsbenchError as error:
-        yield str(error)
+        yield Finding.of(error)
         return
     own = record.get("versions") == _versions() and matching.features in list_cards("features")
     made = matcher_record(matching) if own else asdict(matching)
     for key, value in made.items():
         if record.get(key) != value:
-            yield finding(MATCHER, f"{key} = {record.get(key)!r}, sequence.json and its matcher say {value!r}")
+            yield Finding(MATCHER, f"{key} = {record.get(key)!r}, sequence.json and its matcher say {value!r}")
     versions = record.get("versions")
     if not isinstance(versions, dict) or not all(isinstance(versions.get(k), str) for k in ("rsbench", "opencv")):
-        yield finding(MATCHER, f"versions = {versions!r}: those of rsbench and opencv are needed")
+        yield Finding(MATCHER, f"versions = {versions!r}: those of rsbench and opencv are needed")
     if not isinstance(record.get("class"), str) or not isinstance(record.get("parameters"), dict):
-        yield finding(MATCHER, "class and parameters of the matcher are needed")
+        yield Finding(MATCHER, "class and parameters of the matcher are needed")
 
 
 def _depth_faults(
@@ -107,8 +110,8 @@ def _depth_faults(
     source: View,
     maps: Mapping[Shot, DepthMap],
     told: Collection[str],
-    file: str,
-) -> Iterator[str]:
+    found: Report,
+) -> Iterator[Finding]:
     """The depth of keypoints is that of the flat surface around them, or between those of the pixels around."""
     shot = Shot("rs", *source)
     if shot not in maps or shot.depth in told:
@@ -125,18 +128,20 @@ def _depth_faults(
             what = f"the depth of {np.sum(wrong)} of {np.sum(among)} keypoints is not that of {shot.depth}"
             ratio = float(np.median(1.0 + relative[off])) if np.any(off) else 1.0
             scaled = np.mean(np.abs(relative[off] + 1.0 - ratio) < DEPTH_TOLERANCE) > 0.5 if np.any(off) else False
-            yield finding(file, what, cause=f"looks scaled by {ratio:.6g}" if scaled else "")
+            yield found(what, cause=f"looks scaled by {ratio:.6g}" if scaled else "")
             return
 
 
-def _truth_faults(sequence: Sequence, part: PairLabels, source: View, target: View, file: str) -> Iterator[str]:
+def _truth_faults(
+    sequence: Sequence, part: PairLabels, source: View, target: View, found: Report
+) -> Iterator[Finding]:
     """True places are those where a row sees the point at its own time, and errors the distances from them."""
     points = _points(sequence, part, source)
     _, tau, unsolved = seen_near(sequence, target, points, part.pixels[:, 1])
     known = np.all(np.isfinite(part.truth), axis=1)
     wrong = (known != np.isfinite(tau)) & ~unsolved
     if np.any(wrong):
-        yield finding(file, f"{np.sum(wrong)} of {len(wrong)} true places are wrongly in or out of view")
+        yield found(f"{np.sum(wrong)} of {len(wrong)} true places are wrongly in or out of view")
         return
     times = sequence.shutter.pixel_time(part.truth[known], target[1], target[0])
     exact = project_at(sequence.rig, sequence.motion, target[0], times, points[known])[:, :2]
@@ -145,10 +150,10 @@ def _truth_faults(sequence: Sequence, part: PairLabels, source: View, target: Vi
         what = (
             f"{np.sum(~(off <= _SAME_PX))} of {np.sum(known)} true places are not where their row sees the point"
         )
-        yield finding(file, f"{what}, typically by {np.nanmedian(off[~(off <= _SAME_PX)]):.2g} px")
+        yield found(f"{what}, typically by {np.nanmedian(off[~(off <= _SAME_PX)]):.2g} px")
     error = np.linalg.norm(part.pixels[:, 1] - part.truth, axis=1)
     if np.any(bad := ~((np.abs(error - part.error) <= _SAME) | (np.isnan(error) & np.isnan(part.error)))):
-        yield finding(file, f"{np.sum(bad)} of {len(bad)} errors are not the distance from the true place")
+        yield found(f"{np.sum(bad)} of {len(bad)} errors are not the distance from the true place")
 
 
 def _class_faults(
@@ -159,15 +164,15 @@ def _class_faults(
     maps: Mapping[Shot, DepthMap],
     told: Collection[str],
     bound_px: float,
-    file: str,
-) -> Iterator[str]:
+    found: Report,
+) -> Iterator[Finding]:
     """Classes are those of the errors; hidden points lie behind what the target sees, others do not."""
     hidden = part.classes == MatchClass.OCCLUDED
     unsolved = part.classes == MatchClass.UNSOLVED
     made = classes_of(part.pixels, part.depth, part.truth, hidden, unsolved, bound_px)
     if np.any(made != part.classes):
         what = f"{np.sum(made != part.classes)} of {len(made)} classes are not what error and depth make"
-        yield finding(file, f"{what}, within {bound_px:g} px")
+        yield found(f"{what}, within {bound_px:g} px")
     shot, seen = Shot("rs", *target), np.isfinite(part.error) & (part.depth > 0.0)
     if shot not in maps or shot.depth in told:
         return
@@ -181,7 +186,7 @@ def _class_faults(
     ):
         # Where few points are hidden, all of them may be by things thinner than a pixel.
         if np.sum(so & wrong) > max(_FEW_BESIDE * np.sum(so), _FEW_OTHERS * np.sum(seen), _LEAST):
-            yield finding(file, f"{np.sum(so & wrong)} of {np.sum(seen)} points {words} {shot.depth}")
+            yield found(f"{np.sum(so & wrong)} of {np.sum(seen)} points {words} {shot.depth}")
 
 
 def _points(sequence: Sequence, part: PairLabels, source: View) -> FloatArray:
@@ -190,7 +195,7 @@ def _points(sequence: Sequence, part: PairLabels, source: View) -> FloatArray:
     return eyes + np.where(part.depth > 0.0, part.depth, FAR)[:, None] * (ahead - eyes)
 
 
-def matched_again(sequence: Sequence, told: Collection[str], first: int = 0) -> tuple[list[str], list[str]]:
+def matched_again(sequence: Sequence, told: Collection[str], first: int = 0) -> tuple[list[Finding], list[str]]:
     """Faults of matches that the stated matcher does not find in the pictures, and notes where it was not asked.
 
     Only rsbench's own matcher is asked, in the versions that made them: what a dataset names is never imported.
@@ -201,12 +206,12 @@ def matched_again(sequence: Sequence, told: Collection[str], first: int = 0) -> 
     try:
         stored, record = sequence.matches(first), sequence.matcher()
         if record.get("class") != _OURS or record.get("versions") != _versions():
-            return [], [f"{file}: not matched again: another matcher or version made it"]
+            return [], [str(Finding(file, "not matched again: another matcher or version made it"))]
         component = parse_card(SiftMatcher, record["parameters"], f"{MATCHER}: parameters")
         images = {each[1:3]: sequence.image(*each) for each in shots}
         found = matched_frames(sequence, first, images, wrap(FEATURE_MATCHERS, component))
     except RsbenchError as error:
-        return [str(error)], []
+        return [Finding.of(error)], []
     return list(_unlike_faults(file, stored, arranged(found))), []
 
 
@@ -214,18 +219,18 @@ def _versions() -> dict[str, str]:
     return {"rsbench": __version__, "opencv": str(cv2.__version__)}
 
 
-def _unlike_faults(file: str, stored: LabelledMatches, found: Arranged) -> Iterator[str]:
+def _unlike_faults(file: str, stored: LabelledMatches, found: Arranged) -> Iterator[Finding]:
     for k, name in enumerate(MATCHED):
         ours, theirs = (each.pixels[each.sets == k].reshape(-1, 4) for each in (found, stored))
         strange, missing = np.sum(~repeated(theirs, ours)), np.sum(~repeated(ours, theirs))
         if strange + missing > max(_FEW_OTHERS * (len(ours) + len(theirs)), _LEAST):
             what = f"{strange} of {len(theirs)} matches are not found in the images, and {missing} others are"
-            yield finding(f"{file}: {name}", what)
+            yield Finding(file, what, part=name)
 
 
 def matches_again(
     sequence: Sequence, first: int, rays: Meets, told: Collection[str]
-) -> Iterator[tuple[str, str, bool]]:
+) -> Iterator[tuple[str, Finding | None, bool]]:
     """As ``channel_checks.channels_again``, of matches of frame ``first`` and the next: what rays say of each."""
     if "matches" not in sequence.channels or (file := matches_file(first)) in told:
         return
@@ -242,4 +247,4 @@ def matches_again(
     what = f"{wrong} of {len(alike)} labels differ from what rays say"
     names = ("depth", "truth", "classes")
     same = all(np.array_equal(getattr(made, k), getattr(stored, k), equal_nan=True) for k in names)
-    yield file, finding(file, what) if wrong > max(_FEW_OTHERS * len(alike), _LEAST) else "", same
+    yield file, Finding(file, what) if wrong > max(_FEW_OTHERS * len(alike), _LEAST) else None, same

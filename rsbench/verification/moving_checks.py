@@ -10,7 +10,7 @@ import numpy as np
 
 from rsbench.dataset.object_records import numbers_of
 from rsbench.verification.content import Content, spare_pixels
-from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Shot, land
 
 _LEAST = 8
@@ -18,7 +18,7 @@ _LEAST = 8
 _TRIED_PIXELS = 60_000
 
 
-def label_faults(content: Content, fresh: Content, twins: Content) -> Iterator[str]:
+def label_faults(content: Content, fresh: Content, twins: Content) -> Iterator[Finding]:
     """What labels cannot be. Their maps are taken out of all: they would accuse the depth of others.
 
     Args:
@@ -37,37 +37,37 @@ def label_faults(content: Content, fresh: Content, twins: Content) -> Iterator[s
         del fresh.maps[shot]
 
 
-def _dropped(content: Content, faults: Mapping[Shot, str]) -> Iterator[str]:
+def _dropped(content: Content, faults: Mapping[Shot, Finding | None]) -> Iterator[Finding]:
     for shot, fault in faults.items():
         if fault:
             del content.maps[shot]
             yield fault
 
 
-def _on_nothing(each: DepthMap) -> str:
+def _on_nothing(each: DepthMap) -> Finding | None:
     labels = np.zeros(each.depth.shape, dtype=np.uint8) if each.labels is None else each.labels
     empty = (labels > 0) & (each.depth == 0)
     if not np.any(empty):
-        return ""
-    return finding(each.shot.labels, f"{np.sum(empty)} labels where there is no surface", _rows(empty))
+        return None
+    return Finding(each.shot.labels, f"{np.sum(empty)} labels where there is no surface", _rows(empty))
 
 
-def _unlike_twin(content: Content, twins: Content, shot: Shot) -> str:
+def _unlike_twin(content: Content, twins: Content, shot: Shot) -> Finding | None:
     """The line of a global shutter that its rolling-shutter frame shares."""
     source = shot._replace(shutter="rs", row=0)
     own, other = (twins.maps if shot.row else content.maps).get(shot), content.maps.get(source)
     if shot == source or own is None or other is None or own.labels is None or other.labels is None:
-        return ""
+        return None
     shutter = content.sequence.shutter
     axis, line = 1 - shutter.axis(shot.side), abs(shutter.first_line(shot.side) - shot.row)
     unlike = np.take(own.labels, line, axis) != np.take(other.labels, line, axis)
     if np.sum(unlike) <= spare_pixels(axis, unlike.size):
-        return ""
+        return None
     words = f"{'row' if axis == 0 else 'column'} {line} differs from {source.labels}"
-    return finding(shot.labels, f"{words}: {np.sum(unlike)} labels at the same time")
+    return Finding(shot.labels, f"{words}: {np.sum(unlike)} labels at the same time")
 
 
-def _misplaced(content: Content, own: DepthMap) -> str:
+def _misplaced(content: Content, own: DepthMap) -> Finding | None:
     """Surfaces through which partners see where their labels take them, and which they see where another would."""
     sequence, shot = content.sequence, own.shot
     stride = max(1, int(np.sqrt(own.depth.size / _TRIED_PIXELS)))
@@ -87,9 +87,9 @@ def _misplaced(content: Content, own: DepthMap) -> str:
     # Along an edge that stands out by a hair, a line of pixels may lie by chance where another label takes it.
     wide = cv2.morphologyEx(elsewhere.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     if np.sum(wide) <= _LEAST:
-        return ""
+        return None
     what = f"{np.sum(elsewhere)} pixels are not where their labels take them, but where another would"
-    return finding(shot.labels, what, rows_of(np.repeat(np.any(elsewhere, axis=1), stride)[: len(own.depth)]))
+    return Finding(shot.labels, what, rows_of(np.repeat(np.any(elsewhere, axis=1), stride)[: len(own.depth)]))
 
 
 def _rows(wrong: BoolArray) -> str:

@@ -5,25 +5,25 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-from rsbench.verification.findings import finding
+from rsbench.verification.findings import Finding
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGBA"}
 
 
-def png_fault(path: Path, name: str, size: tuple[int, int]) -> str | None:
+def png_fault(path: Path, name: str, size: tuple[int, int]) -> Finding | None:
     """What keeps a file from being an 8-bit RGB image of ``size`` (width, height); only its header is read."""
     try:
         with path.open("rb") as stream:
             head = stream.read(26)
     except OSError as error:
-        return finding(name, f"cannot be read: {error.strerror}")
+        return Finding(name, f"cannot be read: {error.strerror}")
     if len(head) < 26 or head[:8] != _SIGNATURE or head[12:16] != b"IHDR":
-        return finding(name, "damaged or not a PNG")
+        return Finding(name, "damaged or not a PNG")
     width, height, bits, colour = struct.unpack(">IIBB", head[16:26])
     if (width, height) != size:
-        return finding(name, f"is {width} x {height} pixels, the camera {size[0]} x {size[1]}")
+        return Finding(name, f"is {width} x {height} pixels, the camera {size[0]} x {size[1]}")
     if (bits, colour) != (8, 2):
         kind = _COLOUR_TYPES.get(colour, f"colour type {colour}")
-        return finding(name, f"is {kind} of {bits} bits per channel: 8-bit RGB is needed")
+        return Finding(name, f"is {kind} of {bits} bits per channel: 8-bit RGB is needed")
     return None

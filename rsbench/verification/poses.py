@@ -14,41 +14,41 @@ from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence
 from rsbench.storage.files import read_pose_table
-from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.findings import Finding, rows_of
 
 _ROUNDING = 1e-12
 """Of row times (frame periods), quaternions and places (metres): a thousand roundings of numbers near 1."""
 
 
-def pose_faults(sequence: Sequence) -> Iterator[str]:
+def pose_faults(sequence: Sequence) -> Iterator[Finding]:
     """Stored row poses that are not the motion at the row times."""
     for side, frame in views_of(sequence.frames):
         file = f"poses/{side}_{frame}.csv"
         try:
             table = read_pose_table(sequence.folder / file)
         except RsbenchError as error:
-            yield str(error)
+            yield Finding.of(error)
             continue
         if len(table) != (lines := sequence.shutter.lines(side)):
-            yield finding(file, f"has {len(table)} rows, the camera has {lines}")
+            yield Finding(file, f"has {len(table)} rows, the camera has {lines}")
         else:
             yield from _table_faults(sequence, file, side, frame, table)
 
 
-def _table_faults(sequence: Sequence, file: str, side: Side, frame: int, table: FloatArray) -> Iterator[str]:
+def _table_faults(sequence: Sequence, file: str, side: Side, frame: int, table: FloatArray) -> Iterator[Finding]:
     norm = np.linalg.norm(table[:, 2:6], axis=1)
     zero = norm == 0
     if np.any(zero):
-        yield finding(file, "the quaternion is zero", rows_of(zero))
+        yield Finding(file, "the quaternion is zero", rows_of(zero))
         return
     unlike_unit = np.abs(norm - 1) > _ROUNDING
     if np.any(unlike_unit):
         worst = norm[np.argmax(np.abs(norm - 1))]
-        yield finding(file, f"quaternion of norm {worst:.9g}, not 1", rows_of(unlike_unit))
+        yield Finding(file, f"quaternion of norm {worst:.9g}, not 1", rows_of(unlike_unit))
     # At w = 0, half a turn, both signs are right.
     negated = table[:, 2] < -_ROUNDING
     if np.any(negated):
-        yield finding(
+        yield Finding(
             file, f"quaternion with w = {table[negated, 2].min():.6g}: w >= 0 is needed", rows_of(negated)
         )
     expected = _table(sequence, side, frame)
@@ -59,7 +59,7 @@ def _table_faults(sequence: Sequence, file: str, side: Side, frame: int, table: 
             f"differs from the motion by {np.max(wrong_time):.1e} periods, {np.max(wrong_angle):.1e} rad, "
             f"{np.max(wrong_place):.1e} m"
         )
-        yield finding(file, what, rows_of(wrong), _likely(sequence, side, frame, table))
+        yield Finding(file, what, rows_of(wrong), _likely(sequence, side, frame, table))
 
 
 def _table(sequence: Sequence, side: Side, frame: int) -> FloatArray:

@@ -15,7 +15,7 @@ from PIL import Image
 from rsbench.core.so3 import FloatArray
 from rsbench.renderers.electrons import Mosaic, Sensor, filters
 from rsbench.renderers.image import linear_of_codes, srgb_of
-from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.findings import Finding, rows_of
 
 T = TypeVar("T")
 _BLOCK = 8
@@ -51,7 +51,7 @@ class _Told(NamedTuple):
         return np.asarray(bad)
 
 
-def processing_fault(image: NDArray[np.uint8], sensor: Sensor, file: str) -> str | None:
+def processing_fault(image: NDArray[np.uint8], sensor: Sensor, file: str) -> Finding | None:
     """An image (H, W, 3) that is not compressed or interpolated as its sensor's are; None where nothing tells.
 
     Compressed images do not show a mosaic any more.
@@ -63,7 +63,7 @@ def processing_fault(image: NDArray[np.uint8], sensor: Sensor, file: str) -> str
         # The coarsest that fits: whole steps of 8 are those of 4 too.
         like = _first(q for q in range(1, 100) if _fits(blocks.off_steps(q)))
         what = f"is no JPEG image of quality {sensor.jpeg_quality}: its blocks are not of whole steps"
-        return finding(
+        return Finding(
             file, what, rows_of(wrong), f"looks like quality {like}" if like else "looks not compressed"
         )
     if sensor.mosaic == "none" or not np.any(wrong := _not_means(image, sensor.mosaic).rows()):
@@ -71,7 +71,7 @@ def processing_fault(image: NDArray[np.uint8], sensor: Sensor, file: str) -> str
     patterns = [each for each in get_args(Mosaic) if each != "none"]
     alike = _first(each for each in patterns if _fits(_not_means(image, each)))
     what = f"is not interpolated from a mosaic {sensor.mosaic}: values are not the mean of their neighbours"
-    return finding(file, what, rows_of(wrong), f"looks like {alike or 'no mosaic'}")
+    return Finding(file, what, rows_of(wrong), f"looks like {alike or 'no mosaic'}")
 
 
 def _first(values: Iterable[T]) -> T | None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.frame_comparison import DepthMap
 from rsbench.verification.image_checks import CHANGES, Picture
 
@@ -25,10 +25,10 @@ _OTHER_LABELS, _FEW_LABELS = 1e-3, 8
 
 @dataclass(frozen=True)
 class Check:
-    """One file against its rows rendered again; ``fault`` is "" when they are alike."""
+    """One file against its rows rendered again; ``fault`` is None when they are alike."""
 
     file: str
-    fault: str
+    fault: Finding | None
     same_bits: bool
 
 
@@ -39,7 +39,7 @@ def label_checks(stored: DepthMap, rendered: NDArray[np.uint8], rows: list[int])
     what = f"{100 * np.mean(wrong):.2g} % of {wrong.size} labels differ from what is rendered again"
     in_rows = np.isin(np.arange(len(stored.labels)), np.asarray(rows)[np.any(wrong, axis=1)])
     bad = np.sum(wrong) > max(_OTHER_LABELS * wrong.size, _FEW_LABELS)
-    yield Check(file, finding(file, what, rows_of(in_rows)) if bad else "", not np.any(wrong))
+    yield Check(file, Finding(file, what, rows_of(in_rows)) if bad else None, not np.any(wrong))
 
 
 def depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]) -> Check:
@@ -47,7 +47,7 @@ def depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]
     wrong = np.abs(depth - rendered) > SAME_DEPTH * np.maximum(depth, rendered)
     share = float(np.mean(wrong))
     if share <= _OTHER_DEPTH:
-        return Check(file, "", np.array_equal(depth, rendered))
+        return Check(file, None, np.array_equal(depth, rendered))
     both = wrong & (depth > 0) & (rendered > 0)
     ratio = depth[both] / rendered[both] if np.any(both) else np.ones(1)
     middle = float(np.median(ratio))
@@ -56,7 +56,7 @@ def depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]
     what = f"depth differs from what is rendered again on {100 * share:.3g} % of {wrong.size} pixels"
     if np.any(both):
         what += f", typically by {np.median(np.abs(ratio - 1)):.1e} of itself"
-    return Check(file, finding(file, what, _rows(wrong, rows, len(stored.depth)), cause), False)
+    return Check(file, Finding(file, what, _rows(wrong, rows, len(stored.depth)), cause), False)
 
 
 def image_check(file: str, stored: Picture, rendered: NDArray[np.uint8], rows: list[int], noisy: bool) -> Check:
@@ -65,7 +65,7 @@ def image_check(file: str, stored: Picture, rendered: NDArray[np.uint8], rows: l
     far = difference > _NEAR + (4 * stored.noise if noisy else 0.0)
     other = far if noisy else difference > 0
     if np.mean(far) <= _FAR_CODES and np.mean(other) <= _OTHER_CODES:
-        return Check(file, "", not np.any(difference))
+        return Check(file, None, not np.any(difference))
     what = (
         f"the image differs from what is rendered again on {100 * np.mean(other):.3g} % of {far.size} pixels, "
         f"by up to {np.max(difference):g} codes"
@@ -74,7 +74,7 @@ def image_check(file: str, stored: Picture, rendered: NDArray[np.uint8], rows: l
     costs = [np.mean(np.abs(change.undone(stored.colours, y, x) - truth.reshape(-1, 3))) for change in CHANGES]
     best = int(np.argmin(costs))
     cause = f"looks {CHANGES[best].words}" if best and costs[best] < 0.5 * costs[0] else ""
-    return Check(file, finding(file, what, _rows(other, rows, len(stored.colours)), cause), False)
+    return Check(file, Finding(file, what, _rows(other, rows, len(stored.colours)), cause), False)
 
 
 def _rows(wrong: NDArray[np.bool_], rows: list[int], height: int) -> str:

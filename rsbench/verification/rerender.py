@@ -33,7 +33,7 @@ from rsbench.scenes.object_meshes import with_moving
 from rsbench.verification.affine_checks import affine_again
 from rsbench.verification.channel_checks import channels_again
 from rsbench.verification.content import Content, clean_picture
-from rsbench.verification.findings import finding
+from rsbench.verification.findings import Finding
 from rsbench.verification.image_checks import Picture
 from rsbench.verification.match_checks import matches_again
 from rsbench.verification.mesh_files import with_files
@@ -180,7 +180,7 @@ class Redone:
         self._checks += checks
         self._seconds += time.perf_counter() - start
 
-    def end(self, told: set[str]) -> tuple[list[str], str]:
+    def end(self, told: set[str]) -> tuple[list[Finding], str]:
         """Faults of files that are not ``told`` yet, and what was done or why not."""
         if self._refusal:
             return [], self._refusal
@@ -199,10 +199,10 @@ class Redone:
         if wrong and len(wrong) == len(checks):
             cause = "look at scene, motion, camera and renderer in sequence.json"
             what = f"not one file is what its scene looks like when rendered again, {wrong[0].fault}"
-            return [finding("sequence.json", what, cause=cause)], done
+            return [Finding("sequence.json", what, cause=cause)], done
         same = all(check.same_bits for check in checks)
         done += _ALIKE[0] if same else "" if wrong else _ALIKE[1]
-        return [check.fault for check in wrong if check.file not in told], done
+        return [check.fault for check in wrong if check.fault and check.file not in told], done
 
 
 def _rays(scene: MitsubaScene) -> SceneRays:

@@ -19,7 +19,7 @@ from rsbench.renderers.electrons import Sensor, expose, fall_off
 from rsbench.renderers.image import linear_of_codes
 from rsbench.renderers.processing import compressed, processed, rows_needed, shares_of_noise
 from rsbench.storage.untrusted_files import inside
-from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.frame_comparison import FAR, BoolArray, DepthMap, Shot
 from rsbench.verification.image_checks import Picture
 from rsbench.verification.png_header import png_fault
@@ -45,7 +45,7 @@ _WHITE = 255.0
 
 def sensor_faults(
     sequence: Sequence, maps: Mapping[Shot, DepthMap], pictures: Mapping[Shot, Picture], missing: Collection[str]
-) -> Iterator[str]:
+) -> Iterator[Finding]:
     """What the rolling-shutter frames of a sequence show that their sensor cannot have made of the clean twins."""
     sensor = sequence.sensor
     size = sequence.rig.camera.width, sequence.rig.camera.height
@@ -61,7 +61,7 @@ def sensor_faults(
                 changing = _changing(sequence, own, maps[shot], spacing)
                 fault = _fault(own, seen, pictures[shot], window, spacing, changing)
         except RsbenchError as error:
-            fault = str(error)
+            fault = Finding.of(error)
         if fault:
             yield fault
 
@@ -131,7 +131,7 @@ def _fault(
     window: tuple[int, int],
     spacing: float = 0.5,
     changing: BoolArray | None = None,
-) -> str | None:
+) -> Finding | None:
     """What is wrong with an image of ``picture``'s shot; ``window`` is how far (x, y) its blur may reach, px.
 
     ``changing`` (H, W) where it may reach farther.
@@ -190,7 +190,9 @@ class _Bounds:
         return cls(low, high, own, rounded, _BEYOND_SIGMA * np.sqrt(unsure), inner)
 
 
-def _beyond(bounds: _Bounds, image: NDArray[np.uint8], shot: Shot, spacing: float, told: BoolArray) -> str | None:
+def _beyond(
+    bounds: _Bounds, image: NDArray[np.uint8], shot: Shot, spacing: float, told: BoolArray
+) -> Finding | None:
     seen, inner = linear_of_codes(image), bounds.inner
     beyond = told & ((seen < np.minimum(bounds.low, 1.0) - bounds.slack) | (seen > bounds.high + bounds.slack))
     if not beyond[inner].size:
@@ -200,12 +202,12 @@ def _beyond(bounds: _Bounds, image: NDArray[np.uint8], shot: Shot, spacing: floa
     if many <= _BEYOND_SHARE * max(1.0, 2.0 * spacing) and not np.any(rows):
         return None
     what = f"{100 * many:.2f} % of the values are beyond {_BEYOND_SIGMA:g} sigma of what {_twin(shot)} allows"
-    return finding(shot.image, what, rows_of(rows))
+    return Finding(shot.image, what, rows_of(rows))
 
 
 def _noise_fault(
     bounds: _Bounds, sensor: Sensor, image: NDArray[np.uint8], picture: Picture, told: BoolArray
-) -> str | None:
+) -> Finding | None:
     """Light and noise where the twin is smooth. Rounding is no noise: without any beside it, equal values are
     rounded alike."""
     low, high, shot = bounds.low, bounds.high, picture.shot
@@ -221,7 +223,7 @@ def _noise_fault(
     beside = ((linear_of_codes(image) - 0.5 * (low + high)) / sigma)[smooth]
     if abs(bias := float(np.mean(beside))) > _MOST_BIAS:
         way = "brighter" if bias > 0 else "darker"
-        return finding(shot.image, f"is {way} than its sensor shows {_twin(shot)}, by {abs(bias):.2f} sigma")
+        return Finding(shot.image, f"is {way} than its sensor shows {_twin(shot)}, by {abs(bias):.2f} sigma")
     ratio, (least, most) = float(np.var(beside)), _VARIANCE_RANGE
     if sensor.jpeg_quality:
         made = linear_of_codes(_made_of(picture.colours, sensor))
@@ -230,7 +232,7 @@ def _noise_fault(
     if least < ratio < most:
         return None
     what = f"its noise has {ratio:.2f} times the variance of the sensor's, seen beside {_twin(shot)}"
-    return finding(shot.image, what)
+    return Finding(shot.image, what)
 
 
 def _twin(shot: Shot) -> str:

@@ -15,10 +15,10 @@ from rsbench.dataset.views import Shot
 from rsbench.storage.files import read_png
 from rsbench.storage.untrusted_files import inside
 from rsbench.verification.content import Content, clean_picture
-from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.findings import Finding, rows_of
 
 
-def stack_faults(content: Content, missing: Collection[str], stride: int = 1) -> Iterator[str]:
+def stack_faults(content: Content, missing: Collection[str], stride: int = 1) -> Iterator[Finding]:
     """Row y of image y is row y of the rolling-shutter frame, and image 0 is its global-shutter twin; every
     ``stride``-th image is read."""
     sequence = content.sequence
@@ -35,7 +35,7 @@ def stack_faults(content: Content, missing: Collection[str], stride: int = 1) ->
             try:
                 image = _image(sequence, shot, row)
             except RsbenchError as error:
-                yield str(error)
+                yield Finding.of(error)
                 continue
             wrong[row] = not np.array_equal(image[row], picture.colours[row])
             twin = content.pictures.get(shot._replace(shutter="gs"))
@@ -44,10 +44,10 @@ def stack_faults(content: Content, missing: Collection[str], stride: int = 1) ->
                 and twin is not None
                 and not np.array_equal(image, twin.colours)
             ):
-                yield finding(file, f"differs from {twin.shot.image}, which has the same pose")
+                yield Finding(file, f"differs from {twin.shot.image}, which has the same pose")
         if np.any(wrong):
             what = f"{np.sum(wrong)} images differ in their own row from {clean_picture(sequence, shot)}"
-            yield finding(f"gs_stack/{shot.side}_{shot.frame}", what, rows_of(wrong))
+            yield Finding(f"gs_stack/{shot.side}_{shot.frame}", what, rows_of(wrong))
 
 
 def stack_rows(sequence: Sequence, shot: Shot, rows: Rows[int], of: Rows[int]) -> NDArray[np.uint8]:

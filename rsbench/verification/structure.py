@@ -21,7 +21,7 @@ from rsbench.scenes.load import read_scene_card
 from rsbench.storage.files import read_json, sha256
 from rsbench.storage.untrusted_files import NAME, inside
 from rsbench.storage.work_folder import files_below
-from rsbench.verification.findings import finding
+from rsbench.verification.findings import MISSING, Finding
 
 DATASET = "dataset.json"
 _TEXTS = ("name", "description", "rsbench", "mitsuba")
@@ -37,7 +37,7 @@ class Listing:
 
     folder: Path
     manifest: Mapping[str, Any]
-    card: DatasetCard | str
+    card: DatasetCard | Finding
     """The card, or the fault that it is none."""
     names: tuple[str, ...]
     """Of sequences that may be opened: folders in it, each once."""
@@ -56,7 +56,7 @@ class Listing:
             name, _, relative = path.partition("/")
             if name in below and _stays_inside(path):
                 below[name][relative] = entry
-        made = {} if isinstance(card, str) else {sequence.name: sequence for sequence in card.sequence}
+        made = {} if isinstance(card, Finding) else {sequence.name: sequence for sequence in card.sequence}
         return cls(folder, manifest, card, tuple(below), below, made)
 
 
@@ -65,56 +65,56 @@ def is_name(name: object) -> bool:
     return isinstance(name, str) and NAME.fullmatch(name) is not None
 
 
-def dataset_faults(listing: Listing) -> Iterator[str]:
+def dataset_faults(listing: Listing) -> Iterator[Finding]:
     """What is wrong with dataset.json as a whole."""
     manifest, card = listing.manifest, listing.card
     if manifest.get("format") != FORMAT or isinstance(manifest.get("format"), bool):
-        yield finding(DATASET, f"format = {manifest.get('format')!r}: {FORMAT} is needed")
+        yield Finding(DATASET, f"format = {manifest.get('format')!r}: {FORMAT} is needed")
     for key in _TEXTS:
         if not isinstance(manifest.get(key), str):
-            yield finding(DATASET, f"{key} = {manifest.get(key)!r}: a text is needed")
+            yield Finding(DATASET, f"{key} = {manifest.get(key)!r}: a text is needed")
     if manifest.get("units") != UNITS:
-        yield finding(DATASET, f"units = {manifest.get('units')!r}: {UNITS} is needed")
+        yield Finding(DATASET, f"units = {manifest.get('units')!r}: {UNITS} is needed")
     yield from _name_faults(manifest.get("sequences"))
     yield from _listing_faults(listing)
-    if isinstance(card, str):
+    if isinstance(card, Finding):
         yield card
         return
     for key, value in (("name", card.name), ("description", card.description)):
         if manifest.get(key) != value:
-            yield finding(DATASET, f"{key} = {manifest.get(key)!r}, its card says {value!r}")
+            yield Finding(DATASET, f"{key} = {manifest.get(key)!r}, its card says {value!r}")
     made = [sequence.name for sequence in card.sequence]
     if manifest.get("sequences") != made:
-        yield finding(
+        yield Finding(
             DATASET, f"sequences = {shortened(manifest.get('sequences'))}, its card makes {shortened(made)}"
         )
 
 
-def _name_faults(names: object) -> Iterator[str]:
+def _name_faults(names: object) -> Iterator[Finding]:
     if not isinstance(names, list) or not names:
-        yield finding(DATASET, f"sequences = {names!r}: a list of names is needed")
+        yield Finding(DATASET, f"sequences = {names!r}: a list of names is needed")
         return
     for name in names:
         if not is_name(name):
-            yield finding(DATASET, f"sequences: {name!r} is not the name of a folder in it")
+            yield Finding(DATASET, f"sequences: {name!r} is not the name of a folder in it")
     for name, count in Counter(map(str, names)).items():
         if count > 1:
-            yield finding(DATASET, f"sequences: {name!r} stands there twice")
+            yield Finding(DATASET, f"sequences: {name!r} stands there twice")
 
 
-def _listing_faults(listing: Listing) -> Iterator[str]:
+def _listing_faults(listing: Listing) -> Iterator[Finding]:
     """``files`` against the sequences and the disk; each file's content is looked at with its sequence."""
     folder, files = listing.folder, listing.manifest.get("files")
     if not isinstance(files, dict):
-        yield finding(DATASET, f"files = {files!r}: a table of paths is needed")
+        yield Finding(DATASET, f"files = {files!r}: a table of paths is needed")
         return
     strange = [path for path in files if path.partition("/")[0] not in listing.files or not _stays_inside(path)]
     if strange:
-        yield finding(DATASET, f"files lists what belongs to none of its sequences: {_some(strange)}")
+        yield Finding(DATASET, f"files lists what belongs to none of its sequences: {_some(strange)}")
     there = {path for path in files_below(folder) if not _hidden(Path(path))}
     extra = sorted(there - {DATASET, *files})
     if extra:
-        yield finding(DATASET, f"lies there but is not listed in files: {_some(extra)}")
+        yield Finding(DATASET, f"lies there but is not listed in files: {_some(extra)}")
 
 
 def _stays_inside(path: str) -> bool:
@@ -133,18 +133,18 @@ def _some(names: list[str]) -> str:
     return ", ".join(names[:_MOST_NAMES]) + (f" and {left} more" if left > 0 else "")
 
 
-def _card_of(manifest: Mapping[str, Any]) -> DatasetCard | str:
+def _card_of(manifest: Mapping[str, Any]) -> DatasetCard | Finding:
     """The card of dataset.json, or the fault that it is none."""
     card = manifest.get("card")
     if not isinstance(card, dict):
-        return finding(DATASET, f"card = {card!r}: the card of the dataset is needed")
+        return Finding(DATASET, f"card = {card!r}: the card of the dataset is needed")
     try:
         return parse_card(DatasetCard, card, f"{DATASET}: card")
     except RsbenchError as error:
-        return str(error)
+        return Finding.of(error)
 
 
-def file_faults(listing: Listing, name: str) -> Iterator[str]:
+def file_faults(listing: Listing, name: str) -> Iterator[Finding]:
     """Files of a sequence against both manifests: there, listed in both, and with the bytes that they say."""
     folder, listed, below = listing.folder, listing.files[name], f"{name}/"
     own, needed, fault = _own_files(folder / name)
@@ -153,55 +153,55 @@ def file_faults(listing: Listing, name: str) -> Iterator[str]:
     for relative in sorted({"sequence.json", *needed, *own, *listed}):
         entry = listed.get(relative)
         if relative not in own and relative != "sequence.json" and not fault:
-            yield finding(f"{below}sequence.json", f"files does not list {relative}")
+            yield Finding(f"{below}sequence.json", f"files does not list {relative}")
         if entry is None:
-            yield finding(below + relative, "not listed in dataset.json")
+            yield Finding(below + relative, "not listed in dataset.json")
         else:
             yield from _content_faults(folder, below + relative, entry, own.get(relative))
 
 
-def _own_files(folder: Path) -> tuple[dict[str, object], tuple[str, ...], str]:
+def _own_files(folder: Path) -> tuple[dict[str, object], tuple[str, ...], Finding | None]:
     """``files`` of a sequence.json, those that it must have, and what is wrong with them."""
     try:
         manifest = read_json(inside(folder, "sequence.json"))
     except RsbenchError as error:
-        return {}, RELATIVE_FILES, str(error)
+        return {}, RELATIVE_FILES, Finding.of(error)
     files, needed = manifest.get("files"), files_of(manifest)
     if not isinstance(files, dict) or not files:
         return (
             {},
             needed,
-            finding(f"{folder.name}/sequence.json", f"files = {files!r}: a table of sha256 is needed"),
+            Finding(f"{folder.name}/sequence.json", f"files = {files!r}: a table of sha256 is needed"),
         )
     strange = [path for path in files if not _stays_inside(path)]
     if strange:
-        fault = finding(f"{folder.name}/sequence.json", f"files lists paths that leave it: {_some(strange)}")
+        fault = Finding(f"{folder.name}/sequence.json", f"files lists paths that leave it: {_some(strange)}")
         return {path: digest for path, digest in files.items() if path not in strange}, needed, fault
-    return files, needed, ""
+    return files, needed, None
 
 
-def _content_faults(folder: Path, name: str, entry: object, own: object) -> Iterator[str]:
+def _content_faults(folder: Path, name: str, entry: object, own: object) -> Iterator[Finding]:
     try:
         path = inside(folder, name)
     except RsbenchError as error:
-        yield str(error)
+        yield Finding.of(error)
         return
     if not path.is_file():
-        yield finding(name, "missing")
+        yield Finding(name, MISSING)
         return
     if not isinstance(entry, dict) or not isinstance(entry.get("size"), int) or "sha256" not in entry:
-        yield finding(DATASET, f"files: {name} = {entry!r}: size and sha256 are needed")
+        yield Finding(DATASET, f"files: {name} = {entry!r}: size and sha256 are needed")
         return
     size = path.stat().st_size
     digest = sha256(path) if size == entry["size"] else ""
     if digest != entry["sha256"]:
         what = f"content differs from its checksum in {DATASET}"
-        yield finding(name, what if digest else f"{what}: {size} bytes, it says {entry['size']}")
+        yield Finding(name, what if digest else f"{what}: {size} bytes, it says {entry['size']}")
     elif own is not None and digest != own:
-        yield finding(name, f"content differs from its checksum in {name.partition('/')[0]}/sequence.json")
+        yield Finding(name, f"content differs from its checksum in {name.partition('/')[0]}/sequence.json")
 
 
-def sequence_faults(sequence: Sequence, name: str, listing: Listing) -> Iterator[str]:
+def sequence_faults(sequence: Sequence, name: str, listing: Listing) -> Iterator[Finding]:
     """What sequence.json says against itself, its folder and the card."""
     file, manifest = "sequence.json", sequence.manifest
     expected = sequence_manifest(
@@ -215,18 +215,18 @@ def sequence_faults(sequence: Sequence, name: str, listing: Listing) -> Iterator
     )
     for key, value in expected.items():
         if not _equal(manifest.get(key), value):
-            yield finding(file, f"{key} = {manifest.get(key)!r}, the rest of it makes {value!r}")
+            yield Finding(file, f"{key} = {manifest.get(key)!r}, the rest of it makes {value!r}")
     if not 0 < sequence.frame_period_s < math.inf:
-        yield finding(file, f"frame_period_s = {sequence.frame_period_s}: a positive number is needed")
+        yield Finding(file, f"frame_period_s = {sequence.frame_period_s}: a positive number is needed")
     made_by = manifest.get("made_by")
     for key in ("rsbench", "mitsuba", "drjit", "variant"):
         if not isinstance(made_by, dict) or not isinstance(made_by.get(key), str):
-            yield finding(file, f"made_by: {key} is missing")
+            yield Finding(file, f"made_by: {key} is missing")
     if isinstance(listing.card, DatasetCard) and name in listing.planned:
         yield from _card_faults(manifest, listing.card, listing.planned[name])
 
 
-def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: SequenceCard) -> Iterator[str]:
+def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: SequenceCard) -> Iterator[Finding]:
     """sequence.json against what the card would make, as far as that is known without building the scene."""
     made = manifest.get("made_by")
     same_version = isinstance(made, dict) and made.get("rsbench") == __version__
@@ -249,16 +249,16 @@ def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: Seque
         options = {key: value for key, value in options.items() if key not in ("method", "full_frames")}
     for key, value in planned.items():
         if not _equal(manifest.get(key), value):
-            yield finding("sequence.json", f"{key} = {manifest.get(key)!r}, the card in {DATASET} makes {value!r}")
+            yield Finding("sequence.json", f"{key} = {manifest.get(key)!r}, the card in {DATASET} makes {value!r}")
     for table, wanted in (("scene", scene), ("renderer", options)):
         stored = manifest.get(table)
         if not isinstance(stored, dict):
-            yield finding("sequence.json", f"{table} = {stored!r}: a table is needed")
+            yield Finding("sequence.json", f"{table} = {stored!r}: a table is needed")
             continue
         for key, value in wanted.items():
             if not _equal(stored.get(key), value):
                 what = f"{table}.{key} = {stored.get(key)!r}, the card in {DATASET} makes {value!r}"
-                yield finding("sequence.json", what)
+                yield Finding("sequence.json", what)
 
 
 def _equal(stored: object, expected: object) -> bool:

@@ -18,7 +18,7 @@ from rsbench.dataset.channels import INSTANCE_TABLE, surface_file
 from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import Shot, points_of, seen_from, times_at
-from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.frame_comparison import BoolArray, DepthMap, land
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def surface_faults(
     told: Collection[str],
     times: tuple[int, ...] = FRAMES,
     new: tuple[int, ...] = FRAMES,
-) -> Iterator[str]:
+) -> Iterator[Finding]:
     """What normals and instances show that the surfaces of the depth maps are not, but for files ``told``.
 
     Of frames at these ``times``, and of pairs of them with one that is ``new``.
@@ -60,7 +60,7 @@ def surface_faults(
                 if frame in new:
                     yield from _number_faults(maps[shot], file, instances[shot], len(sequence.instance_table()))
         except RsbenchError as error:
-            yield str(error)
+            yield Finding.of(error)
     for shot in instances:
         for partner in shot.partners():
             if partner in instances and {shot.frame, partner.frame} & {*new}:
@@ -69,18 +69,18 @@ def surface_faults(
 
 def _normal_faults(
     sequence: Sequence, depth_map: DepthMap, file: str, normals: NDArray[np.float32]
-) -> Iterator[str]:
+) -> Iterator[Finding]:
     solid = depth_map.depth > 0
     length = np.linalg.norm(normals, axis=-1)
     wrong = ~(np.abs(length - solid) <= _UNIT)
     if np.sum(wrong) > _LEAST:
-        yield finding(file, f"{np.sum(wrong)} normals are not of length 1, or 0 without a surface", _rows(wrong))
+        yield Finding(file, f"{np.sum(wrong)} normals are not of length 1, or 0 without a surface", _rows(wrong))
         return
     z = np.where(solid, depth_map.depth, 1.0).astype(np.float64)
     X, ways, normals = _resting(sequence, depth_map, z, normals)
     away = solid & (np.sum(ways * normals, axis=-1) > 0)
     if np.sum(away) > _LEAST:
-        yield finding(file, f"{np.sum(away)} normals point away from the camera", _rows(away))
+        yield Finding(file, f"{np.sum(away)} normals point away from the camera", _rows(away))
     bent = np.zeros(solid.shape, dtype=np.bool_)
     for step in (X[1:-1, 2:] - X[1:-1, :-2], X[2:, 1:-1] - X[:-2, 1:-1]):
         cosine = np.sum(step * normals[1:-1, 1:-1], axis=-1) / np.linalg.norm(step, axis=-1)
@@ -89,7 +89,7 @@ def _normal_faults(
     if np.sum(bent & flat) > max(FEW_BENT * np.sum(flat), _LEAST):
         share = f"{100 * np.sum(bent & flat) / np.sum(flat):.2g} % of the flat pixels"
         what = f"{share} have a normal that is not upright on the surface of {depth_map.shot.depth}"
-        yield finding(file, what, _rows(bent & flat))
+        yield Finding(file, what, _rows(bent & flat))
 
 
 def _resting(
@@ -115,14 +115,14 @@ def _resting(
     return X, ways, normals
 
 
-def _number_faults(depth_map: DepthMap, file: str, numbers: NDArray[np.uint16], count: int) -> Iterator[str]:
+def _number_faults(depth_map: DepthMap, file: str, numbers: NDArray[np.uint16], count: int) -> Iterator[Finding]:
     wrong = (numbers > 0) != (depth_map.depth > 0)
     if np.sum(wrong) > _LEAST:
-        yield finding(
+        yield Finding(
             file, f"{np.sum(wrong)} pixels have an instance and no depth, or depth and none", _rows(wrong)
         )
     if np.any(numbers > count):
-        yield finding(
+        yield Finding(
             file, f"holds instance {np.max(numbers)}, {INSTANCE_TABLE} has {count}", _rows(numbers > count)
         )
 
@@ -133,7 +133,7 @@ def _likeness_faults(
     instances: Mapping[Shot, NDArray[np.uint16]],
     shot: Shot,
     partner: Shot,
-) -> Iterator[str]:
+) -> Iterator[Finding]:
     landing = land(sequence, maps[shot], maps[partner])
     with np.errstate(invalid="ignore"):
         same = np.abs(landing.relative) < _SURFACE
@@ -150,12 +150,12 @@ def _likeness_faults(
     if np.sum(other) > max(_FEW_OTHERS * np.sum(same), _LEAST):
         file, there = (surface_file("instances", each.side, each.frame) for each in (shot, partner))
         share = f"{100 * np.sum(other) / np.sum(same):.2g} % of {np.sum(same)} pixels"
-        yield finding(file, f"{share} see another instance than {there}", _rows(other))
+        yield Finding(file, f"{share} see another instance than {there}", _rows(other))
 
 
 def surfaces_again(
     sequence: Sequence, shot: Shot, rows: list[int], frame: Frame, rays: Rays, told: Collection[str]
-) -> Iterator[tuple[str, str, bool]]:
+) -> Iterator[tuple[str, Finding | None, bool]]:
     """As ``channel_checks.channels_again``, of normals and instances."""
     names = [name for name in ("normals", "instances") if shot.shutter == "rs" and name in sequence.channels]
     seen = SeenSurfaces(sequence, shot, frame.depth, rows, numbers_of(frame.labels))
@@ -174,7 +174,7 @@ def surfaces_again(
         in_rows = np.isin(np.arange(sequence.shutter.height), np.asarray(rows)[np.any(wrong, axis=1)])
         bad = np.sum(wrong) > max(_FEW_AGAIN * wrong.size, _LEAST)
         what = f"{100 * np.mean(wrong):.2g} % of {wrong.size} pixels differ from what is made again"
-        yield file, finding(file, what, rows_of(in_rows)) if bad else "", bool(np.all(off == 0))
+        yield file, Finding(file, what, rows_of(in_rows)) if bad else None, bool(np.all(off == 0))
 
 
 def _rows(wrong: BoolArray) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import Shot, Times
-from rsbench.verification.findings import finding
+from rsbench.verification.findings import Finding
 from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, DepthMap, land
 
 _TRIED_PIXELS = 20_000
@@ -21,7 +21,7 @@ _NEAR = 4
 _FARTHEST = 32
 
 
-def misplaced_frames(sequence: Sequence, apart: Collection[Times]) -> list[str]:
+def misplaced_frames(sequence: Sequence, apart: Collection[Times]) -> list[Finding]:
     """A finding for each frame, of those ``apart`` from one beside it, that is that of another time.
 
     A frame is in order if it agrees with any other one near it, but for those that it is said not to.
@@ -44,9 +44,9 @@ def _time_of(maps: _Maps, frame: int, others: list[int]) -> int | None:
     return next((time for time, other in pairs if maps.agree(frame, time, other)), None)
 
 
-def _finding(frame: int, time: int | None) -> str:
+def _finding(frame: int, time: int | None) -> Finding:
     what = f"all pictures of frame {frame} disagree with those of other times, and not with each other"
-    return finding(Shot("rs", "left", frame).depth, what, cause="" if time is None else f"looks like frame {time}")
+    return Finding(Shot("rs", "left", frame).depth, what, cause="" if time is None else f"looks like frame {time}")
 
 
 class _Maps:

@@ -16,7 +16,7 @@ from rsbench.dataset.channels import TRACKS, PixelClass
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.tracks import Tracks, look_for, points_at, track_views
 from rsbench.dataset.views import Shot
-from rsbench.verification.findings import finding
+from rsbench.verification.findings import Finding
 from rsbench.verification.frame_comparison import BoolArray, DepthMap
 
 _SAME, _SAME_PX = 1e-9, 1e-6
@@ -31,7 +31,7 @@ _FEW_AGAIN, _LEAST = 5e-3, 4
 
 def track_faults(
     sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str], times: tuple[int, ...] = FRAMES
-) -> Iterator[str]:
+) -> Iterator[Finding]:
     """What the tracks show in frames at these times that depth maps and motion cannot have made.
 
     But for files ``told``.
@@ -41,28 +41,28 @@ def track_faults(
     try:
         tracks = sequence.tracks()
     except RsbenchError as error:
-        yield str(error)
+        yield Finding.of(error)
         return
     if len(tracks.points) == 0 and any(np.any(each.depth) for each in maps.values()):
-        yield finding(TRACKS, "has no points")
+        yield Finding(TRACKS, "has no points")
     for k, view in enumerate(track_views(sequence.frames)):
         if view[1] not in times:
             continue
-        shot, file = Shot("rs", *view), f"{TRACKS}: {view[0]}_{view[1]}"
+        shot, name = Shot("rs", *view), f"{view[0]}_{view[1]}"
         found = rs_project(sequence.rig, sequence.shutter, sequence.motion, *view, tracks.points)
-        yield from _pixel_faults(sequence, tracks, k, found, file)
+        yield from _pixel_faults(sequence, tracks, k, found, name)
         if shot in maps and shot.depth not in told:
-            yield from _source_faults(sequence, tracks, k, maps[shot], file)
-            yield from _hiding_faults(tracks, k, found, maps[shot], file)
+            yield from _source_faults(sequence, tracks, k, maps[shot], name)
+            yield from _hiding_faults(tracks, k, found, maps[shot], name)
 
 
-def _source_faults(sequence: Sequence, tracks: Tracks, k: int, depth: DepthMap, file: str) -> Iterator[str]:
+def _source_faults(sequence: Sequence, tracks: Tracks, k: int, depth: DepthMap, name: str) -> Iterator[Finding]:
     """Points are those of the depth map at the whole pixels from which they were drawn."""
     own = tracks.sources == k
     pixels, points = tracks.pixels[own, k], tracks.points[own]
     outside = ~np.all((pixels == np.round(pixels)) & sequence.rig.camera.contains(pixels)[:, None], axis=1)
     if np.any(outside):
-        yield finding(file, f"{np.sum(outside)} points were drawn from no pixel of it")
+        yield Finding(TRACKS, f"{np.sum(outside)} points were drawn from no pixel of it", part=name)
         return
     X = points_at(sequence, depth.shot[1:3], pixels, depth.depth)
     off = np.linalg.norm(points - X, axis=1) / np.maximum(np.linalg.norm(X, axis=1), 1e-9)
@@ -71,10 +71,10 @@ def _source_faults(sequence: Sequence, tracks: Tracks, k: int, depth: DepthMap, 
         scaled = np.median(np.linalg.norm(points - ratio * X, axis=1)) < 1e-6 and abs(ratio - 1) > _SAME
         cause = f"looks scaled by {ratio:.6g}" if scaled else ""
         what = f"{np.sum(off > _SAME)} of {len(X)} points are not what {depth.shot.depth} sees"
-        yield finding(file, what, cause=cause)
+        yield Finding(TRACKS, what, cause=cause, part=name)
 
 
-def _pixel_faults(sequence: Sequence, tracks: Tracks, k: int, found: RSProjection, file: str) -> Iterator[str]:
+def _pixel_faults(sequence: Sequence, tracks: Tracks, k: int, found: RSProjection, name: str) -> Iterator[Finding]:
     """Known where and only where a row sees the point; and where that row sees it."""
     pixels, tau, classes = tracks.pixels[:, k], tracks.tau[:, k], tracks.classes[:, k]
     view = track_views(sequence.frames)[k]
@@ -82,7 +82,7 @@ def _pixel_faults(sequence: Sequence, tracks: Tracks, k: int, found: RSProjectio
     seen = np.isfinite(found.tau)
     wrong = (known != np.all(np.isfinite(pixels), axis=1)) | (known != (seen | own)) | (known != np.isfinite(tau))
     if np.any(wrong):
-        yield finding(file, f"{np.sum(wrong)} points are wrongly in or out of view")
+        yield Finding(TRACKS, f"{np.sum(wrong)} points are wrongly in or out of view", part=name)
         return
     late = np.abs(tau[known] - sequence.shutter.pixel_time(pixels[known], view[1], view[0])) > _SAME
     exact = project_at(sequence.rig, sequence.motion, view[0], tau[known], tracks.points[known])[:, :2]
@@ -93,10 +93,10 @@ def _pixel_faults(sequence: Sequence, tracks: Tracks, k: int, found: RSProjectio
     ):
         if np.any(bad):
             size = f", typically by {np.median(off[bad]):.2g} px" if words.startswith("are") else ""
-            yield finding(file, f"{np.sum(bad)} of {np.sum(known)} points {words}{size}")
+            yield Finding(TRACKS, f"{np.sum(bad)} of {np.sum(known)} points {words}{size}", part=name)
 
 
-def _hiding_faults(tracks: Tracks, k: int, found: RSProjection, depth: DepthMap, file: str) -> Iterator[str]:
+def _hiding_faults(tracks: Tracks, k: int, found: RSProjection, depth: DepthMap, name: str) -> Iterator[Finding]:
     """Visible points are not far behind the pixels around them, hidden ones not before all of them."""
     known = np.isfinite(found.tau) & (tracks.sources != k)
     low, high = depths_around(depth.depth, found.pixels[known])
@@ -107,7 +107,7 @@ def _hiding_faults(tracks: Tracks, k: int, found: RSProjection, depth: DepthMap,
     ):
         bad = int(np.sum(classes[so] == wrong))
         if bad > max(min(_FEW * np.sum(known), _NEARLY_ALL * np.sum(so)), _LEAST):
-            yield finding(file, f"{bad} of {np.sum(known)} points {words} {depth.shot.depth}")
+            yield Finding(TRACKS, f"{bad} of {np.sum(known)} points {words} {depth.shot.depth}", part=name)
 
 
 def depths_around(depth: NDArray[np.float32], pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -124,7 +124,9 @@ def depths_around(depth: NDArray[np.float32], pixels: FloatArray) -> tuple[Float
     return np.min(around, axis=0, initial=np.inf), np.max(around, axis=0, initial=0.0)
 
 
-def tracks_again(sequence: Sequence, rays: Rays, told: Collection[str]) -> Iterator[tuple[str, str, bool]]:
+def tracks_again(
+    sequence: Sequence, rays: Rays, told: Collection[str]
+) -> Iterator[tuple[str, Finding | None, bool]]:
     """As ``channel_checks.channels_again``, of tracks: what rays say of each frame."""
     if "tracks" not in sequence.channels or TRACKS in told:
         return
@@ -137,7 +139,7 @@ def tracks_again(sequence: Sequence, rays: Rays, told: Collection[str]) -> Itera
     share = float(np.mean(wrong)) if len(tracks.points) else 0.0
     bad = np.sum(wrong) > max(_FEW_AGAIN * np.size(wrong), _LEAST)
     what = f"{100 * share:.2g} % of {np.size(wrong)} classes differ from what rays say"
-    yield TRACKS, finding(TRACKS, what) if bad else "", not np.any(wrong)
+    yield TRACKS, Finding(TRACKS, what) if bad else None, not np.any(wrong)
 
 
 def _unlike(sequence: Sequence, tracks: Tracks, k: int, view: View, rays: Rays) -> BoolArray:

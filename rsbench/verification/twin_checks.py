@@ -11,7 +11,7 @@ from rsbench.core.rig import SIDES
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import Shot
 from rsbench.verification.content import Content, clean_picture, read_shot, spare_pixels
-from rsbench.verification.findings import finding, rows_of
+from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, land
 
 _NEAR, _LEAST = 0.05, 100
@@ -30,7 +30,7 @@ def read_twins(sequence: Sequence, missing: Collection[str], times: tuple[int, .
     return content
 
 
-def other_twin_faults(content: Content, twins: Content, stride: int = 1) -> Iterator[str]:
+def other_twin_faults(content: Content, twins: Content, stride: int = 1) -> Iterator[Finding]:
     """A twin shares a row with its rolling-shutter frame, bit for bit; it sees the surfaces that this one sees."""
     sequence = content.sequence
     for row in sequence.twins:
@@ -41,7 +41,7 @@ def other_twin_faults(content: Content, twins: Content, stride: int = 1) -> Iter
                 yield from _depth_faults(content, twins, source, twin, stride)
 
 
-def _shared_line_faults(content: Content, twins: Content, source: Shot, twin: Shot) -> Iterator[str]:
+def _shared_line_faults(content: Content, twins: Content, source: Shot, twin: Shot) -> Iterator[Finding]:
     shutter = content.sequence.shutter
     axis, line = 1 - shutter.axis(twin.side), abs(shutter.first_line(twin.side) - twin.row)
     words = f"{'row' if axis == 0 else 'column'} {line} differs from"
@@ -52,15 +52,15 @@ def _shared_line_faults(content: Content, twins: Content, source: Shot, twin: Sh
         unlike = np.any(own != other, axis=-1)
         if np.sum(unlike) > spare_pixels(axis, unlike.size):
             of = clean_picture(content.sequence, source)
-            yield finding(twin.image, f"{words} {of}: {np.sum(unlike)} pixels at the same pose")
+            yield Finding(twin.image, f"{words} {of}: {np.sum(unlike)} pixels at the same pose")
     if source in content.maps and twin in twins.maps:
         own, other = (np.take(each.depth, line, axis) for each in (twins.maps[twin], content.maps[source]))
         if np.sum(own != other) > spare_pixels(axis, own.size):
             far = np.max(np.abs(own - other))
-            yield finding(twin.depth, f"{words} {source.depth}: by up to {far:.3g} m at the same pose")
+            yield Finding(twin.depth, f"{words} {source.depth}: by up to {far:.3g} m at the same pose")
 
 
-def _depth_faults(content: Content, twins: Content, source: Shot, twin: Shot, stride: int) -> Iterator[str]:
+def _depth_faults(content: Content, twins: Content, source: Shot, twin: Shot, stride: int) -> Iterator[Finding]:
     relative = land(content.sequence, twins.maps[twin], content.maps[source], stride).relative
     with np.errstate(invalid="ignore"):
         told = (np.abs(relative) < _NEAR) & (twins.maps[twin].depth[::stride, ::stride] > 0)
@@ -71,7 +71,7 @@ def _depth_faults(content: Content, twins: Content, source: Shot, twin: Shot, st
         share = f"{100 * np.sum(wrong) / np.sum(told):.0f} % of {np.sum(told)} pixels"
         rows = np.repeat(np.sum(wrong, axis=1) > _MOST_WRONG * np.maximum(np.sum(told, axis=1), 1), stride)
         what = f"{share} differ from the surface of {source.depth}"
-        yield finding(twin.depth, what, rows_of(rows[: len(twins.maps[twin].depth)]), cause)
+        yield Finding(twin.depth, what, rows_of(rows[: len(twins.maps[twin].depth)]), cause)
 
 
 def with_twins(content: Content, twins: Content) -> Content:

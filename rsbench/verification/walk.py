@@ -13,7 +13,7 @@ from rsbench.verification.affine_checks import affine_faults
 from rsbench.verification.channel_checks import channel_faults
 from rsbench.verification.content import Comparison, Content, Elsewhere, read_content, twin_faults
 from rsbench.verification.depth import GeometryFault
-from rsbench.verification.findings import DepthAgreement, Progress, finding
+from rsbench.verification.findings import DepthAgreement, Finding, Progress, files_of
 from rsbench.verification.gloss_checks import gloss_faults, known_gloss
 from rsbench.verification.hdr_checks import hdr_faults
 from rsbench.verification.match_checks import match_faults, matched_again
@@ -30,11 +30,6 @@ STEPS = len(PAIRS)
 """Of two successive frames."""
 
 
-def file_of(fault: str) -> str:
-    """The file that a finding tells of."""
-    return fault.partition(": ")[0]
-
-
 @dataclass(eq=False)
 class Walk:
     """What the frames of a sequence show, gathered on the way."""
@@ -45,7 +40,7 @@ class Walk:
     """Images that may have been exchanged with its own."""
     stride: int
     again: Again | None
-    faults: list[str]
+    faults: list[Finding]
     """Those that are told already, to which others come."""
     agreements: dict[tuple[str, str], DepthAgreement] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -55,7 +50,7 @@ class Walk:
     @property
     def told(self) -> set[str]:
         """Files that need not be told of again."""
-        return {*self.missing, *map(file_of, self.faults)}
+        return {*self.missing, *files_of(self.faults)}
 
     def go(self, step: Progress) -> None:
         """Check all of it; ``step`` is called ``STEPS`` times for each two successive frames."""
@@ -104,7 +99,7 @@ class Walk:
             self.apart[content.times[0], content.times[-1]] = geometry
         self.notes += comparison.notes
 
-    def _of_geometry(self) -> Iterator[str]:
+    def _of_geometry(self) -> Iterator[Finding]:
         """What the frames that do not agree show of sequence.json, or of one of them."""
         if not self.apart:
             return
@@ -114,26 +109,26 @@ class Walk:
             yield from found
             return
         where = "" if count == 1 else f", in {len(self.apart)} of {count} pairs of frames"
-        yield finding("sequence.json", first.what + where, cause=first.cause)
+        yield Finding("sequence.json", first.what + where, cause=first.cause)
 
     def _of_channels(self, content: Content, fresh: Content) -> None:
         """Faults of channels, but for files told already; and notes of the accused that are right, and more.
 
         Rays say nothing of what the pictures do not show, and so clear nobody of it.
         """
-        faults: list[str] = []
+        faults: list[Finding] = []
         for found in self._channel_checks(content, fresh):
-            faults += found({*self.told, *map(file_of, faults)})
-        unfound, notes = matched_again(self.sequence, {*self.told, *map(file_of, faults)}, content.times[0])
+            faults += found({*self.told, *files_of(faults)})
+        unfound, notes = matched_again(self.sequence, {*self.told, *files_of(faults)}, content.times[0])
         again = self.again
-        cleared = again.cleared(content, set(map(file_of, faults))) if again is not None and faults else set()
+        cleared = again.cleared(content, files_of(faults)) if again is not None and faults else set()
         what = "others contradict it, and it is what is made again, all of it"
-        self.notes += sorted([*notes, *(finding(file, what) for file in cleared)])
-        self.faults += [*(fault for fault in faults if file_of(fault) not in cleared), *unfound]
+        self.notes += sorted([*notes, *(str(Finding(file, what)) for file in cleared)])
+        self.faults += [*(fault for fault in faults if fault.file not in cleared), *unfound]
 
     def _channel_checks(
         self, content: Content, fresh: Content
-    ) -> Iterator[Callable[[Collection[str]], Iterator[str]]]:
+    ) -> Iterator[Callable[[Collection[str]], Iterator[Finding]]]:
         """Each gives the faults of some channels, but for files that are told already."""
         sequence, new = self.sequence, fresh.times
         yield partial(channel_faults, sequence, content.maps, stride=self.stride, times=content.times, new=new)

@@ -84,7 +84,7 @@ def found(fault: Fault, folder: Path) -> tuple[bool, list[str]]:
     """Whether one line of verify's answer has the fault's words; and all lines, but for the other sequence."""
     listing = Listing.of(folder, read_json(folder / "dataset.json"))
     again = Again("auto", [WET_CASTLE]) if fault.rendered else None
-    lines = [*dataset_faults(listing), *_of_victim(listing, again)]
+    lines = [*map(str, dataset_faults(listing)), *_of_victim(listing, again)]
     return any(all(word in line for word in fault.words) for line in lines), lines
 
 

@@ -211,7 +211,7 @@ def write_words(path: Path) -> None:
 def test_a_planted_fault_is_named(folder: Path, name: str) -> None:
     plant, words = FAULTS[name]
     plant(folder)
-    faults = list(imu_faults(read_sequence(folder), ()))
+    faults = list(map(str, imu_faults(read_sequence(folder), ())))
     assert any(all(word in fault for word in words) for fault in faults), faults
 
 

@@ -58,7 +58,7 @@ def test_sequences_of_every_model_are_rendered_verified_and_read_back(tmp_path: 
     manifest["motion"]["parameters"]["acceleration"] = 0.25
     write_json(path, manifest)
     assert read_sequence(path.parent).motion.parameters == {"acceleration": 0.25}
-    assert all("differs from the motion" in fault for fault in pose_faults(read_sequence(path.parent)))
+    assert all("differs from the motion" in fault.words for fault in pose_faults(read_sequence(path.parent)))
     assert len(list(pose_faults(read_sequence(path.parent)))) == 4
 
 

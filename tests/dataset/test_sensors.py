@@ -116,7 +116,7 @@ def test_another_brightness_than_the_sensor_s_is_named(made: dict[str, Path]) ->
     sequence = read_sequence(made["uneven"])
     content = read_content(sequence)
     wrong = replace(sequence, sensor=replace(UNEVEN, brightness=(1.0, 0.7)))
-    named = [fault.partition(":")[0] for fault in sensor_faults(wrong, content.maps, content.pictures, ())]
+    named = [fault.file for fault in sensor_faults(wrong, content.maps, content.pictures, ())]
     # The right camera's blur and noise hide it; its rows that are rendered again tell.
     assert "rs/left_1.png" in named and set(named) <= {"rs/left_1.png", "rs/right_1.png"}
 
@@ -177,7 +177,7 @@ def test_frames_that_the_sensor_cannot_have_made_are_named(
     bad = FAULTS[fault](sequence.image("rs", "left", 1), sequence.clean_image("left", 1))
     write_png(copy / shot.image, np.ascontiguousarray(bad))
     found = list(sensor_faults(read_sequence(copy), content.maps, content.pictures, ()))
-    assert len(found) == 1 and found[0].startswith("rs/left_1.png: ")
+    assert len(found) == 1 and found[0].file == "rs/left_1.png"
 
 
 def _with_a_clean_row(seen: np.ndarray, clean: np.ndarray) -> np.ndarray:
@@ -206,7 +206,7 @@ def test_frames_that_were_processed_otherwise_are_named(made: dict[str, Path], f
     file = f"rs/{side}_1.png"
     write_png(copy / file, change(read_png(copy / file), read_png(copy / f"rs_clean/{side}_1.png")))
     (found,) = sensor_faults(read_sequence(copy), content.maps, content.pictures, ())
-    assert found.startswith(f"{file}: ") and words in found, found
+    assert found.file == file and words in str(found), found
 
 
 def test_an_exposure_without_noise_is_no_fault(tmp_path: Path) -> None:
