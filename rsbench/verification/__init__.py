@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Collection, Iterator, Mapping
-from functools import partial
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +10,12 @@ from rsbench.components import arguments
 from rsbench.components.cards import card_path
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES
-from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.storage.files import read_json
 from rsbench.verification import structure
-from rsbench.verification.content import images_elsewhere
-from rsbench.verification.findings import MISSING, DepthAgreement, Finding, Progress, SequenceReport, files_of
-from rsbench.verification.imu_checks import imu_faults
-from rsbench.verification.poses import pose_faults
+from rsbench.verification.findings import DepthAgreement, Finding, Progress, SequenceReport
 from rsbench.verification.rerender import Again, Rerender
-from rsbench.verification.timing_checks import timing_faults
-from rsbench.verification.walk import STEPS, Walk
+from rsbench.verification.state import State
+from rsbench.verification.walk import STEPS, check_sequence, run_stage
 
 __all__ = [
     "DepthAgreement",
@@ -32,9 +26,6 @@ __all__ = [
     "verify_dataset",
     "verify_sequence",
 ]
-
-_MOST_ELSEWHERE = 8
-"""Other sequences among whose images an exchanged one is looked for."""
 
 
 def verify_dataset(
@@ -66,8 +57,9 @@ def verify_dataset(
     manifest = read_json(folder / structure.DATASET)
     step = progress or (lambda name: None)
     listing = structure.Listing.of(folder, manifest)
-    faults = tuple(structure.dataset_faults(listing))
-    reports = [SequenceReport(name=structure.DATASET, findings=faults)] if faults else []
+    state = State(listing, structure.DATASET)
+    run_stage(state, "dataset")
+    reports = [SequenceReport(name=state.name, findings=tuple(state.findings))] if state.findings else []
     again = None if rerender == "no" else Again(rerender, *_cards_and_files(scenes))
     return reports + [verify_sequence(listing, name, stride, step, again) for name in listing.names]
 
@@ -98,8 +90,6 @@ def verify_sequence(
     again: Again | None = None,
 ) -> SequenceReport:
     """Check one sequence of a dataset; the rest as of ``verify_dataset``."""
-    faults = list(structure.file_faults(listing, name))
-    walk: Walk | None = None
     steps = _steps(listing)
 
     def counted(sequence: str) -> None:
@@ -108,33 +98,12 @@ def verify_sequence(
         if steps >= 0:  # its frames may be more than the card says
             step(sequence)
 
+    state = State(listing, name, stride, again, counted)
     try:
-        missing = {each.file.removeprefix(f"{name}/") for each in faults if each.words == MISSING}
-        sequence = read_sequence(listing.folder / name)
-        faults += structure.sequence_faults(sequence, name, listing)
-        faults += pose_faults(sequence)
-        faults += timing_faults(sequence, {*missing, *files_of(faults)})
-        faults += imu_faults(sequence, {*missing, *files_of(faults)})
-        elsewhere = images_elsewhere(sequence, partial(_others, listing, name))
-        walk = Walk(sequence, missing, elsewhere, stride, again, faults)
-        walk.go(counted)
+        check_sequence(state)
     except RsbenchError as error:
-        faults.append(Finding.of(error))
+        state.findings.append(Finding.of(error))
     for _ in range(steps):
         step(name)
-    agreements, notes = ((), ()) if walk is None else (walk.agreements.values(), walk.notes)
-    return SequenceReport(
-        name=name,
-        findings=tuple(dict.fromkeys(faults)),
-        agreements=tuple(agreements),
-        notes=tuple(notes),
-    )
-
-
-def _others(listing: structure.Listing, name: str) -> Iterator[Sequence]:
-    """Some sequences, the nearest in the list first."""
-    place = listing.names.index(name)
-    near = sorted(range(len(listing.names)), key=lambda other: abs(other - place))[1 : _MOST_ELSEWHERE + 1]
-    for other in near:
-        with contextlib.suppress(RsbenchError):
-            yield read_sequence(listing.folder / listing.names[other])
+    findings, agreements = tuple(dict.fromkeys(state.findings)), tuple(state.agreements.values())
+    return SequenceReport(name=name, findings=findings, agreements=agreements, notes=tuple(state.notes))

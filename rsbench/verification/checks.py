@@ -1,0 +1,337 @@
+"""The table of checks of ``rsbench verify``: a check is one function and one row of it.
+
+``python -m rsbench.verification docs/explanation/verification.md`` writes the table into that document.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from rsbench.verification.affine_checks import affine_faults
+from rsbench.verification.channel_checks import channel_faults
+from rsbench.verification.content import twin_faults
+from rsbench.verification.findings import Finding
+from rsbench.verification.gloss_checks import gloss_faults, known_gloss
+from rsbench.verification.hdr_checks import hdr_faults
+from rsbench.verification.imu_checks import imu_faults
+from rsbench.verification.match_checks import match_faults, matched_again
+from rsbench.verification.moving_checks import label_faults
+from rsbench.verification.picture_checks import geometry_faults, picture_faults
+from rsbench.verification.poses import pose_faults
+from rsbench.verification.sensors import sensor_faults
+from rsbench.verification.stacks import stack_faults
+from rsbench.verification.state import State
+from rsbench.verification.structure import dataset_faults, file_faults, sequence_faults
+from rsbench.verification.surface_checks import surface_faults
+from rsbench.verification.timing_checks import timing_faults
+from rsbench.verification.track_checks import track_faults
+from rsbench.verification.twin_checks import other_twin_faults, with_twins
+
+Stage = Literal["dataset", "files", "sequence", "masks", "frames", "channels", "matcher", "rays"]
+"""When a check runs: once for a dataset ("dataset") or a sequence ("files", before it is opened, and "sequence"),
+or for each two successive frames. "masks" may change the masks of what was just read; what "channels" find is
+dropped where rays make the file again bit for bit; "rays" come last."""
+Run = Callable[[State], Iterable[Finding]]
+START, END = "<!-- The table of rsbench/verification/checks.py -->\n", "<!-- End of the table -->\n"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """One row of the table."""
+
+    name: str
+    stage: Stage
+    reads: str
+    finds: str
+    costs: str
+    run: Run
+    at_end: Run | None = None
+    """What it finds when all frames were seen."""
+
+    def found(self, findings: Iterable[Finding]) -> Iterator[Finding]:
+        """Findings that say which check found them."""
+        return (replace(each, check=self.name) for each in findings)
+
+
+def _masks_by_rays(state: State) -> list[Finding]:
+    """Replaces the masks by those that rays meet, where the scene can be built."""
+    known = [known_gloss(each, state.again) for each in (state.fresh, state.twins)]
+    state.masks_by_rays = all(derived for _, derived in known)
+    return [each for findings, _ in known for each in findings]
+
+
+def _masks(state: State) -> Iterable[Finding]:
+    return () if state.masks_by_rays else gloss_faults(state.content, state.fresh, state.twins)
+
+
+def _twins(state: State) -> list[Finding]:
+    return [*state.twins.faults, *other_twin_faults(state.fresh, state.twins, state.stride)]
+
+
+def _channels(state: State) -> Iterator[Finding]:
+    content = state.all_content
+    times, new = content.times, state.fresh.times
+    return channel_faults(state.sequence, content.maps, state.told, state.stride, times, new)
+
+
+def _surfaces(state: State) -> Iterator[Finding]:
+    content = state.all_content
+    return surface_faults(state.sequence, content.maps, state.told, content.times, state.fresh.times)
+
+
+def _matches(state: State) -> Iterator[Finding]:
+    content = state.all_content
+    return match_faults(state.sequence, content.maps, state.told, content.times[0])
+
+
+def _matcher(state: State) -> list[Finding]:
+    findings, notes = matched_again(state.sequence, state.told, state.content.times[0])
+    state.notes += notes
+    return findings
+
+
+def _render_rows(state: State) -> tuple[Finding, ...]:
+    if state.redone is not None:
+        state.redone.add(with_twins(state.fresh, state.twins), state.told)
+    return ()
+
+
+def _rendered_rows(state: State) -> list[Finding]:
+    if state.redone is None:
+        return []
+    findings, note = state.redone.end(state.told)
+    state.notes.append(note)
+    return findings
+
+
+CHECKS = (
+    Check(
+        name="dataset",
+        stage="dataset",
+        reads="`dataset.json`, names of the files on disk",
+        finds="keys and sequences that are not those of the card, other units, a name that stands there twice "
+        "or is a path, files that are listed and belong to no sequence, or lie there and are not listed; names "
+        "with a dot in front are left out",
+        costs="one listing of the folder",
+        run=lambda state: dataset_faults(state.listing),
+    ),
+    Check(
+        name="files",
+        stage="files",
+        reads="every file of the sequence, `files` of `dataset.json` and `sequence.json`",
+        finds="files that are missing, listed in one manifest alone, or have another size or SHA-256",
+        costs="every file is read once",
+        run=lambda state: file_faults(state.listing, state.name),
+    ),
+    Check(
+        name="manifest",
+        stage="sequence",
+        reads="`sequence.json`, the card in `dataset.json`",
+        finds="camera, baseline, shutter, motion, seed, viewpoint and times that are not those of the card, the "
+        "folder or the rest of the file; options of the renderer where this version wrote the file",
+        costs="almost nothing",
+        run=lambda state: sequence_faults(state.sequence, state.name, state.listing),
+    ),
+    Check(
+        name="poses",
+        stage="sequence",
+        reads="`poses/*.csv`",
+        finds="poses that are not the motion at the row times, to 1e-12; quaternions that are not of length 1 or "
+        "have w < 0; rows that are missing or hold what is no number",
+        costs="one pose per row",
+        run=lambda state: pose_faults(state.sequence),
+    ),
+    Check(
+        name="timing",
+        stage="sequence",
+        reads="channel `timing`, `poses/*.csv`",
+        finds="times that differ by more than 1 ns from `sequence.json` or from those of the poses",
+        costs="one time per row",
+        run=lambda state: timing_faults(state.sequence, state.told),
+    ),
+    Check(
+        name="imu",
+        stage="sequence",
+        reads="channel `imu`",
+        finds="rates and forces that are not those of motion, gravity and times; noise, or steps of the bias, "
+        "beyond 6 sigma of the stated densities, or not white",
+        costs="one pose per sample",
+        run=lambda state: imu_faults(state.sequence, state.told),
+    ),
+    Check(
+        name="gloss masks by rays",
+        stage="masks",
+        reads="masks of [glossy surfaces](../reference/dataset-format.md#glossy-surfaces)",
+        finds="masks that are not what rays meet, at every pixel, where the scene can be built; the other checks "
+        "then read what the rays met",
+        costs="one ray per pixel, with `--rerender auto` or `all`",
+        run=_masks_by_rays,
+    ),
+    Check(
+        name="gloss masks",
+        stage="frames",
+        reads="the same masks and depth, where no rays were traced",
+        finds="masks where there is no surface, that differ between twins in the row that they share, that mark "
+        "other surfaces in other pictures, or leave less than 5 % of the surfaces to be compared. Colours within "
+        "a pixel of gloss are compared with rows rendered again alone, and blur is not judged there",
+        costs="each map is projected into its partners, at 60 000 pixels at most",
+        run=_masks,
+    ),
+    Check(
+        name="labels",
+        stage="frames",
+        reads="labels of [moving objects](../reference/dataset-format.md#objects-that-move), depth",
+        finds="labels where there is no surface, that differ between twins in the row that they share, or of "
+        "pixels through which other frames see, and which they see where another label would take them. In all "
+        "other checks a surface lies where its label takes it; colours of what moves, and of its shadow, are "
+        "compared between the cameras of one time only",
+        costs="each map is projected into its partners, at 60 000 pixels at most",
+        run=lambda state: label_faults(state.content, state.fresh, state.twins),
+    ),
+    Check(
+        name="images and depth maps",
+        stage="frames",
+        reads="images by their headers, then all pixels; depth maps",
+        finds="files that cannot be read, images that are not 8-bit RGB of the camera's size",
+        costs="every picture is read once",
+        run=lambda state: state.fresh.faults,
+    ),
+    Check(
+        name="first row",
+        stage="frames",
+        reads="images and depth of a frame and its global-shutter twin",
+        finds="a first row that differs between them, bit for bit; where columns are read, a first column that "
+        "differs by more than 1 code or 1e-6 of the depth on more than 5 % of its pixels, as rays are rounded "
+        "with those beside them",
+        costs="almost nothing",
+        run=lambda state: twin_faults(state.fresh),
+    ),
+    Check(
+        name="stacks",
+        stage="frames",
+        reads="channel `gs_stack`",
+        finds="images whose row y is not row y of the clean rolling-shutter frame, or of which the first is not "
+        "the global-shutter twin, bit for bit",
+        costs="every `--stride`-th image is read",
+        run=lambda state: stack_faults(state.fresh, state.missing, state.stride),
+    ),
+    Check(
+        name="sensor",
+        stage="frames",
+        reads="`rs/*.png` of a `[sensor]`, their clean twins",
+        finds="blur and noise that the sensor does not make of the clean twin, which stands for the frame in all "
+        "other checks; with a `mosaic`, values that are neither read nor the mean of their neighbours of that "
+        "colour; with `jpeg_quality`, blocks that are not of whole steps of that quality",
+        costs="filters over the whole frame",
+        run=lambda state: sensor_faults(state.sequence, state.fresh.maps, state.fresh.pictures, state.missing),
+    ),
+    Check(
+        name="depth and colours",
+        stage="frames",
+        reads="depth maps and images of each two successive frames, eight of each",
+        finds="surfaces that the twin, the other camera or the other time see elsewhere; under diffuse light, "
+        "colours that these see otherwise, of the sky too; in sequences of "
+        "[many](../reference/dataset-format.md#many-frames), frames of another time, which are tried at other "
+        "places and named",
+        costs="every pixel is projected into three other pictures, N squared times fewer with `--stride N`",
+        run=picture_faults,
+        at_end=geometry_faults,
+    ),
+    Check(
+        name="twins",
+        stage="frames",
+        reads="channel `gs_twin`",
+        finds="a twin whose own row differs from that row of the rolling-shutter frame, bit for bit, or whose "
+        "surfaces are not those of the frame",
+        costs="each twin is projected into its frame",
+        run=_twins,
+    ),
+    Check(
+        name="flow, disparity and masks",
+        stage="channels",
+        reads="channels between two pictures, depth",
+        finds="values that depth and motion do not make, to 1.5e-3 px on 99.9 % of the pixels; sky and view "
+        "likewise; visible or hidden pixels that are not, where the target is one flat surface",
+        costs="every pixel is projected once per channel, N squared times fewer with `--stride N`",
+        run=_channels,
+    ),
+    Check(
+        name="tracks",
+        stage="channels",
+        reads="channel `tracks`, depth",
+        finds="points that are not what the depth map sees at the pixels of the draw, places and times that the "
+        "row equation does not make, and points hidden or visible against the depths around",
+        costs="the row equation of every point in every view",
+        run=lambda state: track_faults(state.sequence, state.fresh.maps, state.told, state.fresh.times),
+    ),
+    Check(
+        name="affine",
+        stage="channels",
+        reads="channels `affine` and `tracks`, depth",
+        finds="derivatives that normals, tracks and row times do not make, to 1e-6, and normals that are not "
+        "upright on the surface of the depth map",
+        costs="one derivative per point and view",
+        run=lambda state: affine_faults(state.sequence, state.fresh.maps, state.told, state.fresh.times),
+    ),
+    Check(
+        name="normals and instances",
+        stage="channels",
+        reads="channels `normals` and `instances`, depth",
+        finds="normals that are not upright on the surface of the depth map or do not face the camera; surfaces "
+        "that have another number in another picture",
+        costs="every picture is projected into its partners",
+        run=_surfaces,
+    ),
+    Check(
+        name="hdr",
+        stage="channels",
+        reads="channel `hdr`, images",
+        finds="linear light that is not that of the clean image, to a code",
+        costs="almost nothing",
+        run=lambda state: hdr_faults(state.sequence, state.fresh.pictures, state.told),
+    ),
+    Check(
+        name="matches",
+        stage="channels",
+        reads="channel `matches`, depth",
+        finds="keypoints of another depth than the pixels around, true places that the row equation does not "
+        "make, and errors, classes and labels that these places and the depths around do not make",
+        costs="the row equation of every match",
+        run=_matches,
+    ),
+    Check(
+        name="matcher",
+        stage="matcher",
+        reads="channel `matches`, images",
+        finds="matches that the stated matcher does not find in the images, where it is rsbench's own and the "
+        "versions are the same",
+        costs="features of four images per two frames",
+        run=_matcher,
+    ),
+    Check(
+        name="rows rendered again",
+        stage="rays",
+        reads="all images, depth maps, labels and channels, the card of the scene",
+        finds="rows that differ when they are rendered again, bit for bit, on other machines, versions or "
+        "variants to rounding: with the sensor's noise, at the poses of other rows for a stack, and the channels "
+        "by rays",
+        costs="16 rows of each picture with `--rerender auto`, all with `all`, and the scene is built once",
+        run=_render_rows,
+        at_end=_rendered_rows,
+    ),
+)
+
+
+def table() -> str:
+    """The checks as a table in Markdown, in the order in which they run."""
+    rows = [(each.name, each.reads, each.finds, each.costs) for each in CHECKS]
+    head = [("check", "reads", "finds", "costs"), ("---",) * 4]
+    return "".join(f"| {' | '.join(row)} |\n" for row in (*head, *rows))
+
+
+def with_table(text: str) -> str:
+    """A document with the table between ``START`` and ``END``."""
+    before, _, rest = text.partition(START)
+    return f"{before}{START}\n{table()}\n{END}{rest.partition(END)[2]}"
