@@ -74,7 +74,7 @@ def generate_dataset(
     Args:
         card: what to make.
         out: folder of the dataset, made if missing, or the URL of a store, to which sequences are sent when they
-            are complete (``store_home``).
+            are complete (``store_destination``).
         workers: processes, or a cluster; each renders whole sequences.
         full_frames: make every rolling-shutter frame as the paper did, from one whole global-shutter image per
             row, and keep these images as gs_stack/<side>_<frame>/<row>.png.

@@ -41,7 +41,7 @@ def run_on_cluster(
 
         try:
             # A task of its own: it is sent to each worker once, and made again where all that had it died.
-            shared = client.submit(bytes, content, key=f"rsbench-crew-{key[:16]}")
+            shared = client.submit(bytes, content, key=f"rsbench-workers-{key[:16]}")
             futures = {}
             for job in jobs:
                 limit = math.inf if seconds_of is None else seconds_of(job)
@@ -94,7 +94,7 @@ def _connected(cluster: Cluster) -> Iterator[Any]:
 
 @dataclass
 class _Hired:
-    """A child, the crew that it is of, and what stops it."""
+    """A child process, the set of workers that it belongs to, and what stops it."""
 
     processes: WorkerProcesses
     cancel: threading.Event
@@ -103,13 +103,13 @@ class _Hired:
 
 @dataclass
 class _ClusterWorkers:
-    """The children of this process: idle ones by the crew that they are of."""
+    """The children of this process: idle ones by the set of workers that they belong to."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     idle: dict[str, list[_Hired]] = field(default_factory=dict)
 
     def take(self, key: str, content: bytes) -> _Hired:
-        """An idle child of a crew, or a new one; those of other crews, whose runs are over, end."""
+        """An idle child of a set of workers, or a new one; those of other sets, whose runs are over, end."""
         with self.lock:
             others = [hired for name in list(self.idle) if name != key for hired in self.idle.pop(name)]
             own = self.idle.get(key, [])
@@ -136,7 +136,7 @@ _CREWS = _ClusterWorkers()
 
 
 def _dismiss(key: str) -> None:
-    """End the idle children of a crew; those at work end when their task is cancelled."""
+    """End the idle children of a set of workers; those at work end when their task is cancelled."""
     _CREWS.dismiss(key)
 
 

@@ -46,7 +46,7 @@ class WorkerProcesses:
         )
 
     def done_by(self, worker: IsolatedWorker, job: object, limit_s: float = math.inf) -> Outcome:
-        """A job by one of the crew, tried again where its process ended."""
+        """A job by one of the workers, tried again where its process ended."""
         for _ in range(self.tries - 1):
             if not (outcome := worker.call(job, limit_s=limit_s)).ended:
                 return outcome

@@ -85,7 +85,7 @@ def remove(path: Path) -> None:
 def unknown_files(folder: Path, ours: Callable[[str], bool]) -> list[str]:
     """Paths below a folder that are no plain files of ours, sorted; relative, with slashes.
 
-    A link is a stranger whatever its name is; an empty folder is none.
+    A link is an unknown file whatever its name is; an empty folder is none.
     """
     found: list[str] = []
     for place, folders, files in os.walk(folder, onerror=_raise):

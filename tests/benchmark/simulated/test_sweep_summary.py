@@ -57,6 +57,22 @@ def test_failures_score_the_worst_value_and_are_counted() -> None:
     assert row["e_R_median"] < 1e-9
 
 
+def test_a_solver_of_the_left_camera_is_scored_against_its_translation() -> None:
+    content = arrays()
+    rig = SETTING.rig()
+    from rsbench.core.motion import LinearMotion
+
+    for k in range(N):
+        motion = LinearMotion(content["w"][k], content["d"][k])
+        start, end = (rig.cam_from_world(motion, tau, "left") for tau in (0.0, 1.0))
+        content["d_est"][k, 0] = 7.0 * (end.t - end.R @ start.R.T @ start.t)
+    content["metric"][:] = False
+    scores = score_trials(content, 0, "left", CELL)
+    np.testing.assert_allclose(scores["e_T_deg"], 0.0, atol=1e-9)
+    assert np.all(np.isnan(scores["e_s"]))
+    assert score_trials(content, 0, "body", CELL)["e_T_deg"].min() > 0.01
+
+
 def test_errors_that_do_not_exist_are_marked() -> None:
     content = arrays(d=np.zeros((N, 3)))
     limit = LIMIT | {"direction": np.full((N, 2), np.inf), "scale": np.full(N, np.inf)}
