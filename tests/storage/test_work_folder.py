@@ -20,8 +20,8 @@ from rsbench.storage.work_folder import HIDDEN, WORK, files_below, listed, remov
 HOLDS = """
 import sys, time
 from pathlib import Path
-from rsbench.storage.work_folder import workplace
-with workplace(Path(sys.argv[1])) as hidden:
+from rsbench.storage.work_folder import work_folder
+with work_folder(Path(sys.argv[1])) as hidden:
     (hidden / "work/half").write_text("half")
     print("in", flush=True)
     time.sleep(1000)
