@@ -29,7 +29,7 @@ def check_solver(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Findings as one JSON object.")] = False,
 ) -> None:
-    """Hold a solver to what every solver promises: right, deterministic, failing by value, and so on."""
+    """Check the contract of a solver: exact data solved, equal results of equal runs, failures as values."""
     import json as json_module
     from dataclasses import asdict
 

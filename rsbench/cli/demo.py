@@ -23,4 +23,4 @@ def demo(
 
 
 def register(app: typer.Typer) -> None:
-    app.command(epilog="[bold]Example[/bold]  rsbench demo --scene old-town --out /tmp/demo")(demo)
+    app.command(epilog="[bold]Example[/bold]  rsbench demo --scene old-town --out out/demo")(demo)

@@ -92,7 +92,7 @@ def evaluate(
         typer.Option("--from", metavar="LAYOUT", help="DIR is of others: carla-rs, colmap, euroc, kitti, ..."),
     ] = None,
 ) -> None:
-    """Pose, depth and correction against the truth of a dataset, with a report."""
+    """Score pose, depth and correction against the truth of a dataset, and write a report."""
     if layout is not None:
         with results_at(out, scheduler) as place:
             _evaluate_others(folder, place, layout, matcher, seed)

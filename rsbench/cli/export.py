@@ -53,7 +53,7 @@ def export(
         list[str] | None, typer.Option("--sequence", "--only", help="Only this sequence; repeatable.")
     ] = None,
 ) -> None:
-    """Write a dataset for COLMAP, evo and others; what a format cannot hold is refused or told, never bent."""
+    """Write a dataset in the layout of COLMAP, evo and others; say or refuse what a format cannot hold."""
     from rsbench.cli.console import late_progress, say
     from rsbench.interop.writers.exporter import export_dataset
 

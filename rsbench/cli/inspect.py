@@ -27,9 +27,9 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench inspect data/paper     [dim](each sequence of a dataset; or one sequence's folder)[/dim]
 
-What a card or problem says of the shutter is not believed, only shown beside what was found.
+The shutter that a card or problem gives is not used; it is printed beside the estimate.
 
-Exit codes: 0 all told, 1 one that cannot be told, 2 one that is wrong.
+Exit codes: 0 every rig was estimated, 1 one cannot be told from its matches, 2 one input is wrong.
 More: [bold]rsbench docs inspect[/bold]"""
 
 _MODEL = "Motion model to try; repeatable. Default: linear and twist"
@@ -63,17 +63,17 @@ def inspect(
     ] = None,
     rig: Annotated[Path | None, typer.Option(metavar="RIG.toml", help="Camera and baseline, for frames.")] = None,
     left: Annotated[Path | None, typer.Option(help="Folder of images or video of the left camera.")] = None,
-    right: Annotated[Path | None, typer.Option(help="The same of the right camera.")] = None,
-    windows: Annotated[int, typer.Option(min=1, help="Pairs of times of a longer sequence to use, at most.")] = 5,
+    right: Annotated[Path | None, typer.Option(help="Folder of images or video of the right camera.")] = None,
+    windows: Annotated[int, typer.Option(min=1, help="Largest number of frame pairs of a sequence to use.")] = 5,
     max_sigma: Annotated[
-        float, typer.Option(min=0.0, help="Standard deviation, at most, of a readout ratio that is told.")
+        float, typer.Option(min=0.0, help="Largest standard deviation of a readout ratio that is reported.")
     ] = 0.015,
     motion_model: Annotated[list[str] | None, typer.Option(metavar="NAME", help=_MODEL)] = None,
-    features: Annotated[str, named("features", "Finds matches of frames: a name or a card.")] = "sift",
+    features: Annotated[str, named("features", "Feature matcher for frames: a name or a card.")] = "sift",
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
-    json: Annotated[bool, typer.Option("--json", help="One JSON object per line and rig.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per rig, each on a line.")] = False,
 ) -> None:
-    """Tell which camera rolls, from which side of the image it reads, and how fast."""
+    """Estimate scan direction, readout ratio and delay of each camera from matches, where they tell it."""
     from rsbench.capture.estimate import conclude
     from rsbench.capture.hypotheses import MODELS
     from rsbench.solvers.engine.kernel_type import load_kernel

@@ -354,4 +354,8 @@ def register(app: typer.Typer) -> None:
     board_app.command(epilog=SMOKE)(smoke)
     for command in (publish, score):
         board_app.command()(command)
-    app.add_typer(board_app, name="leaderboard", help="Tracks, entries, ranks with intervals; for any language.")
+    app.add_typer(
+        board_app,
+        name="leaderboard",
+        help="Score predictions on tracks and rank them with intervals; predictions come from any language.",
+    )

@@ -34,7 +34,7 @@ def show(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="As one JSON object.")] = False,
 ) -> None:
-    """Tell what a solver needs and gives, a component's parameters with defaults, or what a card says."""
+    """Print what a solver needs and returns, the parameters of a component with defaults, or a card."""
     import json as json_module
 
     found = [_about(name, each) for each in _kinds_of(name, kind)]

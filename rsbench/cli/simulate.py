@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 EPILOG = """[bold]Examples[/bold]
 
-  rsbench simulate noise --out /tmp/noise
+  rsbench simulate noise --out out/noise
 
-  rsbench simulate rotation --set points=9 --trials 100 --solver gs-8pt --solver rs-stereo-linear --out /tmp/nine
+  rsbench simulate rotation --set points=9 --trials 100 --solver gs-8pt --solver rs-stereo-linear --out out/nine
 
 DIR gets [bold]summary.csv[/bold] (median, mean, p90 with 95 % bootstrap intervals, success share, failures and
 their reasons), [bold]trials/*.npz[/bold] (truth and every prediction) and [bold]sweep.json[/bold] (the card).

@@ -44,10 +44,14 @@ def verify(
     ] = None,
     layout: Annotated[
         str | None,
-        typer.Option("--from", metavar="LAYOUT", help="DIR is of others: carla-rs, colmap, euroc, kitti, ..."),
+        typer.Option(
+            "--from",
+            metavar="LAYOUT",
+            help="Layout of DIR, where it is not rsbench's: carla-rs, colmap, euroc, kitti, ...",
+        ),
     ] = None,
 ) -> None:
-    """Check files and lists, poses, all depth maps and images against each other, and rows rendered again."""
+    """Check a dataset: files, poses, depth maps and images against each other and against rows rendered again."""
     if layout is not None:
         _verify_others(folder, layout)
     else:
