@@ -1,13 +1,15 @@
-"""docs/explanation/solvers.md: a section for each solver, from its card, class and committed measurements.
+"""docs/explanation/solvers.md compares the solvers, docs/reference/solver-sheets.md has a section for each.
 
 python benchmarks/solver_measurements.py    # the tables in results/solvers: half an hour of a processor
-python benchmarks/solver_pages.py           # the page: a second
+python benchmarks/solver_pages.py           # the pages: a second
 """
 
 from __future__ import annotations
 
 import json
+import re
 import sys
+import textwrap
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,44 +25,72 @@ from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 from rsbench.storage.files import write_bytes
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs/explanation/solvers.md"
+PAGE, SHEETS = ROOT / "docs/explanation/solvers.md", ROOT / "docs/reference/solver-sheets.md"
 REPOSITORY = "https://github.com/rsbench/rsbench/blob/main"
-HEAD = """# The solvers, one by one
+HEAD = """# Solvers
 
-Made by `python benchmarks/solver_pages.py` from the solvers' cards and
-[tables]({repository}/results/solvers/solvers.csv) that `python benchmarks/solver_measurements.py` measured on
-{date}, on one core of a busy {cores}-core machine ({processor}): a rig of two cameras of 900 x 900 px, f = 810
-px, baseline 0.6 m, readout ratio 0.8; 2 deg and 0.3 m per frame period in random directions, points at 2 to 10
-m. Each section says how many trials it has: shares of 10 of 10 and 20 of 20 are above {ten:.2f} and
-{twenty:.2f} with 95 %, and factors of noise have their intervals.
+A solver estimates the motion of the rig, rotation vector w and translation d over one frame period, from
+matches. `rsbench list solvers` names those of this page; `--solver NAME` of `solve`, `correct`, `evaluate`
+and `simulate` takes one. [One page has a section for each](../reference/solver-sheets.md), with its paper,
+equations, needs and assumptions. [Add a solver](../how-to/add-a-solver.md) says how they are written, and
+[Motion from one camera](monocular.md) is about those of one camera.
+
+## Which one to take
+
+{uses}
+
+## What is measured
+
+The table comes from `python benchmarks/solver_pages.py`, from
+[measurements]({repository}/results/solvers/solvers.csv) by `python benchmarks/solver_measurements.py` on
+{date}, on one core of a busy {cores}-core machine ({processor}). The rig has two cameras of 900 x 900 px,
+f = 810 px, baseline 0.6 m and readout ratio 0.8. It moves by 2 deg and 0.3 m per frame period in random
+directions; points are 2 to 10 m away. A share of 10 of 10 trials means above {ten:.2f} with 95 %, 20 of 20
+above {twenty:.2f}.
+
+- **Bias**: median error on 100 exact matches per camera that follow the motion model of the solver. Its order,
+  in the sections, is the factor by which half the motion reduces it: about 2 is first order, 4 second. A solver
+  that assumes a global shutter sees rolling-shutter matches here.
+- **Noise**: root mean square error with {noise} px of noise over the Cramer-Rao bound of what the solver is
+  given; 1 is best. A bias counts too, and one failure, which errs by 180 deg, is most of a root mean square.
+  The bound has six unknowns: velocities or an acceleration that a solver leaves free increase its factor.
+  Gyroscope and gravity are exact here, and known to the bound; affine frames are exact, and unknown to it.
+- **Success**: share of robust estimates within {e_R} deg and {e_T} deg, at 0, 30 and 50 % outliers and at most
+  1000 samples; then at 50 % with at most {few} samples, and with as many as take about {ms:.0f} ms. "Alone"
+  means that the solver has a robust loop of its own, to which numbers of samples do not apply.
+- **ms**: processor time of a robust estimate from 200 matches with 30 % outliers. One robust estimate by each
+  of the {solvers} solvers, of {many} matches per camera with 30 % outliers, takes {all_s:.0f} s together.
+
+Solvers of the left camera are scored on that camera's own motion. Other settings:
+[sweeps over noise, motion and scene]({repository}/results/sweeps/README.md).
+
+"""
+SHEETS_HEAD = """# Reference: solvers one by one
+
+A section for each solver, made by `python benchmarks/solver_pages.py` from its card, its class and the
+measurements that [Solvers](../explanation/solvers.md#what-is-measured) explains.
 
 - **Equations**: x and y are the rays of a match in frames 0 and 1, s0 and s1 the times of its rows, h the
   readout time of a row, `[v]x u` = v x u. The source has the rest.
-- **Bias**: median error on 100 exact matches per camera, of the motion model that the solver declares; the order
-  is what halving the motion divides it by: about 2 is first order, 4 second. A solver that assumes a global
-  shutter sees rolling-shutter matches here.
-- **Noise**: root mean square error with {noise} px of noise over the Cramer-Rao bound of what the solver is
-  given, with a 95 % interval (median error over that of errors at the bound): 1 is best. A bias counts too, and
-  one failure, which errs 180 deg, is most of a root mean square. The bound has six unknowns: what velocities or
-  an acceleration that a solver leaves free cost is in its factor. Gyroscope and gravity are exact here, and
-  known to the bound; affine frames are exact, and unknown to it.
-- **Time**: of the processor: a minimal sample, and a whole robust estimate from 200 matches with 30 % outliers.
-  "Alone" means that the solver has a robust loop of its own, to which budgets of samples do not apply.
-- **Success**: share of robust estimates within {e_R} deg and {e_T} deg, at 0, 30 and 50 % outliers and at most
-  1000 samples; then at 50 % with equal budgets: at most {few} samples, and as many as take about {ms:.0f} ms.
-- **Degenerate**: what of [the suite]({repository}/cards/sweeps/degenerate.toml) of 11 motions and scenes is not
-  always solved, without noise and with 0.3 px, as trials solved: within {solved_R} deg and {solved_T} deg,
-  or three times the bound where that is more. A direction that the matches leave open cannot be wrong. The rest
-  are wrong answers, but for those that the solver itself called failures.
+- **Noise** has a 95 % interval, and in brackets the median error over that of errors at the bound.
+- **Time** is processor time of a minimal sample, and of a whole robust estimate.
+- **Success**: at 0, 30 and 50 % outliers; then at 50 % in equal time and with equal numbers of samples.
+- **Degenerate**: which of the 11 motions and scenes of
+  [the suite]({repository}/cards/sweeps/degenerate.toml) are not always solved, without noise and with 0.3 px,
+  as numbers of solved trials: within {solved_R} deg and {solved_T} deg, or three times the bound where that is
+  more. A direction that the matches do not determine cannot be wrong. The rest are wrong answers, but for those
+  that the solver itself called failures.
 
-Solvers of the left camera are scored on that camera's own motion. One robust estimate of each of the
-{solvers} solvers, of {many} matches per camera with 30 % outliers, takes {all_s:.0f} s together on that core.
-[How solvers are written](../how-to/add-a-solver.md), [of one camera](monocular.md),
-[sweeps over noise, motion and scene]({repository}/results/sweeps/README.md).
-
-In the table, in this order: bias; noise factor of the root mean square; success at 0, 30 and 50 % outliers, at
-50 % with few samples and in equal time; milliseconds of a robust estimate at 30 %.
 """
+USES = (
+    ("Two cameras, readout ratio known", "rs-stereo-refined", "rs-stereo-refined-pairs", "rs-stereo-tracks"),
+    ("Two cameras on a screw-like path, such as a vehicle", "rs-stereo-refined-twist"),
+    ("One camera, readout ratio known", "rs-mono-refined"),
+    ("A calibrated gyroscope", "rs-gyro-stereo", "rs-gyro-5pt"),
+    ("Global shutters", "gs-stereo-tracks", "gs-stereo-pnp", "gs-poselib-stereo", "gs-poselib"),
+    ("Slow, even motion and little time", "gs-stereo-pnp-scaled", "gs-poselib-stereo-scaled", "gs-poselib-scaled"),
+    ("To compare with Wang, Fan and Dai", "rs-stereo-linear", "gs-8pt"),
+)
 SETS = {
     "left": "matches over time of the left camera",
     "right": "of the right camera",
@@ -71,14 +101,15 @@ SETS = {
 OUTLIERS = ("0%", "30%", "50%")
 
 
-def page(folder: Path) -> str:
-    """The document, from the tables of a folder and the cards of the solvers."""
+def pages(folder: Path) -> dict[Path, str]:
+    """The documents, from the tables of a folder and the cards of the solvers."""
     made = json.loads((folder / "provenance.json").read_text("utf-8"))
     given, machine = made["inputs"], made["machine"]
     equations = tomllib.loads(Path(__file__).with_name("solver_equations.toml").read_text("utf-8"))
     table = pd.read_csv(folder / "solvers.csv")
     table = table[table["solver"].isin(list_cards("solvers"))]  # none under a former name
-    head = HEAD.format(
+    told = dict(
+        uses="\n".join(_use(*row) for row in USES),
         repository=REPOSITORY,
         date=made["date"],
         cores=machine["cores"],
@@ -102,7 +133,24 @@ def page(folder: Path) -> str:
         section(load_solver_entry(name), rows.get(name), hard[hard["solver"] == name], equations)
         for name in list_cards("solvers")
     ]
-    return "\n".join([head, *overview(rows), *sections])
+    return {
+        PAGE: "\n".join([_wrapped(HEAD.format(**told)), *overview(rows)]),
+        SHEETS: "\n".join([_wrapped(SHEETS_HEAD.format(**told)), *sections]),
+    }
+
+
+def _use(case: str, *solvers: str) -> str:
+    return f"- {case}: {', '.join(f'[`{name}`](../reference/solver-sheets.md#{name})' for name in solvers)}."
+
+
+def _wrapped(text: str) -> str:
+    """Paragraphs and items at 100 columns; addresses stay whole."""
+    return "\n\n".join("\n".join(map(_filled, re.split(r"\n(?=- )", block))) for block in text.split("\n\n"))
+
+
+def _filled(text: str) -> str:
+    indent = "  " if text.startswith("- ") else ""
+    return textwrap.fill(text, 100, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 
 def overview(rows: Mapping[str, Mapping[Any, Any]]) -> list[str]:
@@ -112,7 +160,7 @@ def overview(rows: Mapping[str, Mapping[Any, Any]]) -> list[str]:
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for name, row in rows.items():
         cells = [
-            f"[{name}](#{name})",
+            f"[{name}](../reference/solver-sheets.md#{name})",
             ", ".join(_degrees(row[f"bias_{error}_deg"]) for error in ("e_R", "e_T")),
             ", ".join(_short_factor(row, error) for error in ("e_R", "e_T")),
             *(_share(row[f"success_{each}"]) for each in OUTLIERS),
@@ -140,9 +188,9 @@ def section(
         f"- Assumes {spec.assumes}; motion model `{spec.motion_model}`.",
         *(measured(row) if row else ["- Bias, noise, time and success: not measured yet."]),
         *(degenerate(hard) if len(hard) else ["- Degenerate: not measured yet."]),
-        f"- Take it: {entry.options.use}",
+        f"- When to take it: {entry.options.use}",
     ]
-    return "\n".join([f"## {entry.name}\n", f"{entry.description}.\n", *lines, ""])
+    return _wrapped("\n".join([f"## {entry.name}\n", f"{entry.description}.\n", *lines])) + "\n"
 
 
 def measured(row: Mapping[Any, Any]) -> list[str]:
@@ -229,7 +277,8 @@ def _number(value: float) -> str:
 
 
 def main() -> int:
-    write_bytes(PAGE, page(ROOT / "results/solvers").encode())
+    for path, text in pages(ROOT / "results/solvers").items():
+        write_bytes(path, text.encode())
     return 0
 
 

@@ -208,6 +208,14 @@ def test_the_table_of_packages_has_all_of_them_in_the_order_of_the_layers() -> N
         assert all(height[other] < height[name] for other in imported.split(", ")), (name, imported)
 
 
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_lines_of_documents_wrap_at_100_columns(document: Path) -> None:
+    """But those of tables and code, and what has an address, which cannot be broken."""
+    prose = re.sub(r"^( *)(`{3,}).*?^\1\2$", "", document.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+    whole = re.compile(r"\||    |.*\]\(|.*://")
+    assert [line for line in prose.splitlines() if len(line) > 100 and not whole.match(line)] == []
+
+
 def test_the_conversion_to_the_papers_axes_holds() -> None:
     (code,) = _blocks(ROOT / "docs" / "explanation" / "conventions.md", "python")
     exec(compile(code, "conventions.md", "exec"), {})  # asserts

@@ -1,4 +1,4 @@
-"""docs/explanation/solvers.md says what the committed tables say, of every solver that comes with rsbench."""
+"""The pages of solvers (docs) say what the committed tables say, of every solver that comes with rsbench."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from rsbench.components.cards import FORMER_NAMES, list_cards
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/explanation/solvers.md").read_text("utf-8")
+SHEETS = (ROOT / "docs/reference/solver-sheets.md").read_text("utf-8")
 ROWS = [
     row
     for row in pd.read_csv(ROOT / "results/solvers/solvers.csv").to_dict("records")
@@ -22,18 +23,21 @@ ROWS = [
 TABLE = {str(row["solver"]): row for row in ROWS}
 
 
-def test_the_page_is_what_its_program_makes_of_the_tables() -> None:
-    assert programs.program("benchmarks/solver_pages.py").page(ROOT / "results/solvers") == PAGE
+def test_the_pages_are_what_their_program_makes_of_the_tables() -> None:
+    made = programs.program("benchmarks/solver_pages.py").pages(ROOT / "results/solvers")
+    assert list(made.values()) == [PAGE, SHEETS]
 
 
 def test_every_solver_has_a_section_and_was_measured() -> None:
-    assert re.findall(r"^## (\S+)$", PAGE, re.MULTILINE) == list(list_cards("solvers")) == sorted(TABLE)
-    assert "not measured" not in PAGE
+    assert re.findall(r"^## (\S+)$", SHEETS, re.MULTILINE) == list(list_cards("solvers")) == sorted(TABLE)
+    assert "not measured" not in PAGE + SHEETS
 
 
 @pytest.mark.parametrize("name", ["rs-stereo-tracks", "rs-dai-uniform", "rs-zhuang-8pt", "rs-gyro-5pt"])
 def test_a_row_is_read_back_from_the_page(name: str) -> None:
-    (cells,) = re.findall(rf"^\| \[{name}\]\(#{name}\) \| (.*) \|$", PAGE, re.MULTILINE)
+    (cells,) = re.findall(
+        rf"^\| \[{name}\]\(../reference/solver-sheets.md#{name}\) \| (.*) \|$", PAGE, re.MULTILINE
+    )
     bias, noise, *shares, ms = cells.split(" | ")
     found = [float(value) for value in bias.split(", ")]
     row = TABLE[name]
