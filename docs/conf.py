@@ -25,6 +25,7 @@ html_css_files = ["site.css"]
 html_title = f"rsbench {release}"
 html_copy_source = False
 html_show_sphinx = False
+html_show_copyright = False
 myst_heading_anchors = 3
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
