@@ -311,7 +311,7 @@ def test_the_wheel_carries_cards_documents_and_type_marker(tmp_path: Path) -> No
 
 def test_no_two_modules_have_one_name() -> None:
     """Whoever looks for a file by its name finds it."""
-    names = [path.name for path in (ROOT / "rsbench").rglob("*.py") if path.name != "__init__.py"]
+    names = [path.name for path in (ROOT / "rsbench").rglob("*.py") if not path.name.startswith("__")]
     assert sorted({name for name in names if names.count(name) > 1}) == []
 
 

@@ -65,7 +65,7 @@ def _verify_ours(folder: Path, stride: int, rerender: Rerender, scenes: Sequence
     from rsbench.cli.console import print_table, progress_bar, say
     from rsbench.storage.files import read_json
     from rsbench.verification import verification_steps, verify_dataset
-    from rsbench.verification.structure import DATASET
+    from rsbench.verification.manifest_checks import DATASET
 
     with progress_bar("verifying", verification_steps(read_json(folder / "dataset.json"))) as advance:
         reports = verify_dataset(folder, stride, advance, rerender=rerender.value, scenes=scenes)

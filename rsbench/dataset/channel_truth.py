@@ -17,7 +17,7 @@ from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import Layer, PixelClass
 from rsbench.dataset.row_search import Reprojected, find
-from rsbench.dataset.views import FAR, Geometry, Shot, seen_from, times_at
+from rsbench.dataset.views import FAR, Geometry, ImageView, seen_from, times_at
 from rsbench.renderers.visibility import Surfaces
 
 Blocked = Callable[[FloatArray, FloatArray, FloatArray | None], NDArray[np.bool_]]
@@ -43,7 +43,7 @@ class PairTruth(NamedTuple):
     """(H, W) of ``PixelClass``."""
 
 
-def target_of(layer: Layer, source: Shot, frames: int) -> Shot:
+def target_of(layer: Layer, source: ImageView, frames: int) -> ImageView:
     """The picture in which a channel of a sequence of so many frames looks for the pixels of one of them."""
     twin = source.other_shutter._replace(row=layer.row)
     over_time = source.frame_before if layer.back else source.next_frame(frames)
@@ -64,7 +64,7 @@ class SeenSurfaces:
     def __init__(
         self,
         geometry: Geometry,
-        source: Shot,
+        source: ImageView,
         depth: NDArray[np.float32],
         rows: Sequence[int] | None = None,
         numbers: NDArray[np.uint8] | None = None,
@@ -103,7 +103,7 @@ class Carried(NamedTuple):
     """(H, W, 3) where they are when the target sees them, world frame, metres."""
 
 
-def carry(surfaces: SeenSurfaces, target: Shot) -> Carried:
+def carry(surfaces: SeenSurfaces, target: ImageView) -> Carried:
     """Where another picture sees what every pixel of a rolling-shutter frame sees, hidden or not."""
     start = surfaces.grid[..., surfaces.geometry.shutter.axis(target.side)]
     landed = find(surfaces.geometry, target, surfaces.points, start)
@@ -118,14 +118,14 @@ def carry(surfaces: SeenSurfaces, target: Shot) -> Carried:
     return Carried(landed, points)
 
 
-def pair_truth(surfaces: SeenSurfaces, target: Shot, carried: Carried, blocked: Blocked) -> PairTruth:
+def pair_truth(surfaces: SeenSurfaces, target: ImageView, carried: Carried, blocked: Blocked) -> PairTruth:
     """What became of the pixels that ``carry`` carried into the target; ``blocked`` is asked once."""
     landed, points = carried
     return PairTruth(landed.pixels - surfaces.grid, _classes(surfaces, target, landed, points, blocked))
 
 
 def _landed_with(
-    surfaces: SeenSurfaces, target: Shot, number: int, chosen: NDArray[np.bool_], start: FloatArray
+    surfaces: SeenSurfaces, target: ImageView, number: int, chosen: NDArray[np.bool_], start: FloatArray
 ) -> tuple[FloatArray, Reprojected]:
     """Where an object has its chosen points (n, 3) when the target sees them, world frame, and where it does."""
     geometry, thing = surfaces.geometry, surfaces.geometry.objects[number - 1]
@@ -148,7 +148,7 @@ def surface_truth(surfaces: SeenSurfaces, rays: Rays) -> Surfaces:
 
 
 def _classes(
-    surfaces: SeenSurfaces, target: Shot, landed: Reprojected, points: FloatArray, blocked: Blocked
+    surfaces: SeenSurfaces, target: ImageView, landed: Reprojected, points: FloatArray, blocked: Blocked
 ) -> NDArray[np.uint8]:
     """(H, W) of ``PixelClass``; ``points`` (H, W, 3) where they are when the target sees them."""
     inside = np.isfinite(landed.pixels[..., 0])

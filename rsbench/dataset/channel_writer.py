@@ -31,7 +31,7 @@ from rsbench.dataset.channels import (
     surface_file,
 )
 from rsbench.dataset.object_records import numbers_of
-from rsbench.dataset.views import Geometry, Shot
+from rsbench.dataset.views import Geometry, ImageView
 from rsbench.renderers.render import Frame
 from rsbench.renderers.visibility import Surfaces
 from rsbench.storage.background_writer import Later, begun
@@ -44,7 +44,7 @@ def write_channels(
     folder: Path,
     names: Collection[str],
     geometry: Geometry,
-    shot: Shot,
+    view: ImageView,
     rendered: Frame,
     rays: Rays,
     later: Later,
@@ -56,7 +56,7 @@ def write_channels(
         folder: of the sequence.
         names: of channels.
         geometry: of the sequence.
-        shot: the frame.
+        view: the frame.
         rendered: its light and depth.
         rays: through its scene, asked by this thread alone.
         later: has files written beside, see ``written_beside``.
@@ -64,41 +64,41 @@ def write_channels(
     """
     if "hdr" in names:
         light = {name: rendered.image[..., k] for k, name in enumerate(RADIANCE_COMPONENTS)}
-        later(_write_radiance, folder / radiance_file(shot.side, shot.frame), light)
+        later(_write_radiance, folder / radiance_file(view.side, view.frame), light)
     if not set(names) & {*PAIR_CHANNELS, "normals", "instances"}:
         return
-    seen = SeenSurfaces(geometry, shot, rendered.depth, numbers=numbers_of(rendered.labels))
+    seen = SeenSurfaces(geometry, view, rendered.depth, numbers=numbers_of(rendered.labels))
     layers = [
-        each for each in pair_layers(names, twins, geometry.frames) if shot[1:3] in each.views(geometry.frames)
+        each for each in pair_layers(names, twins, geometry.frames) if view[1:3] in each.views(geometry.frames)
     ]
-    targets = [target_of(layer, shot, geometry.frames) for layer in layers]
+    targets = [target_of(layer, view, geometry.frames) for layer in layers]
     carried = begun(later, lambda target: carry(seen, target), targets)
     if {"normals", "instances"} & set(names):
-        later(_write_surfaces, folder, names, shot, surface_truth(seen, rays))
+        later(_write_surfaces, folder, names, view, surface_truth(seen, rays))
     for layer, target, landed in zip(layers, targets, carried, strict=True):
-        later(_write_pair, folder, layer, shot, pair_truth(seen, target, landed, rays.blocked))
+        later(_write_pair, folder, layer, view, pair_truth(seen, target, landed, rays.blocked))
 
 
-def _write_surfaces(folder: Path, names: Collection[str], shot: Shot, surfaces: Surfaces) -> None:
+def _write_surfaces(folder: Path, names: Collection[str], view: ImageView, surfaces: Surfaces) -> None:
     if "normals" in names:
         normals = {name: surfaces.normals[..., k] for k, name in enumerate(NORMAL_COMPONENTS)}
-        write_exr(folder / surface_file("normals", shot.side, shot.frame), normals)
+        write_exr(folder / surface_file("normals", view.side, view.frame), normals)
     if "instances" in names:
-        write_png16(folder / surface_file("instances", shot.side, shot.frame), surfaces.instances)
+        write_png16(folder / surface_file("instances", view.side, view.frame), surfaces.instances)
 
 
 def _write_radiance(path: Path, light: dict[str, NDArray[np.float32]]) -> None:
     write_exr(path, {name: np.minimum(each, _BRIGHTEST) for name, each in light.items()}, half=True)
 
 
-def _write_pair(folder: Path, layer: Layer, shot: Shot, truth: PairTruth) -> None:
-    values = pair_values(layer.channel, shot, truth.offset)
+def _write_pair(folder: Path, layer: Layer, view: ImageView, truth: PairTruth) -> None:
+    values = pair_values(layer.channel, view, truth.offset)
     pixels = {name: values[..., k] for k, name in enumerate(COMPONENTS[layer.channel])}
-    write_exr(folder / layer.values(shot.side, shot.frame), pixels)
-    write_png(folder / layer.mask(shot.side, shot.frame), truth.classes)
+    write_exr(folder / layer.values(view.side, view.frame), pixels)
+    write_png(folder / layer.mask(view.side, view.frame), truth.classes)
 
 
-def pair_values(channel: PairChannel, source: Shot, offset: FloatArray) -> NDArray[np.float32]:
+def pair_values(channel: PairChannel, source: ImageView, offset: FloatArray) -> NDArray[np.float32]:
     """What a channel stores (..., components) of offsets (..., 2), px: a disparity is x_left - x_right."""
     if channel == "disparity":
         offset = offset[..., :1] * (1.0 if source.side == "right" else -1.0)

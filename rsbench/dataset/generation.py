@@ -33,7 +33,7 @@ from rsbench.dataset.posed_scenes import Build, Built, PosedScenes
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.dataset.sequence_identity import Plan, of_scene, plans_of, with_gloss
-from rsbench.dataset.views import Geometry, Shot, image_seed
+from rsbench.dataset.views import Geometry, ImageView, image_seed
 from rsbench.jobs.isolation import EntryFailure
 from rsbench.jobs.process_jobs import finished_jobs
 from rsbench.jobs.workers import Cluster, Workers
@@ -235,47 +235,47 @@ def render_camera(
     poses, twins = row_poses(rig, shutter, motion, side, frame), card.twins_of(sequence)
     write_poses(folder / "poses" / f"{side}_{frame}.csv", shutter.line_times(frame, side), poses)
     keep = _stack_writer(folder / "gs_stack" / f"{side}_{frame}", options) if options.full_frames else None
-    for shot in (Shot("rs", side, frame), *(Shot("gs", side, frame, row) for row in (0, *twins))):
-        kind = shot.shutter
-        rendered = render_shot(scene, geometry, shot, poses, options, keep if kind == "rs" else None)
+    for view in (ImageView("rs", side, frame), *(ImageView("gs", side, frame, row) for row in (0, *twins))):
+        kind = view.shutter
+        rendered = render_view(scene, geometry, view, poses, options, keep if kind == "rs" else None)
         if not np.any(rendered.depth):
             raise RsbenchError(
                 f"sequence {sequence.name}: {side}_{frame} shows no surface at all: change the viewpoint "
                 f"{sequence.viewpoint!r} of scene {sequence.scene}, or the motion"
             )
-        clean = clean_file(side, frame) if kind == "rs" and sensor else shot.image
+        clean = clean_file(side, frame) if kind == "rs" and sensor else view.image
         write_png(folder / clean, to_srgb8(rendered.image, options.exposure))
-        write_depth(folder / shot.depth, rendered.depth)
+        write_depth(folder / view.depth, rendered.depth)
         if things:
-            write_png(folder / shot.labels, rendered.labels)
+            write_png(folder / view.labels, rendered.labels)
         if scene.glossy:
-            write_mask(folder / shot.gloss, rendered.gloss)
+            write_mask(folder / view.gloss, rendered.gloss)
         if kind == "rs" and sensor:
             own, period = sensor.of(side, frame), card.period_of(sequence)
             seen = sensed_rows(scene, rig, shutter, motion, own, period, side, frame, options, objects=things)
-            write_png(folder / shot.image, seen)
+            write_png(folder / view.image, seen)
         if kind == "rs":
-            write_channels(folder, card.channels, geometry, shot, rendered, SceneRays(scene, things), later, twins)
-        if shot.row == 0:
+            write_channels(folder, card.channels, geometry, view, rendered, SceneRays(scene, things), later, twins)
+        if view.row == 0:
             yield
 
 
-def render_shot(
+def render_view(
     scene: MitsubaScene,
     geometry: Geometry,
-    shot: Shot,
+    view: ImageView,
     poses: Pose,
     options: RendererOptions,
     on_gs_frame: OnGlobalFrame | None = None,
     rows: list[int] | None = None,
 ) -> Frame:
-    """A shot of a sequence; ``poses`` are those of the lines of its rolling-shutter frame."""
+    """A view of a sequence; ``poses`` are those of the lines of its rolling-shutter frame."""
     from rsbench.renderers.render import render
 
     shutter = geometry.shutter
-    tau, columns = shutter.line_times(shot.frame, shot.side), shutter.axis(shot.side) == 0
-    if shot.shutter == "gs":
-        line = abs(shutter.first_line(shot.side) - shot.row)
+    tau, columns = shutter.line_times(view.frame, view.side), shutter.axis(view.side) == 0
+    if view.shutter == "gs":
+        line = abs(shutter.first_line(view.side) - view.row)
         poses = Pose(np.broadcast_to(poses.R[line], poses.R.shape), np.broadcast_to(poses.t[line], poses.t.shape))
         # No stitching: all rows have one pose, and one time.
         tau, options = np.full(tau.shape, tau[line]), replace(options, method="single-pass")

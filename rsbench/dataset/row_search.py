@@ -18,7 +18,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import ProjectionStatus, rs_project
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray, hat
-from rsbench.dataset.views import Geometry, Shot
+from rsbench.dataset.views import Geometry, ImageView
 
 _SAME = 1e-11
 """Largest difference of entries of a pose: of rotations, and metres."""
@@ -51,7 +51,7 @@ class _Table(NamedTuple):
     """Entries for each line; 0: one pose for all."""
 
 
-def find(geometry: Geometry, target: Shot, points: FloatArray, start: FloatArray) -> Reprojected:
+def find(geometry: Geometry, target: ImageView, points: FloatArray, start: FloatArray) -> Reprojected:
     """Search the lines of a picture that see points (rows, n, 3), world frame, from lines (rows, n) near them.
 
     Raises:
@@ -75,31 +75,31 @@ def find(geometry: Geometry, target: Shot, points: FloatArray, start: FloatArray
     return Reprojected(pixels, eyes, unsure)
 
 
-def _pose_table(geometry: Geometry, shot: Shot) -> _Table:
+def _pose_table(geometry: Geometry, view: ImageView) -> _Table:
     rig, shutter, motion = geometry.rig, geometry.shutter, geometry.motion
-    if shot.shutter == "gs":
-        R, t = rig.cam_from_world(motion, shutter.time_after(shot.row, shot.frame, shot.side), shot.side)
+    if view.shutter == "gs":
+        R, t = rig.cam_from_world(motion, shutter.time_after(view.row, view.frame, view.side), view.side)
         entry = np.concatenate([R.ravel(), t, np.zeros(12)])
         return _Table(np.stack([entry, entry]), 0.0)
-    lines = shutter.lines(shot.side)
-    rate = shutter.rate(shot.side)[shutter.axis(shot.side)]
+    lines = shutter.lines(view.side)
+    rate = shutter.rate(view.side)[shutter.axis(view.side)]
     per_line = 1
     while per_line <= _FINEST:
         at = np.linspace(-1.0, lines, (lines + 1) * per_line + 1)
-        tau = shutter.line_time(at, shot.frame, shot.side)
-        R, t = rig.cam_from_world(motion, tau, shot.side)
+        tau = shutter.line_time(at, view.frame, view.side)
+        R, t = rig.cam_from_world(motion, tau, view.side)
         spin, speed = motion.velocity(tau)
         changes = np.concatenate([(hat(spin) @ R).reshape(-1, 9), speed], axis=1) * (rate / per_line)
         entries = np.concatenate([R.reshape(-1, 9), t, changes], axis=1)
-        between = shutter.line_time(at[:-1] + 0.5 / per_line, shot.frame, shot.side)
-        R, t = rig.cam_from_world(motion, between, shot.side)
+        between = shutter.line_time(at[:-1] + 0.5 / per_line, view.frame, view.side)
+        R, t = rig.cam_from_world(motion, between, view.side)
         middle = 0.5 * (entries[:-1, :12] + entries[1:, :12]) + 0.125 * (entries[:-1, 12:] - entries[1:, 12:])
         off = np.max(np.abs(middle - np.concatenate([R.reshape(-1, 9), t], axis=1)))
         if off <= (_SAME if per_line < _FINEST else _AT_JUMPS):
             return _Table(entries, float(per_line))
         per_line *= 2
     raise RsbenchError(
-        f"motion model {type(motion).__name__}: jumps between the lines of {shot.image}, or its velocity is not "
+        f"motion model {type(motion).__name__}: jumps between the lines of {view.image}, or its velocity is not "
         "the derivative of its poses: channels of truth cannot be made"
     )
 

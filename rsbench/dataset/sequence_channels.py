@@ -14,7 +14,7 @@ from rsbench.dataset.imu import Imu, draw_samples, gravity_of, sample_times_ns, 
 from rsbench.dataset.matches import Matching, save_matches
 from rsbench.dataset.timing import write_timing
 from rsbench.dataset.tracks import make_tracks, write_tracks
-from rsbench.dataset.views import GivenGeometry, Shot
+from rsbench.dataset.views import GivenGeometry, ImageView
 from rsbench.storage.files import read_depth, read_png, write_json
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def write_sequence_channels(
         times = sample_times_ns(imu, shutter, period, sensor, card.frames)
         write_imu(folder, imu, gravity, draw_samples(imu, motion, times, period, gravity, seed))
     if "tracks" in card.channels:
-        depths = {view: read_depth(folder / Shot("rs", *view).depth) for view in views_of(card.frames)}
+        depths = {view: read_depth(folder / ImageView("rs", *view).depth) for view in views_of(card.frames)}
         tracks = make_tracks(geometry, depths, SceneRays(scene).blocked, seed)
         write_tracks(folder, tracks)
         if "affine" in card.channels:
@@ -59,5 +59,5 @@ def write_sequence_channels(
         write_json(folder / MATCHER, matcher_record(matching))
         for first in range(card.frames - 1):
             views = [(side, first + frame) for side, frame in VIEWS]
-            images = {view: read_png(folder / Shot("rs", *view).image) for view in views}
+            images = {view: read_png(folder / ImageView("rs", *view).image) for view in views}
             save_matches(folder / matches_file(first), make_matches(geometry, first, images, matching, rays))

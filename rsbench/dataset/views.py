@@ -56,7 +56,7 @@ def seen_from(geometry: Geometry, number: int) -> GivenGeometry:
     return GivenGeometry(geometry.rig, geometry.shutter, motion, geometry.frames)
 
 
-class Shot(NamedTuple):
+class ImageView(NamedTuple):
     """One camera at one time, through a rolling shutter or a global one."""
 
     shutter: Shutter
@@ -85,22 +85,22 @@ class Shot(NamedTuple):
         return gloss_file(*self)
 
     @property
-    def other_shutter(self) -> Shot:
+    def other_shutter(self) -> ImageView:
         return self._replace(shutter="gs" if self.shutter == "rs" else "rs")
 
     @property
-    def other_side(self) -> Shot:
+    def other_side(self) -> ImageView:
         return self._replace(side="right" if self.side == "left" else "left")
 
-    def next_frame(self, frames: int) -> Shot:
+    def next_frame(self, frames: int) -> ImageView:
         """At the next time, of so many; of the last one, at the time before."""
         return self._replace(frame=self.frame + (1 if self.frame < frames - 1 else -1))
 
     @property
-    def frame_before(self) -> Shot:
+    def frame_before(self) -> ImageView:
         return self._replace(frame=self.frame - 1)
 
-    def partners(self) -> Iterator[Shot]:
+    def partners(self) -> Iterator[ImageView]:
         """Those that see most of the same: of the other shutter, the other camera, the time after and before.
 
         The last two need not be there.
@@ -113,29 +113,29 @@ Times = tuple[int, int]
 """Numbers of two successive frames."""
 
 
-def shots_of(times: Iterable[int]) -> tuple[Shot, ...]:
+def image_views(times: Iterable[int]) -> tuple[ImageView, ...]:
     """All pictures of these frames, but for twins of later rows."""
-    return tuple(Shot(*each) for each in product(SHUTTERS, SIDES, times))
+    return tuple(ImageView(*each) for each in product(SHUTTERS, SIDES, times))
 
 
-def pairs_of(times: Times) -> tuple[tuple[Shot, Shot], ...]:
-    """Each shot of two frames against its three partners."""
-    both = shots_of(times)
+def view_pairs(times: Times) -> tuple[tuple[ImageView, ImageView], ...]:
+    """Each view of two frames against its three partners."""
+    both = image_views(times)
     return tuple((source, target) for source in both for target in source.partners() if target in both)
 
 
-def near_shots(shot: Shot, frames: int) -> list[Shot]:
-    """Other shots of a sequence of so many frames, the nearest in time first; of long ones not all."""
-    times = sorted(range(frames), key=lambda frame: abs(frame - shot.frame))[:_NEAREST]
-    return [each for time in times for each in shots_of((time,)) if each != shot]
+def nearby_views(view: ImageView, frames: int) -> list[ImageView]:
+    """Other views of a sequence of so many frames, the nearest in time first; of long ones not all."""
+    times = sorted(range(frames), key=lambda frame: abs(frame - view.frame))[:_NEAREST]
+    return [each for time in times for each in image_views((time,)) if each != view]
 
 
-SHOTS, PAIRS = shots_of(FRAMES), pairs_of(FRAMES)
+IMAGE_VIEWS, VIEW_PAIRS = image_views(FRAMES), view_pairs(FRAMES)
 """Of a sequence of two frames."""
 
 
 class Seen(NamedTuple):
-    """Where and when a shot sees points (...); NaN where it does not."""
+    """Where and when a view sees points (...); NaN where it does not."""
 
     pixels: FloatArray
     """(..., 2) px."""
@@ -145,43 +145,43 @@ class Seen(NamedTuple):
     """(...) frame periods."""
 
 
-def points_of(geometry: Geometry, shot: Shot, pixels: FloatArray, depth: FloatArray) -> FloatArray:
-    """World points (..., 3) that a shot sees at pixels (..., 2) with depth (...)."""
+def points_of(geometry: Geometry, view: ImageView, pixels: FloatArray, depth: FloatArray) -> FloatArray:
+    """World points (..., 3) that a view sees at pixels (..., 2) with depth (...)."""
     rig, shutter, motion = geometry.rig, geometry.shutter, geometry.motion
-    if shot.shutter == "gs":
+    if view.shutter == "gs":
         x_in_cam = depth[..., None] * rig.camera.unproject(pixels)
-        return transform(inverse(_pose(geometry, shot)), x_in_cam)
-    return back_project(rig, shutter, motion, shot.side, shot.frame, pixels, depth)
+        return transform(inverse(_pose(geometry, view)), x_in_cam)
+    return back_project(rig, shutter, motion, view.side, view.frame, pixels, depth)
 
 
-def seen_by(geometry: Geometry, shot: Shot, X: FloatArray, rows: ArrayLike) -> Seen:
-    """Where a shot sees world points (..., 3); ``rows`` (...) are guesses, of columns where it reads those."""
+def seen_by(geometry: Geometry, view: ImageView, X: FloatArray, rows: ArrayLike) -> Seen:
+    """Where a view sees world points (..., 3); ``rows`` (...) are guesses, of columns where it reads those."""
     rig, shutter, motion = geometry.rig, geometry.shutter, geometry.motion
-    if shot.shutter == "rs":
-        found = rs_project_near(rig, shutter, motion, shot.side, shot.frame, X, rows)
+    if view.shutter == "rs":
+        found = rs_project_near(rig, shutter, motion, view.side, view.frame, X, rows)
         return Seen(found.pixels, found.depth, found.tau)
-    x_in_cam = transform(_pose(geometry, shot), X)
+    x_in_cam = transform(_pose(geometry, view), X)
     pixels = rig.camera.project(x_in_cam)
     outside = ~rig.camera.contains(pixels)
     pixels[outside] = np.nan
-    tau = np.broadcast_to(_time(geometry, shot), outside.shape)
+    tau = np.broadcast_to(_time(geometry, view), outside.shape)
     return Seen(pixels, np.where(outside, np.nan, x_in_cam[..., 2]), np.where(outside, np.nan, tau))
 
 
-def times_at(geometry: Geometry, shot: Shot, pixels: FloatArray) -> FloatArray:
-    """Times (...) at which a shot sees pixels (..., 2), frame periods; the frame's own for NaN."""
-    if shot.shutter == "gs":
-        return np.broadcast_to(_time(geometry, shot), pixels.shape[:-1])
-    tau = geometry.shutter.pixel_time(pixels, shot.frame, shot.side)
-    return np.where(np.isnan(tau), float(shot.frame), tau)
+def times_at(geometry: Geometry, view: ImageView, pixels: FloatArray) -> FloatArray:
+    """Times (...) at which a view sees pixels (..., 2), frame periods; the frame's own for NaN."""
+    if view.shutter == "gs":
+        return np.broadcast_to(_time(geometry, view), pixels.shape[:-1])
+    tau = geometry.shutter.pixel_time(pixels, view.frame, view.side)
+    return np.where(np.isnan(tau), float(view.frame), tau)
 
 
-def _time(geometry: Geometry, shot: Shot) -> FloatArray:
-    return geometry.shutter.time_after(shot.row, shot.frame, shot.side)
+def _time(geometry: Geometry, view: ImageView) -> FloatArray:
+    return geometry.shutter.time_after(view.row, view.frame, view.side)
 
 
-def _pose(geometry: Geometry, shot: Shot) -> Pose:
-    return geometry.rig.cam_from_world(geometry.motion, _time(geometry, shot), shot.side)
+def _pose(geometry: Geometry, view: ImageView) -> Pose:
+    return geometry.rig.cam_from_world(geometry.motion, _time(geometry, view), view.side)
 
 
 def image_seed(seed: int, sequence: str, side: Side, frame: int) -> int:

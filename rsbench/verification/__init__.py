@@ -11,9 +11,9 @@ from rsbench.components.cards import card_path
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES
 from rsbench.storage.files import read_json
-from rsbench.verification import structure
+from rsbench.verification import manifest_checks
 from rsbench.verification.findings import DepthAgreement, Finding, Progress, SequenceReport
-from rsbench.verification.rerender import Again, Rerender
+from rsbench.verification.rerender import Rerender, Rerenderer
 from rsbench.verification.state import State
 from rsbench.verification.walk import STEPS, check_sequence, run_stage
 
@@ -54,13 +54,13 @@ def verify_dataset(
     """
     arguments.check_whole("stride", stride, 1)
     arguments.check_one_of("rerender", rerender, ("no", "auto", "all"))
-    manifest = read_json(folder / structure.DATASET)
+    manifest = read_json(folder / manifest_checks.DATASET)
     step = progress or (lambda name: None)
-    listing = structure.Listing.of(folder, manifest)
-    state = State(listing, structure.DATASET)
+    listing = manifest_checks.Listing.of(folder, manifest)
+    state = State(listing, manifest_checks.DATASET)
     run_stage(state, "dataset")
     reports = [SequenceReport(name=state.name, findings=tuple(state.findings))] if state.findings else []
-    again = None if rerender == "no" else Again(rerender, *_cards_and_files(scenes))
+    again = None if rerender == "no" else Rerenderer(rerender, *_cards_and_files(scenes))
     return reports + [verify_sequence(listing, name, stride, step, again) for name in listing.names]
 
 
@@ -72,22 +72,22 @@ def _cards_and_files(named: Collection[Path]) -> tuple[list[Path], list[Path]]:
 
 def verification_steps(manifest: Mapping[str, Any]) -> int:
     """How often ``verify_dataset`` reports progress on the dataset of this dataset.json."""
-    listing = structure.Listing.of(Path(), manifest)
+    listing = manifest_checks.Listing.of(Path(), manifest)
     return _steps(listing) * len(listing.names)
 
 
-def _steps(listing: structure.Listing) -> int:
+def _steps(listing: manifest_checks.Listing) -> int:
     """Of each sequence."""
     frames = len(FRAMES) if isinstance(listing.card, Finding) else listing.card.frames
     return 1 + STEPS * (frames - 1)
 
 
 def verify_sequence(
-    listing: structure.Listing,
+    listing: manifest_checks.Listing,
     name: str,
     stride: int = 1,
     step: Progress = lambda name: None,
-    again: Again | None = None,
+    again: Rerenderer | None = None,
 ) -> SequenceReport:
     """Check one sequence of a dataset; the rest as of ``verify_dataset``."""
     steps = _steps(listing)

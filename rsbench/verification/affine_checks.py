@@ -15,7 +15,7 @@ from rsbench.dataset.affine import AffineFrames, Meets, jacobians_of, make_affin
 from rsbench.dataset.channels import AFFINE, TRACKS
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.tracks import Tracks, track_views
-from rsbench.dataset.views import Shot
+from rsbench.dataset.views import ImageView
 from rsbench.verification.findings import Finding
 from rsbench.verification.frame_comparison import DepthMap
 from rsbench.verification.surface_checks import FEW_BENT, LEVEL
@@ -28,13 +28,16 @@ _FEW_AGAIN, _FEW_LOST, _LEAST = 5e-3, 0.02, 4
 
 
 def affine_faults(
-    sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str], times: tuple[int, ...] = FRAMES
+    sequence: Sequence,
+    maps: Mapping[ImageView, DepthMap],
+    reported: Collection[str],
+    times: tuple[int, ...] = FRAMES,
 ) -> Iterator[Finding]:
-    """What affine frames show that tracks, depth maps and motion cannot have made, but for files ``told``.
+    """What affine frames show that tracks, depth maps and motion cannot have made, but for files ``reported``.
 
     Derivatives are looked at once, with frame 0 among these ``times``; normals with the maps that there are.
     """
-    if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(told):
+    if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(reported):
         return
     try:
         affine, tracks = sequence.affine(), sequence.tracks()
@@ -52,9 +55,9 @@ def affine_faults(
         yield Finding(AFFINE, f"{np.sum(off)} normals are not of length 1, and {np.sum(lost)} are 0")
         return
     for k, view in enumerate(track_views(sequence.frames)):
-        shot, own = Shot("rs", *view), (tracks.sources == k) & ~lost
-        if shot in maps and shot.depth not in told:
-            yield from _normal_faults(sequence, maps[shot], affine.normals[own], tracks.pixels[own, k])
+        image_view, own = ImageView("rs", *view), (tracks.sources == k) & ~lost
+        if image_view in maps and image_view.depth not in reported:
+            yield from _normal_faults(sequence, maps[image_view], affine.normals[own], tracks.pixels[own, k])
 
 
 def _jacobian_faults(sequence: Sequence, affine: AffineFrames, tracks: Tracks) -> Iterator[Finding]:
@@ -96,26 +99,26 @@ def _normal_faults(
 
     def seen(across: int, down: int) -> FloatArray:
         place, z = np.stack([x + across, y + down], axis=-1), depth.depth[y + down, x + across]
-        args = sequence.rig, sequence.shutter, sequence.motion, depth.shot.side, depth.shot.frame
+        args = sequence.rig, sequence.shutter, sequence.motion, depth.view.side, depth.view.frame
         return back_project(*args, place, z)
 
     bent = np.zeros(len(x), dtype=np.bool_)
     for step in (seen(1, 0) - seen(-1, 0), seen(0, 1) - seen(0, -1)):
         bent |= np.abs(np.sum(step * normals, axis=-1)) > LEVEL * np.linalg.norm(step, axis=-1)
     if np.sum(bent) > max(FEW_BENT * len(x), _LEAST):
-        what = f"{np.sum(bent)} of {len(x)} normals are not upright on the surface of {depth.shot.depth}"
-        yield Finding(AFFINE, what, part=f"{depth.shot.side}_{depth.shot.frame}")
+        what = f"{np.sum(bent)} of {len(x)} normals are not upright on the surface of {depth.view.depth}"
+        yield Finding(AFFINE, what, part=f"{depth.view.side}_{depth.view.frame}")
 
 
 def affine_again(
-    sequence: Sequence, rays: Meets, told: Collection[str]
+    sequence: Sequence, rays: Meets, reported: Collection[str]
 ) -> Iterator[tuple[str, Finding | None, bool]]:
     """As ``channel_checks.channels_again``, of affine frames: what rays meet at the points of the tracks."""
-    if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(told):
+    if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(reported):
         return
     try:
         stored, tracks = sequence.affine(), sequence.tracks()
-    except RsbenchError:  # told already
+    except RsbenchError:  # reported already
         return
     made = make_affine(sequence, tracks, rays)
     wrong = np.any(np.abs(made.normals - stored.normals) > 10 * _UNIT, axis=1)

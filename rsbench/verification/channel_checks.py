@@ -17,9 +17,9 @@ from rsbench.dataset.channel_writer import pair_values
 from rsbench.dataset.channels import STEP_PX, Layer, PixelClass, pair_layers
 from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import FAR, Shot
+from rsbench.dataset.views import FAR, ImageView
 from rsbench.verification.findings import Finding, rows_of
-from rsbench.verification.frame_comparison import BoolArray, DepthMap, land
+from rsbench.verification.frame_comparison import BoolArray, DepthMap, reproject
 
 if TYPE_CHECKING:
     from rsbench.renderers.render import Frame
@@ -36,7 +36,7 @@ _FEW_THIN, _FEW_GAPS, _FEW_SHOWN = 0.01, 0.3, 3e-3
 pixel hides points between the target's pixels, or shows them. Where little is hidden, such as joints between tiles
 may be most of it."""
 _OF_A_THIN_ROW, _OF_ITS_WIDTH = 0.5, 0.125
-"""Such things may lie along a row: shares of its pixels that are told of, and of all its pixels."""
+"""Such things may lie along a row: shares of its pixels that are reported, and of all its pixels."""
 _FEW_AGAIN = 5e-3
 """Of rows made again: on another processor, rounding of depth moves points across edges now and then."""
 _LEAST = 8
@@ -64,67 +64,67 @@ class _Derived(NamedTuple):
 
 def channel_faults(
     sequence: Sequence,
-    maps: Mapping[Shot, DepthMap],
-    told: Collection[str],
+    maps: Mapping[ImageView, DepthMap],
+    reported: Collection[str],
     stride: int = 1,
     times: tuple[int, ...] = FRAMES,
     new: tuple[int, ...] = FRAMES,
 ) -> Iterator[Finding]:
     """What the channels of a sequence show that its depth maps and motion cannot have made.
 
-    Files that are ``told`` already, missing or wrong, are not looked at; a wrong depth map would accuse others. Of
+    Files that are ``reported`` already, missing or wrong, are left out; a wrong depth map would accuse others. Of
     channels between two frames of these ``times``, or within one, at least one of which is ``new``.
     """
     for layer in pair_layers(sequence.channels, sequence.twins, sequence.frames):
-        stored: dict[Shot, _Stored] = {}
+        stored: dict[ImageView, _Stored] = {}
         for side, frame in layer.views(sequence.frames):
-            files, shot = (layer.values(side, frame), layer.mask(side, frame)), Shot("rs", side, frame)
-            both = {frame, target_of(layer, shot, sequence.frames).frame}
+            files, view = (layer.values(side, frame), layer.mask(side, frame)), ImageView("rs", side, frame)
+            both = {frame, target_of(layer, view, sequence.frames).frame}
             try:
-                if both <= {*times} and both & {*new} and not set(files) & set(told):
-                    stored[shot] = _stored(sequence, layer, shot)
+                if both <= {*times} and both & {*new} and not set(files) & set(reported):
+                    stored[view] = _stored(sequence, layer, view)
             except RsbenchError as error:
                 yield Finding.of(error)
-        for shot in stored:
-            there = target_of(layer, shot, sequence.frames)
-            used = {each for each in (shot, there) if each in maps and each.depth not in told}
+        for view in stored:
+            there = target_of(layer, view, sequence.frames)
+            used = {each for each in (view, there) if each in maps and each.depth not in reported}
             if len(used) == 2:
-                yield from _pair_faults(sequence, maps, layer, shot, stored, stride)
+                yield from _pair_faults(sequence, maps, layer, view, stored, stride)
 
 
-def _stored(sequence: Sequence, layer: Layer, shot: Shot) -> _Stored:
+def _stored(sequence: Sequence, layer: Layer, view: ImageView) -> _Stored:
     """Raises RsbenchError where a file cannot be read."""
     channel, row, back = layer
-    where = channel, shot.side, shot.frame, row, back
+    where = channel, view.side, view.frame, row, back
     return _Stored(sequence.offsets(*where), sequence.classes(*where))
 
 
 def channels_again(
-    sequence: Sequence, shot: Shot, rows: list[int], frame: Frame, rays: Rays, told: Collection[str]
+    sequence: Sequence, view: ImageView, rows: list[int], frame: Frame, rays: Rays, reported: Collection[str]
 ) -> Iterator[tuple[str, Finding | None, bool]]:
     """Rows of the channels of a frame made again: of each file its name, fault or None, and whether all is same.
 
     Args:
         sequence: holds them.
-        shot: the frame; of a global shutter there are none.
+        view: the frame; of a global shutter there are none.
         rows: of the frame.
         frame: these rows rendered again.
         rays: through the scene.
-        told: files that are not looked at.
+        reported: files that are not looked at.
     """
     frames = sequence.frames
-    for layer in pair_layers(sequence.channels, sequence.twins, frames) if shot.shutter == "rs" else ():
-        files = layer.values(shot.side, shot.frame), layer.mask(shot.side, shot.frame)
-        if set(files) & set(told) or shot[1:3] not in layer.views(frames):
+    for layer in pair_layers(sequence.channels, sequence.twins, frames) if view.shutter == "rs" else ():
+        files = layer.values(view.side, view.frame), layer.mask(view.side, view.frame)
+        if set(files) & set(reported) or view[1:3] not in layer.views(frames):
             continue
         try:
-            values, classes = (each[rows] for each in _stored(sequence, layer, shot))
-        except RsbenchError:  # told already
+            values, classes = (each[rows] for each in _stored(sequence, layer, view))
+        except RsbenchError:  # reported already
             continue
-        seen = SeenSurfaces(sequence, shot, frame.depth, rows, numbers_of(frame.labels))
-        target = target_of(layer, shot, frames)
+        seen = SeenSurfaces(sequence, view, frame.depth, rows, numbers_of(frame.labels))
+        target = target_of(layer, view, frames)
         truth = pair_truth(seen, target, carry(seen, target), rays.blocked)
-        made = pair_values(layer.channel, shot, truth.offset)
+        made = pair_values(layer.channel, view, truth.offset)
         far = np.any(~((np.abs(values - made) <= _SAME_PX) | (np.isnan(values) & np.isnan(made))), axis=-1)
         unlike = classes != truth.classes
         everywhere = np.ones(far.shape, dtype=np.bool_)
@@ -140,41 +140,41 @@ def channels_again(
 
 def _pair_faults(
     sequence: Sequence,
-    maps: Mapping[Shot, DepthMap],
+    maps: Mapping[ImageView, DepthMap],
     layer: Layer,
-    shot: Shot,
-    stored: Mapping[Shot, _Stored],
+    view: ImageView,
+    stored: Mapping[ImageView, _Stored],
     stride: int,
 ) -> Iterator[Finding]:
-    derived = _derived(sequence, maps, layer, shot, stride)
-    values, classes = stored[shot].values[::stride, ::stride], stored[shot].classes[::stride, ::stride]
-    file = layer.values(shot.side, shot.frame)
+    derived = _derived(sequence, maps, layer, view, stride)
+    values, classes = stored[view].values[::stride, ::stride], stored[view].classes[::stride, ::stride]
+    file = layer.values(view.side, view.frame)
     known = ~np.isin(classes, _NO_VALUE)
     both = known & np.isfinite(derived.values[..., 0])
     wrong = np.any(~(np.abs(values - derived.values) <= _SAME_PX), axis=-1)
     if _many(wrong & both, both):
         size = np.median(np.max(np.abs(values - derived.values), axis=-1)[wrong & both])
         what = f"{_percent(wrong & both, both)} differ from what depth and motion make, typically by {size:.2g} px"
-        cause = _cause(layer, shot, stored, derived, stride)
-        yield Finding(file, what, _rows(wrong & both, stride, len(stored[shot].classes)), cause)
+        cause = _cause(layer, view, stored, derived, stride)
+        yield Finding(file, what, _rows(wrong & both, stride, len(stored[view].classes)), cause)
     empty = np.isnan(values).any(axis=-1)
     if np.any(empty == known):
         what = f"{np.sum(empty & known)} pixels without a value and {np.sum(~empty & ~known)} with one too many"
-        yield Finding(file, f"{what}, by {layer.mask(shot.side, shot.frame)}")
-    there, sky = target_of(layer, shot, sequence.frames), maps[shot].depth[::stride, ::stride] == 0
-    yield from _mask_faults(layer, shot, there, classes, sky, derived, stride)
+        yield Finding(file, f"{what}, by {layer.mask(view.side, view.frame)}")
+    there, sky = target_of(layer, view, sequence.frames), maps[view].depth[::stride, ::stride] == 0
+    yield from _mask_faults(layer, view, there, classes, sky, derived, stride)
 
 
 def _mask_faults(
     layer: Layer,
-    shot: Shot,
-    there: Shot,
+    view: ImageView,
+    there: ImageView,
     classes: NDArray[np.uint8],
     sky: BoolArray,
     derived: _Derived,
     stride: int,
 ) -> Iterator[Finding]:
-    file, height = layer.mask(shot.side, shot.frame), len(classes) * stride
+    file, height = layer.mask(view.side, view.frame), len(classes) * stride
     lost = np.isnan(derived.values[..., 0])
     everywhere = np.ones(classes.shape, dtype=np.bool_)
     unsolved, empty = classes == PixelClass.UNSOLVED, np.isin(classes, _NO_VALUE)
@@ -183,7 +183,7 @@ def _mask_faults(
     for words, wrong, among, many in (
         ("not solved", unsolved, everywhere, _many),
         ("wrongly in or out of view", ~unsolved & (empty != lost), everywhere, _many),
-        (f"wrongly sky or surface by {shot.depth}", ~empty & (of_sky != sky), everywhere, _many),
+        (f"wrongly sky or surface by {view.depth}", ~empty & (of_sky != sky), everywhere, _many),
         (f"hidden, but visible by {there.depth}", hidden, surface, _many_thin),
         (f"visible, but hidden by {there.depth}", ~empty & ~hidden, behind, partial(_many_gaps, ~empty)),
     ):
@@ -192,14 +192,16 @@ def _mask_faults(
             yield Finding(file, f"{_percent(wrong & among, among)} are {words}", rows)
 
 
-def _derived(sequence: Sequence, maps: Mapping[Shot, DepthMap], layer: Layer, shot: Shot, stride: int) -> _Derived:
+def _derived(
+    sequence: Sequence, maps: Mapping[ImageView, DepthMap], layer: Layer, view: ImageView, stride: int
+) -> _Derived:
     """Sky is a surface at ``FAR``; what has none in the target is before it nowhere."""
-    depth = maps[shot].depth
-    filled = replace(maps[shot], depth=np.where(depth > 0, depth, np.float32(FAR)))
-    landing = land(sequence, filled, maps[target_of(layer, shot, sequence.frames)], stride)
+    depth = maps[view].depth
+    filled = replace(maps[view], depth=np.where(depth > 0, depth, np.float32(FAR)))
+    reprojection = reproject(sequence, filled, maps[target_of(layer, view, sequence.frames)], stride)
     grid = sequence.rig.camera.pixel_grid()[::stride, ::stride]
-    values = pair_values(layer.channel, shot, landing.pixels - grid)
-    sky, relative = depth[::stride, ::stride] == 0, landing.relative
+    values = pair_values(layer.channel, view, reprojection.pixels - grid)
+    sky, relative = depth[::stride, ::stride] == 0, reprojection.relative
     free = np.where(sky, np.isneginf(relative), np.abs(relative) < _SURFACE)
     hidden = np.where(relative > _BEHIND, 1.0, np.where(free, 0.0, np.nan))
     return _Derived(values, hidden.astype(np.float32))
@@ -242,9 +244,11 @@ def _rows(wrong: BoolArray, stride: int, height: int) -> str:
     return rows_of(np.repeat(share > 0.5 * np.max(share), stride)[:height])
 
 
-def _cause(layer: Layer, shot: Shot, stored: Mapping[Shot, _Stored], derived: _Derived, stride: int) -> str:
+def _cause(
+    layer: Layer, view: ImageView, stored: Mapping[ImageView, _Stored], derived: _Derived, stride: int
+) -> str:
     """What the stored values are instead, in words; "" where nothing explains most of them."""
-    values = stored[shot].values
+    values = stored[view].values
     sampled = values[::stride, ::stride]
     tried = {
         "zeroed": values * 0 if not np.any(np.nan_to_num(values)) else None,
@@ -259,7 +263,7 @@ def _cause(layer: Layer, shot: Shot, stored: Mapping[Shot, _Stored], derived: _D
         if candidate is not None and (words == "zeroed" or _explains(candidate[::stride, ::stride], derived)):
             return f"looks {words}"
     for other, held in stored.items():
-        if other != shot and np.array_equal(held.values, values, equal_nan=True):
+        if other != view and np.array_equal(held.values, values, equal_nan=True):
             return f"the same as {layer.values(other.side, other.frame)}"
     ratio = float(np.nanmedian(sampled / np.where(np.abs(derived.values) < 1, np.nan, derived.values)))
     spread = np.nanmedian(np.abs(sampled - ratio * derived.values))

@@ -13,17 +13,17 @@ from rsbench.verification.affine_checks import affine_faults
 from rsbench.verification.channel_checks import channel_faults
 from rsbench.verification.content import twin_faults
 from rsbench.verification.findings import Finding
+from rsbench.verification.frame_pair_checks import geometry_faults, picture_faults
 from rsbench.verification.gloss_checks import gloss_faults, known_gloss
 from rsbench.verification.hdr_checks import hdr_faults
 from rsbench.verification.imu_checks import imu_faults
+from rsbench.verification.manifest_checks import dataset_faults, file_faults, sequence_faults
 from rsbench.verification.match_checks import match_faults, matched_again
-from rsbench.verification.moving_checks import label_faults
-from rsbench.verification.picture_checks import geometry_faults, picture_faults
-from rsbench.verification.poses import pose_faults
-from rsbench.verification.sensors import sensor_faults
-from rsbench.verification.stacks import stack_faults
+from rsbench.verification.moving_object_checks import label_faults
+from rsbench.verification.pose_checks import pose_faults
+from rsbench.verification.sensor_checks import sensor_faults
+from rsbench.verification.stack_checks import stack_faults
 from rsbench.verification.state import State
-from rsbench.verification.structure import dataset_faults, file_faults, sequence_faults
 from rsbench.verification.surface_checks import surface_faults
 from rsbench.verification.timing_checks import timing_faults
 from rsbench.verification.track_checks import track_faults
@@ -73,35 +73,35 @@ def _twins(state: State) -> list[Finding]:
 def _channels(state: State) -> Iterator[Finding]:
     content = state.all_content
     times, new = content.times, state.fresh.times
-    return channel_faults(state.sequence, content.maps, state.told, state.stride, times, new)
+    return channel_faults(state.sequence, content.maps, state.reported, state.stride, times, new)
 
 
 def _surfaces(state: State) -> Iterator[Finding]:
     content = state.all_content
-    return surface_faults(state.sequence, content.maps, state.told, content.times, state.fresh.times)
+    return surface_faults(state.sequence, content.maps, state.reported, content.times, state.fresh.times)
 
 
 def _matches(state: State) -> Iterator[Finding]:
     content = state.all_content
-    return match_faults(state.sequence, content.maps, state.told, content.times[0])
+    return match_faults(state.sequence, content.maps, state.reported, content.times[0])
 
 
 def _matcher(state: State) -> list[Finding]:
-    findings, notes = matched_again(state.sequence, state.told, state.content.times[0])
+    findings, notes = matched_again(state.sequence, state.reported, state.content.times[0])
     state.notes += notes
     return findings
 
 
 def _render_rows(state: State) -> tuple[Finding, ...]:
-    if state.redone is not None:
-        state.redone.add(with_twins(state.fresh, state.twins), state.told)
+    if state.rerendered is not None:
+        state.rerendered.add(with_twins(state.fresh, state.twins), state.reported)
     return ()
 
 
 def _rendered_rows(state: State) -> list[Finding]:
-    if state.redone is None:
+    if state.rerendered is None:
         return []
-    findings, note = state.redone.end(state.told)
+    findings, note = state.rerendered.end(state.reported)
     state.notes.append(note)
     return findings
 
@@ -149,7 +149,7 @@ CHECKS = (
         reads="channel `timing`, `poses/*.csv`",
         finds="times that differ by more than 1 ns from `sequence.json` or from those of the poses",
         costs="one time per row",
-        run=lambda state: timing_faults(state.sequence, state.told),
+        run=lambda state: timing_faults(state.sequence, state.reported),
     ),
     Check(
         name="imu",
@@ -158,7 +158,7 @@ CHECKS = (
         finds="rates and forces that are not those of motion, gravity and times; noise, or steps of the bias, "
         "beyond 6 sigma of the stated densities, or not white",
         costs="one pose per sample",
-        run=lambda state: imu_faults(state.sequence, state.told),
+        run=lambda state: imu_faults(state.sequence, state.reported),
     ),
     Check(
         name="gloss masks by rays",
@@ -264,7 +264,7 @@ CHECKS = (
         finds="points that are not what the depth map sees at the pixels of the draw, places and times that the "
         "row equation does not make, and points hidden or visible against the depths around",
         costs="the row equation of every point in every view",
-        run=lambda state: track_faults(state.sequence, state.fresh.maps, state.told, state.fresh.times),
+        run=lambda state: track_faults(state.sequence, state.fresh.maps, state.reported, state.fresh.times),
     ),
     Check(
         name="affine",
@@ -273,7 +273,7 @@ CHECKS = (
         finds="derivatives that normals, tracks and row times do not make, to 1e-6, and normals that are not "
         "upright on the surface of the depth map",
         costs="one derivative per point and view",
-        run=lambda state: affine_faults(state.sequence, state.fresh.maps, state.told, state.fresh.times),
+        run=lambda state: affine_faults(state.sequence, state.fresh.maps, state.reported, state.fresh.times),
     ),
     Check(
         name="normals and instances",
@@ -290,7 +290,7 @@ CHECKS = (
         reads="channel `hdr`, images",
         finds="linear light that is not that of the clean image, to a code",
         costs="almost nothing",
-        run=lambda state: hdr_faults(state.sequence, state.fresh.pictures, state.told),
+        run=lambda state: hdr_faults(state.sequence, state.fresh.pictures, state.reported),
     ),
     Check(
         name="matches",

@@ -14,20 +14,20 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES
 from rsbench.dataset.layout import clean_file
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import SHOTS, near_shots, pairs_of, shots_of
+from rsbench.dataset.views import IMAGE_VIEWS, ImageView, image_views, nearby_views, view_pairs
 from rsbench.storage.files import read_png
 from rsbench.storage.untrusted_files import inside
-from rsbench.verification import depth, image_checks
+from rsbench.verification import depth_checks, image_checks
 from rsbench.verification.depth_causes import likely_cause
 from rsbench.verification.findings import DepthAgreement, Finding, rows_of
-from rsbench.verification.frame_comparison import DepthMap, Shot, in_one_light, land
-from rsbench.verification.image_causes import Elsewhere as Elsewhere
-from rsbench.verification.image_causes import likeness_faults
+from rsbench.verification.frame_comparison import DepthMap, reproject, without_changing_light
+from rsbench.verification.image_causes import OtherImages as OtherImages
+from rsbench.verification.image_causes import colour_faults
 from rsbench.verification.png_header import png_fault
-from rsbench.verification.thin_structures import roughly_alike
+from rsbench.verification.thin_structures import roughly_agree
 
-Judge = Callable[[Shot], bool]
-"""Says of a file of a shot, from what nobody who made the dataset could change, that it is right."""
+Judge = Callable[[ImageView], bool]
+"""Says of a file of a view, from what nobody who made the dataset could change, that it is right."""
 
 
 @dataclass(eq=False)
@@ -35,47 +35,49 @@ class Content:
     """The depth maps and images of a sequence that can be read, and the faults of those that cannot."""
 
     sequence: Sequence
-    maps: dict[Shot, DepthMap] = field(default_factory=dict)
-    pictures: dict[Shot, image_checks.Picture] = field(default_factory=dict)
+    maps: dict[ImageView, DepthMap] = field(default_factory=dict)
+    pictures: dict[ImageView, image_checks.Picture] = field(default_factory=dict)
     faults: list[Finding] = field(default_factory=list)
     times: tuple[int, ...] = ()
     """Numbers of the frames that were read."""
 
-    def followed_by(self, other: Content, told: Collection[str]) -> Content:
-        """What was read last and the next, but for files that are ``told``: they accuse the next ones no more."""
+    def followed_by(self, other: Content, reported: Collection[str]) -> Content:
+        """The last frame and the next, but for files that are ``reported``: they accuse the next ones no more."""
         last = self.times[-1:]
-        maps = {shot: each for shot, each in self.maps.items() if shot.frame in last and shot.depth not in told}
+        maps = {
+            view: each for view, each in self.maps.items() if view.frame in last and view.depth not in reported
+        }
         pictures = {
-            shot: each
-            for shot, each in self.pictures.items()
-            if shot.frame in last and not {shot.image, clean_picture(self.sequence, shot)} & {*told}
+            view: each
+            for view, each in self.pictures.items()
+            if view.frame in last and not {view.image, clean_picture(self.sequence, view)} & {*reported}
         }
         return Content(self.sequence, maps | other.maps, pictures | other.pictures, times=last + other.times)
 
 
 def read_content(sequence: Sequence, missing: Collection[str] = (), times: tuple[int, ...] = FRAMES) -> Content:
-    """Read all shots of some frames but ``missing`` files, one fault for each that cannot be."""
+    """Read all views of some frames but ``missing`` files, one fault for each that cannot be."""
     content = Content(sequence, times=times)
-    for shot in shots_of(times):
-        read_shot(content, shot, missing)
+    for view in image_views(times):
+        read_view(content, view, missing)
     return content
 
 
-def read_shot(content: Content, shot: Shot, missing: Collection[str]) -> None:
-    """Add what can be read of a shot, and the faults of what cannot."""
+def read_view(content: Content, view: ImageView, missing: Collection[str]) -> None:
+    """Add what can be read of a view, and the faults of what cannot."""
     sequence = content.sequence
     renderer = sequence.manifest.get("renderer")
     noisy = isinstance(renderer, dict) and renderer.get("integrator") == "path"
     size = sequence.rig.camera.width, sequence.rig.camera.height
     try:
-        beside = [shot.labels] * bool(sequence.moving) + [shot.gloss] * sequence.glossy
-        if not {shot.depth, *beside} & set(missing):
-            labels = sequence.labels(*shot) if sequence.moving else None
-            gloss = sequence.gloss(*shot) if sequence.glossy else None
-            content.maps[shot] = DepthMap(shot, sequence.depth(*shot), sequence.rig.camera, labels, gloss)
+        beside = [view.labels] * bool(sequence.moving) + [view.gloss] * sequence.glossy
+        if not {view.depth, *beside} & set(missing):
+            labels = sequence.labels(*view) if sequence.moving else None
+            gloss = sequence.gloss(*view) if sequence.glossy else None
+            content.maps[view] = DepthMap(view, sequence.depth(*view), sequence.rig.camera, labels, gloss)
     except RsbenchError as error:
         content.faults.append(Finding.of(error))
-    file = clean_picture(sequence, shot)
+    file = clean_picture(sequence, view)
     if file in missing:
         return
     try:
@@ -83,15 +85,15 @@ def read_shot(content: Content, shot: Shot, missing: Collection[str]) -> None:
         content.faults += [fault] if fault else []
         if fault is None:
             pixels = read_png(inside(sequence.folder, file), size)
-            content.pictures[shot] = image_checks.Picture.of(shot, pixels, noisy)
+            content.pictures[view] = image_checks.Picture.of(view, pixels, noisy)
     except RsbenchError as error:
         content.faults.append(Finding.of(error))
 
 
-def clean_picture(sequence: Sequence, shot: Shot) -> str:
-    """The image of a shot that shows light alone: where a sensor blurs and errs, its clean twin."""
-    blurred = sequence.sensor is not None and shot.shutter == "rs"
-    return clean_file(shot.side, shot.frame) if blurred else shot.image
+def clean_picture(sequence: Sequence, view: ImageView) -> str:
+    """The image of a view that shows light alone: where a sensor blurs and errs, its clean twin."""
+    blurred = sequence.sensor is not None and view.shutter == "rs"
+    return clean_file(view.side, view.frame) if blurred else view.image
 
 
 def twin_faults(content: Content) -> Iterator[Finding]:
@@ -99,25 +101,25 @@ def twin_faults(content: Content) -> Iterator[Finding]:
 
     Where columns are read, it is the first column.
     """
-    for shot in shots_of(content.times):
-        twin, maps, pictures = shot._replace(shutter="gs"), content.maps, content.pictures
-        axis, number = _first_line(content, shot)
+    for view in image_views(content.times):
+        twin, maps, pictures = view._replace(shutter="gs"), content.maps, content.pictures
+        axis, number = _first_line(content, view)
         line = f"{'row' if axis == 0 else 'column'} {number}"
-        if shot.shutter != "rs":
+        if view.shutter != "rs":
             continue
-        if {shot, twin} <= pictures.keys():
-            rows = [np.take(pictures[each].colours, [number], axis) for each in (shot, twin)]
+        if {view, twin} <= pictures.keys():
+            rows = [np.take(pictures[each].colours, [number], axis) for each in (view, twin)]
             apart = np.max(np.abs(rows[0].astype(np.float64) - rows[1]), axis=-1)
             unlike = apart > _rounding(axis, 1.0)
             if np.sum(unlike) > spare_pixels(axis, unlike.size):
                 what = f"{np.sum(unlike)} pixels differ from the global-shutter twin at the same pose"
-                yield Finding(clean_picture(content.sequence, shot), f"{line} differs from {twin.image}: {what}")
-        if {shot, twin} <= maps.keys():
-            own, other = (np.take(maps[each].depth, [number], axis) for each in (shot, twin))
+                yield Finding(clean_picture(content.sequence, view), f"{line} differs from {twin.image}: {what}")
+        if {view, twin} <= maps.keys():
+            own, other = (np.take(maps[each].depth, [number], axis) for each in (view, twin))
             if np.sum(np.abs(own - other) > _rounding(axis, 1e-6) * other) > spare_pixels(axis, own.size):
                 what = f"by up to {np.max(np.abs(own - other)):.3g} m at the same pose"
-                cause = _first_of_twin(maps[shot].depth, maps[twin].depth)
-                yield Finding(shot.depth, f"{line} differs from {twin.depth}: {what}", cause=cause)
+                cause = _first_of_twin(maps[view].depth, maps[twin].depth)
+                yield Finding(view.depth, f"{line} differs from {twin.depth}: {what}", cause=cause)
 
 
 def _rounding(axis: int, most: float) -> float:
@@ -133,10 +135,10 @@ def spare_pixels(axis: int, size: int) -> int:
     return 0 if axis == 0 else max(2, size // 20)
 
 
-def _first_line(content: Content, shot: Shot) -> tuple[int, int]:
+def _first_line(content: Content, view: ImageView) -> tuple[int, int]:
     """Axis and number of the line of an image that is read first."""
     shutter = content.sequence.shutter
-    return 1 - shutter.axis(shot.side), shutter.first_line(shot.side)
+    return 1 - shutter.axis(view.side), shutter.first_line(view.side)
 
 
 def _first_of_twin(depth: NDArray[np.float32], twin: NDArray[np.float32]) -> str:
@@ -153,120 +155,132 @@ class Comparison:
 
     content: Content
     stride: int
-    agreements: list[tuple[Shot, Shot, DepthAgreement]] = field(default_factory=list)
-    verdicts: dict[Shot, depth.MapVerdict] = field(default_factory=dict)
-    likenesses: list[image_checks.Likeness] = field(default_factory=list)
-    votes: dict[Shot, image_checks.ImageVotes] = field(default_factory=dict)
+    agreements: list[tuple[ImageView, ImageView, DepthAgreement]] = field(default_factory=list)
+    evidence: dict[ImageView, depth_checks.DepthEvidence] = field(default_factory=dict)
+    colour_agreements: list[image_checks.ColourAgreement] = field(default_factory=list)
+    votes: dict[ImageView, image_checks.ImageVotes] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     """What could not be compared well, and is no fault."""
 
     def __post_init__(self) -> None:
         camera = self.content.sequence.rig.camera
-        self.verdicts = {shot: depth.MapVerdict(each, self.stride) for shot, each in self.content.maps.items()}
+        self.evidence = {
+            view: depth_checks.DepthEvidence(each, self.stride) for view, each in self.content.maps.items()
+        }
         self.votes = {
-            shot: image_checks.ImageVotes.none((camera.height, camera.width)) for shot in self.content.pictures
+            view: image_checks.ImageVotes.none((camera.height, camera.width)) for view in self.content.pictures
         }
 
     def pairs(self) -> Iterator[DepthAgreement | None]:
         """Compare one pair after the other; None where a file of it could not be read."""
         maps, pictures = self.content.maps, self.content.pictures
-        for source, target in pairs_of((self.content.times[0], self.content.times[-1])):
+        for source, target in view_pairs((self.content.times[0], self.content.times[-1])):
             if not {source, target} <= maps.keys():
                 yield None
                 continue
-            landing = land(self.content.sequence, maps[source], maps[target], self.stride)
-            agreement = depth.compare(self.verdicts[source], self.verdicts[target], landing)
+            reprojection = reproject(self.content.sequence, maps[source], maps[target], self.stride)
+            agreement = depth_checks.compare(self.evidence[source], self.evidence[target], reprojection)
             self.agreements.append((source, target, agreement))
             if {source, target} <= pictures.keys():
-                lit = in_one_light(self.content.sequence, maps[source], maps[target], landing, self.stride)
-                self.likenesses.append(
+                lit = without_changing_light(
+                    self.content.sequence, maps[source], maps[target], reprojection, self.stride
+                )
+                self.colour_agreements.append(
                     image_checks.compare(
                         pictures[source], pictures[target], maps[source], lit, self.votes[source], self.stride
                     )
                 )
             yield agreement
 
-    def geometry(self) -> depth.GeometryFault | None:
+    def geometry(self) -> depth_checks.GeometryFault | None:
         """What the pairs show of sequence.json; where that is wrong they show nothing else."""
-        return depth.geometry_fault(self.agreements)
+        return depth_checks.geometry_fault(self.agreements)
 
     def faults(
-        self, elsewhere: Elsewhere, is_right: Judge = lambda shot: False, shows: Judge = lambda shot: False
+        self,
+        other_images: OtherImages,
+        depth_is_rendered: Judge = lambda view: False,
+        image_is_rendered: Judge = lambda view: False,
     ) -> Iterator[Finding]:
         """What the pairs show, each with its likely cause.
 
-        ``is_right`` acquits a depth map that they accuse, ``shows`` an image.
+        ``depth_is_rendered`` and ``image_is_rendered`` say which depth maps and images are what is rendered again;
+        these are left out.
         """
-        wrong = self._wrong_maps(is_right)
-        for shot, fault in wrong.items():
-            cause = likely_cause(self.content.sequence, self.content.maps, shot, fault.rows)
-            yield Finding(shot.depth, fault.what, rows_of(fault.rows), cause)
-        yield from depth.pair_faults(self.agreements, wrong)
-        yield from self._acquitted(list(self._image_faults(wrong.keys(), elsewhere)), shows)
+        wrong = self._wrong_maps(depth_is_rendered)
+        for view, fault in wrong.items():
+            cause = likely_cause(self.content.sequence, self.content.maps, view, fault.rows)
+            yield Finding(view.depth, fault.what, rows_of(fault.rows), cause)
+        yield from depth_checks.pair_faults(self.agreements, wrong)
+        yield from self._without_rendered(list(self._image_faults(wrong.keys(), other_images)), image_is_rendered)
 
-    def _acquitted(self, accused: list[tuple[Shot, Finding]], shows: Judge) -> Iterator[Finding]:
+    def _without_rendered(
+        self, accused: list[tuple[ImageView, Finding]], image_is_rendered: Judge
+    ) -> Iterator[Finding]:
         """Faults of images without those that are what is rendered again: fine things look different from each
         place. A partner that is not what is rendered again is then what was wrong."""
-        judged = lru_cache(maxsize=None)(shows)
-        for shot, fault in accused:
-            if not judged(shot):
+        judged = lru_cache(maxsize=None)(image_is_rendered)
+        for view, fault in accused:
+            if not judged(view):
                 yield fault
                 continue
             what = "others contradict it, and it is what is rendered again, all of it"
-            self.notes.append(str(Finding(shot.image, what)))
-            pairs = {(each.source, each.target) for each in self.likenesses}
+            self.notes.append(str(Finding(view.image, what)))
+            pairs = {(each.source, each.target) for each in self.colour_agreements}
             for other in sorted(
-                {one for pair in pairs if shot in pair for one in pair} - {one for one, _ in accused}
+                {one for pair in pairs if view in pair for one in pair} - {one for one, _ in accused}
             ):
                 if not judged(other):
-                    yield Finding(other.image, f"shows other colours than {shot.image} at the same surface")
+                    yield Finding(other.image, f"shows other colours than {view.image} at the same surface")
 
-    def _wrong_maps(self, is_right: Judge) -> dict[Shot, depth.MapFault]:
+    def _wrong_maps(self, depth_is_rendered: Judge) -> dict[ImageView, depth_checks.MapFault]:
         """Faults of maps; one without a flat place is none, where it is roughly what others see."""
-        wrong, right = depth.map_faults(self.verdicts), set[Shot]()
-        while acquitted := {shot for shot in wrong if is_right(shot)}:
-            right |= acquitted
-            wrong = depth.map_faults(self.verdicts, right)
-        for shot in right:
+        wrong, right = depth_checks.map_faults(self.evidence), set[ImageView]()
+        while confirmed := {view for view in wrong if depth_is_rendered(view)}:
+            right |= confirmed
+            wrong = depth_checks.map_faults(self.evidence, right)
+        for view in right:
             what = "others contradict it, and it is what is rendered again, all of it"
-            self.notes.append(str(Finding(shot.depth, what)))
-        for shot in [shot for shot, fault in wrong.items() if fault.uncompared]:
-            if roughly_alike(self.content.sequence, self.content.maps, shot):
-                del wrong[shot]
+            self.notes.append(str(Finding(view.depth, what)))
+        for view in [view for view, fault in wrong.items() if fault.uncompared]:
+            if roughly_agree(self.content.sequence, self.content.maps, view):
+                del wrong[view]
                 what = "no place is flat enough to be compared with another frame; it is roughly what others see"
-                self.notes.append(str(Finding(shot.depth, what)))
+                self.notes.append(str(Finding(view.depth, what)))
         return wrong
 
-    def _image_faults(self, blamed: Collection[Shot], elsewhere: Elsewhere) -> Iterator[tuple[Shot, Finding]]:
+    def _image_faults(
+        self, wrong: Collection[ImageView], other_images: OtherImages
+    ) -> Iterator[tuple[ImageView, Finding]]:
         """Images compared through depth that is in order; a wrong map would accuse its image too."""
-        content, told = self.content, set()
-        for shot, picture in content.pictures.items():
-            fault = image_checks.colour_fault(picture, content.pictures)
+        content, reported = self.content, set()
+        for view, picture in content.pictures.items():
+            fault = image_checks.single_colour_fault(picture, content.pictures)
             if fault:
-                told.add(shot)
-                yield shot, fault
-        sound = [each for each in self.likenesses if not {each.source, each.target} & {*blamed, *told}]
-        heard = image_checks.heard(sound)
-        for shot, fault in likeness_faults(content.sequence, content.maps, content.pictures, heard, elsewhere):
-            told.add(shot)
-            yield shot, fault
-        for shot, votes in self.votes.items():
+                reported.add(view)
+                yield view, fault
+        sound = [each for each in self.colour_agreements if not {each.source, each.target} & {*wrong, *reported}]
+        sound = image_checks.without_refuted(sound)
+        for view, fault in colour_faults(content.sequence, content.maps, content.pictures, sound, other_images):
+            reported.add(view)
+            yield view, fault
+        for view, votes in self.votes.items():
             rows = image_checks.tile_rows(votes)
-            if shot not in told and shot not in blamed and np.any(rows):
+            if view not in reported and view not in wrong and np.any(rows):
                 what = "a part of these rows shows other colours than two partners at the same surface"
-                yield shot, Finding(shot.image, what, rows_of(rows))
+                yield view, Finding(view.image, what, rows_of(rows))
 
 
-def images_elsewhere(sequence: Sequence, others: Callable[[], Iterable[Sequence]]) -> Elsewhere:
+def images_of_others(sequence: Sequence, others: Callable[[], Iterable[Sequence]]) -> OtherImages:
     """Images of frames of a sequence near one, then of other sequences, those of the same name first."""
 
-    def candidates(shot: Shot) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+    def candidates(view: ImageView) -> Iterator[tuple[str, NDArray[np.uint8]]]:
         if sequence.frames > len(FRAMES):
-            for each in near_shots(shot, sequence.frames):
+            for each in nearby_views(view, sequence.frames):
                 with contextlib.suppress(RsbenchError):
                     yield each.image, read_png(sequence.folder / each.image)
         for other in others():
-            for each in sorted(SHOTS, key=lambda one: one != shot):
+            for each in sorted(IMAGE_VIEWS, key=lambda one: one != view):
                 try:
                     yield f"{other.name}/{each.image}", read_png(other.folder / each.image)
                 except RsbenchError:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import near_shots
-from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Shot, land
+from rsbench.dataset.views import ImageView, nearby_views
+from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, reproject
 
 _TRIED_PIXELS = 20_000
 _PLAIN = 0.8
@@ -19,40 +19,42 @@ _PLAIN = 0.8
 Depth = NDArray[np.float32]
 
 
-def likely_cause(sequence: Sequence, maps: Mapping[Shot, DepthMap], shot: Shot, rows: BoolArray) -> str:
+def likely_cause(sequence: Sequence, maps: Mapping[ImageView, DepthMap], view: ImageView, rows: BoolArray) -> str:
     """In words, "" where nothing explains it. ``rows`` (H,) are those that are wrong."""
-    depth = maps[shot].depth
+    depth = maps[view].depth
     if not np.any(depth[rows]):
         return "zeroed"
-    same = [other for other in maps if other != shot and np.array_equal(depth[rows], maps[other].depth[rows])]
+    same = [other for other in maps if other != view and np.array_equal(depth[rows], maps[other].depth[rows])]
     if same:
         return f"the same as {same[0].depth}"
-    partners = [maps[partner] for partner in shot.partners() if partner in maps]
+    partners = [maps[partner] for partner in view.partners() if partner in maps]
     if not partners:
         return ""
-    best, words = _agreeing(sequence, maps[shot], partners, rows) + 0.3, ""
-    for name, candidate in _candidates(sequence, maps, shot):
+    best, words = _agreeing(sequence, maps[view], partners, rows) + 0.3, ""
+    for name, candidate in _candidates(sequence, maps, view):
         share = _agreeing(sequence, candidate, partners, rows)
         if share > max(best, _PLAIN):
             best, words = share, name
     if words:
         return words
-    scale, share, spread = _scale(sequence, maps[shot], partners, rows)
+    scale, share, spread = _scale(sequence, maps[view], partners, rows)
     if share > _PLAIN and abs(scale - 1) > 1e-6:
         return f"looks scaled by {scale:.7g}"
     return f"looks like noise of {spread:.1e} of the depth" if DEPTH_TOLERANCE / 3 < spread < 0.3 else ""
 
 
-def _candidates(sequence: Sequence, maps: Mapping[Shot, DepthMap], shot: Shot) -> Iterator[tuple[str, DepthMap]]:
-    """Depth maps that the stored one may have been, or the shots whose depth it may be."""
-    stored = maps[shot]
+def _candidates(
+    sequence: Sequence, maps: Mapping[ImageView, DepthMap], view: ImageView
+) -> Iterator[tuple[str, DepthMap]]:
+    """Depth maps that the stored one may have been, or the views whose depth it may be."""
+    stored = maps[view]
     depth = stored.depth
-    for other in near_shots(shot, sequence.frames):
-        yield f"looks like {other.depth}", replace(stored, shot=other)
-    lines = sequence.shutter.lines(shot.side)
-    for line in {1, 2, lines // 4, lines // 2, 3 * lines // 4, lines - 1} if shot.shutter == "gs" else set():
+    for other in nearby_views(view, sequence.frames):
+        yield f"looks like {other.depth}", replace(stored, view=other)
+    lines = sequence.shutter.lines(view.side)
+    for line in {1, 2, lines // 4, lines // 2, 3 * lines // 4, lines - 1} if view.shutter == "gs" else set():
         words = f"looks like the global shutter at the pose of line {line}"
-        yield words, replace(stored, shot=shot._replace(row=line))
+        yield words, replace(stored, view=view._replace(row=line))
     for by in (-1, 1, -2, 2):
         plural = "s" if abs(by) > 1 else ""
         yield f"looks shifted by {abs(by)} row{plural}", replace(stored, depth=np.roll(depth, -by, axis=0))
@@ -69,7 +71,7 @@ def _relative(sequence: Sequence, source: DepthMap, partner: DepthMap, rows: Boo
     stride = max(1, int(np.sqrt(np.sum(rows) * source.depth.shape[1] / _TRIED_PIXELS)))
     if not np.any(rows[::stride]):
         stride = 1
-    relative = land(sequence, source, partner, stride).relative
+    relative = reproject(sequence, source, partner, stride).relative
     chosen = rows[::stride, None] & (source.depth[::stride, ::stride] > 0) & ~np.isnan(relative)
     return relative[chosen]
 

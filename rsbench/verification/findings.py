@@ -56,9 +56,9 @@ class DepthAgreement:
     """File below the folder of the sequence, as ``target`` is."""
     target: str
     compared: int
-    """Pixels on a locally flat surface that land on one in the target and are not plainly hidden there."""
+    """Pixels on a locally flat surface that lie on one in the target and are not plainly hidden there."""
     agreeing: int
-    """Of these, within ``shots.DEPTH_TOLERANCE``."""
+    """Of these, within ``frame_comparison.DEPTH_TOLERANCE``."""
     typical: float
     """Median of the relative difference of the agreeing and near pixels."""
     p99: float

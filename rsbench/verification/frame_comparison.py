@@ -14,20 +14,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import FAR, PAIRS, SHOTS, Geometry, Seen, Shot, points_of, seen_by, seen_from
-
-__all__ = [
-    "DEPTH_TOLERANCE",
-    "FAR",
-    "PAIRS",
-    "SHOTS",
-    "BoolArray",
-    "DepthMap",
-    "Landing",
-    "Shot",
-    "land",
-    "relative_depth",
-]
+from rsbench.dataset.views import FAR, Geometry, ImageView, Seen, points_of, seen_by, seen_from
 
 DEPTH_TOLERANCE = 1e-4
 """Relative difference of two depths of one surface point that still agree."""
@@ -44,7 +31,7 @@ BoolArray = NDArray[np.bool_]
 class DepthMap:
     """A depth map, and where it is one flat surface."""
 
-    shot: Shot
+    view: ImageView
     depth: NDArray[np.float32]
     """(H, W) metres, 0 = no surface."""
     camera: PinholeCamera
@@ -145,7 +132,7 @@ def _window_max(values: NDArray, rows: int, columns: int) -> NDArray:  # pyrefly
     return np.maximum.reduce([tall[:, k : width - columns + 1 + k] for k in range(columns)])
 
 
-class Landing(NamedTuple):
+class Reprojection(NamedTuple):
     """Where the pixels of a source are seen in a target; all (h, w) of the source's pixels, strided."""
 
     pixels: NDArray[np.float32]
@@ -155,7 +142,7 @@ class Landing(NamedTuple):
     is not one flat surface, -inf where it sees none; sky is at 0 in sky, NaN elsewhere."""
 
 
-def land(sequence: Sequence, source: DepthMap, target: DepthMap, stride: int = 1) -> Landing:
+def reproject(sequence: Sequence, source: DepthMap, target: DepthMap, stride: int = 1) -> Reprojection:
     """Carry every ``stride``-th pixel of the source, in both directions, into the target."""
     grid = sequence.rig.camera.pixel_grid()[::stride, ::stride]
     depth = source.depth[::stride, ::stride].astype(np.float64)
@@ -166,16 +153,16 @@ def land(sequence: Sequence, source: DepthMap, target: DepthMap, stride: int = 1
         rows = slice(first, first + step)
         sky = depth[rows] == 0
         numbers = None if source.labels is None else numbers_of(source.labels[::stride, ::stride][rows])
-        seen = seen_with(sequence, source.shot, target.shot, grid[rows], np.where(sky, FAR, depth[rows]), numbers)
+        seen = seen_with(sequence, source.view, target.view, grid[rows], np.where(sky, FAR, depth[rows]), numbers)
         pixels[rows] = seen.pixels
         relative[rows] = relative_depth(target, seen.pixels, seen.depth, sky)
-    return Landing(pixels, relative)
+    return Reprojection(pixels, relative)
 
 
 def seen_with(
     geometry: Geometry,
-    source: Shot,
-    target: Shot,
+    source: ImageView,
+    target: ImageView,
     pixels: FloatArray,
     depth: FloatArray,
     numbers: NDArray[np.uint8] | None,
@@ -198,19 +185,21 @@ def seen_with(
     return seen
 
 
-def in_one_light(sequence: Sequence, source: DepthMap, target: DepthMap, landing: Landing, stride: int) -> Landing:
+def without_changing_light(
+    sequence: Sequence, source: DepthMap, target: DepthMap, reprojection: Reprojection, stride: int
+) -> Reprojection:
     """The same without what colours do not tell: gloss, and what turns, or is shaded by what moves, at another
     time."""
-    one_time = source.shot.side != target.shot.side and sequence.shutter.plain and source.camera.lens is None
+    one_time = source.view.side != target.view.side and sequence.shutter.plain and source.camera.lens is None
     changing = [_changing(each, one_time) for each in (source, target)]
     if not np.any(changing):
-        return landing
+        return reprojection
     own = cv2.dilate(changing[0], np.ones((3, 3), np.uint8))[::stride, ::stride] > 0
     other = cv2.dilate(changing[1], np.ones((5, 5), np.uint8)) > 0
-    x, y = np.rint(np.nan_to_num(landing.pixels)).astype(np.int64).reshape(-1, 2).T
+    x, y = np.rint(np.nan_to_num(reprojection.pixels)).astype(np.int64).reshape(-1, 2).T
     height, width = other.shape
     there = other[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].reshape(own.shape)
-    return landing._replace(relative=np.where(own | there, np.float32(np.nan), landing.relative))
+    return reprojection._replace(relative=np.where(own | there, np.float32(np.nan), reprojection.relative))
 
 
 def _changing(each: DepthMap, one_time: bool) -> NDArray[np.uint8]:
@@ -224,7 +213,7 @@ def _changing(each: DepthMap, one_time: bool) -> NDArray[np.uint8]:
 
 
 def relative_depth(target: DepthMap, pixels: FloatArray, z: FloatArray, sky: BoolArray) -> FloatArray:
-    """See ``Landing.relative``; of points (...) with depth ``z`` seen at ``pixels`` (..., 2) of the target."""
+    """See ``Reprojection.relative``; of points (...) with depth ``z`` at ``pixels`` (..., 2) of the target."""
     height, width = target.depth.shape
     relative = np.full(z.shape, np.nan)
     corner = np.floor(np.where(np.isfinite(pixels), pixels, -1.0)).astype(np.int64)

@@ -1,7 +1,7 @@
 """Masks of glossy surfaces, of which comparisons of images leave out the pixels: nothing may hide behind them.
 
-Where the scene can be built, rays say where it is glossy, and the stored masks only have to agree. Elsewhere they
-are held against each other: a surface is glossy in all pictures or in none.
+Where the scene can be built, rays say where it is glossy, and the stored masks only have to agree. Elsewhere
+they are held against each other: a surface is glossy in all pictures or in none.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 
 from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
-from rsbench.dataset.views import Shot, pairs_of
+from rsbench.dataset.views import ImageView, view_pairs
 from rsbench.verification.content import Content, spare_pixels
 from rsbench.verification.findings import Finding, rows_of
-from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, land
-from rsbench.verification.rerender import Again
+from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, reproject
+from rsbench.verification.rerender import Rerenderer
 
 _OTHER, _FEW = 1e-3, 8
 """Share and number of pixels that rounding on another processor may change, at edges."""
@@ -28,7 +28,7 @@ _LEAST_LEFT = 0.05
 _TRIED_PIXELS = 60_000
 
 
-def known_gloss(content: Content, again: Again | None) -> tuple[list[Finding], bool]:
+def known_gloss(content: Content, again: Rerenderer | None) -> tuple[list[Finding], bool]:
     """Faults of masks against rays, which take their place; and whether there were rays to ask."""
     sequence = content.sequence
     if again is None or not content.maps:
@@ -43,11 +43,11 @@ def known_gloss(content: Content, again: Again | None) -> tuple[list[Finding], b
         if not scene.glossy:
             return [], True
         faults = list[Finding]()
-        for shot, each in content.maps.items():
-            gloss = again.whole(content, shot)[1].gloss
+        for view, each in content.maps.items():
+            gloss = again.whole(content, view)[1].gloss
             faults += _unlike(each, gloss)
-            content.maps[shot] = replace(each, gloss=gloss)
-    except RsbenchError:  # told where rows are rendered again
+            content.maps[view] = replace(each, gloss=gloss)
+    except RsbenchError:  # reported where rows are rendered again
         return [], False
     return faults, True
 
@@ -64,7 +64,7 @@ def _unlike(stored: DepthMap, gloss: BoolArray) -> list[Finding]:
     if np.sum(wrong) <= max(_OTHER * wrong.size, _FEW):
         return []
     what = f"{np.sum(wrong)} of {wrong.size} pixels of the mask differ from what rays meet"
-    return [Finding(stored.shot.gloss, what, rows_of(np.any(wrong, axis=1)))]
+    return [Finding(stored.view.gloss, what, rows_of(np.any(wrong, axis=1)))]
 
 
 def gloss_faults(content: Content, fresh: Content, twins: Content) -> Iterator[Finding]:
@@ -80,16 +80,16 @@ def gloss_faults(content: Content, fresh: Content, twins: Content) -> Iterator[F
     for each in (*fresh.maps.values(), *twins.maps.values()):
         yield from _by_itself(each)
     for part in (content, twins):
-        yield from _dropped(part, {shot: _unlike_twin(content, each) for shot, each in part.maps.items()})
+        yield from _dropped(part, {view: _unlike_twin(content, each) for view, each in part.maps.items()})
     yield from _dropped(content, dict(_contradicted(content)))
-    for shot in fresh.maps.keys() - content.maps.keys():
-        del fresh.maps[shot]
+    for view in fresh.maps.keys() - content.maps.keys():
+        del fresh.maps[view]
 
 
-def _dropped(content: Content, faults: dict[Shot, Finding | None]) -> Iterator[Finding]:
-    for shot, fault in faults.items():
+def _dropped(content: Content, faults: dict[ImageView, Finding | None]) -> Iterator[Finding]:
+    for view, fault in faults.items():
         if fault:
-            del content.maps[shot]
+            del content.maps[view]
             yield fault
 
 
@@ -98,53 +98,53 @@ def _by_itself(each: DepthMap) -> Iterator[Finding]:
     empty = gloss & ~solid
     if np.any(empty):
         what = f"{np.sum(empty)} pixels of the mask show no surface"
-        yield Finding(each.shot.gloss, what, rows_of(np.any(empty, axis=1)))
+        yield Finding(each.view.gloss, what, rows_of(np.any(empty, axis=1)))
     covered = cv2.dilate(gloss.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     left = float(np.sum(solid & ~covered) / max(np.sum(solid), 1))
     if np.any(solid) and left < _LEAST_LEFT:
         what = f"leaves {100 * left:.2g} % of the surfaces to be compared; its scene was not built (see --scene)"
-        yield Finding(each.shot.gloss, what)
+        yield Finding(each.view.gloss, what)
 
 
 def _unlike_twin(content: Content, own: DepthMap) -> Finding | None:
     """The line of a global shutter that its rolling-shutter frame shares."""
-    source, shot = own.shot._replace(shutter="rs", row=0), own.shot
-    if shot == source or source not in content.maps:
+    source, view = own.view._replace(shutter="rs", row=0), own.view
+    if view == source or source not in content.maps:
         return None
     shutter = content.sequence.shutter
-    axis, line = 1 - shutter.axis(shot.side), abs(shutter.first_line(shot.side) - shot.row)
+    axis, line = 1 - shutter.axis(view.side), abs(shutter.first_line(view.side) - view.row)
     unlike = np.take(_of(own), line, axis) != np.take(_of(content.maps[source]), line, axis)
     if np.sum(unlike) <= spare_pixels(axis, unlike.size):
         return None
     words = f"{'row' if axis == 0 else 'column'} {line} differs from {source.gloss}"
-    return Finding(shot.gloss, f"{words}: {np.sum(unlike)} pixels at the same pose")
+    return Finding(view.gloss, f"{words}: {np.sum(unlike)} pixels at the same pose")
 
 
-def _contradicted(content: Content) -> Iterator[tuple[Shot, Finding]]:
+def _contradicted(content: Content) -> Iterator[tuple[ImageView, Finding]]:
     """Masks that others contradict, in the order of how many pairs each alone explains."""
-    pairs = pairs_of((content.times[0], content.times[-1]))
+    pairs = view_pairs((content.times[0], content.times[-1]))
     there = [(one, other) for one, other in pairs if {one, other} <= content.maps.keys()]
     wrong = {pair: _contradiction(content, *pair) for pair in there}
     left = [pair for pair, rows in wrong.items() if np.any(rows)]
     while left:
-        counts = Counter(shot for pair in left for shot in pair)
-        worst = max(counts, key=lambda shot: (counts[shot], sum(np.sum(wrong[p]) for p in left if shot in p)))
+        counts = Counter(view for pair in left for view in pair)
+        worst = max(counts, key=lambda view: (counts[view], sum(np.sum(wrong[p]) for p in left if view in p)))
         own = [pair for pair in left if worst in pair]
-        others = sorted({shot.gloss for pair in own for shot in pair} - {worst.gloss})
+        others = sorted({view.gloss for pair in own for view in pair} - {worst.gloss})
         rows = [wrong[pair] for pair in own if pair[0] == worst]
         words = rows_of(np.any(rows, axis=0)) if rows else ""
         yield worst, Finding(worst.gloss, f"marks other surfaces than {', '.join(others)}", words)
         left = [pair for pair in left if worst not in pair]
 
 
-def _contradiction(content: Content, one: Shot, other: Shot) -> BoolArray:
+def _contradiction(content: Content, one: ImageView, other: ImageView) -> BoolArray:
     """(H,) rows of a map in which even surfaces are marked, or not, as another map has it not."""
     source, target = content.maps[one], content.maps[other]
     stride = max(1, int(np.sqrt(source.depth.size / _TRIED_PIXELS)))
-    landing = land(content.sequence, source, target, stride)
+    reprojection = reproject(content.sequence, source, target, stride)
     with np.errstate(invalid="ignore"):
-        alike = (np.abs(landing.relative) <= DEPTH_TOLERANCE) & source.flat[::stride, ::stride]
-    x, y = np.rint(np.nan_to_num(landing.pixels)).astype(np.int64).reshape(-1, 2).T
+        alike = (np.abs(reprojection.relative) <= DEPTH_TOLERANCE) & source.flat[::stride, ::stride]
+    x, y = np.rint(np.nan_to_num(reprojection.pixels)).astype(np.int64).reshape(-1, 2).T
     height, width = target.depth.shape
     place = np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)
     (least, most), there = _span(source), _span(target)

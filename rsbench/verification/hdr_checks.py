@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.channels import radiance_file
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import Shot
+from rsbench.dataset.views import ImageView
 from rsbench.renderers.image import linear_of_codes, to_srgb8
 from rsbench.verification.content import clean_picture
 from rsbench.verification.findings import Finding, rows_of
@@ -21,18 +21,20 @@ _CODE = 0.54
 _FEW, _LEAST = 1e-3, 8
 
 
-def hdr_faults(sequence: Sequence, pictures: Mapping[Shot, Picture], told: Collection[str]) -> Iterator[Finding]:
-    """What linear images show otherwise than the clean images, but for files ``told``."""
+def hdr_faults(
+    sequence: Sequence, pictures: Mapping[ImageView, Picture], reported: Collection[str]
+) -> Iterator[Finding]:
+    """What linear images show otherwise than the clean images, but for files ``reported``."""
     renderer = sequence.manifest.get("renderer")
     exposure = renderer.get("exposure") if isinstance(renderer, dict) else None
     if "hdr" not in sequence.channels or not isinstance(exposure, float):
         return
-    for shot, picture in pictures.items():
-        file, image = radiance_file(shot.side, shot.frame), clean_picture(sequence, shot)
-        if shot.shutter != "rs" or {file, image} & set(told):
+    for view, picture in pictures.items():
+        file, image = radiance_file(view.side, view.frame), clean_picture(sequence, view)
+        if view.shutter != "rs" or {file, image} & set(reported):
             continue
         try:
-            radiance = sequence.radiance(shot.side, shot.frame)
+            radiance = sequence.radiance(view.side, view.frame)
         except RsbenchError as error:
             yield Finding.of(error)
             continue

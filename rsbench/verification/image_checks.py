@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.dataset.views import ImageView
 from rsbench.verification.findings import Finding
-from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Landing, Shot
+from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Reprojection
 
 Colours = NDArray[np.float32]
 _BEYOND = 6.0
@@ -83,7 +84,7 @@ the surface moves by about a pixel, the noise looks shifted."""
 class Picture:
     """An image in float32, and what its neighbourhoods span."""
 
-    shot: Shot
+    view: ImageView
     colours: Colours
     """(H, W, 3) 8-bit codes."""
     noise: float
@@ -95,12 +96,12 @@ class Picture:
     """Whether a path tracer made it, so that what looks like noise is."""
 
     @classmethod
-    def of(cls, shot: Shot, image: NDArray[np.uint8], noisy: bool) -> Picture:
+    def of(cls, view: ImageView, image: NDArray[np.uint8], noisy: bool) -> Picture:
         colours = image.astype(np.float32)
         noise, around = noise_of(colours), np.ones((3, 3), np.uint8)
         beyond = np.float32(_BEYOND + (_NOISE_FACTOR * noise if noisy else 0.0))
         return cls(
-            shot,
+            view,
             colours,
             noise,
             cv2.erode(colours, around) - beyond,
@@ -118,11 +119,11 @@ def noise_of(colours: Colours) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Likeness:
+class ColourAgreement:
     """How an image looks like what another one shows of the same surface, by bands of rows."""
 
-    source: Shot
-    target: Shot
+    source: ImageView
+    target: ImageView
     pixels: NDArray[np.float64]
     """(B,) compared."""
     beyond: NDArray[np.float64]
@@ -135,7 +136,7 @@ class Likeness:
     """(B,) what the best single colour would cost."""
     refuted: BoolArray
     """(C, B) changes of the source that this pair cannot tell, or that another partner clearly speaks against, see
-    ``heard``."""
+    ``without_refuted``."""
 
     @property
     def judged(self) -> BoolArray:
@@ -186,13 +187,13 @@ def band_of_row(height: int) -> NDArray[np.int64]:
 
 
 def show(
-    surface: DepthMap, target: Picture, landing: Landing, stride: int
+    surface: DepthMap, target: Picture, reprojection: Reprojection, stride: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Colours]:
     """Rows and columns (n,) of the source that see one flat surface, or the sky, as the target does, and its
-    colours (n, 3) there; ``landing`` has every ``stride``-th pixel."""
+    colours (n, 3) there; ``reprojection`` has every ``stride``-th pixel."""
     even = surface.flat | (surface.depth == 0)
-    y, x = np.nonzero(even[::stride, ::stride] & (np.abs(landing.relative) <= DEPTH_TOLERANCE))
-    places = np.nan_to_num(landing.pixels)
+    y, x = np.nonzero(even[::stride, ::stride] & (np.abs(reprojection.relative) <= DEPTH_TOLERANCE))
+    places = np.nan_to_num(reprojection.pixels)
     shown = cv2.remap(target.colours, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return y * stride, x * stride, shown[y, x]
 
@@ -203,11 +204,16 @@ def difference(colours: Colours, shown: Colours) -> Colours:
 
 
 def compare(
-    source: Picture, target: Picture, surface: DepthMap, landing: Landing, votes: ImageVotes, stride: int = 1
-) -> Likeness:
-    """Compare the pixels that see one flat surface, or the sky, in both; ``landing`` has every ``stride``-th."""
-    y, x, shown = show(surface, target, landing, stride)
-    near = np.rint(landing.pixels[y // stride, x // stride]).astype(np.int64)
+    source: Picture,
+    target: Picture,
+    surface: DepthMap,
+    reprojection: Reprojection,
+    votes: ImageVotes,
+    stride: int = 1,
+) -> ColourAgreement:
+    """Compare the pixels that see one flat surface, or the sky, in both, of every ``stride``-th."""
+    y, x, shown = show(surface, target, reprojection, stride)
+    near = np.rint(reprojection.pixels[y // stride, x // stride]).astype(np.int64)
     colours = source.colours[y, x]
     height, width = surface.depth.shape
     near_x, near_y = np.clip(near[:, 0], 0, width - 1), np.clip(near[:, 1], 0, height - 1)
@@ -222,9 +228,9 @@ def compare(
     every = slice(None, None, max(1, len(y) // _SAMPLES))
     costs = _costs(source.colours, y[every], x[every], shown[every], bands[y[every]], count)
     refuted = np.zeros(costs[0].shape, dtype=np.bool_)
-    if source.noisy and source.shot[1:3] == target.shot[1:3]:
+    if source.noisy and source.view[1:3] == target.view[1:3]:
         refuted[_SHIFTS] = True
-    return Likeness(source.shot, target.shot, pixels.astype(np.float64), share, *costs, refuted)
+    return ColourAgreement(source.view, target.view, pixels.astype(np.float64), share, *costs, refuted)
 
 
 def _costs(
@@ -255,24 +261,24 @@ def _costs(
     return np.stack(costs), np.stack(errors), mean(difference(middle[bands], shown))
 
 
-def heard(likenesses: list[Likeness]) -> list[Likeness]:
+def without_refuted(agreements: list[ColourAgreement]) -> list[ColourAgreement]:
     """The same, where no change of an image stands that another partner refutes: what is wrong with an image, all
     see; but a texture finer than a pixel is another one from each place."""
     result = []
-    for each in likenesses:
-        others = [other.worse for other in likenesses if other.source == each.source and other is not each]
+    for each in agreements:
+        others = [other.worse for other in agreements if other.source == each.source and other is not each]
         result.append(replace(each, refuted=np.any([each.refuted, *others], axis=0)))
     return result
 
 
-def culprits(likenesses: list[Likeness]) -> Iterator[tuple[Shot, list[Likeness]]]:
+def wrong_images(agreements: list[ColourAgreement]) -> Iterator[tuple[ImageView, list[ColourAgreement]]]:
     """Images in the order of how many disagreeing pairs each alone explains, with these pairs."""
-    left = [each for each in likenesses if np.any(each.unlike)]
+    left = [each for each in agreements if np.any(each.unlike)]
     while left:
-        counts = Counter(shot for each in left for shot in (each.source, each.target))
-        worst = max(counts, key=lambda shot: counts[shot])
+        counts = Counter(view for each in left for view in (each.source, each.target))
+        worst = max(counts, key=lambda view: counts[view])
         pairs = [each for each in left if worst in (each.source, each.target)]
-        partners = {shot for each in pairs for shot in (each.source, each.target)} - {worst}
+        partners = {view for each in pairs for view in (each.source, each.target)} - {worst}
         if len(partners) > 1 or sum(int(np.sum(each.unlike)) for each in pairs) >= _LEAST_EVIDENCE:
             yield worst, pairs
         left = [each for each in left if worst not in (each.source, each.target)]
@@ -290,14 +296,14 @@ def tile_rows(votes: ImageVotes) -> BoolArray:
     return np.repeat(np.any(spoilt, axis=1), _TILE)[:height]
 
 
-def colour_fault(picture: Picture, others: Mapping[Shot, Picture]) -> Finding | None:
+def single_colour_fault(picture: Picture, others: Mapping[ImageView, Picture]) -> Finding | None:
     """An image of one colour, or of greys where others have colours."""
     if np.ptp(picture.colours) == 0 and any(np.ptp(other.colours) > 0 for other in others.values()):
         codes = ", ".join(f"{code:g}" for code in picture.colours[0, 0])
         what = "black" if not np.any(picture.colours) else f"of one colour ({codes})"
-        return Finding(picture.shot.image, f"the image is {what}", "all rows")
+        return Finding(picture.view.image, f"the image is {what}", "all rows")
     if _chroma(picture) == 0 and any(_chroma(other) > 1.0 for other in others.values()):
-        return Finding(picture.shot.image, "the image is grey where others have colours", "all rows")
+        return Finding(picture.view.image, "the image is grey where others have colours", "all rows")
     return None
 
 

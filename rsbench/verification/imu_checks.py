@@ -32,8 +32,8 @@ _SIGMAS = 6.0
 _KINDS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 6)}
 
 
-def imu_faults(sequence: Sequence, told: Collection[str]) -> Iterator[Finding]:
-    """What the inertial sensor shows that the motion cannot have made, but for files ``told``."""
+def imu_faults(sequence: Sequence, reported: Collection[str]) -> Iterator[Finding]:
+    """What the inertial sensor shows that the motion cannot have made, but for files ``reported``."""
     if "imu" not in sequence.channels:
         return
     try:
@@ -43,9 +43,9 @@ def imu_faults(sequence: Sequence, told: Collection[str]) -> Iterator[Finding]:
         if imu is None:
             yield Finding("sequence.json", "lacks 'imu', the sensor of the channel of this name")
             return
-        if IMU_MANIFEST not in told:
+        if IMU_MANIFEST not in reported:
             yield from _manifest_faults(sequence, imu, gravity)
-        if not {MEASURED, TRUE} & set(told):
+        if not {MEASURED, TRUE} & set(reported):
             yield from _sample_faults(sequence, imu, gravity, sequence.inertial())
     except RsbenchError as error:
         yield Finding.of(error)
@@ -98,10 +98,10 @@ def _noise_faults(imu: Imu, samples: ImuSamples, upward: FloatArray) -> Iterator
             (TRUE, f"steps of the bias of the {name}", steps, walk),
             (MEASURED, f"noise of the {name}", white, noise),
         ):
-            told = _unlike(values[:, columns], float(sigma[columns][0]))
-            if told:
+            unlike = _unlike(values[:, columns], float(sigma[columns][0]))
+            if unlike:
                 shown = samples.measured[:, columns], samples.true[:, columns], upward[:, columns]
-                yield Finding(file, f"{words} {told}", cause=_cause(*shown) if file == MEASURED else "")
+                yield Finding(file, f"{words} {unlike}", cause=_cause(*shown) if file == MEASURED else "")
 
 
 def _unlike(values: FloatArray, sigma: float) -> str:

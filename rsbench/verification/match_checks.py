@@ -32,7 +32,7 @@ from rsbench.dataset.match_truth import (
 )
 from rsbench.dataset.matches import MATCHED, LabelledMatches, MatchClass, Matching, PairLabels
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import FAR, Shot
+from rsbench.dataset.views import FAR, ImageView
 from rsbench.verification.findings import Finding
 from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, DepthMap, relative_depth
 from rsbench.verification.track_checks import depths_around
@@ -54,17 +54,17 @@ _OURS = f"{SiftMatcher.__module__}:{SiftMatcher.__qualname__}"
 
 
 def match_faults(
-    sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str], first: int = 0
+    sequence: Sequence, maps: Mapping[ImageView, DepthMap], reported: Collection[str], first: int = 0
 ) -> Iterator[Finding]:
     """What the labels of frame ``first`` and the next show that depth maps and motion cannot have made.
 
-    But for files ``told``.
+    But for files ``reported``.
     """
     if "matches" not in sequence.channels:
         return
     matching = sequence.matching or Matching()
-    yield from _record_faults(sequence, matching, told)
-    if (stored := matches_file(first)) in told:
+    yield from _record_faults(sequence, matching, reported)
+    if (stored := matches_file(first)) in reported:
         return
     try:
         matches = sequence.matches(first)
@@ -78,14 +78,14 @@ def match_faults(
         if np.any(outside):
             yield found(f"{np.sum(outside)} matches have a keypoint beside the images")
             continue
-        yield from _depth_faults(sequence, part, source, maps, told, found)
+        yield from _depth_faults(sequence, part, source, maps, reported, found)
         yield from _truth_faults(sequence, part, source, target, found)
-        yield from _class_faults(sequence, part, source, target, maps, told, matching.bound_px, found)
+        yield from _class_faults(sequence, part, source, target, maps, reported, matching.bound_px, found)
 
 
-def _record_faults(sequence: Sequence, matching: Matching, told: Collection[str]) -> Iterator[Finding]:
+def _record_faults(sequence: Sequence, matching: Matching, reported: Collection[str]) -> Iterator[Finding]:
     """matcher.json against sequence.json, and against the card of the same name where this version wrote it."""
-    if MATCHER in told:
+    if MATCHER in reported:
         return
     try:
         record = sequence.matcher()
@@ -108,24 +108,24 @@ def _depth_faults(
     sequence: Sequence,
     part: PairLabels,
     source: View,
-    maps: Mapping[Shot, DepthMap],
-    told: Collection[str],
+    maps: Mapping[ImageView, DepthMap],
+    reported: Collection[str],
     found: Report,
 ) -> Iterator[Finding]:
     """The depth of keypoints is that of the flat surface around them, or between those of the pixels around."""
-    shot = Shot("rs", *source)
-    if shot not in maps or shot.depth in told:
+    view = ImageView("rs", *source)
+    if view not in maps or view.depth in reported:
         return
     sky = part.depth == 0.0
-    relative = relative_depth(maps[shot], part.pixels[:, 0], part.depth, sky)
-    low, high = depths_around(maps[shot].depth, part.pixels[:, 0])
+    relative = relative_depth(maps[view], part.pixels[:, 0], part.depth, sky)
+    low, high = depths_around(maps[view].depth, part.pixels[:, 0])
     z = np.where(sky, np.inf, part.depth)
     with np.errstate(invalid="ignore"):
         flat, beside = np.isfinite(relative), (z < low * (1 - _BESIDE)) | (z > high * (1 + _BESIDE))
         off = flat & (np.abs(relative) > DEPTH_TOLERANCE)
     for wrong, among, few in ((off, flat, _FEW_OTHERS), (beside, np.ones_like(flat), _FEW_BESIDE)):
         if np.sum(wrong) > max(few * np.sum(among), _LEAST):
-            what = f"the depth of {np.sum(wrong)} of {np.sum(among)} keypoints is not that of {shot.depth}"
+            what = f"the depth of {np.sum(wrong)} of {np.sum(among)} keypoints is not that of {view.depth}"
             ratio = float(np.median(1.0 + relative[off])) if np.any(off) else 1.0
             scaled = np.mean(np.abs(relative[off] + 1.0 - ratio) < DEPTH_TOLERANCE) > 0.5 if np.any(off) else False
             yield found(what, cause=f"looks scaled by {ratio:.6g}" if scaled else "")
@@ -161,8 +161,8 @@ def _class_faults(
     part: PairLabels,
     source: View,
     target: View,
-    maps: Mapping[Shot, DepthMap],
-    told: Collection[str],
+    maps: Mapping[ImageView, DepthMap],
+    reported: Collection[str],
     bound_px: float,
     found: Report,
 ) -> Iterator[Finding]:
@@ -173,20 +173,20 @@ def _class_faults(
     if np.any(made != part.classes):
         what = f"{np.sum(made != part.classes)} of {len(made)} classes are not what error and depth make"
         yield found(f"{what}, within {bound_px:g} px")
-    shot, seen = Shot("rs", *target), np.isfinite(part.error) & (part.depth > 0.0)
-    if shot not in maps or shot.depth in told:
+    view, seen = ImageView("rs", *target), np.isfinite(part.error) & (part.depth > 0.0)
+    if view not in maps or view.depth in reported:
         return
     points, places = _points(sequence, part, source)[seen], part.truth[seen]
     times = sequence.shutter.pixel_time(places, target[1], target[0])
     z = project_at(sequence.rig, sequence.motion, target[0], times, points)[:, 2]
-    low, high = depths_around(maps[shot].depth, places)
+    low, high = depths_around(maps[view].depth, places)
     for words, so, wrong in (
         ("are in sight, but hidden by", z > high * (1 + _BESIDE), ~hidden[seen]),
         ("are hidden, but in sight by", z < low * (1 + _BESIDE), hidden[seen]),
     ):
         # Where few points are hidden, all of them may be by things thinner than a pixel.
         if np.sum(so & wrong) > max(_FEW_BESIDE * np.sum(so), _FEW_OTHERS * np.sum(seen), _LEAST):
-            yield found(f"{np.sum(so & wrong)} of {np.sum(seen)} points {words} {shot.depth}")
+            yield found(f"{np.sum(so & wrong)} of {np.sum(seen)} points {words} {view.depth}")
 
 
 def _points(sequence: Sequence, part: PairLabels, source: View) -> FloatArray:
@@ -195,20 +195,22 @@ def _points(sequence: Sequence, part: PairLabels, source: View) -> FloatArray:
     return eyes + np.where(part.depth > 0.0, part.depth, FAR)[:, None] * (ahead - eyes)
 
 
-def matched_again(sequence: Sequence, told: Collection[str], first: int = 0) -> tuple[list[Finding], list[str]]:
+def matched_again(
+    sequence: Sequence, reported: Collection[str], first: int = 0
+) -> tuple[list[Finding], list[str]]:
     """Faults of matches that the stated matcher does not find in the pictures, and notes where it was not asked.
 
     Only rsbench's own matcher is asked, in the versions that made them: what a dataset names is never imported.
     """
-    shots, file = [Shot("rs", *at(view, first)) for view in VIEWS], matches_file(first)
-    if "matches" not in sequence.channels or {*(each.image for each in shots), file, MATCHER} & set(told):
+    images_of, file = [ImageView("rs", *at(view, first)) for view in VIEWS], matches_file(first)
+    if "matches" not in sequence.channels or {*(each.image for each in images_of), file, MATCHER} & set(reported):
         return [], []
     try:
         stored, record = sequence.matches(first), sequence.matcher()
         if record.get("class") != _OURS or record.get("versions") != _versions():
             return [], [str(Finding(file, "not matched again: another matcher or version made it"))]
         component = parse_card(SiftMatcher, record["parameters"], f"{MATCHER}: parameters")
-        images = {each[1:3]: sequence.image(*each) for each in shots}
+        images = {each[1:3]: sequence.image(*each) for each in images_of}
         found = matched_frames(sequence, first, images, wrap(FEATURE_MATCHERS, component))
     except RsbenchError as error:
         return [Finding.of(error)], []
@@ -229,14 +231,14 @@ def _unlike_faults(file: str, stored: LabelledMatches, found: Arranged) -> Itera
 
 
 def matches_again(
-    sequence: Sequence, first: int, rays: Meets, told: Collection[str]
+    sequence: Sequence, first: int, rays: Meets, reported: Collection[str]
 ) -> Iterator[tuple[str, Finding | None, bool]]:
     """As ``channel_checks.channels_again``, of matches of frame ``first`` and the next: what rays say of each."""
-    if "matches" not in sequence.channels or (file := matches_file(first)) in told:
+    if "matches" not in sequence.channels or (file := matches_file(first)) in reported:
         return
     try:
         stored = sequence.matches(first)
-    except RsbenchError:  # told already
+    except RsbenchError:  # reported already
         return
     as_given = Arranged(stored.sets, stored.tracks, stored.pixels)
     made = labelled(sequence, first, as_given, (sequence.matching or Matching()).bound_px, rays)

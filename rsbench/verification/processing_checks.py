@@ -37,7 +37,7 @@ _DCT = 0.5 * np.cos(np.pi / 16 * np.outer(np.arange(8), 2 * np.arange(8) + 1)) *
 """Orthonormal discrete cosine transform of eight values (ITU-T T.81, A.3.3)."""
 
 
-class _Told(NamedTuple):
+class _Counts(NamedTuple):
     """Of each row of pixels (H,) how many values are not what they should be, and how many tell."""
 
     wrong: FloatArray
@@ -78,11 +78,11 @@ def _first(values: Iterable[T]) -> T | None:
     return next(iter(values), None)
 
 
-def _fits(told: _Told) -> bool:
-    return bool(np.sum(told.asked) >= _LEAST and np.sum(told.wrong) <= _MOST * np.sum(told.asked))
+def _fits(counts: _Counts) -> bool:
+    return bool(np.sum(counts.asked) >= _LEAST and np.sum(counts.wrong) <= _MOST * np.sum(counts.asked))
 
 
-def _not_means(image: NDArray[np.uint8], mosaic: Mosaic) -> _Told:
+def _not_means(image: NDArray[np.uint8], mosaic: Mosaic) -> _Counts:
     """Interpolated values that are not the mean of the neighbours behind filters of their colour."""
     height, width = image.shape[:2]
     light, codes = linear_of_codes(image), image.astype(np.float64)
@@ -98,10 +98,10 @@ def _not_means(image: NDArray[np.uint8], mosaic: Mosaic) -> _Told:
         level, upright = (np.any(own == channel, axis=axis, keepdims=True) for axis in (1, 0))
         # Of two directions the camera has chosen one, by numbers that rounding has changed.
         right = np.where(level | upright, (across & level) | (down & upright), corners)
-        told = inner & (own != channel)
-        wrong += np.sum(told & ~right, axis=1)
-        asked += np.sum(told, axis=1)
-    return _Told(wrong, asked)
+        judged = inner & (own != channel)
+        wrong += np.sum(judged & ~right, axis=1)
+        asked += np.sum(judged, axis=1)
+    return _Counts(wrong, asked)
 
 
 _KERNELS = [
@@ -133,13 +133,15 @@ class _Blocks(NamedTuple):
         open_ = np.all((blocks > 0) & (blocks < 255), axis=4) & (np.abs(luminance) < _OPEN)
         return cls(_DCT @ luminance @ _DCT.T, np.all(open_, axis=(2, 3)), len(image))
 
-    def off_steps(self, quality: int) -> _Told:
+    def off_steps(self, quality: int) -> _Counts:
         """Coefficients that are not whole steps."""
         steps = quality_steps(quality)
         off = np.abs(self.coefficients - steps * np.round(self.coefficients / steps)) > _OFF
-        told = np.broadcast_to(self.open[..., None, None] & (steps >= _COARSE), off.shape)
-        counts = (np.sum(each, axis=(1, 2, 3)).repeat(_BLOCK).astype(np.float64) for each in (off & told, told))
-        return _Told(*(np.pad(each, (0, self.rows - len(each))) for each in counts))
+        judged = np.broadcast_to(self.open[..., None, None] & (steps >= _COARSE), off.shape)
+        counts = (
+            np.sum(each, axis=(1, 2, 3)).repeat(_BLOCK).astype(np.float64) for each in (off & judged, judged)
+        )
+        return _Counts(*(np.pad(each, (0, self.rows - len(each))) for each in counts))
 
 
 @cache

@@ -35,7 +35,7 @@ class Check:
 def label_checks(stored: DepthMap, rendered: NDArray[np.uint8], rows: list[int]) -> Iterator[Check]:
     if stored.labels is None:
         return
-    wrong, file = stored.labels[rows] != rendered, stored.shot.labels
+    wrong, file = stored.labels[rows] != rendered, stored.view.labels
     what = f"{100 * np.mean(wrong):.2g} % of {wrong.size} labels differ from what is rendered again"
     in_rows = np.isin(np.arange(len(stored.labels)), np.asarray(rows)[np.any(wrong, axis=1)])
     bad = np.sum(wrong) > max(_OTHER_LABELS * wrong.size, _FEW_LABELS)
@@ -43,7 +43,7 @@ def label_checks(stored: DepthMap, rendered: NDArray[np.uint8], rows: list[int])
 
 
 def depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]) -> Check:
-    depth, file = stored.depth[rows], stored.shot.depth
+    depth, file = stored.depth[rows], stored.view.depth
     wrong = np.abs(depth - rendered) > SAME_DEPTH * np.maximum(depth, rendered)
     share = float(np.mean(wrong))
     if share <= _OTHER_DEPTH:

@@ -21,11 +21,11 @@ from rsbench.core.moving_objects import poses_of
 from rsbench.core.projection import row_poses
 from rsbench.core.version import __version__
 from rsbench.dataset.channels import AFFINE, TRACKS, matches_file
-from rsbench.dataset.generation import render_shot
+from rsbench.dataset.generation import render_view
 from rsbench.dataset.layout import whole_frames
 from rsbench.dataset.scene_hashes import scene_hash
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import SHOTS, Shot, image_seed, shots_of
+from rsbench.dataset.views import IMAGE_VIEWS, ImageView, image_seed, image_views
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene, read_scene_card
 from rsbench.scenes.model import Start
@@ -38,7 +38,7 @@ from rsbench.verification.image_checks import Picture
 from rsbench.verification.match_checks import matches_again
 from rsbench.verification.mesh_files import with_files
 from rsbench.verification.rendered_checks import SAME_DEPTH, Check, depth_check, image_check, label_checks
-from rsbench.verification.stacks import stack_rows
+from rsbench.verification.stack_checks import stack_rows
 from rsbench.verification.surface_checks import surfaces_again
 from rsbench.verification.track_checks import tracks_again
 
@@ -60,7 +60,7 @@ _MOST_RAYS = 2e8
 
 
 @dataclass(eq=False)
-class Again:
+class Rerenderer:
     """Renders rows of sequences again; keeps the scene of the last one."""
 
     mode: Rerender
@@ -70,23 +70,23 @@ class Again:
     """Of objects that move, likewise."""
     _built: tuple[tuple[object, ...], str, MitsubaScene] | None = field(default=None, init=False)
 
-    def is_right(self, content: Content, shot: Shot) -> bool:
+    def depth_is_rendered(self, content: Content, view: ImageView) -> bool:
         """Whether a depth map is what its scene looks like, at every pixel: that takes but one ray for each."""
-        with contextlib.suppress(RsbenchError):  # told by ``check``
-            stored, rendered = content.maps[shot].depth, self.whole(content, shot)[1].depth
+        with contextlib.suppress(RsbenchError):  # reported by ``check``
+            stored, rendered = content.maps[view].depth, self.whole(content, view)[1].depth
             return bool(np.all(np.abs(stored - rendered) <= SAME_DEPTH * np.maximum(stored, rendered)))
         return False
 
-    def shows(self, content: Content, shot: Shot) -> bool:
+    def image_is_rendered(self, content: Content, view: ImageView) -> bool:
         """Whether a picture, without its sensor, is what its scene looks like: all of it, with all samples."""
         manifest, camera = content.sequence.manifest, content.sequence.rig.camera
-        with contextlib.suppress(RsbenchError):  # told by ``check``
+        with contextlib.suppress(RsbenchError):  # reported by ``check``
             options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
             rows = list(range(camera.height))
             if _rays_of(camera.width, options) * camera.height > _MOST_RAYS:
                 return False
             scene, _ = self.scene(content.sequence)
-            check = _picture_check(content, _render(content, scene, options, shot, rows), options, shot, rows)
+            check = _picture_check(content, _render(content, scene, options, view, rows), options, view, rows)
             return check.same_bits or not (check.fault or _made_here(content))
         return False
 
@@ -97,11 +97,11 @@ class Again:
         sequence, same = content.sequence, set[str]()
         rows = list(range(sequence.rig.camera.height))
         with contextlib.suppress(RsbenchError):
-            for shot in [each for each in shots_of(content.times) if each.shutter == "rs"]:
-                if any(f"/{shot.side}_{shot.frame}." in file for file in accused):
-                    scene, frame = self.whole(content, shot)
+            for view in [each for each in image_views(content.times) if each.shutter == "rs"]:
+                if any(f"/{view.side}_{view.frame}." in file for file in accused):
+                    scene, frame = self.whole(content, view)
                     for made in (channels_again, surfaces_again):
-                        checks = made(sequence, shot, rows, frame, SceneRays(scene, sequence.objects), ())
+                        checks = made(sequence, view, rows, frame, SceneRays(scene, sequence.objects), ())
                         same |= {file for file, _, alike in checks if alike}
             scene, _ = self.scene(sequence)
             for file, again in ((TRACKS, tracks_again), (AFFINE, affine_again)):
@@ -113,13 +113,13 @@ class Again:
                     same |= {name for name, _, alike in checks if alike}
         return same & set(accused)
 
-    def whole(self, content: Content, shot: Shot) -> tuple[MitsubaScene, Frame]:
+    def whole(self, content: Content, view: ImageView) -> tuple[MitsubaScene, Frame]:
         """The scene of a sequence, and a whole frame of it, of one sample."""
         manifest = content.sequence.manifest
         options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
         scene, _ = self.scene(content.sequence)
         quick = replace(options, samples=1, integrator="sunsky")
-        return scene, _render(content, scene, quick, shot, list(range(content.sequence.rig.camera.height)))
+        return scene, _render(content, scene, quick, view, list(range(content.sequence.rig.camera.height)))
 
     def scene(self, sequence: Sequence) -> tuple[MitsubaScene, str]:
         """The scene of a sequence in the renderer, and its hash."""
@@ -151,10 +151,10 @@ class Again:
         return self._built[2], self._built[1]
 
 
-class Redone:
+class RerenderedRows:
     """Rows of one sequence rendered again, some frames after the other."""
 
-    def __init__(self, again: Again, sequence: Sequence) -> None:
+    def __init__(self, again: Rerenderer, sequence: Sequence) -> None:
         self._sequence, self._checks = sequence, list[Check]()
         self._begun, self._seconds, self._refusal = time.perf_counter(), 0.0, ""
         try:
@@ -170,24 +170,24 @@ class Redone:
             self._refusal = "no row rendered again: its renderer takes too many samples; --rerender all does it"
         self._seconds = time.perf_counter() - self._begun
 
-    def add(self, content: Content, told: set[str]) -> None:
-        """Render again what was read, but for channels that are ``told`` already."""
+    def add(self, content: Content, reported: set[str]) -> None:
+        """Render again what was read, but for channels that are ``reported`` already."""
         if not self._refusal:
-            self._take(_checks(content, self._scene, self._options, self._rows, told))
+            self._take(_checks(content, self._scene, self._options, self._rows, reported))
 
     def _take(self, checks: Iterator[Check]) -> None:
         start = time.perf_counter()
         self._checks += checks
         self._seconds += time.perf_counter() - start
 
-    def end(self, told: set[str]) -> tuple[list[Finding], str]:
-        """Faults of files that are not ``told`` yet, and what was done or why not."""
+    def end(self, reported: set[str]) -> tuple[list[Finding], str]:
+        """Faults of files that are not ``reported`` yet, and what was done or why not."""
         if self._refusal:
             return [], self._refusal
         manifest, checks = self._sequence.manifest, self._checks
         rays, pairs = _rays(self._scene), range(self._sequence.frames - 1)
-        of_matches = (each for first in pairs for each in matches_again(self._sequence, first, rays, told))
-        of_points = (made(self._sequence, rays, told) for made in (tracks_again, affine_again))
+        of_matches = (each for first in pairs for each in matches_again(self._sequence, first, rays, reported))
+        of_points = (made(self._sequence, rays, reported) for made in (tracks_again, affine_again))
         again = chain(*of_points, of_matches)
         self._take(Check(*check) for check in again)
         wrong = [check for check in checks if check.fault]
@@ -202,7 +202,7 @@ class Redone:
             return [Finding("sequence.json", what, cause=cause)], done
         same = all(check.same_bits for check in checks)
         done += _ALIKE[0] if same else "" if wrong else _ALIKE[1]
-        return [check.fault for check in wrong if check.fault and check.file not in told], done
+        return [check.fault for check in wrong if check.fault and check.file not in reported], done
 
 
 def _rays(scene: MitsubaScene) -> SceneRays:
@@ -216,8 +216,8 @@ def _rows_of(mode: Rerender, sequence: Sequence, options: RendererOptions) -> li
     camera = sequence.rig.camera
     if mode == "all":
         return list(range(camera.height))
-    shots = len(SHOTS) * sequence.frames // 2
-    affordable = int(_MOST_RAYS / (shots * _rays_of(camera.width, options)))
+    views = len(IMAGE_VIEWS) * sequence.frames // 2
+    affordable = int(_MOST_RAYS / (views * _rays_of(camera.width, options)))
     count = min(_ROWS, camera.height, affordable)
     digest = hashlib.sha256(repr(sequence.manifest.get("files")).encode()).digest()
     rng = np.random.default_rng(int.from_bytes(digest[:8], "little"))
@@ -237,38 +237,45 @@ def _table(manifest: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 
 def _checks(
-    content: Content, scene: MitsubaScene, options: RendererOptions, rows: list[int], told: set[str]
+    content: Content, scene: MitsubaScene, options: RendererOptions, rows: list[int], reported: set[str]
 ) -> Iterator[Check]:
     from rsbench.renderers.visibility import SceneRays
 
-    own = shots_of(content.times)
+    own = image_views(content.times)
     twins = (each._replace(row=row) for row in content.sequence.twins for each in own if each.shutter == "gs")
-    for shot in (*own, *twins):
-        if shot not in content.maps and shot not in content.pictures:
+    for view in (*own, *twins):
+        if view not in content.maps and view not in content.pictures:
             continue
-        frame = _render(content, scene, options, shot, rows)
-        if shot in content.maps:
-            yield depth_check(content.maps[shot], frame.depth, rows)
-            yield from label_checks(content.maps[shot], frame.labels, rows)
-        if shot in content.pictures:
-            yield _picture_check(content, frame, options, shot, rows)
+        frame = _render(content, scene, options, view, rows)
+        if view in content.maps:
+            yield depth_check(content.maps[view], frame.depth, rows)
+            yield from label_checks(content.maps[view], frame.labels, rows)
+        if view in content.pictures:
+            yield _picture_check(content, frame, options, view, rows)
         for made in (channels_again, surfaces_again):
-            again = made(content.sequence, shot, rows, frame, SceneRays(scene, content.sequence.objects), told)
+            again = made(content.sequence, view, rows, frame, SceneRays(scene, content.sequence.objects), reported)
             yield from (Check(*check) for check in again)
-        if shot.shutter == "rs":
-            yield from _frame_checks(content, scene, options, shot, rows, told)
+        if view.shutter == "rs":
+            yield from _frame_checks(content, scene, options, view, rows, reported)
 
 
-def _picture_check(content: Content, frame: Frame, options: RendererOptions, shot: Shot, rows: list[int]) -> Check:
+def _picture_check(
+    content: Content, frame: Frame, options: RendererOptions, view: ImageView, rows: list[int]
+) -> Check:
     from rsbench.renderers.image import to_srgb8
 
     noisy = options.integrator == "path" and not _made_here(content)
     rendered = to_srgb8(frame.image, options.exposure)
-    return image_check(clean_picture(content.sequence, shot), content.pictures[shot], rendered, rows, noisy)
+    return image_check(clean_picture(content.sequence, view), content.pictures[view], rendered, rows, noisy)
 
 
 def _frame_checks(
-    content: Content, scene: MitsubaScene, options: RendererOptions, shot: Shot, rows: list[int], told: set[str]
+    content: Content,
+    scene: MitsubaScene,
+    options: RendererOptions,
+    view: ImageView,
+    rows: list[int],
+    reported: set[str],
 ) -> Iterator[Check]:
     """What lies beside a clean rolling-shutter frame: what its sensor makes of it, and the stack of whole frames.
 
@@ -277,48 +284,48 @@ def _frame_checks(
     """
     from rsbench.renderers.sensor_frame import sensed_rows
 
-    sequence, chosen, elsewhere = content.sequence, _of_image(content, options, shot), not _made_here(content)
-    with contextlib.suppress(RsbenchError):  # told already: a file that cannot be read
-        if sequence.sensor is not None and shot.image not in told:
-            seen = Picture.of(shot, sequence.image(*shot[:3]), noisy=False)
+    sequence, chosen, elsewhere = content.sequence, _of_image(content, options, view), not _made_here(content)
+    with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
+        if sequence.sensor is not None and view.image not in reported:
+            seen = Picture.of(view, sequence.image(*view[:3]), noisy=False)
             geometry = sequence.rig, sequence.shutter, sequence.motion
-            sensor = sequence.sensor.of(shot.side, shot.frame)
+            sensor = sequence.sensor.of(view.side, view.frame)
             some = rows[::_COMPRESSED] if sensor.jpeg_quality and len(rows) < sequence.shutter.height else rows
             sensed = sensed_rows(
                 scene,
                 *geometry,
                 sensor,
                 sequence.frame_period_s,
-                shot.side,
-                shot.frame,
+                view.side,
+                view.frame,
                 chosen,
                 some,
                 sequence.objects,
             )
-            yield image_check(shot.image, seen, sensed, some, elsewhere)
+            yield image_check(view.image, seen, sensed, some, elsewhere)
     with contextlib.suppress(RsbenchError):
         if whole_frames(sequence.manifest):
-            yield _stack_check(content, scene, chosen, shot, rows)
+            yield _stack_check(content, scene, chosen, view, rows)
 
 
 def _stack_check(
-    content: Content, scene: MitsubaScene, chosen: RendererOptions, shot: Shot, rows: list[int]
+    content: Content, scene: MitsubaScene, chosen: RendererOptions, view: ImageView, rows: list[int]
 ) -> Check:
     """Of whole frames at the poses of some rows, other rows: each of these rows at the pose of another."""
     from rsbench.renderers.image import to_srgb8
     from rsbench.renderers.render import render
 
     sequence, of = content.sequence, rows[::-1]
-    seen = Picture.of(shot, stack_rows(sequence, shot, rows, of), noisy=False)
+    seen = Picture.of(view, stack_rows(sequence, view, rows, of), noisy=False)
     R, t = (
-        each.copy() for each in row_poses(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame)
+        each.copy() for each in row_poses(sequence.rig, sequence.shutter, sequence.motion, view.side, view.frame)
     )
-    tau = sequence.shutter.line_times(shot.frame, shot.side).copy()
+    tau = sequence.shutter.line_times(view.frame, view.side).copy()
     R[rows], t[rows], tau[rows] = R[of], t[of], tau[of]
     frame = render(scene, sequence.rig.camera, R, t, chosen, objects=poses_of(sequence.objects, tau), rows=rows)
     rendered = to_srgb8(frame.image, chosen.exposure)
     noisy = chosen.integrator == "path" and not _made_here(content)
-    return image_check(f"gs_stack/{shot.side}_{shot.frame}", seen, rendered, rows, noisy)
+    return image_check(f"gs_stack/{view.side}_{view.frame}", seen, rendered, rows, noisy)
 
 
 def _made_here(content: Content) -> bool:
@@ -330,14 +337,16 @@ def _made_here(content: Content) -> bool:
     return all(made_by.get(key) == value for key, value in here.items())
 
 
-def _of_image(content: Content, options: RendererOptions, shot: Shot) -> RendererOptions:
+def _of_image(content: Content, options: RendererOptions, view: ImageView) -> RendererOptions:
     sequence = content.sequence
-    seed = image_seed(int(sequence.manifest.get("seed", 0)), sequence.name, shot.side, shot.frame)
+    seed = image_seed(int(sequence.manifest.get("seed", 0)), sequence.name, view.side, view.frame)
     return replace(options, seed=seed, method="single-pass", full_frames=False)
 
 
-def _render(content: Content, scene: MitsubaScene, options: RendererOptions, shot: Shot, rows: list[int]) -> Frame:
-    """Rows of a shot, with the bits that they have in the whole image."""
+def _render(
+    content: Content, scene: MitsubaScene, options: RendererOptions, view: ImageView, rows: list[int]
+) -> Frame:
+    """Rows of a view, with the bits that they have in the whole image."""
     sequence = content.sequence
-    poses = row_poses(sequence.rig, sequence.shutter, sequence.motion, shot.side, shot.frame)
-    return render_shot(scene, sequence, shot, poses, _of_image(content, options, shot), rows=rows)
+    poses = row_poses(sequence.rig, sequence.shutter, sequence.motion, view.side, view.frame)
+    return render_view(scene, sequence, view, poses, _of_image(content, options, view), rows=rows)

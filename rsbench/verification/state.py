@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.views import Times
-from rsbench.verification.content import Content, Elsewhere, images_elsewhere
-from rsbench.verification.depth import GeometryFault
+from rsbench.verification.content import Content, OtherImages, images_of_others
+from rsbench.verification.depth_checks import GeometryFault
 from rsbench.verification.findings import MISSING, DepthAgreement, Finding, Progress, files_of
-from rsbench.verification.rerender import Again, Redone
-from rsbench.verification.structure import Listing
+from rsbench.verification.manifest_checks import Listing
+from rsbench.verification.rerender import RerenderedRows, Rerenderer
 from rsbench.verification.twin_checks import with_twins
 
 _MOST_ELSEWHERE = 8
@@ -30,19 +30,19 @@ class State:
     listing: Listing
     name: str
     stride: int = 1
-    again: Again | None = None
+    again: Rerenderer | None = None
     """Builds the scene and renders rows again; None where nobody asked for it."""
     step: Progress = lambda name: None
     findings: list[Finding] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     agreements: dict[tuple[str, str], DepthAgreement] = field(default_factory=dict)
-    apart: dict[Times, GeometryFault] = field(default_factory=dict)
+    disagreeing: dict[Times, GeometryFault] = field(default_factory=dict)
     """Frames whose depth maps do not agree, none by itself."""
     missing: Collection[str] = ()
     """Files that a manifest lists and that are not there."""
     sequence: Sequence = field(init=False)
-    """From the stage "sequence" on, as ``elsewhere``."""
-    elsewhere: Elsewhere = field(init=False)
+    """From the stage "sequence" on, as ``other_images``."""
+    other_images: OtherImages = field(init=False)
     """Images that may have been exchanged with its own."""
     fresh: Content = field(init=False)
     """The frames that were read last: both of the first two, then one at a time. From the stage "masks" on."""
@@ -52,11 +52,11 @@ class State:
     """The last two frames, without what earlier checks found wrong. From the stage "frames" on."""
     masks_by_rays: bool = False
     """Whether the masks of ``fresh`` and ``twins`` are those that rays meet, not those that are stored."""
-    redone: Redone | None = None
+    rerendered: RerenderedRows | None = None
 
     @property
-    def told(self) -> set[str]:
-        """Files that need not be told of again."""
+    def reported(self) -> set[str]:
+        """Files that need not be reported again."""
         return {*self.missing, *files_of(self.findings)}
 
     @property
@@ -73,7 +73,7 @@ class State:
         below = f"{self.name}/"
         self.missing = {each.file.removeprefix(below) for each in self.findings if each.words == MISSING}
         self.sequence = read_sequence(self.listing.folder / self.name)
-        self.elsewhere = images_elsewhere(self.sequence, self._other_sequences)
+        self.other_images = images_of_others(self.sequence, self._other_sequences)
 
     def _other_sequences(self) -> Iterator[Sequence]:
         """Some sequences of the dataset, the nearest in the list first."""

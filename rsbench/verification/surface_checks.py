@@ -17,9 +17,9 @@ from rsbench.dataset.channel_truth import Rays, SeenSurfaces, surface_truth
 from rsbench.dataset.channels import INSTANCE_TABLE, surface_file
 from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import Shot, points_of, seen_from, times_at
+from rsbench.dataset.views import ImageView, points_of, seen_from, times_at
 from rsbench.verification.findings import Finding, rows_of
-from rsbench.verification.frame_comparison import BoolArray, DepthMap, land
+from rsbench.verification.frame_comparison import BoolArray, DepthMap, reproject
 
 if TYPE_CHECKING:
     from rsbench.renderers.render import Frame
@@ -36,35 +36,35 @@ _FEW_AGAIN, _LEAST = 5e-3, 8
 
 def surface_faults(
     sequence: Sequence,
-    maps: Mapping[Shot, DepthMap],
-    told: Collection[str],
+    maps: Mapping[ImageView, DepthMap],
+    reported: Collection[str],
     times: tuple[int, ...] = FRAMES,
     new: tuple[int, ...] = FRAMES,
 ) -> Iterator[Finding]:
-    """What normals and instances show that the surfaces of the depth maps are not, but for files ``told``.
+    """What normals and instances show that the surfaces of the depth maps are not, but for files ``reported``.
 
     Of frames at these ``times``, and of pairs of them with one that is ``new``.
     """
-    instances: dict[Shot, NDArray[np.uint16]] = {}
+    instances: dict[ImageView, NDArray[np.uint16]] = {}
     for side, frame in product(SIDES, times):
-        shot = Shot("rs", side, frame)
-        if shot not in maps or shot.depth in told:
+        view = ImageView("rs", side, frame)
+        if view not in maps or view.depth in reported:
             continue
         try:
             file = surface_file("normals", side, frame)
-            if "normals" in sequence.channels and file not in told and frame in new:
-                yield from _normal_faults(sequence, maps[shot], file, sequence.normals(side, frame))
+            if "normals" in sequence.channels and file not in reported and frame in new:
+                yield from _normal_faults(sequence, maps[view], file, sequence.normals(side, frame))
             file = surface_file("instances", side, frame)
-            if "instances" in sequence.channels and not {file, INSTANCE_TABLE} & set(told):
-                instances[shot] = sequence.instances(side, frame)
+            if "instances" in sequence.channels and not {file, INSTANCE_TABLE} & set(reported):
+                instances[view] = sequence.instances(side, frame)
                 if frame in new:
-                    yield from _number_faults(maps[shot], file, instances[shot], len(sequence.instance_table()))
+                    yield from _number_faults(maps[view], file, instances[view], len(sequence.instance_table()))
         except RsbenchError as error:
             yield Finding.of(error)
-    for shot in instances:
-        for partner in shot.partners():
-            if partner in instances and {shot.frame, partner.frame} & {*new}:
-                yield from _likeness_faults(sequence, maps, instances, shot, partner)
+    for view in instances:
+        for partner in view.partners():
+            if partner in instances and {view.frame, partner.frame} & {*new}:
+                yield from _agreement_faults(sequence, maps, instances, view, partner)
 
 
 def _normal_faults(
@@ -88,7 +88,7 @@ def _normal_faults(
     flat = depth_map.flat
     if np.sum(bent & flat) > max(FEW_BENT * np.sum(flat), _LEAST):
         share = f"{100 * np.sum(bent & flat) / np.sum(flat):.2g} % of the flat pixels"
-        what = f"{share} have a normal that is not upright on the surface of {depth_map.shot.depth}"
+        what = f"{share} have a normal that is not upright on the surface of {depth_map.view.depth}"
         yield Finding(file, what, _rows(bent & flat))
 
 
@@ -97,19 +97,19 @@ def _resting(
 ) -> tuple[FloatArray, FloatArray, NDArray[np.float32]]:
     """Points, rays to them and normals, (H, W, 3) each, in the world; of what moves, in its own frame, where it
     rests: the normals of a frame are those of the times of its rows."""
-    shot, grid, labels = depth_map.shot, sequence.rig.camera.pixel_grid(), depth_map.labels
+    view, grid, labels = depth_map.view, sequence.rig.camera.pixel_grid(), depth_map.labels
 
     def of(number: int, chosen: Any) -> tuple[FloatArray, FloatArray]:
         pixels, depth = grid[chosen], z[chosen]
         own = seen_from(sequence, number)
-        points = points_of(own, shot, pixels, depth)
-        return points, points - points_of(own, shot, pixels, depth * 0)
+        points = points_of(own, view, pixels, depth)
+        return points, points - points_of(own, view, pixels, depth * 0)
 
     X, ways = of(0, ...)
     for number, thing in enumerate(sequence.objects, start=1):
         chosen = np.zeros(z.shape, np.bool_) if labels is None else numbers_of(labels) == number
         X[chosen], ways[chosen] = of(number, chosen)
-        turned = inverse(thing.world_from_object(times_at(sequence, shot, grid[chosen]))).R
+        turned = inverse(thing.world_from_object(times_at(sequence, view, grid[chosen]))).R
         normals = normals.copy()
         normals[chosen] = (turned @ normals[chosen][..., None])[..., 0]
     return X, ways, normals
@@ -127,46 +127,46 @@ def _number_faults(depth_map: DepthMap, file: str, numbers: NDArray[np.uint16], 
         )
 
 
-def _likeness_faults(
+def _agreement_faults(
     sequence: Sequence,
-    maps: Mapping[Shot, DepthMap],
-    instances: Mapping[Shot, NDArray[np.uint16]],
-    shot: Shot,
-    partner: Shot,
+    maps: Mapping[ImageView, DepthMap],
+    instances: Mapping[ImageView, NDArray[np.uint16]],
+    view: ImageView,
+    partner: ImageView,
 ) -> Iterator[Finding]:
-    landing = land(sequence, maps[shot], maps[partner])
+    reprojection = reproject(sequence, maps[view], maps[partner])
     with np.errstate(invalid="ignore"):
-        same = np.abs(landing.relative) < _SURFACE
+        same = np.abs(reprojection.relative) < _SURFACE
     # One of the four pixels around must see the same: between them, things that touch change.
     height, width = same.shape
-    x, y = np.floor(landing.pixels[same]).astype(int).T
+    x, y = np.floor(reprojection.pixels[same]).astype(int).T
     around = [
         instances[partner][np.clip(y + down, 0, height - 1), np.clip(x + across, 0, width - 1)]
         for down in (0, 1)
         for across in (0, 1)
     ]
     other = np.zeros(same.shape, dtype=np.bool_)
-    other[same] = ~np.any(np.equal(around, instances[shot][same]), axis=0)
+    other[same] = ~np.any(np.equal(around, instances[view][same]), axis=0)
     if np.sum(other) > max(_FEW_OTHERS * np.sum(same), _LEAST):
-        file, there = (surface_file("instances", each.side, each.frame) for each in (shot, partner))
+        file, there = (surface_file("instances", each.side, each.frame) for each in (view, partner))
         share = f"{100 * np.sum(other) / np.sum(same):.2g} % of {np.sum(same)} pixels"
         yield Finding(file, f"{share} see another instance than {there}", _rows(other))
 
 
 def surfaces_again(
-    sequence: Sequence, shot: Shot, rows: list[int], frame: Frame, rays: Rays, told: Collection[str]
+    sequence: Sequence, view: ImageView, rows: list[int], frame: Frame, rays: Rays, reported: Collection[str]
 ) -> Iterator[tuple[str, Finding | None, bool]]:
     """As ``channel_checks.channels_again``, of normals and instances."""
-    names = [name for name in ("normals", "instances") if shot.shutter == "rs" and name in sequence.channels]
-    seen = SeenSurfaces(sequence, shot, frame.depth, rows, numbers_of(frame.labels))
+    names = [name for name in ("normals", "instances") if view.shutter == "rs" and name in sequence.channels]
+    seen = SeenSurfaces(sequence, view, frame.depth, rows, numbers_of(frame.labels))
     truth = surface_truth(seen, rays) if names else None
     for name in names:
-        file = surface_file("normals" if name == "normals" else "instances", shot.side, shot.frame)
-        if truth is None or file in told:
+        file = surface_file("normals" if name == "normals" else "instances", view.side, view.frame)
+        if truth is None or file in reported:
             continue
         try:
-            stored: NDArray[Any] = getattr(sequence, name)(shot.side, shot.frame)[rows]
-        except RsbenchError:  # told already
+            stored: NDArray[Any] = getattr(sequence, name)(view.side, view.frame)[rows]
+        except RsbenchError:  # reported already
             continue
         made: FloatArray = getattr(truth, name)
         off = np.abs(stored.astype(np.float64) - made).reshape(*frame.depth.shape, -1).max(axis=-1)

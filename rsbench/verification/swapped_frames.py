@@ -9,9 +9,9 @@ import numpy as np
 
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import Shot, Times
+from rsbench.dataset.views import ImageView, Times
 from rsbench.verification.findings import Finding
-from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, DepthMap, land
+from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, DepthMap, reproject
 
 _TRIED_PIXELS = 20_000
 _AGREE, _LEAST = 0.8, 50
@@ -21,7 +21,7 @@ _NEAR = 4
 _FARTHEST = 32
 
 
-def misplaced_frames(sequence: Sequence, apart: Collection[Times]) -> list[Finding]:
+def frames_of_other_times(sequence: Sequence, apart: Collection[Times]) -> list[Finding]:
     """A finding for each frame, of those ``apart`` from one beside it, that is that of another time.
 
     A frame is in order if it agrees with any other one near it, but for those that it is said not to.
@@ -46,7 +46,9 @@ def _time_of(maps: _Maps, frame: int, others: list[int]) -> int | None:
 
 def _finding(frame: int, time: int | None) -> Finding:
     what = f"all pictures of frame {frame} disagree with those of other times, and not with each other"
-    return Finding(Shot("rs", "left", frame).depth, what, cause="" if time is None else f"looks like frame {time}")
+    return Finding(
+        ImageView("rs", "left", frame).depth, what, cause="" if time is None else f"looks like frame {time}"
+    )
 
 
 class _Maps:
@@ -81,18 +83,18 @@ class _Maps:
         source, target = self._map(frame), self._map(other)
         if source is None or target is None:
             return 0.0, 0
-        moved = replace(source, shot=source.shot._replace(frame=time))
+        moved = replace(source, view=source.view._replace(frame=time))
         stride = max(1, int(np.sqrt(source.depth.size / _TRIED_PIXELS)))
-        relative = land(self.sequence, moved, target, stride).relative
+        relative = reproject(self.sequence, moved, target, stride).relative
         near = relative[(source.depth[::stride, ::stride] > 0) & (relative < 0.01)]
         near = near[np.isfinite(near)]
         return (float(np.mean(np.abs(near) <= DEPTH_TOLERANCE)) if near.size else 0.0), near.size
 
     def _map(self, frame: int) -> DepthMap | None:
         if frame not in self._read:
-            shot = Shot("rs", "left", frame)
+            view = ImageView("rs", "left", frame)
             try:
-                self._read[frame] = DepthMap(shot, self.sequence.depth(*shot), self.sequence.rig.camera)
-            except RsbenchError:  # told already
+                self._read[frame] = DepthMap(view, self.sequence.depth(*view), self.sequence.rig.camera)
+            except RsbenchError:  # reported already
                 self._read[frame] = None
         return self._read[frame]

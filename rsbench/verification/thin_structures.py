@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.object_records import numbers_of
-from rsbench.dataset.views import Geometry, Shot
+from rsbench.dataset.views import Geometry, ImageView
 from rsbench.verification.frame_comparison import DepthMap, seen_with
 
 _NEAR = 5e-3
@@ -25,14 +25,14 @@ in ``forest``."""
 _TRIED_PIXELS = 20_000
 
 
-def roughly_alike(geometry: Geometry, maps: Mapping[Shot, DepthMap], shot: Shot) -> bool:
+def roughly_agree(geometry: Geometry, maps: Mapping[ImageView, DepthMap], view: ImageView) -> bool:
     """Whether a depth map shows thin things, and two partners see them about where they are.
 
     A map that could show flat places and shows none is spoilt. One partner alone may be spoilt in the same way:
     rows of a frame and of its global-shutter twin lie hardly apart.
     """
-    alike = (_alike(geometry, maps[shot], maps[each]) for each in shot.partners() if each in maps)
-    return maps[shot].share_of_edges(_JUMP) > _JUMPS and sum(alike) >= 2
+    alike = (_alike(geometry, maps[view], maps[each]) for each in view.partners() if each in maps)
+    return maps[view].share_of_edges(_JUMP) > _JUMPS and sum(alike) >= 2
 
 
 def _alike(geometry: Geometry, source: DepthMap, target: DepthMap) -> bool:
@@ -40,7 +40,7 @@ def _alike(geometry: Geometry, source: DepthMap, target: DepthMap) -> bool:
     grid, depth = source.camera.pixel_grid()[::stride, ::stride], source.depth[::stride, ::stride]
     numbers = None if source.labels is None else numbers_of(source.labels[::stride, ::stride][depth > 0])
     pixels, z = grid[depth > 0], depth[depth > 0].astype(np.float64)
-    seen = seen_with(geometry, source.shot, target.shot, pixels, z, numbers)
+    seen = seen_with(geometry, source.view, target.view, pixels, z, numbers)
     inside = np.isfinite(seen.depth)
     middle = np.rint(seen.pixels[inside]).astype(np.int64)
     shares = [

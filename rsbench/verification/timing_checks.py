@@ -17,19 +17,19 @@ _NEAR_NS = 1.0
 """Both sides were rounded to a nanosecond at most."""
 
 
-def timing_faults(sequence: Sequence, told: Collection[str]) -> Iterator[Finding]:
-    """What timing.json and its tables say otherwise than sequence.json and the poses, but for files ``told``."""
+def timing_faults(sequence: Sequence, reported: Collection[str]) -> Iterator[Finding]:
+    """Where timing.json and its tables differ from sequence.json and the poses, but for files ``reported``."""
     if "timing" not in sequence.channels:
         return
     try:
-        if MANIFEST not in told:
+        if MANIFEST not in reported:
             yield from _manifest_faults(sequence)
     except RsbenchError as error:
         yield Finding.of(error)
     for side, frame in views_of(sequence.frames):
         try:
-            if table_file(side, frame) not in told:
-                yield from _table_faults(sequence, side, frame, told)
+            if table_file(side, frame) not in reported:
+                yield from _table_faults(sequence, side, frame, reported)
         except RsbenchError as error:
             yield Finding.of(error)
 
@@ -48,7 +48,7 @@ def _manifest_faults(sequence: Sequence) -> Iterator[Finding]:
                 yield Finding(MANIFEST, f"{key}.{name} = {own.get(name)!r}, sequence.json makes {part!r}")
 
 
-def _table_faults(sequence: Sequence, side: Side, frame: int, told: Collection[str]) -> Iterator[Finding]:
+def _table_faults(sequence: Sequence, side: Side, frame: int, reported: Collection[str]) -> Iterator[Finding]:
     file, poses = table_file(side, frame), f"poses/{side}_{frame}.csv"
     stored = sequence.row_times_ns(side, frame)
     expected = _table(sequence, side, frame)
@@ -61,7 +61,7 @@ def _table_faults(sequence: Sequence, side: Side, frame: int, told: Collection[s
             what = f"{name} differs from what sequence.json makes, by up to {np.max(np.abs(off))} ns"
             yield Finding(file, what, rows_of(np.abs(off) > _NEAR_NS), cause)
             return
-    if poses not in told:
+    if poses not in reported:
         tau, _ = sequence.poses(side, frame)
         off = np.abs(stored[:, 1] - 1e9 * sequence.frame_period_s * tau)
         if np.any(off > _NEAR_NS):

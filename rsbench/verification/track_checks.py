@@ -15,7 +15,7 @@ from rsbench.dataset.channel_truth import Rays
 from rsbench.dataset.channels import TRACKS, PixelClass
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.tracks import Tracks, look_for, points_at, track_views
-from rsbench.dataset.views import Shot
+from rsbench.dataset.views import ImageView
 from rsbench.verification.findings import Finding
 from rsbench.verification.frame_comparison import BoolArray, DepthMap
 
@@ -30,13 +30,16 @@ _FEW_AGAIN, _LEAST = 5e-3, 4
 
 
 def track_faults(
-    sequence: Sequence, maps: Mapping[Shot, DepthMap], told: Collection[str], times: tuple[int, ...] = FRAMES
+    sequence: Sequence,
+    maps: Mapping[ImageView, DepthMap],
+    reported: Collection[str],
+    times: tuple[int, ...] = FRAMES,
 ) -> Iterator[Finding]:
     """What the tracks show in frames at these times that depth maps and motion cannot have made.
 
-    But for files ``told``.
+    But for files ``reported``.
     """
-    if "tracks" not in sequence.channels or TRACKS in told:
+    if "tracks" not in sequence.channels or TRACKS in reported:
         return
     try:
         tracks = sequence.tracks()
@@ -48,12 +51,12 @@ def track_faults(
     for k, view in enumerate(track_views(sequence.frames)):
         if view[1] not in times:
             continue
-        shot, name = Shot("rs", *view), f"{view[0]}_{view[1]}"
+        image_view, name = ImageView("rs", *view), f"{view[0]}_{view[1]}"
         found = rs_project(sequence.rig, sequence.shutter, sequence.motion, *view, tracks.points)
         yield from _pixel_faults(sequence, tracks, k, found, name)
-        if shot in maps and shot.depth not in told:
-            yield from _source_faults(sequence, tracks, k, maps[shot], name)
-            yield from _hiding_faults(tracks, k, found, maps[shot], name)
+        if image_view in maps and image_view.depth not in reported:
+            yield from _source_faults(sequence, tracks, k, maps[image_view], name)
+            yield from _hiding_faults(tracks, k, found, maps[image_view], name)
 
 
 def _source_faults(sequence: Sequence, tracks: Tracks, k: int, depth: DepthMap, name: str) -> Iterator[Finding]:
@@ -64,13 +67,13 @@ def _source_faults(sequence: Sequence, tracks: Tracks, k: int, depth: DepthMap, 
     if np.any(outside):
         yield Finding(TRACKS, f"{np.sum(outside)} points were drawn from no pixel of it", part=name)
         return
-    X = points_at(sequence, depth.shot[1:3], pixels, depth.depth)
+    X = points_at(sequence, depth.view[1:3], pixels, depth.depth)
     off = np.linalg.norm(points - X, axis=1) / np.maximum(np.linalg.norm(X, axis=1), 1e-9)
     if np.any(off > _SAME):
         ratio = float(np.median(np.linalg.norm(points, axis=1) / np.maximum(np.linalg.norm(X, axis=1), 1e-9)))
         scaled = np.median(np.linalg.norm(points - ratio * X, axis=1)) < 1e-6 and abs(ratio - 1) > _SAME
         cause = f"looks scaled by {ratio:.6g}" if scaled else ""
-        what = f"{np.sum(off > _SAME)} of {len(X)} points are not what {depth.shot.depth} sees"
+        what = f"{np.sum(off > _SAME)} of {len(X)} points are not what {depth.view.depth} sees"
         yield Finding(TRACKS, what, cause=cause, part=name)
 
 
@@ -107,7 +110,7 @@ def _hiding_faults(tracks: Tracks, k: int, found: RSProjection, depth: DepthMap,
     ):
         bad = int(np.sum(classes[so] == wrong))
         if bad > max(min(_FEW * np.sum(known), _NEARLY_ALL * np.sum(so)), _LEAST):
-            yield Finding(TRACKS, f"{bad} of {np.sum(known)} points {words} {depth.shot.depth}", part=name)
+            yield Finding(TRACKS, f"{bad} of {np.sum(known)} points {words} {depth.view.depth}", part=name)
 
 
 def depths_around(depth: NDArray[np.float32], pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -125,14 +128,14 @@ def depths_around(depth: NDArray[np.float32], pixels: FloatArray) -> tuple[Float
 
 
 def tracks_again(
-    sequence: Sequence, rays: Rays, told: Collection[str]
+    sequence: Sequence, rays: Rays, reported: Collection[str]
 ) -> Iterator[tuple[str, Finding | None, bool]]:
     """As ``channel_checks.channels_again``, of tracks: what rays say of each frame."""
-    if "tracks" not in sequence.channels or TRACKS in told:
+    if "tracks" not in sequence.channels or TRACKS in reported:
         return
     try:
         tracks = sequence.tracks()
-    except RsbenchError:  # told already
+    except RsbenchError:  # reported already
         return
     views = enumerate(track_views(sequence.frames))
     wrong: list[BoolArray] = [_unlike(sequence, tracks, k, view, rays) for k, view in views]

@@ -9,10 +9,10 @@ import numpy as np
 
 from rsbench.core.rig import SIDES
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import Shot
-from rsbench.verification.content import Content, clean_picture, read_shot, spare_pixels
+from rsbench.dataset.views import ImageView
+from rsbench.verification.content import Content, clean_picture, read_view, spare_pixels
 from rsbench.verification.findings import Finding, rows_of
-from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, land
+from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, reproject
 
 _NEAR, _LEAST = 0.05, 100
 """Relative distance within which surfaces are one and the same, badly placed; beyond, one hides the other. And the
@@ -26,7 +26,7 @@ def read_twins(sequence: Sequence, missing: Collection[str], times: tuple[int, .
     content = Content(sequence, times=times)
     for row in sequence.twins:
         for side, frame in product(SIDES, times):
-            read_shot(content, Shot("gs", side, frame, row), missing)
+            read_view(content, ImageView("gs", side, frame, row), missing)
     return content
 
 
@@ -35,13 +35,13 @@ def other_twin_faults(content: Content, twins: Content, stride: int = 1) -> Iter
     sequence = content.sequence
     for row in sequence.twins:
         for side, frame in product(SIDES, content.times):
-            twin, source = Shot("gs", side, frame, row), Shot("rs", side, frame)
+            twin, source = ImageView("gs", side, frame, row), ImageView("rs", side, frame)
             yield from _shared_line_faults(content, twins, source, twin)
             if source in content.maps and twin in twins.maps:
                 yield from _depth_faults(content, twins, source, twin, stride)
 
 
-def _shared_line_faults(content: Content, twins: Content, source: Shot, twin: Shot) -> Iterator[Finding]:
+def _shared_line_faults(content: Content, twins: Content, source: ImageView, twin: ImageView) -> Iterator[Finding]:
     shutter = content.sequence.shutter
     axis, line = 1 - shutter.axis(twin.side), abs(shutter.first_line(twin.side) - twin.row)
     words = f"{'row' if axis == 0 else 'column'} {line} differs from"
@@ -60,16 +60,18 @@ def _shared_line_faults(content: Content, twins: Content, source: Shot, twin: Sh
             yield Finding(twin.depth, f"{words} {source.depth}: by up to {far:.3g} m at the same pose")
 
 
-def _depth_faults(content: Content, twins: Content, source: Shot, twin: Shot, stride: int) -> Iterator[Finding]:
-    relative = land(content.sequence, twins.maps[twin], content.maps[source], stride).relative
+def _depth_faults(
+    content: Content, twins: Content, source: ImageView, twin: ImageView, stride: int
+) -> Iterator[Finding]:
+    relative = reproject(content.sequence, twins.maps[twin], content.maps[source], stride).relative
     with np.errstate(invalid="ignore"):
-        told = (np.abs(relative) < _NEAR) & (twins.maps[twin].depth[::stride, ::stride] > 0)
-        wrong: BoolArray = told & ~(np.abs(relative) < DEPTH_TOLERANCE)
-    if np.sum(told) >= _LEAST and np.sum(wrong) > _MOST_WRONG * np.sum(told):
-        middle = float(np.median(relative[told]))
+        near = (np.abs(relative) < _NEAR) & (twins.maps[twin].depth[::stride, ::stride] > 0)
+        wrong: BoolArray = near & ~(np.abs(relative) < DEPTH_TOLERANCE)
+    if np.sum(near) >= _LEAST and np.sum(wrong) > _MOST_WRONG * np.sum(near):
+        middle = float(np.median(relative[near]))
         cause = f"looks scaled by {1 + middle:.5g}" if abs(middle) > DEPTH_TOLERANCE else ""
-        share = f"{100 * np.sum(wrong) / np.sum(told):.0f} % of {np.sum(told)} pixels"
-        rows = np.repeat(np.sum(wrong, axis=1) > _MOST_WRONG * np.maximum(np.sum(told, axis=1), 1), stride)
+        share = f"{100 * np.sum(wrong) / np.sum(near):.0f} % of {np.sum(near)} pixels"
+        rows = np.repeat(np.sum(wrong, axis=1) > _MOST_WRONG * np.maximum(np.sum(near, axis=1), 1), stride)
         what = f"{share} differ from the surface of {source.depth}"
         yield Finding(twin.depth, what, rows_of(rows[: len(twins.maps[twin].depth)]), cause)
 

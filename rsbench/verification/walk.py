@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from rsbench.dataset.views import PAIRS
+from rsbench.dataset.views import VIEW_PAIRS
 from rsbench.verification.checks import CHECKS, Stage
 from rsbench.verification.content import Content, read_content
 from rsbench.verification.findings import Finding, files_of
-from rsbench.verification.rerender import Redone
+from rsbench.verification.rerender import RerenderedRows
 from rsbench.verification.state import State
 from rsbench.verification.twin_checks import read_twins
 
-STEPS = len(PAIRS)
+STEPS = len(VIEW_PAIRS)
 """Of progress, for two successive frames."""
 
 
@@ -32,13 +32,13 @@ def check_sequence(state: State) -> None:
     run_stage(state, "files")
     state.open()
     run_stage(state, "sequence")
-    state.redone = None if state.again is None else Redone(state.again, state.sequence)
+    state.rerendered = None if state.again is None else RerenderedRows(state.again, state.sequence)
     state.content = Content(state.sequence)
     for times in pairwise(range(state.sequence.frames)):
         state.fresh = read_content(state.sequence, state.missing, times if times[0] == 0 else times[1:])
         state.twins = read_twins(state.sequence, state.missing, state.fresh.times)
         run_stage(state, "masks")
-        state.content = state.content.followed_by(state.fresh, state.told)
+        state.content = state.content.followed_by(state.fresh, state.reported)
         run_stage(state, "frames")
         _check_channels(state)
         run_stage(state, "rays")

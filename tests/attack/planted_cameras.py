@@ -203,7 +203,7 @@ def _times_as(change: Callable[[Sequence], Sequence], names: tuple[str, ...]) ->
 
 
 def _rendered_as(change: Callable[[Sequence], Sequence], shutter: str, view: tuple[Any, int]) -> Plant:
-    """Image and depth of one shot as another rig, shutter or motion makes them."""
+    """Image and depth of one view as another rig, shutter or motion makes them."""
 
     def plant(folder: Path) -> None:
         from rsbench.renderers.image import to_srgb8

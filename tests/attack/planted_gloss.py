@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 from attack.planted_faults import depth_faults, image_faults
 from attack.planting import RNG, VICTIM, Fault, Plant, drop, image_of, manifest_of, removed, swapped
 from rsbench.dataset.sequence import read_sequence
-from rsbench.dataset.views import SHOTS, Shot
+from rsbench.dataset.views import IMAGE_VIEWS, ImageView
 from rsbench.storage.files import read_mask, write_mask, write_png
 
 Mask = NDArray[np.bool_]
 BAND = slice(30, 66)
 """Rows behind which a fault hides."""
-ONE = Shot("rs", "left", 1)
+ONE = ImageView("rs", "left", 1)
 
 
-def _masks(change: Callable[[Mask, Mask], Mask], *shots: Shot) -> Plant:
+def _masks(change: Callable[[Mask, Mask], Mask], *views: ImageView) -> Plant:
     """``change`` takes a mask, and where there is a surface."""
 
     def plant(folder: Path) -> None:
         sequence = read_sequence(folder / VICTIM)
-        for shot in shots:
-            path, solid = sequence.folder / shot.gloss, sequence.depth(*shot) > 0
+        for view in views:
+            path, solid = sequence.folder / view.gloss, sequence.depth(*view) > 0
             write_mask(path, change(read_mask(path), solid) & solid)
 
     return plant
@@ -75,7 +75,7 @@ def _written(values: Callable[[Mask], NDArray[Any]]) -> Plant:
 
 
 def _mask_faults() -> Iterator[Fault]:
-    file, every = ONE.gloss, tuple(SHOTS)
+    file, every = ONE.gloss, tuple(IMAGE_VIEWS)
     for name, change, words in (
         ("emptied", lambda mask, solid: mask & False, "marks other surfaces"),
         ("of all", _everything, "leaves 0 %"),

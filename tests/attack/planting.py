@@ -32,8 +32,8 @@ from rsbench.storage.files import (
     write_poses,
 )
 from rsbench.verification import verify_sequence
-from rsbench.verification.rerender import Again
-from rsbench.verification.structure import Listing, dataset_faults
+from rsbench.verification.manifest_checks import Listing, dataset_faults
+from rsbench.verification.rerender import Rerenderer
 
 VICTIM, OTHER = "castle", "room-twist"
 Plant = Callable[[Path], None]
@@ -83,12 +83,12 @@ def planted(fault: Fault, sound: Path, out: Path) -> Path:
 def found(fault: Fault, folder: Path) -> tuple[bool, list[str]]:
     """Whether one line of verify's answer has the fault's words; and all lines, but for the other sequence."""
     listing = Listing.of(folder, read_json(folder / "dataset.json"))
-    again = Again("auto", [WET_CASTLE]) if fault.rendered else None
+    again = Rerenderer("auto", [WET_CASTLE]) if fault.rendered else None
     lines = [*map(str, dataset_faults(listing)), *_of_victim(listing, again)]
     return any(all(word in line for word in fault.words) for line in lines), lines
 
 
-def _of_victim(listing: Listing, again: Again | None) -> tuple[str, ...]:
+def _of_victim(listing: Listing, again: Rerenderer | None) -> tuple[str, ...]:
     return verify_sequence(listing, VICTIM, again=again).faults if VICTIM in listing.names else ()
 
 

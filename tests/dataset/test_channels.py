@@ -34,6 +34,7 @@ from rsbench.dataset.channels import (
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.matches import MATCHED, MatchClass
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
+from rsbench.dataset.views import ImageView
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.renderers.electrons import Sensor
@@ -42,8 +43,7 @@ from rsbench.scenes.load import load_scene
 from rsbench.storage.files import read_grey_png, write_png
 from rsbench.verification import Rerender, verify_dataset
 from rsbench.verification.content import Comparison, read_content
-from rsbench.verification.frame_comparison import Shot
-from rsbench.verification.rerender import Again
+from rsbench.verification.rerender import Rerenderer
 
 Array = NDArray[np.float64]
 SCENE = """
@@ -367,21 +367,21 @@ def test_a_planted_fault_is_named(yard: Path, tmp_path: Path, name: str) -> None
 def test_a_map_that_others_contradict_is_acquitted_when_it_is_what_rays_meet(yard: Path) -> None:
     """The accused is rendered again, all of it; who else is wrong is then found without it."""
     sequence = read_sequence(yard / "yard")
-    content, again = read_content(sequence, ()), Again("auto", [yard.parent / "yard.toml"])
-    one, other = Shot("rs", "left", 0), Shot("gs", "left", 0)
-    assert all(again.is_right(content, shot) for shot in content.maps)
-    assert not Again("auto").is_right(content, one), "a scene that is not known acquits nobody"
+    content, again = read_content(sequence, ()), Rerenderer("auto", [yard.parent / "yard.toml"])
+    one, other = ImageView("rs", "left", 0), ImageView("gs", "left", 0)
+    assert all(again.depth_is_rendered(content, view) for view in content.maps)
+    assert not Rerenderer("auto").depth_is_rendered(content, one), "a scene that is not known acquits nobody"
     depth = content.maps[other].depth.copy()
     depth[20:30] *= 1.0005
     content.maps[other] = replace(content.maps[other], depth=depth)
-    assert again.is_right(content, one) and not again.is_right(content, other)
+    assert again.depth_is_rendered(content, one) and not again.depth_is_rendered(content, other)
     compared = Comparison(content, 1)
     assert len(list(compared.pairs())) > 0
-    wrong = list(compared.faults(lambda shot: iter(()), partial(again.is_right, content)))
+    wrong = list(compared.faults(lambda view: iter(()), partial(again.depth_is_rendered, content)))
     assert any(fault.file == "gs_depth/left_0.exr" for fault in wrong)
     # Whoever is acquitted is not named, and not believed to be wrong.
     assert not [
-        fault for fault in compared.faults(lambda shot: iter(()), lambda shot: True) if "_depth/" in str(fault)
+        fault for fault in compared.faults(lambda view: iter(()), lambda view: True) if "_depth/" in str(fault)
     ]
     assert any("rendered again, all of it" in note for note in compared.notes)
 
@@ -391,7 +391,7 @@ def test_channels_that_depth_contradicts_are_cleared_when_they_are_what_rays_mak
 ) -> None:
     """All of a file, bit for bit: one pixel that is not is enough to leave it accused."""
     accused = {"flow/right_1.exr", "gs_flow_mask/left_0.png", "normals/left_1.exr", TRACKS, matches_file(0)}
-    again = Again("auto", [yard.parent / "yard.toml"])
+    again = Rerenderer("auto", [yard.parent / "yard.toml"])
     assert again.cleared(read_content(read_sequence(yard / "yard"), ()), accused) == accused
     shutil.copytree(yard / "yard", tmp_path / "yard")
     mask = read_grey_png(tmp_path / "yard/gs_flow_mask/left_0.png").copy()
@@ -399,4 +399,4 @@ def test_channels_that_depth_contradicts_are_cleared_when_they_are_what_rays_mak
     write_png(tmp_path / "yard/gs_flow_mask/left_0.png", mask)
     content = read_content(read_sequence(tmp_path / "yard"), ())
     assert again.cleared(content, accused) == accused - {"gs_flow_mask/left_0.png"}
-    assert Again("auto").cleared(content, accused) == set(), "a scene that is not known clears nothing"
+    assert Rerenderer("auto").cleared(content, accused) == set(), "a scene that is not known clears nothing"

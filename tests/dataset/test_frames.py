@@ -31,7 +31,7 @@ from rsbench.dataset.channel_writer import write_channels
 from rsbench.dataset.channels import CHANNELS, STEP_PX, Layer, channel_files, pair_layers
 from rsbench.dataset.layout import files_of, is_of_sequence
 from rsbench.dataset.sequence import read_dataset, read_pairs
-from rsbench.dataset.views import Shot
+from rsbench.dataset.views import ImageView
 from rsbench.renderers.electrons import Sensor
 from rsbench.renderers.render import Frame
 from rsbench.renderers.visibility import Surfaces
@@ -230,7 +230,7 @@ def flowing(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         gloss = np.zeros(labels.shape, np.bool_)
         seen = Frame(image=image, depth=whole.depth("rs", *view), labels=labels, gloss=gloss)
         with background_writer() as later:
-            write_channels(whole.folder, ["flow"], whole, Shot("rs", *view), seen, Open(), later)
+            write_channels(whole.folder, ["flow"], whole, ImageView("rs", *view), seen, Open(), later)
     own = json.loads((whole.folder / "sequence.json").read_text()) | {"channels": ["flow"]}
     own["files"] |= dict.fromkeys(channel_files(["flow"], (), COUNT), "")
     (whole.folder / "sequence.json").write_text(json.dumps(own))

@@ -22,13 +22,13 @@ from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.cost_estimate import estimate_dataset
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_sequence
-from rsbench.dataset.views import SHOTS, Shot
+from rsbench.dataset.views import IMAGE_VIEWS, ImageView
 from rsbench.storage.files import read_grey_png, read_json, read_mask, write_mask
 from rsbench.verification import verify_dataset
 
 Mask = NDArray[np.bool_]
 Vector = tuple[float, float, float]
-ONE = Shot("rs", "left", 1)
+ONE = ImageView("rs", "left", 1)
 
 
 def _box(edges: Vector, at: Vector, material: PBRMaterial) -> trimesh.Trimesh:
@@ -77,14 +77,14 @@ def faults_of(folder: Path, scenes: Sequence[Path] = ()) -> list[str]:
 
 
 @pytest.fixture
-def spoilt(sound: Path, tmp_path: Path) -> Callable[[Callable[[Mask], Mask], tuple[Shot, ...]], Path]:
+def spoilt(sound: Path, tmp_path: Path) -> Callable[[Callable[[Mask], Mask], tuple[ImageView, ...]], Path]:
     """A copy with other masks, and hashes made to fit."""
 
-    def make(change: Callable[[Mask], Mask], shots: tuple[Shot, ...]) -> Path:
+    def make(change: Callable[[Mask], Mask], views: tuple[ImageView, ...]) -> Path:
         out = tmp_path / "data"
         shutil.copytree(sound, out)
-        for shot in shots:
-            path = out / "hall" / shot.gloss
+        for view in views:
+            path = out / "hall" / view.gloss
             write_mask(path, change(read_mask(path)))
         rehash(out)
         return out
@@ -113,18 +113,21 @@ def test_a_sound_sequence_passes(sound: Path, scene: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "shots", "words"),
+    ("change", "views", "words"),
     [
         (lambda mask: mask & False, (ONE,), (ONE.gloss, "marks other surfaces")),
-        (lambda mask: mask | True, tuple(SHOTS), ("_gloss/", "leaves 0 %")),
+        (lambda mask: mask | True, tuple(IMAGE_VIEWS), ("_gloss/", "leaves 0 %")),
         (lambda mask: mask[:, ::-1], (ONE,), (ONE.gloss, "")),
     ],
     ids=["emptied", "of all", "flipped"],
 )
 def test_wrong_masks_are_named_without_the_scene(
-    spoilt: Callable[..., Path], change: Callable[[Mask], Mask], shots: tuple[Shot, ...], words: tuple[str, str]
+    spoilt: Callable[..., Path],
+    change: Callable[[Mask], Mask],
+    views: tuple[ImageView, ...],
+    words: tuple[str, str],
 ) -> None:
-    found = faults_of(spoilt(change, shots))
+    found = faults_of(spoilt(change, views))
     assert any(all(word in fault for word in words) for fault in found), found
 
 
@@ -133,7 +136,7 @@ def test_rays_know_where_it_is_glossy(spoilt: Callable[..., Path], scene: Path) 
         mask[20:40] = True
         return mask
 
-    out = spoilt(band, tuple(SHOTS))
+    out = spoilt(band, tuple(IMAGE_VIEWS))
     assert any(f"{ONE.gloss}: rows 20-39" in fault and "rays meet" in fault for fault in faults_of(out, [scene]))
     manifest_of("hall/sequence.json", drop("glossy"))(out)
     rehash(out)

@@ -30,7 +30,7 @@ from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.storage.files import read_depth, read_png
 from rsbench.verification import content, verify_dataset
-from rsbench.verification.poses import pose_faults
+from rsbench.verification.pose_checks import pose_faults
 from rsbench.vision.quality import psnr
 
 BARREL = Lens(model="brown-conrady", k1=-0.22, k2=0.05, p1=0.001)

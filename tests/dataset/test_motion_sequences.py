@@ -17,7 +17,7 @@ from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_dataset, read_sequence
 from rsbench.storage.files import read_json, write_json
 from rsbench.verification import verify_dataset
-from rsbench.verification.poses import pose_faults
+from rsbench.verification.pose_checks import pose_faults
 
 COMMON = {"rotation_deg": 2.0, "rotation_axis": "random", "translation": 0.15, "translation_axis": "random"}
 POSES = [[0.01 * k, 0.02 * k, 0.0, 0.06 * k, 0.0, 0.01 * k * k] for k in range(7)]

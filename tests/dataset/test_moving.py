@@ -38,7 +38,7 @@ from rsbench.scenes.load import load_scene
 from rsbench.storage.files import read_grey_png, write_png
 from rsbench.verification import verify_dataset
 from rsbench.verification.content import read_content
-from rsbench.verification.moving_checks import label_faults
+from rsbench.verification.moving_object_checks import label_faults
 from rsbench.verification.twin_checks import read_twins
 
 SCENE = """

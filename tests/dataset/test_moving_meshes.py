@@ -28,7 +28,7 @@ from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.scenes.load import load_scene
 from rsbench.storage.files import read_grey_png, write_png
 from rsbench.verification import verify_dataset
-from rsbench.verification.rerender import Again
+from rsbench.verification.rerender import Rerenderer
 
 CARD = """
 name = "fair"
@@ -178,10 +178,10 @@ def test_verify_finds_nothing_and_renders_again_where_the_meshes_are_named(fair:
     assert report.faults == () and "the same bits" in report.notes[-1]
     (sequence,) = read_dataset(fair)
     with pytest.raises(RsbenchError, match=r"'slab\.ply' of moving object 2 is a file of yours"):
-        Again("auto", [scene], [kite]).scene(sequence)
+        Rerenderer("auto", [scene], [kite]).scene(sequence)
     trimesh.creation.box((70.0, 40.0, 56.0)).export(tmp_path / "slab.ply")
     with pytest.raises(RsbenchError, match=r"slab\.ply: what is drawn of it has another sha256"):
-        Again("auto", [scene], [kite, tmp_path / "slab.ply"]).scene(sequence)
+        Rerenderer("auto", [scene], [kite, tmp_path / "slab.ply"]).scene(sequence)
     assert str(fair.parent) not in (fair / "fair/sequence.json").read_text(), "a dataset names no folder"
 
 

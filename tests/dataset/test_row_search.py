@@ -18,7 +18,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.dataset.row_search import find
-from rsbench.dataset.views import GivenGeometry, Shot
+from rsbench.dataset.views import GivenGeometry, ImageView
 
 LENSES = (
     None,
@@ -37,7 +37,7 @@ def _geometry(lens: Lens | None, motion: Motion, **scan: object) -> GivenGeometr
     return GivenGeometry(StereoRig(camera=camera, baseline=0.3), shutter, motion)
 
 
-def _points(geometry: GivenGeometry, source: Shot, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+def _points(geometry: GivenGeometry, source: ImageView, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """What pixels (4, 64) of the source see at random depths, and the lines where the search starts."""
     rows = np.sort(rng.choice(48, 4, replace=False))
     grid = geometry.rig.camera.pixel_grid()[rows]
@@ -52,7 +52,7 @@ def _points(geometry: GivenGeometry, source: Shot, rng: np.random.Generator) -> 
     scan=st.sampled_from(("top", "bottom", "left", "right")),
     right=st.sampled_from((None, "top", "right")),
     delay=st.sampled_from((0.0, 0.2)),
-    target=st.sampled_from([Shot("rs", "right", 0), Shot("rs", "left", 1), Shot("rs", "right", 1)]),
+    target=st.sampled_from([ImageView("rs", "right", 0), ImageView("rs", "left", 1), ImageView("rs", "right", 1)]),
     speed=st.floats(0.0, 1.0),
     seed=st.integers(0, 2**20),
 )
@@ -62,14 +62,14 @@ def test_it_finds_the_pixels_that_bracketing_finds(
     scan: str,
     right: str | None,
     delay: float,
-    target: Shot,
+    target: ImageView,
     speed: float,
     seed: int,
 ) -> None:
     rng = np.random.default_rng(seed)
     w, d = speed * 0.15 * rng.standard_normal(3), speed * 0.4 * rng.standard_normal(3)
     geometry = _geometry(lens, model(w, d), scan=scan, right_scan=right, right_delay=delay)
-    X, grid = _points(geometry, Shot("rs", "left", 0), rng)
+    X, grid = _points(geometry, ImageView("rs", "left", 0), rng)
     landed = find(geometry, target, X, grid[..., geometry.shutter.axis(target.side)])
     truth = rs_project(*geometry[:3], target.side, target.frame, X)
     once, never = truth.status == ProjectionStatus.SEEN, truth.status == ProjectionStatus.NEVER
@@ -88,8 +88,8 @@ def test_it_finds_the_pixels_that_bracketing_finds(
 def test_a_global_shutter_has_one_pose() -> None:
     rng = np.random.default_rng(5)
     geometry = _geometry(LENSES[1], TwistMotion([0.05, -0.1, 0.08], [0.2, -0.1, 0.3]))
-    X, grid = _points(geometry, Shot("rs", "left", 0), rng)
-    landed = find(geometry, Shot("gs", "left", 0, 24), X, grid[..., 1])
+    X, grid = _points(geometry, ImageView("rs", "left", 0), rng)
+    landed = find(geometry, ImageView("gs", "left", 0, 24), X, grid[..., 1])
     pixels = project_at(geometry.rig, geometry.motion, "left", 0.9 * 24 / 48, X)[..., :2]
     inside = geometry.rig.camera.contains(pixels)
     np.testing.assert_allclose(landed.pixels[inside], pixels[inside], rtol=0, atol=NEAR_PX)
@@ -98,8 +98,8 @@ def test_a_global_shutter_has_one_pose() -> None:
 
 def test_rows_alone_have_the_bits_that_they_have_among_others() -> None:
     geometry = _geometry(None, LinearMotion([0.05, -0.1, 0.08], [0.2, -0.1, 0.3]))
-    X, grid = _points(geometry, Shot("rs", "left", 0), np.random.default_rng(6))
-    target = Shot("rs", "left", 1)
+    X, grid = _points(geometry, ImageView("rs", "left", 0), np.random.default_rng(6))
+    target = ImageView("rs", "left", 1)
     whole, some = find(geometry, target, X, grid[..., 1]), find(geometry, target, X[1:3], grid[1:3, :, 1])
     np.testing.assert_array_equal(whole.pixels[1:3], some.pixels)
 
@@ -116,4 +116,4 @@ def test_a_motion_that_jumps_is_refused() -> None:
     geometry = _geometry(None, _Jump([0.0, 0.1, 0.0], [0.2, 0.0, 0.0]))
     X, grid = np.full((1, 1, 3), 5.0), np.zeros((1, 1, 2))
     with pytest.raises(RsbenchError, match="_Jump: jumps between the lines of rs/left_0"):
-        find(geometry, Shot("rs", "left", 0), X, grid[..., 1])
+        find(geometry, ImageView("rs", "left", 0), X, grid[..., 1])

@@ -21,14 +21,14 @@ from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_sequence
+from rsbench.dataset.views import ImageView
 from rsbench.renderers.electrons import Sensor
 from rsbench.renderers.processing import compressed
 from rsbench.storage.files import read_png, write_png
-from rsbench.verification import sensors, verify_dataset
+from rsbench.verification import sensor_checks, verify_dataset
 from rsbench.verification.content import read_content
-from rsbench.verification.frame_comparison import Shot
 from rsbench.verification.image_checks import Picture
-from rsbench.verification.sensors import sensor_faults
+from rsbench.verification.sensor_checks import sensor_faults
 
 NOISY = Sensor(full_well=6000, gain=4, photon_noise=True, read_noise=2.5, bit_depth=10)
 
@@ -173,9 +173,9 @@ def test_frames_that_the_sensor_cannot_have_made_are_named(
     content = read_content(sequence)
     copy = tmp_path / sequence.name
     shutil.copytree(made[name], copy)
-    shot = Shot("rs", "left", 1)
+    view = ImageView("rs", "left", 1)
     bad = FAULTS[fault](sequence.image("rs", "left", 1), sequence.clean_image("left", 1))
-    write_png(copy / shot.image, np.ascontiguousarray(bad))
+    write_png(copy / view.image, np.ascontiguousarray(bad))
     found = list(sensor_faults(read_sequence(copy), content.maps, content.pictures, ()))
     assert len(found) == 1 and found[0].file == "rs/left_1.png"
 
@@ -231,7 +231,7 @@ def _flat(code: int) -> NDArray[np.uint8]:
 
 def test_what_a_sensor_may_show_beyond_its_clean_twin() -> None:
     """Of a twin that is white where the light was brighter, of a path tracer's noise, and of what comes in."""
-    shot, rng = Shot("rs", "left", 0), np.random.default_rng(3)
+    view, rng = ImageView("rs", "left", 0), np.random.default_rng(3)
     rough = [np.clip(120 + 6 * rng.standard_normal((40, 40, 3)), 0, 255).astype(np.uint8) for _ in range(2)]
     below, above = np.split(_flat(60), [2])[1], _flat(200)[:2]
     blurred = np.concatenate([above, below])
@@ -243,7 +243,7 @@ def test_what_a_sensor_may_show_beyond_its_clean_twin() -> None:
         (Sensor(exposure_s=0.01), blurred, _flat(60), False, (0, 2), True),
         (Sensor(exposure_s=0.01), blurred, _flat(60), False, (0, 1), False),
     ):
-        found = sensors._fault(sensor, image, Picture.of(shot, clean, noisy), window)
+        found = sensor_checks._fault(sensor, image, Picture.of(view, clean, noisy), window)
         assert (found is None) == allowed, (sensor, noisy, window, found)
 
 

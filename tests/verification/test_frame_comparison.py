@@ -15,13 +15,13 @@ from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.views import SHOTS, GivenGeometry
+from rsbench.dataset.views import IMAGE_VIEWS, GivenGeometry
 from rsbench.storage.files import read_depth, write_depth
 from rsbench.verification import frame_comparison as reprojection
 from rsbench.verification import verify_sequence
 from rsbench.verification.frame_comparison import DepthMap
-from rsbench.verification.structure import Listing
-from rsbench.verification.thin_structures import roughly_alike
+from rsbench.verification.manifest_checks import Listing
+from rsbench.verification.thin_structures import roughly_agree
 
 LENSES = (
     None,
@@ -38,7 +38,7 @@ MOTION = LinearMotion([0.02, -0.03, 0.01], [0.1, -0.05, 0.2])
 def _plane(lens: Lens | None) -> DepthMap:
     camera = replace(PinholeCamera.centred(64, 48, 60.0), lens=lens)
     depth = (1.0 / (camera.unproject(camera.pixel_grid()) @ PLANE)).astype(np.float32)
-    return DepthMap(SHOTS[4], depth, camera)
+    return DepthMap(IMAGE_VIEWS[4], depth, camera)
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -80,14 +80,14 @@ def test_maps_of_thin_things_are_compared_roughly() -> None:
     sequence = GivenGeometry(RIG, SHUTTER, still)
     rng = np.random.default_rng(2)
     leaves = rng.uniform(2.0, 9.0, (48, 64)).astype(np.float32)  # another thing in every pixel
-    seen = {shot: DepthMap(shot, leaves, RIG.camera) for shot in SHOTS}
-    shot = SHOTS[0]
-    assert roughly_alike(sequence, seen, shot)
+    seen = {view: DepthMap(view, leaves, RIG.camera) for view in IMAGE_VIEWS}
+    view = IMAGE_VIEWS[0]
+    assert roughly_agree(sequence, seen, view)
     for change in (leaves * 1.05, leaves[:, ::-1], rng.permutation(leaves), leaves + 2.0):
-        spoilt = replace(seen[shot], depth=np.ascontiguousarray(change, dtype=np.float32))
-        assert not roughly_alike(sequence, seen | {shot: spoilt}, shot)
-    smooth = {shot: replace(each, depth=np.ones_like(leaves)) for shot, each in seen.items()}
-    assert not roughly_alike(sequence, smooth, shot), "what could be flat is no thin thing"
+        spoilt = replace(seen[view], depth=np.ascontiguousarray(change, dtype=np.float32))
+        assert not roughly_agree(sequence, seen | {view: spoilt}, view)
+    smooth = {view: replace(each, depth=np.ones_like(leaves)) for view, each in seen.items()}
+    assert not roughly_agree(sequence, smooth, view), "what could be flat is no thin thing"
 
 
 def test_a_map_that_begins_elsewhere_says_where(dataset: Path) -> None:

@@ -8,7 +8,7 @@ from functools import partial
 from rsbench.verification.content import Comparison
 from rsbench.verification.findings import Finding
 from rsbench.verification.state import State
-from rsbench.verification.swapped_frames import misplaced_frames
+from rsbench.verification.swapped_frames import frames_of_other_times
 
 
 def picture_faults(state: State) -> Iterator[Finding]:
@@ -19,23 +19,27 @@ def picture_faults(state: State) -> Iterator[Finding]:
         if agreement is not None:
             state.agreements.setdefault((agreement.source, agreement.target), agreement)
         state.step(state.sequence.name)
-    judges = () if again is None else (partial(again.is_right, content), partial(again.shows, content))
+    judges = (
+        ()
+        if again is None
+        else (partial(again.depth_is_rendered, content), partial(again.image_is_rendered, content))
+    )
     geometry = comparison.geometry()
     if geometry is None:
-        yield from comparison.faults(state.elsewhere, *judges)
+        yield from comparison.faults(state.other_images, *judges)
     else:
-        state.apart[content.times[0], content.times[-1]] = geometry
+        state.disagreeing[content.times[0], content.times[-1]] = geometry
     state.notes += comparison.notes
 
 
 def geometry_faults(state: State) -> Iterator[Finding]:
     """What the frames that do not agree show of sequence.json, or of one of them."""
-    if not state.apart:
+    if not state.disagreeing:
         return
-    first = min(state.apart.values(), key=lambda each: (each.over_time, each.share))
+    first = min(state.disagreeing.values(), key=lambda each: (each.over_time, each.share))
     count = state.sequence.frames - 1
-    if count > 1 and first.over_time and (found := misplaced_frames(state.sequence, state.apart)):
+    if count > 1 and first.over_time and (found := frames_of_other_times(state.sequence, state.disagreeing)):
         yield from found
         return
-    where = "" if count == 1 else f", in {len(state.apart)} of {count} pairs of frames"
+    where = "" if count == 1 else f", in {len(state.disagreeing)} of {count} pairs of frames"
     yield Finding("sequence.json", first.what + where, cause=first.cause)

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.dataset.views import ImageView
 from rsbench.verification.findings import DepthAgreement, Finding
-from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Landing, Shot
+from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Reprojection
 
 Bits = NDArray[np.uint8]
 
@@ -44,7 +45,7 @@ _CENTRED = 0.3
 
 
 @dataclass(eq=False)
-class MapVerdict:
+class DepthEvidence:
     """What the partners of one depth map say of its pixels, gathered pair by pair: one bit for each partner."""
 
     map: DepthMap
@@ -73,9 +74,9 @@ class MapVerdict:
     def surface(self) -> BoolArray:
         return self.map.depth[:: self.stride, :: self.stride] > 0
 
-    def bit(self, partner: Shot) -> np.uint8:
+    def bit(self, partner: ImageView) -> np.uint8:
         """That of a partner."""
-        return np.uint8(1 << list(self.map.shot.partners()).index(partner))
+        return np.uint8(1 << list(self.map.view.partners()).index(partner))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,20 +87,20 @@ class MapFault:
     rows: BoolArray
     """(H,) where."""
     share: float
-    """Of what could be compared: the map with the largest is blamed first."""
+    """Of what could be compared: the map with the largest is wrong first."""
     uncompared: bool = False
     """Whether it has a surface, and nothing of it could be compared."""
 
 
-def compare(source: MapVerdict, target: MapVerdict, landing: Landing) -> DepthAgreement:
-    """Add what one pair shows to the verdicts of both, and count how the flat surfaces of both agree."""
-    relative, stride = landing.relative, source.stride
-    wide = _wide(landing.pixels, stride)
+def compare(source: DepthEvidence, target: DepthEvidence, reprojection: Reprojection) -> DepthAgreement:
+    """Add what one pair shows to the evidence of both, and count how the flat surfaces of both agree."""
+    relative, stride = reprojection.relative, source.stride
+    wide = _wide(reprojection.pixels, stride)
     flat = source.map.flat[::stride, ::stride] & source.surface & wide
     with np.errstate(invalid="ignore"):
         size = np.abs(relative)
         agrees = size <= DEPTH_TOLERANCE
-        bit = source.bit(target.map.shot)
+        bit = source.bit(target.map.view)
         source.confirmed |= np.where(agrees, bit, np.uint8(0))
         # What is not flat may slip between the pixels of a partner that sees nothing there.
         through = (relative < NEAR_MISS) & ~agrees & (flat | (np.isfinite(relative) & wide))
@@ -108,11 +109,11 @@ def compare(source: MapVerdict, target: MapVerdict, landing: Landing) -> DepthAg
         source.hidden |= np.where(relative >= NEAR_MISS, bit, np.uint8(0))
         near = size[flat & (relative < NEAR_MISS)]
     source.difference = np.fmin(source.difference, size)
-    _mark_holes(target, landing.pixels[flat], target.bit(source.map.shot))
+    _mark_holes(target, reprojection.pixels[flat], target.bit(source.map.view))
     near_and_seen = near[np.isfinite(near)]
     return DepthAgreement(
-        source=source.map.shot.depth,
-        target=target.map.shot.depth,
+        source=source.map.view.depth,
+        target=target.map.view.depth,
         compared=near.size,
         agreeing=int(np.sum(near <= DEPTH_TOLERANCE)),
         typical=float(np.median(near_and_seen)) if near_and_seen.size else float("nan"),
@@ -132,7 +133,7 @@ def _wide(pixels: NDArray[np.float32], stride: int) -> BoolArray:
         return np.asarray(area >= _LEAST_WIDTH * longest)
 
 
-def _mark_holes(target: MapVerdict, pixels: NDArray[np.float32], bit: np.uint8) -> None:
+def _mark_holes(target: DepthEvidence, pixels: NDArray[np.float32], bit: np.uint8) -> None:
     """Pixels of the target without a surface although the middle of a flat one lies there."""
     pixels = pixels[np.isfinite(pixels[:, 0])]
     nearest = np.rint(pixels)
@@ -143,53 +144,55 @@ def _mark_holes(target: MapVerdict, pixels: NDArray[np.float32], bit: np.uint8) 
     target.holes[y[missing], x[missing]] |= bit
 
 
-def map_faults(verdicts: Mapping[Shot, MapVerdict], right: Collection[Shot] = ()) -> dict[Shot, MapFault]:
+def map_faults(
+    evidence: Mapping[ImageView, DepthEvidence], right: Collection[ImageView] = ()
+) -> dict[ImageView, MapFault]:
     """The maps that are wrong: the worst first, and then the others without what it says of them.
 
     Those that are known to be ``right`` are none of them.
     """
-    found: dict[Shot, MapFault] = {}
+    found: dict[ImageView, MapFault] = {}
     while True:
         left = {
-            shot: fault
-            for shot in verdicts.keys() - found.keys() - {*right}
-            if (fault := _fault(verdicts[shot], found))
+            view: fault
+            for view in evidence.keys() - found.keys() - {*right}
+            if (fault := _fault(evidence[view], found))
         }
         if not left:
-            return {shot: found[shot] for shot in verdicts if shot in found}
-        worst = max(sorted(left), key=lambda shot: left[shot].share)
+            return {view: found[view] for view in evidence if view in found}
+        worst = max(sorted(left), key=lambda view: left[view].share)
         found[worst] = left[worst]
 
 
-def _fault(verdict: MapVerdict, blamed: Collection[Shot]) -> MapFault | None:
-    """What the partners that are not blamed themselves say against a map."""
-    trusted = np.uint8(sum(int(verdict.bit(each)) for each in verdict.map.shot.partners() if each not in blamed))
-    height, surface = len(verdict.map.depth), verdict.surface
-    holes = np.bitwise_count(verdict.holes & trusted) >= 2
-    seen = verdict.map.depth > 0
+def _fault(evidence: DepthEvidence, wrong: Collection[ImageView]) -> MapFault | None:
+    """What the partners that are not wrong themselves say against a map."""
+    trusted = np.uint8(sum(int(evidence.bit(each)) for each in evidence.map.view.partners() if each not in wrong))
+    height, surface = len(evidence.map.depth), evidence.surface
+    holes = np.bitwise_count(evidence.holes & trusted) >= 2
+    seen = evidence.map.depth > 0
     # Gaps narrower than a pixel, between battlements or leaves, lie one by one among pixels that see a surface.
     holes &= _emptied(holes, seen) | (np.sum(holes) > _EMPTY_SHARE * np.sum(seen))
     if np.sum(holes) > _FEW:
-        share = 1.0 + float(np.mean(holes[verdict.holes > 0]))  # before all others: holes accuse who sees through
+        share = 1.0 + float(np.mean(holes[evidence.holes > 0]))  # before all others: holes accuse who sees through
         return MapFault(
             f"{np.sum(holes)} pixels have no depth where others see a surface", np.any(holes, axis=1), share
         )
-    good = (verdict.confirmed & trusted != 0) & surface
-    bad = (verdict.contradicted & trusted != 0) & ~good & surface
-    behind = (np.bitwise_count(verdict.hidden & trusted) >= 2) & ~good & surface
+    good = (evidence.confirmed & trusted != 0) & surface
+    bad = (evidence.contradicted & trusted != 0) & ~good & surface
+    behind = (np.bitwise_count(evidence.hidden & trusted) >= 2) & ~good & surface
     if np.sum(behind) > _MOST_BEHIND * np.sum(good | bad | behind):
         bad |= behind
     if not np.any(bad | good):
-        if blamed and np.any(verdict.confirmed):
+        if wrong and np.any(evidence.confirmed):
             return None
         what = "nothing can be compared with another frame" if np.any(surface) else "there is no surface"
         return MapFault(what, np.full(height, True), 0.0, uncompared=bool(np.any(surface)))
-    rows = _bad_rows(bad, good, verdict.near)
+    rows = _bad_rows(bad, good, evidence.near)
     if np.any(rows):
         share = np.sum(bad[rows]) / max(1, np.sum((bad | good)[rows]))
         what = f"depth differs from what others see on {100 * share:.3g} % of the comparable pixels"
-        return MapFault(what, np.repeat(rows, verdict.stride)[:height], float(np.sum(bad) / np.sum(bad | good)))
-    typical = float(np.median(verdict.difference[good])) if np.any(good) else 0.0
+        return MapFault(what, np.repeat(rows, evidence.stride)[:height], float(np.sum(bad) / np.sum(bad | good)))
+    typical = float(np.median(evidence.difference[good])) if np.any(good) else 0.0
     if typical > _TYPICAL:
         what = (
             f"depth differs typically by {typical:.1e} of itself from what others see, {_TYPICAL:.0e} is allowed"
@@ -250,7 +253,7 @@ class GeometryFault(NamedTuple):
     """Whether it is only the two times that disagree."""
 
 
-def geometry_fault(pairs: Sequence[tuple[Shot, Shot, DepthAgreement]]) -> GeometryFault | None:
+def geometry_fault(pairs: Sequence[tuple[ImageView, ImageView, DepthAgreement]]) -> GeometryFault | None:
     """What the maps say against the geometry that sequence.json states, where none of them is wrong by itself."""
     wrong = [(source, target) for source, target, each in pairs if not _agree(each, _STRICT_SHARE)]
     across = sum(source.side != target.side for source, target in wrong)
@@ -275,10 +278,12 @@ def _agree(agreement: DepthAgreement, spare: float = _SPARE_SHARE) -> bool:
     return few and not agreement.typical > _TYPICAL
 
 
-def pair_faults(pairs: Sequence[tuple[Shot, Shot, DepthAgreement]], blamed: Collection[Shot]) -> Iterator[Finding]:
+def pair_faults(
+    pairs: Sequence[tuple[ImageView, ImageView, DepthAgreement]], wrong: Collection[ImageView]
+) -> Iterator[Finding]:
     """Pairs that disagree though neither map is contradicted by all who see it."""
     for source, target, agreement in pairs:
-        if _agree(agreement) or {source, target} & set(blamed):
+        if _agree(agreement) or {source, target} & set(wrong):
             continue
         what = (
             f"depth agrees with {target.depth} to {DEPTH_TOLERANCE:g} on only {100 * agreement.share:.2f} % of "

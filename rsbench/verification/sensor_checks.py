@@ -14,13 +14,13 @@ from rsbench.core.projection import back_project, project_at
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.object_records import SHADED, numbers_of
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import seen_from
+from rsbench.dataset.views import FAR, ImageView, seen_from
 from rsbench.renderers.electrons import Sensor, expose, fall_off
 from rsbench.renderers.image import linear_of_codes
 from rsbench.renderers.processing import compressed, processed, rows_needed, shares_of_noise
 from rsbench.storage.untrusted_files import inside
 from rsbench.verification.findings import Finding, rows_of
-from rsbench.verification.frame_comparison import FAR, BoolArray, DepthMap, Shot
+from rsbench.verification.frame_comparison import BoolArray, DepthMap
 from rsbench.verification.image_checks import Picture
 from rsbench.verification.png_header import png_fault
 from rsbench.verification.processing_checks import processing_fault
@@ -44,22 +44,25 @@ _WHITE = 255.0
 
 
 def sensor_faults(
-    sequence: Sequence, maps: Mapping[Shot, DepthMap], pictures: Mapping[Shot, Picture], missing: Collection[str]
+    sequence: Sequence,
+    maps: Mapping[ImageView, DepthMap],
+    pictures: Mapping[ImageView, Picture],
+    missing: Collection[str],
 ) -> Iterator[Finding]:
     """What the rolling-shutter frames of a sequence show that their sensor cannot have made of the clean twins."""
     sensor = sequence.sensor
     size = sequence.rig.camera.width, sequence.rig.camera.height
-    for shot in pictures:
-        if sensor is None or shot.shutter != "rs" or shot.image in missing or shot not in maps:
+    for view in pictures:
+        if sensor is None or view.shutter != "rs" or view.image in missing or view not in maps:
             continue
         try:
-            fault = png_fault(inside(sequence.folder, shot.image), shot.image, size)
+            fault = png_fault(inside(sequence.folder, view.image), view.image, size)
             if fault is None:
-                seen = sequence.image(*shot[:3])
-                own, spacing = sensor.of(shot.side, shot.frame), _spacing(sequence)
-                window = _window(sequence, own, maps[shot], spacing)
-                changing = _changing(sequence, own, maps[shot], spacing)
-                fault = _fault(own, seen, pictures[shot], window, spacing, changing)
+                seen = sequence.image(*view[:3])
+                own, spacing = sensor.of(view.side, view.frame), _spacing(sequence)
+                window = _window(sequence, own, maps[view], spacing)
+                changing = _changing(sequence, own, maps[view], spacing)
+                fault = _fault(own, seen, pictures[view], window, spacing, changing)
         except RsbenchError as error:
             fault = Finding.of(error)
         if fault:
@@ -106,18 +109,18 @@ def _window(
 
     Of the surfaces of an object, by its ``number``, or of what stands still.
     """
-    shot, labels = depth_map.shot, depth_map.labels
+    view, labels = depth_map.view, depth_map.labels
     grid = sequence.rig.camera.pixel_grid()[::4, ::4]
     own = np.ones(grid.shape[:2], np.bool_) if labels is None else numbers_of(labels[::4, ::4]) == number
     if not (sensor.exposure_s and np.any(own)):
         return 0, 0
     depth, grid = depth_map.depth[::4, ::4][own].astype(np.float64), grid[own]
     rig, shutter, motion = seen_from(sequence, number)[:3]
-    X = back_project(rig, shutter, motion, shot.side, shot.frame, grid, np.where(depth > 0, depth, FAR))
+    X = back_project(rig, shutter, motion, view.side, view.frame, grid, np.where(depth > 0, depth, FAR))
     half = 0.5 * sensor.exposure_s / sequence.frame_period_s
-    tau = shutter.pixel_time(grid, shot.frame, shot.side)
+    tau = shutter.pixel_time(grid, view.frame, view.side)
     moved = [
-        np.abs(project_at(rig, motion, shot.side, tau + sign * half, X)[..., :2] - grid) for sign in (-1.0, 1.0)
+        np.abs(project_at(rig, motion, view.side, tau + sign * half, X)[..., :2] - grid) for sign in (-1.0, 1.0)
     ]
     # One more: a pixel is an area, and thin near things lie between the points looked at; and between samples.
     x, y = np.ceil(np.nanmax(np.stack(moved), axis=(0, 1))).astype(int) + 1 + int(spacing)
@@ -132,16 +135,16 @@ def _fault(
     spacing: float = 0.5,
     changing: BoolArray | None = None,
 ) -> Finding | None:
-    """What is wrong with an image of ``picture``'s shot; ``window`` is how far (x, y) its blur may reach, px.
+    """What is wrong with an image of ``picture``'s view; ``window`` is how far (x, y) its blur may reach, px.
 
     ``changing`` (H, W) where it may reach farther.
     """
     bounds = _Bounds.of(sensor, image, picture, window, spacing)
-    told = np.ones((*image.shape[:2], 1), np.bool_) if changing is None else ~changing[..., None]
+    judged = np.ones((*image.shape[:2], 1), np.bool_) if changing is None else ~changing[..., None]
     return (
-        _beyond(bounds, image, picture.shot, spacing, told)
-        or processing_fault(image, sensor, picture.shot.image)
-        or _noise_fault(bounds, sensor, image, picture, told)
+        _beyond(bounds, image, picture.view, spacing, judged)
+        or processing_fault(image, sensor, picture.view.image)
+        or _noise_fault(bounds, sensor, image, picture, judged)
     )
 
 
@@ -191,28 +194,28 @@ class _Bounds:
 
 
 def _beyond(
-    bounds: _Bounds, image: NDArray[np.uint8], shot: Shot, spacing: float, told: BoolArray
+    bounds: _Bounds, image: NDArray[np.uint8], view: ImageView, spacing: float, judged: BoolArray
 ) -> Finding | None:
     seen, inner = linear_of_codes(image), bounds.inner
-    beyond = told & ((seen < np.minimum(bounds.low, 1.0) - bounds.slack) | (seen > bounds.high + bounds.slack))
+    beyond = judged & ((seen < np.minimum(bounds.low, 1.0) - bounds.slack) | (seen > bounds.high + bounds.slack))
     if not beyond[inner].size:
         return None
     many, rows = float(np.mean(beyond[inner])), np.zeros(len(image), dtype=np.bool_)
     rows[inner[0]] = np.mean(beyond[inner], axis=(1, 2)) > _ROW_SHARE
     if many <= _BEYOND_SHARE * max(1.0, 2.0 * spacing) and not np.any(rows):
         return None
-    what = f"{100 * many:.2f} % of the values are beyond {_BEYOND_SIGMA:g} sigma of what {_twin(shot)} allows"
-    return Finding(shot.image, what, rows_of(rows))
+    what = f"{100 * many:.2f} % of the values are beyond {_BEYOND_SIGMA:g} sigma of what {_twin(view)} allows"
+    return Finding(view.image, what, rows_of(rows))
 
 
 def _noise_fault(
-    bounds: _Bounds, sensor: Sensor, image: NDArray[np.uint8], picture: Picture, told: BoolArray
+    bounds: _Bounds, sensor: Sensor, image: NDArray[np.uint8], picture: Picture, judged: BoolArray
 ) -> Finding | None:
     """Light and noise where the twin is smooth. Rounding is no noise: without any beside it, equal values are
     rounded alike."""
-    low, high, shot = bounds.low, bounds.high, picture.shot
+    low, high, view = bounds.low, bounds.high, picture.view
     sigma = np.sqrt(bounds.own + bounds.rounded)
-    smooth = told & (high - low < sigma) & (low > _UNCLIPPED[0]) & (high < _UNCLIPPED[1])
+    smooth = judged & (high - low < sigma) & (low > _UNCLIPPED[0]) & (high < _UNCLIPPED[1])
     smooth &= bounds.own > bounds.rounded
     if sensor.mosaic != "none":
         inside = np.zeros_like(smooth)
@@ -223,7 +226,7 @@ def _noise_fault(
     beside = ((linear_of_codes(image) - 0.5 * (low + high)) / sigma)[smooth]
     if abs(bias := float(np.mean(beside))) > _MOST_BIAS:
         way = "brighter" if bias > 0 else "darker"
-        return Finding(shot.image, f"is {way} than its sensor shows {_twin(shot)}, by {abs(bias):.2f} sigma")
+        return Finding(view.image, f"is {way} than its sensor shows {_twin(view)}, by {abs(bias):.2f} sigma")
     ratio, (least, most) = float(np.var(beside)), _VARIANCE_RANGE
     if sensor.jpeg_quality:
         made = linear_of_codes(_made_of(picture.colours, sensor))
@@ -231,12 +234,12 @@ def _noise_fault(
         least, most = _COMPRESSED_RANGE
     if least < ratio < most:
         return None
-    what = f"its noise has {ratio:.2f} times the variance of the sensor's, seen beside {_twin(shot)}"
-    return Finding(shot.image, what)
+    what = f"its noise has {ratio:.2f} times the variance of the sensor's, seen beside {_twin(view)}"
+    return Finding(view.image, what)
 
 
-def _twin(shot: Shot) -> str:
-    return f"rs_clean/{shot.side}_{shot.frame}.png"
+def _twin(view: ImageView) -> str:
+    return f"rs_clean/{view.side}_{view.frame}.png"
 
 
 def _made_of(clean: NDArray[np.uint8] | NDArray[np.float32], sensor: Sensor) -> NDArray[np.uint8]:
