@@ -99,7 +99,7 @@ def _rounded(content: Any) -> Any:
         return f"{content:.9g}"
     if isinstance(content, dict):
         return {key: _rounded(value) for key, value in content.items()}
-    return [_rounded(each) for each in content] if isinstance(content, list | tuple) else content
+    return [_rounded(each) for each in content] if isinstance(content, list | tuple) else content  # pyrefly: ignore
 
 
 def _identity(truth: Truth) -> dict[str, Any]:
