@@ -1,7 +1,7 @@
 """Motion and shutter of largest likelihood under one hypothesis of how the cameras read and how the rig moves.
 
-The six parameters of the motion and the unknowns of the capture are found together by Newton's method. The
-motion's part of the equations is compiled; that of the other unknowns, at most four, is differences of it.
+The six parameters of the motion and the unknowns of the capture are found together by Newton's method, from
+compiled equations.
 """
 
 from __future__ import annotations
@@ -10,17 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsbench.capture.hypotheses import LEAST_RATIO, RATIO, Hypothesis
+from rsbench.capture.hypotheses import ACCELERATION, LEAST_RATIO, RATIO, Hypothesis
 from rsbench.capture.scans import TimedMatches
 from rsbench.core.correspondences import BoolArray
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.capture_terms import add_pairs, add_tracks
 from rsbench.solvers.engine.heavy_tails import HeavyTailed
 
 BEYOND_RATIO = 1.2
 """No ratio is beyond 1, but the top of what noise makes of one near 1 may be."""
 _MAX_TRANSLATION_M = 50.0
-_DIFFERENCE = np.array([0.002, 0.002, 0.02, 0.01])
-"""Of the unknowns: they move points by a fraction of their noise, far above rounding."""
 _LEAST = np.array([LEAST_RATIO, -1.0, -50.0, -0.45])
 _MOST = np.array([BEYOND_RATIO, 1.0, 50.0, 3.0])
 _LONGEST_STEP = np.array([0.4, 0.4, 2.0, 0.3])
@@ -102,24 +101,17 @@ class CaptureCost:
         return float(np.sum(self.each(theta, unknowns))) + 0.5 * float(self._weight @ unknowns**2)
 
     def local(self, theta: FloatArray, unknowns: FloatArray, free: list[int]) -> tuple[FloatArray, FloatArray]:
-        """Gradient and Hessian by theta and the free unknowns, these by differences."""
-        at, by_theta, H_theta = self.tailed(unknowns).normal_equations(theta)
-        size = _MOTION + len(free)
-        gradient, H = np.zeros(size), np.zeros((size, size))
-        gradient[:_MOTION], H[:_MOTION, :_MOTION] = by_theta, H_theta
-        steps, ahead = np.diag(_DIFFERENCE)[free], np.zeros(len(free))
-        for k, step in enumerate(steps):
-            size_k, place = float(np.sum(step)), _MOTION + k
-            above, g_above, _ = self.tailed(unknowns + step).normal_equations(theta)
-            below = float(np.sum(self.each(theta, unknowns - step)))
-            gradient[place] = (above - below) / (2.0 * size_k)
-            H[place, place] = (above - 2.0 * at + below) / size_k**2
-            H[:_MOTION, place] = H[place, :_MOTION] = (g_above - by_theta) / size_k
-            ahead[k] = above - at
-            for j in range(k):
-                both = float(np.sum(self.each(theta, unknowns + step + steps[j])))
-                mixed = (both - at - ahead[k] - ahead[j]) / (size_k * float(np.sum(steps[j])))
-                H[place, _MOTION + j] = H[_MOTION + j, place] = mixed
+        """Gradient and Hessian by theta and the free unknowns."""
+        packed, size = self._matches.packed(self.hypothesis.scans, unknowns), _MOTION + len(free)
+        by = self._matches.derivatives(self.hypothesis.scans, packed, float(unknowns[ACCELERATION]))
+        by_pairs, by_tracks = (np.ascontiguousarray(each[:, :, free]) for each in by)
+        tails, trust = np.array([self.likelihood.nu, self.likelihood.scale]), self._trust
+        gradient, H, count = np.zeros(size), np.zeros((size, size)), len(packed.pairs)
+        fixed = (theta, packed.kernel)
+        add_pairs(*fixed, packed.pairs, by_pairs, packed.focal, tails, trust[:count], gradient, H)
+        add_tracks(
+            *fixed, packed.tracks, by_tracks, packed.focal, packed.baseline, tails, trust[count:], gradient, H
+        )
         gradient[_MOTION:] += self._weight[free] * unknowns[free]
         H[range(_MOTION, size), range(_MOTION, size)] += self._weight[free]
         return gradient, H

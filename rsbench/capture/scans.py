@@ -13,6 +13,7 @@ from rsbench.core.correspondences import BoolArray, Correspondences, unlinked_pa
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.kernel_type import MotionKernel
 from rsbench.solvers.engine.motion_kernels import AcceleratedKernel
 from rsbench.solvers.engine.packed import Packed, pack
 
@@ -172,10 +173,28 @@ class TimedMatches:
                 pairs[mine, 0] -= shift
                 pairs[mine, 2] -= shift
                 tracks[:, ends, 0] -= shift
+        return replace(self._base, pairs=pairs, tracks=tracks, h=0.0, kernel=self._kernel(acceleration))
+
+    def _kernel(self, acceleration: float) -> MotionKernel:
         kernel = self._base.kernel
-        if isinstance(kernel, AcceleratedKernel):
-            kernel = AcceleratedKernel(acceleration=acceleration)
-        return replace(self._base, pairs=pairs, tracks=tracks, h=0.0, kernel=kernel)
+        return AcceleratedKernel(acceleration=acceleration) if isinstance(kernel, AcceleratedKernel) else kernel
+
+    def derivatives(self, scans: Scans, packed: Packed, acceleration: float) -> tuple[FloatArray, FloatArray]:
+        """Of the ends' rays and times by the four unknowns: (n, 2, 4, 3) of pairs, (m, 4, 4, 3) of tracks.
+
+        An acceleration is one of all times: the motion is at beta(tau), see ``AcceleratedKernel``.
+        """
+        pairs, tracks = np.zeros((len(packed.pairs), 2, 4, 3)), np.zeros((len(packed.tracks), 4, 4, 3))
+        half = 0.5 / self._base.focal[0]
+        for side in SIDES:
+            lines, late, sign = self._lines[scans.start(side)], float(side == "right"), 1.0 - 2.0 * (side == "left")
+            mine, ends = self.left if side == "left" else ~self.left, list(_ENDS[side])
+            pairs[mine, :, 0, 2], tracks[:, ends, 0, 2] = lines.pairs[mine], lines.tracks[:, ends]
+            pairs[mine, :, 1, 2], tracks[:, ends, 1, 2] = late, late
+            pairs[mine, :, 2, 0], tracks[:, ends, 2, 0] = sign * half, sign * half
+        for by, tau in ((pairs, packed.pairs[:, 4:6]), (tracks, packed.tracks[:, :, 2])):
+            by[:, :, 3, 2] = (tau**2 - tau) / ((2.0 + acceleration) * (1.0 + acceleration * tau))
+        return pairs, tracks
 
 
 def _late(rig: StereoRig, scan: Scan) -> RollingShutter:

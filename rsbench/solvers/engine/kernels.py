@@ -50,7 +50,7 @@ def pair_terms(
     Args:
         theta: (6,) w and v.
         pairs: (n, 7) ray 0 (x, y), ray 1 (x, y), tau0, tau1, x of the camera's offset from the body in metres; or
-            (n, 17) with what ``_at_pixels`` names, where the lens or the scan make it differ.
+            (n, 17) with what ``at_pixels`` names, where the lens or the scan make it differ.
         focal: (2,) fx, fy in pixels; h: frame periods per row, of pairs (n, 7).
         residuals: (n,) filled, in pixels.
         H, gradient: (6, 6), (6,), added to when ``want``.
@@ -63,17 +63,17 @@ def pair_terms(
         Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
         T = plus((T[0] + offset, T[1], T[2]), -1.0, Ro)
         rate0, rate1 = plus(rate0, -1.0, cross(spin0, Ro)), plus(rate1, -1.0, cross(spin1, Ro))
-        L0, L1, slope = _at_pixels(pairs, m, h)
-        value, q = _pair_gradient(x, y, R, T, rate0, rate1, spin0, spin1, focal, L0, L1, slope)
+        L0, L1, slope = at_pixels(pairs, m, h)
+        value, q = pair_gradient(x, y, R, T, rate0, rate1, spin0, spin1, focal, L0, L1, slope)
         qq = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
-        residuals[m] = value / math.sqrt(qq) if qq > 0.0 else _displacement(apply(R, x), y, focal)
+        residuals[m] = value / math.sqrt(qq) if qq > 0.0 else displacement(apply(R, x), y, focal)
         if not want or qq <= 0.0:
             continue
         step = value / qq
-        x, y = _shifted(x, L0, step * q[0], step * q[1], focal), _shifted(y, L1, step * q[2], step * q[3], focal)
+        x, y = shifted(x, L0, step * q[0], step * q[1], focal), shifted(y, L1, step * q[2], step * q[3], focal)
         tau0 -= slope[1] * step * q[1] + slope[0] * step * q[0]
         tau1 -= slope[1] * step * q[3] + slope[0] * step * q[2]
-        _pair_jacobian(theta, kernel, x, y, tau0, tau1, offset, R, A, T_w, T_v, J)
+        pair_jacobian(theta, kernel, x, y, tau0, tau1, offset, R, A, T_w, T_v, J)
         for i in range(6):
             gradient[i] += J[i] / math.sqrt(qq) * residuals[m]
             for j in range(6):
@@ -81,7 +81,7 @@ def pair_terms(
 
 
 @compiled
-def _at_pixels(pairs: FloatArray, m: int, h: float) -> tuple[Matrix, Matrix, tuple[float, float]]:
+def at_pixels(pairs: FloatArray, m: int, h: float) -> tuple[Matrix, Matrix, tuple[float, float]]:
     """Derivatives of both ideal pixels by the pixels (2 x 2, rows first), and of tau by the pixel."""
     if pairs.shape[1] == 7:
         return (1.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.0), (0.0, h)
@@ -93,13 +93,13 @@ def _at_pixels(pairs: FloatArray, m: int, h: float) -> tuple[Matrix, Matrix, tup
 
 
 @compiled
-def _shifted(ray: Vector, L: Matrix, dx: float, dy: float, focal: FloatArray) -> Vector:
+def shifted(ray: Vector, L: Matrix, dx: float, dy: float, focal: FloatArray) -> Vector:
     """The ray of a pixel that is (dx, dy) less."""
     return (ray[0] - (L[0] * dx + L[1] * dy) / focal[0], ray[1] - (L[2] * dx + L[3] * dy) / focal[1], 1.0)
 
 
 @compiled
-def _displacement(p: Vector, y: Vector, focal: FloatArray) -> float:
+def displacement(p: Vector, y: Vector, focal: FloatArray) -> float:
     """Error (px) of a pair where the camera only turns: its constraint vanishes, and would let anything pass."""
     if p[2] <= 0.0:
         return math.sqrt(BEHIND)
@@ -107,7 +107,7 @@ def _displacement(p: Vector, y: Vector, focal: FloatArray) -> float:
 
 
 @compiled
-def _pair_gradient(
+def pair_gradient(
     x: Vector,
     y: Vector,
     R: FloatArray,
@@ -138,7 +138,7 @@ def _pair_gradient(
 
 
 @compiled
-def _pair_jacobian(
+def pair_jacobian(
     theta: FloatArray,
     kernel: MotionKernel,
     x: Vector,

@@ -46,27 +46,49 @@ def timed_track_terms(
     """
     e, D, W = np.zeros(8), np.zeros((8, 9)), np.zeros((4, 2, 2))
     N, inverse, Q = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((6, 3))
-    work = np.zeros((4, 3, 3))
+    work = np.zeros((6, 3, 3))
     for k in range(len(tracks)):
-        squares[k] = BEHIND
-        point = _first_point(theta, kernel, tracks[k], baseline, work)
-        seen = True
-        for step in range(_POINT_STEPS + 1):
-            if step > 0:
-                g = (_column(D, 0, e), _column(D, 1, e), _column(D, 2, e))
-                point = plus(point, -1.0, apply(inverse, g))
-            # Weighed where it starts. A literal True would compile _linearise once more.
-            seen = _linearise(theta, kernel, tracks[k], focal, baseline, point, e, D, W, work, step == 0)
-            seen = seen and _fill_inverse(D, N, inverse)
-            if not seen:
-                break
-        if not seen:
+        if not linearise_best(theta, kernel, tracks[k], focal, baseline, e, D, W, N, inverse, work):
+            squares[k] = BEHIND
             continue
         squares[k] = 0.0
         for i in range(8):
             squares[k] += e[i] * e[i]
         if want:
             _add_reduced(D, e, inverse, Q, H, gradient)
+
+
+@compiled
+def linearise_best(
+    theta: FloatArray,
+    kernel: MotionKernel,
+    ends: FloatArray,
+    focal: FloatArray,
+    baseline: float,
+    e: FloatArray,
+    D: FloatArray,
+    W: FloatArray,
+    N: FloatArray,
+    inverse: FloatArray,
+    work: FloatArray,
+) -> bool:
+    """Errors and derivatives of one track at its best point; False when the ends determine none before a camera.
+
+    Args:
+        ends: (4, 9) of the track.
+        e, D, W: see ``_linearise``; N, inverse: (3, 3) normal matrix of the point, and its inverse.
+        work: (6, 3, 3); the last two hold the pixels' velocities, see ``_linearise``.
+    """
+    point = _first_point(theta, kernel, ends, baseline, work)
+    for step in range(_POINT_STEPS + 1):
+        if step > 0:
+            g = (_column(D, 0, e), _column(D, 1, e), _column(D, 2, e))
+            point = plus(point, -1.0, apply(inverse, g))
+        # Weighed where it starts. A literal True would compile _linearise once more.
+        seen = _linearise(theta, kernel, ends, focal, baseline, point, e, D, W, work, step == 0)
+        if not (seen and _fill_inverse(D, N, inverse)):
+            return False
+    return True
 
 
 @compiled
@@ -103,25 +125,32 @@ def _linearise(
 ) -> bool:
     """Fill whitened errors e (8,) and their derivative D (8, 9) by the point and theta; False behind a camera.
 
-    ``weigh`` fills W (4, 2, 2) too, which takes errors in ideal pixels to pixels of unit noise.
+    ``weigh`` fills W (4, 2, 2) too, which takes errors in ideal pixels to pixels of unit noise. ``work[4:]`` gets
+    the derivatives of the predicted pixels of the right camera's frame 0 and of frame 1 (columns) by the time of
+    the first end (4) and by their own (5): x and y in the first two rows. That of the first end does not move.
     """
     R, A, T_w, T_v = work[0], work[1], work[2], work[3]
     half, rho = 0.5 * baseline, point[2]
     start = plus((point[0], point[1], 1.0), -rho, (half, 0.0, 0.0))
     for i in range(4):
         offset = half if i % 2 == 0 else -half
-        T, _, rate, _, spin = kernel.move(theta, ends[0, 2], ends[i, 2], R, A)
+        T, rate0, rate, spin0, spin = kernel.move(theta, ends[0, 2], ends[i, 2], R, A)
         kernel.translation_jacobian(theta, ends[0, 2], ends[i, 2], R, A, T_w, T_v)
         turned = apply(R, start)
         p = plus(plus(turned, rho, T), rho, (offset, 0.0, 0.0))
         if not p[2] > NEAREST:
             return False
         u, v = p[0] / p[2], p[1] / p[2]
+        moved = plus(times(rho, rate), 1.0, cross(spin, turned))
+        vx, vy = focal[0] * (moved[0] - u * moved[2]) / p[2], focal[1] * (moved[1] - v * moved[2]) / p[2]
+        if i > 0:
+            first = plus(times(rho, rate0), 1.0, cross(spin0, turned))
+            work[4, 0, i - 1] = focal[0] * (first[0] - u * first[2]) / p[2]
+            work[4, 1, i - 1] = focal[1] * (first[1] - v * first[2]) / p[2]
+            work[5, 0, i - 1], work[5, 1, i - 1] = vx, vy
         if weigh:
-            moved = plus(times(rho, rate), 1.0, cross(spin, turned))
-            vx, vy = focal[0] * (moved[0] - u * moved[2]) / p[2], focal[1] * (moved[1] - v * moved[2]) / p[2]
             _fill_weight(ends[i], vx, vy, W[i])
-        _whiten(W[i], focal[0] * (ends[i, 0] - u), focal[1] * (ends[i, 1] - v), i, e)
+        whiten(W[i], focal[0] * (ends[i, 0] - u), focal[1] * (ends[i, 1] - v), i, e)
         by_rho = plus(plus(T, 1.0, (offset, 0.0, 0.0)), -half, (R[0, 0], R[1, 0], R[2, 0]))
         for j in range(9):
             if j < 2:
@@ -133,7 +162,7 @@ def _linearise(
             else:
                 q = times(rho, _of(T_v, j - 6))
             gx, gy = -focal[0] * (q[0] - u * q[2]) / p[2], -focal[1] * (q[1] - v * q[2]) / p[2]
-            _whiten(W[i], gx, gy, i, D[:, j])
+            whiten(W[i], gx, gy, i, D[:, j])
     return True
 
 
@@ -152,7 +181,7 @@ def _fill_weight(end: FloatArray, vx: float, vy: float, W: FloatArray) -> None:
 
 
 @compiled
-def _whiten(W: FloatArray, x: float, y: float, i: int, out: FloatArray) -> None:
+def whiten(W: FloatArray, x: float, y: float, i: int, out: FloatArray) -> None:
     out[2 * i], out[2 * i + 1] = W[0, 0] * x + W[0, 1] * y, W[1, 0] * x + W[1, 1] * y
 
 
