@@ -18,7 +18,7 @@ from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.scene_hashes import SceneHashes, scene_key
 from rsbench.jobs.process_jobs import LostJobsError
 from rsbench.storage import file_hashes
-from rsbench.storage.file_hashes import FileHashes
+from rsbench.storage.file_hashes import HASHES, FileHashes
 from rsbench.storage.files import sha256
 from rsbench.storage.work_folder import HIDDEN, work_folder
 
@@ -235,4 +235,4 @@ def test_lost_jobs_end_a_command_with_code_1(monkeypatch: pytest.MonkeyPatch, tm
 
 def test_hidden_files_are_no_part_of_the_dataset(dataset: Path) -> None:
     listed = json.loads((dataset / "dataset.json").read_text())["files"]
-    assert not any(HIDDEN in path for path in listed) and (dataset / HIDDEN / "file_hashes.jsonl").is_file()
+    assert not any(HIDDEN in path for path in listed) and (dataset / HASHES).is_file()
