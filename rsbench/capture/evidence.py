@@ -24,6 +24,8 @@ _SCREENED = 160
 """Measurements by which most scans are put aside."""
 _CLOSE = 30.0
 """Differences of the logarithm of the likelihood beyond which a hypothesis is put aside after that."""
+_LIKELY = 12.0
+"""The same, beyond which one is left out in the end: of matches whose errors are independent."""
 _MOST_SCALE, _FIRST_NU = 10.0, 4.0
 """Scale of the errors, px, at most, and their tails, before their distribution is found."""
 _FALLS, _STEADY = 10, 0.9
@@ -116,13 +118,15 @@ def window_evidence(
     if full is None:
         return None
     near = _near(_fitted(timed, known, full, fits, known.delays), full.scale)
-    slopes = [_Slope(_cost(timed, full, known, fit.hypothesis), fit) for fit in near]
-    sharp = min(slopes, key=lambda slope: slope.best.cost)
+    sharp = _Slope(_cost(timed, full, known, near[0].hypothesis), near[0])
     dispersion = _dispersion(sharp, first.pixels[full.chosen]) if sharp.varies else 1.0
+    near = _near(near, full.scale, _LIKELY * dispersion)
+    slopes = [sharp, *(_Slope(_cost(timed, full, known, fit.hypothesis), fit) for fit in near[1:])]
+    sharp = min(slopes, key=lambda slope: slope.best.cost)
     reference, unit = sharp.best.cost, full.scale**2 * dispersion
     return WindowEvidence(
         peaks={slope.best.hypothesis: slope.peak(reference, unit) for slope in slopes},
-        lost=_CLOSE,
+        lost=_LIKELY,
         used=int(np.count_nonzero(full.chosen)),
         of=first.count,
         noise_px=full.scale,
@@ -213,9 +217,9 @@ def _judged(
 
 
 def _near(fits: Sequence[CaptureFit], scale: float, far: float = _CLOSE) -> list[CaptureFit]:
-    """Those whose log-likelihood is not far below the best one's."""
-    least = min(fit.cost for fit in fits)
-    return [fit for fit in fits if fit.cost - least <= far * scale**2]
+    """Those whose log-likelihood is not far below the best one's, the best first."""
+    fits = sorted(fits, key=lambda fit: fit.cost)
+    return [fit for fit in fits if fit.cost - fits[0].cost <= far * scale**2]
 
 
 def _fitted(

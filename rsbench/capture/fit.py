@@ -100,21 +100,20 @@ class CaptureCost:
     def __call__(self, theta: FloatArray, unknowns: FloatArray) -> float:
         return float(np.sum(self.each(theta, unknowns))) + 0.5 * float(self._weight @ unknowns**2)
 
-    def local(self, theta: FloatArray, unknowns: FloatArray, free: list[int]) -> tuple[FloatArray, FloatArray]:
-        """Gradient and Hessian by theta and the free unknowns."""
+    def local(
+        self, theta: FloatArray, unknowns: FloatArray, free: list[int]
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """The cost, its gradient and its Hessian by theta and the free unknowns."""
         packed, size = self._matches.packed(self.hypothesis.scans, unknowns), _MOTION + len(free)
-        by = self._matches.derivatives(self.hypothesis.scans, packed, float(unknowns[ACCELERATION]))
-        by_pairs, by_tracks = (np.ascontiguousarray(each[:, :, free]) for each in by)
+        by = self._matches.derivatives(self.hypothesis.scans, packed, float(unknowns[ACCELERATION]), free)
         tails, trust = np.array([self.likelihood.nu, self.likelihood.scale]), self._trust
-        gradient, H, count = np.zeros(size), np.zeros((size, size)), len(packed.pairs)
-        fixed = (theta, packed.kernel)
-        add_pairs(*fixed, packed.pairs, by_pairs, packed.focal, tails, trust[:count], gradient, H)
-        add_tracks(
-            *fixed, packed.tracks, by_tracks, packed.focal, packed.baseline, tails, trust[count:], gradient, H
-        )
+        gradient, H, n = np.zeros(size), np.zeros((size, size)), len(packed.pairs)
+        at, focal, baseline = (theta, packed.kernel), packed.focal, packed.baseline
+        cost = add_pairs(*at, packed.pairs, by[0], focal, tails, trust[:n], gradient, H)
+        cost += add_tracks(*at, packed.tracks, by[1], focal, baseline, tails, trust[n:], gradient, H)
         gradient[_MOTION:] += self._weight[free] * unknowns[free]
         H[range(_MOTION, size), range(_MOTION, size)] += self._weight[free]
-        return gradient, H
+        return cost + 0.5 * float(self._weight @ unknowns**2), gradient, H
 
 
 def fit_capture(
@@ -134,21 +133,20 @@ def fit_capture(
     """
     free = [k for k in cost.free if k != RATIO or not hold_ratio]
     unknowns = _within(unknowns, free)
-    now, damping = cost(theta, unknowns), _LEAST_DAMPING
-    gradient, H = cost.local(theta, unknowns, free)
+    damping = _LEAST_DAMPING
+    now, gradient, H = cost.local(theta, unknowns, free)
     for _ in range(iterations):
         before = now
         while damping < _LARGEST_DAMPING:
             moved = _stepped(gradient, H, theta, unknowns, free, damping)
-            trial = cost(*moved)
-            if trial <= now:
-                (theta, unknowns), now = moved, trial
+            trial = cost.local(*moved, free)
+            if trial[0] <= now:
+                (theta, unknowns), (now, gradient, H) = moved, trial
                 damping = max(0.1 * damping, _LEAST_DAMPING)
                 break
             damping *= 10.0
         if before - now < still * cost.likelihood.scale**2:
             break
-        gradient, H = cost.local(theta, unknowns, free)
     sigma = np.zeros(4)
     covariance = cost.likelihood.scale**2 * np.linalg.pinv(H, hermitian=True)[_MOTION:, _MOTION:]
     sigma[free] = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))

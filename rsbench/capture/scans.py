@@ -179,21 +179,30 @@ class TimedMatches:
         kernel = self._base.kernel
         return AcceleratedKernel(acceleration=acceleration) if isinstance(kernel, AcceleratedKernel) else kernel
 
-    def derivatives(self, scans: Scans, packed: Packed, acceleration: float) -> tuple[FloatArray, FloatArray]:
-        """Of the ends' rays and times by the four unknowns: (n, 2, 4, 3) of pairs, (m, 4, 4, 3) of tracks.
+    def derivatives(
+        self, scans: Scans, packed: Packed, acceleration: float, free: list[int]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Of the ends' rays and times by k free unknowns: (n, 2, k, 3) of pairs, (m, 4, k, 3) of tracks.
 
         An acceleration is one of all times: the motion is at beta(tau), see ``AcceleratedKernel``.
         """
-        pairs, tracks = np.zeros((len(packed.pairs), 2, 4, 3)), np.zeros((len(packed.tracks), 4, 4, 3))
-        half = 0.5 / self._base.focal[0]
-        for side in SIDES:
-            lines, late, sign = self._lines[scans.start(side)], float(side == "right"), 1.0 - 2.0 * (side == "left")
-            mine, ends = self.left if side == "left" else ~self.left, list(_ENDS[side])
-            pairs[mine, :, 0, 2], tracks[:, ends, 0, 2] = lines.pairs[mine], lines.tracks[:, ends]
-            pairs[mine, :, 1, 2], tracks[:, ends, 1, 2] = late, late
-            pairs[mine, :, 2, 0], tracks[:, ends, 2, 0] = sign * half, sign * half
-        for by, tau in ((pairs, packed.pairs[:, 4:6]), (tracks, packed.tracks[:, :, 2])):
-            by[:, :, 3, 2] = (tau**2 - tau) / ((2.0 + acceleration) * (1.0 + acceleration * tau))
+        pairs = np.zeros((len(packed.pairs), 2, len(free), 3))
+        tracks = np.zeros((len(packed.tracks), 4, len(free), 3))
+        for k, unknown in enumerate(free):
+            if unknown == 3:
+                for by, tau in ((pairs, packed.pairs[:, 4:6]), (tracks, packed.tracks[:, :, 2])):
+                    by[:, :, k, 2] = (tau**2 - tau) / ((2.0 + acceleration) * (1.0 + acceleration * tau))
+                continue
+            for side in SIDES:
+                mine, ends = self.left if side == "left" else ~self.left, list(_ENDS[side])
+                if unknown == 0:
+                    lines = self._lines[scans.start(side)]
+                    pairs[mine, :, k, 2], tracks[:, ends, k, 2] = lines.pairs[mine], lines.tracks[:, ends]
+                elif unknown == 1:
+                    pairs[mine, :, k, 2] = tracks[:, ends, k, 2] = float(side == "right")
+                else:
+                    shift = (-0.5 if side == "left" else 0.5) / self._base.focal[0]
+                    pairs[mine, :, k, 0] = tracks[:, ends, k, 0] = shift
         return pairs, tracks
 
 
