@@ -228,6 +228,7 @@ def correct(
     readout_ratio: float | None = None,
     *,
     solver: str | Path | Solver = "rs-stereo-refined",
+    motion_model: str | None = None,
     matcher: str | Path = "sgm",
     features: str | Path = "sift",
     corrector: str | Path = "fusion",
@@ -241,8 +242,9 @@ def correct(
     Args:
         images: four images, as the sensor read them; the cameras look the same way, side by side.
         rig: the cameras, with their lens where they have one; the result has it too.
-        readout_ratio: readout time over frame period; None has it estimated, of cameras without a lens.
+        readout_ratio: readout time over frame period; None has it found, with the side that lines are read from.
         solver: finds the motion, in metres; as in ``estimate_motion``.
+        motion_model: ``auto``, which the matches prefer, or a name; None is auto where the solver takes it.
         matcher, features: names or cards of what finds depth, and the matches of the motion.
         corrector: name or card of what makes the corrected frames.
         target_row: the time of this row of a frame is that of its corrected image.
@@ -257,16 +259,22 @@ def correct(
         RsbenchError: frames that cannot be what they are said to be, or no such component; NoMotionError: the
             matches determine no motion or readout ratio, or the solver no metres; NotCorrectedError.
     """
+    from rsbench.capture.settle import AUTO
     from rsbench.pipeline.chain import Given, correct_four
     from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.pipeline.frame_motion import check_model, takes_models
     from rsbench.pipeline.isolated_parts import Isolation
     from rsbench.vision.corrector import demand_corrected, load_corrector
     from rsbench.vision.feature_matcher import load_features
     from rsbench.vision.stereo_matcher import load_matcher
 
+    entry = _entry(solver)
+    if motion_model is not None:
+        check_model(motion_model, entry)
     options = CorrectionOptions(
         features=load_features(features),
-        solver=_entry(solver),
+        solver=entry,
+        motion_model=motion_model or (AUTO if takes_models(entry) else None),
         matcher=load_matcher(matcher),
         corrector=load_corrector(corrector),
         target_row=target_row,

@@ -18,8 +18,9 @@ import scipy
 from rsbench.capture.evidence import Peak, WindowEvidence, window_evidence
 from rsbench.capture.hypotheses import DELAY, OFFSET, Hypothesis, Known
 from rsbench.capture.scans import ALL_SCANS, GLOBAL, Scans
-from rsbench.capture.start import find_start
+from rsbench.capture.start import find_lag, find_start
 from rsbench.core.correspondences import Correspondences, temporal_pairs
+from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.so3 import FloatArray
 from rsbench.core.track_building import join_stereo
@@ -61,8 +62,8 @@ class Capture:
     """The most probable first; those below one in a hundred are left out."""
     models: Mapping[str, float]
     """Probability of each motion model, the most probable first."""
-    best: Peak | None
-    """Of the most probable hypothesis: of the last window, where there are several."""
+    peaks: Mapping[str, Peak]
+    """Of each motion model under the most probable scans: of the last window, where there are several."""
     offset: float
     """px by which disparities are too large."""
     offset_sigma: float
@@ -111,8 +112,13 @@ def examine(
     known: Known | None = None,
     options: RobustOptions | None = None,
     seed: int = 0,
+    start: Motion | None = None,
 ) -> Window:
-    """The matches of two times, with outliers; left-right matches are joined where there are no tracks."""
+    """The matches of two times, with outliers; left-right matches are joined where there are no tracks.
+
+    Args:
+        start: a motion near theirs, of any model; None has it looked for.
+    """
     known, options = known or Known(), options or RobustOptions()
     if len(matches.tracks) == 0 and len(matches.stereo_0) + len(matches.stereo_1) > 0:
         matches = join_stereo(matches).correspondences
@@ -122,10 +128,13 @@ def examine(
     if count < FEWEST:
         reason = f"{count} matches between two times, need {FEWEST}"
         return Window(evidence=None, reason=reason, matches=count, moved_px=moved)
-    start, lag = find_start(matches, rig, known, options, seed)
     if start is None:
-        return Window(evidence=None, reason="no motion explains the matches", matches=count, moved_px=moved)
-    motion = (start.estimate.w, start.estimate.d)
+        found, lag = find_start(matches, rig, known, options, seed)
+        if found is None:
+            return Window(evidence=None, reason="no motion explains the matches", matches=count, moved_px=moved)
+        motion = (found.estimate.w, found.estimate.d)
+    else:
+        motion, lag = (start.w, start.d), find_lag(matches.tracks, rig)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         evidence = window_evidence(matches, rig, known, motion, lag)
     reason = "too few matches agree with any motion" if evidence is None else ""
@@ -152,10 +161,11 @@ def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA) -> Capture
     kept = sum(window.used for window in used)
     share = kept / sum(window.of for window in used)
     best = max(shares, key=lambda key: shares[key])
+    likely = sorted((key for key in sums if key.scans == candidates[0].scans), key=lambda key: shares[key])
     return Capture(
         candidates=tuple(each for each in candidates if each.probability >= _UNLIKELY),
         models=_shares_by(shares, lambda key: key.motion_model),
-        best=sums[best].last,
+        peaks={key.motion_model: sums[key].last for key in likely},
         offset=sums[best].mean[OFFSET],
         offset_sigma=sums[best].sigmas[OFFSET],
         reason=_doubt(candidates, share, moved, max_sigma),
@@ -172,7 +182,7 @@ def _nothing(reason: str, matches: int, moved_px: float) -> Capture:
     return Capture(
         candidates=(),
         models={},
-        best=None,
+        peaks={},
         offset=0.0,
         offset_sigma=0.0,
         reason=reason,

@@ -11,7 +11,7 @@ import typer
 from rsbench.cli.component_kinds import named
 
 if TYPE_CHECKING:
-    from rsbench.capture.readout import ReadoutEstimate
+    from rsbench.capture.estimate import Capture
     from rsbench.core.rig import StereoRig
     from rsbench.core.shutter import RollingShutter
     from rsbench.pipeline.correction_options import CorrectionOptions
@@ -25,11 +25,11 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench correct --left left.mp4 --right right.mp4 --rig rig.toml --out corrected --target middle
 
-  rsbench correct l0.png r0.png l1.png r1.png --rig rig.toml --out corrected --motion-model auto
+  rsbench correct l0.png r0.png l1.png r1.png --rig rig.toml --out corrected --motion-model twist
 
   rsbench correct data/footage/castle --out corrected     [dim](a sequence of a dataset, which knows its rig)[/dim]
 
-RIG.toml, for images of cameras side by side (pixels, metres; without readout_ratio it is estimated):
+RIG.toml, for images of cameras side by side (pixels, metres; without readout_ratio and scan both are found):
 
   baseline = 0.12
   readout_ratio = 0.8        [dim]# readout time / frame period; or shutter = "gopro-hero6-4k30", of a real
@@ -49,7 +49,7 @@ the other camera, 64 from the other frame, 0 seen by nobody) and [bold]motion.js
 
 _PAGE_FRAMES = 6
 _SOLVER = "rs-stereo-refined"
-_MODEL = "Motion model: auto, which the matches prefer, or a name. Default: the solver's"
+_MODEL = "Motion model: auto, which the matches prefer, or a name. Default: auto where the solver takes it"
 
 
 def correct(
@@ -169,8 +169,11 @@ def _of_sequence(folder: Path, out: Path) -> _Given:
 def _options(
     features: str, solver: str, matcher: str, corrector: str, fill: bool, **others: Any
 ) -> CorrectionOptions:
-    from rsbench.capture.model_choice import check_asked
+    from dataclasses import replace
+
+    from rsbench.capture.settle import AUTO
     from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.pipeline.frame_motion import check_model, takes_models
     from rsbench.solvers.engine.registry import load_solver_entry
     from rsbench.vision.feature_matcher import load_features
     from rsbench.vision.stereo_matcher import load_matcher
@@ -183,7 +186,9 @@ def _options(
         **others,
     )
     if options.motion_model is not None:
-        check_asked(options.motion_model, options.solver)
+        check_model(options.motion_model, options.solver)
+    elif takes_models(options.solver):
+        options = replace(options, motion_model=AUTO)
     return options
 
 
@@ -249,14 +254,15 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
         demand_corrected(result.frames, options.corrector.name)
         for (side, frame), fused in result.frames.items():
             write_frame(folder, f"{side}_{frame}", fused)
-        record = rig_record(rig, result.shutter, result.readout, options, card.disparity_offset)
+        offset = (card.disparity_offset or 0.0) if result.found is None else result.found.disparity_offset
+        record = rig_record(rig, result.shutter, result.capture, options, offset)
         record["motion"] = None if result.found is None else motion_record(result.found)
         record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in result.frames.items()}
         record["seconds"] = result.seconds
         write_record(folder, record)
         cards = [card_of(f"{s} {f}", images[s, f], fused) for (s, f), fused in result.frames.items()]
-        _page(folder, out, result.shutter, result.readout, record["motion"], cards)
-    _say(out, result.shutter, result.readout, record["motion"])
+        _page(folder, out, result.shutter, result.capture, record["motion"], cards)
+    _say(out, result.shutter, result.capture, record["motion"])
 
 
 def _sized(card: RigCard, image: Any) -> StereoRig:
@@ -273,13 +279,13 @@ def _page(
     folder: Path,
     out: Path,
     shutter: RollingShutter,
-    readout: ReadoutEstimate | None,
+    capture: Capture | None,
     motion: dict[str, Any] | None,
     cards: list[Any],
 ) -> None:
     from rsbench.report.corrected_page import write_page
 
-    facts = [("readout ratio", _readout(shutter, readout))]
+    facts = [("readout ratio", _readout(shutter, capture))]
     if motion is not None:
         facts += [("rotation", f"{motion['rotation_deg']:.4f} deg per frame period")]
         facts += [("translation", f"{motion['translation']:.4f} m per frame period")]
@@ -296,23 +302,24 @@ def _agreeing(motion: dict[str, Any]) -> str:
     return ", ".join(f"{inliers} of {matches} {name}" for name, inliers, matches in sets if matches)
 
 
-def _readout(shutter: RollingShutter, readout: ReadoutEstimate | None) -> str:
-    if readout is None:
+def _readout(shutter: RollingShutter, capture: Capture | None) -> str:
+    best = None if capture is None else capture.likeliest
+    if capture is None or best is None:
         return f"{shutter.readout_ratio:.3f} (given)"
-    text = f"{readout} (estimated)"
-    if readout.signed_ratio < 0.0:
-        text += ", corrected as 0"
-    if readout.offset_sigma > 0.0:
-        text += f"; disparity offset {readout.disparity_offset:+.2f} +- {readout.offset_sigma:.2f} px (estimated)"
-        if readout.windows == 1:
+    text = f"{best.ratio:.3f} +- {best.sigma:.3f}, {best.scans} (found, {100.0 * best.probability:.0f} % sure)"
+    if shutter.right_delay:
+        text += f"; right camera late by {best.delay:+.3f} +- {best.delay_sigma:.3f} frame periods"
+    if capture.offset_sigma > 0.0:
+        text += f"; disparity offset {capture.offset:+.2f} +- {capture.offset_sigma:.2f} px"
+        if capture.windows == 1:
             text += "; a rig like this errs by twice the deviations of one window"
     return text
 
 
 def _say(
-    out: Path, shutter: RollingShutter, readout: ReadoutEstimate | None, motion: dict[str, Any] | None
+    out: Path, shutter: RollingShutter, capture: Capture | None, motion: dict[str, Any] | None
 ) -> None:
-    typer.echo(f"readout ratio {_readout(shutter, readout)}")
+    typer.echo(f"readout ratio {_readout(shutter, capture)}")
     if motion is not None:
         typer.echo(f"motion {motion['rotation_deg']:.4f} deg, {motion['translation']:.4f} m per frame period")
         if motion["model_choice"]:
@@ -328,28 +335,33 @@ def _correct_sequence(
     from dataclasses import replace
 
     from rsbench.cli.console import progress_bar
+    from rsbench.core.shutter import Scanning
     from rsbench.dataset.corrected_frames import fresh_folder, rig_record, write_record
     from rsbench.pipeline.chain import check_cameras
-    from rsbench.pipeline.sequence_correction import correct_sequence, estimate_sequence_readout
+    from rsbench.pipeline.sequence_correction import WINDOWS, correct_sequence, estimate_sequence_capture
 
     rig = _sized(card, next(iter(left)))
     options = replace(options, target_row=_target_row(target, rig.camera.height))
-    ratio, offset, readout = card.readout_ratio, card.disparity_offset, None
-    check_cameras(rig, card.scanning, options, ratio, offset)
+    ratio, offset, scanning, capture = card.readout_ratio, card.disparity_offset, card.scanning, None
+    check_cameras(rig, scanning or Scanning(), options, offset)
     with fresh_folder(out) as folder:
         if ratio is None:
-            readout = estimate_sequence_readout(left, right, rig, options, offset)
-            ratio, offset = readout.readout_ratio, readout.disparity_offset
-        shutter = card.shutter_of(rig.camera.width, rig.camera.height, ratio)
-        record = rig_record(rig, shutter, readout, options, offset)
+            windows = min(max(left.count - 1, 1), WINDOWS)
+            with progress_bar("looking at the shutter", windows) as advance:
+                found = estimate_sequence_capture(left, right, rig, options, scanning, offset, advance)
+            capture, shutter = found
+            ratio, scanning = shutter.readout_ratio, shutter.scanning
+            offset = capture.offset if offset is None and shutter.rows_together else offset
+        shutter = (scanning or Scanning()).shutter_of(rig.camera.width, rig.camera.height, ratio)
+        record = rig_record(rig, shutter, capture, options, offset or 0.0)
         with progress_bar("correcting", max(left.count, 1)) as advance:
-            moments = correct_sequence(left, right, rig, ratio, options, offset or 0.0, card.scanning)
+            moments = correct_sequence(left, right, rig, ratio, options, offset or 0.0, scanning)
             record["frames"], cards = _write_moments(folder, moments, left, advance)
         write_record(folder, record)
-        _page(folder, out, shutter, readout, None, cards)
+        _page(folder, out, shutter, capture, None, cards)
     failed = _told(record["frames"], "reason")
     skipped = _told(record["frames"], "skipped")
-    typer.echo(f"readout ratio {_readout(shutter, readout)}")
+    typer.echo(f"readout ratio {_readout(shutter, capture)}")
     corrected = [frame for frame in record["frames"] if "reason" not in frame]
     typer.echo(f"{len(corrected)} of {len(record['frames'])} times corrected")
     typer.echo(f"report: {(out / 'report.html').resolve()}")

@@ -155,7 +155,8 @@ def _framed(name: str, left: FrameSource, right: FrameSource, card: Path, option
     try:
         rig = said.rig(width, height)
         ratio = said.readout_ratio
-        shutter = None if ratio is None else said.shutter_of(width, height, ratio)
+        scanning = said.scanning
+        shutter = None if ratio is None or scanning is None else scanning.shutter_of(width, height, ratio)
     except ValueError as error:
         raise RsbenchError(f"--rig: of images of {width} x {height} pixels: {error}") from error
     return _Case(name, _frame_windows(left, right, rig, options), shutter)
@@ -210,6 +211,8 @@ def _frame_windows(left: FrameSource, right: FrameSource, rig: StereoRig, option
 
 def _record(case: _Case, found: Capture) -> dict[str, Any]:
     """What JSON says of one rig; what is not told is null."""
+    from rsbench.capture.settle import candidates_of
+
     named, best = (found.likeliest if known else None for known in (found.named, found.told))
     return {
         "name": case.name,
@@ -222,16 +225,7 @@ def _record(case: _Case, found: Capture) -> dict[str, Any]:
         "right_delay_sigma": None if best is None else best.delay_sigma,
         "probability": None if named is None else named.probability,
         "reason": found.reason,
-        "candidates": [
-            {
-                "left": each.scans.left,
-                "right": each.scans.right,
-                "probability": each.probability,
-                "readout_ratio": each.ratio,
-                "readout_ratio_sigma": each.sigma,
-            }
-            for each in found.candidates
-        ],
+        "candidates": candidates_of(found),
         "motion_model": found.motion_model or None,
         "windows": found.windows,
         "matches": found.matches,

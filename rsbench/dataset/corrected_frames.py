@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.readout import ReadoutEstimate
+from rsbench.capture.estimate import Capture
+from rsbench.capture.settle import record_of
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_motion import FoundMotion, referee
+from rsbench.pipeline.frame_motion import FoundMotion
 from rsbench.storage.files import read_json, read_png, write_depth, write_json, write_png
 from rsbench.storage.work_folder import HIDDEN, WORK, files_below, named, remove, unknown_files, work_folder
 from rsbench.vision.fusion import Fused, Origin
@@ -150,13 +151,12 @@ def motion_record(found: FoundMotion) -> dict[str, Any]:
 def rig_record(
     rig: StereoRig,
     shutter_: RollingShutter,
-    readout: ReadoutEstimate | None,
+    capture: Capture | None,
     options: CorrectionOptions,
-    disparity_offset: float | None = None,
+    disparity_offset: float = 0.0,
 ) -> dict[str, Any]:
-    """What the correction assumed and which components it was made with, ready for JSON."""
-    offset = (disparity_offset or 0.0) if readout is None else readout.disparity_offset
-    camera = rig.camera
+    """What the correction assumed or found, and which components it was made with, ready for JSON."""
+    camera, best = rig.camera, None if capture is None else capture.likeliest
     components = {name: {"name": entry.name, "key": entry.key} for name, entry in options.components.items()}
     return {
         "units": {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = infinite or unknown"},
@@ -165,12 +165,11 @@ def rig_record(
         "scan": asdict(shutter_.scanning),
         "baseline": rig.baseline,
         "readout_ratio": shutter_.readout_ratio,
-        "readout_ratio_sigma": readout.sigma if readout is not None and np.isfinite(readout.sigma) else None,
-        "readout_ratio_estimated": readout is not None,
-        "readout_ratio_signed": None if readout is None else readout.signed_ratio,
-        "disparity_offset": offset,
-        "disparity_offset_sigma": None if readout is None else readout.offset_sigma,
-        "readout_ratio_by": referee(options.solver)[0] if readout is not None else None,
+        "readout_ratio_sigma": None if best is None else best.sigma,
+        "readout_ratio_estimated": capture is not None,
+        "disparity_offset": disparity_offset,
+        "disparity_offset_sigma": None if capture is None else capture.offset_sigma,
+        "capture": None if capture is None else record_of(capture),
         "target_row": options.target_row,
         "components": components,
         "mask_values": {origin.name.lower(): value for origin, value in MASK_VALUES.items()},

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.capture.readout import ReadoutEstimate
+from rsbench.capture.estimate import Capture
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
@@ -29,7 +29,7 @@ from rsbench.pipeline.frame_depth import (
     moving_pairs,
     timed_pairs,
 )
-from rsbench.pipeline.frame_motion import FoundMotion, match_frames, solve_frames, solve_shutter
+from rsbench.pipeline.frame_motion import FoundMotion, match_frames, match_unknown, solve_frames
 from rsbench.vision.corrector import CorrectionProblem, find_corrected_rows
 from rsbench.vision.fusion import Fused, Origin, inpaint
 from rsbench.vision.stereo_matcher import needs_motion, refuse_motion
@@ -61,8 +61,8 @@ class CorrectedFrames:
     found: FoundMotion | None
     """Where it comes from; None when it was given."""
     shutter: RollingShutter
-    readout: ReadoutEstimate | None
-    """How the readout ratio was estimated; None when it was given."""
+    capture: Capture | None
+    """How the shutter was found; None when it was given."""
     matches: Correspondences | None
     pairs: Pairs | None
     """The frames with the depth that they were corrected with."""
@@ -90,13 +90,14 @@ def correct_four(
     Args:
         images: by side and frame.
         rig: its cameras have the images' size.
-        readout_ratio: None has it estimated.
+        readout_ratio: None has it found from the matches.
         options: components and what happens between them.
         step: called with the name of each of the 4 steps done.
         given: what is known already.
         views: the frames that are wanted.
         disparity_offset: see ``solve_frames``.
-        scanning: how the cameras read their lines; None: rows from the top, both at once.
+        scanning: how the cameras read their lines; None: found with the readout ratio, or where that is given,
+            rows from the top, both at once.
         rows: further target rows, at whose times the frames are wanted too.
 
     Raises:
@@ -105,15 +106,16 @@ def correct_four(
         NoMotionError: the matches determine no motion or readout ratio.
         ValueError: a motion is given and no readout ratio.
     """
-    given, scanning = given or Given(), scanning or Scanning()
-    check_cameras(rig, scanning, options, readout_ratio, disparity_offset, given.pairs is not None)
+    given = given or Given()
+    check_cameras(rig, scanning or Scanning(), options, disparity_offset, given.pairs is not None)
     if given.motion is not None and readout_ratio is None:
         raise ValueError("readout_ratio must be known where the motion is given: the matches would give another")
     clock, needs = _Clock(step), options.corrector.component.spec.needs
-    matches, found, shutter, readout = _solve(
-        images, rig, readout_ratio, scanning, options, given, clock, disparity_offset
-    )
-    offset = disparity_offset or 0.0 if readout is None else readout.disparity_offset
+    asked = (readout_ratio, scanning, disparity_offset)
+    matches, found, shutter, capture = _solve(images, rig, asked, options, given, clock)
+    offset = disparity_offset or 0.0 if found is None else found.disparity_offset
+    if capture is not None:
+        check_cameras(rig, shutter.scanning, options, disparity_offset, given.pairs is not None)
     motion = given.motion if found is None else found.motion
     pairs = (
         find_depth(images, rig, shutter, motion, options, given.pairs, offset) if "depth" in needs else given.pairs
@@ -128,7 +130,7 @@ def correct_four(
         motion=motion,
         found=found,
         shutter=shutter,
-        readout=readout,
+        capture=capture,
         matches=matches,
         pairs=pairs,
         frames=frames,
@@ -141,47 +143,37 @@ def check_cameras(
     rig: StereoRig,
     scanning: Scanning,
     options: CorrectionOptions,
-    readout_ratio: float | None,
     disparity_offset: float | None,
     depth_is_known: bool = False,
 ) -> None:
     """Whether these cameras can be corrected with these options.
 
     Raises:
-        RsbenchError: depth is to be found where a pair is of two times, and no motion; or a readout ratio is to
-            be found, or an offset given, of cameras with a lens or another scan, or with a matcher that needs
-            the motion.
+        RsbenchError: depth is to be found where a pair is of two times, and no motion; or an offset is given, of
+            cameras with a lens or another scan, or with a matcher that needs the motion.
     """
     lens, needs = rig.camera.lens, options.corrector.component.spec.needs
     if not depth_is_known and "depth" in needs:
-        _check_matcher(options, readout_ratio, disparity_offset)
+        _check_matcher(options, disparity_offset)
     if not (depth_is_known or scanning.rows_together) and "depth" in needs and "motion" not in needs:
         raise RsbenchError(
             f"scan = {scanning.scan!r}, right_scan = {scanning.right_scan!r}, "
             f"right_delay = {scanning.right_delay}: depth is found with the motion between the times of both "
             f"cameras, for which corrector {options.corrector.name!r} does not ask"
         )
-    if lens is None and scanning.plain:
-        return
     what = f"camera.lens = {lens.model!r}" if lens is not None else f"scan = {scanning.scan!r}"
-    if readout_ratio is None:
-        raise RsbenchError(f"readout_ratio: must be given with {what}; it is estimated for ideal cameras alone")
-    if disparity_offset:
+    if disparity_offset and not (lens is None and scanning.plain):
         raise RsbenchError(
             f"disparity_offset = {disparity_offset}: must be 0 with {what}; calibrate the rig again"
         )
 
 
-def _check_matcher(
-    options: CorrectionOptions, readout_ratio: float | None, disparity_offset: float | None
-) -> None:
+def _check_matcher(options: CorrectionOptions, disparity_offset: float | None) -> None:
     """Raises RsbenchError where the matcher needs a motion and there is none, or only one of a doubtful rig."""
     if not needs_motion(options.matcher):
         return
     if "motion" not in options.corrector.component.spec.needs:
         refuse_motion(options.matcher, f"corrector {options.corrector.name!r} does not ask for one")
-    if readout_ratio is None:
-        raise RsbenchError(f"readout_ratio: must be given with matcher {options.matcher.name!r}")
     if disparity_offset:
         raise RsbenchError(
             f"disparity_offset = {disparity_offset}: must be 0 with matcher {options.matcher.name!r}; "
@@ -192,35 +184,36 @@ def _check_matcher(
 def _solve(
     images: Images,
     rig: StereoRig,
-    readout_ratio: float | None,
-    scanning: Scanning,
+    asked: tuple[float | None, Scanning | None, float | None],
     options: CorrectionOptions,
     given: Given,
     clock: _Clock,
-    disparity_offset: float | None,
-) -> tuple[Correspondences | None, FoundMotion | None, RollingShutter, ReadoutEstimate | None]:
-    """Matches, motion and shutter, as far as they are needed and not given."""
+) -> tuple[Correspondences | None, FoundMotion | None, RollingShutter, Capture | None]:
+    """Matches, motion and shutter, as far as they are needed and not given.
+
+    Args:
+        asked: readout ratio, scanning and disparity offset, as of ``correct_four``.
+    """
+    readout_ratio, scanning, disparity_offset = asked
     needs = options.corrector.component.spec.needs
-    wanted, matched = (
-        given.motion is None and "motion" in needs,
-        given.matches is not None or "matches" not in needs,
-    )
+    wanted = given.motion is None and "motion" in needs
+    matched = given.matches is not None or "matches" not in needs
+    camera, doubt, matches = rig.camera, None, given.matches
     if readout_ratio is not None and not wanted and matched:
         clock("matching")
         clock("motion")
-        shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
-        return given.matches, None, shutter, None
-    matches = match_frames(images, rig, options, scanning) if given.matches is None else given.matches
+        shutter = (scanning or Scanning()).shutter_of(camera.width, camera.height, readout_ratio)
+        return matches, None, shutter, None
+    if matches is None and readout_ratio is None and scanning is None:
+        matches, doubt = match_unknown(images, rig, options)
+    elif matches is None:
+        matches = match_frames(images, rig, options, scanning)
     clock("matching")
-    found, readout = None, None
-    if wanted:
-        found, shutter, readout = solve_frames(matches, rig, readout_ratio, options, disparity_offset, scanning)
-    elif readout_ratio is None:
-        shutter, readout = solve_shutter(matches, rig, readout_ratio, options, disparity_offset)
-    else:
-        shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
+    solved = solve_frames(
+        matches, rig, readout_ratio, options, disparity_offset, scanning, doubt=doubt, with_motion=wanted
+    )
     clock("motion")
-    return matches, found, shutter, readout
+    return solved.matches, solved.found, solved.shutter, solved.capture
 
 
 def find_depth(

@@ -21,7 +21,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.lens import Lens
 from rsbench.core.rig import StereoRig, View
-from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.storage.untrusted_files import check_image_size, check_size, read_bytes
 
 _SMALLEST = 32
@@ -58,6 +58,9 @@ class RigCard(Scanning):
     """Intrinsics of both cameras, which are the same."""
     baseline: float
     """Full distance between the cameras, metres."""
+    scan: Scan | None = None  # pyrefly: ignore[bad-override]
+    """Side of the image at which the readout of both cameras begins. Absent: found with the readout ratio, or
+    ``top`` where that is given."""
     readout_ratio: float | None = None
     """Readout time over frame period, 0 to 1. Absent: estimated from the frames."""
     disparity_offset: float | None = None
@@ -65,7 +68,7 @@ class RigCard(Scanning):
 
     def __post_init__(self) -> None:
         self.rig(1, 1)
-        self.shutter_of(1, 1, 0.0)
+        (self.scanning or Scanning()).shutter_of(1, 1, 0.0)
         if self.disparity_offset is not None and not abs(self.disparity_offset) <= _LARGEST_OFFSET_PX:
             raise ValueError(
                 f"disparity_offset = {self.disparity_offset}: must lie within {_LARGEST_OFFSET_PX:g} px; "
@@ -75,9 +78,11 @@ class RigCard(Scanning):
             raise ValueError(f"readout_ratio = {self.readout_ratio}: must lie in [0, 1], or be absent if unknown")
 
     @property
-    def scanning(self) -> Scanning:
-        """How its cameras read their lines."""
-        return Scanning(scan=self.scan, right_scan=self.right_scan, right_delay=self.right_delay)
+    def scanning(self) -> Scanning | None:
+        """How its cameras read their lines; None where that is to be found with the readout ratio."""
+        if self.readout_ratio is None and self.scan is None and self.right_scan is None and self.right_delay == 0.0:
+            return None
+        return Scanning(scan=self.scan or "top", right_scan=self.right_scan, right_delay=self.right_delay)
 
     def rig(self, width: int, height: int) -> StereoRig:
         """The rig with images of this size; ValueError where its lens cannot be one of such images."""

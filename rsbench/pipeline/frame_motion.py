@@ -6,9 +6,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.capture.model_choice import ModelChoice, settle_model
-from rsbench.capture.readout import LEAST_BACKWARDS, ReadoutEstimate, estimate_readout_ratio, runs_backwards
+from rsbench.capture.estimate import Capture, conclude, examine
+from rsbench.capture.hypotheses import MODELS
 from rsbench.capture.rectification import RefusedFramesError, check_rig, without_offset
+from rsbench.capture.scans import scans_of
+from rsbench.capture.settle import (
+    AUTO,
+    LEAST_BACKWARDS,
+    ModelChoice,
+    NoMotionError,
+    backwards_known,
+    choose_model,
+    known_of,
+    runs_backwards,
+    shutter_found,
+    spread_by_ratio,
+)
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
@@ -19,26 +32,20 @@ from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Images
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.engine.kernel_type import load_kernel
 from rsbench.solvers.engine.registry import SolverEntry
 from rsbench.solvers.engine.robust_motion import RobustEstimate, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.vision.feature_matcher import find_correspondences
-from rsbench.vision.features import SiftMatcher
+from rsbench.vision.features import ROW_TOLERANCE_PX, SiftMatcher
 from rsbench.vision.images import eight_bit
 from rsbench.vision.undistortion import undistorted, with_lens
 
 _FEWEST_MATCHES = 12
-_MAX_READOUT_SIGMA = 0.25
 BACKWARDS = (
-    "time runs backwards in them: the two times are exchanged, or rows are read from the bottom up (turn the "
-    "images by 180 degrees then, and exchange left and right)"
+    "time runs backwards in them: the two times are exchanged, or lines are read from the side opposite to what is "
+    "said (scan in the rig's card)"
 )
-_REFEREE = "rs-stereo-refined"
-"""Name of the card with the default parameters of ``RefinedSolver``."""
-
-
-class NoMotionError(RsbenchError):
-    """The frames are in order, but no motion explains their matches; the message says why."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,6 +113,7 @@ def match_frames(
     """``find_matches_of_rig`` of frames that a user says to be those of a rig.
 
     Args:
+        scanning: how the cameras read; None: rows from the top, both at once.
         judge_rig: whether to look if frame 0 is a rectified pair in the right order.
 
     Raises:
@@ -114,7 +122,36 @@ def match_frames(
     scanning = scanning or Scanning()
     if judge_rig and scanning.rows_together:
         check_rig(images["left", 0], images["right", 0], rig)
-    matches = find_matches_of_rig(images, rig, scanning, options)
+    return _enough(find_matches_of_rig(images, rig, scanning, options))
+
+
+def match_unknown(
+    images: Images, rig: StereoRig, options: CorrectionOptions, *, judge_rig: bool = True
+) -> tuple[Correspondences, RefusedFramesError | None]:
+    """``match_frames`` of cameras that may read in any way, and what speaks against a pair that reads as one.
+
+    Raises:
+        RefusedFramesError: no texture.
+    """
+    doubt = None
+    try:
+        if judge_rig:
+            check_rig(images["left", 0], images["right", 0], rig)
+    except RefusedFramesError as error:
+        doubt = error
+    anyhow = isinstance(options.features.component, SiftMatcher)
+    scanning = Scanning(scan="left") if anyhow else Scanning()
+    return _enough(find_matches_of_rig(images, rig, scanning, options)), doubt
+
+
+def on_their_rows(matches: Correspondences, rig: StereoRig) -> Correspondences:
+    """Without tracks whose left-right ends are not on one row, of cameras that read rows together."""
+    tracks = rig.camera.ideal_pixels(matches.tracks.reshape(-1, 2)).reshape(-1, 8)
+    off = np.maximum(np.abs(tracks[:, 1] - tracks[:, 3]), np.abs(tracks[:, 5] - tracks[:, 7]))
+    return replace(matches, tracks=matches.tracks[off <= ROW_TOLERANCE_PX])
+
+
+def _enough(matches: Correspondences) -> Correspondences:
     temporal = max(len(matches.left) + len(matches.right), 2 * len(matches.tracks))
     if temporal < _FEWEST_MATCHES:
         raise RefusedFramesError(
@@ -130,8 +167,12 @@ def find_motion(
     shutter: RollingShutter,
     options: CorrectionOptions,
     rng: np.random.Generator | None = None,
+    capture: Capture | None = None,
 ) -> FoundMotion:
     """The body's motion by the solver of the options; ``rng`` draws RANSAC's samples, by default from the seed.
+
+    With a motion model in the options the matches decide which is used: by ``capture``, where the shutter was
+    found too, or by a look at the models alone.
 
     Another package's solver answers from a process of its own, within the time limit of its card.
 
@@ -141,19 +182,80 @@ def find_motion(
     """
     entry = options.solver
     rng = np.random.default_rng(options.seed) if rng is None else rng
-    if entry.built_in:
-        robust = estimate_motion(matches, rig, shutter, entry.solver, options.robust, rng, entry.options.robust)
-    else:
-        with SolverRunner() as runner:
-            robust = runner.robust(entry, matches, rig, shutter, options.robust, rng)
-    motion, choice = motion_of(robust.estimate, entry, rig), None
-    if options.motion_model is not None:
-        robust, choice = settle_model(
-            options.motion_model, robust, entry, matches, rig, shutter, options.robust, rng
-        )
-        motion = motion if choice is None else choice.motion
-    point = entry.solver.spec.reference_point
+    choice = None if capture is None or options.motion_model is None else choose_model(capture)
+    robust = _solved(entry if choice is None else entry_of(entry, choice), matches, rig, shutter, options, rng)
+    if capture is None and options.motion_model is not None and robust.estimate.success:
+        choice = _chosen(motion_of(robust.estimate, entry, rig), matches, rig, shutter, options)
+        if choice is not None and choice.used != entry.solver.spec.motion_model:
+            robust = _solved(entry_of(entry, choice), matches, rig, shutter, options, rng)
+    if capture is not None:
+        robust = replace(robust, estimate=with_ratio_unknown(robust.estimate, capture))
+    entry = entry if choice is None else entry_of(entry, choice)
+    motion, point = motion_of(robust.estimate, entry, rig), entry.solver.spec.reference_point
     return FoundMotion(motion=motion, robust=robust, solver=entry.name, reference_point=point, choice=choice)
+
+
+def _solved(
+    entry: SolverEntry,
+    matches: Correspondences,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    options: CorrectionOptions,
+    rng: np.random.Generator,
+) -> RobustEstimate:
+    if entry.built_in:
+        return estimate_motion(matches, rig, shutter, entry.solver, options.robust, rng, entry.options.robust)
+    with SolverRunner() as runner:
+        return runner.robust(entry, matches, rig, shutter, options.robust, rng)
+
+
+def _chosen(
+    start: Motion, matches: Correspondences, rig: StereoRig, shutter: RollingShutter, options: CorrectionOptions
+) -> ModelChoice | None:
+    """The motion model, of a shutter that is known; None where nothing can be said."""
+    known = known_of(matches, rig, shutter.readout_ratio, shutter.scanning, 0.0, models_asked(options.motion_model))
+    return choose_model(conclude([examine(matches, rig, known, options.robust, options.seed, start)]))
+
+
+def models_asked(motion_model: str | None) -> tuple[str, ...]:
+    """Those that ``auto`` chooses from, or the one that is asked for."""
+    return MODELS if motion_model in (None, AUTO) else (str(motion_model),)
+
+
+def takes_models(entry: SolverEntry) -> bool:
+    """Whether a solver can assume any motion model."""
+    solver = entry.solver
+    return isinstance(solver, RefinedSolver) and solver.shutter == "rolling" and not solver.one_camera
+
+
+def check_model(asked: str, entry: SolverEntry) -> None:
+    """Raises RsbenchError when there is no such model to ask for, or the solver cannot take another one."""
+    if asked != AUTO:
+        load_kernel(asked)
+    if not takes_models(entry):
+        spec = entry.solver.spec
+        known_to = f"solver {entry.name!r} knows only {spec.motion_model} motion and a {spec.shutter} shutter"
+        known_to += "" if spec.metric else ", without a length"
+        raise RsbenchError(f"--motion-model {asked}: {known_to}; take rs-stereo-refined")
+
+
+def entry_of(entry: SolverEntry, choice: ModelChoice) -> SolverEntry:
+    """A refined solver with another motion model."""
+    solver = entry.solver
+    assert isinstance(solver, RefinedSolver)
+    if choice.used == solver.motion_model and not choice.parameters:
+        return entry
+    return replace(
+        entry, solver=replace(solver, motion_model=choice.used, motion_parameters=dict(choice.parameters))
+    )
+
+
+def with_ratio_unknown(estimate: MotionEstimate, capture: Capture) -> MotionEstimate:
+    """The covariance with what an estimated readout ratio adds to it."""
+    best, peak = capture.likeliest, capture.peaks.get(capture.motion_model)
+    if estimate.covariance is None or best is None or peak is None or not best.sigma > 0.0:
+        return estimate
+    return replace(estimate, covariance=estimate.covariance + spread_by_ratio(peak, best.sigma))
 
 
 def motion_of(estimate: MotionEstimate, entry: SolverEntry, rig: StereoRig) -> Motion:
@@ -172,25 +274,17 @@ def motion_of(estimate: MotionEstimate, entry: SolverEntry, rig: StereoRig) -> M
     raise NoMotionError(f"solver {entry.name!r}: {motion}; a correction needs metres, as rs-stereo-refined finds")
 
 
-def find_readout(
-    matches: Correspondences, rig: StereoRig, options: CorrectionOptions, disparity_offset: float | None = None
-) -> ReadoutEstimate | None:
-    """The readout ratio that explains the matches best, by ``referee``; None when no motion does at any."""
-    _, judge = referee(options.solver)
-    return estimate_readout_ratio(matches, rig, judge, options.robust, options.seed, disparity_offset)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SolvedFrames:
+    """Motion and shutter of four frames."""
 
-
-def referee(entry: SolverEntry) -> tuple[str, RefinedSolver]:
-    """The solver that finds an unknown readout ratio and the direction of time, with its name.
-
-    The chosen one when it is a refined one of both cameras, else rs-stereo-refined. Both need residuals that hold
-    for any readout ratio, and a fit as good as the matches allow: a solver that is off by pixels would blame the
-    shutter.
-    """
-    solver = entry.solver
-    if isinstance(solver, RefinedSolver) and not solver.one_camera:
-        return entry.name, solver
-    return _REFEREE, RefinedSolver()
+    found: FoundMotion | None
+    """None where none was asked for."""
+    shutter: RollingShutter
+    matches: Correspondences
+    """Those that it rests on; disparities as matched."""
+    capture: Capture | None
+    """How the shutter was found; None where it was given."""
 
 
 def solve_frames(
@@ -200,88 +294,76 @@ def solve_frames(
     options: CorrectionOptions,
     disparity_offset: float | None = None,
     scanning: Scanning | None = None,
-) -> tuple[FoundMotion, RollingShutter, ReadoutEstimate | None]:
-    """Motion and shutter from matches; the readout ratio is estimated when it is None.
+    *,
+    doubt: RefusedFramesError | None = None,
+    in_order: bool = False,
+    with_motion: bool = True,
+) -> SolvedFrames:
+    """Motion and shutter from matches; what is None of the shutter is found with the motion.
 
     Args:
         disparity_offset: what a disparity is too large by, px; None has it estimated with the readout ratio,
             and is 0 where that is known.
-        scanning: how the cameras read; must be plain where the readout ratio is estimated.
+        scanning: how the cameras read; None: found with the readout ratio; rows from the top where that is given.
+        doubt: raised where the cameras read rows together, see ``match_unknown``.
+        in_order: whether the frames are known to be in the order of time.
+        with_motion: whether a motion is asked for, beside the shutter.
 
     Raises:
         RefusedFramesError: time runs backwards in the frames.
-        NoMotionError: no motion explains the matches, or they do not determine the readout ratio.
+        NoMotionError: no motion explains the matches, or they do not determine the shutter.
     """
-    shutter, readout = solve_shutter(matches, rig, readout_ratio, options, disparity_offset)
-    shutter = (scanning or Scanning()).shutter_of(rig.camera.width, rig.camera.height, shutter.readout_ratio)
-    offset = (disparity_offset or 0.0) if readout is None else readout.disparity_offset
-    matches = without_offset(matches, offset)
-    found = replace(find_motion(matches, rig, shutter, options), disparity_offset=offset)
-    if readout is None and _runs_backwards(matches, rig, found.robust, shutter, options):
+    if readout_ratio is None:
+        capture = find_capture(matches, rig, options, scanning, disparity_offset)
+        if scanning is not None and runs_backwards(capture, scans_of(_rolling(scanning, rig))):
+            raise RefusedFramesError(BACKWARDS)
+        shutter = shutter_found(capture, rig)
+        offset = (capture.offset if disparity_offset is None else disparity_offset) if shutter.rows_together else 0.0
+        if shutter.rows_together:
+            if doubt is not None:
+                raise doubt
+            matches = on_their_rows(matches, rig)
+    else:
+        scanning, capture, offset = scanning or Scanning(), None, disparity_offset or 0.0
+        shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
+    if not with_motion:
+        return SolvedFrames(found=None, shutter=shutter, matches=matches, capture=capture)
+    at_rest = without_offset(matches, offset)
+    found = replace(find_motion(at_rest, rig, shutter, options, capture=capture), disparity_offset=offset)
+    if capture is None and not in_order and _runs_backwards(at_rest, rig, found.motion, shutter, options):
         raise RefusedFramesError(BACKWARDS)
-    return found, shutter, readout
+    return SolvedFrames(found=found, shutter=shutter, matches=matches, capture=capture)
 
 
-def solve_shutter(
+def find_capture(
     matches: Correspondences,
     rig: StereoRig,
-    readout_ratio: float | None,
     options: CorrectionOptions,
+    scanning: Scanning | None,
     disparity_offset: float | None = None,
-) -> tuple[RollingShutter, ReadoutEstimate | None]:
-    """The shutter, from its readout ratio or, when that is None, from the matches.
-
-    Raises:
-        RefusedFramesError: time runs backwards in the frames.
-        NoMotionError: no motion explains the matches, or they do not determine the readout ratio.
-    """
-    readout = None
-    if readout_ratio is None:
-        readout = find_readout(matches, rig, options, disparity_offset)
-        if readout is None:
-            raise NoMotionError("no motion explains the matches at any readout ratio")
-        check_readout(readout)
-        readout_ratio = readout.readout_ratio
-    return RollingShutter(height=rig.camera.height, readout_ratio=readout_ratio), readout
+) -> Capture:
+    """What the matches of two times say of an unknown readout ratio, and of the scans where they are None."""
+    entry, models = options.solver, models_asked(options.motion_model)
+    if options.motion_model is None and isinstance(entry.solver, RefinedSolver):
+        models = (entry.solver.motion_model,)
+    known = known_of(matches, rig, None, scanning, disparity_offset, models)
+    return conclude([examine(matches, rig, known, options.robust, options.seed)])
 
 
-def check_readout(readout: ReadoutEstimate) -> None:
-    """Whether frames can be corrected with this estimate.
-
-    Raises:
-        RefusedFramesError: time runs backwards in the frames.
-        NoMotionError: the matches do not determine the readout ratio.
-    """
-    if readout.backwards:
-        raise RefusedFramesError(BACKWARDS)
-    if not readout.sigma <= _MAX_READOUT_SIGMA:
-        raise NoMotionError(
-            f"the matches do not determine the readout ratio ({readout}): the motion is too small; put "
-            "readout_ratio into the rig's card"
-        )
+def _rolling(scanning: Scanning, rig: StereoRig) -> RollingShutter:
+    return scanning.shutter_of(rig.camera.width, rig.camera.height, 1.0)
 
 
 def _runs_backwards(
-    matches: Correspondences,
-    rig: StereoRig,
-    robust: RobustEstimate,
-    shutter: RollingShutter,
-    options: CorrectionOptions,
+    matches: Correspondences, rig: StereoRig, motion: Motion, shutter: RollingShutter, options: CorrectionOptions
 ) -> bool:
-    """Whether time runs backwards in the frames: they then fit a negative readout ratio.
+    """Whether time runs backwards in the frames: their lines then seem to be read from the opposite side.
 
     At a ratio near 0 there is no order to see, and a wrong ratio or focal length is no wrong order: what counts is
-    the ratio that fits best. It is not looked for with a lens or another scan: those are of calibrated cameras.
+    whether the opposite scan, with the ratio that fits it best, is beyond doubt.
     """
-    _, judge = referee(options.solver)
-    if shutter.readout_ratio < LEAST_BACKWARDS or rig.camera.lens is not None or not shutter.plain:
+    if shutter.readout_ratio < LEAST_BACKWARDS or not shutter.plain:
         return False
-    if judge is not options.solver.solver:
-        rng = np.random.default_rng(options.seed)
-        robust = estimate_motion(matches, rig, shutter, judge, options.robust, rng)
-        if not robust.estimate.success:
-            return False
-    if not runs_backwards(matches, rig, shutter.readout_ratio, judge, options.robust, robust, options.seed):
-        return False
-    best = find_readout(matches, rig, options)
-    return best is not None and best.backwards
+    known = backwards_known(matches, rig, shutter, models_asked(options.motion_model))
+    capture = conclude([examine(matches, rig, known, options.robust, options.seed, motion)])
+    return runs_backwards(capture, scans_of(shutter))

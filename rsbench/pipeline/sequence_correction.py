@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.readout import ReadoutEstimate, combined
+from rsbench.capture.estimate import CERTAIN, Capture, conclude, examine
+from rsbench.capture.hypotheses import Known
+from rsbench.capture.estimate import Window as Examined
 from rsbench.capture.rectification import RefusedFramesError
+from rsbench.capture.scans import GLOBAL
+from rsbench.capture.settle import known_of, shutter_found
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, StereoRig
@@ -23,14 +27,16 @@ from rsbench.pipeline.frame_depth import Images, Pairs, frame_pair
 from rsbench.pipeline.frame_motion import (
     FoundMotion,
     NoMotionError,
-    check_readout,
-    find_readout,
     match_frames,
+    match_unknown,
+    models_asked,
     solve_frames,
 )
 from rsbench.vision.fusion import Fused
 from rsbench.vision.stereo_matcher import needs_motion
 
+WINDOWS = 8
+"""At most, of those by which the shutter is found."""
 _JUDGED = 3
 """First windows whose rig is looked at; when all of them are refused, so is the sequence."""
 
@@ -63,38 +69,59 @@ class CorrectedMoment:
     when this is the last frame."""
 
 
-def estimate_sequence_readout(
+def estimate_sequence_capture(
     left: FrameSource,
     right: FrameSource,
     rig: StereoRig,
     options: CorrectionOptions,
+    scanning: Scanning | None = None,
     disparity_offset: float | None = None,
-) -> ReadoutEstimate:
-    """Readout ratio and disparity offset of a sequence, from all of its windows.
+    advance: Callable[[str], None] = lambda word: None,
+) -> tuple[Capture, RollingShutter]:
+    """How the cameras of a sequence read, from windows that lie evenly over it: their shutter does not change.
 
     Args:
-        disparity_offset: see ``solve_frames``.
+        scanning, disparity_offset: see ``solve_frames``.
+        advance: called for each window.
 
     Raises:
-        RefusedFramesError: the first windows cannot be what they are said to be, or time runs backwards.
-        NoMotionError: the windows do not determine the ratio.
+        RefusedFramesError: the first windows cannot be what they are said to be.
+        NoMotionError: the windows do not determine the shutter.
     """
-    estimates, refusals = list[ReadoutEstimate](), _Refusals(left)
+    examined, refusals, known, doubt = list[Examined](), _Refusals(left), None, None
+    every, number = max((left.count - 1) // WINDOWS, 1), -1
     for number, images in enumerate(_window_images(left, right)):
+        if number % every != 0 or len(examined) >= WINDOWS:
+            continue
         try:
-            matches = match_frames(images, rig, options, judge_rig=number < _JUDGED)
+            if scanning is None:
+                matches, doubt = match_unknown(images, rig, options, judge_rig=number < _JUDGED)
+            else:
+                matches = match_frames(images, rig, options, scanning, judge_rig=number < _JUDGED)
         except RefusedFramesError as error:
             refusals.add(number, error)
             continue
-        estimate = find_readout(matches, rig, options, disparity_offset)
-        if estimate is not None and np.isfinite(estimate.sigma):
-            estimates.append(estimate)
+        if known is None:
+            known = known_of(matches, rig, None, scanning, disparity_offset, models_asked(options.motion_model))
+        examined.append(examine(matches, rig, known, options.robust, options.seed))
+        advance(f"window {number}")
+        known = _narrowed(known, conclude(examined))
     refusals.end(number + 1)
-    if not estimates:
-        raise NoMotionError("no window of the sequence determines the readout ratio: put it into the rig's card")
-    found = combined(estimates)
-    check_readout(found)
-    return found
+    if not examined:
+        raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
+    capture = conclude(examined)
+    shutter = shutter_found(capture, rig)
+    if doubt is not None and shutter.rows_together:
+        raise doubt
+    return capture, shutter
+
+
+def _narrowed(known: Known, capture: Capture) -> Known:
+    """Without scans that the windows so far exclude."""
+    if not capture.candidates or capture.candidates[0].probability < CERTAIN:
+        return known
+    left = {candidate.scans for candidate in capture.candidates} | {GLOBAL}
+    return replace(known, scans=tuple(each for each in known.scans if each in left))
 
 
 def correct_sequence(
@@ -120,7 +147,7 @@ def correct_sequence(
         RsbenchError: frames that differ in size, or cannot be read; cameras that the options do not take.
     """
     scanning = scanning or Scanning()
-    check_cameras(rig, scanning, options, readout_ratio, disparity_offset)
+    check_cameras(rig, scanning, options, disparity_offset)
     shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
     last: Window | None = None
     number = -1
@@ -177,7 +204,8 @@ def _windows(
                 judged, scanning = number < _JUDGED, shutter.scanning
                 matches = match_frames(images, rig, options, scanning, judge_rig=judged)
                 if "motion" in needs:
-                    found, _, _ = solve_frames(matches, rig, shutter.readout_ratio, options, offset, scanning)
+                    ratio = shutter.readout_ratio
+                    found = solve_frames(matches, rig, ratio, options, offset, scanning, in_order=True).found
             except NoMotionError as error:
                 reason = str(error)
             except RefusedFramesError as error:

@@ -1,0 +1,283 @@
+"""What a correction takes from what the matches say: a shutter and a motion model, or words for why not.
+
+What is known is given and not looked for (``known_of``). What was found is used where it is sure, or where it does
+not matter; else the message names what the matches leave open, what that trades against, and what would settle it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from rsbench.capture.estimate import CERTAIN, Candidate, Capture
+from rsbench.capture.evidence import Peak
+from rsbench.capture.hypotheses import ACCELERATION, MODELS, Known
+from rsbench.capture.rectification import row_pattern
+from rsbench.capture.scans import ALL_SCANS, GLOBAL, Scans, scans_of
+from rsbench.components.motion_models import make_motion
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
+from rsbench.core.motion import Motion
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.kernel_type import load_kernel
+
+AUTO = "auto"
+_MAX_SIGMA, _HARMLESS_PX = 0.1, 1.0
+"""Standard deviation of a ratio that frames are corrected with, at most; more where it moves no pixel by this."""
+_PRIOR_FACTOR, _LEAST_PRIOR_PX = 2.0, 0.1
+"""Standard deviation of the disparity offset over the size of the row differences: rows show errors of roll and
+pitch, and the error of yaw, which shifts disparities, is of their kind. Below the second there is none to fit."""
+_CLEARLY, LEAST_BACKWARDS = 0.999, 0.25
+"""Probability of the opposite scan at which frames are refused, and the readout ratio from which its order shows."""
+_AXES = ("tilt", "pan", "roll", "sideways motion", "vertical motion", "forward motion")
+
+
+class NoMotionError(RsbenchError):
+    """The frames are in order, but no motion explains their matches; the message says why."""
+
+
+def known_of(
+    matches: Correspondences,
+    rig: StereoRig,
+    readout_ratio: float | None,
+    scanning: Scanning | None,
+    disparity_offset: float | None = None,
+    models: tuple[str, ...] = MODELS,
+) -> Known:
+    """What is known before the matches are asked; None of it is looked for.
+
+    An unknown offset is looked for with an unknown ratio, as large as the row differences of the left-right matches
+    allow: they come from the same calibration.
+    """
+    offset_sigma = 0.0
+    if disparity_offset is None and readout_ratio is None and rig.camera.lens is None:
+        pattern = row_pattern(_stereo(matches), rig)
+        sigma = 0.0 if pattern is None else _PRIOR_FACTOR * pattern.systematic_px
+        offset_sigma = sigma if sigma > _LEAST_PRIOR_PX else 0.0
+    scans = ALL_SCANS
+    if scanning is not None:
+        width, height = rig.camera.width, rig.camera.height
+        rolling = scans_of(scanning.shutter_of(width, height, 1.0))
+        scans = (GLOBAL, rolling, reversed_scans(rolling)) if readout_ratio is None else (rolling if readout_ratio > 0.0 else GLOBAL,)
+    return Known(
+        ratio=readout_ratio,
+        scans=scans,
+        delay=None if scanning is None else scanning.right_delay,
+        offset=disparity_offset or 0.0,
+        offset_sigma=offset_sigma,
+        models=models,
+    )
+
+
+def _stereo(matches: Correspondences) -> FloatArray:
+    """The left-right matches (n, 4) of both times; those of the tracks where there are no others."""
+    pairs = np.concatenate([matches.stereo_0, matches.stereo_1])
+    tracks = matches.tracks
+    return pairs if len(pairs) else np.concatenate([tracks[:, :4], tracks[:, 4:]])
+
+
+def shutter_found(capture: Capture, rig: StereoRig) -> RollingShutter:
+    """The shutter of the most probable candidate.
+
+    Raises:
+        NoMotionError: there is none, or the matches leave open what would matter; in words.
+    """
+    best = capture.likeliest
+    if best is None:
+        raise NoMotionError(f"cannot tell how the cameras read: {capture.reason}")
+    harmless = best.sigma * capture.moved_px <= _HARMLESS_PX
+    named = best.probability >= CERTAIN or capture.moved_px <= _HARMLESS_PX
+    if not named or not (best.sigma <= _MAX_SIGMA or harmless):
+        raise NoMotionError(cannot_tell(capture))
+    return shutter_of(best, rig)
+
+
+def shutter_of(candidate: Candidate, rig: StereoRig) -> RollingShutter:
+    """The shutter of a candidate; a camera with a global shutter beside one that rolls has none here.
+
+    Raises:
+        NoMotionError: one camera alone rolls.
+    """
+    camera, scans = rig.camera, candidate.scans
+    ratio = candidate.ratio if scans.rolls else 0.0
+    if scans.rolls and "global" in (scans.left, scans.right):
+        raise NoMotionError(f"{scans}: a rig of which one camera alone rolls cannot be corrected")
+    delay = candidate.delay if abs(candidate.delay) > 2.0 * candidate.delay_sigma else 0.0
+    if not scans.rolls:
+        return RollingShutter(height=camera.height, readout_ratio=0.0, right_delay=delay)
+    scanning = Scanning(scan=scans.left, right_scan=scans.right, right_delay=delay)  # pyrefly: ignore[bad-argument-type]
+    return scanning.shutter_of(camera.width, camera.height, ratio)
+
+
+def cannot_tell(capture: Capture) -> str:
+    """Which unknowns the matches leave open, what the ratio trades against, and what would settle it."""
+    text = f"cannot tell the readout ratio: {capture.reason}"
+    peak = next(reversed(capture.peaks.values()), None)
+    best = capture.likeliest
+    if best is not None and peak is not None and best.sigma > _MAX_SIGMA:
+        text += f"; a larger ratio goes with {trade(peak)}"
+    return f"{text}. Give readout_ratio in the rig's card, or frames in which the rig turns, or more frames"
+
+
+def trade(peak: Peak) -> str:
+    """The parameter of the motion, or the offset, that takes up most of a change of the ratio, with its amount."""
+    w, d, offset = peak.trade[:3], peak.trade[3:6], float(peak.trade[8])
+    depth = 10.0 * max(float(np.linalg.norm(peak.fit.theta[3:])), 1e-6)
+    share = np.abs(np.concatenate([w, d / depth]))
+    k = int(np.argmax(share))
+    more = "more" if peak.trade[k] * peak.fit.theta[k] >= 0.0 else "less"
+    amount = 0.1 * abs(float(peak.trade[k]))
+    unit = f"{np.rad2deg(amount):.2g} deg" if k < 3 else f"{amount:.2g} m"
+    text = f"{more} {_AXES[k]} ({unit} for 0.1)"
+    return text if abs(offset) < 0.1 else f"{text} and a disparity offset ({0.1 * offset:+.2g} px for 0.1)"
+
+
+def reversed_scans(scans: Scans) -> Scans:
+    """Lines read from the opposite side: what frames in the wrong order look like."""
+    opposite = {"top": "bottom", "bottom": "top", "left": "right", "right": "left", "global": "global"}
+    return Scans(opposite[scans.left], opposite[scans.right])  # pyrefly: ignore[bad-argument-type]
+
+
+def runs_backwards(capture: Capture, scans: Scans) -> bool:
+    """Whether lines are read from the side opposite to what is said, or the frames are in the wrong order."""
+    best = capture.likeliest
+    if best is None or best.scans != reversed_scans(scans) or best.scans == scans:
+        return False
+    return best.probability > _CLEARLY and best.ratio >= LEAST_BACKWARDS
+
+
+def backwards_known(
+    matches: Correspondences, rig: StereoRig, shutter: RollingShutter, models: tuple[str, ...]
+) -> Known:
+    """What is known of a shutter whose lines may be read from the opposite side, at any ratio."""
+    known = known_of(matches, rig, None, shutter.scanning, None, models)
+    return replace(known, delay=shutter.right_delay)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ModelChoice:
+    """What the matches say about the motion model."""
+
+    used: str
+    parameters: Mapping[str, float]
+    """Of the model used, beside w and d."""
+    probability: Mapping[str, float]
+    """Of each model that was tried, the most probable first."""
+    decided: bool
+    """Whether the first of them is beyond doubt."""
+    rival: str
+    """The most probable one of the others; empty where none was tried."""
+    d_angle_deg: float
+    """Between the d of the model used and that of the rival."""
+    d_length_percent: float
+    """By how much the rival's d is longer."""
+
+    def record(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return {
+            "text": str(self),
+            "used": self.used,
+            "decided": self.decided,
+            "probability": dict(self.probability),
+            "rival": self.rival,
+            "d_angle_to_rival_deg": self.d_angle_deg,
+            "d_length_of_rival_percent": self.d_length_percent,
+        }
+
+    def __str__(self) -> str:
+        shares = ", ".join(f"{name} {_percent(p)}" for name, p in list(self.probability.items())[:3] if p >= 0.001)
+        head = self.used if self.decided else f"cannot tell, so {self.used} is used"
+        if not self.rival:
+            return head
+        change = f"with {self.rival} d turns by {self.d_angle_deg:.2g} deg and its length changes by "
+        return f"{head} ({shares}); {change}{self.d_length_percent:+.2g} %"
+
+
+def _percent(p: float) -> str:
+    return f"{100.0 * p:.1f} %" if p <= 0.999 else "> 99.9 %"
+
+
+def choose_model(capture: Capture) -> ModelChoice | None:
+    """The model found, else linear, the paper's, unless it is excluded; None where no hypothesis was judged."""
+    if not capture.peaks:
+        return None
+    probability = {name: p for name, p in capture.models.items() if name in capture.peaks}
+    best = next(iter(probability))
+    undecided = probability[best] < CERTAIN and probability.get("linear", 0.0) > 1.0 - CERTAIN
+    used = "linear" if undecided else best
+    rival = next((name for name in probability if name != used), "")
+    d = motion_at(capture.peaks[used]).d
+    other = motion_at(capture.peaks[rival]).d if rival else d
+    length = max(float(np.linalg.norm(d)), 1e-12)
+    return ModelChoice(
+        used=used,
+        parameters=_parameters(capture.peaks[used]),
+        probability=probability,
+        decided=used == best and probability[best] >= CERTAIN,
+        rival=rival,
+        d_angle_deg=float(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(d, other)), d @ other))),
+        d_length_percent=100.0 * (float(np.linalg.norm(other)) / length - 1.0),
+    )
+
+
+def _parameters(peak: Peak) -> dict[str, float]:
+    accelerated = peak.fit.hypothesis.motion_model == "accelerated"
+    return {"acceleration": float(peak.fit.unknowns[ACCELERATION])} if accelerated else {}
+
+
+def motion_at(peak: Peak) -> Motion:
+    """The motion of the body, metres, that a hypothesis found."""
+    model = peak.fit.hypothesis.motion_model
+    w, d = load_kernel(model, _parameters(peak)).motion(peak.fit.theta)
+    return make_motion(model, w, d, _parameters(peak))
+
+
+def spread_by_ratio(peak: Peak, sigma: float) -> FloatArray:
+    """Covariance (6, 6) that an unknown ratio of this deviation adds to w and d."""
+    kernel = load_kernel(peak.fit.hypothesis.motion_model, _parameters(peak))
+    slope = kernel.motion_jacobian(peak.fit.theta) @ peak.trade[:6]
+    return sigma**2 * np.outer(slope, slope)
+
+
+def record_of(capture: Capture) -> dict[str, Any]:
+    """What was found of the shutter and how sure it is, as JSON holds it."""
+    best = capture.likeliest
+    return {
+        "told": capture.told,
+        "reason": capture.reason,
+        "left": None if best is None else best.scans.left,
+        "right": None if best is None else best.scans.right,
+        "probability": None if best is None else best.probability,
+        "readout_ratio": None if best is None else best.ratio,
+        "readout_ratio_sigma": None if best is None else best.sigma,
+        "right_delay": None if best is None else best.delay,
+        "right_delay_sigma": None if best is None else best.delay_sigma,
+        "disparity_offset": capture.offset,
+        "disparity_offset_sigma": capture.offset_sigma,
+        "candidates": candidates_of(capture),
+        "motion_models": dict(capture.models),
+        "windows": capture.windows,
+        "matches": capture.matches,
+        "used": capture.used,
+        "noise_px": capture.noise_px if capture.used else None,
+        "moved_px": capture.moved_px,
+    }
+
+
+def candidates_of(capture: Capture) -> list[dict[str, Any]]:
+    """Every way of reading that is not out of the question, the most probable first."""
+    return [
+        {
+            "left": each.scans.left,
+            "right": each.scans.right,
+            "probability": each.probability,
+            "readout_ratio": each.ratio,
+            "readout_ratio_sigma": each.sigma,
+        }
+        for each in capture.candidates
+    ]
