@@ -11,7 +11,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
@@ -45,18 +44,20 @@ class Linear:
 
 @dataclass(frozen=True)
 class Twist:
-    """The same velocity in the body at all times: the pose is exp(tau xi), xi = (w, v)."""
+    """The same velocity in the body at all times: the pose is exp(tau xi), xi = (w, v); w is not 0."""
 
     w: Array
     v: Array
 
     def body(self, tau: Array) -> tuple[Array, Array]:
-        xi = np.zeros((4, 4))
-        x, y, z = self.w
-        xi[:3, :3] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
-        xi[:3, 3] = self.v
-        pose = np.asarray(expm(tau[:, None, None] * xi))
-        return pose[:, :3, :3], pose[:, :3, 3]
+        # The integral of exp(s w) v over s from 0 to tau; what lies along w only grows.
+        rate = float(np.linalg.norm(self.w))
+        axis = self.w / rate
+        along = (axis @ self.v) * axis
+        across, turned = self.v - along, np.cross(axis, self.v)
+        angle = (rate * tau)[:, None]
+        t = tau[:, None] * along + (np.sin(angle) * across + (1.0 - np.cos(angle)) * turned) / rate
+        return matrices(tau[:, None] * self.w), t
 
 
 @dataclass(frozen=True)
