@@ -68,8 +68,15 @@ class Outcome:
         return abs(self.ratio - self.true_ratio) / self.sigma if self.sigma > 0.0 else _NAN
 
 
-def run_case(folder: Path, told: bool, again: bool, options: Sequence[str] = ()) -> tuple[int, str, float]:
-    """Correct a case; returns the exit code, what was said last and the seconds."""
+def run_case(folder: Path, told: bool, again: bool, model: str | None = None) -> tuple[int, str, float]:
+    """Correct a case; returns the exit code, what was said and the seconds.
+
+    Args:
+        folder: of the case.
+        told: whether the command is told what the shutter does, and the law where rsbench knows it.
+        again: even where it has been done.
+        model: motion model where the law is not told.
+    """
     name = "told" if told else "untold"
     record = folder / f"{name}.json"
     if record.is_file() and not again:
@@ -80,19 +87,28 @@ def run_case(folder: Path, told: bool, again: bool, options: Sequence[str] = ())
         frames = [str(picture(folder, 2, side, frame)) for frame in (0, 1) for side in SIDES]
     else:
         frames = ["--left", str(folder / "left"), "--right", str(folder / "right")]
-    model = ["--motion-model", truth["motion_model"]] if told and truth["motion_model"] else []
-    files = ["--rig", str(folder / f"{name}.toml"), "--out", str(folder / f"corrected-{name}")]
-    command = [sys.executable, "-m", "rsbench", "correct", *frames, *files, *model, *([] if told else options)]
     shutil.rmtree(folder / f"corrected-{name}", ignore_errors=True)
+    arguments = [*frames, "--rig", str(folder / f"{name}.toml"), "--out", str(folder / f"corrected-{name}")]
+    law = truth["motion_model"] if told else None
+    code, message, seconds = _correct(arguments, law or model)
+    if law and code == 2 and "--motion-model" in message:
+        code, message, seconds = _correct(arguments, "auto")
+        message = f"{law} cannot be asked for: auto. {message}".strip()
+    record.write_text(json.dumps([code, message, seconds]), "utf-8")
+    return code, message, seconds
+
+
+def _correct(arguments: Sequence[str], model: str | None) -> tuple[int, str, float]:
+    """Exit code, what was said and seconds of the command."""
+    options = [] if model is None else ["--motion-model", model]
+    command = [sys.executable, "-m", "rsbench", "correct", *arguments, *options]
     begin = time.perf_counter()
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_LONGEST)
         code, message = done.returncode, _said(done.stderr, done.returncode)
     except subprocess.TimeoutExpired:
         code, message = 124, f"took more than {_LONGEST:.0f} s"
-    seconds = time.perf_counter() - begin
-    record.write_text(json.dumps([code, message, seconds]), "utf-8")
-    return code, message, seconds
+    return code, message, time.perf_counter() - begin
 
 
 def _said(text: str, code: int) -> str:
@@ -102,9 +118,9 @@ def _said(text: str, code: int) -> str:
     return " ".join(said).replace("|", "/").removeprefix("rsbench: ")
 
 
-def outcome(row: str, seed: int, folder: Path, told: bool, again: bool, options: Sequence[str] = ()) -> Outcome:
+def outcome(row: str, seed: int, folder: Path, told: bool, again: bool, model: str | None = None) -> Outcome:
     """One run, compared with the truth."""
-    code, message, seconds = run_case(folder, told, again, options)
+    code, message, seconds = run_case(folder, told, again, model)
     truth = json.loads((folder / "truth.json").read_text("utf-8"))
     known = {"row": row, "seed": seed, "told": told, "frames": truth["frames"], "true_ratio": truth["ratio"]}
     corrected = folder / f"corrected-{'told' if told else 'untold'}"
@@ -267,10 +283,9 @@ def main() -> None:
     parser.add_argument("--photographs", type=Path, help="folder (default: those of scikit-image, if installed)")
     parser.add_argument("--again", action="store_true", help="correct again what has been corrected")
     parser.add_argument("--only", choices=("told", "untold"), help="run one of the two")
-    parser.add_argument("--untold-model", help="--motion-model of those that are told nothing, such as auto")
+    parser.add_argument("--model", help="motion model where the law is not told, such as auto (default: none)")
     arguments = parser.parse_args()
     photographs = read_photographs(arguments.photographs)
-    options = [] if arguments.untold_model is None else ["--motion-model", arguments.untold_model]
     outcomes = []
     for row in arguments.rows:
         for seed in range(arguments.seeds):
@@ -279,7 +294,7 @@ def main() -> None:
                 write_case(row, seed, folder, photographs)
             for told in (True, False):
                 if arguments.only in (None, "told" if told else "untold"):
-                    outcomes.append(outcome(row, seed, folder, told, arguments.again, options))
+                    outcomes.append(outcome(row, seed, folder, told, arguments.again, arguments.model))
                     sys.stderr.write(f"| {' | '.join(_cells(outcomes[-1]))} |\n")
     sys.stdout.write(table(outcomes) + "\n")
 
