@@ -258,7 +258,7 @@ def _row_cells(told: list[Outcome], untold: list[Outcome]) -> list[str]:
         f"{len(told)} + {len(untold)}",
         f"{sum(one.failed for one in told)} + {sum(one.failed for one in untold)}",
         f"{np.count_nonzero(known <= _LIMIT)} of {len(untold)}",
-        _number(float(np.max(known, initial=0.0)), 1),
+        _number(float(np.max(known)) if len(known) else _NAN, 1),
         *(
             f"{_median([o.turn_error for o in kind], 3)}, {_median([o.way_error for o in kind], 2)}"
             for kind in (told, untold)
