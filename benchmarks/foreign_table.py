@@ -1,0 +1,303 @@
+"""What ``rsbench correct`` makes of frames that other code traced: ``foreign_frames.py``.
+
+Each case is corrected twice: told everything (readout ratio, scans, and the law of motion where rsbench knows it),
+and told nothing but the cameras. Frames are compared with the traced global-shutter ones, on the pixels that the
+correction claims (mask above 0); the gain is over the uncorrected frames on the same pixels.
+
+    python benchmarks/foreign_table.py --data data/foreign --seeds 5 --rows twist lens
+
+Nothing is rendered or corrected twice; with --again, corrections are, as after a change of rsbench.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from foreign_frames import ROWS, SIDES, picture, write_case
+from foreign_motion import Array, matrices
+from foreign_world import read_photographs
+from scipy.spatial.transform import Rotation
+
+_NAN = float("nan")
+_LIMIT = 3.0
+"""Deviations that a found readout ratio may err by."""
+_LONGEST = 3600.0
+"""Seconds of a command."""
+HEAD = ("case", "told", "ratio", "sigma", "error / sigma", "e_R (deg)", "e_T (deg)", "PSNR", "gain", "s", "note")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """One run of the command; what it did not say is NaN."""
+
+    row: str
+    seed: int
+    told: bool
+    frames: int
+    message: str = ""
+    """Why it failed, or its notes."""
+    failed: bool = False
+    ratio: float = _NAN
+    sigma: float = _NAN
+    true_ratio: float = _NAN
+    turn_error: float = _NAN
+    """e_R in degrees; the median over the periods of a sequence."""
+    way_error: float = _NAN
+    """e_T in degrees, likewise."""
+    psnr: float = _NAN
+    """Mean over the frames of both cameras; of a sequence, of the left camera."""
+    gain: float = _NAN
+    worst_gain: float = _NAN
+    """Of one frame."""
+    seconds: float = _NAN
+
+    @property
+    def deviations(self) -> float:
+        """Error of the ratio over its stated deviation."""
+        return abs(self.ratio - self.true_ratio) / self.sigma if self.sigma > 0.0 else _NAN
+
+
+def run_case(folder: Path, told: bool, again: bool, model: str | None = None) -> tuple[int, str, float]:
+    """Correct a case; returns the exit code, what was said and the seconds.
+
+    Args:
+        folder: of the case.
+        told: whether the command is told what the shutter does, and the law where rsbench knows it.
+        again: even where it has been done.
+        model: motion model where the law is not told.
+    """
+    name = "told" if told else "untold"
+    record = folder / f"{name}.json"
+    if record.is_file() and not again:
+        code, message, seconds = json.loads(record.read_text("utf-8"))
+        return int(code), str(message), float(seconds)
+    truth = json.loads((folder / "truth.json").read_text("utf-8"))
+    if truth["frames"] == 2:
+        frames = [str(picture(folder, 2, side, frame)) for frame in (0, 1) for side in SIDES]
+    else:
+        frames = ["--left", str(folder / "left"), "--right", str(folder / "right")]
+    shutil.rmtree(folder / f"corrected-{name}", ignore_errors=True)
+    arguments = [*frames, "--rig", str(folder / f"{name}.toml"), "--out", str(folder / f"corrected-{name}")]
+    law = truth["motion_model"] if told else None
+    code, message, seconds = _correct(arguments, law or model)
+    if law and code == 2 and "--motion-model" in message:
+        code, message, seconds = _correct(arguments, "auto")
+        message = f"{law} cannot be asked for: auto. {message}".strip()
+    record.write_text(json.dumps([code, message, seconds]), "utf-8")
+    return code, message, seconds
+
+
+def _correct(arguments: Sequence[str], model: str | None) -> tuple[int, str, float]:
+    """Exit code, what was said and seconds of the command."""
+    options = [] if model is None else ["--motion-model", model]
+    command = [sys.executable, "-m", "rsbench", "correct", *arguments, *options]
+    begin = time.perf_counter()
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_LONGEST)
+        code, message = done.returncode, _said(done.stderr, done.returncode)
+    except subprocess.TimeoutExpired:
+        code, message = 124, f"took more than {_LONGEST:.0f} s"
+    return code, message, time.perf_counter() - begin
+
+
+def _said(text: str, code: int) -> str:
+    """The lines of rsbench in what a command said; of one that failed otherwise, the last line."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    said = [line for line in lines if line.startswith("rsbench:")] or (lines[-1:] if code else [])
+    return " ".join(said).replace("|", "/").removeprefix("rsbench: ")
+
+
+def outcome(row: str, seed: int, folder: Path, told: bool, again: bool, model: str | None = None) -> Outcome:
+    """One run, compared with the truth."""
+    code, message, seconds = run_case(folder, told, again, model)
+    truth = json.loads((folder / "truth.json").read_text("utf-8"))
+    known = {"row": row, "seed": seed, "told": told, "frames": truth["frames"], "true_ratio": truth["ratio"]}
+    corrected = folder / f"corrected-{'told' if told else 'untold'}"
+    if code != 0 and not (truth["frames"] > 2 and code == 1 and corrected.is_dir()):
+        return Outcome(**known, failed=True, message=f"exit {code}: {message}", seconds=seconds)
+    found = json.loads((corrected / "motion.json").read_text("utf-8"))
+    e_R, e_T = _motion_errors(found, truth)
+    psnr, gains = _gains(folder, corrected, truth["frames"])
+    estimated = found["readout_ratio_estimated"]
+    return Outcome(
+        **known,
+        message=_remark(found, message, code),
+        ratio=float(
+            found["readout_ratio"] if found["readout_ratio_signed"] is None else found["readout_ratio_signed"]
+        ),
+        sigma=float(found["readout_ratio_sigma"] or _NAN) if estimated else _NAN,
+        turn_error=e_R,
+        way_error=e_T,
+        psnr=psnr,
+        gain=float(np.mean(gains)),
+        worst_gain=float(np.min(gains)),
+        seconds=seconds,
+    )
+
+
+def _remark(found: dict[str, Any], message: str, code: int) -> str:
+    """What the command said besides numbers: scans it found, the model it chose, messages."""
+    parts = [f"exit {code}: {message}" if code else message]
+    scan = found["scan"]
+    if (scan["scan"], scan["right_scan"] or scan["scan"]) != ("top", "top"):
+        parts.append(f"scan {scan['scan']}, {scan['right_scan'] or scan['scan']}")
+    motion = found.get("motion")
+    if motion and motion["model"] != "linear":
+        parts.append(motion["model"])
+    return "; ".join(part for part in parts if part)
+
+
+def _motion_errors(found: dict[str, Any], truth: dict[str, Any]) -> tuple[float, float]:
+    """e_R and e_T in degrees, medians over the periods."""
+    if truth["frames"] == 2:
+        motions = {0: found["motion"]}
+    else:
+        motions = {int(frame["number"]): frame.get("motion") for frame in found["frames"][:-1]}
+    pairs = [(truth["motions"][number], motion) for number, motion in motions.items() if motion]
+    errors = [(_turn(true["w"], motion["w"]), _angle(true["d"], motion["d"])) for true, motion in pairs]
+    if not errors:
+        return _NAN, _NAN
+    e_R, e_T = np.median(np.array(errors), axis=0)
+    return float(e_R), float(e_T)
+
+
+def _turn(true: Sequence[float], found: Sequence[float]) -> float:
+    R = matrices(np.array([true, found]))
+    return float(np.degrees(np.linalg.norm(Rotation.from_matrix(R[1] @ R[0].T).as_rotvec())))
+
+
+def _angle(true: Sequence[float], found: Sequence[float]) -> float:
+    a, b = np.array(true), np.array(found)
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+
+
+def _gains(folder: Path, corrected: Path, frames: int) -> tuple[float, Array]:
+    """Mean PSNR, and the gains (n,) of the frames, in dB."""
+    found = []
+    for frame in range(frames):
+        for side in SIDES if frames == 2 else SIDES[:1]:
+            name = f"{side}_{frame}" if frames == 2 else f"{side}_{frame:06d}"
+            if not (corrected / "mask" / f"{name}.png").is_file():
+                found.append((_NAN, 0.0))  # given back as it was
+                continue
+            mask = _read(corrected / "mask" / f"{name}.png") > 0
+            truth = _read(picture(folder / "gs", frames, side, frame))
+            images = [_read(corrected / "corrected" / f"{name}.png"), _read(picture(folder, frames, side, frame))]
+            after, before = (_psnr(image[mask], truth[mask]) for image in images)
+            found.append((after, after - before))
+    values = np.array(found)
+    return float(np.nanmean(values[:, 0])) if np.any(np.isfinite(values[:, 0])) else _NAN, values[:, 1]
+
+
+def _read(path: Path) -> Array:
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None, path
+    return np.asarray(image, dtype=np.float64)
+
+
+def _psnr(image: Array, truth: Array) -> float:
+    return float(10.0 * np.log10(255.0**2 / max(float(np.mean((image - truth) ** 2)), 1e-12)))
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """All cases, and below them a line for each row."""
+    lines = [f"| {' | '.join(HEAD)} |", "|---|---|" + "---:|" * (len(HEAD) - 3) + "---|"]
+    lines += [f"| {' | '.join(_cells(one))} |" for one in outcomes]
+    return "\n".join([*lines, "", *_summary(outcomes)])
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if np.isfinite(value) else "-"
+
+
+def _cells(one: Outcome) -> list[str]:
+    gain = _number(one.gain, 2)
+    if one.frames > 2 and np.isfinite(one.gain):
+        gain += f" (worst {one.worst_gain:.2f})"
+    seconds = f"{one.seconds / one.frames:.1f} a frame" if one.frames > 2 else f"{one.seconds:.1f}"
+    numbers = [
+        (one.ratio, 4),
+        (one.sigma, 4),
+        (one.deviations, 1),
+        (one.turn_error, 3),
+        (one.way_error, 2),
+        (one.psnr, 2),
+    ]
+    cells = [_number(value, digits) for value, digits in numbers]
+    return [f"{one.row}-{one.seed}", "all" if one.told else "nothing", *cells, gain, seconds, one.message]
+
+
+def _summary(outcomes: Sequence[Outcome]) -> list[str]:
+    """Per row: ratios within the limit, the worst, medians, and what being told gains."""
+    head = ("row", "runs", "failed", f"within {_LIMIT:g} sigma", "worst", "median e_R, e_T told", "untold")
+    head = (*head, "median gain told", "untold", "worst gain untold", "PSNR told - untold", "median s")
+    lines = [f"| {' | '.join(head)} |", "|---|" + "---:|" * (len(head) - 1)]
+    for row in dict.fromkeys(one.row for one in outcomes):
+        told, untold = ([one for one in outcomes if one.row == row and one.told == kind] for kind in (True, False))
+        lines.append(f"| {' | '.join([row, *_row_cells(told, untold)])} |")
+    return lines
+
+
+def _row_cells(told: list[Outcome], untold: list[Outcome]) -> list[str]:
+    deviations = np.array([one.deviations for one in untold])
+    known = deviations[np.isfinite(deviations)]
+    by_seed = {one.seed: one.psnr for one in told}
+    more = [by_seed[one.seed] - one.psnr for one in untold if one.seed in by_seed]
+    return [
+        f"{len(told)} + {len(untold)}",
+        f"{sum(one.failed for one in told)} + {sum(one.failed for one in untold)}",
+        f"{np.count_nonzero(known <= _LIMIT)} of {len(untold)}",
+        _number(float(np.max(known)) if len(known) else _NAN, 1),
+        *(
+            f"{_median([o.turn_error for o in kind], 3)}, {_median([o.way_error for o in kind], 2)}"
+            for kind in (told, untold)
+        ),
+        *(_median([one.gain for one in kind], 2) for kind in (told, untold)),
+        _number(min((one.worst_gain for one in untold if not one.failed), default=_NAN), 2),
+        _median(more, 2),
+        _median([one.seconds / (one.frames if one.frames > 2 else 1) for one in [*told, *untold]], 1),
+    ]
+
+
+def _median(values: Sequence[float], digits: int) -> str:
+    finite = [value for value in values if np.isfinite(value)]
+    return _number(float(np.median(finite)), digits) if finite else "-"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path("data/foreign"))
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS), metavar="ROW", help=", ".join(ROWS))
+    parser.add_argument("--photographs", type=Path, help="folder (default: those of scikit-image, if installed)")
+    parser.add_argument("--again", action="store_true", help="correct again what has been corrected")
+    parser.add_argument("--only", choices=("told", "untold"), help="run one of the two")
+    parser.add_argument("--model", help="motion model where the law is not told, such as auto (default: none)")
+    arguments = parser.parse_args()
+    photographs = read_photographs(arguments.photographs)
+    outcomes = []
+    for row in arguments.rows:
+        for seed in range(arguments.seeds):
+            folder = arguments.data / f"{row}-{seed}"
+            if not (folder / "truth.json").is_file():
+                write_case(row, seed, folder, photographs)
+            for told in (True, False):
+                if arguments.only in (None, "told" if told else "untold"):
+                    outcomes.append(outcome(row, seed, folder, told, arguments.again, arguments.model))
+                    sys.stderr.write(f"| {' | '.join(_cells(outcomes[-1]))} |\n")
+    sys.stdout.write(table(outcomes) + "\n")
+
+
+if __name__ == "__main__":
+    main()

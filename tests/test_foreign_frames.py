@@ -1,0 +1,234 @@
+"""Foreign frames: their laws, times, lens and visibility against rsbench's, which shares no code with them."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from programs import ROOT
+from scipy.optimize import brentq
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.lens import Lens
+from rsbench.core.motion import AcceleratedMotion, InertialMotion, LinearMotion, Motion, TwistMotion
+from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.pipeline.footage import read_rig_card
+
+SMALL = {"width": 160, "height": 120, "focal": 130.0}
+W, D = np.array([0.03, -0.055, 0.02]), np.array([-0.12, 0.05, -0.15])
+CASES = [(0.8, ("top", "top"), 0.0), (0.7, ("bottom", "left"), -0.15), (0.6, ("right", "bottom"), 0.1)]
+
+
+class Programs(NamedTuple):
+    frames: ModuleType
+    motion: ModuleType
+    table: ModuleType
+    world: ModuleType
+
+
+@pytest.fixture(scope="module")
+def programs_() -> Iterator[Programs]:
+    """The programs, which find each other in their folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "benchmarks"))
+        yield Programs(*(importlib.import_module(f"foreign_{name}") for name in Programs._fields))
+
+
+def _ours(rig: Any) -> tuple[StereoRig, RollingShutter]:
+    """The same rig and shutter in rsbench."""
+    lens = Lens(model="brown-conrady", k1=rig.k1) if rig.k1 else None
+    camera = PinholeCamera(
+        width=rig.width,
+        height=rig.height,
+        fx=rig.focal,
+        fy=rig.focal,
+        cx=rig.centre[0],
+        cy=rig.centre[1],
+        lens=lens,
+    )
+    shutter = RollingShutter(
+        height=rig.height, width=rig.width, readout_ratio=rig.ratio, scan=rig.scans[0], right_scan=rig.scans[1]
+    )
+    return StereoRig(camera=camera, baseline=rig.baseline), shutter
+
+
+def _laws(motion: ModuleType) -> list[tuple[Any, type[Motion], dict[str, float]]]:
+    return [
+        (motion.Linear(W, D), LinearMotion, {}),
+        (motion.Twist(W, D), TwistMotion, {}),
+        (motion.Inertial(W, D), InertialMotion, {}),
+        (motion.Accelerated(W, D, 0.3), AcceleratedMotion, {"acceleration": 0.3}),
+        (motion.Shaken(W, D), InertialMotion, {}),  # with amplitudes of 0, nothing pushes
+    ]
+
+
+def test_laws_are_those_of_the_models_with_their_end_points(programs_: Programs) -> None:
+    tau = np.linspace(0.0, 2.0, 23)
+    for law, model, parameters in _laws(programs_.motion):
+        R, t = law.body(tau)
+        true = model(*programs_.motion.between(law, 0.0, 1.0), **parameters).body_from_world(tau)
+        # Rounding, which the vector of a rotation matrix enlarges.
+        np.testing.assert_allclose(R, true.R, atol=1e-12)
+        np.testing.assert_allclose(t, true.t, atol=1e-12)
+
+
+def test_a_shaken_body_starts_at_rest_in_the_world_and_shakes_as_strongly_as_said(programs_: Programs) -> None:
+    motion = programs_.motion
+    law = motion.shaken(np.random.default_rng(3), 1.0, 0.15, 0.45)
+    R, t = law.body(np.zeros(1))
+    np.testing.assert_allclose(R[0], np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(t[0], 0.0, atol=1e-15)
+    tau = np.linspace(0.0, 200.0, 4001)
+    rest = motion.centres(law, tau) - tau[:, None] * law.v
+    expected = np.sqrt(np.sum(law.amplitudes[3:] ** 2, axis=1) / 2.0)  # of a sum of sines
+    np.testing.assert_allclose(np.std(rest, axis=0), expected, rtol=0.05)  # 30 periods or more of the slowest
+    assert np.all((law.amplitudes[3:] > 0.002) & (law.amplitudes[3:] < 0.008))
+
+
+@pytest.mark.parametrize(("ratio", "scans", "k1"), CASES)
+@pytest.mark.parametrize("side", SIDES)
+def test_dots_are_drawn_where_the_row_equation_has_them(
+    programs_: Programs, ratio: float, scans: tuple[str, str], k1: float, side: Side
+) -> None:
+    frames, rng = programs_.frames, np.random.default_rng(7)
+    foreign = frames.Rig(ratio=ratio, scans=scans, k1=k1, **SMALL)
+    rig, shutter = _ours(foreign)
+    motion = TwistMotion(*programs_.motion.between(programs_.motion.Twist(W, D), 0.0, 1.0))
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.35, 0.35, 4))
+    depth = rng.uniform(3.0, 12.0, x.shape)
+    points = np.stack([x * depth, y * depth, depth], axis=-1).reshape(-1, 3)
+    image = _dots(programs_, foreign, points, side)
+    found = 0
+    for point in points:
+        true = _seen(rig, shutter, motion, side, point)
+        if true is not None and np.all((true > 12.0) & (true < np.array([147.0, 107.0]))):
+            # Across a dot of 1.4 px a tilt of 6 deg shifts the centroid by 0.005 px and the lens by up to 0.02.
+            np.testing.assert_allclose(_centroid(image, true), true, atol=0.03)
+            found += 1
+    assert found >= 8
+
+
+def _dots(programs_: Programs, rig: Any, points: NDArray[np.float64], side: Side) -> NDArray[np.float32]:
+    """Frame 1 of a camera that moves by a twist and sees a soft dot at each point."""
+    at = np.linspace(-1.0, 1.0, 33)
+    dot = 200.0 * np.exp(-0.5 * (at**2 + at[:, None] ** 2) / 0.23**2)
+    quads = [
+        programs_.world.Quad(point - [size, size, 0.0], np.array([2.0 * size, 0, 0]), np.array([0, 2.0 * size, 0]))
+        for point, size in zip(points, points[:, 2] * 6.0 / rig.focal, strict=True)
+    ]
+    world = programs_.world.assemble(quads, [dot.astype(np.float32)] * len(quads))
+    poses = rig.camera(programs_.motion.Twist(W, D), side, rig.times(side, 1))
+    image: NDArray[np.float32] = programs_.frames.trace(world, rig, poses, rig.rows(side))
+    return image
+
+
+def _seen(
+    rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, point: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """The pixel of frame 1 that is read just when it shows the point, by bisection of the time."""
+
+    def pixel(tau: float) -> NDArray[np.float64]:
+        R, t = rig.cam_from_world(motion, tau, side)
+        return rig.camera.project(R @ point + t)
+
+    def late(tau: float) -> float:
+        return float(shutter.pixel_time(pixel(tau), 1, side)) - tau
+
+    if not late(0.9) * late(2.1) < 0.0:
+        return None
+    return pixel(float(brentq(late, 0.9, 2.1, xtol=1e-12)))
+
+
+def _centroid(image: NDArray[np.float32], near: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of the grey values within 8 px."""
+    x, y = np.meshgrid(np.arange(image.shape[1]), np.arange(image.shape[0]))
+    weight = np.where(np.hypot(x - near[0], y - near[1]) < 8.0, image, 0.0)
+    return np.array([np.sum(x * weight), np.sum(y * weight)]) / np.sum(weight)
+
+
+@pytest.mark.parametrize(("ratio", "scans", "k1"), CASES)
+def test_each_pixel_shows_the_nearest_quad_of_its_ray_at_its_time(
+    programs_: Programs, ratio: float, scans: tuple[str, str], k1: float
+) -> None:
+    rng, foreign = np.random.default_rng(5), programs_.frames.Rig(ratio=ratio, scans=scans, k1=k1, **SMALL)
+    quads = programs_.world.random_world(rng, np.zeros((1, 3)), 20.0).quads
+    greys = [np.full((9, 9), 10.0 * (k + 1), dtype=np.float32) for k in range(len(quads))]
+    world = programs_.world.assemble(quads, greys)
+    law, (rig, shutter) = programs_.motion.Linear(W, D), _ours(foreign)
+    for side in SIDES:
+        poses = foreign.camera(law, side, foreign.times(side, 0))
+        image = programs_.frames.trace(world, foreign, poses, foreign.rows(side), samples=1)
+        for pixel in rng.integers(0, (160, 120), (60, 2)):
+            R, t = rig.cam_from_world(LinearMotion(W, D), shutter.pixel_time(pixel, 0, side), side)
+            start, ray = -R.T @ t, R.T @ rig.camera.unproject(pixel)
+            assert abs(image[pixel[1], pixel[0]] - 10.0 * (_nearest(quads, start, ray) + 1)) < 0.01
+
+
+def _nearest(quads: list[Any], start: NDArray[np.float64], ray: NDArray[np.float64]) -> int:
+    """Number of the quad that a ray meets first."""
+    hits = []
+    for number, quad in enumerate(quads):
+        u, v, z = np.linalg.solve(np.stack([-quad.across, -quad.down, ray], axis=-1), quad.corner - start)
+        if 0.0 <= u <= 1.0 and 0.0 <= v <= 1.0 and z > 0.0:
+            hits.append((z, number))
+    return min(hits)[1]
+
+
+def test_a_line_of_a_rolling_frame_is_that_of_the_global_frame_at_its_time(programs_: Programs) -> None:
+    frames, law = programs_.frames, programs_.motion.Twist(W, D)
+    world = programs_.world.random_world(np.random.default_rng(2), np.zeros((1, 3)), 25.0)
+    rig = frames.Rig(ratio=0.8, scans=("bottom", "left"), k1=-0.2, **SMALL)
+    for side, line in (("left", 0), ("left", 77), ("right", 31), ("right", 159)):
+        tau = rig.times(side, 0)
+        rolling = frames.trace(world, rig, rig.camera(law, side, tau), rig.rows(side))
+        still = frames.trace(world, rig, rig.camera(law, side, tau[line : line + 1]))
+        at = np.s_[line] if rig.rows(side) else np.s_[:, line]
+        np.testing.assert_allclose(rolling[at], still[at], atol=1e-3)  # grey levels; rounding of float32
+        assert np.mean(np.abs(rolling - still)) > 1.0  # elsewhere they differ
+        assert np.min(rolling) > 0.0  # the room is closed
+
+
+def test_a_case_is_written_with_rigs_that_the_command_reads_and_poses_that_are_true(
+    programs_: Programs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = programs_.frames
+    small = frames.Rig(ratio=0.6, scans=("top", "right"), k1=-0.1, width=48, height=36, focal=40.0)
+    case = frames.Case(law=programs_.motion.Linear(W, D), rig=small, frames=3)
+    monkeypatch.setitem(frames.ROWS, "tiny", lambda rng: case)
+    frames.write_case("tiny", 0, tmp_path, [])
+    told, untold = (read_rig_card(tmp_path / f"{name}.toml") for name in ("told", "untold"))
+    assert (told.readout_ratio, told.scan, told.right_scan) == (0.6, "top", "right")
+    assert untold.readout_ratio is None and untold.scanning.plain
+    assert told.rig(48, 36) == untold.rig(48, 36) == _ours(small)[0]
+    truth = json.loads((tmp_path / "truth.json").read_text("utf-8"))
+    times = _ours(small)[1].line_times(2, "right")
+    R, t = LinearMotion(W, D).body_from_world(times)
+    poses = np.array(truth["poses"]["right"][2])
+    np.testing.assert_allclose(programs_.motion.matrices(poses[:, :3]), R, atol=1e-10)
+    np.testing.assert_allclose(poses[:, 3:], t, atol=1e-10)
+    assert len(list(tmp_path.rglob("*.png"))) == 12  # two cameras, three times, rolling and global
+
+
+def test_the_table_finds_no_error_in_the_truth_and_counts_failures(programs_: Programs) -> None:
+    table = programs_.table
+    truth = {"frames": 2, "motions": [{"w": W.tolist(), "d": D.tolist()}]}
+    e_R, e_T = table._motion_errors({"motion": {"w": W.tolist(), "d": (2.0 * D).tolist()}}, truth)
+    assert e_R < 1e-9 and e_T < 1e-5
+    turned = [-value for value in D]
+    assert table._motion_errors({"motion": {"w": [0.0] * 3, "d": turned}}, truth)[1] == pytest.approx(180.0)
+    known = {"row": "twist", "seed": 0, "frames": 2, "true_ratio": 0.8}
+    found = table.Outcome(**known, told=False, ratio=0.75, sigma=0.02, psnr=28.0, gain=2.0, worst_gain=1.0)
+    failed = table.Outcome(**known, told=True, failed=True, message="exit 1: no motion")
+    assert found.deviations == pytest.approx(2.5)
+    *cases, head, rule, line = table.table([failed, found]).split("\n")
+    assert "exit 1: no motion" in cases[2] and {row.count("|") for row in cases[:4]} == {12}
+    assert head.count("|") == rule.count("|") == line.count("|")
+    assert line.startswith("| twist | 1 + 1 | 1 + 0 | 1 of 1 | 2.5 |")
