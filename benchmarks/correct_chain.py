@@ -44,7 +44,9 @@ def run(sequence: Sequence, options: CorrectionOptions) -> dict[str, tuple[float
         return result
 
     matches = timed("match", lambda: match_frames(images, rig, options))
-    found, shutter, _ = timed("solve", lambda: solve_frames(matches, rig, sequence.shutter.readout_ratio, options))
+    ratio = sequence.shutter.readout_ratio
+    solved = timed("solve", lambda: solve_frames(matches, rig, ratio, options))
+    found, shutter = solved.found, solved.shutter
     pairs = timed("depth", lambda: find_depth(images, rig, shutter, found.motion, options))
     timed("correct", lambda: correct_frames(images, pairs, rig, shutter, found.motion, options))
     return times

@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from rsbench.benchmark.simulated.simulation import SimulationOptions, random_direction, simulate
 from rsbench.capture.model_choice import MODELS, choose_model
 from rsbench.capture.model_fit import ACCELERATION_SIGMA
+
+from rsbench.benchmark.simulated.simulation import SimulationOptions, random_direction, simulate
 from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion

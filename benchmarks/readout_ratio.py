@@ -11,9 +11,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from rsbench.capture.readout import estimate_readout_ratio
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
-from rsbench.capture.readout import estimate_readout_ratio
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter

@@ -27,7 +27,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, read_frame
 from rsbench.pipeline.frame_motion import match_frames, solve_frames
-from rsbench.pipeline.sequence_correction import estimate_sequence_readout
+from rsbench.pipeline.sequence_correction import estimate_sequence_capture
 
 Step = tuple[FloatArray, FloatArray]
 """Rotation (3, 3) and translation (3,), metres, of the body from one frame to the next."""
@@ -147,16 +147,19 @@ def score(given: argparse.Namespace) -> list[str]:
         )
     ratio, offset, lines = given.ratio, 0.0, []
     if ratio is None:
-        found = estimate_sequence_readout(sources[0], sources[1], rig, options)
-        ratio, offset = found.readout_ratio, found.disparity_offset
-        lines.append(f"readout ratio {found}, disparity offset {offset:+.2f} +- {found.offset_sigma:.2f} px")
+        capture, shutter = estimate_sequence_capture(sources[0], sources[1], rig, options)
+        ratio, offset, best = shutter.readout_ratio, capture.offset, capture.likeliest
+        assert best is not None
+        lines.append(f"readout ratio {best.ratio:.3f} +- {best.sigma:.3f}, {best.scans}")
+        lines.append(f"disparity offset {offset:+.2f} +- {capture.offset_sigma:.2f} px")
     rows, steps, refused = [], [], 0
     for k in range(0, len(poses) - 1, given.every):
         images = {
             (side, n): read_frame(files[i][k + n]) for n in (0, 1) for i, side in enumerate(("left", "right"))
         }
         try:
-            motion, _, _ = solve_frames(match_frames(images, rig, options), rig, ratio, options, offset)
+            motion = solve_frames(match_frames(images, rig, options), rig, ratio, options, offset).found
+            assert motion is not None
         except RsbenchError as error:
             refused += 1
             lines.append(f"{k:4d}  {error}")

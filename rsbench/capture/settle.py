@@ -33,7 +33,7 @@ _PRIOR_FACTOR, _LEAST_PRIOR_PX = 2.0, 0.1
 """Standard deviation of the disparity offset over the size of the row differences: rows show errors of roll and
 pitch, and the error of yaw, which shifts disparities, is of their kind. Below the second there is none to fit."""
 _CLEARLY, LEAST_BACKWARDS = 0.999, 0.25
-"""Probability of the opposite scan at which frames are refused, and the readout ratio from which its order shows."""
+"""Probability of the opposite scan at which frames are refused, and the ratio from which their order shows."""
 _AXES = ("tilt", "pan", "roll", "sideways motion", "vertical motion", "forward motion")
 
 
@@ -51,8 +51,8 @@ def known_of(
 ) -> Known:
     """What is known before the matches are asked; None of it is looked for.
 
-    An unknown offset is looked for with an unknown ratio, as large as the row differences of the left-right matches
-    allow: they come from the same calibration.
+    An unknown offset is looked for with an unknown ratio, as large as the row differences of the left-right
+    matches allow: they come from the same calibration.
     """
     offset_sigma = 0.0
     if disparity_offset is None and readout_ratio is None and rig.camera.lens is None:
@@ -63,7 +63,11 @@ def known_of(
     if scanning is not None:
         width, height = rig.camera.width, rig.camera.height
         rolling = scans_of(scanning.shutter_of(width, height, 1.0))
-        scans = (GLOBAL, rolling, reversed_scans(rolling)) if readout_ratio is None else (rolling if readout_ratio > 0.0 else GLOBAL,)
+        scans = (
+            (GLOBAL, rolling, reversed_scans(rolling))
+            if readout_ratio is None
+            else (rolling if readout_ratio > 0.0 else GLOBAL,)
+        )
     return Known(
         ratio=readout_ratio,
         scans=scans,
@@ -117,7 +121,7 @@ def shutter_of(candidate: Candidate, rig: StereoRig) -> RollingShutter:
 def cannot_tell(capture: Capture) -> str:
     """Which unknowns the matches leave open, what the ratio trades against, and what would settle it."""
     text = f"cannot tell the readout ratio: {capture.reason}"
-    peak = next(reversed(capture.peaks.values()), None)
+    peak = capture.peaks.get(capture.motion_model)
     best = capture.likeliest
     if best is not None and peak is not None and best.sigma > _MAX_SIGMA:
         text += f"; a larger ratio goes with {trade(peak)}"

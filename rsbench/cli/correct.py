@@ -77,7 +77,7 @@ def correct(
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
 ) -> None:
     """Correct your own rolling-shutter stereo frames: two times of a rig, or a whole sequence."""
-    from rsbench.pipeline.frame_motion import NoMotionError
+    from rsbench.capture.settle import NoMotionError
     from rsbench.pipeline.isolated_parts import Isolation
     from rsbench.vision.corrector import NotCorrectedError
 
@@ -316,9 +316,7 @@ def _readout(shutter: RollingShutter, capture: Capture | None) -> str:
     return text
 
 
-def _say(
-    out: Path, shutter: RollingShutter, capture: Capture | None, motion: dict[str, Any] | None
-) -> None:
+def _say(out: Path, shutter: RollingShutter, capture: Capture | None, motion: dict[str, Any] | None) -> None:
     typer.echo(f"readout ratio {_readout(shutter, capture)}")
     if motion is not None:
         typer.echo(f"motion {motion['rotation_deg']:.4f} deg, {motion['translation']:.4f} m per frame period")

@@ -37,7 +37,7 @@ Exit codes: 0 all solved, 1 one without a motion, 2 one that is wrong; the other
 More: [bold]rsbench docs problem-format[/bold]"""
 
 
-_MODEL = "Motion model: auto, which the matches prefer, or a name. Default: the solver's"
+_MODEL = "Motion model: auto, which the matches prefer, or a name. Default: auto where the solver takes it"
 _SOLVER = "Name of a solver (rsbench list solvers) or path of a card; repeatable. Default: rs-stereo-refined"
 
 
@@ -78,7 +78,7 @@ def solve(
     wanted, options, limit = _extras(extras, json), _options(threshold_px), _limit(time_limit)
     entries = load_solver_entries(solver or ["rs-stereo-refined"])
     _check_model(motion_model, entries)
-    code = _tell(_answers(problems, entries, options, seed, wanted, limit, motion_model), json)
+    code = _tell(_answers(problems, entries, options, seed, wanted, limit, motion_model or "auto"), json)
     if code:
         raise typer.Exit(code)
 
@@ -116,7 +116,7 @@ def _answers(
     seed: int,
     extras: list[Extra],
     time_limit: float | None,
-    motion_model: str | None,
+    motion_model: str,
 ) -> Iterator[dict[str, Any] | RsbenchError]:
     """One answer per problem and solver, or the error that a problem is."""
     import sys
@@ -205,10 +205,10 @@ def _options(threshold_px: float | None) -> RobustOptions:
 
 
 def _check_model(motion_model: str | None, entries: list[SolverEntry]) -> None:
-    from rsbench.capture.model_choice import check_asked
+    from rsbench.pipeline.frame_motion import check_model
 
     for entry in entries if motion_model is not None else []:
-        check_asked(str(motion_model), entry)
+        check_model(str(motion_model), entry)
 
 
 def _limit(seconds: float | None) -> float | None:

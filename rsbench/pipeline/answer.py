@@ -7,9 +7,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rsbench.capture.model_choice import settle_model
+from rsbench.capture.settle import ModelChoice
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.motion import Motion
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
 from rsbench.core.track_building import join_stereo
 from rsbench.pipeline.body_motion import body_motion
+from rsbench.pipeline.frame_motion import chosen_model, entry_of, takes_models
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.registry import SolverEntry
@@ -33,7 +38,7 @@ def solve_problem(
     """Answer to a problem, ready for JSON; a failure has null for every motion, and the reason.
 
     Args:
-        motion_model: ``auto`` or a model to use instead of the solver's, see ``settle_model``.
+        motion_model: ``auto`` or a model to use instead of the solver's; None: the solver's.
 
     Raises:
         RsbenchError: there is no such motion model, or the solver can take no other than its own.
@@ -41,8 +46,8 @@ def solve_problem(
     joined, spec, choice = join_stereo(problem.correspondences), entry.solver.spec, None
     given = (joined.correspondences, problem.rig, problem.shutter, options, np.random.default_rng(seed))
     result = runner.robust(entry, *given)
-    if motion_model is not None:
-        result, choice = settle_model(motion_model, result, entry, *given)
+    if motion_model is not None and takes_models(entry):
+        entry, result, choice = _under_model(motion_model, entry, result, runner, given, seed)
     estimate = result.estimate
     body = body_motion(estimate, spec, problem.rig)
     notes = [estimate.reason] if joined.note in estimate.reason else [estimate.reason, joined.note]
@@ -70,6 +75,22 @@ def solve_problem(
         "seconds": result.seconds,
         **_extras(problem, result, extras),
     }
+
+
+Given = tuple[Correspondences, StereoRig, RollingShutter, RobustOptions, np.random.Generator]
+
+
+def _under_model(
+    asked: str, entry: SolverEntry, result: RobustEstimate, runner: SolverRunner, given: Given, seed: int
+) -> tuple[SolverEntry, RobustEstimate, ModelChoice | None]:
+    """The answer under the motion model that the matches prefer, or that is asked for."""
+    matches, rig, shutter, options, _ = given
+    start = body_motion(result.estimate, entry.solver.spec, rig)
+    choice = (
+        chosen_model(asked, start, matches, rig, shutter, options, seed) if isinstance(start, Motion) else None
+    )
+    other = entry if choice is None else entry_of(entry, choice)
+    return other, result if other is entry else runner.robust(other, *given), choice
 
 
 def _extras(problem: Problem, result: RobustEstimate, extras: Collection[Extra]) -> Answer:

@@ -80,7 +80,12 @@ class RigCard(Scanning):
     @property
     def scanning(self) -> Scanning | None:
         """How its cameras read their lines; None where that is to be found with the readout ratio."""
-        if self.readout_ratio is None and self.scan is None and self.right_scan is None and self.right_delay == 0.0:
+        if (
+            self.readout_ratio is None
+            and self.scan is None
+            and self.right_scan is None
+            and self.right_delay == 0.0
+        ):
             return None
         return Scanning(scan=self.scan or "top", right_scan=self.right_scan, right_delay=self.right_delay)
 

@@ -34,7 +34,7 @@ from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.kernel_type import load_kernel
 from rsbench.solvers.engine.registry import SolverEntry
-from rsbench.solvers.engine.robust_motion import RobustEstimate, estimate_motion
+from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.vision.feature_matcher import find_correspondences
 from rsbench.vision.features import ROW_TOLERANCE_PX, SiftMatcher
@@ -43,8 +43,8 @@ from rsbench.vision.undistortion import undistorted, with_lens
 
 _FEWEST_MATCHES = 12
 BACKWARDS = (
-    "time runs backwards in them: the two times are exchanged, or lines are read from the side opposite to what is "
-    "said (scan in the rig's card)"
+    "time runs backwards in them: the two times are exchanged, or lines are read from the side opposite to what "
+    "is said (scan in the rig's card)"
 )
 
 
@@ -185,7 +185,9 @@ def find_motion(
     choice = None if capture is None or options.motion_model is None else choose_model(capture)
     robust = _solved(entry if choice is None else entry_of(entry, choice), matches, rig, shutter, options, rng)
     if capture is None and options.motion_model is not None and robust.estimate.success:
-        choice = _chosen(motion_of(robust.estimate, entry, rig), matches, rig, shutter, options)
+        start = motion_of(robust.estimate, entry, rig)
+        asked, seed = options.motion_model, options.seed
+        choice = chosen_model(asked, start, matches, rig, shutter, options.robust, seed)
         if choice is not None and choice.used != entry.solver.spec.motion_model:
             robust = _solved(entry_of(entry, choice), matches, rig, shutter, options, rng)
     if capture is not None:
@@ -209,12 +211,23 @@ def _solved(
         return runner.robust(entry, matches, rig, shutter, options.robust, rng)
 
 
-def _chosen(
-    start: Motion, matches: Correspondences, rig: StereoRig, shutter: RollingShutter, options: CorrectionOptions
+def chosen_model(
+    asked: str,
+    start: Motion,
+    matches: Correspondences,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    robust: RobustOptions,
+    seed: int,
 ) -> ModelChoice | None:
-    """The motion model, of a shutter that is known; None where nothing can be said."""
-    known = known_of(matches, rig, shutter.readout_ratio, shutter.scanning, 0.0, models_asked(options.motion_model))
-    return choose_model(conclude([examine(matches, rig, known, options.robust, options.seed, start)]))
+    """The motion model that matches prefer, of a shutter that is known; None where nothing can be said.
+
+    Args:
+        asked: ``auto`` or the one to take.
+        start: a motion near theirs, of any model.
+    """
+    known = known_of(matches, rig, shutter.readout_ratio, shutter.scanning, 0.0, models_asked(asked))
+    return choose_model(conclude([examine(matches, rig, known, robust, seed, start)]))
 
 
 def models_asked(motion_model: str | None) -> tuple[str, ...]:
@@ -246,7 +259,7 @@ def entry_of(entry: SolverEntry, choice: ModelChoice) -> SolverEntry:
     if choice.used == solver.motion_model and not choice.parameters:
         return entry
     return replace(
-        entry, solver=replace(solver, motion_model=choice.used, motion_parameters=dict(choice.parameters))
+        entry, component=replace(solver, motion_model=choice.used, motion_parameters=dict(choice.parameters))
     )
 
 
@@ -272,6 +285,15 @@ def motion_of(estimate: MotionEstimate, entry: SolverEntry, rig: StereoRig) -> M
     if entry.solver.spec.metric:
         raise NoMotionError(f"solver {entry.name!r}: {motion}: more matches must be seen by both cameras")
     raise NoMotionError(f"solver {entry.name!r}: {motion}; a correction needs metres, as rs-stereo-refined finds")
+
+
+def kept_matches(matches: Correspondences, robust: RobustEstimate) -> Correspondences:
+    """The temporal matches and tracks that a robust estimate kept."""
+    return Correspondences(
+        left=matches.left[robust.inliers["left"]],
+        right=matches.right[robust.inliers["right"]],
+        tracks=matches.tracks[robust.inliers["tracks"]],
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -318,7 +340,9 @@ def solve_frames(
         if scanning is not None and runs_backwards(capture, scans_of(_rolling(scanning, rig))):
             raise RefusedFramesError(BACKWARDS)
         shutter = shutter_found(capture, rig)
-        offset = (capture.offset if disparity_offset is None else disparity_offset) if shutter.rows_together else 0.0
+        offset = (
+            (capture.offset if disparity_offset is None else disparity_offset) if shutter.rows_together else 0.0
+        )
         if shutter.rows_together:
             if doubt is not None:
                 raise doubt

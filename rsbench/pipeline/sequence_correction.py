@@ -7,15 +7,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.capture.estimate import CERTAIN, Capture, conclude, examine
-from rsbench.capture.hypotheses import Known
 from rsbench.capture.estimate import Window as Examined
+from rsbench.capture.hypotheses import Known
 from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.scans import GLOBAL
-from rsbench.capture.settle import known_of, shutter_found
+from rsbench.capture.settle import NoMotionError, known_of, shutter_found
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, StereoRig
@@ -24,14 +23,7 @@ from rsbench.pipeline.chain import Given, check_cameras, correct_known, find_dep
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, check_alike
 from rsbench.pipeline.frame_depth import Images, Pairs, frame_pair
-from rsbench.pipeline.frame_motion import (
-    FoundMotion,
-    NoMotionError,
-    match_frames,
-    match_unknown,
-    models_asked,
-    solve_frames,
-)
+from rsbench.pipeline.frame_motion import FoundMotion, match_frames, match_unknown, models_asked, solve_frames
 from rsbench.vision.fusion import Fused
 from rsbench.vision.stereo_matcher import needs_motion
 

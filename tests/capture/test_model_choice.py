@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rsbench.capture.model_choice import MODELS, choose_model, preferred, settle_model
+from rsbench.capture.model_fit import CANDIDATES, Candidate, Errors, dispersion, fit_model
 from scipy.special import logsumexp
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.capture import model_fit
-from rsbench.capture.model_choice import MODELS, choose_model, preferred, settle_model
-from rsbench.capture.model_fit import CANDIDATES, Candidate, Errors, dispersion, fit_model
 from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 from commands import assert_refused, run_here
-
 from rsbench.capture.readout import ReadoutEstimate
+
 from rsbench.cli.correct import _readout
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.corrected_frames import MASK_VALUES, fresh_folder

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.capture.readout import (
     ReadoutEstimate,
     combined,
@@ -16,6 +14,8 @@ from rsbench.capture.readout import (
     truncated_losses,
 )
 from rsbench.capture.readout_profile import reversed_in_time
+
+from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.capture.rectification import without_offset
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences

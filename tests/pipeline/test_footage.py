@@ -9,13 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
+from rsbench.capture.settle import NoMotionError
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, check_alike, read_frame, read_rig_card
-from rsbench.pipeline.frame_motion import NoMotionError, solve_frames
+from rsbench.pipeline.frame_motion import solve_frames
 from rsbench.pipeline.sequence_correction import correct_sequence, estimate_sequence_readout
 
 Folders = tuple[FrameSource, FrameSource]

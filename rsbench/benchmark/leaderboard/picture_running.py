@@ -263,8 +263,9 @@ class _Made:
         if self.given.motion is None:
             matches = match_frames(self.images, rig, chain, shutter.scanning)
             matched = time.perf_counter()
-            found, _, _ = solve_frames(matches, rig, shutter.readout_ratio, chain, scanning=shutter.scanning)
-            self.given = Given(motion=found.motion)
+            solved = solve_frames(matches, rig, shutter.readout_ratio, chain, scanning=shutter.scanning)
+            assert solved.found is not None
+            self.given = Given(motion=solved.found.motion)
             self.spent = {"matching": matched - start, "motion": time.perf_counter() - matched}
         assert self.given.motion is not None
         return self.given.motion

@@ -25,14 +25,14 @@ from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import submission_text
 from rsbench.benchmark.provenance import numeric_version, processor
 from rsbench.benchmark.simulated.trials import Information, enter
-from rsbench.capture.readout import estimate_readout_ratio
+from rsbench.capture.estimate import conclude, examine
+from rsbench.capture.settle import known_of, shutter_found
 from rsbench.core.errors import RsbenchError
 from rsbench.core.track_building import join_stereo
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.jobs.process_jobs import finished_jobs, run_jobs
 from rsbench.jobs.workers import Workers
 from rsbench.pipeline.answer import Extra, solve_problem
-from rsbench.pipeline.frame_motion import check_readout
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import Problem, parse_problem
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
@@ -318,19 +318,18 @@ def _seed(problem: Problem, entry: SolverEntry) -> int:
 
 
 def _readout(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
-    """The readout ratio that explains the matches best; it needs no ``runner``: the solver is one of ours."""
+    """The readout ratio that explains the matches best, under the solver's motion model; no ``runner`` is needed."""
     solver = entry.solver
     assert isinstance(solver, RefinedSolver)
     matches, start = join_stereo(problem.correspondences).correspondences, time.perf_counter()
-    found = estimate_readout_ratio(matches, problem.rig, solver, RobustOptions(), _seed(problem, entry))
+    known = known_of(matches, problem.rig, None, problem.shutter.scanning, None, (solver.motion_model,))
+    capture = conclude([examine(matches, problem.rig, known, RobustOptions(), _seed(problem, entry))])
     seconds = round(time.perf_counter() - start, 6)
     try:
-        if found is None:
-            raise RsbenchError("no motion explains the matches at any readout ratio")
-        check_readout(found)
+        ratio = shutter_found(capture, problem.rig).readout_ratio
     except RsbenchError as error:
         return {"name": problem.name, "success": False, "reason": str(error)[:300], "seconds": seconds}
-    return {"name": problem.name, "readout_ratio": min(found.readout_ratio, 1.0), "seconds": seconds}
+    return {"name": problem.name, "readout_ratio": ratio, "seconds": seconds}
 
 
 def answer_problem(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from rsbench.benchmark.studies.correction_methods import METHODS, ON_REQUEST
 from rsbench.benchmark.studies.layer_methods import asked_layers
 from rsbench.benchmark.studies.resumable_rows import ResumableRows, Row, Rows
 from rsbench.benchmark.studies.rotation_methods import asked_rotation
-from rsbench.capture.readout import select
+from rsbench.capture.settle import NoMotionError
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, VIEWS, Side, View
@@ -38,7 +38,7 @@ from rsbench.pipeline.baseline_motions import global_shutter_motion, monocular_m
 from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Pairs, frame_pairs, known_depth
-from rsbench.pipeline.frame_motion import FoundMotion, NoMotionError, find_matches, find_motion
+from rsbench.pipeline.frame_motion import FoundMotion, find_matches, find_motion, kept_matches
 from rsbench.pipeline.one_camera import ZhuangCorrector, depth_alone
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 from rsbench.vision.baseline_depths import plane_depth
@@ -253,7 +253,7 @@ class Bench:
     def _velocity(self, side: Side) -> Motion | None:
         if self.found is None:
             return None
-        inliers = select(self.matches, self.found.robust)
+        inliers = kept_matches(self.matches, self.found.robust)
         return monocular_motion(inliers, self.rig, self.shutter, side, self.found.motion)
 
     def _scaled_monocular(self, side: Side) -> Motion | None:

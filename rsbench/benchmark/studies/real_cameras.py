@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.studies.resumable_rows import ResumableRows, Row
+from rsbench.capture.settle import NoMotionError
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import VIEWS, View
@@ -28,7 +29,7 @@ from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.chain import correct_frames, find_depth
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Pairs, frame_pairs
-from rsbench.pipeline.frame_motion import FoundMotion, NoMotionError, find_matches_of_rig, find_motion
+from rsbench.pipeline.frame_motion import FoundMotion, find_matches_of_rig, find_motion
 from rsbench.vision.fusion import Origin
 from rsbench.vision.quality import psnr
 

@@ -161,8 +161,8 @@ def linearise_pair(
 ) -> tuple[float, float]:
     """Sampson residual, px, of one pair (1, 17), and the norm of its constraint's derivative by the pixels.
 
-    Fills J (6 and more,) with the derivative of the constraint by the motion, and ``ends`` (6,) with that by ray and
-    time of either end, both at the corrected pair, see ``kernels``.
+    Fills J (6 and more,) with the derivative of the constraint by the motion, and ``ends`` (6,) with that by ray
+    and time of either end, both at the corrected pair, see ``kernels``.
     """
     R, A, T_w, T_v = work[0], work[1], work[2], work[3]
     x, y, offset = (pairs[0, 0], pairs[0, 1], 1.0), (pairs[0, 2], pairs[0, 3], 1.0), pairs[0, 6]
