@@ -309,7 +309,7 @@ class _Slope:
             value=(reference - self.least) / unit + self.best.occam + others * float(np.log(spread)),
             at=self.at,
             information=self.curvature / unit + 1.0 / _WIDE**2 if self.varies else 0.0,
-            fit=replace(self.best, sigma=self.best.sigma * spread),
+            fit=replace(self.best, sigma=self.best.sigma * spread, spread=self.best.spread * spread**2),
             trade=(high - low) / apart if apart > 0.0 else np.zeros(10),
         )
 

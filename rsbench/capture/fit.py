@@ -56,6 +56,8 @@ class CaptureFit:
     """Negative logarithm of likelihood and prior, times the squared scale, px^2."""
     sigma: FloatArray
     """(4,) standard deviations of the unknowns; the ratio's is 0 where it was held."""
+    spread: FloatArray
+    """(6, 6) what not knowing them, but for a ratio that was held, adds to the covariance of theta."""
     occam: float
     """Logarithm of the volume of the posterior of the unknowns beside the ratio over that of their prior."""
 
@@ -148,7 +150,8 @@ def fit_capture(
         if before - now < still * cost.likelihood.scale**2:
             break
     sigma = np.zeros(4)
-    covariance = cost.likelihood.scale**2 * np.linalg.pinv(H, hermitian=True)[_MOTION:, _MOTION:]
+    whole = cost.likelihood.scale**2 * np.linalg.pinv(H, hermitian=True)
+    covariance, shared = whole[_MOTION:, _MOTION:], whole[:_MOTION, _MOTION:]
     sigma[free] = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     others = [k for k, j in enumerate(free) if j != RATIO]
     values = np.linalg.eigvalsh(covariance[np.ix_(others, others)]) if others else np.zeros(0)
@@ -159,6 +162,7 @@ def fit_capture(
         unknowns=unknowns,
         cost=now,
         sigma=sigma,
+        spread=shared @ np.linalg.pinv(covariance, hermitian=True) @ shared.T,
         occam=volume - float(np.sum(np.log(cost.prior[[free[k] for k in others]]))),
     )
 

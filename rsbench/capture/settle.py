@@ -180,6 +180,8 @@ class ModelChoice:
     """Between the d of the model used and that of the rival."""
     d_length_percent: float
     """By how much the rival's d is longer."""
+    spread: FloatArray
+    """(6, 6) what not knowing the ratio, the offset and the model's own parameters adds to w's and d's covariance."""
 
     def record(self) -> dict[str, Any]:
         """As JSON holds it."""
@@ -226,6 +228,7 @@ def choose_model(capture: Capture) -> ModelChoice | None:
         rival=rival,
         d_angle_deg=float(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(d, other)), d @ other))),
         d_length_percent=100.0 * (float(np.linalg.norm(other)) / length - 1.0),
+        spread=spread_by_unknowns(capture.peaks[used]),
     )
 
 
@@ -241,11 +244,11 @@ def motion_at(peak: Peak) -> Motion:
     return make_motion(model, w, d, _parameters(peak))
 
 
-def spread_by_ratio(peak: Peak, sigma: float) -> FloatArray:
-    """Covariance (6, 6) that an unknown ratio of this deviation adds to w and d."""
-    kernel = load_kernel(peak.fit.hypothesis.motion_model, _parameters(peak))
-    slope = kernel.motion_jacobian(peak.fit.theta) @ peak.trade[:6]
-    return sigma**2 * np.outer(slope, slope)
+def spread_by_unknowns(peak: Peak) -> FloatArray:
+    """(6, 6) what not knowing the ratio and the other unknowns adds to the covariance of w and d."""
+    J = load_kernel(peak.fit.hypothesis.motion_model, _parameters(peak)).motion_jacobian(peak.fit.theta)
+    slope = J @ peak.trade[:6]
+    return np.asarray(J @ peak.fit.spread @ J.T + peak.sigma**2 * np.outer(slope, slope))
 
 
 def record_of(capture: Capture) -> dict[str, Any]:

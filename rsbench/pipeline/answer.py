@@ -14,7 +14,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.track_building import join_stereo
 from rsbench.pipeline.body_motion import body_motion
-from rsbench.pipeline.frame_motion import chosen_model, entry_of, takes_models
+from rsbench.pipeline.frame_motion import chosen_model, entry_of, takes_models, widened
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.registry import SolverEntry
@@ -90,7 +90,8 @@ def _under_model(
         chosen_model(asked, start, matches, rig, shutter, options, seed) if isinstance(start, Motion) else None
     )
     other = entry if choice is None else entry_of(entry, choice)
-    return other, result if other is entry else runner.robust(other, *given), choice
+    result = result if other is entry else runner.robust(other, *given)
+    return other, result if choice is None else widened(result, choice.spread), choice
 
 
 def _extras(problem: Problem, result: RobustEstimate, extras: Collection[Extra]) -> Answer:

@@ -20,13 +20,14 @@ from rsbench.capture.settle import (
     known_of,
     runs_backwards,
     shutter_found,
-    spread_by_ratio,
+    spread_by_unknowns,
 )
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Images
@@ -190,11 +191,19 @@ def find_motion(
         choice = chosen_model(asked, start, matches, rig, shutter, options.robust, seed)
         if choice is not None and choice.used != entry.solver.spec.motion_model:
             robust = _solved(entry_of(entry, choice), matches, rig, shutter, options, rng)
-    if capture is not None:
-        robust = replace(robust, estimate=with_ratio_unknown(robust.estimate, capture))
+    if choice is not None:
+        robust = widened(robust, choice.spread)
+    elif capture is not None and capture.motion_model in capture.peaks:
+        robust = widened(robust, spread_by_unknowns(capture.peaks[capture.motion_model]))
     entry = entry if choice is None else entry_of(entry, choice)
     motion, point = motion_of(robust.estimate, entry, rig), entry.solver.spec.reference_point
     return FoundMotion(motion=motion, robust=robust, solver=entry.name, reference_point=point, choice=choice)
+
+
+def widened(robust: RobustEstimate, spread: FloatArray) -> RobustEstimate:
+    """With what unknowns add to the covariance."""
+    known = robust.estimate.covariance
+    return robust if known is None else replace(robust, estimate=replace(robust.estimate, covariance=known + spread))
 
 
 def _solved(
@@ -261,14 +270,6 @@ def entry_of(entry: SolverEntry, choice: ModelChoice) -> SolverEntry:
     return replace(
         entry, component=replace(solver, motion_model=choice.used, motion_parameters=dict(choice.parameters))
     )
-
-
-def with_ratio_unknown(estimate: MotionEstimate, capture: Capture) -> MotionEstimate:
-    """The covariance with what an estimated readout ratio adds to it."""
-    best, peak = capture.likeliest, capture.peaks.get(capture.motion_model)
-    if estimate.covariance is None or best is None or peak is None or not best.sigma > 0.0:
-        return estimate
-    return replace(estimate, covariance=estimate.covariance + spread_by_ratio(peak, best.sigma))
 
 
 def motion_of(estimate: MotionEstimate, entry: SolverEntry, rig: StereoRig) -> Motion:

@@ -144,6 +144,7 @@ def _peak(value: float, at: float, information: float, delay: float = 0.0, delay
         unknowns=np.array([at, delay, 0.0, 0.0]),
         cost=0.0,
         sigma=np.array([0.0, delay_sigma, 0.0, 0.0]),
+        spread=np.zeros((6, 6)),
         occam=0.0,
     )
     return Peak(value=value, at=at, information=information, fit=fit, trade=np.zeros(10))
