@@ -133,9 +133,7 @@ def outcome(row: str, seed: int, folder: Path, told: bool, again: bool, model: s
     return Outcome(
         **known,
         message=_remark(found, message, code),
-        ratio=float(
-            found["readout_ratio"] if found["readout_ratio_signed"] is None else found["readout_ratio_signed"]
-        ),
+        ratio=float(found["readout_ratio"]),
         sigma=float(found["readout_ratio_sigma"] or _NAN) if estimated else _NAN,
         turn_error=e_R,
         way_error=e_T,

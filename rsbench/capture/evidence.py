@@ -106,9 +106,9 @@ def window_evidence(
 
     Most scans are put aside by some of the matches, under the first motion model. None for too few matches.
     """
-    timed = {model: TimedMatches(matches, rig, model) for model in known.models}
-    first = timed[known.models[0]]
-    screened = _screened(timed, known, motion, lag)
+    first = TimedMatches(matches, rig, known.models[0])
+    timed = {model: first.under(model) for model in known.models}
+    screened = (_of_models if known.shutter_known else _screened)(timed, known, motion, lag)
     if screened is None:
         return None
     fits, likelihood = screened
@@ -139,7 +139,7 @@ def _screened(
 ) -> tuple[list[CaptureFit], Likelihood] | None:
     """What some of the matches allow, and the distribution of their errors: first scans, then motion models."""
     first = timed[known.models[0]]
-    some = np.arange(first.count) % max(first.count // _SCREENED, 1) == 0
+    some = _some(first.count, _SCREENED)
     theta = first.packed(GLOBAL, np.zeros(4)).theta(*motion)
     found = dict[Scans, tuple[CaptureFit, float]]()
     for scans in sorted(known.scans, key=lambda each: (each != GLOBAL, not each.together)):
@@ -159,11 +159,34 @@ def _screened(
         return None
     judged = [_judged(timed, likelihood, known, fit) for fit, _ in found.values()]
     near = _near(judged, likelihood.scale, _UNSETTLED * _CLOSE)
-    models = _fitted(timed, known, likelihood, near, known.delays[-1:])
+    models = _fitted(timed, known, likelihood, near, known.delays[-1:], known.models)
     best = min(models, key=lambda fit: fit.cost)
     sharper = _distribution(timed[best.hypothesis.motion_model], some, best, likelihood.scale) or likelihood
     judged = [_judged(timed, sharper, known, fit) for fit in models]
     return _near(judged, sharper.scale, _UNSETTLED * _CLOSE), sharper
+
+
+def _of_models(
+    timed: Mapping[str, TimedMatches], known: Known, motion: tuple[FloatArray, FloatArray], lag: Lag
+) -> tuple[list[CaptureFit], Likelihood] | None:
+    """What ``_screened`` is where the shutter is known and motion models alone compete."""
+    first, scans = timed[known.models[0]], known.scans[0]
+    hypothesis = Hypothesis(scans=scans, motion_model=known.models[0])
+    start = known.start(hypothesis, 0.0, 0.0)
+    theta, some = first.packed(scans, start).theta(*motion), _some(first.count, 2 * _SCREENED)
+    wide = Likelihood(nu=_FIRST_NU, scale=_MOST_SCALE, chosen=some)
+    cost = CaptureCost(first, hypothesis, wide, known.prior(hypothesis))
+    scale = min(cost.typical_error(theta, start), _MOST_SCALE)
+    fit = fit_capture(cost, theta, start, iterations=1)
+    likelihood = _distribution(first, some, replace(fit, theta=theta, unknowns=start), scale)
+    if likelihood is None:
+        return None
+    return _near(_fitted(timed, known, likelihood, [fit], (False,), known.models), likelihood.scale), likelihood
+
+
+def _some(count: int, wanted: int) -> BoolArray:
+    """About as many, evenly chosen."""
+    return np.asarray(np.arange(count) % max(count // wanted, 1) == 0)
 
 
 def _is_excluded(scans: Scans, lag: Lag, found: Mapping[Scans, tuple[CaptureFit, float]]) -> bool:
@@ -228,12 +251,13 @@ def _fitted(
     likelihood: Likelihood,
     fits: Sequence[CaptureFit],
     delays: Sequence[bool],
+    models: Sequence[str] | None = None,
 ) -> list[CaptureFit]:
-    """Every motion model, with and without a late right camera, on the scans of fits, from the nearest of them."""
+    """The fits again, with and without a late right camera; or every model on their scans, from the nearest fit."""
     out = []
     pairs = dict.fromkeys((fit.hypothesis.scans, fit.hypothesis.motion_model) for fit in fits)
-    if len(dict.fromkeys(model for _, model in pairs)) == 1:
-        pairs = dict.fromkeys(product(dict.fromkeys(scans for scans, _ in pairs), known.models))
+    if models is not None:
+        pairs = dict.fromkeys(product(dict.fromkeys(scans for scans, _ in pairs), models))
     for (scans, model), delayed in product(pairs, delays):
         hypothesis = Hypothesis(scans=scans, motion_model=model, delayed=delayed)
         of_scans = [fit for fit in fits if fit.hypothesis.scans == scans]

@@ -63,6 +63,11 @@ class Known:
         return out
 
     @property
+    def shutter_known(self) -> bool:
+        """Whether nothing but the motion and its model is looked for."""
+        return len(self.scans) == 1 and self.ratio is not None and self.delay is not None
+
+    @property
     def delays(self) -> tuple[bool, ...]:
         """Whether the right camera may be late."""
         return (False, True) if self.delay is None else (False,)

@@ -13,7 +13,7 @@ from rsbench.core.correspondences import BoolArray, Correspondences, unlinked_pa
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.kernel_type import MotionKernel
+from rsbench.solvers.engine.kernel_type import MotionKernel, load_kernel
 from rsbench.solvers.engine.motion_kernels import AcceleratedKernel
 from rsbench.solvers.engine.packed import Packed, pack
 
@@ -128,6 +128,12 @@ class TimedMatches:
             tracks=np.zeros((tracks, 4)),
             track_slopes=np.zeros((tracks, 4, 2)),
         )
+
+    def under(self, motion_model: str) -> TimedMatches:
+        """The same matches under another motion model."""
+        other = copy.copy(self)
+        other._base = replace(self._base, kernel=load_kernel(motion_model))
+        return other
 
     def subset(self, chosen: BoolArray) -> TimedMatches:
         """Of a mask (count,) over pairs and tracks."""

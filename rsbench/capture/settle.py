@@ -181,7 +181,7 @@ class ModelChoice:
     d_length_percent: float
     """By how much the rival's d is longer."""
     spread: FloatArray
-    """(6, 6) what not knowing the ratio, the offset and the model's own parameters adds to w's and d's covariance."""
+    """(6, 6) what not knowing the ratio, the offset and the model's own parameters adds to the covariance."""
 
     def record(self) -> dict[str, Any]:
         """As JSON holds it."""
@@ -208,14 +208,18 @@ def _percent(p: float) -> str:
     return f"{100.0 * p:.1f} %" if p <= 0.999 else "> 99.9 %"
 
 
-def choose_model(capture: Capture) -> ModelChoice | None:
-    """The model found, else linear, the paper's, unless it is excluded; None where no hypothesis was judged."""
-    if not capture.peaks:
+def choose_model(capture: Capture, asked: str = AUTO) -> ModelChoice | None:
+    """The model found, else linear, the paper's, unless it is excluded; None where no hypothesis was judged.
+
+    Args:
+        asked: a model that is used whatever the matches prefer.
+    """
+    if asked not in (AUTO, *capture.peaks) or not capture.peaks:
         return None
     probability = {name: p for name, p in capture.models.items() if name in capture.peaks}
     best = next(iter(probability))
     undecided = probability[best] < CERTAIN and probability.get("linear", 0.0) > 1.0 - CERTAIN
-    used = "linear" if undecided else best
+    used = asked if asked != AUTO else "linear" if undecided else best
     rival = next((name for name in probability if name != used), "")
     d = motion_at(capture.peaks[used]).d
     other = motion_at(capture.peaks[rival]).d if rival else d

@@ -203,7 +203,9 @@ def find_motion(
 def widened(robust: RobustEstimate, spread: FloatArray) -> RobustEstimate:
     """With what unknowns add to the covariance."""
     known = robust.estimate.covariance
-    return robust if known is None else replace(robust, estimate=replace(robust.estimate, covariance=known + spread))
+    return (
+        robust if known is None else replace(robust, estimate=replace(robust.estimate, covariance=known + spread))
+    )
 
 
 def _solved(
@@ -235,8 +237,9 @@ def chosen_model(
         asked: ``auto`` or the one to take.
         start: a motion near theirs, of any model.
     """
-    known = known_of(matches, rig, shutter.readout_ratio, shutter.scanning, 0.0, models_asked(asked))
-    return choose_model(conclude([examine(matches, rig, known, robust, seed, start)]))
+    models = tuple(dict.fromkeys((*MODELS, *models_asked(asked))))
+    known = known_of(matches, rig, shutter.readout_ratio, shutter.scanning, 0.0, models)
+    return choose_model(conclude([examine(matches, rig, known, robust, seed, start)]), asked)
 
 
 def models_asked(motion_model: str | None) -> tuple[str, ...]:

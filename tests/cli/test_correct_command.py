@@ -14,9 +14,15 @@ import cv2
 import numpy as np
 import pytest
 from commands import assert_refused, run_here
-from rsbench.capture.readout import ReadoutEstimate
 
+from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
+from rsbench.capture.estimate import conclude, examine
+from rsbench.capture.hypotheses import Known
+from rsbench.capture.scans import Scans
 from rsbench.cli.correct import _readout
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.motion import LinearMotion
+from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.corrected_frames import MASK_VALUES, fresh_folder
 from rsbench.dataset.sequence import Sequence, read_dataset
@@ -214,8 +220,13 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
 
 def test_one_window_of_a_rig_that_is_off_says_how_far_it_errs() -> None:
     """A fitted disparity offset is what tells a real rig from a rendered one."""
-    shutter, covariance = RollingShutter(height=480, readout_ratio=0.1), np.diag([0.02**2, 0.1**2])
-    off = ReadoutEstimate(signed_ratio=0.1, disparity_offset=-0.5, covariance=covariance, matches=100)
-    right = replace(off, disparity_offset=0.0, covariance=np.diag([0.02**2, 0.0]))
-    assert "twice" in _readout(shutter, off)
-    assert not any("twice" in _readout(shutter, each) for each in (replace(off, windows=25), right))
+    shutter = RollingShutter(height=480, readout_ratio=0.1)
+    options = SimulationOptions(tracks=60, noise_px=0.2)
+    rig = StereoRig(camera=PinholeCamera.centred(640, 480, 520.0), baseline=0.4)
+    motion = LinearMotion(w=np.radians([1.2, -0.7, 1.5]), d=[0.1, -0.15, 0.1])
+    matches = simulate(rig, shutter, motion, options, np.random.default_rng(0)).correspondences
+    known = Known(scans=(Scans("top", "top"),), delay=0.0, models=("linear",))
+    window = examine(matches, rig, replace(known, offset_sigma=0.5))
+    assert "twice" in _readout(shutter, conclude([window]))
+    assert "twice" not in _readout(shutter, conclude([window, window]))
+    assert "twice" not in _readout(shutter, conclude([examine(matches, rig, known)]))

@@ -226,9 +226,9 @@ def test_an_unknown_readout_ratio_is_estimated_or_declared_open(castle: Sequence
     except NoMotionError as refusal:
         assert "readout_ratio" in str(refusal)
     else:
-        assert result.readout is not None
-        miss = abs(result.readout.readout_ratio - castle.shutter.readout_ratio)
-        assert miss < 4 * result.readout.sigma
+        assert result.capture is not None and result.capture.likeliest is not None
+        best = result.capture.likeliest
+        assert abs(best.ratio - castle.shutter.readout_ratio) < 4 * best.sigma
 
 
 def _refused(images: Images, rig: StereoRig, *words: str) -> None:

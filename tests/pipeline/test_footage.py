@@ -17,7 +17,7 @@ from rsbench.pipeline.chain import correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, check_alike, read_frame, read_rig_card
 from rsbench.pipeline.frame_motion import solve_frames
-from rsbench.pipeline.sequence_correction import correct_sequence, estimate_sequence_readout
+from rsbench.pipeline.sequence_correction import correct_sequence, estimate_sequence_capture
 
 Folders = tuple[FrameSource, FrameSource]
 
@@ -128,9 +128,9 @@ def test_a_frame_without_motion_to_the_next_uses_the_motion_that_led_to_it(
         _write(source.path, "2.png", read_frame(source.path / "0.png")[..., ::-1])
     results = iter([True, False])
 
-    def solve(*arguments: Any) -> Any:
+    def solve(*arguments: Any, **options: Any) -> Any:
         if next(results):
-            return solve_frames(*arguments)
+            return solve_frames(*arguments, **options)
         raise NoMotionError("nothing there")
 
     monkeypatch.setattr("rsbench.pipeline.sequence_correction.solve_frames", solve)
@@ -156,11 +156,12 @@ def test_sequences_of_different_lengths_are_refused(folders: Folders, castle: Se
 
 def test_the_readout_of_a_sequence_is_that_of_its_windows(folders: Folders, castle: Sequence) -> None:
     try:
-        found = estimate_sequence_readout(*folders, castle.rig, CorrectionOptions())
+        capture, shutter = estimate_sequence_capture(*folders, castle.rig, CorrectionOptions())
     except NoMotionError as refusal:
         assert "readout_ratio" in str(refusal)
     else:
-        assert abs(found.readout_ratio - castle.shutter.readout_ratio) < 4 * found.sigma
+        assert capture.likeliest is not None
+        assert abs(shutter.readout_ratio - castle.shutter.readout_ratio) < 4 * capture.likeliest.sigma
 
 
 def test_sources_that_do_not_exist_are_refused(tmp_path: Path) -> None:

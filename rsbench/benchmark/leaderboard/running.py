@@ -318,7 +318,7 @@ def _seed(problem: Problem, entry: SolverEntry) -> int:
 
 
 def _readout(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
-    """The readout ratio that explains the matches best, under the solver's motion model; no ``runner`` is needed."""
+    """The readout ratio that explains the matches best, under the solver's motion model; without ``runner``."""
     solver = entry.solver
     assert isinstance(solver, RefinedSolver)
     matches, start = join_stereo(problem.correspondences).correspondences, time.perf_counter()

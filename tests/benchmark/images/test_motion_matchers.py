@@ -83,8 +83,6 @@ def test_without_a_motion_the_matcher_is_refused_by_name(smoke_dataset: Path) ->
     with pytest.raises(RsbenchError, match="matcher 'sweep': needs the rig's motion, and corrector"):
         correct_four(images, sequence.rig, 0.8, options)
     options = CorrectionOptions(matcher=load_matcher("sweep"))
-    with pytest.raises(RsbenchError, match="readout_ratio: must be given with matcher 'sweep'"):
-        correct_four(images, sequence.rig, None, options)
     with pytest.raises(RsbenchError, match=r"disparity_offset = 0\.5: must be 0 with matcher 'sweep'"):
         correct_four(images, sequence.rig, 0.8, options, disparity_offset=0.5)
 
