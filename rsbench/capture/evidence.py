@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from rsbench.capture.fit import BEYOND_RATIO, CaptureCost, CaptureFit, Likelihood, fit_capture
+from rsbench.capture.fit import BEYOND_RATIO, LEAST_SCALE_PX, CaptureCost, CaptureFit, Likelihood, fit_capture
 from rsbench.capture.hypotheses import ACCELERATION, DELAY, LEAST_RATIO, OFFSET, RATIO, Hypothesis, Known
 from rsbench.capture.scans import GLOBAL, Scans, TimedMatches
 from rsbench.capture.start import Lag, first_shutter, largest_ratio
@@ -253,7 +253,7 @@ def _fitted(
     delays: Sequence[bool],
     models: Sequence[str] | None = None,
 ) -> list[CaptureFit]:
-    """The fits again, with and without a late right camera; or every model on their scans, from the nearest fit."""
+    """The fits again, with and without a late right camera; or all models on their scans, from the nearest fit."""
     out = []
     pairs = dict.fromkeys((fit.hypothesis.scans, fit.hypothesis.motion_model) for fit in fits)
     if models is not None:
@@ -281,7 +281,7 @@ def _distribution(timed: TimedMatches, among: BoolArray, fit: CaptureFit, scale:
     freedom = np.repeat([1.0, 5.0], [len(packed.pairs), len(packed.tracks)])
     chosen = among.copy()
     chosen[among] = each_term(packed, fit.theta).squares / freedom <= (_REACH * found.scale) ** 2
-    return Likelihood(nu=found.nu, scale=found.scale, chosen=chosen, trust=found.trust)
+    return Likelihood(nu=found.nu, scale=max(found.scale, LEAST_SCALE_PX), chosen=chosen, trust=found.trust)
 
 
 class _Slope:

@@ -26,7 +26,7 @@ _LONGEST_STEP = np.array([0.4, 0.4, 2.0, 0.3])
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-8, 1e6
 """A motion makes up for most of a wrong ratio: more damping than this would hold the ratio where it is."""
 _MOTION = 6
-_MEDIAN, _LEAST_SCALE_PX = 0.6, 0.02
+_MEDIAN, LEAST_SCALE_PX = 0.6, 0.02
 """Median of squared normal errors, one or five together; and what exact matches are taken for."""
 
 
@@ -97,7 +97,7 @@ class CaptureCost:
         """Scale of the errors, px, that their median shows: up to half of them may be wrong."""
         tailed = self.tailed(unknowns)
         squares = np.concatenate([tailed.pair_residuals(theta) ** 2, tailed.track_squares(theta)])
-        return max(float(np.sqrt(np.median(squares / tailed.freedom) / _MEDIAN)), _LEAST_SCALE_PX)
+        return max(float(np.sqrt(np.median(squares / tailed.freedom) / _MEDIAN)), LEAST_SCALE_PX)
 
     def __call__(self, theta: FloatArray, unknowns: FloatArray) -> float:
         return float(np.sum(self.each(theta, unknowns))) + 0.5 * float(self._weight @ unknowns**2)

@@ -307,6 +307,8 @@ def _readout(shutter: RollingShutter, capture: Capture | None) -> str:
     if capture is None or best is None:
         return f"{shutter.readout_ratio:.3f} (given)"
     text = f"{best.ratio:.3f} +- {best.sigma:.3f}, {best.scans} (found, {100.0 * best.probability:.0f} % sure)"
+    if not capture.told and capture.moved_px < 1.0:
+        text += f"; matches move by {capture.moved_px:.1f} px, so that it hardly matters"
     if shutter.right_delay:
         text += f"; right camera late by {best.delay:+.3f} +- {best.delay_sigma:.3f} frame periods"
     if capture.offset_sigma > 0.0:

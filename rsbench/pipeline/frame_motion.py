@@ -237,9 +237,13 @@ def chosen_model(
         asked: ``auto`` or the one to take.
         start: a motion near theirs, of any model.
     """
-    models = tuple(dict.fromkeys((*MODELS, *models_asked(asked))))
-    known = known_of(matches, rig, shutter.readout_ratio, shutter.scanning, 0.0, models)
-    return choose_model(conclude([examine(matches, rig, known, robust, seed, start)]), asked)
+    known = known_of(matches, rig, shutter.readout_ratio, shutter.scanning, 0.0)
+    capture = conclude([examine(matches, rig, known, robust, seed, start)])
+    if asked not in (AUTO, *capture.peaks):  # one that the matches exclude, or another package's
+        alone = conclude([examine(matches, rig, replace(known, models=(asked,)), robust, seed, start)])
+        models, peaks = {**capture.models, asked: 0.0}, {**capture.peaks, **alone.peaks}
+        capture = replace(capture, models=models, peaks=peaks)
+    return choose_model(capture, asked)
 
 
 def models_asked(motion_model: str | None) -> tuple[str, ...]:

@@ -200,14 +200,35 @@ def test_a_folder_of_others_is_not_touched(tmp_path: Path, frames: list[Path], r
     assert (out / "precious.txt").read_text() == "mine"
 
 
-def test_matches_that_leave_the_readout_open_exit_with_1(tmp_path: Path, castle: Sequence, rig: Path) -> None:
-    """The same pair twice: no motion, so nothing tells how the rows were read."""
-    left, right = (castle.folder / "gs" / f"{side}_0.png" for side in ("left", "right"))
+def _without_ratio(rig: Path) -> None:
     rig.write_text("\n".join(line for line in rig.read_text().splitlines() if "readout" not in line))
-    result = correct(left, right, left, right, "--rig", rig, "--out", tmp_path / "out")
+
+
+def test_matches_that_leave_the_readout_open_exit_with_1(tmp_path: Path, castle: Sequence, rig: Path) -> None:
+    """All moves along the rows, by 9 px: each point is read a period later, however the rows are read."""
+    left, right = (castle.folder / "gs" / f"{side}_0.png" for side in ("left", "right"))
+    moved = []
+    for path in (left, right):
+        moved.append(tmp_path / path.name)
+        write_png(moved[-1], np.roll(read_png(path), 9, axis=1))
+    _without_ratio(rig)
+    result = correct(left, right, *moved, "--rig", rig, "--out", tmp_path / "out")
     assert result.returncode == 1, result.stderr
-    assert "not corrected" in result.stderr and "readout_ratio" in result.stderr
+    assert "not corrected: cannot tell" in result.stderr and "readout_ratio" in result.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_where_nothing_moves_an_unknown_readout_hardly_matters(
+    tmp_path: Path, castle: Sequence, rig: Path
+) -> None:
+    """The same pair twice: nothing tells how the rows were read, and there is nothing to correct."""
+    left, right = (castle.folder / "gs" / f"{side}_0.png" for side in ("left", "right"))
+    _without_ratio(rig)
+    result = correct(left, right, left, right, "--rig", rig, "--out", tmp_path / "out")
+    assert result.returncode == 0, result.stderr
+    assert "hardly matters" in result.stdout
+    image, before = (read_png(path).astype(float) for path in (tmp_path / "out/corrected/left_0.png", left))
+    assert np.median(np.abs(image - before)) <= 1.0
 
 
 def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
