@@ -1,0 +1,209 @@
+"""The spline of largest posterior probability: robust Levenberg-Marquardt steps on banded normal equations.
+
+Noise, its tails and the strength of the prior are found on the way: the first two by maximum likelihood, the last
+by maximum evidence (D. MacKay, Bayesian interpolation, Neural Computation 1992).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from rsbench.capture import trajectory_banded as banded
+from rsbench.capture.trajectory_data import TimedTracks
+from rsbench.capture.trajectory_kernels import Tails, add_tracks
+from rsbench.capture.trajectory_prior import Prior, Roughness, anchors, roughness
+from rsbench.capture.trajectory_spline import Curve, from_pose_at, moved
+from rsbench.core.so3 import FloatArray
+
+_TAILS = (3.0, 5.0, 10.0, 30.0)
+"""Degrees of freedom to choose from, as in ``heavy_tails``."""
+_REACH = 10.0
+"""Errors, in scales, beyond which a track is wrong."""
+_LEAST_SCALE_PX = 1e-3
+_ROUNDS, _STEPS_A_ROUND, _LAST_STEPS = 15, 2, 10
+_FLAT, _FLAT_STRENGTH, _FLAT_COST = 0.01, 0.05, 1e-3
+_ANCHORED = 1e4
+"""Precision of the pose at time 0, in those of the most certain control pose."""
+_STRENGTHS = (1e-16, 1e2)
+_LARGEST_DAMPING = 1e8
+
+
+class Equations(NamedTuple):
+    """Normal equations at a spline."""
+
+    cost: float
+    """Negative logarithm of likelihood and prior, but for constants."""
+    gradient: FloatArray
+    band: FloatArray
+    """Without anchors."""
+    squares: FloatArray
+    """(n,) of the tracks, px^2."""
+    rough: Roughness
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fit:
+    """A spline, and the distributions that it was found under."""
+
+    curve: Curve
+    tails: Tails
+    prior: Prior
+    trust: FloatArray
+    """(n,) 1 of tracks that count, else 0."""
+    equations: Equations
+    lower: FloatArray
+    """Factor of the normal matrix with anchors, a band."""
+
+
+def width_of(tracks: TimedTracks, curve: Curve) -> int:
+    """Width of the band: unknowns that are felt together."""
+    last = len(curve.p) - 4
+    places = [np.clip(np.floor((tau - curve.first) / curve.interval), 0, last) for tau in tracks.span]
+    return 6 * (int(np.max(places[1] - places[0], initial=0)) + 4)
+
+
+def normal_equations(
+    curve: Curve, tracks: TimedTracks, tails: Tails, prior: Prior, trust: FloatArray, want: bool = True
+) -> Equations:
+    """At a spline, under given distributions."""
+    n = len(curve.p)
+    width = width_of(tracks, curve)
+    band, gradient, squares = np.zeros((6 * n, width)), np.zeros(6 * n), np.zeros(len(trust))
+    cost = add_tracks(curve, tracks.ends, tracks.starts, tracks.focal, tails, trust, squares, band, gradient, want)
+    rough = roughness(curve, prior.order, width)
+    for kind, strength in enumerate((prior.rotation, prior.position)):
+        cost += 0.5 * rough.squares[kind] / strength
+        gradient += rough.gradients[kind] / strength
+        band += rough.bands[kind] / strength
+    return Equations(cost, gradient, band, squares, rough)
+
+
+def squared_errors(curve: Curve, tracks: TimedTracks) -> FloatArray:
+    """(n,) of the best points of tracks, px^2."""
+    squares, nothing = np.zeros(len(tracks.window)), np.zeros((1, width_of(tracks, curve)))
+    trust = np.zeros(len(squares))
+    add_tracks(
+        curve,
+        tracks.ends,
+        tracks.starts,
+        tracks.focal,
+        Tails(3.0, 1.0),
+        trust,
+        squares,
+        nothing,
+        np.zeros(1),
+        False,
+    )
+    return squares
+
+
+def anchored(equations: Equations, curve: Curve, prior: Prior) -> FloatArray:
+    """The factor of the normal matrix at a spline whose pose at time 0 is held."""
+    band = equations.band
+    precision = _ANCHORED * float(np.max(band[:, 0]))
+    return banded.factor(band + anchors(curve, prior.order, band.shape[1], precision))
+
+
+def descend(
+    curve: Curve, tracks: TimedTracks, tails: Tails, prior: Prior, trust: FloatArray, steps: int
+) -> tuple[Curve, Equations]:
+    """Levenberg-Marquardt steps, until the cost falls by less than a thousandth of a unit."""
+    here = normal_equations(curve, tracks, tails, prior, trust)
+    damping = 0.0
+    for _ in range(steps):
+        fixed = here.band + anchors(curve, prior.order, here.band.shape[1], float(np.max(here.band[:, 0])))
+        while True:
+            damped = fixed.copy()
+            damped[:, 0] += damping * here.band[:, 0]
+            try:
+                step = -banded.solve(banded.factor(damped), here.gradient)
+            except banded.NotDefiniteError:
+                damping = max(10.0 * damping, 1e-6)
+                continue
+            trial = from_pose_at(moved(curve, step), 0.0)
+            there = normal_equations(trial, tracks, tails, prior, trust)
+            if there.cost <= here.cost or damping > _LARGEST_DAMPING:
+                break
+            damping = max(10.0 * damping, 1e-6)
+        if not there.cost <= here.cost:
+            break
+        fall = here.cost - there.cost
+        curve, here, damping = trial, there, 0.1 * damping if damping > 1e-6 else 0.0
+        if fall < _FLAT_COST:
+            break
+    return curve, here
+
+
+def fit(curve: Curve, tracks: TimedTracks, prior: Prior, tails: Tails | None = None, learn: bool = True) -> Fit:
+    """The spline, from one that is near, with noise, tails and, if ``learn``, the prior's strength."""
+    count = len(tracks.window)
+    trust = np.ones(count)
+    if tails is None:
+        median = float(np.median(squared_errors(curve, tracks) / tracks.freedom))
+        tails = Tails(3.0, max(float(np.sqrt(median)), _LEAST_SCALE_PX))
+    for _ in range(_ROUNDS):
+        curve, here = descend(curve, tracks, tails, prior, trust, _STEPS_A_ROUND)
+        last = np.array([tails.scale, prior.rotation, prior.position])
+        lower = anchored(here, curve, prior)
+        used, learned = _strengths(here, lower, prior)
+        tails, trust = observed(here.squares, tracks.freedom, tails, used)
+        prior = learned if learn else prior
+        change = np.abs(np.log([tails.scale, prior.rotation, prior.position] / last))
+        if change[0] < _FLAT and np.max(change[1:]) < _FLAT_STRENGTH:
+            break
+    curve, here = descend(curve, tracks, tails, prior, trust, _LAST_STEPS)
+    return Fit(
+        curve=curve, tails=tails, prior=prior, trust=trust, equations=here, lower=anchored(here, curve, prior)
+    )
+
+
+def _strengths(here: Equations, lower: FloatArray, prior: Prior) -> tuple[float, Prior]:
+    """Number of parameters that the data determine, and the prior of more evidence."""
+    inverse = banded.inverse_band(lower)
+    old, new, used = (prior.rotation, prior.position), [], len(lower) - 6.0
+    for kind in range(2):
+        tied = banded.inner(inverse, here.rough.bands[kind]) / old[kind]
+        determined = max(here.rough.count - tied, 1e-3)
+        used -= tied
+        new.append(float(np.clip(here.rough.squares[kind] / determined, *_STRENGTHS)))
+    return used, Prior(prior.order, *new)
+
+
+def observed(squares: FloatArray, freedom: FloatArray, tails: Tails, used: float) -> tuple[Tails, FloatArray]:
+    """Distribution of errors, and which tracks (n,) are right, 1 or 0.
+
+    Args:
+        used: degrees of freedom that the trajectory has taken.
+    """
+    scale = tails.scale
+    near = squares <= freedom * (_REACH * scale) ** 2
+    if not np.any(near):
+        return tails, np.ones(len(squares))
+    q, p = squares[near], freedom[near]
+    left = max(float(np.sum(p)) - used, 0.1 * float(np.sum(p)))
+    found = [Tails(nu, _scale(q, p, nu, scale, left)) for nu in _TAILS]
+    best = max(found, key=lambda each: _likelihood(q, p, each))
+    return best, (squares <= freedom * (_REACH * best.scale) ** 2).astype(np.float64)
+
+
+def _scale(q: FloatArray, p: FloatArray, nu: float, scale: float, left: float) -> float:
+    """Of the largest likelihood (parameter-expanded EM, see ``heavy_tails``)."""
+    count = len(p) + (float(np.sum(p)) - left) / nu
+    for _ in range(50):
+        weights = (nu + p) / (nu + q / scale**2)
+        last, scale = scale, max(float(np.sqrt(weights @ q / left * count / np.sum(weights))), _LEAST_SCALE_PX)
+        if abs(scale - last) <= 1e-4 * scale:
+            break
+    return scale
+
+
+def _likelihood(q: FloatArray, p: FloatArray, tails: Tails) -> float:
+    """Logarithm, without terms that are the same for all."""
+    nu, scale = tails
+    gammaln = scipy.special.gammaln
+    norm = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * p * np.log(nu * scale**2)
+    return float(np.sum(norm - 0.5 * (nu + p) * np.log1p(q / (nu * scale**2))))
