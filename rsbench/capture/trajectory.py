@@ -16,7 +16,7 @@ import scipy
 
 from rsbench.capture import trajectory_banded as banded
 from rsbench.capture.trajectory_data import pack_windows
-from rsbench.capture.trajectory_fit import Fit, fit
+from rsbench.capture.trajectory_fit import Fit, fit, information
 from rsbench.capture.trajectory_poses import blank_views, fill_views
 from rsbench.capture.trajectory_prior import Prior
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve
@@ -38,14 +38,10 @@ class TrajectoryOptions:
 
     interval: float = 0.5
     """Frame periods between two control poses."""
-    order: int = 3
-    """Of the derivative that is white noise: 2, acceleration; 3, jerk."""
-    rotation_strength: float = 1e-4
-    """Power of the rotation's noise, rad^2 per period^(2 order - 1), to begin with."""
-    position_strength: float = 1e-3
-    """Power of the position's noise, m^2 per period^(2 order - 1), to begin with."""
+    prior: Prior = Prior(memory=2.0, smooth=2, rotation=1e-4, position=1e-4)  # noqa: RUF009
+    """To begin with."""
     learn: bool = True
-    """Whether the matches say the strengths."""
+    """Whether the matches say its variances."""
     seed: int = 0
     """Of the search for motions of single windows."""
 
@@ -109,8 +105,7 @@ def estimate_trajectory(
     if motions is None:
         motions = window_motions(windows, rig, shutter, options.seed)
     curve = first_curve(motions, tracks, time_span(len(windows), shutter), options.interval)
-    prior = Prior(options.order, options.rotation_strength, options.position_strength)
-    found = fit(curve, tracks, prior, learn=options.learn)
+    found = fit(curve, tracks, options.prior, learn=options.learn)
     masks = tuple(found.trust[tracks.window == k] > 0.0 for k in range(len(windows)))
     enough = [np.count_nonzero(m) >= max(_FEWEST, _LEAST_SHARE * len(m)) for m in masks]
     return Trajectory(
@@ -121,7 +116,9 @@ def estimate_trajectory(
         inliers=masks,
         supported=np.array(enough),
         fit=found,
-        covariance_band=banded.inverse_band(found.lower),
+        covariance_band=banded.inverse_band(
+            information(found.curve, tracks, found.tails, found.prior, found.trust)
+        ),
     )
 
 

@@ -15,21 +15,25 @@ import scipy
 from rsbench.capture import trajectory_banded as banded
 from rsbench.capture.trajectory_data import TimedTracks
 from rsbench.capture.trajectory_kernels import Tails, add_tracks
-from rsbench.capture.trajectory_prior import Prior, Roughness, anchors, roughness
+from rsbench.capture.trajectory_prior import Prior, Roughness, anchors, log_prior, roughness
 from rsbench.capture.trajectory_spline import Curve, from_pose_at, moved
 from rsbench.core.so3 import FloatArray
 
 _TAILS = (3.0, 5.0, 10.0, 30.0)
 """Degrees of freedom to choose from, as in ``heavy_tails``."""
+_NORMAL = 1e9
 _REACH = 10.0
 """Errors, in scales, beyond which a track is wrong."""
 _LEAST_SCALE_PX = 1e-3
 _ROUNDS, _STEPS_A_ROUND, _LAST_STEPS = 15, 2, 10
 _FLAT, _FLAT_STRENGTH, _FLAT_COST = 0.01, 0.05, 1e-3
+_LEAST_WIDTH = 5
+"""Control poses that the prior ties."""
 _ANCHORED = 1e4
 """Precision of the pose at time 0, in those of the most certain control pose."""
-_STRENGTHS = (1e-16, 1e2)
-_LARGEST_DAMPING = 1e8
+_STRENGTHS = (1e-12, 1e2)
+"""Least and largest, of both kinds: far below and far above what anybody holds a camera with."""
+_LEAST_DAMPING, _LARGEST_DAMPING = 1e-6, 1e8
 
 
 class Equations(NamedTuple):
@@ -63,7 +67,7 @@ def width_of(tracks: TimedTracks, curve: Curve) -> int:
     """Width of the band: unknowns that are felt together."""
     last = len(curve.p) - 4
     places = [np.clip(np.floor((tau - curve.first) / curve.interval), 0, last) for tau in tracks.span]
-    return 6 * (int(np.max(places[1] - places[0], initial=0)) + 4)
+    return 6 * max(int(np.max(places[1] - places[0], initial=0)) + 4, _LEAST_WIDTH)
 
 
 def normal_equations(
@@ -74,12 +78,46 @@ def normal_equations(
     width = width_of(tracks, curve)
     band, gradient, squares = np.zeros((6 * n, width)), np.zeros(6 * n), np.zeros(len(trust))
     cost = add_tracks(curve, tracks.ends, tracks.starts, tracks.focal, tails, trust, squares, band, gradient, want)
-    rough = roughness(curve, prior.order, width)
+    rough = roughness(curve, prior.memory, prior.smooth, width)
     for kind, strength in enumerate((prior.rotation, prior.position)):
         cost += 0.5 * rough.squares[kind] / strength
         gradient += rough.gradients[kind] / strength
         band += rough.bands[kind] / strength
     return Equations(cost, gradient, band, squares, rough)
+
+
+def information(
+    curve: Curve, tracks: TimedTracks, tails: Tails, prior: Prior | None, trust: FloatArray
+) -> FloatArray:
+    """Factor of the expected information of the control poses, whose pose at time 0 is held; a band.
+
+    Args:
+        prior: None: what the tracks alone say.
+
+    Raises:
+        NotDefiniteError: they do not determine the spline.
+    """
+    freedom = tracks.freedom
+    expected = (
+        trust * (tails.nu + freedom) / (tails.nu + freedom + 2.0)
+    )  # as K. Lange, R. Little, J. Taylor have it
+    silent = prior or Prior(1.0, 1, np.inf, np.inf)
+    found = normal_equations(curve, tracks, Tails(_NORMAL, tails.scale), silent, expected)
+    return anchored(found, curve)
+
+
+def log_evidence(found: Fit, precision: float) -> float:
+    """Logarithm of the probability of the tracks under the prior (Laplace's approximation), but for constants.
+
+    To compare fits of other knots and orders, under the same tails and of the same tracks.
+
+    Args:
+        precision: of the pose at time 0, the same for all.
+    """
+    curve, equations = found.curve, found.equations
+    held = anchors(curve, equations.band.shape[1], precision)
+    after = banded.log_determinant(banded.factor(equations.band + held))
+    return log_prior(curve, found.prior, equations.rough) - 0.5 * after - equations.cost
 
 
 def squared_errors(curve: Curve, tracks: TimedTracks) -> FloatArray:
@@ -101,64 +139,78 @@ def squared_errors(curve: Curve, tracks: TimedTracks) -> FloatArray:
     return squares
 
 
-def anchored(equations: Equations, curve: Curve, prior: Prior) -> FloatArray:
+def anchored(equations: Equations, curve: Curve) -> FloatArray:
     """The factor of the normal matrix at a spline whose pose at time 0 is held."""
     band = equations.band
     precision = _ANCHORED * float(np.max(band[:, 0]))
-    return banded.factor(band + anchors(curve, prior.order, band.shape[1], precision))
+    return banded.factor(band + anchors(curve, band.shape[1], precision))
 
 
 def descend(
     curve: Curve, tracks: TimedTracks, tails: Tails, prior: Prior, trust: FloatArray, steps: int
 ) -> tuple[Curve, Equations]:
     """Levenberg-Marquardt steps, until the cost falls by less than a thousandth of a unit."""
-    here = normal_equations(curve, tracks, tails, prior, trust)
-    damping = 0.0
+    here, damping = normal_equations(curve, tracks, tails, prior, trust), 0.0
     for _ in range(steps):
-        fixed = here.band + anchors(curve, prior.order, here.band.shape[1], float(np.max(here.band[:, 0])))
-        while True:
-            damped = fixed.copy()
-            damped[:, 0] += damping * here.band[:, 0]
-            try:
-                step = -banded.solve(banded.factor(damped), here.gradient)
-            except banded.NotDefiniteError:
-                damping = max(10.0 * damping, 1e-6)
-                continue
-            trial = from_pose_at(moved(curve, step), 0.0)
-            there = normal_equations(trial, tracks, tails, prior, trust)
-            if there.cost <= here.cost or damping > _LARGEST_DAMPING:
-                break
-            damping = max(10.0 * damping, 1e-6)
+        held = here.band + anchors(curve, here.band.shape[1], float(np.max(here.band[:, 0])))
+        trial, there = curve, here
+        while damping <= _LARGEST_DAMPING:
+            step = _step(held, here, damping)
+            if step is not None:
+                trial = from_pose_at(moved(curve, step), 0.0)
+                there = normal_equations(trial, tracks, tails, prior, trust)
+                if there.cost <= here.cost:
+                    break
+            damping = max(10.0 * damping, _LEAST_DAMPING)
         if not there.cost <= here.cost:
             break
         fall = here.cost - there.cost
-        curve, here, damping = trial, there, 0.1 * damping if damping > 1e-6 else 0.0
+        curve, here, damping = trial, there, 0.1 * damping if damping > _LEAST_DAMPING else 0.0
         if fall < _FLAT_COST:
             break
     return curve, here
 
 
-def fit(curve: Curve, tracks: TimedTracks, prior: Prior, tails: Tails | None = None, learn: bool = True) -> Fit:
-    """The spline, from one that is near, with noise, tails and, if ``learn``, the prior's strength."""
-    count = len(tracks.window)
-    trust = np.ones(count)
+def _step(held: FloatArray, here: Equations, damping: float) -> FloatArray | None:
+    damped = held.copy()
+    damped[:, 0] += damping * here.band[:, 0]
+    try:
+        return -banded.solve(banded.factor(damped), here.gradient)
+    except banded.NotDefiniteError:
+        return None
+
+
+def fit(
+    curve: Curve,
+    tracks: TimedTracks,
+    prior: Prior,
+    learn: bool = True,
+    tails: Tails | None = None,
+    trust: FloatArray | None = None,
+) -> Fit:
+    """The spline, from one that is near, with noise, tails and, if ``learn``, the prior's strength.
+
+    Args:
+        trust: with it, ``tails`` and ``trust`` stay as they are.
+    """
+    settled = trust is not None
+    trust = np.ones(len(tracks.window)) if trust is None else trust
     if tails is None:
         median = float(np.median(squared_errors(curve, tracks) / tracks.freedom))
         tails = Tails(3.0, max(float(np.sqrt(median)), _LEAST_SCALE_PX))
     for _ in range(_ROUNDS):
         curve, here = descend(curve, tracks, tails, prior, trust, _STEPS_A_ROUND)
         last = np.array([tails.scale, prior.rotation, prior.position])
-        lower = anchored(here, curve, prior)
+        lower = anchored(here, curve)
         used, learned = _strengths(here, lower, prior)
-        tails, trust = observed(here.squares, tracks.freedom, tails, used)
+        if not settled:
+            tails, trust = observed(here.squares, tracks.freedom, tails, used)
         prior = learned if learn else prior
         change = np.abs(np.log([tails.scale, prior.rotation, prior.position] / last))
         if change[0] < _FLAT and np.max(change[1:]) < _FLAT_STRENGTH:
             break
     curve, here = descend(curve, tracks, tails, prior, trust, _LAST_STEPS)
-    return Fit(
-        curve=curve, tails=tails, prior=prior, trust=trust, equations=here, lower=anchored(here, curve, prior)
-    )
+    return Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=here, lower=anchored(here, curve))
 
 
 def _strengths(here: Equations, lower: FloatArray, prior: Prior) -> tuple[float, Prior]:
@@ -170,7 +222,7 @@ def _strengths(here: Equations, lower: FloatArray, prior: Prior) -> tuple[float,
         determined = max(here.rough.count - tied, 1e-3)
         used -= tied
         new.append(float(np.clip(here.rough.squares[kind] / determined, *_STRENGTHS)))
-    return used, Prior(prior.order, *new)
+    return used, prior._replace(rotation=new[0], position=new[1])
 
 
 def observed(squares: FloatArray, freedom: FloatArray, tails: Tails, used: float) -> tuple[Tails, FloatArray]:

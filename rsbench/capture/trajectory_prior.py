@@ -1,8 +1,11 @@
-"""How hands, heads and vehicles shake: a Gaussian prior of a trajectory, white acceleration or white jerk.
+"""How hands, heads and vehicles shake: a Gaussian prior of a trajectory.
 
-Its strength is a power spectral density, of rotations and of positions: what the derivative of order 2 or 3 of a
-rotation or of a position scatters by, per axis. T. Barfoot, C. Tong, S. Sarkka, Batch continuous-time trajectory
-estimation as exactly sparse Gaussian process regression, RSS 2014, for such priors of trajectories.
+Accelerations, about each axis and along it, are stationary noise that forgets within a time (R. Singer, Estimating
+optimal tracking filter performance for manned maneuvering targets, IEEE Trans. AES 1970): as second differences d
+of the control poses, (1 - rho L)^m d is white, L the step back by a knot and rho = exp(-interval / memory). White
+accelerations, whose memory is 0, would let a rig tremble at any rate; jerk that is white lets it run away.
+T. Barfoot, C. Tong, S. Sarkka, Batch continuous-time trajectory estimation as exactly sparse Gaussian process
+regression, RSS 2014, for such priors of trajectories.
 """
 
 from __future__ import annotations
@@ -16,24 +19,25 @@ from rsbench.capture.trajectory_poses import blank_views, fill_views
 from rsbench.capture.trajectory_spline import Curve
 from rsbench.core.so3 import FloatArray
 
-_DIFFERENCES = {2: (-1.0, 1.0), 3: (1.0, -2.0, 1.0)}
-"""Of steps between control poses."""
 _WIDEST = (1.0, 10.0)
 """Rates, radians and metres per frame period, that are expected before anything is seen."""
 
 
 class Prior(NamedTuple):
-    """White noise of the derivative of order ``order``."""
+    """Accelerations that are expected."""
 
-    order: int
+    memory: float
+    """Frame periods after which they are forgotten."""
+    smooth: int
+    """m: 1 or 2; the power of fast shaking falls with its rate to the power of -4 - 2 m."""
     rotation: float
-    """rad^2 per frame period^(2 order - 1)."""
+    """Variance of angular accelerations about each axis, rad^2 per frame period^4."""
     position: float
-    """m^2 per frame period^(2 order - 1)."""
+    """Variance of accelerations along each axis, m^2 per frame period^4."""
 
 
 class Roughness(NamedTuple):
-    """Sums of squared differences of control poses; with a prior, twice its cost are they over its densities."""
+    """Sums of squared accelerations, whitened; over the variances of a prior, twice its cost."""
 
     squares: tuple[float, float]
     """Of rotations and of positions."""
@@ -42,28 +46,60 @@ class Roughness(NamedTuple):
     bands: FloatArray
     """(2, 6 controls, width) Gauss-Newton matrices of half the squares, see ``trajectory_kernels.add_tracks``."""
     count: int
-    """Differences of either kind, scalar."""
+    """Accelerations of either kind, scalar."""
+    log_density: float
+    """Logarithm of the density of control poses of one axis, at unit variances and but for constants."""
 
 
-def roughness(curve: Curve, order: int, width: int) -> Roughness:
-    """Of a spline, in bands of a width (at least 6 (order + 1))."""
-    scale = curve.interval ** (-(order - 0.5))
-    weights = np.array(_DIFFERENCES[order]) * scale
-    count, n = len(curve.p) - order, len(curve.p)
-    along = np.diff(curve.p, axis=0)
-    errors = [sum(c * x[j : j + count] for j, c in enumerate(weights)) for x in (curve.steps, along)]
-    by = np.zeros((2, count, order + 1, 3, 3))
-    for j, c in enumerate(weights):
-        left = curve.inverse_left[j : j + count]
-        by[0, :, j + 1] += c * left
-        by[0, :, j] -= c * np.swapaxes(left, 1, 2)
-        by[1, :, j + 1] += c * np.eye(3)
-        by[1, :, j] -= c * np.eye(3)
+def whitening(interval: float, memory: float, smooth: int) -> list[FloatArray]:
+    """Weights of successive second differences, unit variance of accelerations: of the first one, ..., of all later.
+
+    The first ``smooth`` of them know less of what was before.
+    """
+    rho = float(np.exp(-interval / memory)) if memory > 0.0 else 0.0
+    unit = interval**-2
+    if smooth == 1:
+        rows = [np.array([1.0]), np.array([-rho, 1.0]) / np.sqrt(1.0 - rho**2)]
+    else:
+        r = 2.0 * rho / (1.0 + rho**2)
+        late = np.array([rho**2, -2.0 * rho, 1.0]) * np.sqrt((1.0 + rho**2) / (1.0 - rho**2) ** 3)
+        rows = [np.array([1.0]), np.array([-r, 1.0]) / np.sqrt(1.0 - r**2), late]
+    return [unit * row for row in rows]
+
+
+def roughness(curve: Curve, memory: float, smooth: int, width: int) -> Roughness:
+    """Of a spline, in bands of a width (at least 6 (smooth + 3))."""
+    n, steps = len(curve.p), (curve.steps, np.diff(curve.p, axis=0))
     gradients, bands = np.zeros((2, 6 * n)), np.zeros((2, 6 * n, width))
-    for kind in range(2):
-        add_blocks(gradients[kind], bands[kind], by[kind], errors[kind], np.arange(count), 3 * kind)
-    squares = float(np.sum(errors[0] ** 2)), float(np.sum(errors[1] ** 2))
-    return Roughness(squares, gradients, bands, 3 * count)
+    squares, log_density = [0.0, 0.0], -float(np.log(curve.interval))
+    rows = whitening(curve.interval, memory, smooth)
+    for number, row in enumerate(rows):
+        count = 1 if number < smooth else n - 2 - smooth
+        first = np.arange(count)
+        log_density += count * float(np.log(row[-1]))
+        weights = np.diff(np.concatenate([[0.0], row, [0.0]])) * -1.0
+        by = np.zeros((2, count, len(weights) + 1, 3, 3))
+        for j, c in enumerate(weights):
+            left = curve.inverse_left[j : j + count]
+            by[0, :, j + 1] += c * left
+            by[0, :, j] -= c * np.swapaxes(left, 1, 2)
+            by[1, :, j + 1] += c * np.eye(3)
+            by[1, :, j] -= c * np.eye(3)
+        for kind in range(2):
+            errors = np.asarray(sum(c * steps[kind][j : j + count] for j, c in enumerate(weights)))
+            add_blocks(gradients[kind], bands[kind], by[kind], errors, first, 3 * kind)
+            squares[kind] += float(np.sum(errors**2))
+    return Roughness((squares[0], squares[1]), gradients, bands, 3 * (n - 2), log_density)
+
+
+def log_prior(curve: Curve, prior: Prior, rough: Roughness) -> float:
+    """Logarithm of the density of a prior at its mode, but for constants that are the same for any knots.
+
+    All second differences, one rate and one pose are as good as the control poses: the matrix between them has the
+    determinant 1.
+    """
+    sizes = 0.5 * rough.count * float(np.log(prior.rotation) + np.log(prior.position))
+    return 6.0 * rough.log_density - sizes
 
 
 def add_blocks(
@@ -88,23 +124,20 @@ def add_blocks(
                     band[columns + j, 6 * (a - b) + i - j] += product[:, i, j]
 
 
-def anchors(curve: Curve, order: int, width: int, precision: float) -> FloatArray:
-    """Band (6 controls, width) of what a roughness leaves free: the first pose, and what is expected of rates.
+def anchors(curve: Curve, width: int, precision: float) -> FloatArray:
+    """Band (6 controls, width) of what a roughness leaves free: the pose at time 0, and a rate.
 
     They are the same for any knots. ``precision`` is that of the pose at time 0.
     """
     n = len(curve.p)
-    band = np.zeros((6 * n, width))
-    views = blank_views(1)
+    band, views = np.zeros((6 * n, width)), blank_views(1)
     fill_views(curve, np.zeros(1), views)
     first, nothing, unused = views.index, np.zeros((1, 3)), np.zeros(6 * n)
     root = np.sqrt(precision)
     add_blocks(unused, band, root * views.turn, nothing, first, 0)
     add_blocks(unused, band, root * views.share[..., None, None] * np.eye(3), nothing, first, 3)
-    middle = np.array([(n - order) // 2])
+    middle = np.array([(n - 2) // 2])
     for kind in range(2):
-        for degree in range(1, order):
-            weights = np.diff(np.eye(order + 1), n=degree, axis=0)[0] / curve.interval**degree / _WIDEST[kind]
-            by = weights[None, : degree + 1, None, None] * np.eye(3)
-            add_blocks(unused, band, by, nothing, middle, 3 * kind)
+        by = np.array([-1.0, 1.0])[None, :, None, None] / curve.interval / _WIDEST[kind] * np.eye(3)
+        add_blocks(unused, band, by, nothing, middle, 3 * kind)
     return band
