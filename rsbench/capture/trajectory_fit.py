@@ -122,7 +122,7 @@ def log_evidence(found: Fit, precision: float) -> float:
 
 def squared_errors(curve: Curve, tracks: TimedTracks) -> FloatArray:
     """(n,) of the best points of tracks, px^2."""
-    squares, nothing = np.zeros(len(tracks.window)), np.zeros((1, width_of(tracks, curve)))
+    squares, nothing = np.zeros(len(tracks)), np.zeros((1, width_of(tracks, curve)))
     trust = np.zeros(len(squares))
     add_tracks(
         curve,
@@ -194,7 +194,7 @@ def fit(
         trust: with it, ``tails`` and ``trust`` stay as they are.
     """
     settled = trust is not None
-    trust = np.ones(len(tracks.window)) if trust is None else trust
+    trust = np.ones(len(tracks)) if trust is None else trust
     if tails is None:
         median = float(np.median(squared_errors(curve, tracks) / tracks.freedom))
         tails = Tails(3.0, max(float(np.sqrt(median)), _LEAST_SCALE_PX))
@@ -216,7 +216,7 @@ def fit(
 def _strengths(here: Equations, lower: FloatArray, prior: Prior) -> tuple[float, Prior]:
     """Number of parameters that the data determine, and the prior of more evidence."""
     inverse = banded.inverse_band(lower)
-    old, new, used = (prior.rotation, prior.position), [], len(lower) - 6.0
+    old, new, used = (prior.rotation, prior.position), list[float](), len(lower) - 6.0
     for kind in range(2):
         tied = banded.inner(inverse, here.rough.bands[kind]) / old[kind]
         determined = max(here.rough.count - tied, 1e-3)

@@ -13,6 +13,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rsbench.capture.trajectory_poses import Views, blank_views, fill_view
 from rsbench.capture.trajectory_spline import Curve
@@ -103,7 +104,7 @@ def _scratch(ends: int, size: int) -> Scratch:
 def add_tracks(
     curve: Curve,
     ends: FloatArray,
-    starts: FloatArray,
+    starts: NDArray[np.int64],
     focal: FloatArray,
     tails: Tails,
     trust: FloatArray,
@@ -117,7 +118,7 @@ def add_tracks(
     Args:
         ends: (e, 10) ray (x, y), tau, derivative of the ideal pixel by the pixel (2 x 2, rows first), derivative
             of tau by the pixel (2), x of the camera's offset from the body.
-        starts: (n + 1,) first end of each track, whole numbers, and e.
+        starts: (n + 1,) first end of each track, and e.
         trust: (n,) factors on the tracks' parts; those of 0 have squares, and no part.
         squares: (n,) filled, px^2: chi-squared with 2 ends - 3 degrees of freedom at a noise of 1 px.
         band: (6 controls, width) lower half of the normal matrix, by columns from the diagonal on; added to when

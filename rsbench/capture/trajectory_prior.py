@@ -52,9 +52,10 @@ class Roughness(NamedTuple):
 
 
 def whitening(interval: float, memory: float, smooth: int) -> list[FloatArray]:
-    """Weights of successive second differences, unit variance of accelerations: of the first one, ..., of all later.
+    """Weights of successive second differences, for accelerations of unit variance.
 
-    The first ``smooth`` of them know less of what was before.
+    One row for each of the first ``smooth`` differences, which know less of what was before, and one for all
+    later ones.
     """
     rho = float(np.exp(-interval / memory)) if memory > 0.0 else 0.0
     unit = interval**-2

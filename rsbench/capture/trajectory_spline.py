@@ -21,7 +21,9 @@ from numpy.typing import ArrayLike
 
 from rsbench.core import so3
 from rsbench.core.motion import Motion
+from rsbench.core.rig import SIDES
 from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
 _ORDER = 4
@@ -69,6 +71,12 @@ def from_pose_at(curve: Curve, tau: float) -> Curve:
     (R, t), _, _ = evaluate(curve, tau)
     p = -R.T @ t
     return make_curve(curve.first, curve.interval, curve.R @ R.T, (curve.p - p) @ R.T)
+
+
+def span_of(windows: int, shutter: RollingShutter) -> tuple[float, float]:
+    """From the first line to the last one of so many windows, time 0 within."""
+    ends = [shutter.start(frame, side) for frame in (0, windows) for side in SIDES]
+    return min(0.0, float(np.min(ends))), float(np.max(ends)) + shutter.readout_ratio
 
 
 def control_count(first: float, last: float, interval: float) -> int:

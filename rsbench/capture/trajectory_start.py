@@ -48,14 +48,14 @@ def first_curve(
     own = _chained(_bridged(rates, known), span, interval)
     others = np.stack([_without(rates, known, k) for k in range(len(rates))])
     bridged = _chained(others, span, interval)
-    errors = [_median_errors(squared_errors(curve, tracks), tracks, len(rates)) for curve in (own, bridged)]
+    errors = [_median_errors(squared_errors(curve, tracks), tracks) for curve in (own, bridged)]
     known &= ~(errors[0] > _SUSPECT * errors[1])
     return _chained(_bridged(rates, known), span, interval)
 
 
-def _median_errors(squares: FloatArray, tracks: TimedTracks, count: int) -> FloatArray:
-    """(count,) of the tracks of each window; 0 of none."""
-    chosen = [squares[tracks.window == k] for k in range(count)]
+def _median_errors(squares: FloatArray, tracks: TimedTracks) -> FloatArray:
+    """(windows,) of the tracks of each window; 0 of none."""
+    chosen = [squares[members] for members in tracks.members]
     return np.array([float(np.median(each)) if len(each) else 0.0 for each in chosen])
 
 
