@@ -41,7 +41,7 @@ _FEWEST, _LEAST_SHARE = 15, 0.2
 class TrajectoryOptions:
     """How a trajectory is found."""
 
-    intervals: tuple[float, ...] = (1 / 2, 1 / 3, 1.0)
+    intervals: tuple[float, ...] = (1 / 2, 1 / 3, 1 / 4)
     """Frame periods between two control poses: those of most evidence are taken, the first ones to begin with."""
     prior: Prior = Prior(memory=0.5, smooth=2, rotation=1e-4, position=1e-4)  # noqa: RUF009
     """To begin with."""

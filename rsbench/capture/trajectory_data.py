@@ -131,8 +131,9 @@ def _met(begins: FloatArray, ends: FloatArray, known: BoolArray) -> IntArray:
     out = -np.ones(len(begins), dtype=np.int64)
     if len(begins) == 0 or len(ends) == 0:
         return out
-    distance, nearest = cKDTree(ends).query(begins, p=np.inf, distance_upper_bound=BEYOND_PX)
-    order = np.lexsort((np.arange(len(begins)), distance))
+    found = cKDTree(ends).query(begins, p=np.inf, distance_upper_bound=BEYOND_PX)
+    distance, nearest = np.asarray(found[0]), np.asarray(found[1])
+    order = np.argsort(distance, kind="stable")
     order = order[np.isfinite(distance[order]) & known[order]]
     _, firsts = np.unique(nearest[order], return_index=True)
     out[order[firsts]] = nearest[order[firsts]]

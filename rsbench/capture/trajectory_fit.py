@@ -26,12 +26,13 @@ _REACH = 10.0
 """Errors, in scales, beyond which a track is wrong."""
 _LEAST_SCALE_PX = 1e-3
 _ROUNDS, _STEPS_A_ROUND, _LAST_STEPS = 15, 2, 10
-_FLAT, _FLAT_STRENGTH, _FLAT_COST = 0.01, 0.05, 1e-3
+_FLAT, _FLAT_STRENGTH, _FLAT_EVIDENCE = 0.01, 0.05, 0.1
+_FLAT_COST, _NEAR = 1e-3, 1.0
 _LEAST_WIDTH = 5
 """Control poses that the prior ties."""
 _ANCHORED = 1e4
 """Precision of the pose at time 0, in those of the most certain control pose."""
-_STRENGTHS = (1e-12, 1e2)
+_STRENGTHS = (1e-10, 1e2)
 """Least and largest, of both kinds: far below and far above what anybody holds a camera with."""
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-6, 1e8
 
@@ -149,24 +150,29 @@ def anchored(equations: Equations, curve: Curve) -> FloatArray:
 def descend(
     curve: Curve, tracks: TimedTracks, tails: Tails, prior: Prior, trust: FloatArray, steps: int
 ) -> tuple[Curve, Equations]:
-    """Levenberg-Marquardt steps, until the cost falls by less than a thousandth of a unit."""
+    """Levenberg-Marquardt steps, until one promises to lower the cost by less than a thousandth of a unit.
+
+    Steps that promise little are taken as they are: the equations take the weights of pixels as given, and their
+    root is not quite the least cost.
+    """
     here, damping = normal_equations(curve, tracks, tails, prior, trust), 0.0
     for _ in range(steps):
         held = here.band + anchors(curve, here.band.shape[1], float(np.max(here.band[:, 0])))
-        trial, there = curve, here
+        promise, trial, there = 0.0, curve, here
         while damping <= _LARGEST_DAMPING:
             step = _step(held, here, damping)
             if step is not None:
+                promise = -0.5 * float(step @ here.gradient)
                 trial = from_pose_at(moved(curve, step), 0.0)
                 there = normal_equations(trial, tracks, tails, prior, trust)
-                if there.cost <= here.cost:
+                near = damping == 0.0 and abs(promise) < _NEAR
+                if there.cost <= here.cost + (_NEAR if near else 0.0):
                     break
             damping = max(10.0 * damping, _LEAST_DAMPING)
-        if not there.cost <= here.cost:
+        if damping > _LARGEST_DAMPING:
             break
-        fall = here.cost - there.cost
         curve, here, damping = trial, there, 0.1 * damping if damping > _LEAST_DAMPING else 0.0
-        if fall < _FLAT_COST:
+        if promise < _FLAT_COST:
             break
     return curve, here
 
@@ -202,27 +208,26 @@ def fit(
         curve, here = descend(curve, tracks, tails, prior, trust, _STEPS_A_ROUND)
         last = np.array([tails.scale, prior.rotation, prior.position])
         lower = anchored(here, curve)
-        used, learned = _strengths(here, lower, prior)
+        used, determined, learned = _strengths(here, lower, prior)
         if not settled:
             tails, trust = observed(here.squares, tracks.freedom, tails, used)
         prior = learned if learn else prior
         change = np.abs(np.log([tails.scale, prior.rotation, prior.position] / last))
-        if change[0] < _FLAT and np.max(change[1:]) < _FLAT_STRENGTH:
+        settling = (change[1:] > _FLAT_STRENGTH) & (change[1:] * determined > _FLAT_EVIDENCE)
+        if change[0] < _FLAT and not np.any(settling):
             break
     curve, here = descend(curve, tracks, tails, prior, trust, _LAST_STEPS)
     return Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=here, lower=anchored(here, curve))
 
 
-def _strengths(here: Equations, lower: FloatArray, prior: Prior) -> tuple[float, Prior]:
-    """Number of parameters that the data determine, and the prior of more evidence."""
-    inverse = banded.inverse_band(lower)
-    old, new, used = (prior.rotation, prior.position), list[float](), len(lower) - 6.0
-    for kind in range(2):
-        tied = banded.inner(inverse, here.rough.bands[kind]) / old[kind]
-        determined = max(here.rough.count - tied, 1e-3)
-        used -= tied
-        new.append(float(np.clip(here.rough.squares[kind] / determined, *_STRENGTHS)))
-    return used, prior._replace(rotation=new[0], position=new[1])
+def _strengths(here: Equations, lower: FloatArray, prior: Prior) -> tuple[float, FloatArray, Prior]:
+    """Numbers of parameters, and of accelerations (2,), that the data determine; the prior of more evidence."""
+    inverse, old = banded.inverse_band(lower), np.array([prior.rotation, prior.position])
+    tied = np.array([banded.inner(inverse, band) for band in here.rough.bands]) / old
+    determined = np.maximum(here.rough.count - tied, 1e-3)
+    new = np.clip(here.rough.squares / determined, *_STRENGTHS)
+    used = len(lower) - 6.0 - float(np.sum(tied))
+    return used, determined, prior._replace(rotation=float(new[0]), position=float(new[1]))
 
 
 def observed(squares: FloatArray, freedom: FloatArray, tails: Tails, used: float) -> tuple[Tails, FloatArray]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from rsbench.capture.trajectory_poses import blank_views, fill_views
 from rsbench.capture.trajectory_spline import Curve
+from rsbench.components.compiled import compiled
 from rsbench.core.so3 import FloatArray
 
 _WIDEST = (1.0, 10.0)
@@ -104,25 +105,43 @@ def log_prior(curve: Curve, prior: Prior, rough: Roughness) -> float:
 
 
 def add_blocks(
-    gradient: FloatArray, band: FloatArray, by: FloatArray, errors: FloatArray, first: NDArray[np.int64], part: int
+    gradient: FloatArray,
+    band: FloatArray,
+    by: FloatArray,
+    errors: FloatArray,
+    first: NDArray[np.int64],
+    part: int,
 ) -> None:
     """Add normal equations of errors (n, m) whose derivatives (n, k, m, 3) are by k successive control poses.
 
     Args:
-        first: (n,) number of the first of these poses, each once.
+        first: (n,) number of the first of these poses.
         part: 0 or 3: rotations or positions.
     """
-    k = by.shape[1]
-    for a in range(k):
-        rows = 6 * (first + a) + part
-        for i in range(3):
-            gradient[rows + i] += np.sum(by[:, a, :, i] * errors, axis=1)
-        for b in range(a + 1):
-            product = np.swapaxes(by[:, a], 1, 2) @ by[:, b]
-            columns = 6 * (first + b) + part
-            for i in range(3):
-                for j in range(3 if b < a else i + 1):
-                    band[columns + j, 6 * (a - b) + i - j] += product[:, i, j]
+    by, errors = np.ascontiguousarray(by), np.ascontiguousarray(errors)
+    _add_blocks(gradient, band, by, errors, first, part)
+
+
+@compiled
+def _add_blocks(
+    gradient: FloatArray,
+    band: FloatArray,
+    by: FloatArray,
+    errors: FloatArray,
+    first: NDArray[np.int64],
+    part: int,
+) -> None:
+    count, controls, size, _ = by.shape
+    for k in range(count):
+        for a in range(3 * controls):
+            row, i = 6 * (first[k] + a // 3) + part + a % 3, a % 3
+            for m in range(size):
+                gradient[row] += by[k, a // 3, m, i] * errors[k, m]
+            for b in range(a + 1):
+                column, j, total = 6 * (first[k] + b // 3) + part + b % 3, b % 3, 0.0
+                for m in range(size):
+                    total += by[k, a // 3, m, i] * by[k, b // 3, m, j]
+                band[column, row - column] += total
 
 
 def anchors(curve: Curve, width: int, precision: float) -> FloatArray:
