@@ -19,7 +19,7 @@ from rsbench.capture import trajectory_banded as banded
 from rsbench.capture.trajectory_choice import approximated, choose
 from rsbench.capture.trajectory_covariance import covariance_between, pose_covariance
 from rsbench.capture.trajectory_data import TimedTracks, pack_windows
-from rsbench.capture.trajectory_fit import Fit, fit, information
+from rsbench.capture.trajectory_fit import NORMAL, Fit, fit, information
 from rsbench.capture.trajectory_kernels import Tails
 from rsbench.capture.trajectory_prior import Prior
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, span_of
@@ -193,5 +193,5 @@ def trajectory_bound(
     everything = [np.ones(len(each)) for each in pack_windows(windows, rig, shutter).members]
     tracks = pack_windows(windows, rig, shutter, everything)
     curve = approximated(motion.body_from_world, span_of(len(windows), shutter), interval)
-    lower = information(curve, tracks, Tails(np.inf, noise_px), prior, np.ones(len(tracks)))
+    lower = information(curve, tracks, Tails(NORMAL, noise_px), prior, np.ones(len(tracks)))
     return TrajectoryBound(curve=curve, covariance_band=banded.inverse_band(lower))

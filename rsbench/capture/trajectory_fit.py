@@ -21,7 +21,8 @@ from rsbench.core.so3 import FloatArray
 
 _TAILS = (3.0, 5.0, 10.0, 30.0)
 """Degrees of freedom to choose from, as in ``heavy_tails``."""
-_NORMAL = 1e9
+NORMAL = 1e9
+"""Degrees of freedom of tails that are none."""
 _REACH = 10.0
 """Errors, in scales, beyond which a track is wrong."""
 _LEAST_SCALE_PX = 1e-3
@@ -98,12 +99,10 @@ def information(
     Raises:
         NotDefiniteError: they do not determine the spline.
     """
-    freedom = tracks.freedom
-    expected = (
-        trust * (tails.nu + freedom) / (tails.nu + freedom + 2.0)
-    )  # as K. Lange, R. Little, J. Taylor have it
+    # Of a t distribution: K. Lange, R. Little, J. Taylor, see ``heavy_tails``.
+    expected = trust * (tails.nu + tracks.freedom) / (tails.nu + tracks.freedom + 2.0)
     silent = prior or Prior(1.0, 1, np.inf, np.inf)
-    found = normal_equations(curve, tracks, Tails(_NORMAL, tails.scale), silent, expected)
+    found = normal_equations(curve, tracks, Tails(NORMAL, tails.scale), silent, expected)
     return anchored(found, curve)
 
 
