@@ -157,17 +157,27 @@ def _told(found: Fit, tracks: TimedTracks, windows: Sequence[Correspondences]) -
     inliers = tuple(mask[: len(window.tracks)] for mask, window in zip(masks, windows, strict=True))
     return Trajectory(
         motion=ContinuousMotion.of(found.curve),
-        noise_px=found.tails.scale * float(scipy.special.stdtrit(found.tails.nu, _ONE_SIGMA)),
+        noise_px=noise_px(found.tails),
         nu=found.tails.nu,
         prior=found.prior,
         inliers=inliers,
-        supported=np.array([np.count_nonzero(m) >= max(_FEWEST, _LEAST_SHARE * len(m)) for m in inliers]),
+        supported=np.array([is_supported(mask) for mask in inliers]),
         fit=found,
         curve=found.curve,
         covariance_band=banded.inverse_band(
             information(found.curve, tracks, found.tails, found.prior, found.trust)
         ),
     )
+
+
+def noise_px(tails: Tails) -> float:
+    """Of a coordinate, as of a normal error: two in three are below it."""
+    return tails.scale * float(scipy.special.stdtrit(tails.nu, _ONE_SIGMA))
+
+
+def is_supported(inliers: BoolArray) -> bool:
+    """Whether tracks (n,), some of them right, carry their window."""
+    return bool(np.count_nonzero(inliers) >= max(_FEWEST, _LEAST_SHARE * len(inliers)))
 
 
 def trajectory_bound(

@@ -21,6 +21,20 @@ LONGEST = 5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Past:
+    """What matches that are gone say of the first control poses of a spline: a quadratic cost."""
+
+    R: FloatArray
+    """(k, 3, 3) the control poses about which it is known."""
+    p: FloatArray
+    """(k, 3)."""
+    gradient: FloatArray
+    """(6 k,)."""
+    H: FloatArray
+    """(6 k, 6 k)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class TimedTracks:
     """Tracks, as ``trajectory_kernels.add_tracks`` takes them."""
 
@@ -32,6 +46,8 @@ class TimedTracks:
     """For each window, the track (m,) of each of its tracks, left pairs and right pairs that no track repeats."""
     focal: FloatArray
     """(2,) fx, fy, px."""
+    past: Past | None = None
+    """Of the tracks of earlier windows; None: the spline begins here, and the pose at time 0 is the world's."""
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -53,12 +69,16 @@ def pack_windows(
     rig: StereoRig,
     shutter: RollingShutter,
     right: Sequence[FloatArray] | None = None,
+    first: int = 0,
+    past: Past | None = None,
 ) -> TimedTracks:
     """The tracks of windows, and their pairs that no track repeats; window k is of the frames k and k + 1.
 
     Args:
         right: for each window, which of its members (m,) are right (not 0): of those, ones that meet in a frame
             are one track; None: none is linked to another.
+        first: number of the first window.
+        past: of those before.
     """
     members = [np.zeros(0, dtype=np.int64) for _ in windows]
     ends, owners = list[FloatArray](), list[IntArray]()
@@ -72,7 +92,9 @@ def pack_windows(
             for frame, chosen in ((0, new), (1, np.ones(len(own), dtype=np.bool_))):
                 for i, side in enumerate(sides):
                     place = 2 * (frame * len(sides) + i)
-                    ends.append(pack_ends(pixels[k][chosen, place : place + 2], k + frame, side, rig, shutter))
+                    ends.append(
+                        pack_ends(pixels[k][chosen, place : place + 2], first + k + frame, side, rig, shutter)
+                    )
                     owners.append(own[chosen])
             members[k] = np.concatenate([members[k], own])
         offset = count
@@ -83,6 +105,7 @@ def pack_windows(
         starts=np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=count))]).astype(np.int64),
         members=tuple(members),
         focal=np.array([rig.camera.fx, rig.camera.fy]),
+        past=past,
     )
 
 

@@ -13,10 +13,11 @@ import numpy as np
 import scipy
 
 from rsbench.capture import trajectory_banded as banded
-from rsbench.capture.trajectory_data import TimedTracks
+from rsbench.capture.trajectory_data import Past, TimedTracks
 from rsbench.capture.trajectory_kernels import Tails, add_tracks
 from rsbench.capture.trajectory_prior import Prior, Roughness, anchors, log_prior, roughness
 from rsbench.capture.trajectory_spline import Curve, from_pose_at, moved
+from rsbench.core import so3
 from rsbench.core.so3 import FloatArray
 
 _TAILS = (3.0, 5.0, 10.0, 30.0)
@@ -31,7 +32,7 @@ _FLAT, _FLAT_STRENGTH, _FLAT_EVIDENCE = 0.01, 0.05, 0.1
 _FLAT_COST, _NEAR = 1e-3, 1.0
 _LEAST_WIDTH = 5
 """Control poses that the prior ties."""
-_ANCHORED = 1e4
+ANCHORED = 1e4
 """Precision of the pose at time 0, in those of the most certain control pose."""
 _STRENGTHS = (1e-10, 1e2)
 """Least and largest, of both kinds: far below and far above what anybody holds a camera with."""
@@ -61,31 +62,66 @@ class Fit:
     trust: FloatArray
     """(n,) 1 of tracks that count, else 0."""
     equations: Equations
-    lower: FloatArray
-    """Factor of the normal matrix with anchors, a band."""
 
 
 def width_of(tracks: TimedTracks, curve: Curve) -> int:
     """Width of the band: unknowns that are felt together."""
     last = len(curve.p) - 4
     places = [np.clip(np.floor((tau - curve.first) / curve.interval), 0, last) for tau in tracks.span]
-    return 6 * max(int(np.max(places[1] - places[0], initial=0)) + 4, _LEAST_WIDTH)
+    known = 0 if tracks.past is None else len(tracks.past.p)
+    return 6 * max(int(np.max(places[1] - places[0], initial=0)) + 4, _LEAST_WIDTH, known)
 
 
 def normal_equations(
-    curve: Curve, tracks: TimedTracks, tails: Tails, prior: Prior, trust: FloatArray, want: bool = True
+    curve: Curve,
+    tracks: TimedTracks,
+    tails: Tails,
+    prior: Prior,
+    trust: FloatArray,
+    want: bool = True,
+    until: int | None = None,
 ) -> Equations:
-    """At a spline, under given distributions."""
-    n = len(curve.p)
+    """At a spline, under given distributions.
+
+    Args:
+        until: number of a control pose; only that part of the prior which begins before it.
+    """
+    n, past = len(curve.p), tracks.past
     width = width_of(tracks, curve)
     band, gradient, squares = np.zeros((6 * n, width)), np.zeros(6 * n), np.zeros(len(trust))
     cost = add_tracks(curve, tracks.ends, tracks.starts, tracks.focal, tails, trust, squares, band, gradient, want)
-    rough = roughness(curve, prior.memory, prior.smooth, width)
+    rough = roughness(curve, prior.memory, prior.smooth, width, past is None, until)
     for kind, strength in enumerate((prior.rotation, prior.position)):
         cost += 0.5 * rough.squares[kind] / strength
         gradient += rough.gradients[kind] / strength
         band += rough.bands[kind] / strength
+    if past is not None:
+        cost += _add_past(past, curve, gradient, band)
     return Equations(cost, gradient, band, squares, rough)
+
+
+def _add_past(past: Past, curve: Curve, gradient: FloatArray, band: FloatArray) -> float:
+    """Cost of control poses that are not where earlier matches had them, and its equations."""
+    k = len(past.p)
+    turned = so3.log(curve.R[:k] @ np.swapaxes(past.R, 1, 2))
+    away = np.concatenate([turned, curve.p[:k] - past.p], axis=1).ravel()
+    slope = past.H @ away
+    gradient[: 6 * k] += slope + past.gradient
+    for i in range(6 * k):
+        band[: 6 * k - i, i] += np.diagonal(past.H, -i)
+    return float(away @ (0.5 * slope + past.gradient))
+
+
+def held(equations: Equations, curve: Curve, tracks: TimedTracks, certain: float) -> FloatArray:
+    """The normal matrix, a band, with the pose at time 0 held where nothing else holds the spline.
+
+    Args:
+        certain: precision of that pose, in those of the most certain control pose.
+    """
+    band = equations.band
+    if tracks.past is not None:
+        return band
+    return band + anchors(curve, band.shape[1], certain * float(np.max(band[:, 0])))
 
 
 def information(
@@ -103,7 +139,7 @@ def information(
     expected = trust * (tails.nu + tracks.freedom) / (tails.nu + tracks.freedom + 2.0)
     silent = prior or Prior(1.0, 1, np.inf, np.inf)
     found = normal_equations(curve, tracks, Tails(NORMAL, tails.scale), silent, expected)
-    return anchored(found, curve)
+    return banded.factor(held(found, curve, tracks, ANCHORED))
 
 
 def log_evidence(found: Fit, precision: float) -> float:
@@ -115,8 +151,8 @@ def log_evidence(found: Fit, precision: float) -> float:
         precision: of the pose at time 0, the same for all.
     """
     curve, equations = found.curve, found.equations
-    held = anchors(curve, equations.band.shape[1], precision)
-    after = banded.log_determinant(banded.factor(equations.band + held))
+    anchor = anchors(curve, equations.band.shape[1], precision)
+    after = banded.log_determinant(banded.factor(equations.band + anchor))
     return log_prior(curve, found.prior, equations.rough) - 0.5 * after - equations.cost
 
 
@@ -139,13 +175,6 @@ def squared_errors(curve: Curve, tracks: TimedTracks) -> FloatArray:
     return squares
 
 
-def anchored(equations: Equations, curve: Curve) -> FloatArray:
-    """The factor of the normal matrix at a spline whose pose at time 0 is held."""
-    band = equations.band
-    precision = _ANCHORED * float(np.max(band[:, 0]))
-    return banded.factor(band + anchors(curve, band.shape[1], precision))
-
-
 def descend(
     curve: Curve, tracks: TimedTracks, tails: Tails, prior: Prior, trust: FloatArray, steps: int
 ) -> tuple[Curve, Equations]:
@@ -156,13 +185,15 @@ def descend(
     """
     here, damping = normal_equations(curve, tracks, tails, prior, trust), 0.0
     for _ in range(steps):
-        held = here.band + anchors(curve, here.band.shape[1], float(np.max(here.band[:, 0])))
+        matrix = held(here, curve, tracks, 1.0)
         promise, trial, there = 0.0, curve, here
         while damping <= _LARGEST_DAMPING:
-            step = _step(held, here, damping)
+            step = _step(matrix, here, damping)
             if step is not None:
                 promise = -0.5 * float(step @ here.gradient)
-                trial = from_pose_at(moved(curve, step), 0.0)
+                trial = moved(curve, step)
+                if tracks.past is None:
+                    trial = from_pose_at(trial, 0.0)
                 there = normal_equations(trial, tracks, tails, prior, trust)
                 near = damping == 0.0 and abs(promise) < _NEAR
                 if there.cost <= here.cost + (_NEAR if near else 0.0):
@@ -176,8 +207,8 @@ def descend(
     return curve, here
 
 
-def _step(held: FloatArray, here: Equations, damping: float) -> FloatArray | None:
-    damped = held.copy()
+def _step(matrix: FloatArray, here: Equations, damping: float) -> FloatArray | None:
+    damped = matrix.copy()
     damped[:, 0] += damping * here.band[:, 0]
     try:
         return -banded.solve(banded.factor(damped), here.gradient)
@@ -206,7 +237,7 @@ def fit(
     for _ in range(_ROUNDS):
         curve, here = descend(curve, tracks, tails, prior, trust, _STEPS_A_ROUND)
         last = np.array([tails.scale, prior.rotation, prior.position])
-        lower = anchored(here, curve)
+        lower = banded.factor(held(here, curve, tracks, ANCHORED))
         used, determined, learned = _strengths(here, lower, prior)
         if not settled:
             tails, trust = observed(here.squares, tracks.freedom, tails, used)
@@ -216,7 +247,7 @@ def fit(
         if change[0] < _FLAT and not np.any(settling):
             break
     curve, here = descend(curve, tracks, tails, prior, trust, _LAST_STEPS)
-    return Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=here, lower=anchored(here, curve))
+    return Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=here)
 
 
 def _strengths(here: Equations, lower: FloatArray, prior: Prior) -> tuple[float, FloatArray, Prior]:

@@ -40,8 +40,8 @@ class Prior(NamedTuple):
 class Roughness(NamedTuple):
     """Sums of squared accelerations, whitened; over the variances of a prior, twice its cost."""
 
-    squares: tuple[float, float]
-    """Of rotations and of positions."""
+    squares: FloatArray
+    """(2,) of rotations and of positions."""
     gradients: FloatArray
     """(2, 6 controls) of half the squares."""
     bands: FloatArray
@@ -69,17 +69,27 @@ def whitening(interval: float, memory: float, smooth: int) -> list[FloatArray]:
     return [unit * row for row in rows]
 
 
-def roughness(curve: Curve, memory: float, smooth: int, width: int) -> Roughness:
-    """Of a spline, in bands of a width (at least 6 (smooth + 3))."""
+def roughness(
+    curve: Curve, memory: float, smooth: int, width: int, begins: bool = True, until: int | None = None
+) -> Roughness:
+    """Of a spline, in bands of a width (at least 6 (smooth + 3)).
+
+    Args:
+        begins: whether nothing is known of accelerations before the first control pose; without it, differences
+            that need them are left out.
+        until: number of a control pose; only differences that begin before it.
+    """
     n, steps = len(curve.p), (curve.steps, np.diff(curve.p, axis=0))
     gradients, bands = np.zeros((2, 6 * n)), np.zeros((2, 6 * n, width))
-    squares, log_density = [0.0, 0.0], -float(np.log(curve.interval))
-    rows = whitening(curve.interval, memory, smooth)
-    for number, row in enumerate(rows):
-        count = 1 if number < smooth else n - 2 - smooth
-        first = np.arange(count)
+    squares, log_density, total = np.zeros(2), -float(np.log(curve.interval)), 0
+    for number, row in enumerate(whitening(curve.interval, memory, smooth)):
+        late = number == smooth
+        if not late and not begins:
+            continue
+        count = max(min(n - 2 - smooth, n if until is None else until), 0) if late else 1
         log_density += count * float(np.log(row[-1]))
-        weights = np.diff(np.concatenate([[0.0], row, [0.0]])) * -1.0
+        total += 3 * count
+        weights = -np.diff(np.concatenate([[0.0], row, [0.0]]))
         by = np.zeros((2, count, len(weights) + 1, 3, 3))
         for j, c in enumerate(weights):
             left = curve.inverse_left[j : j + count]
@@ -89,9 +99,9 @@ def roughness(curve: Curve, memory: float, smooth: int, width: int) -> Roughness
             by[1, :, j] -= c * np.eye(3)
         for kind in range(2):
             errors = np.asarray(sum(c * steps[kind][j : j + count] for j, c in enumerate(weights)))
-            add_blocks(gradients[kind], bands[kind], by[kind], errors, first, 3 * kind)
-            squares[kind] += float(np.sum(errors**2))
-    return Roughness((squares[0], squares[1]), gradients, bands, 3 * (n - 2), log_density)
+            add_blocks(gradients[kind], bands[kind], by[kind], errors, np.arange(count), 3 * kind)
+            squares[kind] += np.sum(errors**2)
+    return Roughness(squares, gradients, bands, total, log_density)
 
 
 def log_prior(curve: Curve, prior: Prior, rough: Roughness) -> float:

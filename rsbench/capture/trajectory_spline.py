@@ -75,6 +75,14 @@ def from_pose_at(curve: Curve, tau: float) -> Curve:
     return make_curve(curve.first, curve.interval, curve.R @ R.T, (curve.p - p) @ R.T)
 
 
+def part(curve: Curve, first: float, last: float, zero: float) -> Curve:
+    """Of the intervals that hold times from ``first`` to ``last``; ``zero`` is time 0 there."""
+    low = int(np.clip(np.floor((first - curve.first) / curve.interval + 1e-9), 0, len(curve.p) - _ORDER))
+    high = int(np.clip(np.ceil((last - curve.first) / curve.interval - 1e-9), low + 1, len(curve.p) - _ORDER + 1))
+    chosen = slice(low, high + _ORDER - 1)
+    return make_curve(curve.first + low * curve.interval - zero, curve.interval, curve.R[chosen], curve.p[chosen])
+
+
 def span_of(windows: int, shutter: RollingShutter) -> tuple[float, float]:
     """From the first line to the last one of so many windows, time 0 within."""
     ends = [shutter.start(frame, side) for frame in (0, windows) for side in SIDES]

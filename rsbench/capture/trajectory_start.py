@@ -8,8 +8,15 @@ import numpy as np
 
 from rsbench.capture.trajectory_data import TimedTracks
 from rsbench.capture.trajectory_fit import squared_errors
-from rsbench.capture.trajectory_spline import Curve, control_count, make_curve
-from rsbench.core.correspondences import Correspondences
+from rsbench.capture.trajectory_spline import (
+    ContinuousMotion,
+    Curve,
+    control_count,
+    evaluate,
+    from_pose_at,
+    make_curve,
+)
+from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.motion import LinearMotion, Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose, compose, inverse
@@ -53,13 +60,33 @@ def first_curve(
     return _chained(_bridged(rates, known), span, interval)
 
 
+def continued(curve: Curve, motions: Sequence[Motion | None], start: int, last: float) -> Curve:
+    """A spline, longer: along the motions of the windows from ``start`` on, to a time."""
+    known = np.array([motion is not None for motion in motions])
+    if not np.any(known):
+        motions, known = [ContinuousMotion.of(curve).from_time(start - 1.0)], np.ones(1, dtype=np.bool_)
+    rates = np.array([[0.0] * 6 if motion is None else [*motion.w, *motion.d] for motion in motions])
+    rates = _bridged(rates, known)
+    count = control_count(curve.first, last, curve.interval)
+    taus = curve.first + curve.interval * (np.arange(count) - 1.0)
+    ahead = from_pose_at(_chained(rates, (0.0, max(last - start, 1.0)), curve.interval), 0.0)
+    own, later = evaluate(curve, taus)[0], evaluate(ahead, taus - start)[0]
+    here = evaluate(curve, float(start))[0]
+    R, p = curve.R, curve.p
+    for k in range(len(p), count):
+        far = taus[k] > start
+        pose = compose(Pose(later.R[k], later.t[k]), here) if far else Pose(own.R[k], own.t[k])
+        R, p = np.concatenate([R, pose.R[None]]), np.concatenate([p, -(pose.R.T @ pose.t)[None]])
+    return make_curve(curve.first, curve.interval, R, p)
+
+
 def _median_errors(squares: FloatArray, tracks: TimedTracks) -> FloatArray:
     """(windows,) of the tracks of each window; 0 of none."""
     chosen = [squares[members] for members in tracks.members]
     return np.array([float(np.median(each)) if len(each) else 0.0 for each in chosen])
 
 
-def _bridged(rates: FloatArray, known: FloatArray) -> FloatArray:
+def _bridged(rates: FloatArray, known: BoolArray) -> FloatArray:
     """Rates (n, 6), those that are not known between those of neighbours; 0 where none is."""
     if not np.any(known):
         return np.zeros_like(rates)
@@ -67,7 +94,7 @@ def _bridged(rates: FloatArray, known: FloatArray) -> FloatArray:
     return np.stack([np.interp(places, places[known], column[known]) for column in rates.T], axis=1)
 
 
-def _without(rates: FloatArray, known: FloatArray, k: int) -> FloatArray:
+def _without(rates: FloatArray, known: BoolArray, k: int) -> FloatArray:
     """What the neighbours of window k say of it (6,)."""
     others = known.copy()
     others[k] = False

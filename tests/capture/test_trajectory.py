@@ -1,6 +1,7 @@
 """The trajectory of a sequence. Truth: points projected at their rows' times, moving by laws that are not ours."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,9 +17,10 @@ from rsbench.capture.trajectory_kernels import Tails
 from rsbench.capture.trajectory_poses import blank_views, fill_views
 from rsbench.capture.trajectory_prior import Prior, roughness, whitening
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, moved
+from rsbench.capture.trajectory_stream import stream_trajectory
 from rsbench.components.motion_models import motion_record, read_motion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -77,16 +79,16 @@ def scattered(law: Law, frame: int, count: int, rng: np.random.Generator) -> Flo
     return np.einsum("nji,nj->ni", R, rays) + p
 
 
-def inside(pixels: FloatArray) -> FloatArray:
+def inside(pixels: FloatArray) -> BoolArray:
     x, y = pixels[:, 0::2], pixels[:, 1::2]
     return np.all((x > 0.0) & (x < 639.0) & (y > 0.0) & (y < 479.0), axis=1)
 
 
 def matches(
     law: Law, frames: int, rng: np.random.Generator, outliers: float = 0.2, count: int = 300, noise: float = 0.3
-) -> tuple[list[Correspondences], list[FloatArray]]:
+) -> tuple[list[Correspondences], list[BoolArray]]:
     """For each two frames, tracks (count, 8) and which of them are right."""
-    windows, right = [], []
+    windows, right = list[Correspondences](), list[BoolArray]()
     for k in range(frames - 1):
         points = scattered(law, k, 3 * count, rng)
         tracks = np.concatenate([seen(law, points, k + i // 2, i % 2) for i in range(4)], axis=1)
@@ -103,12 +105,12 @@ def matches(
 
 def row_errors_deg(found: Trajectory, law: Law, frames: int) -> FloatArray:
     """Errors of the rotations of all rows against the first row of their frame."""
-    rows, out = np.arange(0.0, HEIGHT, 12.0), []
+    rows, out = np.arange(0.0, HEIGHT, 12.0), list[FloatArray]()
     for k in range(frames):
         tau = times(rows, k)
         ours, truth = found.motion.body_from_world(tau).R, law(tau)[0]
         ours, truth = ours @ ours[0].T, truth @ truth[0].T
-        out.append(Rotation.from_matrix(ours @ np.swapaxes(truth, 1, 2)).magnitude()[1:])
+        out.append(np.asarray(Rotation.from_matrix(ours @ np.swapaxes(truth, 1, 2)).magnitude())[1:])
     return np.rad2deg(np.array(out))
 
 
@@ -176,7 +178,7 @@ def test_the_gradient_of_the_tracks_and_of_the_prior() -> None:
     tracks = pack_windows(windows, RIG, SHUTTER)
     still = tracks.ends.copy()
     still[:, 7:9] = 0.0
-    tracks = type(tracks)(**{**vars(tracks), "ends": still})
+    tracks = replace(tracks, ends=still)
     everything, prior, tails = np.ones(len(tracks)), Prior(0.5, 2, 1e-3, 1e-3), Tails(4.0, 2.0)
 
     def cost(other: Curve) -> FloatArray:
@@ -410,3 +412,24 @@ def test_a_window_is_seen_from_its_own_first_row() -> None:
     R2, t2 = motion.body_from_world(2.0)
     np.testing.assert_allclose(R @ R2, motion.body_from_world(2.3).R, atol=1e-14)
     np.testing.assert_allclose(R @ t2 + t, motion.body_from_world(2.3).t, atol=1e-14)
+
+
+def test_a_stream_says_what_the_whole_sequence_does() -> None:
+    """Windows that have left count as a quadratic cost: the same trajectory, as well as it is known."""
+    rng = np.random.default_rng(14)
+    law = sines(rng, *SHAKES["walk"])
+    windows, _ = matches(law, 20, rng)
+    whole = estimate_trajectory(windows, RIG, SHUTTER)
+    parts = list(stream_trajectory(windows, RIG, SHUTTER))
+    assert [each.number for each in parts] == list(range(19))
+    errors, tau = list[FloatArray](), times(np.arange(0.0, HEIGHT, 48.0), 0)
+    for each in parts:
+        ours, truth = each.motion.body_from_world(tau).R, law(each.number + tau)[0]
+        errors.append(np.asarray(Rotation.from_matrix(ours @ np.swapaxes(truth @ truth[0].T, 1, 2)).magnitude()))
+    assert np.median(np.rad2deg(errors)) < 1.3 * np.median(row_errors_deg(whole, law, 20)) + 0.001
+    # Six windows later than a frame say little more of it: it is as far as the whole sequence has it.
+    R, t = whole.motion.body_from_world(18.0)
+    sigma = np.sqrt(np.diagonal(whole.covariance(18.0)[0]))
+    turned = Rotation.from_matrix(parts[18].body_from_world.R @ R.T).as_rotvec()
+    assert np.all(np.abs(turned) < 2.0 * sigma[:3])
+    assert np.linalg.norm(parts[18].body_from_world.t - t) < 3.0 * np.linalg.norm(sigma[3:])
