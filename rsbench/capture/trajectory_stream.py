@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from rsbench.capture.trajectory import TrajectoryOptions, is_supported, noise_px
 from rsbench.capture.trajectory_choice import choose
 from rsbench.capture.trajectory_data import Past, TimedTracks, pack_windows
+from rsbench.capture.trajectory_estimate import TrajectoryOptions, is_supported, noise_px
 from rsbench.capture.trajectory_fit import ANCHORED, Fit, fit, held, normal_equations
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, part, span_of
 from rsbench.capture.trajectory_start import continued, first_curve, window_motions

@@ -1,238 +1,36 @@
-"""The trajectory of a sequence. Truth: points projected at their rows' times, moving by laws that are not ours."""
-
-from collections.abc import Callable
-from dataclasses import replace
+"""The trajectory of a sequence. Truth: points projected at their rows' times (``shaken_rig``)."""
 
 import numpy as np
 import pytest
 import scipy
 from scipy.spatial.transform import Rotation
+from shaken_rig import (
+    HEIGHT,
+    RIG,
+    SHAKES,
+    SHUTTER,
+    Law,
+    drawn,
+    inside,
+    law_of,
+    matches,
+    row_errors_deg,
+    scattered,
+    seen,
+    sines,
+    times,
+)
 
-from rsbench.capture import trajectory_banded as banded
-from rsbench.capture.trajectory import Trajectory, TrajectoryOptions, estimate_trajectory, trajectory_bound
-from rsbench.capture.trajectory_choice import approximated
 from rsbench.capture.trajectory_data import pack_windows
-from rsbench.capture.trajectory_fit import fit, normal_equations
+from rsbench.capture.trajectory_estimate import TrajectoryOptions, estimate_trajectory, trajectory_bound
+from rsbench.capture.trajectory_fit import fit
 from rsbench.capture.trajectory_kernels import Tails
-from rsbench.capture.trajectory_poses import blank_views, fill_views
-from rsbench.capture.trajectory_prior import Prior, roughness, whitening
-from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, moved
+from rsbench.capture.trajectory_prior import Prior
+from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.capture.trajectory_stream import stream_trajectory
-from rsbench.components.motion_models import motion_record, read_motion
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.correspondences import BoolArray, Correspondences
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import LinearMotion
-from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-
-FOCAL, BASELINE, HEIGHT, RATIO = 520.0, 0.2, 480, 0.8
-RIG = StereoRig(camera=PinholeCamera.centred(640, HEIGHT, FOCAL), baseline=BASELINE)
-SHUTTER = RollingShutter(height=HEIGHT, readout_ratio=RATIO)
-Law = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""Rotations body_from_world (n, 3, 3) and positions of the body (n, 3) at times (n,)."""
-
-
-def sines(rng: np.random.Generator, size: float, slowest: float, fastest: float) -> Law:
-    """Three sines about and along each axis, on top of 1.5 degrees and 0.15 m per frame."""
-    turn = np.radians(0.2) * size * rng.uniform(0.5, 1.5, (3, 3))
-    shift = 0.005 * size * rng.uniform(0.5, 1.5, (3, 3))
-    rates, phases = rng.uniform(slowest, fastest, (2, 3, 3)), rng.uniform(0.0, 2.0 * np.pi, (2, 3, 3))
-    w, v = (
-        scale * each / np.linalg.norm(each)
-        for scale, each in ((0.02618, rng.normal(size=3)), (0.15, rng.normal(size=3)))
-    )
-
-    def law(tau: FloatArray) -> tuple[FloatArray, FloatArray]:
-        angles, places = (
-            np.sum(size * np.sin(2.0 * np.pi * f * tau[:, None, None] + p), axis=-1)
-            for size, f, p in ((turn, rates[0], phases[0]), (shift, rates[1], phases[1]))
-        )
-        R = Rotation.from_rotvec(angles) * Rotation.from_rotvec(tau[:, None] * w)
-        return R.as_matrix(), tau[:, None] * v + places
-
-    return law
-
-
-def times(y: FloatArray, frame: int) -> FloatArray:
-    """The rule of the conventions, written once more."""
-    return frame + RATIO * y / HEIGHT
-
-
-def seen(law: Law, points: FloatArray, frame: int, side: int) -> FloatArray:
-    """Pixels (n, 2) of points of the world (n, 3): the row decides the time, and the time the row."""
-    y = np.full(len(points), 0.5 * HEIGHT)
-    for _ in range(12):
-        R, p = law(times(y, frame))
-        x = np.einsum("nij,nj->ni", R, points - p) + np.array([(0.5 - side) * BASELINE, 0.0, 0.0])
-        y = FOCAL * x[:, 1] / x[:, 2] + 239.5
-    pixels = np.stack([FOCAL * x[:, 0] / x[:, 2] + 319.5, y], axis=-1)
-    return np.where(x[:, 2:] > 0.1, pixels, np.nan)
-
-
-def scattered(law: Law, frame: int, count: int, rng: np.random.Generator) -> FloatArray:
-    """Points (n, 3) 2 to 12 m in front of the left camera."""
-    pixels, z = rng.uniform([0.0, 0.0], [640.0, HEIGHT], (count, 2)), rng.uniform(2.0, 12.0, count)
-    R, p = law(times(pixels[:, 1], frame))
-    rays = np.concatenate([(pixels - [319.5, 239.5]) / FOCAL, np.ones((count, 1))], axis=1) * z[:, None]
-    rays[:, 0] -= 0.5 * BASELINE
-    return np.einsum("nji,nj->ni", R, rays) + p
-
-
-def inside(pixels: FloatArray) -> BoolArray:
-    x, y = pixels[:, 0::2], pixels[:, 1::2]
-    return np.all((x > 0.0) & (x < 639.0) & (y > 0.0) & (y < 479.0), axis=1)
-
-
-def matches(
-    law: Law, frames: int, rng: np.random.Generator, outliers: float = 0.2, count: int = 300, noise: float = 0.3
-) -> tuple[list[Correspondences], list[BoolArray]]:
-    """For each two frames, tracks (count, 8) and which of them are right."""
-    windows, right = list[Correspondences](), list[BoolArray]()
-    for k in range(frames - 1):
-        points = scattered(law, k, 3 * count, rng)
-        tracks = np.concatenate([seen(law, points, k + i // 2, i % 2) for i in range(4)], axis=1)
-        tracks = tracks[inside(tracks)][:count]
-        tracks = tracks + noise * rng.normal(size=tracks.shape)
-        wrong = rng.random(len(tracks)) < outliers
-        for j in np.flatnonzero(wrong):
-            end = rng.integers(4)
-            tracks[j, 2 * end : 2 * end + 2] = rng.uniform([0.0, 0.0], [640.0, 480.0])
-        windows.append(Correspondences(tracks=tracks))
-        right.append(~wrong)
-    return windows, right
-
-
-def row_errors_deg(found: Trajectory, law: Law, frames: int) -> FloatArray:
-    """Errors of the rotations of all rows against the first row of their frame."""
-    rows, out = np.arange(0.0, HEIGHT, 12.0), list[FloatArray]()
-    for k in range(frames):
-        tau = times(rows, k)
-        ours, truth = found.motion.body_from_world(tau).R, law(tau)[0]
-        ours, truth = ours @ ours[0].T, truth @ truth[0].T
-        out.append(np.asarray(Rotation.from_matrix(ours @ np.swapaxes(truth, 1, 2)).magnitude())[1:])
-    return np.rad2deg(np.array(out))
-
-
-def wild(rng: np.random.Generator, controls: int = 9) -> Curve:
-    """A spline that turns far."""
-    R = Rotation.from_rotvec(0.3 * rng.normal(size=(controls, 3))).as_matrix()
-    return make_curve(-0.4, 0.6, R, 0.3 * rng.normal(size=(controls, 3)))
-
-
-def differences(of: Callable[[Curve], FloatArray], curve: Curve, step: float) -> FloatArray:
-    """Central differences (..., 6 controls) by the control poses."""
-    out = []
-    for unit in np.eye(6 * len(curve.p)):
-        out.append((of(moved(curve, step * unit)) - of(moved(curve, -step * unit))) / (2.0 * step))
-    return np.stack(out, axis=-1)
-
-
-def test_poses_and_their_derivatives_by_the_control_poses() -> None:
-    curve = wild(np.random.default_rng(0))
-    taus = np.linspace(curve.first, curve.last, 17)
-    views = blank_views(len(taus))
-    fill_views(curve, taus, views)
-    (R, t), spin, speed = evaluate(curve, taus)
-    np.testing.assert_allclose(views.R, R, atol=1e-14)
-    np.testing.assert_allclose(views.p, -np.einsum("nji,nj->ni", R, t), atol=1e-14)
-    np.testing.assert_allclose(views.spin, spin, atol=1e-14)
-    np.testing.assert_allclose(views.speed, speed, atol=1e-14)
-
-    def turned(other: Curve) -> FloatArray:
-        return Rotation.from_matrix(evaluate(other, taus)[0].R @ np.swapaxes(R, 1, 2)).as_rotvec()
-
-    ours = np.zeros((len(taus), 3, len(curve.p), 6))
-    for k, i in enumerate(views.index):
-        ours[k, :, i : i + 4, :3] = np.swapaxes(views.turn[k], 0, 1)
-    # A step of 1e-6 leaves 1e-12 of truncation and 1e-10 of rounding.
-    np.testing.assert_allclose(ours.reshape(len(taus), 3, -1), differences(turned, curve, 1e-6), atol=1e-8)
-
-
-def test_the_spline_runs_through_its_velocity_and_goes_on_at_it() -> None:
-    motion = ContinuousMotion.of(wild(np.random.default_rng(1)))
-    tau, step = np.linspace(-1.0, 5.0, 31), 1e-5
-    (before, t0), (after, t1) = (motion.body_from_world(tau + each) for each in (-step, step))
-    spin, speed = motion.velocity(tau)
-    turn = Rotation.from_matrix(after @ np.swapaxes(before, 1, 2)).as_rotvec() / (2.0 * step)
-    # Jumps of the third derivative at knots: 1e-5 of them.
-    np.testing.assert_allclose(turn, spin, atol=1e-4)
-    np.testing.assert_allclose((t1 - t0) / (2.0 * step), speed, atol=1e-4)
-    R, t = motion.body_from_world(0.0)
-    np.testing.assert_allclose(R, np.eye(3), atol=1e-14)
-    np.testing.assert_allclose(t, 0.0, atol=1e-14)
-
-
-def test_a_motion_is_read_back_as_it_was_written() -> None:
-    motion = ContinuousMotion.of(wild(np.random.default_rng(2)))
-    again = read_motion(motion_record(motion))
-    np.testing.assert_allclose(again.body_from_world(1.7).t, motion.body_from_world(1.7).t, atol=1e-15)
-
-
-def test_the_gradient_of_the_tracks_and_of_the_prior() -> None:
-    rng = np.random.default_rng(3)
-    law = sines(rng, 1.0, 0.15, 0.45)
-    windows, _ = matches(law, 3, rng, outliers=0.0, count=12)
-    curve = approximated(LinearMotion([0.02, -0.01, 0.01], [0.1, 0.0, -0.1]).body_from_world, (0.0, 2.8), 0.5)
-    # A global shutter: the weights of pixels, which the gradient takes as given, do not depend on the motion.
-    tracks = pack_windows(windows, RIG, SHUTTER)
-    still = tracks.ends.copy()
-    still[:, 7:9] = 0.0
-    tracks = replace(tracks, ends=still)
-    everything, prior, tails = np.ones(len(tracks)), Prior(0.5, 2, 1e-3, 1e-3), Tails(4.0, 2.0)
-
-    def cost(other: Curve) -> FloatArray:
-        return np.array(normal_equations(other, tracks, tails, prior, everything, False).cost)
-
-    ours = normal_equations(curve, tracks, tails, prior, everything).gradient
-    wanted = differences(cost, curve, 1e-6)
-    # Points are found to 1e-3 px of errors of some pixels, which they lower to first order only.
-    np.testing.assert_allclose(ours, wanted, atol=2e-3 * np.max(np.abs(wanted)))
-
-
-@pytest.mark.parametrize("smooth", [1, 2])
-def test_the_prior_whitens_accelerations_that_forget(smooth: int) -> None:
-    """Its weights undo the covariance of the autoregression that they mean, by brute force."""
-    interval, memory, count = 0.5, 0.8, 9
-    rho = np.exp(-interval / memory)
-    long = 4000  # the autoregression's answer to one push, until it is 0
-    push = np.zeros(long)
-    push[0] = 1.0
-    answer = scipy.signal.lfilter([1.0], np.poly([rho] * smooth), push)
-    lags = np.array([answer[: long - k] @ answer[k:] for k in range(count)])
-    covariance = scipy.linalg.toeplitz(lags / lags[0])
-    rows = whitening(interval, memory, smooth)
-    W = np.zeros((count, count))
-    for k in range(count):
-        row = rows[min(k, smooth)]
-        W[k, k + 1 - len(row) : k + 1] = row
-    np.testing.assert_allclose(W @ covariance @ W.T * interval**4, np.eye(count), atol=1e-9)
-
-
-def test_roughness_is_that_of_second_differences() -> None:
-    rng = np.random.default_rng(4)
-    p = rng.normal(size=(9, 3))
-    curve = make_curve(0.0, 0.5, np.broadcast_to(np.eye(3), (9, 3, 3)), p)
-    d = np.diff(p, n=2, axis=0)
-    rows = whitening(0.5, 0.7, 2)
-    errors = [rows[0][0] * d[0], rows[1] @ d[:2], *(rows[2] @ d[k : k + 3] for k in range(5))]
-    assert roughness(curve, 0.7, 2, 30).squares[1] == pytest.approx(float(np.sum(np.square(errors))), rel=1e-12)
-
-
-def test_the_inverse_of_a_band() -> None:
-    rng = np.random.default_rng(5)
-    n, width = 40, 7
-    A = np.tril(np.triu(rng.normal(size=(n, n)), -width + 1))
-    dense = A @ A.T + np.eye(n)
-    band = np.stack([np.concatenate([np.diagonal(dense, -i), np.zeros(i)]) for i in range(width)], axis=1)
-    lower = banded.factor(band)
-    inverse = np.linalg.inv(dense)
-    for i in range(width):
-        np.testing.assert_allclose(banded.inverse_band(lower)[: n - i, i], np.diagonal(inverse, -i), rtol=1e-9)
-    assert banded.log_determinant(lower) == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-12)
-
-
-SHAKES = {"strong": (1.0, 0.15, 0.45), "tremor": (0.25, 0.15, 0.45), "walk": (1.0, 0.06, 0.18)}
 
 
 @pytest.mark.parametrize(("shake", "frames"), [("strong", 8), ("tremor", 8), ("walk", 8), ("strong", 60)])
@@ -247,38 +45,6 @@ def test_rows_of_a_shaken_rig(shake: str, frames: int) -> None:
     assert np.all(found.supported)
     wrong = sum(np.count_nonzero(mask != truth) for mask, truth in zip(found.inliers, right, strict=True))
     assert wrong <= 0.01 * 300 * frames  # wrong ends that lie within ten deviations by chance
-
-
-def drawn(prior: Prior, rng: np.random.Generator, frames: int, interval: float) -> Curve:
-    """A spline whose control poses the prior draws: accelerations by brute force from their covariance."""
-    count = int(np.ceil((frames - 1 + RATIO) / interval)) + 3
-    rho, m = np.exp(-interval / prior.memory), prior.smooth
-    push = np.zeros(2000)
-    push[0] = 1.0
-    answer = scipy.signal.lfilter([1.0], np.poly([rho] * m), push)
-    lags = np.array([answer[: 2000 - k] @ answer[k:] for k in range(count - 2)])
-    root = np.linalg.cholesky(scipy.linalg.toeplitz(lags / lags[0]))
-    turns, shifts = (np.sqrt(s) * interval**2 * root @ rng.normal(size=(count - 2, 3)) for s in prior[2:])
-    w, v = (
-        scale * each / np.linalg.norm(each)
-        for scale, each in ((0.02618, rng.normal(size=3)), (0.15, rng.normal(size=3)))
-    )
-    steps, along = (
-        np.concatenate([[interval * a], interval * a + np.cumsum(b, axis=0)]) for a, b in ((w, turns), (v, shifts))
-    )
-    R = [np.eye(3)]
-    for step in steps:
-        R.append(Rotation.from_rotvec(step).as_matrix() @ R[-1])
-    p = np.concatenate([np.zeros((1, 3)), np.cumsum(along, axis=0)])
-    return ContinuousMotion.of(make_curve(0.0, interval, np.array(R), p)).curve
-
-
-def law_of(curve: Curve) -> Law:
-    def law(tau: FloatArray) -> tuple[FloatArray, FloatArray]:
-        R, t = evaluate(curve, tau)[0]
-        return R, -np.einsum("nji,nj->ni", R, t)
-
-    return law
 
 
 def test_errors_are_those_of_the_bound_and_of_the_covariances() -> None:
@@ -403,15 +169,6 @@ def test_a_wrong_motion_of_a_window_is_mended() -> None:
     found = estimate_trajectory(windows, RIG, SHUTTER, [*motions[:5], None, *motions[6:]])
     assert np.all(found.supported)
     assert np.median(row_errors_deg(found, law, 8)) < 0.02
-
-
-def test_a_window_is_seen_from_its_own_first_row() -> None:
-    motion = ContinuousMotion.of(wild(np.random.default_rng(13)))
-    later = motion.from_time(2.0)
-    R, t = later.body_from_world(0.3)
-    R2, t2 = motion.body_from_world(2.0)
-    np.testing.assert_allclose(R @ R2, motion.body_from_world(2.3).R, atol=1e-14)
-    np.testing.assert_allclose(R @ t2 + t, motion.body_from_world(2.3).t, atol=1e-14)
 
 
 def test_a_stream_says_what_the_whole_sequence_does() -> None:
