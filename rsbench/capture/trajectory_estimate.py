@@ -1,0 +1,207 @@
+"""One way of a rig through a whole sequence, from the matches of all neighbouring frames.
+
+Two frames do not show what both shake alike; a sequence does, for its windows overlap. The way is a spline
+(``trajectory_spline``) of largest posterior probability (``trajectory_fit``) under tracks with heavy-tailed errors
+(``trajectory_kernels``) and a prior of how hands shake, whose strength the matches say themselves
+(``trajectory_prior``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike
+
+from rsbench.capture import trajectory_banded as banded
+from rsbench.capture.trajectory_choice import approximated, choose
+from rsbench.capture.trajectory_covariance import covariance_between, pose_covariance
+from rsbench.capture.trajectory_data import TimedTracks, pack_windows
+from rsbench.capture.trajectory_fit import NORMAL, Fit, fit, information
+from rsbench.capture.trajectory_kernels import Tails
+from rsbench.capture.trajectory_prior import Prior
+from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, span_of
+from rsbench.capture.trajectory_start import first_curve, window_motions
+from rsbench.core.correspondences import BoolArray, Correspondences
+from rsbench.core.motion import Motion
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+
+_ONE_SIGMA = 0.8413447460685429
+_JUDGED = 8
+"""First windows, from which knots and prior are chosen."""
+_FEWEST, _LEAST_SHARE = 15, 0.2
+"""Right tracks, and their share, from which on a window is supported by its own matches."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrajectoryOptions:
+    """How a trajectory is found."""
+
+    intervals: tuple[float, ...] = (1 / 2, 1 / 3, 1 / 4)
+    """Frame periods between two control poses: those of most evidence are taken, the first ones to begin with."""
+    prior: Prior = Prior(memory=0.5, smooth=2, rotation=1e-4, position=1e-4)  # noqa: RUF009
+    """To begin with."""
+    learn: bool = True
+    """Whether the matches say the prior and the knots."""
+    link: bool = True
+    """Whether tracks that meet in a frame are one; without it their common ends count as two."""
+    seed: int = 0
+    """Of the search for motions of single windows."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrajectoryBound:
+    """How well a trajectory can be known: covariances of its poses."""
+
+    curve: Curve
+    covariance_band: FloatArray
+    """Of the control poses, see ``trajectory_banded``."""
+
+    def covariance(self, tau: ArrayLike) -> FloatArray:
+        """Covariance (n, 6, 6) of the poses at times (n,), given that of time 0.
+
+        Of small turns of the body about its own axes, radians, and of its position in the world, metres.
+        """
+        return pose_covariance(self.curve, self.covariance_band, np.atleast_1d(tau))
+
+    def covariance_between(self, start: float, tau: ArrayLike) -> FloatArray:
+        """Covariance (n, 6, 6) of the poses at times (n,) within a period of ``start``, given the pose there.
+
+        Of small turns of the body about its own axes, radians, and of its position in the axes of the body at
+        ``start``, metres.
+        """
+        return covariance_between(self.curve, self.covariance_band, start, np.atleast_1d(tau))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trajectory(TrajectoryBound):
+    """What the rig did, seen from the body at time 0."""
+
+    motion: ContinuousMotion
+    """body_from_world at any time of the sequence, frame periods."""
+    noise_px: float
+    """Of a coordinate, as of a normal error: two in three are below it."""
+    nu: float
+    """Degrees of freedom of the tails; 30 is as good as normal."""
+    prior: Prior
+    inliers: tuple[BoolArray, ...]
+    """For each window, which of its tracks are right."""
+    supported: BoolArray
+    """(windows,) whether a window's own tracks carry it; elsewhere the spline bridges it."""
+    fit: Fit
+
+    @property
+    def interval(self) -> float:
+        """Frame periods between two control poses."""
+        return self.motion.interval
+
+    def window(self, number: int) -> Motion:
+        """The motion seen from the body at the start of a frame, which is time 0."""
+        return self.motion.from_time(float(number))
+
+
+def estimate_trajectory(
+    windows: Sequence[Correspondences],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motions: Sequence[Motion | None] | None = None,
+    options: TrajectoryOptions | None = None,
+) -> Trajectory:
+    """The trajectory of a rig, from matches with outliers.
+
+    Args:
+        windows: of the frames 0 and 1, 1 and 2, ...
+        motions: of each window, to begin with; None: they are searched.
+
+    Raises:
+        ValueError: no windows, or no tracks in any.
+    """
+    options = options or TrajectoryOptions()
+    if not any(len(window.tracks) for window in windows):
+        raise ValueError("a trajectory needs tracks: matches of both cameras over time")
+    if motions is None:
+        motions = window_motions(windows, rig, shutter, options.seed)
+    few = slice(0, _JUDGED)
+    found, tracks = _fitted(windows[few], rig, shutter, motions[few], options.intervals[0], options.prior, options)
+    if options.learn:
+        found = choose(found, tracks, options.intervals)
+    if len(windows) > _JUDGED:
+        found, tracks = _fitted(windows, rig, shutter, motions, found.curve.interval, found.prior, options)
+    if options.link:
+        tracks = pack_windows(windows, rig, shutter, [found.trust[each] for each in tracks.members])
+        found = fit(found.curve, tracks, found.prior, options.learn, found.tails)
+    return _told(found, tracks, windows)
+
+
+def _fitted(
+    windows: Sequence[Correspondences],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motions: Sequence[Motion | None],
+    interval: float,
+    prior: Prior,
+    options: TrajectoryOptions,
+) -> tuple[Fit, TimedTracks]:
+    """The spline of windows, and their tracks."""
+    tracks = pack_windows(windows, rig, shutter)
+    curve = first_curve(motions, tracks, span_of(len(windows), shutter), interval)
+    return fit(curve, tracks, prior, options.learn), tracks
+
+
+def _told(found: Fit, tracks: TimedTracks, windows: Sequence[Correspondences]) -> Trajectory:
+    masks = tuple(found.trust[each] > 0.0 for each in tracks.members)
+    inliers = tuple(mask[: len(window.tracks)] for mask, window in zip(masks, windows, strict=True))
+    return Trajectory(
+        motion=ContinuousMotion.of(found.curve),
+        noise_px=noise_px(found.tails),
+        nu=found.tails.nu,
+        prior=found.prior,
+        inliers=inliers,
+        supported=np.array([is_supported(mask) for mask in inliers]),
+        fit=found,
+        curve=found.curve,
+        covariance_band=banded.inverse_band(
+            information(found.curve, tracks, found.tails, found.prior, found.trust)
+        ),
+    )
+
+
+def noise_px(tails: Tails) -> float:
+    """Of a coordinate, as of a normal error: two in three are below it."""
+    return tails.scale * float(scipy.special.stdtrit(tails.nu, _ONE_SIGMA))
+
+
+def is_supported(inliers: BoolArray) -> bool:
+    """Whether tracks (n,), some of them right, carry their window."""
+    return bool(np.count_nonzero(inliers) >= max(_FEWEST, _LEAST_SHARE * len(inliers)))
+
+
+def trajectory_bound(
+    motion: Motion,
+    windows: Sequence[Correspondences],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    noise_px: float,
+    interval: float = 0.5,
+    prior: Prior | None = None,
+) -> TrajectoryBound:
+    """The Cramer-Rao bound of a trajectory, at the truth.
+
+    Args:
+        windows: the right matches, without outliers; those that meet in a frame are one track.
+        noise_px: standard deviation of a coordinate, normal.
+        interval: frame periods between the control poses, which are all that is unknown.
+        prior: what is known beside (H. van Trees' bound); None: nothing.
+
+    Raises:
+        ValueError: the matches do not determine the trajectory.
+    """
+    everything = [np.ones(len(each)) for each in pack_windows(windows, rig, shutter).members]
+    tracks = pack_windows(windows, rig, shutter, everything)
+    curve = approximated(motion.body_from_world, span_of(len(windows), shutter), interval)
+    lower = information(curve, tracks, Tails(NORMAL, noise_px), prior, np.ones(len(tracks)))
+    return TrajectoryBound(curve=curve, covariance_band=banded.inverse_band(lower))

@@ -1,0 +1,343 @@
+"""Compiled: reprojection errors of points that a moving rig sees at many times, with the points left out.
+
+A track is any number of ends: pixels of one point, each with its camera and time. Its point, (x, y, 1) / rho in
+the camera of the first end, is found by few Gauss-Newton steps and left out of the normal equations (Schur
+complement; B. Triggs et al., Bundle Adjustment, 2000). A pixel that is shifted is also read at another time, which
+counts in the noise of an end. Nothing is linear in the motion but for those steps. A track weighs as under a
+multivariate t distribution (``solvers.engine.heavy_tails``).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.capture.trajectory_poses import Views, blank_views, fill_view
+from rsbench.capture.trajectory_spline import Curve
+from rsbench.components.compiled import compiled
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.vectors import Vector, apply, apply_transposed, cross, plus, times
+
+BEHIND = 1e12
+"""Squared error, px^2, of a track whose point lies behind a camera."""
+_NEAREST = 1e-3
+"""Least ratio of depths at two ends."""
+_POINT_STEPS = 2
+"""Steps to the best point: an error of 1 px leaves 1e-3 px after one and 1e-9 after two."""
+_ROUGH_RHO = 3.0
+"""1/m: deviation of inverse depths about 0 that is expected where a track does not show its own."""
+_UNCERTAIN = 0.3
+"""px: what an expected inverse depth counts as much as."""
+END = 10
+"""Numbers of an end."""
+
+
+class Tails(NamedTuple):
+    """Distribution of errors."""
+
+    nu: float
+    scale: float
+    """px."""
+
+
+class Scratch(NamedTuple):
+    """Memory of one track."""
+
+    views: Views
+    G: FloatArray
+    """(n, 3, 3) rotation from the camera of the first end."""
+    b: FloatArray
+    """(n, 3) how the point moves with rho."""
+    W: FloatArray
+    """(n, 2, 2) takes errors in ideal pixels to pixels of unit noise."""
+    e: FloatArray
+    """(n, 2) errors, px."""
+    D: FloatArray
+    """(n, 2, 3) their derivatives by x, y, rho."""
+    point: FloatArray
+    """(3,) x, y, rho."""
+    left: FloatArray
+    """(3,) gradient by them: 0 but for rounding at the best point."""
+    P: FloatArray
+    """(n, 3) the point, in units of its depth at the first end."""
+    N: FloatArray
+    """(3, 3) normal matrix of the point."""
+    L: FloatArray
+    """(3, 3) its Cholesky factor."""
+    work: FloatArray
+    block: FloatArray
+    """(2, 24) derivatives of one end by four control poses."""
+    Q: FloatArray
+    """(m, 3) mixed part of the normal matrix."""
+    H: FloatArray
+    """(m, m) normal matrix of the control poses that the track feels."""
+    g: FloatArray
+    """(m,) gradient."""
+
+
+@compiled
+def _scratch(ends: int, size: int) -> Scratch:
+    return Scratch(
+        blank_views(ends),
+        np.zeros((ends, 3, 3)),
+        np.zeros((ends, 3)),
+        np.zeros((ends, 2, 2)),
+        np.zeros((ends, 2)),
+        np.zeros((ends, 2, 3)),
+        np.zeros(3),
+        np.zeros(3),
+        np.zeros((ends, 3)),
+        np.zeros((3, 3)),
+        np.zeros((3, 3)),
+        np.zeros((6, 3, 3)),
+        np.zeros((2, 24)),
+        np.zeros((size, 3)),
+        np.zeros((size, size)),
+        np.zeros(size),
+    )
+
+
+@compiled
+def add_tracks(
+    curve: Curve,
+    ends: FloatArray,
+    starts: NDArray[np.int64],
+    focal: FloatArray,
+    tails: Tails,
+    trust: FloatArray,
+    squares: FloatArray,
+    band: FloatArray,
+    gradient: FloatArray,
+    want: bool,
+) -> float:
+    """Negative logarithm of the likelihood of tracks, and the normal equations of their weighted squares.
+
+    Args:
+        ends: (e, 10) ray (x, y), tau, derivative of the ideal pixel by the pixel (2 x 2, rows first), derivative
+            of tau by the pixel (2), x of the camera's offset from the body.
+        starts: (n + 1,) first end of each track, and e.
+        trust: (n,) factors on the tracks' parts; those of 0 have squares, and no part.
+        squares: (n,) filled, px^2: chi-squared with 2 ends - 3 degrees of freedom at a noise of 1 px.
+        band: (6 controls, width) lower half of the normal matrix, by columns from the diagonal on; added to when
+            ``want``, as is gradient (6 controls,).
+    """
+    most = 0
+    for k in range(len(starts) - 1):
+        most = max(most, starts[k + 1] - starts[k])
+    scratch = _scratch(most, band.shape[1])
+    total = 0.0
+    for k in range(len(starts) - 1):
+        track = ends[starts[k] : starts[k + 1]]
+        squares[k] = _explain(curve, track, focal, scratch)
+        if trust[k] == 0.0:
+            continue
+        freedom = 2.0 * len(track) - 3.0
+        spread = tails.nu * tails.scale * tails.scale
+        total += 0.5 * trust[k] * (tails.nu + freedom) * math.log1p(squares[k] / spread)
+        if want and squares[k] < BEHIND:
+            weight = trust[k] * (tails.nu + freedom) / (spread + squares[k])
+            _add_track(track, focal, scratch, weight, band, gradient)
+    return total
+
+
+@compiled
+def _explain(curve: Curve, track: FloatArray, focal: FloatArray, s: Scratch) -> float:
+    """The best point of a track; its squared error, px^2."""
+    count = len(track)
+    for n in range(count):
+        fill_view(curve, track[n, 2], s.views, n, s.work)
+    point = _first_point(track, s)
+    for step in range(_POINT_STEPS + 1):
+        if step > 0:
+            point = plus(point, -1.0, _solve(s.L, (s.left[0], s.left[1], s.left[2])))
+        if not _linearise(track, focal, point, s, step == 0):
+            return BEHIND
+    s.point[0], s.point[1], s.point[2] = point
+    total = _ridge() * point[2] * point[2]
+    for n in range(count):
+        total += s.e[n, 0] * s.e[n, 0] + s.e[n, 1] * s.e[n, 1]
+    return total
+
+
+@compiled
+def _ridge() -> float:
+    return (_UNCERTAIN / _ROUGH_RHO) ** 2
+
+
+@compiled
+def _first_point(track: FloatArray, s: Scratch) -> Vector:
+    """The point of the first end's ray and of the inverse depth that all others show; fills G and b."""
+    v, x = s.views, (track[0, 0], track[0, 1], 1.0)
+    R, p = v.R[0], (v.p[0, 0], v.p[0, 1], v.p[0, 2])
+    centre = plus(p, -1.0, apply_transposed(R, (track[0, 9], 0.0, 0.0)))
+    above, below = 0.0, _ridge() / 1e4
+    for n in range(len(track)):
+        for i in range(3):
+            for j in range(3):
+                s.G[n, i, j] = v.R[n, i, 0] * R[j, 0] + v.R[n, i, 1] * R[j, 1] + v.R[n, i, 2] * R[j, 2]
+        b = plus(
+            apply(v.R[n], plus(centre, -1.0, (v.p[n, 0], v.p[n, 1], v.p[n, 2]))), track[n, 9], (1.0, 0.0, 0.0)
+        )
+        s.b[n, 0], s.b[n, 1], s.b[n, 2] = b
+        a = apply(s.G[n], x)
+        for i in range(2):
+            factor = b[i] - track[n, i] * b[2]
+            above += factor * (track[n, i] * a[2] - a[i])
+            below += factor * factor
+    return x[0], x[1], above / below
+
+
+@compiled
+def _linearise(track: FloatArray, focal: FloatArray, point: Vector, s: Scratch, weigh: bool) -> bool:
+    """Fill errors, their derivatives by the point and the factor of its normal matrix; False behind a camera.
+
+    ``weigh`` fills W too.
+    """
+    rho, v = point[2], s.views
+    s.N[:, :] = 0.0
+    s.N[2, 2] = _ridge()
+    s.left[0], s.left[1], s.left[2] = 0.0, 0.0, _ridge() * rho
+    for n in range(len(track)):
+        b = (s.b[n, 0], s.b[n, 1], s.b[n, 2])
+        P = plus(apply(s.G[n], (point[0], point[1], 1.0)), rho, b)
+        if not P[2] > _NEAREST:
+            return False
+        s.P[n, 0], s.P[n, 1], s.P[n, 2] = P
+        if weigh:
+            body = plus(P, -rho * track[n, 9], (1.0, 0.0, 0.0))
+            along = apply(v.R[n], (v.speed[n, 0], v.speed[n, 1], v.speed[n, 2]))
+            rate = plus(cross((v.spin[n, 0], v.spin[n, 1], v.spin[n, 2]), body), -rho, along)
+            _fill_weight(track[n], _flow(P, rate, focal), s.W[n])
+        W = s.W[n]
+        e = (focal[0] * (track[n, 0] - P[0] / P[2]), focal[1] * (track[n, 1] - P[1] / P[2]))
+        s.e[n, 0], s.e[n, 1] = W[0, 0] * e[0] + W[0, 1] * e[1], W[1, 0] * e[0] + W[1, 1] * e[1]
+        for j in range(3):
+            q = b if j == 2 else (s.G[n, 0, j], s.G[n, 1, j], s.G[n, 2, j])
+            d = _flow(P, q, focal)
+            s.D[n, 0, j], s.D[n, 1, j] = -W[0, 0] * d[0] - W[0, 1] * d[1], -W[1, 0] * d[0] - W[1, 1] * d[1]
+        for i in range(3):
+            s.left[i] += s.D[n, 0, i] * s.e[n, 0] + s.D[n, 1, i] * s.e[n, 1]
+            for j in range(i + 1):
+                s.N[i, j] += s.D[n, 0, i] * s.D[n, 0, j] + s.D[n, 1, i] * s.D[n, 1, j]
+    return _factor(s.N, s.L)
+
+
+@compiled
+def _flow(P: Vector, rate: Vector, focal: FloatArray) -> tuple[float, float]:
+    """How the ideal pixel of P moves when P moves by ``rate``."""
+    return (
+        focal[0] * (rate[0] - P[0] / P[2] * rate[2]) / P[2],
+        focal[1] * (rate[1] - P[1] / P[2] * rate[2]) / P[2],
+    )
+
+
+@compiled
+def _fill_weight(end: FloatArray, flow: tuple[float, float], W: FloatArray) -> None:
+    """W = (L - v s^T)^-1: the ideal pixel moves by L, the prediction by its velocity times the time's slope s."""
+    a, b = end[3] - flow[0] * end[7], end[4] - flow[0] * end[8]
+    c, d = end[5] - flow[1] * end[7], end[6] - flow[1] * end[8]
+    det = a * d - b * c
+    if not abs(det) > 1e-3:  # the image overtakes its own readout
+        a, b, c, d, det = 1.0, 0.0, 0.0, 1.0, 1.0
+    W[0, 0], W[0, 1], W[1, 0], W[1, 1] = d / det, -b / det, -c / det, a / det
+
+
+@compiled
+def _factor(N: FloatArray, L: FloatArray) -> bool:
+    """Lower Cholesky factor (3, 3) of N; False when the ends do not determine the point."""
+    for i in range(3):
+        for j in range(i + 1):
+            total = N[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j:
+                if not total > 1e-14 * N[i, i]:
+                    return False
+                L[i, i] = math.sqrt(total)
+            else:
+                L[i, j] = total / L[j, j]
+    return True
+
+
+@compiled
+def _solve(L: FloatArray, g: Vector) -> Vector:
+    """N^-1 g."""
+    a = _forward(L, g)
+    z = a[2] / L[2, 2]
+    y = (a[1] - L[2, 1] * z) / L[1, 1]
+    return (a[0] - L[1, 0] * y - L[2, 0] * z) / L[0, 0], y, z
+
+
+@compiled
+def _forward(L: FloatArray, g: Vector) -> Vector:
+    """L^-1 g."""
+    x = g[0] / L[0, 0]
+    y = (g[1] - L[1, 0] * x) / L[1, 1]
+    return x, y, (g[2] - L[2, 0] * x - L[2, 1] * y) / L[2, 2]
+
+
+@compiled
+def _add_track(
+    track: FloatArray, focal: FloatArray, s: Scratch, weight: float, band: FloatArray, gradient: FloatArray
+) -> None:
+    """Normal equations without the point: H = Dc^T Dc - Q N^-1 Q^T with Q = Dc^T Dp."""
+    low, high = s.views.index[0], s.views.index[0]
+    for n in range(len(track)):
+        low, high = min(low, s.views.index[n]), max(high, s.views.index[n])
+    size = 6 * (high - low + 4)
+    H, Q, g = s.H, s.Q, s.g
+    for i in range(size):
+        g[i] = Q[i, 0] = Q[i, 1] = Q[i, 2] = 0.0
+        for j in range(i + 1):
+            H[i, j] = 0.0
+    for n in range(len(track)):
+        _fill_block(track[n], n, focal, s)
+        first = 6 * (s.views.index[n] - low)
+        for i in range(24):
+            a, b = s.block[0, i], s.block[1, i]
+            g[first + i] += a * s.e[n, 0] + b * s.e[n, 1]
+            for j in range(3):
+                Q[first + i, j] += a * s.D[n, 0, j] + b * s.D[n, 1, j]
+            for j in range(i + 1):
+                H[first + i, first + j] += a * s.block[0, j] + b * s.block[1, j]
+    _reduce(s, size, weight, 6 * low, band, gradient)
+
+
+@compiled
+def _fill_block(end: FloatArray, n: int, focal: FloatArray, s: Scratch) -> None:
+    """Derivatives of the errors of an end by its four control poses."""
+    v, W, P, rho = s.views, s.W[n], (s.P[n, 0], s.P[n, 1], s.P[n, 2]), s.point[2]
+    body = plus(P, -rho * end[9], (1.0, 0.0, 0.0))
+    by_pose = s.work[0], s.work[1]
+    for axis in range(3):
+        unit = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0)
+        along = (v.R[n, 0, axis], v.R[n, 1, axis], v.R[n, 2, axis])
+        turned, shifted = _flow(P, cross(unit, body), focal), _flow(P, times(-rho, along), focal)
+        for i in range(2):
+            by_pose[0][i, axis] = -W[i, 0] * turned[0] - W[i, 1] * turned[1]
+            by_pose[1][i, axis] = -W[i, 0] * shifted[0] - W[i, 1] * shifted[1]
+    for j in range(4):
+        for i in range(2):
+            row = (by_pose[0][i, 0], by_pose[0][i, 1], by_pose[0][i, 2])
+            chained = apply_transposed(v.turn[n, j], row)
+            for k in range(3):
+                s.block[i, 6 * j + k] = chained[k]
+                s.block[i, 6 * j + 3 + k] = by_pose[1][i, k] * v.share[n, j]
+
+
+@compiled
+def _reduce(s: Scratch, size: int, weight: float, first: int, band: FloatArray, gradient: FloatArray) -> None:
+    """Add the weighted equations (size) to the band from unknown ``first`` on, without the point."""
+    Q = s.Q
+    for i in range(size):
+        q = _forward(s.L, (Q[i, 0], Q[i, 1], Q[i, 2]))
+        Q[i, 0], Q[i, 1], Q[i, 2] = q
+    best = _forward(s.L, (s.left[0], s.left[1], s.left[2]))
+    for j in range(size):
+        gradient[first + j] += weight * (s.g[j] - Q[j, 0] * best[0] - Q[j, 1] * best[1] - Q[j, 2] * best[2])
+        for i in range(j, size):
+            reduced = s.H[i, j] - Q[i, 0] * Q[j, 0] - Q[i, 1] * Q[j, 1] - Q[i, 2] * Q[j, 2]
+            band[first + j, i - j] += weight * reduced

@@ -1,0 +1,167 @@
+"""The trajectory of a sequence without end: some frames at a time, in memory that stays the same.
+
+What matches say that leave the memory is kept as a quadratic cost of the control poses that stay (marginalisation:
+G. Sibley, L. Matthies, G. Sukhatme, Sliding window filter with application to planetary landing, J. Field Robotics
+2010). Knots and the memory of the prior are those of the first frames; its variances follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from rsbench.capture.trajectory_choice import choose
+from rsbench.capture.trajectory_data import Past, TimedTracks, pack_windows
+from rsbench.capture.trajectory_estimate import TrajectoryOptions, is_supported, noise_px
+from rsbench.capture.trajectory_fit import ANCHORED, Fit, fit, held, normal_equations
+from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, part, span_of
+from rsbench.capture.trajectory_start import continued, first_curve, window_motions
+from rsbench.core.correspondences import BoolArray, Correspondences
+from rsbench.core.motion import Motion
+from rsbench.core.rig import StereoRig
+from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+
+_ADVANCE, _LAG = 4, 6
+"""Windows that leave together, and those behind them that they wait for."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StreamedWindow:
+    """Two successive frames of a sequence; all that is said of them is final."""
+
+    number: int
+    motion: ContinuousMotion
+    """Seen from the body at the start of the first frame, which is time 0; right for both frames."""
+    body_from_world: Pose
+    """Of that time; the world is the body at time 0 of the sequence."""
+    inliers: BoolArray
+    """(n,) which tracks are right."""
+    supported: bool
+    """Whether its own tracks carry it; else the spline bridges it."""
+    noise_px: float
+
+
+def stream_trajectory(
+    windows: Iterable[Correspondences],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motions: Iterable[Motion | None] | None = None,
+    options: TrajectoryOptions | None = None,
+) -> Iterator[StreamedWindow]:
+    """As ``estimate_trajectory``, for windows that come one after the other.
+
+    Args:
+        motions: of each window, to begin with; None: they are searched.
+    """
+    options = options or TrajectoryOptions()
+    given = None if motions is None else iter(motions)
+    state = _State(rig, shutter, options)
+    for window in windows:
+        motion = window_motions([window], rig, shutter, options.seed)[0] if given is None else next(given)
+        state.add(window, motion)
+        if len(state.windows) == _ADVANCE + _LAG:
+            found, tracks = state.solve()
+            yield from state.told(found, tracks, _ADVANCE)
+            state.leave(found, tracks, _ADVANCE)
+    if state.windows:
+        yield from state.told(*state.solve(), len(state.windows))
+
+
+class _State:
+    """What is remembered: the windows since the last that left, and what those said that have."""
+
+    def __init__(self, rig: StereoRig, shutter: RollingShutter, options: TrajectoryOptions) -> None:
+        self.rig, self.shutter, self.options = rig, shutter, options
+        self.windows, self.motions = list[Correspondences](), list[Motion | None]()
+        self.first = self.fresh = 0
+        self.curve: Curve | None = None
+        self.past: Past | None = None
+        self.fit: Fit | None = None
+
+    def add(self, window: Correspondences, motion: Motion | None) -> None:
+        self.windows.append(window)
+        self.motions.append(motion)
+        self.fresh += 1
+
+    def _pack(self, count: int, right: Sequence[FloatArray] | None = None) -> TimedTracks:
+        return pack_windows(self.windows[:count], self.rig, self.shutter, right, self.first, self.past)
+
+    def solve(self) -> tuple[Fit, TimedTracks]:
+        """The spline of all that is remembered."""
+        count, options = len(self.windows), self.options
+        tracks = self._pack(count)
+        last = span_of(self.first + count, self.shutter)[1]
+        if self.curve is None or self.fit is None:
+            curve = first_curve(self.motions, tracks, span_of(count, self.shutter), options.intervals[0])
+            found = fit(curve, tracks, options.prior, options.learn)
+            found = choose(found, tracks, options.intervals) if options.learn else found
+        else:
+            start = self.first + count - self.fresh
+            ahead = self.motions[count - self.fresh :]
+            curve = continued(self.curve, ahead, start, last) if ahead else self.curve
+            found = fit(curve, tracks, self.fit.prior, options.learn, self.fit.tails)
+        if options.link:
+            tracks = self._pack(count, [found.trust[each] for each in tracks.members])
+            found = fit(found.curve, tracks, found.prior, options.learn, found.tails)
+        return found, tracks
+
+    def told(self, found: Fit, tracks: TimedTracks, count: int) -> Iterator[StreamedWindow]:
+        """The first so many windows."""
+        start, end = span_of(1, self.shutter)
+        for k in range(count):
+            inliers = found.trust[tracks.members[k]][: len(self.windows[k].tracks)] > 0.0
+            number = self.first + k
+            yield StreamedWindow(
+                number=number,
+                motion=ContinuousMotion.of(part(found.curve, number + start, number + end, float(number))),
+                body_from_world=evaluate(found.curve, float(number))[0],
+                inliers=inliers,
+                supported=is_supported(inliers),
+                noise_px=noise_px(found.tails),
+            )
+
+    def leave(self, found: Fit, tracks: TimedTracks, count: int) -> None:
+        """Forget the first so many windows, but for what they say of those that stay."""
+        right = [found.trust[each] for each in tracks.members[:count]]
+        gone = self._pack(count, right if self.options.link else None)
+        trust = np.zeros(len(gone))
+        for members, each in zip(gone.members, right, strict=True):
+            trust[members] = each
+        curve = found.curve
+        stays = self.first + count + span_of(0, self.shutter)[0]
+        drop = max(int(np.floor((stays - curve.first) / curve.interval + 1e-9)), 0)
+        self.past = _marginal(found, gone, trust, drop)
+        first = curve.first + drop * curve.interval
+        self.curve = make_curve(first, curve.interval, curve.R[drop:], curve.p[drop:])
+        self.fit = found
+        self.windows, self.motions = self.windows[count:], self.motions[count:]
+        self.first, self.fresh = self.first + count, 0
+
+
+def _marginal(found: Fit, gone: TimedTracks, trust: FloatArray, drop: int) -> Past:
+    """What tracks say of the control poses from number ``drop`` on, whatever those before are."""
+    curve, smooth = found.curve, found.prior.smooth
+    equations = normal_equations(curve, gone, found.tails, found.prior, trust, until=drop)
+    band = held(equations, curve, gone, ANCHORED)
+    latest = np.floor((gone.span[1] - curve.first) / curve.interval)
+    known = 0 if gone.past is None else len(gone.past.p)
+    count = min(max(int(np.max(latest, initial=0)) + 4, drop + smooth + 2, known), len(curve.p))
+    m, size = 6 * drop, 6 * count
+    H = np.zeros((size, size))
+    for i in range(band.shape[1]):
+        rows = np.arange(max(size - i, 0))
+        H[rows + i, rows] = H[rows, rows + i] = band[: len(rows), i]
+    gradient = equations.gradient[:size]
+    solved = scipy.linalg.cho_solve(scipy.linalg.cho_factor(H[:m, :m]), np.column_stack([H[:m, m:], gradient[:m]]))
+    reduced = H[m:, m:] - H[m:, :m] @ solved[:, :-1]
+    return Past(
+        R=curve.R[drop:count],
+        p=curve.p[drop:count],
+        gradient=gradient[m:] - H[m:, :m] @ solved[:, -1],
+        H=0.5 * (reduced + reduced.T),
+    )

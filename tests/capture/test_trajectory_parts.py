@@ -1,0 +1,149 @@
+"""The parts of a trajectory's estimate against differences and brute force."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy
+from scipy.spatial.transform import Rotation
+from shaken_rig import RIG, SHUTTER, matches, sines
+
+from rsbench.capture import trajectory_banded as banded
+from rsbench.capture.trajectory_choice import approximated
+from rsbench.capture.trajectory_data import pack_windows
+from rsbench.capture.trajectory_fit import normal_equations
+from rsbench.capture.trajectory_kernels import Tails
+from rsbench.capture.trajectory_poses import blank_views, fill_views
+from rsbench.capture.trajectory_prior import Prior, roughness, whitening
+from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, moved
+from rsbench.components.motion_models import motion_record, read_motion
+from rsbench.core.motion import LinearMotion
+from rsbench.core.so3 import FloatArray
+
+
+def wild(rng: np.random.Generator, controls: int = 9) -> Curve:
+    """A spline that turns far."""
+    R = Rotation.from_rotvec(0.3 * rng.normal(size=(controls, 3))).as_matrix()
+    return make_curve(-0.4, 0.6, R, 0.3 * rng.normal(size=(controls, 3)))
+
+
+def differences(of: Callable[[Curve], FloatArray], curve: Curve, step: float) -> FloatArray:
+    """Central differences (..., 6 controls) by the control poses."""
+    out = []
+    for unit in np.eye(6 * len(curve.p)):
+        out.append((of(moved(curve, step * unit)) - of(moved(curve, -step * unit))) / (2.0 * step))
+    return np.stack(out, axis=-1)
+
+
+def test_poses_and_their_derivatives_by_the_control_poses() -> None:
+    curve = wild(np.random.default_rng(0))
+    taus = np.linspace(curve.first, curve.last, 17)
+    views = blank_views(len(taus))
+    fill_views(curve, taus, views)
+    (R, t), spin, speed = evaluate(curve, taus)
+    np.testing.assert_allclose(views.R, R, atol=1e-14)
+    np.testing.assert_allclose(views.p, -np.einsum("nji,nj->ni", R, t), atol=1e-14)
+    np.testing.assert_allclose(views.spin, spin, atol=1e-14)
+    np.testing.assert_allclose(views.speed, speed, atol=1e-14)
+
+    def turned(other: Curve) -> FloatArray:
+        return Rotation.from_matrix(evaluate(other, taus)[0].R @ np.swapaxes(R, 1, 2)).as_rotvec()
+
+    ours = np.zeros((len(taus), 3, len(curve.p), 6))
+    for k, i in enumerate(views.index):
+        ours[k, :, i : i + 4, :3] = np.swapaxes(views.turn[k], 0, 1)
+    # A step of 1e-6 leaves 1e-12 of truncation and 1e-10 of rounding.
+    np.testing.assert_allclose(ours.reshape(len(taus), 3, -1), differences(turned, curve, 1e-6), atol=1e-8)
+
+
+def test_the_spline_runs_through_its_velocity_and_goes_on_at_it() -> None:
+    motion = ContinuousMotion.of(wild(np.random.default_rng(1)))
+    tau, step = np.linspace(-1.0, 5.0, 31), 1e-5
+    (before, t0), (after, t1) = (motion.body_from_world(tau + each) for each in (-step, step))
+    spin, speed = motion.velocity(tau)
+    turn = Rotation.from_matrix(after @ np.swapaxes(before, 1, 2)).as_rotvec() / (2.0 * step)
+    # Jumps of the third derivative at knots: 1e-5 of them.
+    np.testing.assert_allclose(turn, spin, atol=1e-4)
+    np.testing.assert_allclose((t1 - t0) / (2.0 * step), speed, atol=1e-4)
+    R, t = motion.body_from_world(0.0)
+    np.testing.assert_allclose(R, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(t, 0.0, atol=1e-14)
+
+
+def test_a_motion_is_read_back_as_it_was_written() -> None:
+    motion = ContinuousMotion.of(wild(np.random.default_rng(2)))
+    again = read_motion(motion_record(motion))
+    np.testing.assert_allclose(again.body_from_world(1.7).t, motion.body_from_world(1.7).t, atol=1e-15)
+
+
+def test_the_gradient_of_the_tracks_and_of_the_prior() -> None:
+    rng = np.random.default_rng(3)
+    law = sines(rng, 1.0, 0.15, 0.45)
+    windows, _ = matches(law, 3, rng, outliers=0.0, count=12)
+    curve = approximated(LinearMotion([0.02, -0.01, 0.01], [0.1, 0.0, -0.1]).body_from_world, (0.0, 2.8), 0.5)
+    # A global shutter: the weights of pixels, which the gradient takes as given, do not depend on the motion.
+    tracks = pack_windows(windows, RIG, SHUTTER)
+    still = tracks.ends.copy()
+    still[:, 7:9] = 0.0
+    tracks = replace(tracks, ends=still)
+    everything, prior, tails = np.ones(len(tracks)), Prior(0.5, 2, 1e-3, 1e-3), Tails(4.0, 2.0)
+
+    def cost(other: Curve) -> FloatArray:
+        return np.array(normal_equations(other, tracks, tails, prior, everything, False).cost)
+
+    ours = normal_equations(curve, tracks, tails, prior, everything).gradient
+    wanted = differences(cost, curve, 1e-6)
+    # Points are found to 1e-3 px of errors of some pixels, which they lower to first order only.
+    np.testing.assert_allclose(ours, wanted, atol=2e-3 * np.max(np.abs(wanted)))
+
+
+@pytest.mark.parametrize("smooth", [1, 2])
+def test_the_prior_whitens_accelerations_that_forget(smooth: int) -> None:
+    """Its weights undo the covariance of the autoregression that they mean, by brute force."""
+    interval, memory, count = 0.5, 0.8, 9
+    rho = np.exp(-interval / memory)
+    long = 4000  # the autoregression's answer to one push, until it is 0
+    push = np.zeros(long)
+    push[0] = 1.0
+    answer = scipy.signal.lfilter([1.0], np.poly([rho] * smooth), push)
+    lags = np.array([answer[: long - k] @ answer[k:] for k in range(count)])
+    covariance = scipy.linalg.toeplitz(lags / lags[0])
+    rows = whitening(interval, memory, smooth)
+    W = np.zeros((count, count))
+    for k in range(count):
+        row = rows[min(k, smooth)]
+        W[k, k + 1 - len(row) : k + 1] = row
+    np.testing.assert_allclose(W @ covariance @ W.T * interval**4, np.eye(count), atol=1e-9)
+
+
+def test_roughness_is_that_of_second_differences() -> None:
+    rng = np.random.default_rng(4)
+    p = rng.normal(size=(9, 3))
+    curve = make_curve(0.0, 0.5, np.broadcast_to(np.eye(3), (9, 3, 3)), p)
+    d = np.diff(p, n=2, axis=0)
+    rows = whitening(0.5, 0.7, 2)
+    errors = [rows[0][0] * d[0], rows[1] @ d[:2], *(rows[2] @ d[k : k + 3] for k in range(5))]
+    assert roughness(curve, 0.7, 2, 30).squares[1] == pytest.approx(float(np.sum(np.square(errors))), rel=1e-12)
+
+
+def test_the_inverse_of_a_band() -> None:
+    rng = np.random.default_rng(5)
+    n, width = 40, 7
+    A = np.tril(np.triu(rng.normal(size=(n, n)), -width + 1))
+    dense = A @ A.T + np.eye(n)
+    band = np.stack([np.concatenate([np.diagonal(dense, -i), np.zeros(i)]) for i in range(width)], axis=1)
+    lower = banded.factor(band)
+    inverse = np.linalg.inv(dense)
+    for i in range(width):
+        np.testing.assert_allclose(banded.inverse_band(lower)[: n - i, i], np.diagonal(inverse, -i), rtol=1e-9)
+    assert banded.log_determinant(lower) == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-12)
+
+
+def test_a_window_is_seen_from_its_own_first_row() -> None:
+    motion = ContinuousMotion.of(wild(np.random.default_rng(13)))
+    later = motion.from_time(2.0)
+    R, t = later.body_from_world(0.3)
+    R2, t2 = motion.body_from_world(2.0)
+    np.testing.assert_allclose(R @ R2, motion.body_from_world(2.3).R, atol=1e-14)
+    np.testing.assert_allclose(R @ t2 + t, motion.body_from_world(2.3).t, atol=1e-14)
