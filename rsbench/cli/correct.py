@@ -336,7 +336,7 @@ def _correct_sequence(
 
     from rsbench.cli.console import progress_bar
     from rsbench.core.shutter import Scanning
-    from rsbench.dataset.corrected_frames import fresh_folder, rig_record, write_record
+    from rsbench.dataset.corrected_frames import fresh_folder, rig_record, write_record, write_trajectory
     from rsbench.pipeline.chain import check_cameras
     from rsbench.pipeline.sequence_correction import WINDOWS, correct_sequence, estimate_sequence_capture
 
@@ -356,7 +356,9 @@ def _correct_sequence(
         record = rig_record(rig, shutter, capture, options, offset or 0.0)
         with progress_bar("correcting", max(left.count, 1)) as advance:
             moments = correct_sequence(left, right, rig, ratio, options, offset or 0.0, scanning)
-            record["frames"], cards = _write_moments(folder, moments, left, advance)
+            record["frames"], cards, poses = _write_moments(folder, moments, left, advance)
+        if poses:
+            write_trajectory(folder / "trajectory.csv", poses)
         write_record(folder, record)
         _page(folder, out, shutter, capture, None, cards)
     failed = _told(record["frames"], "reason")
@@ -379,14 +381,15 @@ def _told(frames: list[dict[str, Any]], key: str) -> str:
 
 def _write_moments(
     folder: Path, moments: Any, left: FrameSource, advance: Any
-) -> tuple[list[dict[str, Any]], list[Any]]:
-    """Write every corrected time; returns what motion.json says of each, and some for the page."""
+) -> tuple[list[dict[str, Any]], list[Any], dict[int, Any]]:
+    """Write every corrected time; returns what motion.json says of each, some for the page, and poses by number."""
     from rsbench.dataset.corrected_frames import motion_record, write_frame
     from rsbench.report.corrected_page import card_of
 
     every = max(left.count // _PAGE_FRAMES, 1)
     records: list[dict[str, Any]] = []
     cards: list[Any] = []
+    poses: dict[int, Any] = {}
     moment: CorrectedMoment
     for moment in moments:
         entry: dict[str, Any] = {"number": moment.number}
@@ -403,9 +406,11 @@ def _write_moments(
             if moment.number % every == 0 and len(cards) < _PAGE_FRAMES:
                 title = f"left, frame {moment.number}"
                 cards.append(card_of(title, moment.images["left"], moment.frames["left"]))
+        if moment.pose is not None:
+            poses[moment.number] = moment.pose
         records.append(entry)
         advance(f"frame {moment.number}")
-    return records, cards
+    return records, cards, poses
 
 
 def register(app: typer.Typer) -> None:

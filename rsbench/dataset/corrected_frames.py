@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from rsbench.capture.estimate import Capture
 from rsbench.capture.settle import record_of
+from rsbench.core import so3
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
+from rsbench.core.se3 import Pose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import FoundMotion
-from rsbench.storage.files import read_json, read_png, write_depth, write_json, write_png
+from rsbench.storage.files import read_json, read_png, write_bytes, write_depth, write_json, write_png
 from rsbench.storage.work_folder import HIDDEN, WORK, files_below, named, remove, unknown_files, work_folder
 from rsbench.vision.fusion import Fused, Origin
 
@@ -174,6 +176,20 @@ def rig_record(
         "components": components,
         "mask_values": {origin.name.lower(): value for origin, value in MASK_VALUES.items()},
     }
+
+
+def write_trajectory(path: Path, poses: Mapping[int, Pose]) -> None:
+    """Poses of the body at the starts of frames in TUM's format: lines ``tau tx ty tz qx qy qz qw``.
+
+    Args:
+        poses: body from world, by the frame's number, which is its time in frame periods.
+    """
+    lines = ["# frame periods, metres: the body in the world, which is the body at the start of the first frame"]
+    for number, pose in poses.items():
+        R, position = inverse(pose)
+        a, b, c, d = so3.quaternion(R)
+        lines.append(" ".join(f"{value:.9g}" for value in (number, *position, b, c, d, a)))
+    write_bytes(path, ("\n".join(lines) + "\n").encode())
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> None:

@@ -14,36 +14,26 @@ from rsbench.capture.estimate import Window as Examined
 from rsbench.capture.hypotheses import Known
 from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.scans import GLOBAL
-from rsbench.capture.settle import NoMotionError, known_of, shutter_found
-from rsbench.core.correspondences import Correspondences
+from rsbench.capture.settle import AUTO, NoMotionError, known_of, shutter_found
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.se3 import Pose, compose
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.pipeline.chain import Given, check_cameras, correct_known, find_depth
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, check_alike
-from rsbench.pipeline.frame_depth import Images, Pairs, frame_pair
+from rsbench.pipeline.frame_depth import Images, frame_pair
 from rsbench.pipeline.frame_motion import FoundMotion, match_frames, match_unknown, models_asked, solve_frames
+from rsbench.pipeline.sequence_trajectory import Window, on_one_trajectory
 from rsbench.vision.fusion import Fused
 from rsbench.vision.stereo_matcher import needs_motion
 
 WINDOWS = 8
 """At most, of those by which the shutter is found."""
+_FEWEST_FRAMES = 4
+"""Of a sequence through which a trajectory is fitted: fewer do not show what two frames shake alike."""
 _JUDGED = 3
 """First windows whose rig is looked at; when all of them are refused, so is the sequence."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Window:
-    """What was found for two consecutive frames; ``found`` is None and ``reason`` says why when no motion was."""
-
-    images: Images
-    pairs: Pairs | None
-    """With depth from the other camera; None when the corrector needs none, or it is found with the motion."""
-    found: FoundMotion | None
-    reason: str = ""
-    matches: Correspondences | None = None
-    """None when the corrector needs none, or they were refused."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,6 +49,8 @@ class CorrectedMoment:
     reason: str
     """Why no motion leads from here to the next frame, or why there is no correction; empty when neither is so, or
     when this is the last frame."""
+    pose: Pose | None = None
+    """Body from world at the start of the frame, where a trajectory was found; the world is the first body."""
 
 
 def estimate_sequence_capture(
@@ -143,11 +135,21 @@ def correct_sequence(
     shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
     last: Window | None = None
     number = -1
-    for number, window in enumerate(_windows(left, right, rig, shutter, options, disparity_offset)):
+    windows = _windows(left, right, rig, shutter, options, disparity_offset)
+    if _has_trajectory(left, shutter, options):
+        alone = _windows(left, right, rig, shutter, replace(options, motion_model=None), disparity_offset)
+        windows = on_one_trajectory(alone, rig, shutter, options, disparity_offset)
+    for number, window in enumerate(windows):
         yield _moment(number, 0, [window] if last is None else [window, last], rig, shutter, options)
         last = window
     if last is not None:
         yield _moment(number + 1, 1, [last], rig, shutter, options)
+
+
+def _has_trajectory(left: FrameSource, shutter: RollingShutter, options: CorrectionOptions) -> bool:
+    """Whether one trajectory is fitted to all windows: of four frames and more whose motion model is open."""
+    asked = options.motion_model == AUTO and "motion" in options.corrector.component.spec.needs
+    return asked and shutter.readout_ratio > 0.0 and not 0 < left.count < _FEWEST_FRAMES
 
 
 class _Refusals:
@@ -240,8 +242,20 @@ def _moment(
             return CorrectedMoment(number=number, images=images, frames={}, found=window.found, reason=why)
     frames = {side: fused[side, place] for side in SIDES}
     return CorrectedMoment(
-        number=number, images=images, frames=frames, found=window.found, reason=here.reason if frame == 0 else ""
+        number=number,
+        images=images,
+        frames=frames,
+        found=window.found,
+        reason=here.reason if frame == 0 else "",
+        pose=_pose_at(here, frame),
     )
+
+
+def _pose_at(window: Window, frame: int) -> Pose | None:
+    """Of the body at the start of a frame of a window."""
+    if window.pose is None or window.found is None or frame == 0:
+        return window.pose
+    return compose(window.found.motion.body_from_world(float(frame)), window.pose)
 
 
 def _both(left: FrameSource, right: FrameSource) -> Iterator[dict[Side, NDArray[Any]]]:

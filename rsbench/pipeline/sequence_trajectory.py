@@ -1,0 +1,94 @@
+"""The motion of every window of a sequence from one trajectory through all of them.
+
+Two frames do not show what both shake alike; a sequence does, for its windows overlap. Windows wait until those
+after them have been seen too, some at a time, so that memory does not grow with the length of the footage.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rsbench.capture.rectification import without_offset
+from rsbench.capture.trajectory_stream import StreamedWindow, stream_trajectory
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.motion import Motion
+from rsbench.core.rig import StereoRig
+from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import Images, Pairs
+from rsbench.pipeline.frame_motion import FoundMotion
+from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.engine.robust_motion import RobustEstimate
+from rsbench.solvers.engine.robust_problem import MatchCount
+
+BRIDGED = "few of the matches agree: the motion is that of the trajectory through the frames around"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Window:
+    """What was found for two consecutive frames; ``found`` is None and ``reason`` says why when no motion was."""
+
+    images: Images
+    pairs: Pairs | None
+    """With depth from the other camera; None when the corrector needs none, or it is found with the motion."""
+    found: FoundMotion | None
+    reason: str = ""
+    matches: Correspondences | None = None
+    """None when the corrector needs none, or they were refused."""
+    pose: Pose | None = None
+    """Body from world at the start of the first frame, where a trajectory was found; the world is the first body."""
+
+
+def on_one_trajectory(
+    windows: Iterable[Window], rig: StereoRig, shutter: RollingShutter, options: CorrectionOptions, offset: float
+) -> Iterator[Window]:
+    """Windows with the motion of one trajectory in place of that of each; those without matches are bridged.
+
+    Args:
+        windows: in order; their own motions are where the search starts.
+        offset: px by which disparities are too large.
+    """
+    waiting = deque[Window]()
+
+    def matches() -> Iterator[Correspondences]:
+        for window in windows:
+            waiting.append(window)
+            yield without_offset(window.matches or Correspondences(), offset)
+
+    def starts() -> Iterator[Motion | None]:
+        while True:
+            found = waiting[-1].found
+            yield None if found is None else found.motion
+
+    for streamed in stream_trajectory(matches(), rig, shutter, starts()):
+        window = waiting.popleft()
+        found = _found(window, streamed, options, offset)
+        yield replace(window, found=found, reason="", pose=streamed.body_from_world)
+
+
+def _found(window: Window, streamed: StreamedWindow, options: CorrectionOptions, offset: float) -> FoundMotion:
+    motion, right = streamed.motion, int(np.count_nonzero(streamed.inliers))
+    estimate = MotionEstimate(
+        w=motion.w,
+        d=motion.d,
+        success=True,
+        reason="" if streamed.supported else BRIDGED,
+        metric=True,
+        noise_px=streamed.noise_px,
+    )
+    robust = RobustEstimate(
+        estimate=estimate,
+        inliers={"tracks": streamed.inliers},
+        counts={"tracks": MatchCount(right, len(streamed.inliers))},
+        iterations=0,
+        seconds=0.0,
+        threshold_px=0.0 if window.found is None else window.found.robust.threshold_px,
+    )
+    return FoundMotion(
+        motion=motion, robust=robust, solver=options.solver.name, reference_point="body", disparity_offset=offset
+    )
