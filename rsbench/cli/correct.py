@@ -382,7 +382,7 @@ def _told(frames: list[dict[str, Any]], key: str) -> str:
 def _write_moments(
     folder: Path, moments: Any, left: FrameSource, advance: Any
 ) -> tuple[list[dict[str, Any]], list[Any], dict[int, Any]]:
-    """Write every corrected time; returns what motion.json says of each, some for the page, and poses by number."""
+    """Write every corrected time; returns what motion.json says of each, some for the page, and poses."""
     from rsbench.dataset.corrected_frames import motion_record, write_frame
     from rsbench.report.corrected_page import card_of
 

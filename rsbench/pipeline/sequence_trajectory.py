@@ -41,7 +41,7 @@ class Window:
     matches: Correspondences | None = None
     """None when the corrector needs none, or they were refused."""
     pose: Pose | None = None
-    """Body from world at the start of the first frame, where a trajectory was found; the world is the first body."""
+    """Body from world at the start of its first frame, where a trajectory was found; the world: the first body."""
 
 
 def on_one_trajectory(
@@ -84,7 +84,7 @@ def _found(window: Window, streamed: StreamedWindow, options: CorrectionOptions,
     robust = RobustEstimate(
         estimate=estimate,
         inliers={"tracks": streamed.inliers},
-        counts={"tracks": MatchCount(right, len(streamed.inliers))},
+        counts={"tracks": MatchCount(inliers=right, matches=len(streamed.inliers))},
         iterations=0,
         seconds=0.0,
         threshold_px=0.0 if window.found is None else window.found.robust.threshold_px,
