@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench.components.cards import load_card
 from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import Geometry
 from rsbench.core.moving_objects import poses_of
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, Side, views_of
@@ -33,7 +34,7 @@ from rsbench.dataset.posed_scenes import Build, Built, PosedScenes
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.dataset.sequence_identity import Plan, of_scene, plans_of, with_gloss
-from rsbench.dataset.views import Geometry, ImageView, image_seed
+from rsbench.dataset.views import ImageView, image_seed
 from rsbench.jobs.isolation import EntryFailure
 from rsbench.jobs.process_jobs import finished_jobs
 from rsbench.jobs.workers import Cluster, Workers

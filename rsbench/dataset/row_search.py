@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from rsbench.components.compiled import compiled
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import Geometry
 from rsbench.core.projection import ProjectionStatus, rs_project
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray, hat
-from rsbench.dataset.views import Geometry, ImageView
+from rsbench.dataset.views import ImageView
 
 _SAME = 1e-11
 """Largest difference of entries of a pose: of rotations, and metres."""
