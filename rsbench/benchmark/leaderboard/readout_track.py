@@ -1,0 +1,113 @@
+"""The track that asks for the readout ratio."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from rsbench.benchmark.leaderboard.answers import Answer
+from rsbench.benchmark.leaderboard.frame_inputs import FrameTrack
+from rsbench.benchmark.leaderboard.marking import last, named
+from rsbench.benchmark.leaderboard.running import SolverTrack, seed_of_answer
+from rsbench.benchmark.leaderboard.splits import Split, Truth
+from rsbench.benchmark.leaderboard.submissions import Submission
+from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Row, Score
+from rsbench.capture.readout import estimate_readout_ratio
+from rsbench.core.errors import RsbenchError
+from rsbench.core.track_building import join_stereo
+from rsbench.pipeline.frame_motion import check_readout
+from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.problem import Problem
+from rsbench.solvers.engine.registry import SolverEntry
+from rsbench.solvers.engine.robust_motion import RobustOptions
+from rsbench.solvers.refined import RefinedSolver
+
+AUC_READOUT = {"auc_r10": 0.1, "auc_r02": 0.02}
+"""Thresholds of the areas under the curve of the error, by the name of the column."""
+_WORST = 1.0
+"""Error of a failure: between the two ends of what a ratio can be."""
+_READOUT = (
+    *(
+        Score(
+            key=key,
+            title=f"AUC@{limit:g}",
+            hint=f"area under the curve of the error of the readout ratio to {limit:g}",
+            kind="share",
+            better="higher",
+        )
+        for key, limit in AUC_READOUT.items()
+    ),
+    FAILED,
+    Score(key="e_readout", title="error", hint="median error of the readout ratio", kind="median"),
+    SECONDS,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Readout(Answer):
+    """An answer where the readout ratio is asked."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.success and self.readout_ratio is None:
+            raise ValueError("readout_ratio: a success needs it; a failure says success = false")
+
+
+class ReadoutTrack(FrameTrack, SolverTrack):
+    """The readout ratio, from given matches of rendered frames."""
+
+    name, id = "readout", "readout-1"
+    title = "Readout ratio from given matches of rendered frames"
+    allowed = ("left", "right", "links")
+    given = "matches of the frames by rsbench's SIFT, without the readout ratio"
+    scores = _READOUT
+    error, error_title = "e_readout", "error of the readout ratio"
+    answers = _Readout
+    smoke = ("rs-stereo-refined", "rs-stereo-refined-pairs", ORACLE)
+    smoke_metrics = ("e_readout",)
+    example = MappingProxyType({"readout_ratio": 0.5})
+
+    def true_answer(self, truth: Truth) -> Mapping[str, Any]:
+        return {"readout_ratio": truth.shutter.readout_ratio}
+
+    def check_entry(self, entry: SolverEntry) -> None:
+        solver = entry.solver
+        if not isinstance(solver, RefinedSolver) or solver.spec.shutter != "rolling" or solver.one_camera:
+            raise RsbenchError(
+                f"solver {entry.name!r}: finds no readout ratio; rs-stereo-refined and its variants do"
+            )
+        super().check_entry(entry)
+
+    def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
+        """The readout ratio that explains the matches best; it needs no ``runner``: the solver is one of ours."""
+        solver = entry.solver
+        assert isinstance(solver, RefinedSolver)
+        matches, start = join_stereo(problem.correspondences).correspondences, time.perf_counter()
+        found = estimate_readout_ratio(
+            matches, problem.rig, solver, RobustOptions(), seed_of_answer(problem, entry)
+        )
+        seconds = round(time.perf_counter() - start, 6)
+        try:
+            if found is None:
+                raise RsbenchError("no motion explains the matches at any readout ratio")
+            check_readout(found)
+        except RsbenchError as error:
+            return {"name": problem.name, "success": False, "reason": str(error)[:300], "seconds": seconds}
+        return {"name": problem.name, "readout_ratio": min(found.readout_ratio, 1.0), "seconds": seconds}
+
+    def rows(self, submission: Submission, split: Split) -> list[Row]:
+        return [_row(truth, submission.answers.get(truth.name)) for truth in split.truths]
+
+
+def _row(truth: Truth, answer: Answer | None) -> Row:
+    ratio = None if answer is None or not answer.success else answer.readout_ratio
+    error = _WORST if ratio is None else abs(ratio - truth.shutter.readout_ratio)
+    return {
+        **named(truth, ratio is not None),
+        "e_readout": error,
+        **{name: max(0.0, 1.0 - error / limit) for name, limit in AUC_READOUT.items()},
+        **last(ratio is not None, answer),
+    }
