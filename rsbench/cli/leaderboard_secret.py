@@ -1,4 +1,4 @@
-"""``rsbench leaderboard publish`` and ``score``: test splits of frames that nobody can foresee."""
+"""``rsbench leaderboard publish`` and ``score``: secret test splits of rendered frames."""
 
 from __future__ import annotations
 

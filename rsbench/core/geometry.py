@@ -1,4 +1,4 @@
-"""What travels together through the house: a rig, how its cameras read their lines, and how it moves."""
+"""A moving rig as one object: cameras, shutter and motion, with the objects that it passes."""
 
 from __future__ import annotations
 

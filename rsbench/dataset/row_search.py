@@ -1,4 +1,4 @@
-"""Where a picture sees points that another sees at its pixels: the row equation of ``core.projection``, compiled.
+"""Compiled projection of many points into a picture: the row equation of ``core.projection``.
 
 The poses of a picture are read from a table between whose entries they are cubic. The table is made so fine that
 poses half-way, where a cubic errs most, are those of the motion model to ``_SAME``: some 1e-8 px.

@@ -1,4 +1,4 @@
-"""The pictures of a sequence, what they see where, and from where."""
+"""The pictures of a sequence: their names, poses and times, and projection between them."""
 
 from __future__ import annotations
 

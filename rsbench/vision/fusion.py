@@ -1,4 +1,4 @@
-"""Filling what a corrected frame did not see: from the other camera, from the other frame, at last by a guess.
+"""Filling the holes of a corrected frame: from the other camera, from the other frame, at last by a guess.
 
 A pixel of the target is a hole of the corrected frame for one of three reasons: something hid the place, it lies
 outside the frame, or its depth is unknown. Another image of the same scene may have seen it. Each is warped to the

@@ -1,4 +1,4 @@
-"""Where another view of the rig sees a pixel of a given inverse depth, each line at its own pose.
+"""Reprojection of a pixel of given inverse depth into another view, each line at its own pose.
 
 The plane of constant depth that a pixel looks at maps to the other view by the homography of two rows, that of
 the pixel and that which sees it there; which row that is depends on where the pixel lands, so it is iterated.

@@ -1,4 +1,4 @@
-"""Scores of pictures by parts of their pixels: how far from the reference row they lie, and how textured they are.
+"""Scores of pictures by parts of their pixels: by distance from the reference row, and by texture.
 
 What a part is decides the truth alone, so that all entries are scored on the same pixels.
 """

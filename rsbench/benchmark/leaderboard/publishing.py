@@ -1,4 +1,4 @@
-"""Test splits of rendered frames from a secret text: a part for everybody, and the truth from the text again.
+"""Secret test splits of rendered frames: inputs for everybody, a commitment, and the truth from the secret text.
 
 Announced are a hash of the text, the fingerprint of the split, and a hash of all files of the keeper's dataset. So
 whoever is told the text afterwards can see that it is the announced one, that it makes the same motions, and, by

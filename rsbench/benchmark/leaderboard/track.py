@@ -1,6 +1,6 @@
 """What a track is: its question, what is given, what an answer is, how it is scored, run, and shown on a board.
 
-Each track is one class below ``Track``; ``track_list`` has them all. Its protocol, ``id``, never changes: what would
+Each track is one class below ``Track``; ``track_list`` has all. Its protocol, ``id``, never changes: what would
 change scores is a protocol with another number.
 """
 
