@@ -71,7 +71,7 @@ def flow_errors(sequence: Sequence) -> NDArray[np.float64]:
     """Errors (n,), px, of the flow of all surface pixels of the rolling-shutter frame."""
     depth, grid = sequence.depth("rs", SIDE, FRAME), sequence.rig.camera.pixel_grid()
     geometry = sequence.rig, sequence.shutter, sequence.motion
-    flow = correction_flow(depth, *geometry, SIDE, FRAME)
+    flow = correction_flow(depth, sequence, (SIDE, FRAME))
     points = back_project(*geometry, SIDE, FRAME, grid, depth)
     exact = project_at(sequence.rig, sequence.motion, SIDE, float(FRAME), points)[..., :2] - grid
     return np.asarray(np.linalg.norm(flow - exact, axis=-1)[depth > 0])
@@ -121,8 +121,7 @@ def main() -> None:
     start_backend()
     sequence = next(one for one in read_dataset(arguments.data) if one.name == arguments.sequence)
     rolling, depth = sequence.image("rs", SIDE, FRAME), sequence.depth("rs", SIDE, FRAME)
-    geometry = sequence.rig, sequence.shutter, sequence.motion
-    corrected = correct_frame(rolling, depth, *geometry, SIDE, FRAME, sky_mask=depth == 0)
+    corrected = correct_frame(rolling, depth, sequence, (SIDE, FRAME), sky_mask=depth == 0)
     error, mask = visible(sequence, corrected)
     write = sys.stdout.write
     flow = flow_errors(sequence)

@@ -29,7 +29,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.renderers.backend import start_backend
 from rsbench.renderers.exposure import instant_count, instant_times
 from rsbench.renderers.options import RendererOptions
-from rsbench.renderers.render import Frame, render, render_global
+from rsbench.renderers.render import Frame, LinePoses, render, render_global
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Light, Material, Scene, SceneMesh
 from rsbench.scenes.object_meshes import Body, with_moving
@@ -92,15 +92,15 @@ def kinds(
     def with_objects(count: int) -> Callable[[], Frame]:
         moving = MitsubaScene(with_moving(scene, BODIES[:count]))
         poses = poses_of([MovingObject(np.array(body.position), MOVES) for body in BODIES[:count]], tau)
-        return lambda: render(moving, camera, R, t, options, objects=poses)
+        return lambda: render(moving, camera, LinePoses(R, t, objects=poses), options)
 
     def through(lens: Lens) -> Callable[[], Frame]:
-        return lambda: render(built, replace(camera, lens=lens), R, t, options)
+        return lambda: render(built, replace(camera, lens=lens), LinePoses(R, t), options)
 
     return {
         GLOBAL: lambda: render_global(built, camera, R[0], t[0], options),
-        ROLLING: lambda: render(built, camera, R, t, options),
-        EXPOSED: lambda: render(built, camera, R, t, options, exposed=exposed),
+        ROLLING: lambda: render(built, camera, LinePoses(R, t), options),
+        EXPOSED: lambda: render(built, camera, LinePoses(R, t), options, exposed=LinePoses(*exposed)),
         **{lens.model: through(lens) for lens in LENSES},
         **{f"{count} moving": with_objects(count) for count in range(1, len(BODIES) + 1)},
     }

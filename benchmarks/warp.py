@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.geometry import GivenGeometry
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -56,15 +57,16 @@ def main() -> None:
     shutter = RollingShutter(height=size, readout_ratio=0.8)
     w, d = np.deg2rad(0.4) * np.array([0.6, 1.0, -0.5]), 0.3 * np.array([0.6, -0.4, 0.7])
     motion = LinearMotion(w / np.linalg.norm([0.6, 1.0, -0.5]), d / np.linalg.norm([0.6, -0.4, 0.7]))
+    moving = GivenGeometry(rig, shutter, motion)
     depth = depth_map(size)
     colour = np.random.default_rng(0).random((size, size, 3), dtype=np.float32)
     sys.stdout.write(f"{'frame':<16}{'remap cubic':>14}{'correct':>12}{'ratio':>8}\n")
     for name, image in (("float32 colour", colour), ("uint8 colour", (255 * colour).astype(np.uint8))):
-        corrected = correct_frame(image, depth, rig, shutter, motion, "left", 1)
+        corrected = correct_frame(image, depth, moving, ("left", 1))
         positions = np.nan_to_num(corrected.source_map)
         remap = cpu_ms(lambda: cv2.remap(image, positions, None, cv2.INTER_CUBIC), arguments.repetitions)  # noqa: B023
         correct = cpu_ms(
-            lambda: correct_frame(image, depth, rig, shutter, motion, "left", 1),  # noqa: B023
+            lambda: correct_frame(image, depth, moving, ("left", 1)),  # noqa: B023
             arguments.repetitions,
         )
         sys.stdout.write(f"{name:<16}{remap:>11.1f} ms{correct:>9.1f} ms{correct / remap:>8.2f}\n")

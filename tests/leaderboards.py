@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.splits import Split, points_split
 from rsbench.benchmark.leaderboard.submissions import truth_text
+from rsbench.benchmark.leaderboard.track_list import TRACKS
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
@@ -23,7 +23,7 @@ Line = dict[str, Any]
 
 def small_split(problems: int = 12) -> Split:
     """The first problems of the public split of points."""
-    split = points_split(PROTOCOLS["points"])
+    split = points_split(TRACKS["points"])
     return replace(split, truths=split.truths[:problems])
 
 
@@ -46,7 +46,7 @@ _RIG = StereoRig(camera=PinholeCamera.centred(96, 80, 110.0), baseline=0.3)
 _SHUTTER = RollingShutter(height=80, readout_ratio=0.9)
 _MOTION = LinearMotion(np.array([0.01, 0.02, -0.01]), np.array([0.1, -0.05, 0.08]))
 PLANES = _RIG, _SHUTTER, _MOTION
-TRACKS = ("depth", "correction")
+ASK_PICTURES = ("depth", "correction")
 
 
 def lines_of(path: Path) -> list[Line]:

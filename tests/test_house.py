@@ -36,6 +36,7 @@ DOCS = ROOT / "docs"
 SOURCES = sorted((ROOT / "rsbench").rglob("*.py"))
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
 MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_REPOSITORY_MB = 400, 45, 30
+MAX_ARGUMENTS = 9
 
 in_checkout = pytest.mark.skipif(not (ROOT / ".git").exists(), reason="needs a git checkout")
 
@@ -63,6 +64,27 @@ def test_files_and_functions_are_short() -> None:
             if isinstance(node, ast.FunctionDef) and (lines := _own_lines(node)) > MAX_FUNCTION_LINES:
                 long.append(f"{name}: {node.name}: {lines} lines")
     assert not long, f"files above {MAX_FILE_LINES} lines, functions above {MAX_FUNCTION_LINES}: {long}"
+
+
+def test_what_travels_together_is_one_object() -> None:
+    """Of all functions but those whose keywords a user types, and compiled loops, which take arrays."""
+    many: list[str] = []
+    for path in SOURCES:
+        name = path.relative_to(ROOT)
+        if name.parts[1] in ("api.py", "cli"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.FunctionDef) and not any(
+                "compiled" in ast.unparse(d) for d in node.decorator_list
+            ):
+                given = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
+                count = sum(each.arg not in ("self", "cls") for each in given)
+                if count > MAX_ARGUMENTS and node.name not in _OF_MANY:
+                    many.append(f"{name}: {node.name}: {count} arguments")
+    assert not many, f"functions of more than {MAX_ARGUMENTS} arguments: {many}"
+
+
+_OF_MANY = {"correct_four", "solve_frames"}
 
 
 def _own_lines(function: ast.FunctionDef) -> int:

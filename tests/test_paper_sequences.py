@@ -20,7 +20,7 @@ from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
 from rsbench.renderers import scene as renderer_scene
 from rsbench.renderers.options import RendererOptions
-from rsbench.renderers.render import render
+from rsbench.renderers.render import LinePoses, render
 from rsbench.scenes.model import Scene
 from rsbench.verification import verify_dataset
 
@@ -101,7 +101,7 @@ def test_single_pass_equals_stitched_on_the_paper_frame(shot: tuple[Shot, str]) 
     preset = "default" if integrator == "sunsky" else "path"
     options = replace(load_card(RendererOptions, "renderers", preset), samples=1 if integrator == "path" else 4)
     rows = np.linspace(0, 899, 20).astype(int).tolist()
-    geometry = scene, camera, poses.R, poses.t
+    geometry = scene, camera, LinePoses(*poses)
     whole = render(*geometry, replace(options, method="single-pass"))
     stitched = render(*geometry, replace(options, method="stitched"), rows=rows)
     np.testing.assert_array_equal(whole.image[rows], stitched.image)

@@ -1,4 +1,4 @@
-"""What a result must carry to be made again: versions, machine, seed, inputs, date."""
+"""Provenance of results, by which they can be made again: versions, machine, seed, inputs, date."""
 
 from __future__ import annotations
 

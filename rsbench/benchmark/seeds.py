@@ -1,4 +1,4 @@
-"""Randomness by name: every draw has its own generator, so results do not depend on order or on workers."""
+"""Random generators seeded by name: every draw has its own, so results do not depend on order or on workers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Intervals that hold as often as they say: order statistics for few values, a bootstrap of clusters for many.
+"""Confidence intervals: order statistics for few values, a cluster bootstrap for many.
 
 With few values a percentile bootstrap of the median is too narrow: it never leaves the values drawn. The order
 statistics of independent values bracket the median of what they were drawn from with a probability that the

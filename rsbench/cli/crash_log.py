@@ -1,4 +1,4 @@
-"""What nobody foresaw: one line for the user, and all that helps to mend it in a log of its own."""
+"""Unexpected errors: one line for the user, and the traceback in a log."""
 
 from __future__ import annotations
 

@@ -9,14 +9,13 @@ import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
 from rsbench.cli.component_kinds import complete
-from rsbench.cli.leaderboard_run import load_cards, predict
+from rsbench.cli.leaderboard_run import predict
 from rsbench.cli.leaderboard_tracks import (
     Data,
     Hidden,
     Secret,
     Track,
     Workers,
-    problems_of,
     split_of,
     write_frames_of,
 )
@@ -74,10 +73,10 @@ def export(
     split = split_of(track, data, seed_file, secret)
     check_place(split, out)
     with work_folder(out), progress_bar(f"exporting {split.name}", len(split.truths)) as advance:
-        if data is not None and "images" in split.protocol.allowed:
+        if data is not None and split.track.gives_images:
             write_frames_of(split, data, out)
-        write_inputs(split, _counted(problems_of(split, data, seed_file), advance), out)
-    typer.echo(f"{split.protocol.id}, split {split.name}, {len(split.truths)} problems: {out}")
+        write_inputs(split, _counted(split.track.problems(data, seed_file, len(split.truths)), advance), out)
+    typer.echo(f"{split.track.id}, split {split.name}, {len(split.truths)} problems: {out}")
     typer.echo(f"fingerprint: {split.fingerprint}")
 
 
@@ -89,24 +88,20 @@ def template(
     out: Annotated[Path | None, typer.Option(help="New folder for it; needed where pictures are asked.")] = None,
 ) -> None:
     """Print a file of predictions that is in order: fill in your own."""
-    from rsbench.benchmark.leaderboard.picture_oracles import write_template
-    from rsbench.benchmark.leaderboard.submissions import template_text
-    from rsbench.storage.files import write_bytes
+    import tempfile
 
     split = split_of(track, data, seed_file)
     if out is None:
-        if split.protocol.pictures:
+        if split.track.pictures:
             raise RsbenchError(f"--out: the track {track!r} asks for pictures; name a new folder for the example")
-        typer.echo(template_text(split), nl=False)
+        with tempfile.TemporaryDirectory() as folder:
+            split.track.write_template(split, path := Path(folder) / "predictions.jsonl")
+            typer.echo(path.read_text("utf-8"), nl=False)
         return
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RsbenchError(f"--out {out}: is there already; choose a new folder")
     out.mkdir(parents=True, exist_ok=True)
-    if split.protocol.pictures:
-        path = write_template(split, out)
-    else:
-        path = out / "predictions.jsonl"
-        write_bytes(path, template_text(split).encode())
+    split.track.write_template(split, path := out / "predictions.jsonl")
     typer.echo(str(path))
 
 
@@ -144,7 +139,7 @@ def submit(
     for note in check_submission(file, split).notes:
         typer.echo(f"note: {note}", err=True)
     scored = add(board, file, split, provenance("rsbench leaderboard submit"), replace=replace, workers=workers)
-    _show(board, split.protocol.id, split.name, None, scored.header.method)
+    _show(board, split.track.id, split.name, None, scored.header.method)
 
 
 @board_app.command()
@@ -174,13 +169,11 @@ def run(
     """Run cards on a track, keep what they predict, and score it. An interrupted run goes on there."""
     from rsbench.benchmark.leaderboard.adding import add_all
     from rsbench.benchmark.leaderboard.board import RUN, made_by
-    from rsbench.benchmark.leaderboard.running import Limits
+    from rsbench.benchmark.leaderboard.track import Limits
     from rsbench.benchmark.provenance import provenance
 
     processes, split = chosen_workers(workers, scheduler), split_of(track, data, seed_file, secret)
-    if track == "pose-own":
-        raise RsbenchError(f"track {track!r}: solvers of cards take given matches; run them on the track 'pose'")
-    load_cards(entry, split)  # before anything is written
+    split.track.load(entry)  # before anything is written
     with results_at(board, scheduler) as place:
         files = predict(entry, split, place, data, seed_file, processes, Limits(time_limit, memory))
         with _scoring(split) as step:
@@ -193,7 +186,7 @@ def run(
                 workers=processes,
                 step=step,
             )
-        _show(place, split.protocol.id, split.name, None)
+        _show(place, split.track.id, split.name, None)
 
 
 @board_app.command()
@@ -207,9 +200,9 @@ def show(
 ) -> None:
     """Print the tables of a board."""
     from rsbench.benchmark.leaderboard.board import splits_of
-    from rsbench.benchmark.leaderboard.protocols import protocol_of_track
+    from rsbench.benchmark.leaderboard.track_list import track_of_name
 
-    wanted = None if track is None else protocol_of_track(track).id
+    wanted = None if track is None else track_of_name(track).id
     for protocol, split in splits_of(board):
         if wanted in (None, protocol):
             _show(board, protocol, split, at_most, csv=csv)
@@ -220,24 +213,16 @@ def oracles(track: Track, board: _Board, data: Data = None, seed_file: Secret = 
     """Add the truth and others that know it, as rows without a rank; to correction, frames as they are too."""
     import tempfile
 
-    from rsbench.benchmark.leaderboard.adding import add_all, add_texts
-    from rsbench.benchmark.leaderboard.oracles import bound_text
-    from rsbench.benchmark.leaderboard.picture_oracles import write_oracles
-    from rsbench.benchmark.leaderboard.splits import seed_of
-    from rsbench.benchmark.leaderboard.submissions import truth_text
+    from rsbench.benchmark.leaderboard.adding import add_all
     from rsbench.benchmark.provenance import provenance
 
     split = split_of(track, data, seed_file)
     if not split.public:
         raise RsbenchError(f"split {split.name}: its truth is secret, and would be told as an entry of the board")
     made = provenance("rsbench leaderboard oracles")
-    if split.protocol.pictures:
-        with tempfile.TemporaryDirectory() as folder, _scoring(split) as step:
-            add_all(board, write_oracles(split, Path(folder)), split, made, step=step)
-    else:
-        texts = [truth_text(split), *([bound_text(split, seed_of(None))] if data is None else [])]
-        add_texts(board, texts, split, made)
-    _show(board, split.protocol.id, split.name, "truth")
+    with tempfile.TemporaryDirectory() as folder, _scoring(split) as step:
+        add_all(board, split.track.oracles(split, Path(folder)), split, made, step=step)
+    _show(board, split.track.id, split.name, "truth")
 
 
 @board_app.command()
@@ -287,7 +272,7 @@ def _scoring(split: Split) -> AbstractContextManager[Callable[[str], None]]:
 
     from rsbench.cli.console import progress_bar
 
-    if not split.protocol.pictures:  # the rest takes no time
+    if not split.track.pictures:  # the rest takes no time
         return nullcontext(lambda word: None)
     return progress_bar(f"scoring {split.name}", len(split.truths))
 
@@ -299,9 +284,14 @@ def _counted(problems: Iterator[Problem], advance: object) -> Iterator[Problem]:
 
 
 def _track_of(file: Path) -> str:
-    from rsbench.benchmark.leaderboard.submissions import track_of
+    from rsbench.benchmark.leaderboard.submissions import protocol_of
+    from rsbench.benchmark.leaderboard.track_list import track_of_id
 
-    return track_of(file)
+    protocol, where = protocol_of(file)
+    try:
+        return track_of_id(protocol).name
+    except RsbenchError as error:
+        raise RsbenchError(f"{where}: {error}") from error
 
 
 def _show(
@@ -331,10 +321,10 @@ def _show(
 def _cells(line: Standing) -> dict[str, str]:
     from rsbench.benchmark.statistics import in_words
 
-    primary = line.protocol.primary
+    primary = line.track.primary
     cells = {"method": line.scored.header.method, "rank": line.rank_words}
     cells[primary.title] = in_words(*line.means[primary.key])
-    for score in line.protocol.scores:
+    for score in line.track.scores:
         if score.key in ("flip", "failure"):
             cells[score.title] = f"{100.0 * line.means[score.key][0]:.1f} %"
         elif score.key in ("e_R_deg", "e_T_deg", "e_readout", "abs_rel", "psnr", "epe_px"):

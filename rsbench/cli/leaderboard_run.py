@@ -5,20 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rsbench.cli.leaderboard_tracks import problems_of, write_frames_of
+from rsbench.cli.leaderboard_tracks import write_frames_of
 
 if TYPE_CHECKING:
-    from rsbench.benchmark.leaderboard.running import Limits
     from rsbench.benchmark.leaderboard.splits import Split
+    from rsbench.benchmark.leaderboard.track import Limits
     from rsbench.jobs.workers import Workers
-
-
-def load_cards(cards: list[str], split: Split) -> None:
-    """Raises RsbenchError when one of them is wrong, or is none of the track's kind."""
-    from rsbench.benchmark.leaderboard.picture_running import load_chains
-    from rsbench.benchmark.leaderboard.running import load_entries
-
-    (load_chains if split.protocol.pictures else load_entries)(cards, split.protocol)
 
 
 def predict(
@@ -31,25 +23,21 @@ def predict(
     limits: Limits,
 ) -> list[Path]:
     """Files of predictions of cards, in the hidden folder of the board."""
-    from rsbench.benchmark.leaderboard.picture_running import run_picture_cards
-    from rsbench.benchmark.leaderboard.running import prepare_inputs, run_cards, steps_of
+    from rsbench.benchmark.leaderboard.running import prepare_inputs
     from rsbench.cli.console import progress_bar
     from rsbench.storage.work_folder import work_folder
 
-    steps = len(split.truths) if split.protocol.pictures else steps_of(entry, split, limits)
-    with work_folder(board) as hidden, progress_bar(f"running {split.name}", steps) as advance:
-        place = hidden / "runs" / split.protocol.id / split.name
+    track = split.track
+    with (
+        work_folder(board) as hidden,
+        progress_bar(f"running {split.name}", track.steps(entry, split, limits)) as advance,
+    ):
+        place = hidden / "runs" / track.id / split.name
         place.mkdir(parents=True, exist_ok=True)
         prepare_inputs(
             split,
-            lambda: problems_of(split, data, seed_file),
+            lambda: track.problems(data, seed_file, len(split.truths)),
             place / "inputs",
-            lambda folder: write_frames_of(split, data, folder) if data and split.protocol.pictures else None,
+            lambda folder: write_frames_of(split, data, folder) if data and track.pictures else None,
         )
-        if split.protocol.pictures:
-            files = run_picture_cards(
-                entry, split, place / "inputs", place, workers=workers, limits=limits, step=advance
-            )
-        else:
-            files = run_cards(entry, split, place / "inputs", place, workers=workers, limits=limits, step=advance)
-    return files
+        return track.run(entry, split, place / "inputs", place, workers=workers, limits=limits, step=advance)

@@ -1,4 +1,4 @@
-"""``rsbench leaderboard publish`` and ``score``: test splits of frames that nobody can foresee."""
+"""``rsbench leaderboard publish`` and ``score``: secret test splits of rendered frames."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def publish(
 ) -> None:
     """Render a secret test split, and write its inputs without truth. Run again, it proves what was announced."""
     from rsbench.benchmark.leaderboard import publishing
-    from rsbench.benchmark.leaderboard.protocols import protocol_of_track
+    from rsbench.benchmark.leaderboard.track_list import track_of_name
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.generation import steps_of
     from rsbench.dataset.secret_split import read_secret, secret_card
 
-    protocol, text = protocol_of_track(track), read_secret(seed_file)
+    of_frames, text = track_of_name(track), read_secret(seed_file)
     if track == "points":
         raise RsbenchError("track 'points': has no frames; export and submit take --seed-file themselves")
     for hidden in (keep, seed_file):
@@ -44,7 +44,7 @@ def publish(
             raise RsbenchError(f"{hidden}: lies in {out}, which everybody may see; take another place")
     drawn = secret_card(card, text)
     with progress_bar(f"rendering {drawn.name}", steps_of(drawn) * len(drawn.sequence)) as advance:
-        made = publishing.publish(protocol, card, text, keep, out, workers=workers, progress=advance)
+        made = publishing.publish(of_frames, card, text, keep, out, workers=workers, progress=advance)
     typer.echo(f"{made.protocol}, split {made.split}, {len(drawn.sequence)} sequences: {out}")
     for name in ("commitment", "fingerprint", "truth"):
         typer.echo(f"{name}: {getattr(made, name)}")
@@ -64,15 +64,15 @@ def score(
 ) -> None:
     """Draw the truth of a secret split from its text again, see that it is the announced one, and score."""
     from rsbench.benchmark.leaderboard.adding import add
-    from rsbench.benchmark.leaderboard.protocols import protocol_of_id
     from rsbench.benchmark.leaderboard.publishing import announced_split, read_announcement
     from rsbench.benchmark.leaderboard.submissions import check_submission
+    from rsbench.benchmark.leaderboard.track_list import track_of_id
     from rsbench.benchmark.provenance import provenance
     from rsbench.dataset.secret_split import read_secret
 
     announced = read_announcement(published)
-    protocol, text = protocol_of_id(announced.protocol), read_secret(seed_file)
-    split = announced_split(announced, protocol, card or announced.card, text, keep)
+    track, text = track_of_id(announced.protocol), read_secret(seed_file)
+    split = announced_split(announced, track, card or announced.card, text, keep)
     for note in check_submission(file, split).notes:
         typer.echo(f"note: {note}", err=True)
     made = provenance("rsbench leaderboard score")

@@ -56,8 +56,7 @@ def smoke(
 
     Exit code 1: there is one.
     """
-    from rsbench.benchmark.leaderboard.smoke import read_scores, run_smoke
-    from rsbench.benchmark.leaderboard.smoke_tracks import hashes_of_frames
+    from rsbench.benchmark.leaderboard.smoke import hashes_of_frames, read_scores, run_smoke
     from rsbench.cli.console import progress_bar
     from rsbench.storage.files import check_out
 
@@ -86,12 +85,11 @@ def _jobs(tracks: Sequence[str] | None, entries: Sequence[str] | None) -> list[J
     Raises:
         RsbenchError: no such track, or an entry that none of the tracks has.
     """
-    from rsbench.benchmark.leaderboard.protocols import PROTOCOLS, protocol_of_track
-    from rsbench.benchmark.leaderboard.smoke import Job
-    from rsbench.benchmark.leaderboard.smoke_tracks import ENTRIES
+    from rsbench.benchmark.leaderboard.smoke import ENTRIES, Job
+    from rsbench.benchmark.leaderboard.track_list import TRACKS, track_of_name
     from rsbench.core.errors import RsbenchError
 
-    chosen = [protocol_of_track(track).track for track in dict.fromkeys(tracks or PROTOCOLS)]
+    chosen = [track_of_name(track).name for track in dict.fromkeys(tracks or TRACKS)]
     jobs, taken = list[Job](), set[str]()
     for track in (*reversed(ENTRIES), "points"):
         if track not in chosen:
@@ -124,7 +122,7 @@ def _check_stored(stored: Path, tracks: Sequence[str]) -> None:
 @contextmanager
 def _frames(data: Path | None, tracks: Sequence[str], problems: int | None) -> Iterator[Path | None]:
     """The dataset of the tracks of frames; rendered for as long as this lasts, unless it is there."""
-    from rsbench.benchmark.leaderboard.smoke_tracks import CARD
+    from rsbench.benchmark.leaderboard.smoke import CARD
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import generate_dataset, steps_of

@@ -200,7 +200,7 @@ def _render_right(card: str, name: str, timing: Timing, path: Path) -> None:
     from rsbench.renderers.backend import start_backend
     from rsbench.renderers.image import to_srgb8
     from rsbench.renderers.options import RendererOptions
-    from rsbench.renderers.render import render
+    from rsbench.renderers.render import LinePoses, render
     from rsbench.renderers.scene import MitsubaScene
     from rsbench.scenes.load import load_scene
     from rsbench.storage.files import write_png
@@ -213,6 +213,6 @@ def _render_right(card: str, name: str, timing: Timing, path: Path) -> None:
     rig, shutter, motion = dataset.rig_of(sequence), dataset.shutter_for(sequence), dataset.motion_of(sequence)
     poses = right_row_poses(rig, shutter, motion, timing)
     seen = MitsubaScene(scene.seen_from(scene.viewpoints[sequence.viewpoint]))
-    frame = render(seen, rig.camera, poses.R, poses.t, options)
+    frame = render(seen, rig.camera, LinePoses(poses.R, poses.t), options)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_png(path, to_srgb8(frame.image, options.exposure))

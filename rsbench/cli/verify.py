@@ -1,4 +1,4 @@
-"""``rsbench verify``: whether a dataset is what it says."""
+"""``rsbench verify``: check a dataset against its card, its manifests and itself."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of what people hand to the public functions: one line with the argument, its value and what may be."""
+"""Checks of the arguments of public functions: one line with the argument, its value and what may be."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What installed packages offer, and whose it is; read from disk once, for there are often dozens of them."""
+"""Entry points of installed packages, and whose they are; read from disk once: there may be dozens."""
 
 from __future__ import annotations
 

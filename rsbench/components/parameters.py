@@ -1,4 +1,4 @@
-"""What the parameters of a class are: names, types, defaults and docstrings, for people."""
+"""Parameters of a class: names, types, defaults and docstrings, for people."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A motion whose rotation is what a gyroscope says."""
+"""A motion model whose rotation is integrated from a gyroscope."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an inertial sensor at the rig's body feels: rates of turn and specific forces of a motion, exactly.
+"""Angular rates and specific forces at the rig's body, exactly: what an ideal inertial sensor measures.
 
 The sensor stands at the body's origin with the body's axes: x right, y down, z forward.
 """

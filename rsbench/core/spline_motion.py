@@ -1,4 +1,4 @@
-"""A shaken rig: a cumulative cubic B-spline on SE(3) through given or drawn control poses.
+"""Hand-held motion: a cumulative cubic B-spline on SE(3) through given or drawn control poses.
 
 S. Lovegrove, A. Patron-Perez, G. Sibley, Spline Fusion: a continuous-time representation for visual-inertial
 fusion with application to rolling shutter cameras, BMVC 2013, for the spline; C. Sommer, V. Usenko, D. Schubert,

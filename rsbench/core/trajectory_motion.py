@@ -1,4 +1,4 @@
-"""A rig that goes along given poses: cubic splines through them, at their own times.
+"""Motion through given poses: cubic splines through them, at their own times.
 
 Positions and unit quaternions (of one sign along the way) are interpolated together, component by component, by
 the cubic spline that is twice continuously differentiable (C. de Boor, A Practical Guide to Splines, 1978;

@@ -29,7 +29,7 @@ from rsbench.storage.files import save_arrays
 from rsbench.storage.untrusted_files import load_arrays
 
 if TYPE_CHECKING:  # which reads affine frames
-    from rsbench.dataset.views import Geometry
+    from rsbench.core.geometry import Geometry
     from rsbench.renderers.visibility import Surfaces
 
 

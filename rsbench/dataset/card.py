@@ -14,6 +14,7 @@ from rsbench.components.imports import search
 from rsbench.components.shutters import SHUTTER_KEY, with_shutters
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import GivenGeometry
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
@@ -28,7 +29,6 @@ from rsbench.dataset.sequence_card import CameraCard as CameraCard
 from rsbench.dataset.sequence_card import SequenceCard as SequenceCard
 from rsbench.dataset.sequence_card import Variation as Variation
 from rsbench.dataset.trajectory import TrajectoryCard, parts_along
-from rsbench.dataset.views import GivenGeometry
 from rsbench.renderers.electrons import Sensor, check_brightness
 from rsbench.storage.untrusted_files import check_size
 

@@ -12,12 +12,13 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core.geometry import Geometry
 from rsbench.core.projection import row_poses
 from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import Layer, PixelClass
 from rsbench.dataset.row_search import Reprojected, find
-from rsbench.dataset.views import FAR, Geometry, ImageView, seen_from, times_at
+from rsbench.dataset.views import FAR, ImageView, seen_from, times_at
 from rsbench.renderers.visibility import Surfaces
 
 Blocked = Callable[[FloatArray, FloatArray, FloatArray | None], NDArray[np.bool_]]

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core.geometry import Geometry
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channel_truth import (
     PairTruth,
@@ -31,7 +32,7 @@ from rsbench.dataset.channels import (
     surface_file,
 )
 from rsbench.dataset.object_records import numbers_of
-from rsbench.dataset.views import Geometry, ImageView
+from rsbench.dataset.views import ImageView
 from rsbench.renderers.render import Frame
 from rsbench.renderers.visibility import Surfaces
 from rsbench.storage.background_writer import Later, begun

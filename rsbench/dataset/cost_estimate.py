@@ -1,4 +1,4 @@
-"""What a dataset will take, by trying: one camera's frames of one sequence of each scene."""
+"""Time and space that a dataset will take, by a trial: one camera's frames of one sequence of each scene."""
 
 from __future__ import annotations
 

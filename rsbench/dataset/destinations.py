@@ -1,4 +1,4 @@
-"""Where a dataset lies: a folder of this machine, or a store (``store_destination``)."""
+"""Destinations of a generated dataset: a local folder, or an object store (``store_destination``)."""
 
 from __future__ import annotations
 

@@ -11,13 +11,14 @@ from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.cards import load_card
 from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import Geometry
 from rsbench.core.moving_objects import poses_of
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, Side, views_of
@@ -33,7 +34,7 @@ from rsbench.dataset.posed_scenes import Build, Built, PosedScenes
 from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.dataset.sequence_identity import Plan, of_scene, plans_of, with_gloss
-from rsbench.dataset.views import Geometry, ImageView, image_seed
+from rsbench.dataset.views import ImageView, image_seed
 from rsbench.jobs.isolation import EntryFailure
 from rsbench.jobs.process_jobs import finished_jobs
 from rsbench.jobs.workers import Cluster, Workers
@@ -252,7 +253,7 @@ def render_camera(
             write_mask(folder / view.gloss, rendered.gloss)
         if kind == "rs" and sensor:
             own, period = sensor.of(side, frame), card.period_of(sequence)
-            seen = sensed_rows(scene, rig, shutter, motion, own, period, side, frame, options, objects=things)
+            seen = sensed_rows(scene, geometry, (side, frame), own, period, options)
             write_png(folder / view.image, seen)
         if kind == "rs":
             write_channels(folder, card.channels, geometry, view, rendered, SceneRays(scene, things), later, twins)
@@ -270,7 +271,7 @@ def render_view(
     rows: list[int] | None = None,
 ) -> Frame:
     """A view of a sequence; ``poses`` are those of the lines of its rolling-shutter frame."""
-    from rsbench.renderers.render import render
+    from rsbench.renderers.render import LinePoses, render
 
     shutter = geometry.shutter
     tau, columns = shutter.line_times(view.frame, view.side), shutter.axis(view.side) == 0
@@ -279,8 +280,8 @@ def render_view(
         poses = Pose(np.broadcast_to(poses.R[line], poses.R.shape), np.broadcast_to(poses.t[line], poses.t.shape))
         # No stitching: all rows have one pose, and one time.
         tau, options = np.full(tau.shape, tau[line]), replace(options, method="single-pass")
-    more: Any = {"objects": poses_of(geometry.objects, tau), "columns": columns, "on_gs_frame": on_gs_frame}
-    return render(scene, geometry.rig.camera, *poses, options, rows=rows, **more)
+    lines = LinePoses(*poses, poses_of(geometry.objects, tau), columns)
+    return render(scene, geometry.rig.camera, lines, options, rows=rows, on_gs_frame=on_gs_frame)
 
 
 def _stack_writer(folder: Path, options: RendererOptions) -> Callable[[int, NDArray[np.float32]], None]:

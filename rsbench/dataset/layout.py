@@ -1,4 +1,4 @@
-"""Where the files of a sequence lie below its folder, by its sequence.json."""
+"""Paths of the files of a sequence below its folder, by its sequence.json."""
 
 from __future__ import annotations
 

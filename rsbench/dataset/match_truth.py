@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.correspondences import Correspondences, repeated
+from rsbench.core.geometry import Geometry
 from rsbench.core.projection import ProjectionStatus, rs_project, rs_project_near
 from rsbench.core.rig import VIEWS, View
 from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.core.version import __version__
 from rsbench.dataset.matches import MATCHED, LabelledMatches, MatchClass, Matching
-from rsbench.dataset.views import FAR, Geometry
+from rsbench.dataset.views import FAR
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Images
 from rsbench.pipeline.frame_motion import find_matches_of_rig

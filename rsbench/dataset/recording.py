@@ -1,4 +1,4 @@
-"""What any layout comes down to: images, cameras, and as far as it says, times, poses, depth and disparity.
+"""A recording read from any layout: images, cameras, and as far as it says, times, poses, depth and disparity.
 
 All in the conventions of rsbench: the centre of the top-left pixel is (0, 0), x right, y down, z forward, depth is
 z in the camera of the pixel's own row, poses are ``cam_from_world``. What a layout lacks is None or missing.

@@ -1,4 +1,4 @@
-"""Where a picture sees points that another sees at its pixels: the row equation of ``core.projection``, compiled.
+"""Compiled projection of many points into a picture: the row equation of ``core.projection``.
 
 The poses of a picture are read from a table between whose entries they are cubic. The table is made so fine that
 poses half-way, where a cubic errs most, are those of the motion model to ``_SAME``: some 1e-8 px.
@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from rsbench.components.compiled import compiled
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import Geometry
 from rsbench.core.projection import ProjectionStatus, rs_project
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray, hat
-from rsbench.dataset.views import Geometry, ImageView
+from rsbench.dataset.views import ImageView
 
 _SAME = 1e-11
 """Largest difference of entries of a pose: of rotations, and metres."""

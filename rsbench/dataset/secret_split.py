@@ -1,4 +1,4 @@
-"""Datasets that nobody can foresee: of a card, with scenes, motions, noise, order and names from a secret text.
+"""Secret datasets: of a card, with scenes, motions, noise, order and names from a secret text.
 
 Whoever has the text draws the same card again. What is drawn for one purpose tells nothing of what is drawn for
 another, nor of the text: all are hashes of it, each with a word of its own before it. A text is announced by such

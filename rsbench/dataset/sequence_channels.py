@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rsbench.core.geometry import GivenGeometry
 from rsbench.core.rig import VIEWS, views_of
 from rsbench.dataset.affine import make_affine, save_affine
 from rsbench.dataset.card import DatasetCard, SequenceCard
@@ -14,7 +15,7 @@ from rsbench.dataset.imu import Imu, draw_samples, gravity_of, sample_times_ns, 
 from rsbench.dataset.matches import Matching, save_matches
 from rsbench.dataset.timing import write_timing
 from rsbench.dataset.tracks import make_tracks, write_tracks
-from rsbench.dataset.views import GivenGeometry, ImageView
+from rsbench.dataset.views import ImageView
 from rsbench.storage.files import read_depth, read_png, write_json
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""What decides the bytes of each sequence of a card, and whether a sequence was made from it."""
+"""Identity of a sequence: what of a card decides its bytes, and whether a sequence was made from it."""
 
 from __future__ import annotations
 

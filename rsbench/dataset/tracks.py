@@ -21,7 +21,7 @@ from rsbench.storage.files import save_arrays
 from rsbench.storage.untrusted_files import load_arrays
 
 if TYPE_CHECKING:  # which reads tracks
-    from rsbench.dataset.views import Geometry
+    from rsbench.core.geometry import Geometry
 
 IN_ALL = 2048
 """Points drawn from the pixels of all frames, of each as many."""

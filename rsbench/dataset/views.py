@@ -1,53 +1,26 @@
-"""The pictures of a sequence, what they see where, and from where."""
+"""The pictures of a sequence: their names, poses and times, and projection between them."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator
 from itertools import product
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rsbench.core.motion import Motion
-from rsbench.core.moving_objects import MovingObject, RelativeMotion
+from rsbench.core.geometry import Geometry, GivenGeometry
+from rsbench.core.moving_objects import RelativeMotion
 from rsbench.core.projection import back_project, rs_project_near
-from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
+from rsbench.core.rig import FRAMES, SIDES, Side
 from rsbench.core.se3 import Pose, inverse, transform
-from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.layout import SHUTTERS, Shutter, gloss_file, moving_file, picture_file
 
 _NEAREST = 32
 FAR = 1e7
 """Where the sky is looked for, metres: no motion of a rig moves it by a hundredth of a pixel."""
-
-
-class Geometry(Protocol):
-    """What sees, how it reads and how it moves: a ``Sequence`` is one."""
-
-    @property
-    def rig(self) -> StereoRig: ...
-    @property
-    def shutter(self) -> RollingShutter: ...
-    @property
-    def motion(self) -> Motion: ...
-    @property
-    def frames(self) -> int: ...
-    @property
-    def objects(self) -> tuple[MovingObject, ...]: ...
-
-
-class GivenGeometry(NamedTuple):
-    """A ``Geometry`` before there is a sequence."""
-
-    rig: StereoRig
-    shutter: RollingShutter
-    motion: Motion
-    frames: int = len(FRAMES)
-    objects: tuple[MovingObject, ...] = ()
-    """Those that move by themselves, in the order of their numbers from 1."""
 
 
 def seen_from(geometry: Geometry, number: int) -> GivenGeometry:

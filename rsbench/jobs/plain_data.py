@@ -1,4 +1,4 @@
-"""What a child process sends its parent: plain data, so that the parent runs nothing that comes from there.
+"""Encoding of messages from a child process: plain data, so that the parent runs nothing that comes from there.
 
 A value is None, a truth value, a number, a text, an array, or a tuple, list, dict or dataclass of such. A message
 is its length and an npz file: arrays, and the rest as JSON that refers to them.

@@ -1,4 +1,4 @@
-"""Who does the jobs of a run: child processes of one kind, here or on other machines."""
+"""Workers that do the jobs of a run: child processes of one kind, here or on other machines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the cameras of a rig can go their way: no lens goes through a wall."""
+"""Collision check of a motion: no camera of the rig goes through a wall."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What this machine can render with: everything that may break is tried in a child process."""
+"""Diagnosis of what this machine can render with: everything that may break is tried in a child process."""
 
 from __future__ import annotations
 

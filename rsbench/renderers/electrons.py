@@ -1,4 +1,4 @@
-"""What a sensor makes of light: electrons, their noise, and digital numbers.
+"""Sensor noise model: from light to electrons, their noise, and digital numbers.
 
 The linear model of EMVA 1288 (release 4.0, section 2): light and dark current free a Poisson number of electrons,
 read-out adds Gaussian noise, the gain makes digital numbers of them, which are rounded and clipped. In electrons

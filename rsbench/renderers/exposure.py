@@ -1,4 +1,4 @@
-"""When the samples of a pixel are taken while its row is exposed.
+"""Sample times of a pixel within the exposure of its row.
 
 A row collects light for a while about its row time. The while is cut into instants, midpoints of equal parts: an
 exposed frame is the mean of the frames of its instants, up to the Monte Carlo error of seeing some in a pixel.

@@ -1,4 +1,4 @@
-"""What a ray brings back: ``sunsky``, free of noise, and Mitsuba's ``path`` with its own random numbers."""
+"""Integrators of radiance: ``sunsky``, free of noise, and Mitsuba's ``path`` with its own random numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a renderer card says."""
+"""Options of a renderer, the keys of a renderer card."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the samples of a pixel lie."""
+"""Sub-pixel positions of the samples of a pixel."""
 
 from __future__ import annotations
 

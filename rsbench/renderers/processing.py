@@ -1,4 +1,4 @@
-"""What a camera makes of what its sensor reads: three colours at each pixel, 8-bit codes, and a JPEG image.
+"""Camera processing of a sensor's reading: three colours at each pixel, 8-bit codes, and a JPEG image.
 
 A mosaic is interpolated by OpenCV's edge-aware demosaicing (``COLOR_Bayer..2RGB_EA``) of linear 16-bit numbers: a
 green value is the mean of its two neighbours in the direction in which they differ less, a red or blue one that of

@@ -1,4 +1,4 @@
-"""What rays through pixel centres meet."""
+"""Hits of rays through pixel centres: depth, object and gloss."""
 
 from __future__ import annotations
 

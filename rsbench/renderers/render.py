@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import Pose
-from rsbench.core.so3 import FloatArray
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.ray_hits import Hits
 from rsbench.renderers.scene import MitsubaScene
@@ -42,44 +41,39 @@ class Frame:
     """(rows, width) whether the surface is glossy that the ray through the pixel's centre meets."""
 
 
-class Poses(NamedTuple):
-    """Of the camera and of the objects of a scene that move."""
+class LinePoses(NamedTuple):
+    """Poses of the camera, and of objects that move, while each line of a frame is read or exposed."""
 
-    R: FloatArray
+    R: ArrayLike
     """([instants,] lines, 3, 3) ``cam_from_world``."""
-    t: FloatArray
+    t: ArrayLike
+    """([instants,] lines, 3) metres, ``X_cam = R @ X_world + t``; equal lines make a global shutter."""
     objects: Pose | None = None
-    """(objects, [instants,] lines, ...) ``world_from_object``."""
+    """(objects, [instants,] lines, ...) ``world_from_object`` of the scene's objects that move."""
+    columns: bool = False
+    """Whether lines are columns."""
 
 
 def render(
     scene: MitsubaScene,
     camera: PinholeCamera,
-    rotations: ArrayLike,
-    translations: ArrayLike,
+    poses: LinePoses,
     options: RendererOptions | None = None,
     *,
-    exposed: Pose | None = None,
-    objects: Pose | None = None,
-    exposed_objects: Pose | None = None,
+    exposed: LinePoses | None = None,
     rows: Sequence[int] | None = None,
-    columns: bool = False,
     on_gs_frame: OnGlobalFrame | None = None,
 ) -> Frame:
-    """Render a frame whose every row has its own pose, by ``options.method``.
+    """Render a frame whose every line has its own poses, by ``options.method``.
 
     Args:
         scene: in the world frame of the poses.
         camera: size and intrinsics; the centre of the top-left pixel is (0, 0).
-        rotations: (height, 3, 3) ``cam_from_world`` of each row.
-        translations: (height, 3) metres, ``X_cam = R @ X_world + t``; equal rows make a global shutter.
+        poses: of each line at its time.
         options: a renderer card; the default one when absent.
-        exposed: poses (instants, height) of each row while it collects light, see ``exposure``; the image is their
-            mean, the depth that of the row poses. The number of instants is a multiple of ``options.samples``.
-        objects: poses (objects, height) of the scene's objects that move, ``world_from_object``, at row times.
-        exposed_objects: (objects, instants, height) likewise at those of ``exposed``.
+        exposed: of each line at instants while it collects light, see ``exposure``; the image is their mean, the
+            depth that of ``poses``. The number of instants is a multiple of ``options.samples``.
         rows: render only these rows of the full frame, with the bits that they have in it.
-        columns: every column has its own pose instead: ``rotations`` and ``translations`` have as many.
         on_gs_frame: ``stitched`` with ``full_frames`` calls it with each row and its global-shutter image
             (height, width, 3), so that the stack can be kept as the paper keeps it.
 
@@ -90,15 +84,14 @@ def render(
     if on_gs_frame is not None and not (options.method == "stitched" and options.full_frames):
         raise RsbenchError("on_gs_frame needs renderer method = 'stitched' and full_frames = true")
     chosen = _checked_rows(rows, camera.height)
-    row_poses = Poses(np.asarray(rotations, np.float64), np.asarray(translations, np.float64), objects)
-    image_poses = row_poses if exposed is None else Poses(*exposed, exposed_objects)
-    for poses in (row_poses, image_poses):
-        _check_objects(scene, poses.objects, options)
-    if exposed is not None and len(exposed.R) % options.samples:
-        raise RsbenchError(f"{len(exposed.R)} instants: a multiple of the {options.samples} samples is needed")
+    image_poses = poses if exposed is None else exposed._replace(columns=poses.columns)
+    for each in (poses, image_poses):
+        _check_objects(scene, each.objects, options)
+    if exposed is not None and (instants := len(np.asarray(exposed.R))) % options.samples:
+        raise RsbenchError(f"{instants} instants: a multiple of the {options.samples} samples is needed")
     if options.method == "single-pass":
-        return _single_pass(scene, camera, row_poses, image_poses, options, chosen, columns)
-    return _stitched(scene, camera, row_poses, image_poses, options, chosen, columns, on_gs_frame)
+        return _single_pass(scene, camera, (image_poses, poses), options, chosen)
+    return _stitched(scene, camera, (image_poses, poses), options, chosen, on_gs_frame)
 
 
 def render_global(
@@ -118,22 +111,21 @@ def render_global(
     if R.shape != (3, 3) or t.shape != (3,):
         raise RsbenchError(f"camera pose has shapes {R.shape} and {t.shape}: (3, 3) and (3,) are needed")
     rows = range(camera.height)
-    poses = Poses(np.broadcast_to(R, (camera.height, 3, 3)), np.broadcast_to(t, (camera.height, 3)))
+    poses = LinePoses(np.broadcast_to(R, (camera.height, 3, 3)), np.broadcast_to(t, (camera.height, 3)))
     _check_objects(scene, None, options)
-    return _single_pass(scene, camera, poses, poses, options, rows)
+    return _single_pass(scene, camera, (poses, poses), options, rows)
 
 
 def _single_pass(
     scene: MitsubaScene,
     camera: PinholeCamera,
-    row_poses: Poses,
-    image_poses: Poses,
+    poses: tuple[LinePoses, LinePoses],
     options: RendererOptions,
     rows: Sequence[int],
-    columns: bool = False,
 ) -> Frame:
+    """``poses`` are those of the image and those of the depth, as of ``_stitched``."""
     tracer = _tracer()
-    image_sensor, row_sensor = (make_sensor(camera, *each, columns=columns) for each in (image_poses, row_poses))
+    image_sensor, row_sensor = (_sensor(camera, each) for each in poses)
     image = tracer.radiance_rows(scene, image_sensor, camera, rows, options)
     return Frame(image=image, **tracer.depth_rows(scene, row_sensor, camera, rows)._asdict())
 
@@ -141,11 +133,9 @@ def _single_pass(
 def _stitched(
     scene: MitsubaScene,
     camera: PinholeCamera,
-    row_poses: Poses,
-    image_poses: Poses,
+    poses: tuple[LinePoses, LinePoses],
     options: RendererOptions,
     rows: Sequence[int],
-    columns: bool,
     on_gs_frame: OnGlobalFrame | None,
 ) -> Frame:
     """One global-shutter camera per row. Without ``full_frames`` only the kept row of each is traced.
@@ -153,11 +143,11 @@ def _stitched(
     The pixels of that row keep their index in the full frame, hence their random numbers, and their neighbours in
     a packet, hence their rounding: they have the bits of the whole image. Of columns, all rows are traced.
     """
-    tracer = _tracer()
-    sensors = [make_sensor(camera, *poses, columns=columns) for poses in (image_poses, row_poses)]
+    tracer, columns = _tracer(), poses[0].columns
+    sensors = [_sensor(camera, each) for each in poses]
     tables = [
         [pose_table(camera, each.R, each.t, columns), *object_tables(camera, each.objects, columns)]
-        for each in (image_poses, row_poses)
+        for each in poses
     ]
     image = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
     hits = Hits.none(len(rows), camera.width)
@@ -176,6 +166,10 @@ def _stitched(
         if on_gs_frame is not None:
             on_gs_frame(line, gs_image)
     return Frame(image=image, **hits._asdict())
+
+
+def _sensor(camera: PinholeCamera, poses: LinePoses) -> Any:
+    return make_sensor(camera, poses.R, poses.t, poses.objects, columns=poses.columns)
 
 
 def _check_objects(scene: MitsubaScene, objects: Pose | None, options: RendererOptions) -> None:

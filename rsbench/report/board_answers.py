@@ -18,22 +18,22 @@ DEPTH_PX, FRAME_LEVELS = 3.0, 64.0
 """Errors that have the last colour: of disparity, and of the mean over the colours in 8-bit levels."""
 ERRORS = {
     "depth": f"error, 0 (dark) to {DEPTH_PX:g} px of disparity or more (bright); grey: unknown, or no surface",
-    "frames": f"difference, 0 (dark) to {FRAME_LEVELS:g} of 255 levels or more (bright); grey: not drawn",
+    "correction": f"difference, 0 (dark) to {FRAME_LEVELS:g} of 255 levels or more (bright); grey: not drawn",
 }
 Named = tuple[str, str, Image]
 """Stem of the file, words, picture."""
 
 
-def true_images(asks: str, pictures: TruePictures) -> Iterator[Named]:
+def true_images(track: str, pictures: TruePictures) -> Iterator[Named]:
     """The truth of all that is asked."""
     for each in pictures.asked:
-        if asks == "depth":
+        if track == "depth":
             yield each.stem, "true depth", _depth_image(pictures.depth(), pictures.depth())
         else:
             yield each.stem, f"true frame, {_row(each.stem)}", pictures.frame(each.row)
 
 
-def answer_images(asks: str, entry: Scored, truth: Truth) -> Iterator[Named]:
+def answer_images(track: str, entry: Scored, truth: Truth) -> Iterator[Named]:
     """What an entry handed in for a problem, and where that errs; nothing of a failure.
 
     Raises:
@@ -45,7 +45,7 @@ def answer_images(asks: str, entry: Scored, truth: Truth) -> Iterator[Named]:
     if not bool(scores.loc[scores["problem"] == truth.name, "success"].all()):
         return
     for each in pictures.asked:
-        if asks == "depth":
+        if track == "depth":
             depth = read_answer_depth(folder, truth, entry.header.png_unit_m)
             yield each.stem, method, _depth_image(depth, pictures.depth())
             yield f"{each.stem}-error", f"{method}, error", depth_error_image(depth, pictures)

@@ -57,7 +57,7 @@ def _oracles(each: Board, line: Standing) -> list[Standing]:
 
 def _scores(line: Standing) -> list[dict[str, str]]:
     found = [{"title": "rank", "text": line.rank_words, "hint": "among those that use no more"}]
-    for score in line.protocol.scores:
+    for score in line.track.scores:
         if score.kind == "share":
             text = in_words(*line.means[score.key])
         else:
@@ -68,27 +68,27 @@ def _scores(line: Standing) -> list[dict[str, str]]:
 
 
 def _by(each: Board, line: Standing, name: str, kinds: pd.Series) -> dict[str, Any]:
-    scores, protocol, rows = line.scored.scores, each.protocol, list[list[object]]()
+    scores, track, rows = line.scored.scores, each.track, list[list[object]]()
     for kind, part in scores.groupby(kinds.astype(str).to_numpy()):
-        value, low, high = score_interval(part[protocol.primary.key].to_numpy(), list(part["scene"]))
+        value, low, high = score_interval(part[track.primary.key].to_numpy(), list(part["scene"]))
         # One scene bounds nothing: an interval of it would only round its value away.
         share = f"{value:.3g}" if part["scene"].nunique() == 1 else in_words(value, low, high)
-        medians = (part[key].median() for key in protocol.of_kind("median")[:BRIEF])
+        medians = (part[key].median() for key in track.of_kind("median")[:BRIEF])
         rows.append([str(kind), len(part), share, *(f"{x:.3g}" for x in medians), int(part["failure"].sum())])
     return {
         "title": f"By {fact_title(name)}",
-        "columns": [fact_title(name), "problems", protocol.primary.title, *brief_medians(protocol), "failed"],
+        "columns": [fact_title(name), "problems", track.primary.title, *brief_medians(track), "failed"],
         "rows": rows,
     }
 
 
 def _worst(each: Board, line: Standing, album: Album) -> dict[str, Any]:
-    protocol = each.protocol
-    worst = line.scored.scores.sort_values([protocol.error, "problem"], ascending=[False, True]).head(_WORST)
+    track = each.track
+    worst = line.scored.scores.sort_values([track.error, "problem"], ascending=[False, True]).head(_WORST)
     names = [str(name) for name in each.facts.columns]
     rows = []
     for case in worst.to_dict("records"):
-        numbers = [f"{case[key]:.3g}" for key in protocol.of_kind("median")[:BRIEF]]
+        numbers = [f"{case[key]:.3g}" for key in track.of_kind("median")[:BRIEF]]
         known = [each.facts[name].get(case["problem"], "") for name in names]
         words = [f"{value:.3g}" if isinstance(value, float) else str(value) for value in known]
         problem = str(case["problem"])
@@ -101,7 +101,7 @@ def _worst(each: Board, line: Standing, album: Album) -> dict[str, Any]:
                 "cells": [*numbers, *words],
             }
         )
-    return {"columns": [*brief_medians(protocol), *map(fact_title, names)], "rows": rows}
+    return {"columns": [*brief_medians(track), *map(fact_title, names)], "rows": rows}
 
 
 def _calibration(line: Standing) -> dict[str, Any] | None:

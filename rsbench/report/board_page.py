@@ -15,8 +15,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rsbench.benchmark.leaderboard.board import splits_of
 from rsbench.benchmark.leaderboard.calibration import LEVELS, named_numbers
-from rsbench.benchmark.leaderboard.protocols import KNOWLEDGE, Score
 from rsbench.benchmark.leaderboard.standings import Standing
+from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Score
 from rsbench.benchmark.statistics import in_words
 from rsbench.report.board_entry import entry_context
 from rsbench.report.board_figures import bar
@@ -75,7 +75,7 @@ def _section(each: Board) -> dict[str, Any]:
         **each.named,
         "count": len(each.problems),
         "scenes": len(set(each.scenes)),
-        "given": each.protocol.given,
+        "given": each.track.given,
         "files": [(suffix, f"{each.id}.{suffix}") for suffix in ("csv", "md", "tex")],
         "knowledge": [name for name in KNOWLEDGE if name in used],
         "columns": _columns(each),
@@ -110,7 +110,7 @@ def _columns(each: Board) -> list[dict[str, Any]]:
 
 def _scores(each: Board) -> list[Score]:
     """In the order of the cells: shares, then medians."""
-    return sorted(each.protocol.scores, key=lambda score: score.kind == "median")
+    return sorted(each.track.scores, key=lambda score: score.kind == "median")
 
 
 def _stated(each: Board) -> bool:
@@ -118,7 +118,7 @@ def _stated(each: Board) -> bool:
 
 
 def _row(each: Board, line: Standing) -> dict[str, Any]:
-    header, rank, primary = line.scored.header, line.rank, line.protocol.primary.key
+    header, rank, primary = line.scored.header, line.rank, line.track.primary.key
     cells: list[dict[str, Any]] = [
         {"value": "" if rank is None else rank.place, "text": line.rank_words, "bar": None}
     ]

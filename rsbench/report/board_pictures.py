@@ -48,7 +48,7 @@ class Album:
     @property
     def errors(self) -> str:
         """What the colours of error maps mean; nothing where there are none."""
-        return ERRORS.get(self._each.protocol.asks, "") if self._sequences else ""
+        return ERRORS.get(self._each.track.name, "") if self._sequences else ""
 
     def thumb(self, problem: str) -> str:
         """Path from the folder of the index, or nothing."""
@@ -79,7 +79,7 @@ class Album:
     def _groups(self, problem: str) -> Iterator[list[Named]]:
         """What stands or falls together: frames with the truth, then each entry, the best first."""
         assert self._split is not None
-        sequence, truth, asks = self._sequences[problem], self._split.by_name[problem], self._each.protocol.asks
+        sequence, truth, track = self._sequences[problem], self._split.by_name[problem], self._each.track.name
         frames = [sequence.image("rs", "left", frame) for frame in (0, 1)]
         self._write(problem, "thumb.jpg", encode_jpeg(shrink(frames[0], _THUMB), _QUALITY))
         first = [(f"left_{k}", f"rolling-shutter frame {k}", image) for k, image in enumerate(frames)]
@@ -88,11 +88,11 @@ class Album:
             return
         yield [
             *first,
-            *((f"true-{stem}", words, image) for stem, words, image in true_images(asks, truth.pictures)),
+            *((f"true-{stem}", words, image) for stem, words, image in true_images(track, truth.pictures)),
         ]
         for line in self._each.by_score:
             method = line.scored.header.method
-            answer = answer_images(asks, line.scored, truth)
+            answer = answer_images(track, line.scored, truth)
             yield [(f"{method}/{stem}", words, image) for stem, words, image in answer]
 
     def _write(self, problem: str, name: str, data: bytes) -> None:
@@ -118,11 +118,11 @@ def _at_hand(each: Board, data: Sequence[Path]) -> tuple[Split | None, Path | No
     if each.pages and not each.facts.empty:
         for folder in data:
             try:
-                split = dataset_split(each.protocol, folder)
+                split = dataset_split(each.track, folder)
             except RsbenchError:
                 if not (folder / "dataset.json").is_file():
                     raise
-                continue  # of cameras that this protocol does not ask
+                continue  # of cameras that this track does not ask
             if split.fingerprint == each.fingerprint:
                 return split, folder
     return None, None

@@ -17,7 +17,7 @@ _SHADES = 5
 
 def matrix_context(each: Board, album: Album) -> dict[str, Any]:
     """Of the template board_problems.html.j2: a row for each problem, a column for each entry."""
-    errors = np.stack([line.scored.scores[each.protocol.error].to_numpy(dtype=np.float64) for line in each.lines])
+    errors = np.stack([line.scored.scores[each.track.error].to_numpy(dtype=np.float64) for line in each.lines])
     failed = np.stack([line.scored.scores["failure"].to_numpy() > 0.0 for line in each.lines])
     names = [str(name) for name in each.facts.columns]
     shades = _shades(errors)
@@ -69,7 +69,7 @@ def problem_contexts(each: Board, album: Album) -> Iterator[tuple[str, dict[str,
                 "before": before,
                 "after": after,
                 "facts": [(fact_title(str(n)), _fact(each, str(n), problem)["text"]) for n in each.facts.columns],
-                "columns": [{"title": score.title, "hint": score.hint} for score in each.protocol.scores],
+                "columns": [{"title": score.title, "hint": score.hint} for score in each.track.scores],
                 "rows": [_row(each, line, k) for line in each.lines],
                 "place": f"../pictures/{problem}",
                 "pictures": album.pictures(problem),
@@ -83,7 +83,7 @@ def _row(each: Board, line: Standing, k: int) -> dict[str, Any]:
     scores = line.scored.scores.iloc[k]
     cells = [
         "–" if np.isnan(value) else f"{value:.3g}"
-        for value in (float(scores[score.key]) for score in each.protocol.scores)
+        for value in (float(scores[score.key]) for score in each.track.scores)
     ]
     method = line.scored.header.method
     return {"method": method, "page": f"../{method}.html", "oracle": line.rank is None, "cells": cells}

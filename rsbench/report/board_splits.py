@@ -13,25 +13,19 @@ import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.leaderboard.board import about_split, entries_of, place
-from rsbench.benchmark.leaderboard.picture_parts import PARTINGS, TITLES, columns
-from rsbench.benchmark.leaderboard.protocols import Protocol, protocol_of_id
+from rsbench.benchmark.leaderboard.picture_parts import PARTINGS, columns
+from rsbench.benchmark.leaderboard.picture_track import PictureTrack
 from rsbench.benchmark.leaderboard.standings import Standing, standings
+from rsbench.benchmark.leaderboard.track import Track
+from rsbench.benchmark.leaderboard.track_list import track_of_id
 from rsbench.report.board_figures import ErrorLine, curves, drawable, legend
-
-_ERRORS = {
-    "error_deg": "max(e_R, e_T) in degrees",
-    "e_readout": "error of the readout ratio",
-    "bad_1": "bad@1",
-    "error": "1 - SSIM",
-}
-"""What figures call the column of scores.csv that they draw."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Board:
     """A split with its lines, and what is told of its problems."""
 
-    protocol: Protocol
+    track: Track
     split: str
     fingerprint: str
     lines: list[Standing]
@@ -43,7 +37,7 @@ class Board:
     @property
     def id(self) -> str:
         """Of its part of the index, of its files, and of the folder of its pages."""
-        return f"{self.protocol.id}--{self.split}"
+        return f"{self.track.id}--{self.split}"
 
     @property
     def secret(self) -> bool:
@@ -68,7 +62,7 @@ class Board:
     @property
     def pages(self) -> bool:
         """Whether its problems have pages: simulated ones, of which nothing is to be seen, have a row."""
-        return self.problem_pages and self.protocol.track != "points" and not self.secret
+        return self.problem_pages and self.track.name != "points" and not self.secret
 
     def page_of(self, problem: str) -> str:
         """Where a problem is told, from the folder of the index."""
@@ -79,10 +73,10 @@ class Board:
         """Words of its own, for all pages."""
         return {
             "id": self.id,
-            "title": self.protocol.title,
-            "protocol": self.protocol.id,
+            "title": self.track.title,
+            "protocol": self.track.id,
             "split": self.split,
-            "primary": self.protocol.primary.title,
+            "primary": self.track.primary.title,
             "error": self.error,
             "problems": "" if self.secret else f"{self.id}--problems.html",
         }
@@ -90,7 +84,7 @@ class Board:
     @property
     def error(self) -> str:
         """What figures draw."""
-        return _ERRORS.get(self.protocol.error, self.protocol.error)
+        return self.track.error_title
 
     def known(self) -> list[tuple[str, pd.Series]]:
         """What is known of the problems, in their order: numbers and words, each with its name, and the scene."""
@@ -100,7 +94,7 @@ class Board:
     @property
     def by_score(self) -> list[Standing]:
         """Lines that have a rank, the best first, whatever they use."""
-        primary = self.protocol.primary
+        primary = self.track.primary
         ranked = [line for line in self.lines if line.rank is not None]
         return sorted(ranked, key=lambda line: -primary.sign * line.means[primary.key][0])
 
@@ -115,9 +109,11 @@ class Board:
 
     def figures_within(self, lines: Sequence[Standing]) -> dict[str, Any]:
         """Errors of some of its lines in parts of the pictures, where stored scores have them."""
-        asks, drawn, shown = self.protocol.asks, list[dict[str, Any]](), list[ErrorLine]()
-        for parting in PARTINGS if self.protocol.pictures and not self.secret else ():
-            names = columns(asks, parting)
+        track, drawn, shown = self.track, list[dict[str, Any]](), list[ErrorLine]()
+        if not isinstance(track, PictureTrack):
+            return {"legend": legend(shown), "drawn": drawn, "error": ""}
+        for parting in () if self.secret else PARTINGS:
+            names = columns(track.part_score, parting)
             having = [line for line in lines if set(names) <= set(line.scored.scores)]
             if not having:
                 continue
@@ -133,10 +129,10 @@ class Board:
             if svg is not None:
                 drawn.append({"title": parting.title, "svg": svg})
                 shown = drawable(found)
-        return {"legend": legend(shown), "drawn": drawn, "error": TITLES.get(asks, "")}
+        return {"legend": legend(shown), "drawn": drawn, "error": track.part_title}
 
     def _line(self, line: Standing) -> ErrorLine:
-        errors = line.scored.scores[self.protocol.error].to_numpy(dtype=np.float64)
+        errors = line.scored.scores[self.track.error].to_numpy(dtype=np.float64)
         return ErrorLine(line.scored.header.method, errors, line.rank is None)
 
 
@@ -148,7 +144,7 @@ def read_split(board: Path, protocol: str, split: str) -> Board:
     """
     about = about_split(place(board, protocol, split))
     return Board(
-        protocol=protocol_of_id(protocol),
+        track=track_of_id(protocol),
         split=split,
         fingerprint=about.fingerprint,
         lines=standings(entries_of(board, protocol, split)),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rsbench.benchmark.leaderboard.protocols import Protocol
 from rsbench.benchmark.leaderboard.standings import Standing, table
+from rsbench.benchmark.leaderboard.track import Track
 from rsbench.benchmark.statistics import in_words
 
 BRIEF = 2
@@ -31,16 +31,16 @@ def as_latex(lines: Sequence[Standing]) -> str:
     return "\n".join([begin, r"\toprule", head, r"\midrule", *rows, r"\bottomrule", end, ""])
 
 
-def brief_medians(protocol: Protocol) -> list[str]:
+def brief_medians(track: Track) -> list[str]:
     """Titles of the most telling ones."""
-    return [score.title for score in protocol.scores if score.kind == "median"][:BRIEF]
+    return [score.title for score in track.scores if score.kind == "median"][:BRIEF]
 
 
 def _brief(lines: Sequence[Standing]) -> list[list[str]]:
-    protocol = lines[0].protocol
-    rows = [["method", "uses", "rank", protocol.primary.title, "failed", *brief_medians(protocol)]]
+    track = lines[0].track
+    rows = [["method", "uses", "rank", track.primary.title, "failed", *brief_medians(track)]]
     for line in lines:
-        shares = [in_words(*line.means[key]) for key in (protocol.primary.key, "failure")]
-        medians = [f"{line.medians[key]:.3g}" for key in protocol.of_kind("median")[:BRIEF]]
+        shares = [in_words(*line.means[key]) for key in (track.primary.key, "failure")]
+        medians = [f"{line.medians[key]:.3g}" for key in track.of_kind("median")[:BRIEF]]
         rows.append([line.scored.header.method, line.uses, line.rank_words, *shares, *medians])
     return rows

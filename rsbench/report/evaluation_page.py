@@ -275,7 +275,7 @@ def draw_sequence(sequence: Sequence, folder: Path, chosen: dict[str, str]) -> D
         "global": (truth, "Global-shutter truth at row 0's pose"),
         "rolling-over-global": (
             pictures.overlay(rolling, truth),
-            "Rolling-shutter frame (red) over the truth (cyan): colour is distortion",
+            "Rolling-shutter frame (red) over the truth (cyan): colours show the distortion",
         ),
     }
     return (

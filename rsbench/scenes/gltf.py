@@ -1,4 +1,4 @@
-"""What trimesh passes over in a glTF header: extensions that it cannot decode, and transforms of textures."""
+"""Parts of a glTF header that trimesh ignores: extensions that it cannot decode, and transforms of textures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a mesh file would unfold to, by what it states of itself, before trimesh reads it."""
+"""Limits of mesh files: the size that a file states, checked before trimesh reads it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a model of the user's stands: its size and place, the ground below it and walls around."""
+"""Placement of a user's model: its size and place, the ground below it and walls around."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a wrong depth map is instead: candidates are tried against the maps of its partners."""
+"""Causes of a wrong depth map: candidates are tried against the maps of its partners."""
 
 from __future__ import annotations
 

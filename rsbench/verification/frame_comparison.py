@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.geometry import Geometry
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import FAR, Geometry, ImageView, Seen, points_of, seen_by, seen_from
+from rsbench.dataset.views import FAR, ImageView, Seen, points_of, seen_by, seen_from
 
 DEPTH_TOLERANCE = 1e-4
 """Relative difference of two depths of one surface point that still agree."""

@@ -1,4 +1,4 @@
-"""What a wrong image is instead: candidates are tried against what its partners show."""
+"""Causes of a wrong image: candidates are tried against what its partners show."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What dataset.json, its card, each sequence.json and the folders say of each other."""
+"""Checks of dataset.json, its card, each sequence.json and the folders against each other."""
 
 from __future__ import annotations
 

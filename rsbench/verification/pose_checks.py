@@ -1,4 +1,4 @@
-"""Row poses: what the motion says, as unit quaternions of the documented sign."""
+"""Row poses against the motion: unit quaternions of the documented sign, at the row times."""
 
 from __future__ import annotations
 

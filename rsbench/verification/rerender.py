@@ -288,20 +288,10 @@ def _frame_checks(
     with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
         if sequence.sensor is not None and view.image not in reported:
             seen = Picture.of(view, sequence.image(*view[:3]), noisy=False)
-            geometry = sequence.rig, sequence.shutter, sequence.motion
             sensor = sequence.sensor.of(view.side, view.frame)
             some = rows[::_COMPRESSED] if sensor.jpeg_quality and len(rows) < sequence.shutter.height else rows
-            sensed = sensed_rows(
-                scene,
-                *geometry,
-                sensor,
-                sequence.frame_period_s,
-                view.side,
-                view.frame,
-                chosen,
-                some,
-                sequence.objects,
-            )
+            period = sequence.frame_period_s
+            sensed = sensed_rows(scene, sequence, (view.side, view.frame), sensor, period, chosen, some)
             yield image_check(view.image, seen, sensed, some, elsewhere)
     with contextlib.suppress(RsbenchError):
         if whole_frames(sequence.manifest):
@@ -313,7 +303,7 @@ def _stack_check(
 ) -> Check:
     """Of whole frames at the poses of some rows, other rows: each of these rows at the pose of another."""
     from rsbench.renderers.image import to_srgb8
-    from rsbench.renderers.render import render
+    from rsbench.renderers.render import LinePoses, render
 
     sequence, of = content.sequence, rows[::-1]
     seen = Picture.of(view, stack_rows(sequence, view, rows, of), noisy=False)
@@ -322,7 +312,8 @@ def _stack_check(
     )
     tau = sequence.shutter.line_times(view.frame, view.side).copy()
     R[rows], t[rows], tau[rows] = R[of], t[of], tau[of]
-    frame = render(scene, sequence.rig.camera, R, t, chosen, objects=poses_of(sequence.objects, tau), rows=rows)
+    poses = LinePoses(R, t, poses_of(sequence.objects, tau))
+    frame = render(scene, sequence.rig.camera, poses, chosen, rows=rows)
     rendered = to_srgb8(frame.image, chosen.exposure)
     noisy = chosen.integrator == "path" and not _made_here(content)
     return image_check(f"gs_stack/{view.side}_{view.frame}", seen, rendered, rows, noisy)

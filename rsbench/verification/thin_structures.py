@@ -8,9 +8,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core.geometry import Geometry
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.object_records import numbers_of
-from rsbench.dataset.views import Geometry, ImageView
+from rsbench.dataset.views import ImageView
 from rsbench.verification.frame_comparison import DepthMap, seen_with
 
 _NEAR = 5e-3

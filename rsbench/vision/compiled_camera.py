@@ -32,6 +32,22 @@ class Optics(NamedTuple):
     """Whether lines, each read at one time, are columns."""
 
 
+class LineMaps(NamedTuple):
+    """Of each line of a frame its map of ideal pixels to another camera's, with the optics of both.
+
+    Homogeneous target pixel = M_y (x, y, 1) + b_y / depth, and the target has the lens of the source.
+    """
+
+    M: FloatArray
+    """(lines, 3, 3)."""
+    b: FloatArray
+    """(lines, 3) px m."""
+    ideal: Table
+    """Of ``Optics``, as the next two."""
+    lens: Table
+    columns: bool
+
+
 @lru_cache(maxsize=4)
 def optics_of(camera: PinholeCamera, columns: bool = False) -> Optics:
     """The camera for compiled loops."""
@@ -49,7 +65,8 @@ def _ideal_pixels(camera: PinholeCamera) -> FloatArray:
     return np.ascontiguousarray(camera.ideal_pixels(camera.pixel_grid()))
 
 
-@compiled(error_model="numpy", inline="always")
+# Not inlined by Numba, which would then not leave out the branch of what is None: LLVM inlines them.
+@compiled(error_model="numpy")
 def look(ideal: Table, x: int, y: int) -> tuple[float, float]:
     """Ideal pixel of a pixel of the image."""
     if ideal is None:
@@ -57,7 +74,7 @@ def look(ideal: Table, x: int, y: int) -> tuple[float, float]:
     return ideal[y, x, 0], ideal[y, x, 1]
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(error_model="numpy")
 def see(lens: Table, u: float, v: float) -> tuple[float, float]:
     """Pixel at which the camera sees what it would see at an ideal pixel without its lens; NaN for none."""
     if lens is None:

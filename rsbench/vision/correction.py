@@ -20,14 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import Motion
+from rsbench.core.geometry import MovingRig
 from rsbench.core.projection import row_poses
-from rsbench.core.rig import Side, StereoRig
+from rsbench.core.rig import Side, View
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision import forward_warp
-from rsbench.vision.compiled_camera import optics_of
+from rsbench.vision.compiled_camera import LineMaps, optics_of
 from rsbench.vision.resample import Interpolation, resample
 
 _IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
@@ -51,6 +51,22 @@ class WarpOptions:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class LineView:
+    """A frame each of whose lines has a pose of its own."""
+
+    image: NDArray[Any]
+    """(H, W) or (H, W, C) of uint8, uint16 or float32."""
+    depth: NDArray[Any]
+    """(H, W) z in each line's own camera, metres; inf is infinitely far, 0, negative or NaN unknown."""
+    poses: Pose
+    """``cam_from_world`` of every line, (lines, 3, 3) and (lines, 3)."""
+    camera: PinholeCamera | None = None
+    """Where it is not the target's: a rig whose disparities are off has two principal points. None with a lens."""
+    columns: bool = False
+    """Whether lines are columns."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Corrected:
     """A frame as one camera at one time would have seen it."""
 
@@ -64,17 +80,22 @@ class Corrected:
     """(H, W) z in the target camera, metres; inf at infinity, NaN where the mask is False."""
 
 
-def relative_row_maps(
-    camera: PinholeCamera, source_poses: Pose, target_pose: Pose, source_camera: PinholeCamera | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """``M`` (lines, 3, 3) and ``b`` (lines, 3) px m: homogeneous target pixel = M_y (x, y, 1) + b_y / depth.
+def line_maps(
+    camera: PinholeCamera,
+    source_poses: Pose,
+    target_pose: Pose,
+    columns: bool = False,
+    source_camera: PinholeCamera | None = None,
+) -> LineMaps:
+    """Where the pixels of a frame, one pose per line, lie in ``camera`` at the target pose.
 
-    Pixels are ideal ones. ``source_poses`` are ``cam_from_world`` of every line, ``target_pose`` of the target
-    camera. ``source_camera`` is the frame's when it is another one.
+    Poses are ``cam_from_world``, of every line and of the target; either may be the one that has lines.
+    ``source_camera`` is the frame's when it is another one, of the same lens.
     """
     R, t = compose(target_pose, inverse(source_poses))
     K = camera.ideal.K
-    return K @ R @ np.linalg.inv((source_camera or camera).ideal.K), t @ K.T
+    M = K @ R @ np.linalg.inv((source_camera or camera).ideal.K)
+    return LineMaps(M, t @ K.T, *optics_of(camera, columns))
 
 
 def warp_gain(camera: PinholeCamera, source_poses: Pose, target_pose: Pose, columns: bool = False) -> FloatArray:
@@ -94,38 +115,30 @@ def inverse_depth(depth: NDArray[Any], sky_mask: NDArray[np.bool_] | None = None
 
 
 def warp(
-    image: NDArray[Any],
-    depth: NDArray[Any],
+    view: LineView,
     camera: PinholeCamera,
-    source_poses: Pose,
     target_pose: Pose,
     *,
     sky_mask: NDArray[np.bool_] | None = None,
     options: WarpOptions | None = None,
-    source_camera: PinholeCamera | None = None,
-    columns: bool = False,
 ) -> Corrected:
-    """Warp a frame with one pose per line to any pose of the same camera model; z-buffered.
+    """Warp a frame with one pose per line to any pose (3, 3), (3,) of the same camera model; z-buffered.
 
-    ``image`` (H, W) or (H, W, C) of uint8, uint16 or float32; ``depth`` (H, W) is z in each line's own camera,
-    metres: inf is infinitely far, and 0, negative or NaN unknown, unless ``sky_mask`` (H, W) puts the pixel at
-    infinity. Poses are ``cam_from_world``, (lines, 3, 3) and (lines, 3), and (3, 3) and (3,); lines are rows, or
-    ``columns``. ``source_camera``, of the same size and lens, is the frame's where its principal point is another
-    one; there is none with a lens. Raises ValueError on other shapes or types.
+    Pixels under ``sky_mask`` (H, W) are infinitely far. Raises ValueError on other shapes or types.
     """
     options = options or WarpOptions()
-    _check(image, depth, camera, source_poses, sky_mask, columns)
-    M, b = relative_row_maps(camera, source_poses, target_pose, source_camera)
-    rho, optics = inverse_depth(depth, sky_mask), optics_of(camera, columns)
-    gain = np.broadcast_to(warp_gain(camera, source_poses, target_pose, columns), rho.shape)
+    _check(view.image, view.depth, camera, view.poses, sky_mask, view.columns)
+    maps = line_maps(camera, view.poses, target_pose, view.columns, view.camera)
+    rho = inverse_depth(view.depth, sky_mask)
+    gain = np.broadcast_to(warp_gain(camera, view.poses, target_pose, view.columns), rho.shape)
     joined = forward_warp.connect(rho, options.tear_px / np.maximum(gain, np.finfo(np.float64).tiny))
     source_map = np.full((*rho.shape, 2), np.nan, dtype=np.float32)
     buffer = np.full(rho.shape, -1.0, dtype=np.float32)
-    forward_warp.draw_mesh(rho, joined, M, b, *optics, source_map, buffer)
-    forward_warp.draw_cells(rho, joined, M, b, *optics, source_map, buffer)
+    forward_warp.draw_mesh(rho, joined, maps, source_map, buffer)
+    forward_warp.draw_cells(rho, joined, maps, source_map, buffer)
     mask = buffer >= 0.0
     return Corrected(
-        image=resample(image, source_map, options.interpolation),
+        image=resample(view.image, source_map, options.interpolation),
         mask=mask,
         source_map=source_map,
         depth=_depth(buffer, mask),
@@ -135,11 +148,8 @@ def warp(
 def correct_frame(
     image: NDArray[Any],
     depth: NDArray[Any],
-    rig: StereoRig,
-    shutter: RollingShutter,
-    motion: Motion,
-    side: Side,
-    frame: int,
+    moving: MovingRig,
+    view: View,
     *,
     target_tau: float | None = None,
     sky_mask: NDArray[np.bool_] | None = None,
@@ -150,18 +160,15 @@ def correct_frame(
     ``target_tau`` is in frame periods; by default that of the first line read. ``depth`` (H, W) and the errors
     are those of ``warp``.
     """
-    target = rig.cam_from_world(motion, _target_time(shutter, side, frame, target_tau), side)
-    poses, columns = row_poses(rig, shutter, motion, side, frame), shutter.axis(side) == 0
-    return warp(image, depth, rig.camera, poses, target, sky_mask=sky_mask, options=options, columns=columns)
+    poses, target, columns = _poses(moving, view, target_tau)
+    frame = LineView(image=image, depth=depth, poses=poses, columns=columns)
+    return warp(frame, moving.rig.camera, target, sky_mask=sky_mask, options=options)
 
 
 def correction_flow(
     depth: NDArray[Any],
-    rig: StereoRig,
-    shutter: RollingShutter,
-    motion: Motion,
-    side: Side,
-    frame: int,
+    moving: MovingRig,
+    view: View,
     *,
     target_tau: float | None = None,
     sky_mask: NDArray[np.bool_] | None = None,
@@ -171,13 +178,19 @@ def correction_flow(
     ``x_target - x_source`` on the grid of the source; NaN where the depth is unknown or the point is behind the
     target camera. Arguments as in ``correct_frame``.
     """
-    poses, columns = row_poses(rig, shutter, motion, side, frame), shutter.axis(side) == 0
-    _check(None, depth, rig.camera, poses, sky_mask, columns)
-    target = rig.cam_from_world(motion, _target_time(shutter, side, frame, target_tau), side)
-    M, b = relative_row_maps(rig.camera, poses, target)
+    camera = moving.rig.camera
+    poses, target, columns = _poses(moving, view, target_tau)
+    _check(None, depth, camera, poses, sky_mask, columns)
     moved = np.zeros((3, *depth.shape))
-    forward_warp.move_pixels(inverse_depth(depth, sky_mask), M, b, *optics_of(rig.camera, columns), moved)
-    return np.asarray(np.moveaxis(moved[:2], 0, -1) - rig.camera.pixel_grid(), dtype=np.float32)
+    forward_warp.move_pixels(inverse_depth(depth, sky_mask), line_maps(camera, poses, target, columns), moved)
+    return np.asarray(np.moveaxis(moved[:2], 0, -1) - camera.pixel_grid(), dtype=np.float32)
+
+
+def _poses(moving: MovingRig, view: View, target_tau: float | None) -> tuple[Pose, Pose, bool]:
+    """Poses of a frame's lines and of its target, and whether lines are columns."""
+    rig, shutter, motion, (side, frame) = moving.rig, moving.shutter, moving.motion, view
+    target = rig.cam_from_world(motion, _target_time(shutter, side, frame, target_tau), side)
+    return row_poses(rig, shutter, motion, side, frame), target, shutter.axis(side) == 0
 
 
 def _target_time(shutter: RollingShutter, side: Side, frame: int, target_tau: float | None) -> float:

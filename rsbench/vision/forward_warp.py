@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.compiled import compiled
-from rsbench.vision.compiled_camera import Table, line_of, look, see
+from rsbench.vision.compiled_camera import LineMaps, line_of, look, see
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -70,44 +70,40 @@ def connect(rho: F32, limit: F64) -> U8:
 
 
 @compiled(error_model="numpy", inline="always")
-def move(
-    M: F64, b: F64, ideal: Table, lens: Table, columns: bool, x: int, y: int, rho: float
-) -> tuple[float, float, float]:
+def move(maps: LineMaps, columns: bool, x: int, y: int, rho: float) -> tuple[float, float, float]:
     """Target pixel and inverse depth of a source pixel; NaN behind the target camera or where rho is NaN."""
-    line = line_of(columns, x, y)
-    gx, gy = look(ideal, x, y)
+    M, b, line = maps.M, maps.b, line_of(columns, x, y)
+    gx, gy = look(maps.ideal, x, y)
     z = M[line, 2, 0] * gx + M[line, 2, 1] * gy + M[line, 2, 2] + rho * b[line, 2]
     s = 1.0 / z if z > 0.0 else np.nan
     u = M[line, 0, 0] * gx + M[line, 0, 1] * gy + M[line, 0, 2] + rho * b[line, 0]
     v = M[line, 1, 0] * gx + M[line, 1, 1] * gy + M[line, 1, 2] + rho * b[line, 1]
-    px, py = see(lens, u * s, v * s)
+    px, py = see(maps.lens, u * s, v * s)
     return px, py, rho * s
 
 
 @compiled(error_model="numpy")
-def move_pixels(rho: F32, M: F64, b: F64, ideal: Table, lens: Table, columns: bool, moved: F64) -> None:
+def move_pixels(rho: F32, maps: LineMaps, moved: F64) -> None:
     """Fill ``moved`` (3, H, W) with target x, y and inverse depth of every source pixel centre."""
     height, width = rho.shape
     for y in range(height):
         for x in range(width):
-            moved[0, y, x], moved[1, y, x], moved[2, y, x] = move(M, b, ideal, lens, columns, x, y, rho[y, x])
+            moved[0, y, x], moved[1, y, x], moved[2, y, x] = move(maps, maps.columns, x, y, rho[y, x])
 
 
 @compiled(error_model="numpy", inline="always")
-def _move_row(M: F64, b: F64, ideal: Table, lens: Table, columns: bool, y: int, rho: F32, out: F64) -> None:
+def _move_row(maps: LineMaps, y: int, rho: F32, out: F64) -> None:
     """``move`` of a row of pixels into ``out`` (W, 3)."""
-    if columns:
+    if maps.columns:
         for x in range(rho.shape[1]):
-            out[x, 0], out[x, 1], out[x, 2] = move(M, b, ideal, lens, True, x, y, rho[y, x])
+            out[x, 0], out[x, 1], out[x, 2] = move(maps, True, x, y, rho[y, x])
     else:  # apart, so that the row's map is loaded once
         for x in range(rho.shape[1]):
-            out[x, 0], out[x, 1], out[x, 2] = move(M, b, ideal, lens, False, x, y, rho[y, x])
+            out[x, 0], out[x, 1], out[x, 2] = move(maps, False, x, y, rho[y, x])
 
 
 @compiled(error_model="numpy")
-def draw_mesh(
-    rho: F32, joined: U8, M: F64, b: F64, ideal: Table, lens: Table, columns: bool, source_map: F32, buffer: F32
-) -> None:
+def draw_mesh(rho: F32, joined: U8, maps: LineMaps, source_map: F32, buffer: F32) -> None:
     """Draw the triangles of all joined neighbours into ``source_map`` (H, W, 2) and ``buffer`` (H, W).
 
     ``buffer`` holds inverse depth at the target, -1 where nothing is drawn yet; the larger one wins.
@@ -116,7 +112,7 @@ def draw_mesh(
     rows = np.zeros((2, width, 3))
     for y in range(height):
         upper, lower = rows[(y + 1) & 1], rows[y & 1]
-        _move_row(M, b, ideal, lens, columns, y, rho, lower)
+        _move_row(maps, y, rho, lower)
         if y == 0:
             continue
         for x in range(width - 1):
@@ -194,9 +190,7 @@ def _quad(
 
 
 @compiled(error_model="numpy")
-def draw_cells(
-    rho: F32, joined: U8, M: F64, b: F64, ideal: Table, lens: Table, columns: bool, source_map: F32, buffer: F32
-) -> None:
+def draw_cells(rho: F32, joined: U8, maps: LineMaps, source_map: F32, buffer: F32) -> None:
     """Draw the cells of pixels that are not joined to four neighbours, behind ``draw_mesh``'s result.
 
     A cell reaches half a pixel beyond the centre along its own surface: the boundary between two surfaces is
@@ -219,32 +213,25 @@ def draw_cells(
             ahead = y + 1 if below else y
             behind = y - 1 if above else y
             along_y = (rho[ahead, x] - rho[behind, x]) / max(ahead - behind, 1)
-            _cell(rho, x, y, along_x, along_y, M, b, ideal, lens, columns, source_map, buffer)
+            _cell(rho, x, y, (along_x, along_y), maps, source_map, buffer)
 
 
 @compiled(error_model="numpy")
 def _cell(
-    rho: F32,
-    x: int,
-    y: int,
-    along_x: float,
-    along_y: float,
-    M: F64,
-    b: F64,
-    ideal: Table,
-    lens: Table,
-    columns: bool,
-    source_map: F32,
-    buffer: F32,
+    rho: F32, x: int, y: int, along: tuple[float, float], maps: LineMaps, source_map: F32, buffer: F32
 ) -> None:
-    """Draw the parallelogram that the square of half a pixel around source pixel (x, y) becomes."""
+    """Draw the parallelogram that the square of half a pixel around source pixel (x, y) becomes.
+
+    ``along`` are the steps of inverse depth to the next column and row.
+    """
     height, width = buffer.shape
-    ax, ay, az = move(M, b, ideal, lens, columns, x, y, rho[y, x])
+    columns = maps.columns
+    ax, ay, az = move(maps, columns, x, y, rho[y, x])
     # The next line has another pose, also at the last one, whose next neighbour does not exist. A row's goes on.
-    right = -1 if x + 1 == width and (columns or lens is not None) else 1
-    bx, by, bz = move(M, b, ideal, lens, columns, x + right, y, rho[y, x] + right * along_x)
+    right = -1 if x + 1 == width and (columns or maps.lens is not None) else 1
+    bx, by, bz = move(maps, columns, x + right, y, rho[y, x] + right * along[0])
     step = 1 if y + 1 < height else -1
-    cx, cy, cz = move(M, b, ideal, lens, columns, x, y + step, rho[y, x] + step * along_y)
+    cx, cy, cz = move(maps, columns, x, y + step, rho[y, x] + step * along[1])
     ux, uy, uz = right * (bx - ax), right * (by - ay), right * (bz - az)
     vx, vy, vz = step * (cx - ax), step * (cy - ay), step * (cz - az)
     scale = 1.0 / (ux * vy - uy * vx)

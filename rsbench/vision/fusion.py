@@ -1,4 +1,4 @@
-"""Filling what a corrected frame did not see: from the other camera, from the other frame, at last by a guess.
+"""Filling the holes of a corrected frame: from the other camera, from the other frame, at last by a guess.
 
 A pixel of the target is a hole of the corrected frame for one of three reasons: something hid the place, it lies
 outside the frame, or its depth is unknown. Another image of the same scene may have seen it. Each is warped to the
@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from rsbench.components.compiled import compiled
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
-from rsbench.core.so3 import FloatArray
-from rsbench.vision.compiled_camera import Table, across_lines, line_of, look, optics_of, see
-from rsbench.vision.correction import Corrected, WarpOptions, inverse_depth, relative_row_maps, warp
+from rsbench.vision.compiled_camera import LineMaps, across_lines, line_of, look, see
+from rsbench.vision.correction import Corrected, LineView, WarpOptions, inverse_depth, line_maps, warp
 from rsbench.vision.forward_warp import move
 from rsbench.vision.resample import resample
 from rsbench.vision.stereo_depth import known_beside
@@ -46,20 +45,10 @@ class Origin(IntEnum):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SourceView:
+class SourceView(LineView):
     """One image that may know something about the target."""
 
-    image: NDArray[Any]
-    """(H, W) or (H, W, C)."""
-    depth: NDArray[np.float32]
-    """(H, W) metres; inf is infinitely far, 0 or NaN unknown."""
-    poses: Pose
-    """``cam_from_world`` of every line."""
     origin: Origin
-    camera: PinholeCamera | None = None
-    """Where it is not the target's: a rig whose disparities are off has two principal points."""
-    columns: bool = False
-    """Whether lines are columns."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -120,7 +109,7 @@ def fuse(
     Raises ValueError as ``rsbench.vision.correction.warp``.
     """
     first, others = views[0], views[1:]
-    corrected = _warped(first, first.depth, camera, target_pose, options)
+    corrected = warp(first, camera, target_pose, options=options)
     image, depth = corrected.image.copy(), corrected.depth.copy()
     origin = np.where(corrected.mask, np.uint8(first.origin), np.uint8(Origin.NOBODY))
     measured = [view for view in others if view.origin is not Origin.GUESSED]
@@ -217,10 +206,10 @@ def _look_up(
         The places (H, W, 2), px, NaN outside the view; the inverse depth (H, W) of the points there; what the view
         knows there, NaN where it knows none.
     """
-    M, b = relative_row_maps(view.camera or camera, target_pose, view.poses, camera)
+    maps = line_maps(view.camera or camera, target_pose, view.poses, view.columns, camera)
     places = np.full((*wanted.shape, 2), np.nan, dtype=np.float32)
     expected = np.zeros(wanted.shape, dtype=np.float32)
-    _find_in_lines(rho, wanted, M, b, *optics_of(camera, view.columns), places, expected)
+    _find_in_lines(rho, wanted, maps, places, expected)
     # Half a pixel past the last centre still belongs to the frame, and rounds beyond it in float32.
     nearest = np.rint(np.where(np.isfinite(places), places, 0.0)).astype(np.intp)
     x, y = np.moveaxis(np.clip(nearest, 0, (camera.width - 1, camera.height - 1)), -1, 0)
@@ -240,33 +229,30 @@ def _differ(a: NDArray[Any], b: NDArray[Any], where: Mask) -> Mask:
 def _find_in_lines(
     rho: NDArray[np.float32],
     wanted: Mask,
-    M: FloatArray,
-    b: FloatArray,
-    ideal: Table,
-    lens: Table,
-    columns: bool,
+    maps: LineMaps,
     places: NDArray[np.float32],
     seen_rho: NDArray[np.float32],
 ) -> None:
     """Where a rolling-shutter frame sees points given by pixel and inverse depth ``rho`` (H, W) of the target.
 
     Fills ``places`` (H, W, 2), px, and ``seen_rho`` (H, W), the inverse depth there, of the ``wanted`` pixels
-    whose points lie inside the frame. ``M`` (lines, 3, 3) and ``b`` (lines, 3) take them to each line's camera.
+    whose points lie inside the frame. ``maps`` take them to each line's camera.
     """
+    M, b, columns = maps.M, maps.b, maps.columns
     height, width = rho.shape
     lines = len(M)
     for y in range(height):
         for x in range(width):
             if not wanted[y, x]:
                 continue
-            gx, gy = look(ideal, x, y)
+            gx, gy = look(maps.ideal, x, y)
             line, u, v, s = line_of(columns, x, y), np.nan, np.nan, np.nan
             for _ in range(_ROW_STEPS):
                 z = M[line, 2, 0] * gx + M[line, 2, 1] * gy + M[line, 2, 2] + rho[y, x] * b[line, 2]
                 s = 1.0 / z if z > 0.0 else np.nan
                 u = (M[line, 0, 0] * gx + M[line, 0, 1] * gy + M[line, 0, 2] + rho[y, x] * b[line, 0]) * s
                 v = (M[line, 1, 0] * gx + M[line, 1, 1] * gy + M[line, 1, 2] + rho[y, x] * b[line, 1]) * s
-                u, v = see(lens, u, v)
+                u, v = see(maps.lens, u, v)
                 along = across_lines(columns, u, v)
                 if not -lines < along < 2 * lines:  # NaN included
                     break
@@ -279,51 +265,31 @@ def _warp_into(
     view: SourceView, holes: Mask, camera: PinholeCamera, target_pose: Pose, options: WarpOptions | None
 ) -> Corrected | None:
     """The part of a view that falls into the holes; None when nothing does."""
-    M, b = relative_row_maps(camera, view.poses, target_pose, view.camera)
+    maps = line_maps(camera, view.poses, target_pose, view.columns, view.camera)
     wanted = cv2.dilate(holes.astype(np.uint8), np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8))
     depth = np.zeros_like(view.depth)
-    optics = optics_of(camera, view.columns)
-    if _keep_landing(view.depth, inverse_depth(view.depth), M, b, *optics, wanted, depth) == 0:
+    if _keep_landing(view.depth, inverse_depth(view.depth), maps, wanted, depth) == 0:
         return None
-    return _warped(view, depth, camera, target_pose, options)
-
-
-def _warped(
-    view: SourceView, depth: NDArray[Any], camera: PinholeCamera, target_pose: Pose, options: WarpOptions | None
-) -> Corrected:
-    return warp(
-        view.image,
-        depth,
-        camera,
-        view.poses,
-        target_pose,
-        options=options,
-        source_camera=view.camera,
-        columns=view.columns,
-    )
+    return warp(replace(view, depth=depth), camera, target_pose, options=options)
 
 
 @compiled(error_model="numpy")
 def _keep_landing(
     depth: NDArray[np.float32],
     rho: NDArray[np.float32],
-    M: FloatArray,
-    b: FloatArray,
-    ideal: Table,
-    lens: Table,
-    columns: bool,
+    maps: LineMaps,
     wanted: NDArray[np.uint8],
     kept: NDArray[np.float32],
 ) -> int:
     """Copy to ``kept`` the depth (H, W) of pixels that land on wanted target pixels (H, W); how many these are.
 
-    ``rho`` is inverse depth, NaN where unknown; ``M`` and ``b`` as of ``relative_row_maps``.
+    ``rho`` is inverse depth, NaN where unknown.
     """
     height, width = depth.shape
     count = 0
     for y in range(height):
         for x in range(width):
-            u, v, _ = move(M, b, ideal, lens, columns, x, y, rho[y, x])
+            u, v, _ = move(maps, maps.columns, x, y, rho[y, x])
             u, v = u + 0.5, v + 0.5
             if 0.0 <= u < width and 0.0 <= v < height and wanted[int(v), int(u)] != 0:  # NaN is outside
                 kept[y, x] = depth[y, x]

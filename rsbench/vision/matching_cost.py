@@ -1,4 +1,4 @@
-"""How alike two images are around each pixel."""
+"""Matching costs: how alike two images are around each pixel."""
 
 from __future__ import annotations
 

@@ -21,8 +21,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.core.so3 import FloatArray
-from rsbench.vision.compiled_camera import Table, across_lines, line_of
+from rsbench.vision.compiled_camera import across_lines, line_of
 from rsbench.vision.correction import inverse_depth
 from rsbench.vision.images import grey_u8
 from rsbench.vision.reprojection import Reprojection, parallax_gain, reproject, reprojection_of
@@ -72,7 +71,7 @@ def depth_from_motion(
         both = (greys[frame], greys[1 - frame], censuses[frame], censuses[1 - frame])
         rhos[frame][y, x] = _search(y, x, both, maps[frame], count, 1.0 / gain)
     for frame in (0, 1):
-        _keep_agreeing(rhos[frame], rhos[1 - frame], unknown[frame], *maps[frame], _AGREE_PX / gain, found[frame])
+        _keep_agreeing(rhos[frame], rhos[1 - frame], unknown[frame], maps[frame], _AGREE_PX / gain, found[frame])
     return found
 
 
@@ -92,7 +91,7 @@ def _search(
     lines, best = (x if maps.columns else y).copy(), np.full(len(y), -1, dtype=np.int32)
     costs = np.full((len(y), 4), np.inf, dtype=np.float32)
     for k in range(count):
-        _fill_costs(y, x, lines, *both, *maps, k * step, cost)
+        _fill_costs(y, x, lines, *both, maps, k * step, cost)
         mean = cv2.boxFilter(cost, -1, window, borderType=cv2.BORDER_CONSTANT)[y, x] / weight
         _keep_best(k, mean, best, costs)
     before, least, after = costs[:, 1], costs[:, 0], costs[:, 2]
@@ -133,24 +132,17 @@ def _fill_costs(
     other: NDArray[np.uint8],
     census: NDArray[np.uint32],
     other_census: NDArray[np.uint32],
-    G: FloatArray,
-    c: FloatArray,
-    A: FloatArray,
-    B: FloatArray,
-    ideal: Table,
-    lens: Table,
-    columns: bool,
-    there: bool,
+    maps: Reprojection,
     rho: float,
     cost: F32,
 ) -> None:
     """Cost of one inverse depth at every pixel (n,); ``lines`` (n,) are those where the last one landed."""
     height, width = grey.shape
-    count = len(A)
+    count = len(maps.A)
     for i in range(len(y)):
         # One step along the curve changes the line by one at most: its pose is that of the last landing.
-        u, v, _ = reproject(x[i], y[i], rho, lines[i], G, c, A, B, ideal, lens, columns)
-        along = across_lines(there, u, v)
+        u, v, _ = reproject(x[i], y[i], rho, lines[i], maps)
+        along = across_lines(maps.there, u, v)
         if -count < along < 2 * count:
             lines[i] = min(max(int(along + 0.5), 0), count - 1)
         value = _NOWHERE
@@ -178,28 +170,21 @@ def _keep_agreeing(
     rho: F32,
     other: F32,
     wanted: Mask,
-    G: FloatArray,
-    c: FloatArray,
-    A: FloatArray,
-    B: FloatArray,
-    ideal: Table,
-    lens: Table,
-    columns: bool,
-    there: bool,
+    maps: Reprojection,
     tolerance: float,
     depth: F32,
 ) -> None:
     """Write the depth of ``wanted`` pixels whose inverse depth the other frame confirms where it sees them."""
     height, width = rho.shape
-    lines = len(A)
+    lines = len(maps.A)
     for y in range(height):
         for x in range(width):
             if not wanted[y, x] or not rho[y, x] >= 0.0:
                 continue
-            line, u, v, s = line_of(columns, x, y), np.nan, np.nan, np.nan
+            line, u, v, s = line_of(maps.columns, x, y), np.nan, np.nan, np.nan
             for _ in range(6):
-                u, v, s = reproject(x, y, rho[y, x], line, G, c, A, B, ideal, lens, columns)
-                along = across_lines(there, u, v)
+                u, v, s = reproject(x, y, rho[y, x], line, maps)
+                along = across_lines(maps.there, u, v)
                 if not -lines < along < 2 * lines:
                     break
                 line = min(max(int(along + 0.5), 0), lines - 1)

@@ -1,4 +1,4 @@
-"""Where another view of the rig sees a pixel of a given inverse depth, each line at its own pose.
+"""Reprojection of a pixel of given inverse depth into another view, each line at its own pose.
 
 The plane of constant depth that a pixel looks at maps to the other view by the homography of two rows, that of
 the pixel and that which sees it there; which row that is depends on where the pixel lands, so it is iterated.
@@ -67,31 +67,17 @@ def parallax_gain(camera: PinholeCamera, maps: Reprojection, back: Reprojection)
 
 
 @compiled(error_model="numpy", inline="always")
-def reproject(
-    x: int,
-    y: int,
-    rho: float,
-    line: int,
-    G: FloatArray,
-    c: FloatArray,
-    A: FloatArray,
-    B: FloatArray,
-    ideal: Table,
-    lens: Table,
-    columns: bool,
-) -> tuple[float, float, float]:
+def reproject(x: int, y: int, rho: float, line: int, maps: Reprojection) -> tuple[float, float, float]:
     """Pixel and depth factor in the other view's camera of ``line``; NaN behind it."""
-    p, q, r = _point(x, y, rho, G, c, ideal, columns)
-    return _seen_from(p, q, r, rho, A[line], B[line], lens)
+    p, q, r = _point(x, y, rho, maps)
+    return _seen_from(p, q, r, rho, maps.A[line], maps.B[line], maps.lens)
 
 
 @compiled(error_model="numpy", inline="always")
-def _point(
-    x: int, y: int, rho: float, G: FloatArray, c: FloatArray, ideal: Table, columns: bool
-) -> tuple[float, float, float]:
+def _point(x: int, y: int, rho: float, maps: Reprojection) -> tuple[float, float, float]:
     """World point of a pixel, times its inverse depth."""
-    own = line_of(columns, x, y)
-    gx, gy = look(ideal, x, y)
+    G, c, own = maps.G, maps.c, line_of(maps.columns, x, y)
+    gx, gy = look(maps.ideal, x, y)
     p = G[own, 0, 0] * gx + G[own, 0, 1] * gy + G[own, 0, 2] + rho * c[own, 0]
     q = G[own, 1, 0] * gx + G[own, 1, 1] * gy + G[own, 1, 2] + rho * c[own, 1]
     r = G[own, 2, 0] * gx + G[own, 2, 1] * gy + G[own, 2, 2] + rho * c[own, 2]
@@ -112,31 +98,19 @@ def _seen_from(
 
 
 @compiled(error_model="numpy")
-def reproject_all(
-    rho: F32,
-    lines: NDArray[np.int32],
-    G: FloatArray,
-    c: FloatArray,
-    A: FloatArray,
-    B: FloatArray,
-    ideal: Table,
-    lens: Table,
-    columns: bool,
-    there: bool,
-    places: F32,
-    factors: F32,
-) -> None:
+def reproject_all(rho: F32, lines: NDArray[np.int32], maps: Reprojection, places: F32, factors: F32) -> None:
     """Fill ``places`` (H, W, 2) px and depth factors (H, W) of all pixels of inverse depth ``rho`` (H, W).
 
     NaN where the other view does not see the point. ``lines`` (H, W) are those where the search begins and, after
     it, those where it ended.
     """
     height, width = rho.shape
+    A, B, lens, there = maps.A, maps.B, maps.lens, maps.there
     last = len(A) - 1
     for y in range(height):
         for x in range(width):
             line, u, v, s, along = min(max(lines[y, x], 0), last), np.nan, np.nan, np.nan, np.nan
-            p, q, r = _point(x, y, rho[y, x], G, c, ideal, columns)
+            p, q, r = _point(x, y, rho[y, x], maps)
             nearest = line
             for _ in range(_STEPS):
                 line = nearest
@@ -162,5 +136,5 @@ def reproject_all(
 def reproject_pixels(maps: Reprojection, rho: F32, lines: NDArray[Any]) -> tuple[F32, F32]:
     """``reproject_all`` into new arrays."""
     places, factors = np.zeros((*rho.shape, 2), np.float32), np.zeros_like(rho)
-    reproject_all(rho, lines, *maps, places, factors)
+    reproject_all(rho, lines, maps, places, factors)
     return places, factors

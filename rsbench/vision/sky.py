@@ -1,4 +1,4 @@
-"""Where a frame looks at the sky: a guess from its texture, for semi-global matching cannot tell.
+"""Sky detection in a frame: a guess from its texture, for semi-global matching cannot tell.
 
 Without texture the matcher carries the disparity of the neighbours on, so the sky comes out as far as the roof
 below it. Here the sky is a large smooth area that reaches the upper border, not darker than the middle of the

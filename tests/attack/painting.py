@@ -17,9 +17,9 @@ def keep_frames(folder: Path) -> None:
     rendered = render.render
     folder.mkdir(exist_ok=True)
 
-    def keep(scene: Any, camera: Any, rotations: Any, translations: Any, options: Any, **more: Any) -> Any:
-        frame = rendered(scene, camera, rotations, translations, options, **more)
-        np.savez(_path(folder, camera, rotations, translations, options), **vars(frame))
+    def keep(scene: Any, camera: Any, poses: Any, options: Any, **more: Any) -> Any:
+        frame = rendered(scene, camera, poses, options, **more)
+        np.savez(_path(folder, camera, poses, options), **vars(frame))
         (folder / "variant").write_text(backend.start_backend().variant)
         return frame
 
@@ -33,8 +33,8 @@ def show_frames(folder: Path) -> None:
     """
     from rsbench.renderers import backend, clearance, render, scene
 
-    def show(_: Any, camera: Any, rotations: Any, translations: Any, options: Any, **more: Any) -> Any:
-        with np.load(_path(folder, camera, rotations, translations, options)) as kept:
+    def show(_: Any, camera: Any, poses: Any, options: Any, **more: Any) -> Any:
+        with np.load(_path(folder, camera, poses, options)) as kept:
             return render.Frame(**kept)
 
     started = backend.Backend(variant=(folder / "variant").read_text())
@@ -44,8 +44,8 @@ def show_frames(folder: Path) -> None:
     setattr(render, "render", show)  # noqa: B010  an assignment has the wrong type
 
 
-def _path(folder: Path, camera: Any, rotations: Any, translations: Any, options: Any) -> Path:
+def _path(folder: Path, camera: Any, poses: Any, options: Any) -> Path:
     digest = hashlib.sha256(f"{camera} {options}".encode())
-    for values in (rotations, translations):
+    for values in (poses.R, poses.t):
         digest.update(np.ascontiguousarray(values, dtype=np.float64).tobytes())
     return folder / f"{digest.hexdigest()}.npz"

@@ -207,7 +207,7 @@ def _rendered_as(change: Callable[[Sequence], Sequence], shutter: str, view: tup
 
     def plant(folder: Path) -> None:
         from rsbench.renderers.image import to_srgb8
-        from rsbench.renderers.render import render
+        from rsbench.renderers.render import LinePoses, render
 
         home = folder / VICTIM
         sequence = change(read_sequence(home))
@@ -218,7 +218,7 @@ def _rendered_as(change: Callable[[Sequence], Sequence], shutter: str, view: tup
             R, t = np.broadcast_to(R[line], R.shape), np.broadcast_to(t[line], t.shape)
         options = load_card(RendererOptions, "renderers", "preview")
         columns = sequence.shutter.axis(side) == 0
-        seen = render(scene_of_victim(), sequence.rig.camera, R, t, options, columns=columns)
+        seen = render(scene_of_victim(), sequence.rig.camera, LinePoses(R, t, columns=columns), options)
         write_png(home / shutter / f"{side}_{frame}.png", to_srgb8(seen.image, options.exposure))
         write_depth(home / f"{shutter}_depth" / f"{side}_{frame}.exr", seen.depth)
 

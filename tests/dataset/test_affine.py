@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.geometry import Geometry, GivenGeometry
 from rsbench.core.lens import Lens
 from rsbench.core.motion import LinearMotion, Motion, TwistMotion
 from rsbench.core.projection import rs_project, rs_project_near
@@ -18,7 +19,6 @@ from rsbench.core.se3 import inverse, transform
 from rsbench.core.shutter import Scanning
 from rsbench.dataset.affine import AffineFrames, jacobians_of
 from rsbench.dataset.tracks import Tracks, track_views
-from rsbench.dataset.views import Geometry, GivenGeometry
 
 TRACK_VIEWS = track_views(2)
 Array = NDArray[np.float64]

@@ -32,7 +32,7 @@ from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.renderers.clearance import obstacle
 from rsbench.renderers.electrons import Sensor
 from rsbench.renderers.options import RendererOptions
-from rsbench.renderers.render import render
+from rsbench.renderers.render import LinePoses, render
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.load import load_scene
 from rsbench.storage.files import read_grey_png, write_png
@@ -229,14 +229,11 @@ def test_single_pass_and_stitching_agree_and_objects_that_rest_are_still_ones(
     blur = tau + 0.1 * np.arange(4)[:, None]
     poses, options = row_poses(rig, shutter, motion, "left", 1), RendererOptions(samples=4, seed=3)
     scene = MitsubaScene(seen)
-    blurred = partial(
-        render,
-        exposed=rig.cam_from_world(motion, blur, "left"),
-        objects=poses_of(things, tau),
-        exposed_objects=poses_of(things, blur),
-    )
-    whole = blurred(scene, rig.camera, *poses, options)
-    stitched = blurred(scene, rig.camera, *poses, replace(options, method="stitched"), rows=rows)
+    lines = LinePoses(*poses, poses_of(things, tau))
+    exposed = LinePoses(*rig.cam_from_world(motion, blur, "left"), poses_of(things, blur))
+    blurred = partial(render, scene, rig.camera, lines, exposed=exposed)
+    whole = blurred(options)
+    stitched = blurred(replace(options, method="stitched"), rows=rows)
     for name in ("image", "depth", "labels"):
         assert np.array_equal(getattr(whole, name)[rows], getattr(stitched, name))
     at = poses_of(things, np.full(tau.shape, 0.7))
@@ -247,8 +244,8 @@ def test_single_pass_and_stitching_agree_and_objects_that_rest_are_still_ones(
         else mesh
         for mesh in seen.meshes
     )
-    moving = render(scene, rig.camera, *poses, options, objects=at)
-    still = render(MitsubaScene(replace(seen, meshes=placed)), rig.camera, *poses, options)
+    moving = render(scene, rig.camera, LinePoses(*poses, objects=at), options)
+    still = render(MitsubaScene(replace(seen, meshes=placed)), rig.camera, LinePoses(*poses), options)
     np.testing.assert_allclose(moving.depth, still.depth, rtol=1e-5)
     # A sample may round to the other side of an edge.
     assert np.mean(np.abs(moving.image - still.image) > 1e-3) < 2e-3

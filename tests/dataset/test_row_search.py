@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import GivenGeometry
 from rsbench.core.lens import Lens
 from rsbench.core.motion import AcceleratedMotion, LinearMotion, Motion, TwistMotion
 from rsbench.core.projection import ProjectionStatus, back_project, project_at, rs_project
@@ -18,7 +19,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.dataset.row_search import find
-from rsbench.dataset.views import GivenGeometry, ImageView
+from rsbench.dataset.views import ImageView
 
 LENSES = (
     None,

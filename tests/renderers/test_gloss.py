@@ -13,7 +13,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.renderers.options import Integrator, RendererOptions
 from rsbench.renderers.pixel_samples import facet_points
-from rsbench.renderers.render import Frame, render, render_global
+from rsbench.renderers.render import Frame, LinePoses, render, render_global
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Light, Material, Scene, SceneMesh
 
@@ -144,10 +144,10 @@ def test_single_pass_is_stitched_with_gloss(town: Scene, row_poses: Any, options
     camera = PinholeCamera.centred(30, 24, 26.0)
     R, t = row_poses(24, w=(-0.1, 0.2, 0.1), d=(-0.4, 0.1, 0.3))
     chosen = RendererOptions(samples=4, seed=7, **options)
-    one = render(scene, camera, R, t, chosen)
-    whole = render(scene, camera, R, t, replace(chosen, method="stitched", full_frames=True))
-    rows = render(scene, camera, R, t, replace(chosen, method="stitched"), rows=[3, 17])
-    dull = render(MitsubaScene(town), camera, R, t, chosen)
+    one = render(scene, camera, LinePoses(R, t), chosen)
+    whole = render(scene, camera, LinePoses(R, t), replace(chosen, method="stitched", full_frames=True))
+    rows = render(scene, camera, LinePoses(R, t), replace(chosen, method="stitched"), rows=[3, 17])
+    dull = render(MitsubaScene(town), camera, LinePoses(R, t), chosen)
     for name in ("image", "depth", "gloss"):
         np.testing.assert_array_equal(getattr(one, name), getattr(whole, name))
         np.testing.assert_array_equal(getattr(rows, name), getattr(one, name)[[3, 17]])

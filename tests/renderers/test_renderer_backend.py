@@ -31,7 +31,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
 from rsbench.renderers.backend import start_backend
 from rsbench.renderers.options import RendererOptions
-from rsbench.renderers.render import render
+from rsbench.renderers.render import LinePoses, render
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Light, Material, Scene, SceneMesh
 
@@ -54,14 +54,14 @@ tau = np.arange(height) / height
 R = np.tile(np.eye(3), (height, 1, 1))
 t = np.stack([0.2 * tau, 0 * tau, -0.3 * tau], axis=-1)
 begin = time.perf_counter()
-sunsky = render(scene, camera, R, t, RendererOptions(samples=4))
+sunsky = render(scene, camera, LinePoses(R, t), RendererOptions(samples=4))
 seconds = time.perf_counter() - begin
-path = render(scene, camera, R, t, RendererOptions(samples=4, integrator="path", seed=3))
-stitched = render(scene, camera, R, t, RendererOptions(samples=4, method="stitched"))
+path = render(scene, camera, LinePoses(R, t), RendererOptions(samples=4, integrator="path", seed=3))
+stitched = render(scene, camera, LinePoses(R, t), RendererOptions(samples=4, method="stitched"))
 assert (stitched.image == sunsky.image).all() and (stitched.depth == sunsky.depth).all()
 parts = 0.3 * ((np.arange(64) + 0.5) / 64 - 0.5)[:, None, None]
-blur = Pose(np.tile(R, (64, 1, 1, 1)), t + parts * np.array([0.2, 0, -0.3]))
-exposed = render(scene, camera, R, t, RendererOptions(samples=4, seed=3), exposed=blur)
+blur = LinePoses(np.tile(R, (64, 1, 1, 1)), t + parts * np.array([0.2, 0, -0.3]))
+exposed = render(scene, camera, LinePoses(R, t), RendererOptions(samples=4, seed=3), exposed=blur)
 np.savez(sys.argv[1], sunsky=sunsky.image, exposed=exposed.image, depth=sunsky.depth, path=path.image,
          seconds=seconds, variant=started.variant, message=started.message or "")
 """
@@ -109,7 +109,7 @@ def test_same_bits_in_another_process(tmp_path: Path) -> None:
 def test_threads_change_no_bit(town: Any, row_poses: Any) -> None:
     from rsbench.core.camera import PinholeCamera
     from rsbench.renderers.options import RendererOptions
-    from rsbench.renderers.render import render
+    from rsbench.renderers.render import LinePoses, render
     from rsbench.renderers.scene import MitsubaScene
 
     camera = PinholeCamera.centred(300, 200, 200.0)
@@ -119,7 +119,7 @@ def test_threads_change_no_bit(town: Any, row_poses: Any) -> None:
     frames = []
     for threads in (1, 3, os.cpu_count() or 1):
         backend.set_threads(threads)
-        frames.append(render(scene, camera, R, t, options))
+        frames.append(render(scene, camera, LinePoses(R, t), options))
     for frame in frames[1:]:
         np.testing.assert_array_equal(frame.image, frames[0].image)
         np.testing.assert_array_equal(frame.depth, frames[0].depth)

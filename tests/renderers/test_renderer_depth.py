@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.renderers.options import RendererOptions
-from rsbench.renderers.render import render, render_global
+from rsbench.renderers.render import LinePoses, render, render_global
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Light, Material, Scene, SceneMesh
 
@@ -60,7 +60,7 @@ def test_global_shutter_depth_of_a_plane(quad: Any) -> None:
 def test_rolling_shutter_depth_of_a_plane_follows_every_row(quad: Any, row_poses: Any) -> None:
     ground = quad([[-900, 1.6, 900], [900, 1.6, 900], [900, 1.6, -900], [-900, 1.6, -900]])
     R, t = row_poses(44, w=(0.1, 0.3, -0.4), d=(0.5, 0.2, -0.9), start=(0.2, 0.1, 0.3), ratio=1.0)
-    depth = render(scene_of(ground), CAMERA, R, t, QUICK).depth
+    depth = render(scene_of(ground), CAMERA, LinePoses(R, t), QUICK).depth
     truth = plane_depth(CAMERA, R, t, np.array([0.0, 1.0, 0.0]), 1.6)
     near = (truth > 0) & (truth < 100)  # beyond, the plane is seen at a grazing angle and then ends
     assert near.mean() > 0.3 and (truth == 0).mean() > 0.2
@@ -81,7 +81,7 @@ def test_depth_of_a_triangulated_ball_against_float64_intersection(row_poses: An
     faces = np.asarray(ball.faces, dtype=np.int32)
     mesh = SceneMesh(name="ball", vertices=vertices, faces=faces, material=Material(name="m"))
     R, t = row_poses(44, w=(0.1, -0.2, 0.3), d=(0.2, 0.1, 0.5))
-    depth = render(scene_of(mesh), CAMERA, R, t, QUICK).depth
+    depth = render(scene_of(mesh), CAMERA, LinePoses(R, t), QUICK).depth
     origin, direction = rays(CAMERA, R, t)
     truth, margin = nearest_triangle(origin, direction, vertices[faces])
     inside = (truth > 0) & (margin > 1e-5)  # rays through an edge may round to either side of it
@@ -159,7 +159,7 @@ def test_depth_does_not_depend_on_the_card(town: Scene, row_poses: Any) -> None:
     R, t = row_poses(44, w=(0.1, 0.0, 0.1))
     scene = MitsubaScene(town)
     cards = (QUICK, RendererOptions(samples=9), RendererOptions(samples=1, integrator="path"))
-    frames = [render(scene, CAMERA, R, t, card) for card in cards]
+    frames = [render(scene, CAMERA, LinePoses(R, t), card) for card in cards]
     np.testing.assert_array_equal(frames[0].depth, frames[1].depth)
     np.testing.assert_array_equal(frames[0].depth, frames[2].depth)
 

@@ -15,7 +15,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import Pose
 from rsbench.renderers.exposure import instant_count, instant_of, instant_times
 from rsbench.renderers.options import Integrator, RendererOptions
-from rsbench.renderers.render import render
+from rsbench.renderers.render import LinePoses, render
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Light, Material, Scene
 
@@ -40,11 +40,11 @@ def test_single_pass_is_stitched_from_exposed_frames(town: Scene, integrator: In
     rows, instants = _times(0.5, 64)
     scene, geometry = MitsubaScene(town), _poses(rows)
     options = RendererOptions(integrator=integrator, samples=4, seed=7)
-    whole = render(scene, CAMERA, *geometry, options, exposed=_poses(instants))
-    sharp = render(scene, CAMERA, *geometry, options)
+    whole = render(scene, CAMERA, LinePoses(*geometry), options, exposed=LinePoses(*_poses(instants)))
+    sharp = render(scene, CAMERA, LinePoses(*geometry), options)
     for full in (True, False):
         stitched = replace(options, method="stitched", full_frames=full)
-        oracle = render(scene, CAMERA, *geometry, stitched, exposed=_poses(instants))
+        oracle = render(scene, CAMERA, LinePoses(*geometry), stitched, exposed=LinePoses(*_poses(instants)))
         np.testing.assert_array_equal(whole.image, oracle.image)
         np.testing.assert_array_equal(whole.depth, oracle.depth)
     np.testing.assert_array_equal(whole.depth, sharp.depth)
@@ -57,19 +57,26 @@ def test_an_exposed_frame_is_the_mean_of_its_instants(town: Scene) -> None:
     scene, geometry, exposed = MitsubaScene(town), _poses(rows), _poses(instants)
     frames = np.stack(
         [
-            render(scene, CAMERA, *geometry, RendererOptions(samples=4, seed=seed), exposed=exposed).image
+            render(
+                scene,
+                CAMERA,
+                LinePoses(*geometry),
+                RendererOptions(samples=4, seed=seed),
+                exposed=LinePoses(*exposed),
+            ).image
             for seed in range(40)
         ]
     )
     # 64 instants, all sub-pixel samples at each: what the exposed frame is a random part of.
     truth = np.mean(
-        [render(scene, CAMERA, *_poses(tau), RendererOptions(samples=4)).image for tau in instants], axis=0
+        [render(scene, CAMERA, LinePoses(*_poses(tau)), RendererOptions(samples=4)).image for tau in instants],
+        axis=0,
     )
     error = frames.mean(axis=0) - truth
     sigma = frames.std(axis=0, ddof=1) / np.sqrt(len(frames))
     assert np.sqrt(np.mean(error**2)) < 1.2 * np.sqrt(np.mean(sigma**2))
     assert np.mean(np.abs(error) > 5.0 * sigma + 1e-6) < 0.005
-    sharp = render(scene, CAMERA, *geometry, RendererOptions(samples=4)).image
+    sharp = render(scene, CAMERA, LinePoses(*geometry), RendererOptions(samples=4)).image
     assert np.abs(truth - sharp).max() > 0.05, "nothing is blurred"
 
 
@@ -90,7 +97,9 @@ def test_an_edge_is_smeared_as_far_as_it_moves(quad: Callable[..., Any]) -> None
     t[..., 0] = -speed * tau
     exposed = Pose(np.broadcast_to(np.eye(3), (64, 48, 3, 3)), t)
     still = np.broadcast_to(np.eye(3), (48, 3, 3)), np.zeros((48, 3))
-    image = render(scene, camera, *still, RendererOptions(samples=16), exposed=exposed).image[..., 0]
+    image = render(
+        scene, camera, LinePoses(*still), RendererOptions(samples=16), exposed=LinePoses(*exposed)
+    ).image[..., 0]
     profile = image.mean(axis=0) / image[:, -1].mean()
     ramp = camera.fx * speed * exposure / 4.0  # 12 px
     expected = np.clip((np.arange(64) - camera.cx) / ramp + 0.5, 0.0, 1.0)
@@ -122,4 +131,10 @@ def _first(value: Any) -> Any:
 def test_instants_that_samples_cannot_share_are_refused(town: Scene) -> None:
     rows, instants = _times(0.3, 6)
     with pytest.raises(RsbenchError, match="6 instants: a multiple of the 4 samples is needed"):
-        render(MitsubaScene(town), CAMERA, *_poses(rows), RendererOptions(samples=4), exposed=_poses(instants))
+        render(
+            MitsubaScene(town),
+            CAMERA,
+            LinePoses(*_poses(rows)),
+            RendererOptions(samples=4),
+            exposed=LinePoses(*_poses(instants)),
+        )

@@ -18,7 +18,7 @@ from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.renderers.backend import start_backend
 from rsbench.renderers.exposure import instant_times
 from rsbench.renderers.options import RendererOptions
-from rsbench.renderers.render import render
+from rsbench.renderers.render import LinePoses, render
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.renderers.sensor import make_sensor
 from rsbench.scenes.model import Scene
@@ -69,16 +69,16 @@ def test_single_pass_is_stitched_with_a_lens_and_every_scan(town: Any, scan: Sca
     poses, columns = line_poses(rig, shutter, motion, "left", 0), shutter.axis("left") == 0
     options, rows = RendererOptions(samples=4, seed=7), [0, 1, 11, 23]
     instants = instant_times(shutter.line_times(0, "left"), 0.2, 64)
-    blur = rig.cam_from_world(motion, instants, "left") if exposed else None
-    one = render(scene, camera, *poses, options, exposed=blur, columns=columns)
+    blur = LinePoses(*rig.cam_from_world(motion, instants, "left")) if exposed else None
+    one = render(scene, camera, LinePoses(*poses, columns=columns), options, exposed=blur)
     other = replace(options, method="stitched")
-    stitched = render(scene, camera, *poses, other, exposed=blur, columns=columns, rows=rows)
+    stitched = render(scene, camera, LinePoses(*poses, columns=columns), other, exposed=blur, rows=rows)
     np.testing.assert_array_equal(one.image[rows], stitched.image)
     np.testing.assert_array_equal(one.depth[rows], stitched.depth)
     # The scan is seen at all: its first line is the global shutter's at that time, the last one is not.
     first = shutter.first_line("left")
     still = Pose(*(np.broadcast_to(part[first], part.shape) for part in poses))
-    gs = render(scene, camera, *still, options, columns=columns)
+    gs = render(scene, camera, LinePoses(*still, columns=columns), options)
     lines = one.depth.T if columns else one.depth
     gs_lines = gs.depth.T if columns else gs.depth
     np.testing.assert_array_equal(lines[first], gs_lines[first])
@@ -91,6 +91,8 @@ def test_depth_is_that_of_the_ray_through_the_lens(quad: Any, town: Any) -> None
     wall = quad([[-60, -60, -27], [60, -60, 33], [60, 60, 33], [-60, 60, -27]])
     camera = replace(CAMERA, lens=BARREL)
     poses = np.broadcast_to(np.eye(3), (24, 3, 3)), np.zeros((24, 3))
-    depth = render(MitsubaScene(Scene(name="wall", meshes=(wall,), light=town.light)), camera, *poses).depth
+    depth = render(
+        MitsubaScene(Scene(name="wall", meshes=(wall,), light=town.light)), camera, LinePoses(*poses)
+    ).depth
     u = camera.unproject(camera.pixel_grid())[..., 0]
     np.testing.assert_allclose(depth, 3.0 / (1.0 - 0.5 * u), rtol=2e-6)  # single precision

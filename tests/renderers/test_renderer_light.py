@@ -13,7 +13,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.renderers.image import to_srgb8
 from rsbench.renderers.options import Integrator, RendererOptions
 from rsbench.renderers.pixel_samples import subpixel_grid
-from rsbench.renderers.render import render, render_global
+from rsbench.renderers.render import LinePoses, render, render_global
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Light, Material, Scene, SceneMesh
 
@@ -248,5 +248,5 @@ def test_a_hidden_sky_is_that_of_the_path_tracer(town: Scene) -> None:
     rough = np.median(np.abs(seen.image[on] / traced.image[on] - 1))
     assert rough < 0.08
     poses = np.broadcast_to(np.eye(3), (30, 3, 3)), np.zeros((30, 3))
-    rows = render(scene, camera, *poses, options, rows=[3, 17]).image
+    rows = render(scene, camera, LinePoses(*poses), options, rows=[3, 17]).image
     np.testing.assert_array_equal(rows, seen.image[[3, 17]])

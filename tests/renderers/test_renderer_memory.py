@@ -18,7 +18,7 @@ import numpy as np
 from rsbench.core.camera import PinholeCamera
 from rsbench.renderers.backend import start_backend
 from rsbench.renderers.options import RendererOptions
-from rsbench.renderers.render import render
+from rsbench.renderers.render import LinePoses, render
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Light, Material, Scene, SceneMesh
 
@@ -47,7 +47,7 @@ for size in (1600, 1500, 1550, 1450, 1525, 1575):
     empty = resident()
     held = MitsubaScene(scene(size))
     for integrator in ("sunsky", "path"):
-        render(held, camera, *poses, RendererOptions(samples=4, integrator=integrator))
+        render(held, camera, LinePoses(*poses), RendererOptions(samples=4, integrator=integrator))
     full = resident()
     del held
     found.append({"texels": 3 * size**2, "empty": empty, "full": full, "after": resident()})

@@ -10,7 +10,7 @@ import pytest
 from rsbench.core.camera import PinholeCamera
 from rsbench.renderers.backend import start_backend
 from rsbench.renderers.options import Integrator, RendererOptions
-from rsbench.renderers.render import render
+from rsbench.renderers.render import LinePoses, render
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.renderers.sensor import make_sensor, pose_table
 
@@ -42,7 +42,7 @@ def test_only_the_first_frame_compiles(scene: MitsubaScene, row_poses: Any, inte
     def frame(camera: PinholeCamera, samples: int, seed: int, rows: Any = None, **motion: Any) -> Any:
         R, t = row_poses(camera.height, **motion)
         options = RendererOptions(integrator=integrator, samples=samples, seed=seed)
-        return kernels(lambda: render(scene, camera, R, t, options, rows=rows))
+        return kernels(lambda: render(scene, camera, LinePoses(R, t), options, rows=rows))
 
     first = frame(CAMERA, 4, 0)
     assert len(first) >= 2
@@ -78,7 +78,9 @@ def test_plugin_and_renderer_see_the_same_scene(scene: MitsubaScene, row_poses: 
     import mitsuba as mi
 
     R, t = row_poses(24, w=(0.1, -0.1, 0.3), d=(0.2, 0.1, 0.5))
-    ours = render(scene, CAMERA, R, t, RendererOptions(integrator="path", samples=1024, max_depth=3)).image
+    ours = render(
+        scene, CAMERA, LinePoses(R, t), RendererOptions(integrator="path", samples=1024, max_depth=3)
+    ).image
     integrator = mi.load_dict({"type": "path", "max_depth": 3})
     theirs = np.array(mi.render(scene.scene, sensor=make_sensor(CAMERA, R, t), integrator=integrator, spp=1024))
     # Deviation of a sample is about the mean radiance (0.5), of a pixel 0.5 / 32, of the difference 1.4 times it.

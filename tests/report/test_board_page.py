@@ -21,9 +21,8 @@ from browser import CHROMIUM, Browser, started
 from leaderboards import Line, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.picture_oracles import write_truth
-from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.splits import dataset_split
+from rsbench.benchmark.leaderboard.track_list import TRACKS
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
@@ -292,10 +291,10 @@ def rendered_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     motion = LinearMotion(np.array([0.01, -0.02, 0.01]), np.array([0.1, 0.0, 0.2]))
     shutter = RollingShutter(height=72, readout_ratio=0.8)
     write_analytic_dataset(folder / "data", rig, shutter, motion, twins=(36,))
-    splits = {track: dataset_split(PROTOCOLS[track], folder / "data") for track in ("pose", "depth", "correction")}
+    splits = {track: dataset_split(TRACKS[track], folder / "data") for track in ("pose", "depth", "correction")}
     add(folder / "board", write(folder / "x.jsonl", truth_lines(splits["pose"])), splits["pose"], {})
     for track in ("depth", "correction"):
-        path = write_truth(splits[track], folder / track)
+        path = splits[track].track.write_truth(splits[track], folder / track)
         lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
         for picture in (path.parent / "pictures" / "planes").iterdir():
             if track == "depth":

@@ -10,12 +10,13 @@ import pytest
 from analytic_dataset import write_analytic_dataset
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.geometry import GivenGeometry
 from rsbench.core.lens import Lens
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.views import IMAGE_VIEWS, GivenGeometry
+from rsbench.dataset.views import IMAGE_VIEWS
 from rsbench.storage.files import read_depth, write_depth
 from rsbench.verification import frame_comparison as reprojection
 from rsbench.verification import verify_sequence

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rsbench.core.motion import LinearMotion, TwistMotion
 from rsbench.core.projection import back_project, project_at, row_poses
 from rsbench.core.se3 import Pose
-from rsbench.vision.correction import WarpOptions, correct_frame, correction_flow, warp
+from rsbench.vision.correction import LineView, WarpOptions, correct_frame, correction_flow, warp
 from rsbench.vision.quality import psnr
 
 GEOMETRY_PX = 0.01
@@ -25,11 +25,8 @@ def _correct(world: Any, side: Any = "left", frame: int = 1, tau: float | None =
     return correct_frame(
         image.astype(np.float32),
         depth.astype(np.float32),
-        world.rig,
-        world.shutter,
-        world.motion,
-        side,
-        frame,
+        world,
+        (side, frame),
         target_tau=tau,
         **options,
     )
@@ -134,7 +131,7 @@ def test_sky_mask_and_infinite_depth_are_the_same(world: Build, shapes: Any, tru
     scene = world((card,), sky=True)
     image, depth = scene.rolling("left", 1)
     zero = np.where(np.isfinite(depth), depth, 0.0)
-    arguments: Any = (scene.rig, scene.shutter, scene.motion, "left", 1)
+    arguments: Any = (scene, ("left", 1))
     a = correct_frame(image.astype(np.float32), depth, *arguments)
     b = correct_frame(image.astype(np.float32), zero, *arguments, sky_mask=zero == 0.0)
     c = correct_frame(image.astype(np.float32), zero, *arguments)
@@ -156,7 +153,7 @@ def test_nothing_moves_without_readout_or_motion(world: Build, shapes: Any, case
     image, depth = scene.rolling("right", 1)
     image = (image if dtype is np.float32 else image * np.iinfo(dtype).max).astype(dtype)
     depth[10:20, 30:50] = np.nan
-    got = correct_frame(image, depth, scene.rig, scene.shutter, scene.motion, "right", 1)
+    got = correct_frame(image, depth, scene, ("right", 1))
     np.testing.assert_array_equal(got.mask, np.isfinite(depth))
     np.testing.assert_array_equal(got.image, np.where(np.isfinite(depth)[..., None], image, 0))
     moved = np.abs(got.source_map - scene.rig.camera.pixel_grid())[got.mask]
@@ -180,7 +177,7 @@ def test_image_is_that_of_the_global_shutter(world: Build, shapes: Any, truth: B
 def test_grey_colour_and_16_bit_agree(world: Build, shapes: Any) -> None:
     scene = world((shapes[0]((0.2, 0.3, 1.0), 6.0),))
     image, depth = scene.rolling("left", 0)
-    arguments: Any = (depth, scene.rig, scene.shutter, scene.motion, "left", 0)
+    arguments: Any = (depth, scene, ("left", 0))
     colour = correct_frame((image * 65535).astype(np.uint16), *arguments)
     grey = correct_frame((image[..., 1] * 65535).astype(np.uint16), *arguments)
     single = correct_frame((image[..., 1:2] * 65535).astype(np.uint16), *arguments)
@@ -193,7 +190,7 @@ def test_grey_colour_and_16_bit_agree(world: Build, shapes: Any) -> None:
 def test_flow_is_back_projection_and_projection(world: Build, shapes: Any) -> None:
     """Equations 11a and 11b done by the geometry core, and the flow and the map invert each other."""
     scene = world((shapes[0]((0.2, 0.3, 1.0), 6.0),))
-    arguments: Any = (scene.rig, scene.shutter, scene.motion, "right", 1)
+    arguments: Any = (scene, ("right", 1))
     _, depth = scene.rolling("right", 1)
     depth[3, 4] = np.nan
     flow = correction_flow(depth, *arguments, target_tau=1.3)
@@ -216,7 +213,7 @@ def test_isolated_pixels_cover_their_cells(world: Build, shapes: Any) -> None:
     image, depth = scene.rolling("left", 1)
     lonely = np.full_like(depth, np.nan)
     lonely[40:120:10, 40:160:10] = depth[40:120:10, 40:160:10]
-    got = correct_frame(image.astype(np.float32), lonely, scene.rig, scene.shutter, scene.motion, "left", 1)
+    got = correct_frame(image.astype(np.float32), lonely, scene, ("left", 1))
     count = np.count_nonzero(np.isfinite(lonely))
     assert count <= np.count_nonzero(got.mask) <= 1.3 * count  # the area of the cells: motion magnifies a little
     nearest = np.abs(got.source_map[got.mask] - np.rint(got.source_map[got.mask] / 10) * 10)
@@ -231,7 +228,7 @@ def test_other_poses_and_twist_motion(world: Build, shapes: Any, truth: Build) -
     image, depth = scene.rolling("left", 1)
     poses = row_poses(scene.rig, scene.shutter, twist, "left", 1)
     target = scene.rig.cam_from_world(twist, 1.0, "right")
-    got = warp(image.astype(np.float32), depth, scene.rig.camera, poses, target)
+    got = warp(LineView(image=image.astype(np.float32), depth=depth, poses=poses), scene.rig.camera, target)
     points = back_project(scene.rig, scene.shutter, twist, "left", 1, got.source_map[got.mask], 1.0)
     centre = back_project(scene.rig, scene.shutter, twist, "left", 1, got.source_map[got.mask], 0.0)
     n = np.array([0.2, 0.3, 1.0])
@@ -246,23 +243,11 @@ def test_nothing_in_front_is_nothing_covered(world: Build, shapes: Any) -> None:
     scene = world((shapes[0]((0.0, 0.0, 1.0), 6.0),), d=(0.0, 0.0, -20.0))
     image, depth = scene.rolling("left", 0)
     depth[~np.isfinite(depth)] = np.nan  # the last rows are beyond it, too
-    arguments: Any = (scene.rig, scene.shutter, scene.motion, "left", 0)
+    arguments: Any = (scene, ("left", 0))
     beyond = correct_frame(image.astype(np.float32), depth, *arguments, target_tau=0.9)
     unknown = correct_frame(image.astype(np.float32), np.full_like(depth, np.nan), *arguments)
     for got in (beyond, unknown):
         assert not np.any(got.mask) and np.all(np.isnan(got.source_map)) and not np.any(got.image)
-
-
-def _arguments(world: Build) -> dict[str, Any]:
-    scene = world(())
-    poses = row_poses(scene.rig, scene.shutter, LinearMotion(np.zeros(3), np.zeros(3)), "left", 0)
-    return {
-        "image": np.zeros((160, 200, 3), dtype=np.uint8),
-        "depth": np.ones((160, 200)),
-        "camera": scene.rig.camera,
-        "source_poses": poses,
-        "target_pose": Pose(np.eye(3), np.zeros(3)),
-    }
 
 
 @pytest.mark.parametrize(
@@ -276,12 +261,20 @@ def _arguments(world: Build) -> dict[str, Any]:
         {"depth": np.ones((160, 200), dtype=np.int64)},
         {"sky_mask": np.zeros((160, 200))},
         {"sky_mask": np.zeros((160, 2), dtype=bool)},
-        {"source_poses": Pose(np.zeros((3, 3, 3)), np.zeros((3, 3)))},
+        {"poses": Pose(np.zeros((3, 3, 3)), np.zeros((3, 3)))},
     ],
 )
 def test_bad_input(world: Build, wrong: dict[str, Any]) -> None:
+    scene, wrong = world(()), dict(wrong)
+    poses = row_poses(scene.rig, scene.shutter, LinearMotion(np.zeros(3), np.zeros(3)), "left", 0)
+    right: dict[str, Any] = {
+        "image": np.zeros((160, 200, 3), dtype=np.uint8),
+        "depth": np.ones((160, 200)),
+        "poses": poses,
+    }
+    sky_mask = wrong.pop("sky_mask", None)
     with pytest.raises(ValueError, match="must"):
-        warp(**(_arguments(world) | wrong))
+        warp(LineView(**(right | wrong)), scene.rig.camera, Pose(np.eye(3), np.zeros(3)), sky_mask=sky_mask)
 
 
 def test_bad_options_and_times(world: Build) -> None:
@@ -291,6 +284,4 @@ def test_bad_options_and_times(world: Build) -> None:
             WarpOptions(**options)
     scene = world(())
     with pytest.raises(ValueError, match="target_tau"):
-        correction_flow(
-            np.ones((160, 200)), scene.rig, scene.shutter, scene.motion, "left", 0, target_tau=float("nan")
-        )
+        correction_flow(np.ones((160, 200)), scene, ("left", 0), target_tau=float("nan"))

@@ -57,8 +57,8 @@ def test_what_the_frame_saw_stays_as_it_is(scene: Any) -> None:
     here = alone.origin == Origin.HERE
     np.testing.assert_array_equal(here, fused.origin == Origin.HERE)
     np.testing.assert_array_equal(alone.image[here], fused.image[here])
-    poses, target = views[0].poses, scene.rig.cam_from_world(scene.motion, 0.0, "left")
-    np.testing.assert_array_equal(here, warp(views[0].image, views[0].depth, scene.rig.camera, poses, target).mask)
+    target = scene.rig.cam_from_world(scene.motion, 0.0, "left")
+    np.testing.assert_array_equal(here, warp(views[0], scene.rig.camera, target).mask)
 
 
 def test_holes_show_what_the_other_frames_saw(scene: Any, truth: Build) -> None:
@@ -156,7 +156,7 @@ def test_what_one_frame_alone_sees_is_not_replaced_by_what_lies_behind(
     darker = [replace(view, image=view.image * np.float32(0.5)) for view in others]
     guess = replace(seen, depth=np.where(post, left.depth, np.float32(0.0)), origin=Origin.GUESSED)
     fused = _fuse(scene, seen, *darker, guess)
-    where = warp(post.astype(np.float32), left.depth, scene.rig.camera, left.poses, _target(scene))
+    where = warp(replace(left, image=post.astype(np.float32)), scene.rig.camera, _target(scene))
     inside = where.mask & (where.image > 0.999)
     assert np.count_nonzero(inside) > 500
     assert np.all(fused.origin[inside] == Origin.GUESSED) and np.all(fused.image[inside] > 0.9)

@@ -222,7 +222,7 @@ def test_layers_motion_and_frames_of_its_own_model(filmed: Filmed, u8: Any) -> N
         assert np.mean(wrong(scene.depth(view[1]) * unit, truth)[inside(truth)]) < 0.03
         still, depth = world.still("left", float(view[1]))
         image, fused = filmed.problem.images[view], corrected[view]
-        known = correct_frame(image, truth.astype(np.float32), world.rig, world.shutter, world.motion, *view)
+        known = correct_frame(image, truth.astype(np.float32), world, view)
         drawn = (fused.origin == Origin.HERE) & known.mask & inside(depth)
         assert np.mean(drawn) > 0.5
         score, best = (psnr(each, u8(still), drawn) for each in (fused.image, known.image))

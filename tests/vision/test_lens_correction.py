@@ -85,9 +85,7 @@ def test_every_pixel_lands_where_the_twin_sees_its_point(scene: Any, truth: Buil
     tau = float(real.shutter.start(1, side))
     image, depth = real.rolling(side, 1)
     expected = truth(real, side, 1, tau)
-    got = correct_frame(
-        image.astype(np.float32), depth.astype(np.float32), real.rig, real.shutter, real.motion, side, 1
-    )
+    got = correct_frame(image.astype(np.float32), depth.astype(np.float32), real, (side, 1))
     seen = expected.visible & _smooth(expected.depth.astype(np.float32))
     assert np.mean(got.mask[seen]) > 0.999
     both = seen & got.mask
@@ -102,22 +100,18 @@ def test_every_pixel_lands_where_the_twin_sees_its_point(scene: Any, truth: Buil
 @pytest.mark.parametrize("case", CASES)
 def test_flow_is_back_projection_and_projection(scene: Any, case: str) -> None:
     real = _seen(scene, *CASES[case])
-    geometry: Any = (real.rig, real.shutter, real.motion, "right", 1)
     _, depth = real.rolling("right", 1)
     grid = real.rig.camera.pixel_grid()
     X = back_project(real.rig, real.shutter, real.motion, "right", 1, grid, depth)
     expected = project_at(real.rig, real.motion, "right", 1.3, X)[..., :2] - grid
-    np.testing.assert_allclose(correction_flow(depth, *geometry, target_tau=1.3), expected, atol=1e-4)
+    np.testing.assert_allclose(correction_flow(depth, real, ("right", 1), target_tau=1.3), expected, atol=1e-4)
 
 
 def test_a_lens_without_distortion_is_none(scene: Any) -> None:
     """The ideal camera is the special case: the loops with a lens that does nothing give the same frame."""
     image, depth = scene.rolling("left", 1)
     nothing = _seen(scene, Lens(model="brown-conrady"))
-    alone, through = (
-        correct_frame(image.astype(np.float32), depth, one.rig, one.shutter, one.motion, "left", 1)
-        for one in (scene, nothing)
-    )
+    alone, through = (correct_frame(image.astype(np.float32), depth, one, ("left", 1)) for one in (scene, nothing))
     np.testing.assert_array_equal(alone.mask, through.mask)
     np.testing.assert_allclose(alone.source_map, through.source_map, atol=1e-4)  # float32 of pixels
 

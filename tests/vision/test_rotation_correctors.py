@@ -11,6 +11,7 @@ import pytest
 
 from rsbench.components.plugins import wrap
 from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import GivenGeometry
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import VIEWS, View
 from rsbench.dataset.imu import ImuSamples, gyro_samples, true_samples
@@ -144,7 +145,8 @@ def test_one_image_with_lines_tells_how_its_rows_are_turned(
     motion = corrector.rotation(problem, view)
     assert not isinstance(motion, str), motion
     far = np.full((240, 240), np.inf, dtype=np.float32)
-    flows = [correction_flow(far, scene.rig, scene.shutter, each, *view) for each in (scene.motion, motion)]
+    moving = [GivenGeometry(scene.rig, scene.shutter, each) for each in (scene.motion, motion)]
+    flows = [correction_flow(far, each, view) for each in moving]
     distortion, left = (np.mean(np.linalg.norm(flow, axis=-1)) for flow in (flows[0], flows[1] - flows[0]))
     assert distortion > 4.0 and left < 0.3 * distortion
     fused = find_corrected(wrap(CORRECTORS, corrector), problem, [view])[view]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,13 +23,11 @@ from rsbench.benchmark.leaderboard.board import (
     refuse_another,
     write_split,
 )
-from rsbench.benchmark.leaderboard.marking import Step, mark_all
-from rsbench.benchmark.leaderboard.own_matches import FOLDER as MATCHES
-from rsbench.benchmark.leaderboard.own_matches import match_files
-from rsbench.benchmark.leaderboard.picture_files import FOLDER as PICTURES
-from rsbench.benchmark.leaderboard.picture_files import copy_files, find_picture
+from rsbench.benchmark.leaderboard.marking import mark_all
+from rsbench.benchmark.leaderboard.picture_files import copy_files
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import Submission, read_submission
+from rsbench.benchmark.leaderboard.track import Step
 from rsbench.benchmark.provenance import numeric_version
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.workers import Workers
@@ -102,11 +99,11 @@ def add_all(
     scored = list[Scored]()
     with work_folder(board) as hidden:
         open_board(board)
-        entries = place(board, split.protocol.id, split.name) / "entries"
+        entries = place(board, split.track.id, split.name) / "entries"
         taken = list[_Taken]()
         for number, (submission, data) in enumerate(read):
             method, new = submission.header.method, hidden / WORK / str(number)
-            kept = copy_files(submission.folder, _files_of(submission, split), new)
+            kept = copy_files(submission.folder, split.track.files_of(submission, split), new)
             if not replace(method):
                 refuse_another(entries / method, hashlib.sha256(data).hexdigest(), kept)
             taken.append(_Taken(dataclasses.replace(submission, folder=new), data, kept))
@@ -142,28 +139,6 @@ def _read_all(files: Iterable[Path], split: Split) -> tuple[list[tuple[Submissio
         except RsbenchError as error:
             faults.append(error)
     return read, faults
-
-
-def add_texts(board: Path, texts: Sequence[str], split: Split, made: dict[str, Any]) -> None:
-    """``add`` for predictions that are no files yet; entries of their names are replaced."""
-    with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(folder) / str(number) / "predictions.jsonl" for number in range(len(texts))]
-        for path, text in zip(paths, texts, strict=True):
-            path.parent.mkdir()
-            write_bytes(path, text.encode())
-        add_all(board, paths, split, made)
-
-
-def _files_of(submission: Submission, split: Split) -> Iterator[str]:
-    """Paths of all that the answers hold beside their file."""
-    if split.protocol.own_matches:
-        yield from (f"{MATCHES}/{name}" for name in match_files(submission.folder))
-    for truth in split.truths:
-        answer = submission.answers.get(truth.name)
-        if truth.pictures is not None and answer is not None and answer.success:
-            for asked in truth.pictures.asked:
-                found = find_picture(submission.folder / PICTURES, truth.name, asked, split.protocol.asks)
-                yield f"{PICTURES}/{truth.name}/{found.name}"
 
 
 def _record(taken: _Taken, split: Split, made: dict[str, Any]) -> dict[str, Any]:

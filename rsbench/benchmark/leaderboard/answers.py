@@ -1,15 +1,18 @@
-"""What stands in a file of predictions: the header, and answers of the kinds that protocols ask."""
+"""What stands in a file of predictions: the header, and what answers of all tracks have in common."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from rsbench.benchmark.leaderboard.protocols import Asks, protocol_of_id
+from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
 from rsbench.storage.untrusted_files import check_name
+
+if TYPE_CHECKING:
+    from rsbench.benchmark.leaderboard.track import Track
 
 LARGEST = 1e9
 """Number of w and d: larger ones are no motions, and their squares overflow."""
@@ -55,13 +58,19 @@ class Header:
             check_name(self.method)
         except ValueError as error:
             raise ValueError(str(error).replace("name =", "method =", 1)) from error
-        protocol_of_id(self.protocol).check_uses(self.uses)
         if self.png_unit_m is not None and not 0.0 < self.png_unit_m <= 1.0:
             raise ValueError(f"png_unit_m = {self.png_unit_m}: must be above 0 and at most 1 m")
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, str) and (len(value) > _TEXT_CHARACTERS or not value.isprintable()):
                 raise ValueError(f"{field.name}: must be one line of at most {_TEXT_CHARACTERS} characters")
+
+    def check_uses(self, track: Track, where: str) -> None:
+        """Raises RsbenchError when the method uses what its track does not give."""
+        try:
+            track.check_uses(self.uses)
+        except ValueError as error:
+            raise RsbenchError(f"{where}: {error}") from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,44 +122,3 @@ def _symmetric(covariance: FloatArray) -> bool:
     sizes = np.sqrt(np.abs(np.diag(covariance)))
     with np.errstate(over="ignore"):
         return bool(np.all(np.abs(covariance - covariance.T) <= 1e-3 * np.outer(sizes, sizes)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Motion(Answer):
-    """An answer where a motion is asked."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("w", "d"):
-            if self.success and getattr(self, name) is None:
-                raise ValueError(f"{name}: a success needs three numbers; a failure says success = false")
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Readout(Answer):
-    """An answer where the readout ratio is asked."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.success and self.readout_ratio is None:
-            raise ValueError("readout_ratio: a success needs it; a failure says success = false")
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Pictures(Answer):
-    """An answer whose pictures lie beside the file."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("w", "d", "readout_ratio", "covariance"):
-            if getattr(self, name) is not None:
-                raise ValueError(f"{name}: is not asked; an answer is pictures, and its line says the name")
-
-
-KINDS: dict[Asks, type[Answer]] = {
-    "motion": _Motion,
-    "readout": _Readout,
-    "depth": _Pictures,
-    "frames": _Pictures,
-}
-"""What an answer to each question must hold."""

@@ -23,11 +23,12 @@ import pandas as pd
 
 from rsbench.benchmark.leaderboard.answers import Header
 from rsbench.benchmark.leaderboard.exporting import split_record
-from rsbench.benchmark.leaderboard.marking import Step, mark_all
+from rsbench.benchmark.leaderboard.marking import mark_all
 from rsbench.benchmark.leaderboard.picture_files import file_bytes
-from rsbench.benchmark.leaderboard.protocols import PROTOCOLS, protocol_of_id
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import SUBMISSION_BYTES, Submission, read_submission
+from rsbench.benchmark.leaderboard.track import Step
+from rsbench.benchmark.leaderboard.track_list import TRACKS, track_of_id
 from rsbench.components.cards import parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.workers import Workers
@@ -81,7 +82,7 @@ class Scored:
 
 def made_by(board: Path, split: Split, method: str) -> str:
     """The command that made an entry; ``RUN`` where there is none."""
-    path = place(board, split.protocol.id, split.name) / "entries" / method / FILES[2]
+    path = place(board, split.track.id, split.name) / "entries" / method / FILES[2]
     if not path.is_file():
         return RUN
     made = read_json(path).get("made")
@@ -126,7 +127,7 @@ def _check_board(board: Path) -> None:
 
 def write_split(board: Path, split: Split) -> None:
     """The split.json of a board, with facts of the problems where those are public."""
-    path = place(board, split.protocol.id, split.name) / "split.json"
+    path = place(board, split.track.id, split.name) / "split.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     facts = {truth.name: truth.facts for truth in split.truths} if split.public else {}
     write_json(path, {**split_record(split), "facts": facts})
@@ -155,7 +156,7 @@ def splits_of(board: Path) -> list[tuple[str, str]]:
     """
     _check_board(board)
     found: list[tuple[str, str]] = []
-    for protocol in (each.id for each in PROTOCOLS.values()):
+    for protocol in (track.id for track in TRACKS.values()):
         found += [(protocol, folder.name) for folder in _folders(board / protocol)]
     return found
 
@@ -213,6 +214,7 @@ def _read_record(folder: Path) -> Recorded:
     named = (record.header.protocol, record.header.split, record.header.method)
     if named != (folder.parents[2].name, folder.parents[1].name, folder.name):
         raise RsbenchError(f"{path}: header: names {'/'.join(named)}, which is not where it lies")
+    record.header.check_uses(track_of_id(record.header.protocol), str(path))
     if hashlib.sha256(read_bytes(folder / FILES[0], SUBMISSION_BYTES)).hexdigest() != record.predictions_sha256:
         raise RsbenchError(
             f"{folder / FILES[0]}: has changed since it was scored; remove the entry, and submit it again"
@@ -221,10 +223,10 @@ def _read_record(folder: Path) -> Recorded:
 
 
 def _read_scores(folder: Path, protocol_id: str) -> pd.DataFrame:
-    columns, protocol = ("problem", "scene", "success"), protocol_of_id(protocol_id)
-    numbers = (*(score.key for score in protocol.scores), protocol.error)
+    columns, track = ("problem", "scene", "success"), track_of_id(protocol_id)
+    numbers = (*(score.key for score in track.scores), track.error)
     scores = read_table(folder / FILES[1], columns, numbers, dtype={"problem": str, "scene": str})
-    shares = scores[list(protocol.of_kind("share"))].to_numpy()
+    shares = scores[list(track.of_kind("share"))].to_numpy()
     if scores["problem"].duplicated().any() or not np.all((shares >= 0.0) & (shares <= 1.0)):
         raise RsbenchError(f"{folder / FILES[1]}: is damaged; rsbench leaderboard rescore makes it again")
     return scores
@@ -256,14 +258,14 @@ def rescore(
     changed: dict[str, list[str]] = {}
     _check_board(board)
     with work_folder(board):
-        folders = list(_folders(place(board, split.protocol.id, split.name) / "entries"))
+        folders = list(_folders(place(board, split.track.id, split.name) / "entries"))
         stored = [_stored(folder, split) for folder in folders]
         for folder, scores in zip(folders, mark_all(stored, split, workers, step), strict=True):
             if isinstance(scores, RsbenchError):
                 raise scores
             old = pd.DataFrame()
             with contextlib.suppress(RsbenchError):
-                old = _read_scores(folder, split.protocol.id)
+                old = _read_scores(folder, split.track.id)
             write_table(folder / FILES[1], scores)
             now = read_entry(folder).scores
             if columns := [str(name) for name in now if not now[name].equals(old.get(name, pd.Series()))]:

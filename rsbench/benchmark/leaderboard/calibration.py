@@ -1,4 +1,4 @@
-"""Whether stated covariances are right: shown beside scores, and never ranked.
+"""Calibration of the covariances that methods state (NEES): shown beside scores, and never ranked.
 
 The squared error of a motion by its covariance (NEES) is chi-squared with six degrees of freedom where that is
 right (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4):

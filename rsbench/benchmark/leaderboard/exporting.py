@@ -16,10 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.benchmark.images.store import read_record
-from rsbench.benchmark.leaderboard.picture_oracles import write_truth
-from rsbench.benchmark.leaderboard.protocols import Protocol
 from rsbench.benchmark.leaderboard.splits import Split
-from rsbench.benchmark.leaderboard.submissions import truth_text
+from rsbench.benchmark.leaderboard.track import Track
 from rsbench.benchmark.leaderboard.true_pictures import VIEW
 from rsbench.core.errors import RsbenchError
 from rsbench.pipeline.problem import COLUMNS, Problem, problem_record
@@ -49,18 +47,16 @@ def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:
     """
     given = list(problems)
     out.mkdir(parents=True, exist_ok=True)
-    columns = rig_columns(split.protocol)
-    records = [_record(problem, split.protocol) for problem in given]
+    columns = rig_columns(split.track)
+    records = [_record(problem, split.track) for problem in given]
     write_bytes(out / "problems.jsonl", "".join(json.dumps(each) + "\n" for each in records).encode())
     write_bytes(out / "problems.csv", _csv(("name", *columns), ((p.name, *_rig(p, columns)) for p in given)))
     write_matches(given, out)
     save_arrays(out / "problems.npz", _arrays(given, columns))
-    if split.protocol.asks == "frames":
+    if split.track.asks_rows:
         write_bytes(out / "pictures.csv", _csv(("name", "picture", "row", "time"), _asked(split)))
-    if split.public and split.protocol.pictures:
-        write_truth(split, out, "truth.jsonl")
-    elif split.public:
-        write_bytes(out / "truth.jsonl", truth_text(split).encode())
+    if split.public:
+        split.track.write_truth(split, out, "truth.jsonl")
     write_json(out / "split.json", split_record(split))
 
 
@@ -80,23 +76,23 @@ def write_matches(problems: Sequence[Problem], out: Path) -> None:
 def split_record(split: Split) -> dict[str, Any]:
     """What is told of a split before anything is scored."""
     return {
-        "protocol": split.protocol.id,
+        "protocol": split.track.id,
         "split": split.name,
         "fingerprint": split.fingerprint,
         "problems": len(split.truths),
-        "given": split.protocol.given,
-        "allowed": list(split.protocol.allowed),
+        "given": split.track.given,
+        "allowed": list(split.track.allowed),
     }
 
 
-def rig_columns(protocol: Protocol) -> tuple[str, ...]:
-    """Those of ``RIG`` that a protocol gives."""
-    return RIG[:-1] if protocol.asks == "readout" else RIG
+def rig_columns(track: Track) -> tuple[str, ...]:
+    """Those of ``RIG`` that a track gives."""
+    return RIG if track.gives_readout else RIG[:-1]
 
 
-def _record(problem: Problem, protocol: Protocol) -> dict[str, Any]:
+def _record(problem: Problem, track: Track) -> dict[str, Any]:
     record = problem_record(problem)
-    if protocol.asks == "readout":
+    if not track.gives_readout:
         del record["readout_ratio"]
     return record
 

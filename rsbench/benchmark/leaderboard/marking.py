@@ -1,41 +1,33 @@
-"""Scores of a submission, one row for each problem of its split: by the one scorer, and by nothing else.
+"""Scores of submissions, a row for each problem: by the one scorer of their track, and by nothing else.
 
-A problem without an answer is a failure, and a failure scores the worst value of everything.
+A problem without an answer is a failure, and a failure scores the worst value of everything. Pictures take
+longest: they are scored problem by problem, for what is found of the truth serves all entries, each problem in one
+process of one thread. A score does not depend on which process it comes from, or on the other entries: none draws
+at random, or adds in an order of its own.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.leaderboard.answers import Answer
-from rsbench.benchmark.leaderboard.own_matches import match_scores, read_own_matches
-from rsbench.benchmark.leaderboard.protocols import (
-    AUC_DEG,
-    AUC_READOUT,
-    FLIP_DEG,
-    SUCCESS_DEG,
-)
-from rsbench.benchmark.leaderboard.scoring_workers import Row, last, named, rows_of_workers
 from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.submissions import Submission
-from rsbench.benchmark.scoring import answered, pose_errors
-from rsbench.components.motion_models import make_motion
-from rsbench.core import so3
+from rsbench.benchmark.leaderboard.track import Row, Step
 from rsbench.core.errors import RsbenchError
-from rsbench.core.pose_errors import translation_of_offset
-from rsbench.core.so3 import FloatArray
+from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.jobs.plain_data import decode, encode
+from rsbench.jobs.process_jobs import run_jobs
 from rsbench.jobs.workers import Workers
+from rsbench.storage.files import write_bytes
+from rsbench.storage.untrusted_files import read_bytes
 
-_TIMES = 33
-"""Row times, from the first row of frame 0 to the last of frame 1, at which poses are compared."""
-_WORST_READOUT = 1.0
-"""Error of a failure: between the two ends of what a ratio can be."""
-Step = Callable[[str], None]
+Numbers = dict[str, float]
 
 
 def mark(submission: Submission, split: Split, workers: Workers = 1) -> pd.DataFrame:
@@ -72,105 +64,88 @@ def mark_all(
     Raises:
         RsbenchError: the truth has changed since the split was read.
     """
-    if not split.protocol.pictures:
-        return [pd.DataFrame(_rows(submission, split)) for submission in submissions]
-    marked, names = dict[str, list[Row | str]](), [truth.name for truth in split.truths]
-    for name, rows in rows_of_workers(submissions, split, workers, kept):
-        marked[name] = rows
-        step(name)
-    tables = list[pd.DataFrame | RsbenchError]()
-    for rows in zip(*(marked[name] for name in names), strict=True):
-        faults = [row for row in rows if isinstance(row, str)]
-        tables.append(RsbenchError(faults[0]) if faults else pd.DataFrame(list(rows)))
-    return tables
+    return split.track.mark(submissions, split, workers, step, kept)
 
 
-def _rows(submission: Submission, split: Split) -> list[Row]:
-    """Of what holds no pictures."""
-    model, found = submission.header.motion_model, submission.answers
-    if split.protocol.asks == "readout":
-        return [_readout_row(truth, found.get(truth.name)) for truth in split.truths]
-    rows = [_motion_row(truth, found.get(truth.name), model) for truth in split.truths]
-    if split.protocol.own_matches:
-        own = read_own_matches(submission.folder, split.by_name)
-        for row, truth in zip(rows, split.truths, strict=True):
-            assert truth.sequence is not None
-            row |= match_scores(truth.sequence, None if own is None else own[truth.name])
+def rows_of_workers(
+    submissions: Sequence[Submission], split: Split, workers: Workers, kept: Path | None = None
+) -> Iterator[tuple[str, list[Row | str]]]:
+    """``picture_rows`` of each problem by its name, as they become ready; with one worker, in this process.
+
+    A folder ``kept`` holds those of a run that was cut off, and gets those that are new.
+
+    Raises:
+        RsbenchError: as it does; or a process ended each time over the same problem.
+    """
+    names = list[str]()
+    for truth in split.truths:
+        if kept is not None and (path := kept / truth.name).is_file():
+            yield truth.name, decode(read_bytes(path), {})
+        else:
+            names.append(truth.name)
+    for name, rows in _rows_of(submissions, split, workers, names):
+        if kept is not None:
+            kept.mkdir(parents=True, exist_ok=True)
+            write_bytes(kept / name, encode(rows))
+        yield name, rows
+
+
+def _rows_of(
+    submissions: Sequence[Submission], split: Split, workers: Workers, names: list[str]
+) -> Iterator[tuple[str, list[Row | str]]]:
+    if workers == 1:
+        for name in names:
+            yield name, picture_rows(split, name, submissions)
+        return
+    outcomes = run_jobs(_serve, names, workers, dict.fromkeys(THREAD_VARIABLES, "1"), tuple(submissions), split)
+    with closing(outcomes) as ready:
+        for name, outcome in ready:
+            if not outcome.success:
+                raise RsbenchError(f"problem {name}: {outcome.reason}" if outcome.ended else outcome.reason)
+            yield name, outcome.value
+
+
+def _serve(submissions: Sequence[Submission], split: Split) -> Callable[[str], list[Row | str]]:
+    use_one_thread()
+
+    def run(name: str) -> list[Row | str]:
+        try:
+            return picture_rows(split, name, submissions)
+        except RsbenchError as error:
+            raise EntryFailure(str(error)) from error
+
+    return run
+
+
+def picture_rows(split: Split, name: str, submissions: Sequence[Submission]) -> list[Row | str]:
+    """Of each submission the scores of its pictures, which are read here, or what is at fault with them.
+
+    Raises:
+        RsbenchError: the truth has changed since the split was read.
+    """
+    truth, track = split.by_name[name], split.track
+    assert truth.pictures is not None
+    truth.pictures.check()
+    scores_of = track.scorer(truth, truth.pictures)
+    rows = list[Row | str]()
+    for submission in submissions:
+        answer = submission.answers.get(truth.name)
+        success = answer is not None and answer.success
+        try:
+            scores = scores_of(submission, success)
+        except RsbenchError as error:
+            rows.append(str(error))
+        else:
+            rows.append({**named(truth, success), **scores, **last(success, answer)})
     return rows
 
 
-def _readout_row(truth: Truth, answer: Answer | None) -> Row:
-    ratio = None if answer is None or not answer.success else answer.readout_ratio
-    error = _WORST_READOUT if ratio is None else abs(ratio - truth.shutter.readout_ratio)
-    return {
-        **named(truth, ratio is not None),
-        "e_readout": error,
-        **{name: max(0.0, 1.0 - error / limit) for name, limit in AUC_READOUT.items()},
-        **last(ratio is not None, answer),
-    }
+def named(truth: Truth, success: bool) -> Row:
+    """The first columns."""
+    return {"problem": truth.name, "scene": truth.scene, "success": success}
 
 
-def _motion_row(truth: Truth, answer: Answer | None, model: str) -> Row:
-    w, d = _vectors(answer)
-    success = answer is not None and bool(answered(w, d, answer.success))
-    point = "body" if answer is None else answer.reference_point
-    metric = answer is not None and answer.metric
-    errors = pose_errors(
-        w,
-        d,
-        true_w=truth.motion.w,
-        true_d=truth.motion.d,
-        rig=truth.rig,
-        success=success,
-        metric=metric,
-        reference_point=point,
-    )
-    found = {name: float(value) for name, value in errors.items()}
-    worst = float(np.fmax(found["e_R_deg"], found["e_T_deg"]))
-    return {
-        **named(truth, success),
-        **found,
-        "metres": _metres(d, truth, point) if success and metric else math.nan if success else math.inf,
-        "e_row_deg": _row_angle(w, d, truth, model) if success else 180.0,
-        "error_deg": worst,
-        **{f"auc_{limit}": max(0.0, 1.0 - worst / limit) for limit in AUC_DEG},
-        "within": float(found["e_R_deg"] < SUCCESS_DEG[0] and not found["e_T_deg"] >= SUCCESS_DEG[1]),
-        "flip": float(success and found["e_T_deg"] > FLIP_DEG),
-        "nees": _nees(answer, w, d, truth) if answer is not None and success and metric else math.nan,
-        **last(success, answer),
-    }
-
-
-def _vectors(answer: Answer | None) -> tuple[FloatArray, FloatArray]:
-    if answer is None or answer.w is None or answer.d is None:
-        return np.full(3, np.nan), np.full(3, np.nan)
-    return np.array(answer.w), np.array(answer.d)
-
-
-def _true_d(truth: Truth, point: str) -> FloatArray:
-    if point == "body":
-        return truth.motion.d
-    return translation_of_offset(truth.motion.w, truth.motion.d, truth.rig.offset("left"))
-
-
-def _metres(d: FloatArray, truth: Truth, point: str) -> float:
-    return float(np.linalg.norm(d - _true_d(truth, point)))
-
-
-def _row_angle(w: FloatArray, d: FloatArray, truth: Truth, model: str) -> float:
-    """The largest angle between estimated and true poses of a row, degrees."""
-    times = np.linspace(0.0, 1.0 + truth.shutter.readout_ratio, _TIMES)
-    estimated = make_motion(model, w, d).body_from_world(times).R
-    true = truth.motion.body_from_world(times).R
-    return float(np.rad2deg(np.max(so3.angle(estimated @ np.swapaxes(true, -1, -2)))))
-
-
-def _nees(answer: Answer, w: FloatArray, d: FloatArray, truth: Truth) -> float:
-    """Squared error of (w, d) by the covariance that was stated: on average 6 where that is right."""
-    if answer.covariance is None:
-        return math.nan
-    error = np.concatenate([w - truth.motion.w, d - _true_d(truth, answer.reference_point)])
-    values, vectors = np.linalg.eigh(np.array(answer.covariance))
-    if not values[0] > 0.0:
-        return math.inf
-    return float(np.sum((vectors.T @ error) ** 2 / values))
+def last(success: bool, answer: Answer | None) -> Row:
+    """The last columns."""
+    seconds = math.nan if answer is None or answer.seconds is None else answer.seconds
+    return {"failure": float(not success), "seconds": seconds}

@@ -1,4 +1,4 @@
-"""Two boards become one."""
+"""Merge two boards."""
 
 from __future__ import annotations
 

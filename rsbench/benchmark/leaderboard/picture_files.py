@@ -1,4 +1,4 @@
-"""Pictures of strangers, depth maps and corrected frames: beside a file of answers, ``pictures/PROBLEM/NAME.png``.
+"""Pictures that anybody hands in: beside a file of answers, ``pictures/PROBLEM/NAME.png``.
 
 Names are looked up, never taken from what was handed in, and no link is followed. The size of an image is known
 from its header, before anything is decoded.
@@ -12,14 +12,13 @@ import os
 import re
 import stat
 import struct
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.benchmark.leaderboard.protocols import Asks
 from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.true_pictures import Asked
 from rsbench.core.errors import RsbenchError
@@ -28,7 +27,6 @@ from rsbench.storage.untrusted_files import NAME, read_bytes
 
 FOLDER = "pictures"
 """Beside the file of answers."""
-SUFFIXES: Mapping[Asks, tuple[str, ...]] = {"depth": (".exr", ".png"), "frames": (".png",)}
 FARTHEST = 1e9
 """m: no surface is farther."""
 _FILE = re.compile(
@@ -43,13 +41,13 @@ _BYTES = 1 << 16
 """A file has at most so many, and so many for each pixel."""
 
 
-def find_picture(folder: Path, problem: str, asked: Asked, asks: Asks) -> Path:
+def find_picture(folder: Path, problem: str, asked: Asked) -> Path:
     """The file of a picture below ``pictures``.
 
     Raises:
         RsbenchError: there is none, two of different kinds, or something that is no file of its own.
     """
-    paths = [folder / problem / f"{asked.stem}{suffix}" for suffix in SUFFIXES[asks]]
+    paths = [folder / problem / f"{asked.stem}{suffix}" for suffix in asked.suffixes]
     found = [path for path in paths if os.path.lexists(path)]
     if len(found) != 1:
         names = " and ".join(path.name for path in paths)
@@ -114,9 +112,7 @@ def strange_files(folder: Path, split: Split, answered: Collection[str]) -> Iter
             continue
         if place.name not in answered:
             yield f"{place}: has pictures, but no line in the file of answers says so; add one, or remove them"
-        names = {
-            f"{asked.stem}{suffix}" for asked in truth.pictures.asked for suffix in SUFFIXES[split.protocol.asks]
-        }
+        names = {f"{asked.stem}{suffix}" for asked in truth.pictures.asked for suffix in asked.suffixes}
         for path in sorted(place.iterdir()):
             if path.name not in names:
                 yield f"{path}: is not asked; there are: {', '.join(sorted(names))}"
@@ -167,14 +163,14 @@ def read_frame(path: Path, size: tuple[int, int]) -> tuple[NDArray[np.uint8], ND
 def read_answer_frame(folder: Path, truth: Truth, asked: Asked) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """``read_frame`` of a problem; errors as ``find_picture`` too."""
     assert truth.pictures is not None
-    return read_frame(find_picture(folder, truth.name, asked, "frames"), truth.pictures.size)
+    return read_frame(find_picture(folder, truth.name, asked), truth.pictures.size)
 
 
 def read_answer_depth(folder: Path, truth: Truth, png_unit_m: float | None) -> NDArray[np.float32]:
     """``read_depth_map`` of a problem; errors as ``find_picture`` too."""
     assert truth.pictures is not None
     (asked,) = truth.pictures.asked
-    return read_depth_map(find_picture(folder, truth.name, asked, "depth"), truth.pictures.size, png_unit_m)
+    return read_depth_map(find_picture(folder, truth.name, asked), truth.pictures.size, png_unit_m)
 
 
 def frame_png(image: NDArray[np.uint8], drawn: NDArray[np.bool_]) -> bytes:

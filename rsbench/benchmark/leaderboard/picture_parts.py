@@ -1,4 +1,4 @@
-"""Scores of pictures by parts of their pixels: how far from the reference row they lie, and how textured they are.
+"""Scores of pictures by parts of their pixels: by distance from the reference row, and by texture.
 
 What a part is decides the truth alone, so that all entries are scored on the same pixels.
 """
@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.benchmark.leaderboard.protocols import Asks
 from rsbench.core.so3 import FloatArray
 
 WINDOW = 9
@@ -43,14 +42,11 @@ PARTINGS = (
         starts=(0.0, 2.0, 5.0, 10.0, 20.0),
     ),
 )
-_SCORES: dict[Asks, str] = {"depth": "bad_1", "frames": "rms"}
-TITLES: dict[Asks, str] = {"depth": "bad@1", "frames": "RMS error of the common pixels, of 255"}
-"""What figures call them."""
 
 
-def columns(asks: Asks, parting: Parting) -> list[str]:
+def columns(score: str, parting: Parting) -> list[str]:
     """Of scores.csv, such as ``bad_1_rows_1``, in the order of the parts."""
-    return [f"{_SCORES[asks]}_{parting.name}_{number}" for number in range(1, len(parting.starts) + 1)]
+    return [f"{score}_{parting.name}_{number}" for number in range(1, len(parting.starts) + 1)]
 
 
 def parts_of(image: NDArray[np.uint8], row: int) -> Iterator[tuple[Parting, list[BoolArray]]]:
@@ -80,33 +76,24 @@ Parts = dict[str, BoolArray]
 """Pixels (H, W) of each part, by column."""
 
 
-def frame_parts(image: NDArray[np.uint8], common: BoolArray, row: int) -> Parts:
-    """Of the ``common`` pixels of a frame (H, W, 3) of row ``row``'s time."""
+def parts_within(score: str, image: NDArray[np.uint8], row: int, counted: BoolArray) -> Parts:
+    """Of the ``counted`` pixels of a picture (H, W, 3) of row ``row``'s time, by the columns of a ``score``."""
     return {
-        name: part & common
+        name: part & counted
         for parting, parts in parts_of(image, row)
-        for name, part in zip(columns("frames", parting), parts, strict=True)
-    }
-
-
-def depth_parts(image: NDArray[np.uint8], surface: BoolArray) -> Parts:
-    """Of the pixels of a rolling-shutter frame (H, W, 3) that show a ``surface``."""
-    return {
-        name: part & surface
-        for parting, parts in parts_of(image, 0)
-        for name, part in zip(columns("depth", parting), parts, strict=True)
+        for name, part in zip(columns(score, parting), parts, strict=True)
     }
 
 
 class SquareErrors:
     """Root mean squares of frames by part; what was not drawn is black."""
 
-    def __init__(self) -> None:
-        self._sums = {name: np.zeros(2) for parting in PARTINGS for name in columns("frames", parting)}
+    def __init__(self, score: str) -> None:
+        self._sums = {name: np.zeros(2) for parting in PARTINGS for name in columns(score, parting)}
         """Of squared errors, and how many."""
 
     def add(self, image: NDArray[np.uint8] | None, truth: NDArray[np.uint8], parts: Parts) -> None:
-        """A frame (H, W, 3) and its ``frame_parts``; None: a failure, which errs by all levels."""
+        """A frame (H, W, 3) and its ``parts_within``; None: a failure, which errs by all levels."""
         off = np.full(truth.shape, _MOST) if image is None else image.astype(np.float64) - truth
         squares = _mean(off * off)
         for name, part in parts.items():

@@ -1,4 +1,4 @@
-"""Test splits of rendered frames from a secret text: a part for everybody, and the truth from the text again.
+"""Secret test splits of rendered frames: inputs for everybody, a commitment, and the truth from the secret text.
 
 Announced are a hash of the text, the fingerprint of the split, and a hash of all files of the keeper's dataset. So
 whoever is told the text afterwards can see that it is the announced one, that it makes the same motions, and, by
@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rsbench.benchmark.leaderboard.exporting import check_place, write_inputs
-from rsbench.benchmark.leaderboard.frames import bare_problems, matched_problems, write_frames
-from rsbench.benchmark.leaderboard.protocols import Protocol
+from rsbench.benchmark.leaderboard.frame_inputs import write_frames
 from rsbench.benchmark.leaderboard.splits import Split, dataset_split, truth_of
+from rsbench.benchmark.leaderboard.track import Track
 from rsbench.components.cards import card_path, parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import DatasetCard
@@ -55,25 +55,23 @@ class Announcement:
     """SHA-256 of the public files."""
 
 
-def secret_of(protocol: Protocol, text: Secret) -> Secret:
+def secret_of(track: Track, text: Secret) -> Secret:
     """What a split is drawn from. One track asks for the readout ratio, which the inputs of others tell: it has
     another split."""
-    return Secret(text.digest("track", protocol.track).hex()) if protocol.asks == "readout" else text
+    return text if track.gives_readout else Secret(text.digest("track", track.name).hex())
 
 
-def drawn_split(protocol: Protocol, card: str, text: Secret) -> Split:
+def drawn_split(track: Track, card: str, text: Secret) -> Split:
     """The split that ``publish`` makes, from the text alone; nothing is rendered.
 
     Raises:
-        RsbenchError: as ``secret_card``; or the protocol asks for what only rendering tells.
+        RsbenchError: as ``secret_card``; or the track asks for what only rendering tells.
     """
-    if protocol.asks not in ("motion", "readout"):
-        raise RsbenchError(
-            f"track {protocol.track!r}: its truth is rendered; name the keeper's folder with --keep"
-        )
-    drawn = secret_card(card, secret_of(protocol, text))
+    if track.pictures:
+        raise RsbenchError(f"track {track.name!r}: its truth is rendered; name the keeper's folder with --keep")
+    drawn = secret_card(card, secret_of(track, text))
     pairs = [pair for each in _sequences(drawn) for pair in each.pairs()]
-    return Split(protocol=protocol, label=drawn.name, public=False, truths=tuple(map(truth_of, pairs)))
+    return Split(track=track, label=drawn.name, public=False, truths=tuple(map(truth_of, pairs)))
 
 
 def _sequences(card: DatasetCard) -> list[Sequence]:
@@ -85,7 +83,7 @@ def _sequences(card: DatasetCard) -> list[Sequence]:
 
 
 def publish(
-    protocol: Protocol,
+    track: Track,
     card: str,
     text: Secret,
     keep: Path,
@@ -100,7 +98,7 @@ def publish(
     the proof.
 
     Args:
-        protocol: of a track of frames.
+        track: of frames.
         card: name or path of a dataset card.
         text: the secret.
         keep: gets the scene cards and the dataset, which ``verify`` checks; an interrupted run resumes there.
@@ -111,21 +109,20 @@ def publish(
     Raises:
         RsbenchError: a card that hides nothing; a folder with something else; another split was announced.
     """
-    secret, data = secret_of(protocol, text), keep / DATA
+    secret, data = secret_of(track, text), keep / DATA
     drawn = secret_card(card, secret, keep / SCENES)
     write_scenes(card, secret, keep / SCENES)
     generate_dataset(drawn, data, workers=workers, progress=progress)
-    split = dataset_split(protocol, data, public=False)
+    split = dataset_split(track, data, public=False)
     made = _announcement(split, card, text, data)
     announced = read_announcement(out) if (out / ANNOUNCEMENT).exists() else None
     if announced is not None:
         _check_same(announced, made, "card_sha256", "commitment", "fingerprint", "truth")
     check_place(split, out)
     with work_folder(out):
-        images = "images" in protocol.allowed
-        if images:
+        if track.gives_images:
             write_frames(data, out)
-        write_inputs(split, bare_problems(data) if images else matched_problems(data), out)
+        write_inputs(split, track.problems(data, None, len(split.truths)), out)
         names = [name for name in files_below(out) if name != ANNOUNCEMENT and not name.startswith(HIDDEN)]
         made = replace(made, files={name: sha256(out / name) for name in sorted(names)})
         if announced is None:
@@ -142,7 +139,7 @@ def _announcement(split: Split, card: str, text: Secret, data: Path) -> Announce
         format=FORMAT,
         card=path.stem,
         card_sha256=sha256(path),
-        protocol=split.protocol.id,
+        protocol=split.track.id,
         split=split.name,
         fingerprint=split.fingerprint,
         commitment=text.commitment,
@@ -174,9 +171,7 @@ def read_announcement(folder: Path) -> Announcement:
     return found
 
 
-def announced_split(
-    announced: Announcement, protocol: Protocol, card: str, text: Secret, keep: Path | None
-) -> Split:
+def announced_split(announced: Announcement, track: Track, card: str, text: Secret, keep: Path | None) -> Split:
     """The truth of an announced split: drawn again, or that of the keeper's folder.
 
     Raises:
@@ -184,9 +179,7 @@ def announced_split(
     """
     if text.commitment != announced.commitment:
         raise RsbenchError("--seed-file: its text is not the announced one; take the file that publish was given")
-    split = (
-        drawn_split(protocol, card, text) if keep is None else dataset_split(protocol, keep / DATA, public=False)
-    )
+    split = drawn_split(track, card, text) if keep is None else dataset_split(track, keep / DATA, public=False)
     found = replace(announced, fingerprint=split.fingerprint)
     _check_same(
         announced, found if keep is None else replace(found, truth=truth_hash(keep / DATA)), "truth", "fingerprint"

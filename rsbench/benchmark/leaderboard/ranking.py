@@ -1,4 +1,4 @@
-"""Who is better than whom: intervals of mean scores over scenes, and ranks that say how far the data tell.
+"""Ranks of methods: confidence intervals of mean scores over scenes, ties, and ranks with intervals.
 
 Scores of one scene are not independent, so scenes count, each alike: the score of an entry is the mean over scenes
 of its mean over the problems there, and its interval is Student's, of the scenes' means. For simulated problems

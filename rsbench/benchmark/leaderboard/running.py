@@ -10,25 +10,25 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import time
-from collections.abc import Callable, Iterator, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import pandas as pd
 
 from rsbench.benchmark.images.store import identity_of, read_record
 from rsbench.benchmark.leaderboard.answers import LARGEST
 from rsbench.benchmark.leaderboard.exporting import write_inputs
-from rsbench.benchmark.leaderboard.protocols import PROTOCOLS, Protocol, protocol_of_id
 from rsbench.benchmark.leaderboard.splits import Split
-from rsbench.benchmark.leaderboard.submissions import submission_text
+from rsbench.benchmark.leaderboard.submissions import Submission, submission_text, template_text, truth_text
+from rsbench.benchmark.leaderboard.track import ORACLE, Limits, Row, Step, Track
 from rsbench.benchmark.provenance import numeric_version, processor
 from rsbench.benchmark.simulated.trials import Information, enter
-from rsbench.capture.estimate import conclude, examine
-from rsbench.capture.settle import known_of, shutter_found
 from rsbench.core.errors import RsbenchError
-from rsbench.core.track_building import join_stereo
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.jobs.process_jobs import finished_jobs, run_jobs
 from rsbench.jobs.workers import Workers
@@ -38,14 +38,11 @@ from rsbench.pipeline.problem import Problem, parse_problem
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.engine.warm_up import warm_up
-from rsbench.solvers.refined import RefinedSolver
 from rsbench.storage.files import sha256, write_bytes, write_json
-from rsbench.storage.untrusted_files import check_name, parse_json, read_json, read_text
+from rsbench.storage.untrusted_files import check_name, parse_json, read_text
 
 _EXTRAS: tuple[Extra, ...] = ("covariance",)
 Job = TypeVar("Job")
-CHUNK = 10
-"""Problems of one job."""
 _USES: dict[Information, tuple[str, ...]] = {
     "left pairs": ("left",),
     "left and right pairs": ("left", "right"),
@@ -67,18 +64,6 @@ _KEPT = (
 """Of an answer of ``solve_problem``."""
 
 
-class Limits(NamedTuple):
-    """What a method may take for one problem, in a process that ends when it takes more; None: no limit."""
-
-    seconds: float | None = None
-    memory_mb: float | None = None
-
-    @property
-    def chunk(self) -> int:
-        """Problems of one job: a job that takes too much is the failure of one problem."""
-        return CHUNK if self == Limits() else 1
-
-
 class _Job(NamedTuple):
     card: str
     first: int
@@ -89,21 +74,69 @@ class _Job(NamedTuple):
         return f"{self.card}, problems {self.first} to {self.first + self.problems - 1}"
 
 
-def uses_of(entry: SolverEntry, protocol: Protocol = PROTOCOLS["points"]) -> tuple[str, ...]:
-    """What a solver uses, by what it declares; what is asked is not used."""
-    rolling = entry.solver.spec.shutter == "rolling" and protocol.asks == "motion"
+class SolverTrack(Track):
+    """A track whose cards are solvers, and whose answers are lines of numbers."""
+
+    example: ClassVar[Mapping[str, Any]]
+    """An answer for a template."""
+
+    @abstractmethod
+    def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
+        """What a solver says of a problem, as a line of a submission."""
+
+    def check_entry(self, entry: SolverEntry) -> None:
+        """Raises RsbenchError when a solver does not fit the track."""
+        try:
+            check_name(entry.name)
+            self.check_uses(uses_of(entry, self.gives_readout))
+        except ValueError as error:
+            raise RsbenchError(f"solver {entry.name!r}: {error}") from error
+
+    def load(self, cards: Sequence[str]) -> None:
+        load_entries(cards, self)
+
+    def steps(self, cards: Sequence[str], split: Split, limits: Limits) -> int:
+        return len(cards) * -(-len(split.truths) // limits.chunk)
+
+    def run(self, cards: Sequence[str], split: Split, inputs: Path, work: Path, **options: Any) -> list[Path]:
+        return run_cards(self, cards, split, inputs, work, **options)
+
+    @abstractmethod
+    def rows(self, submission: Submission, split: Split) -> list[Row]:
+        """Scores of each problem."""
+
+    def mark(
+        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Path | None
+    ) -> list[pd.DataFrame | RsbenchError]:
+        return [pd.DataFrame(self.rows(submission, split)) for submission in submissions]
+
+    def write_template(self, split: Split, path: Path) -> None:
+        write_bytes(path, template_text(split, self.example).encode())
+
+    def write_truth(self, split: Split, folder: Path, file: str = "predictions.jsonl") -> Path:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_bytes(folder / file, truth_text(split).encode())
+        return folder / file
+
+    def oracles(self, split: Split, folder: Path) -> Iterator[Path]:
+        yield self.write_truth(split, folder / ORACLE)
+
+
+def uses_of(entry: SolverEntry, readout: bool = True) -> tuple[str, ...]:
+    """What a solver uses, by what it declares, of a track that gives the ``readout`` ratio or not."""
+    rolling = entry.solver.spec.shutter == "rolling" and readout
     return _USES[enter(entry).information] + (("readout",) if rolling else ())
 
 
-def load_entries(cards: Sequence[str], protocol: Protocol) -> dict[str, SolverEntry]:
+def load_entries(cards: Sequence[str], track: SolverTrack) -> dict[str, SolverEntry]:
     """Solvers by their cards.
 
     Raises:
-        RsbenchError: no such solver, or it uses what the protocol does not give.
+        RsbenchError: no such solver, or it uses what the track does not give.
     """
     entries = {card: load_solver_entry(card) for card in cards}
     for entry in entries.values():
-        _check_uses(protocol, entry)
+        track.check_entry(entry)
     return entries
 
 
@@ -124,6 +157,7 @@ def prepare_inputs(
 
 
 def run_cards(
+    track: SolverTrack,
     cards: Sequence[str],
     split: Split,
     inputs: Path,
@@ -139,7 +173,7 @@ def run_cards(
         RsbenchError: no such solver; it uses what the protocol does not give; processes died each time over
             the same problems: what is done is kept.
     """
-    entries = load_entries(cards, split.protocol)
+    entries = load_entries(cards, track)
     data, count = sha256(inputs / "problems.jsonl"), len(split.truths)
     jobs, identities = list[_Job](), dict[str, str]()
     for card, entry in entries.items():
@@ -161,7 +195,7 @@ def run_cards(
     def limited(job: _Job) -> bool:
         return entries[job.card].built_in  # those of others are limited in processes of their own
 
-    for job in jobs_done(_serve, jobs, workers, inputs, limits, fail, limited):
+    for job in jobs_done(partial(_serve, track), jobs, workers, inputs, limits, fail, limited):
         step(entries[job.card].name)
     return [_joined(entry, split, work, identities[card], limits.chunk) for card, entry in entries.items()]
 
@@ -214,23 +248,6 @@ def jobs_done(
             yield job
 
 
-def steps_of(cards: Sequence[str], split: Split, limits: Limits = Limits()) -> int:  # noqa: B008  a constant
-    """How often ``run_cards`` reports progress."""
-    return len(cards) * -(-len(split.truths) // limits.chunk)
-
-
-def _check_uses(protocol: Protocol, entry: SolverEntry) -> None:
-    solver = entry.solver
-    refined = isinstance(solver, RefinedSolver) and solver.spec.shutter == "rolling" and not solver.one_camera
-    if protocol.asks == "readout" and not refined:
-        raise RsbenchError(f"solver {entry.name!r}: finds no readout ratio; rs-stereo-refined and its variants do")
-    try:
-        check_name(entry.name)
-        protocol.check_uses(uses_of(entry, protocol))
-    except ValueError as error:
-        raise RsbenchError(f"solver {entry.name!r}: {error}") from error
-
-
 def _identity(entry: SolverEntry, split: Split, data: str, limits: Limits) -> str:
     return identity_of(
         **({} if limits == Limits() else {"limits": list(limits)}),
@@ -238,7 +255,7 @@ def _identity(entry: SolverEntry, split: Split, data: str, limits: Limits) -> st
         solver=entry.key,
         options=entry.options.deciding,
         robust=asdict(RobustOptions()),
-        protocol=split.protocol.id,
+        protocol=split.track.id,
         data=data,
     )
 
@@ -247,10 +264,10 @@ def header_of(entry: SolverEntry, split: Split) -> dict[str, Any]:
     """The first line of a solver's submission."""
     spec = entry.solver.spec
     return {
-        "protocol": split.protocol.id,
+        "protocol": split.track.id,
         "split": split.name,
         "method": entry.name,
-        "uses": uses_of(entry, split.protocol),
+        "uses": uses_of(entry, split.track.gives_readout),
         "description": entry.description[:300],
         "paper": spec.reference[:300],
         "code": "rsbench" if entry.built_in else "",
@@ -273,19 +290,17 @@ def _joined(entry: SolverEntry, split: Split, work: Path, identity: str, chunk: 
 # In the child
 
 
-def _serve(inputs: Path, limits: Limits) -> Callable[[_Job], None]:
+def _serve(track: SolverTrack, inputs: Path, limits: Limits) -> Callable[[_Job], None]:
     use_one_thread()
     warm_up()
     runner = SolverRunner(time_limit_s=limits.seconds, single_thread=True, memory_mb=limits.memory_mb)
-    protocol = protocol_of_id(str(read_json(inputs / "split.json").get("protocol")))
-    answer = answer_problem if protocol.asks == "motion" else _readout
-    problems = read_inputs(inputs, protocol)
+    problems = read_inputs(inputs, track)
 
     def run(job: _Job) -> None:
         try:
             entry = load_solver_entry(job.card)
             answers = [
-                answer(problem, entry, runner) for problem in problems[job.first : job.first + job.problems]
+                track.answer(problem, entry, runner) for problem in problems[job.first : job.first + job.problems]
             ]
         except RsbenchError as error:
             raise EntryFailure(str(error)) from error
@@ -295,15 +310,15 @@ def _serve(inputs: Path, limits: Limits) -> Callable[[_Job], None]:
     return run
 
 
-def read_inputs(inputs: Path, protocol: Protocol) -> list[Problem]:
+def read_inputs(inputs: Path, track: Track) -> list[Problem]:
     """The exported problems; where the readout ratio is not given, it is 0.
 
     Raises:
         RsbenchError: they are not there, or damaged.
     """
     path = inputs / "problems.jsonl"
-    unknown = {"readout_ratio": 0.0} if protocol.asks == "readout" else {}
-    found = []
+    unknown: dict[str, float] = {} if track.gives_readout else {"readout_ratio": 0.0}
+    found = list[Problem]()
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         where = f"{path}:{number}"
         text = json.dumps(parse_json(line, where) | unknown) if unknown else line
@@ -311,30 +326,15 @@ def read_inputs(inputs: Path, protocol: Protocol) -> list[Problem]:
     return found
 
 
-def _seed(problem: Problem, entry: SolverEntry) -> int:
+def seed_of_answer(problem: Problem, entry: SolverEntry) -> int:
     """Samples are drawn by the names of problem and solver: they do not depend on the order or on the workers."""
     text = f"leaderboard {problem.name} {entry.name}"
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
 
 
-def _readout(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
-    """The readout ratio that explains the matches best, under the solver's motion model; without ``runner``."""
-    solver = entry.solver
-    assert isinstance(solver, RefinedSolver)
-    matches, start = join_stereo(problem.correspondences).correspondences, time.perf_counter()
-    known = known_of(matches, problem.rig, None, problem.shutter.scanning, None, (solver.motion_model,))
-    capture = conclude([examine(matches, problem.rig, known, RobustOptions(), _seed(problem, entry))])
-    seconds = round(time.perf_counter() - start, 6)
-    try:
-        ratio = shutter_found(capture, problem.rig).readout_ratio
-    except RsbenchError as error:
-        return {"name": problem.name, "success": False, "reason": str(error)[:300], "seconds": seconds}
-    return {"name": problem.name, "readout_ratio": ratio, "seconds": seconds}
-
-
 def answer_problem(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
     """What a solver says of a problem, as a line of a submission."""
-    found = solve_problem(problem, entry, RobustOptions(), runner, _seed(problem, entry), extras=_EXTRAS)
+    found = solve_problem(problem, entry, RobustOptions(), runner, seed_of_answer(problem, entry), extras=_EXTRAS)
     kept = {key: found[key] for key in _KEPT}
     if found["success"] and max(map(abs, (*found["w"], *found["d"]))) > LARGEST:
         return {"name": problem.name, "success": False, "reason": f"w or d goes beyond {LARGEST:g}"}

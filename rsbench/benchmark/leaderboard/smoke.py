@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -13,18 +14,37 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from rsbench.benchmark.images.store import read_record
+from rsbench.benchmark.leaderboard.exporting import write_matches
+from rsbench.benchmark.leaderboard.frame_inputs import FEATURES, FrameTrack, read_frames, write_frames
 from rsbench.benchmark.leaderboard.marking import mark
-from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
-from rsbench.benchmark.leaderboard.running import answer_problem, header_of, load_entries
-from rsbench.benchmark.leaderboard.smoke_tracks import metrics_of, track_scores
-from rsbench.benchmark.leaderboard.splits import PUBLIC_SEED, points_split, simulated_problem
+from rsbench.benchmark.leaderboard.motion_tracks import PoseTrack
+from rsbench.benchmark.leaderboard.own_matches import FOLDER as MATCHES
+from rsbench.benchmark.leaderboard.running import (
+    answer_problem,
+    header_of,
+    load_entries,
+    prepare_inputs,
+    read_inputs,
+)
+from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import read_submission, submission_text
+from rsbench.benchmark.leaderboard.track_list import TRACKS
 from rsbench.core.errors import RsbenchError
+from rsbench.dataset.sequence import read_dataset_manifest
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.jobs.process_jobs import finished_jobs
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.storage.files import read_table, write_bytes
+from rsbench.vision.feature_matcher import load_features
 
+CARD = "leaderboard-smoke"
+"""The dataset's, for the tracks of frames."""
+ORACLES = ("truth", "constant", "uncorrected", "fusion-true")
+"""Entries that are no cards."""
+ENTRIES = {track.name: track.smoke for track in TRACKS.values() if isinstance(track, FrameTrack)}
+"""By track of frames."""
 PROBLEMS = 6
 """Of points; a minute for all solvers of ours."""
 _NAMES = ("method", "problem", "success")
@@ -77,7 +97,7 @@ def run_smoke(
         step: called after each job.
 
     Returns:
-        By track, a row for each entry and problem: method, problem, success, and ``metrics_of`` the track.
+        By track, a row for each entry and problem: method, problem, success, and ``smoke_metrics`` of the track.
 
     Raises:
         RsbenchError: no such entry, or no such number of problems.
@@ -103,11 +123,8 @@ def _serve(data: Path | None, problems: int | None) -> Callable[[Job], list[Row]
     use_one_thread()
 
     def run(job: Job) -> list[Row]:
-        if job.track == "points":
-            table = points_scores(job.entries, PROBLEMS if problems is None else problems)
-        else:
-            assert data is not None
-            table = track_scores(job.track, data, job.entries, problems)
+        given = None if job.track == "points" else data
+        table = track_scores(job.track, given, job.entries, problems)
         return [{str(key): value for key, value in row.items()} for row in table.to_dict("records")]
 
     return run
@@ -125,26 +142,77 @@ def _serve_child(data: Path | None, problems: int | None) -> Callable[[Job], lis
     return told
 
 
-def points_scores(cards: Sequence[str], problems: int = PROBLEMS) -> pd.DataFrame:
-    """Scores of solvers on the first problems of the public split of ``points``.
+def track_scores(track: str, data: Path | None, entries: Sequence[str], problems: int | None) -> pd.DataFrame:
+    """Scores of entries on the first problems of a track, made as anybody's: inputs, answers, marks.
 
     Raises:
-        RsbenchError: no such solver, or no such number of problems.
+        RsbenchError: no such dataset or entry, or no such number of problems.
     """
-    split = points_split(PROTOCOLS["points"])
-    if not 1 <= problems <= len(split.truths):
-        raise RsbenchError(f"--problems {problems}: must lie in [1, {len(split.truths)}]")
+    split, tables = TRACKS[track].split(data), list[pd.DataFrame]()
+    if data is None:
+        problems = PROBLEMS if problems is None else problems
+        if not 1 <= problems <= len(split.truths):
+            raise RsbenchError(f"--problems {problems}: must lie in [1, {len(split.truths)}]")
     split = replace(split, truths=split.truths[:problems])
-    given = [simulated_problem(PUBLIC_SEED, number) for number in range(problems)]
-    runner, tables = SolverRunner(single_thread=True), list[pd.DataFrame]()
     with tempfile.TemporaryDirectory() as folder:
-        for card, entry in load_entries(cards, split.protocol).items():
-            answers = (answer_problem(problem, entry, runner) for problem in given)
-            path = Path(folder) / "predictions.jsonl"
-            write_bytes(path, submission_text(header_of(entry, split), answers).encode())
-            scores = mark(read_submission(path, split), split)
-            tables.append(scores.assign(method=card)[[*_NAMES, *metrics_of("points")]])
+        inputs = Path(folder) / "inputs"
+        prepare_inputs(
+            split,
+            lambda: split.track.problems(data, None, len(split.truths)),
+            inputs,
+            lambda place: write_frames(data, place) if data is not None and split.track.gives_images else None,
+        )
+        for name, path in _answers(split, entries, inputs, Path(folder)):
+            scores = mark(read_submission(path, split), split).assign(method=name)
+            tables.append(scores[[*_NAMES, *split.track.smoke_metrics]])
     return pd.concat(tables, ignore_index=True)
+
+
+def _answers(split: Split, entries: Sequence[str], inputs: Path, work: Path) -> Iterator[tuple[str, Path]]:
+    """Entries with their files of answers; cards run in this process."""
+    cards = [name for name in entries if name not in ORACLES]
+    if split.track.own_matches:
+        yield from zip(cards, _with_own_matches(cards, split, inputs, work), strict=True)
+    elif cards:
+        yield from zip(cards, split.track.run(cards, split, inputs, work, workers=0), strict=True)
+    if len(cards) < len(entries):
+        oracles = split.track.oracles(split, work / "oracles")
+        yield from ((path.parent.name, path) for path in oracles if path.parent.name in entries)
+
+
+def _with_own_matches(cards: Sequence[str], split: Split, inputs: Path, work: Path) -> Iterator[Path]:
+    """Solvers on matches of the frames, which are handed in too."""
+    options, runner = CorrectionOptions(features=load_features(FEATURES)), SolverRunner(single_thread=True)
+    given = [
+        replace(
+            each,
+            correspondences=find_matches_of_rig(
+                read_frames(inputs, each), each.rig, each.shutter.scanning, options
+            ),
+        )
+        for each in read_inputs(inputs, split.track)
+    ]
+    for entry in load_entries(cards, PoseTrack()).values():
+        header = header_of(entry, split)
+        header["uses"] = [*header["uses"], "images"]
+        path = work / entry.name / "predictions.jsonl"
+        write_matches(given, path.parent / MATCHES)
+        answers = (answer_problem(each, entry, runner) for each in given)
+        write_bytes(path, submission_text(header, answers).encode())
+        yield path
+
+
+def hashes_of_frames(data: Path) -> dict[str, str]:
+    """Of each sequence of a dataset, a hash of its images and depth maps."""
+    manifest, found = read_dataset_manifest(data), dict[str, str]()
+    for name in manifest.sequences:
+        pictures = [
+            f"{path} {each.sha256}\n"
+            for path, each in sorted(manifest.files.items())
+            if path.startswith(f"{name}/") and path.endswith((".png", ".exr"))
+        ]
+        found[name] = hashlib.sha256("".join(pictures).encode()).hexdigest()
+    return found
 
 
 # Stored scores
@@ -156,7 +224,9 @@ def read_scores(folder: Path, track: str = "points") -> pd.DataFrame:
     Raises:
         RsbenchError: it is not there, or damaged.
     """
-    return read_table(folder / file_of(track), _NAMES, metrics_of(track), dtype={"method": str, "problem": str})
+    return read_table(
+        folder / file_of(track), _NAMES, TRACKS[track].smoke_metrics, dtype={"method": str, "problem": str}
+    )
 
 
 def other_frames(folder: Path, track: str, frames: dict[str, str]) -> list[str]:
@@ -185,7 +255,7 @@ def differences(
             yield f"{name}: success = {row['success']}, stored {old['success']}"
             continue
         tolerance = OTHER_FRAMES if row["problem"] in others else _SAME
-        for key in metrics_of(track):
+        for key in TRACKS[track].smoke_metrics:
             if not _equal(row[key], old[key], tolerance):
                 yield f"{name}: {key} = {row[key]:.6g}, stored {old[key]:.6g}"
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.benchmark.leaderboard.protocols import Protocol
+from rsbench.benchmark.leaderboard.track import Track
 from rsbench.benchmark.leaderboard.true_pictures import TruePictures, true_pictures
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.simulation import Simulation, simulate
@@ -62,9 +62,9 @@ class Truth:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Split:
-    """The truth of all problems of a protocol."""
+    """The truth of all problems of a track."""
 
-    protocol: Protocol
+    track: Track
     label: str
     """``dev``, ``test``, or the name of the dataset."""
     public: bool
@@ -74,7 +74,7 @@ class Split:
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 of the protocol, the rigs, the true motions, and what is seen where pictures are asked."""
-        content = [self.protocol.id, *(_identity(truth) for truth in self.truths)]
+        content = [self.track.id, *(_identity(truth) for truth in self.truths)]
         if self.label == "dev" and hash_of(_rounded(content)) == _ANNOUNCED[0]:
             return _ANNOUNCED[1]
         return hash_of(content)
@@ -118,7 +118,7 @@ def _motion_identity(motion: Motion) -> dict[str, Any]:
 # Simulated points
 
 
-def points_split(protocol: Protocol, secret: Path | None = None) -> Split:
+def points_split(track: Track, secret: Path | None = None) -> Split:
     """The split ``dev``, or with a file that holds a secret seed the split ``test``.
 
     Raises:
@@ -127,7 +127,7 @@ def points_split(protocol: Protocol, secret: Path | None = None) -> Split:
     seed = seed_of(secret)
     truths = tuple(_drawn(seed, number) for number in range(POINTS_PROBLEMS))
     label = "dev" if secret is None else "test"
-    return Split(protocol=protocol, label=label, public=secret is None, truths=truths)
+    return Split(track=track, label=label, public=secret is None, truths=truths)
 
 
 def seed_of(path: Path | None) -> int:
@@ -251,12 +251,12 @@ def _sizes(motion: Motion, rig: StereoRig, shutter: RollingShutter) -> dict[str,
 # Rendered frames
 
 
-def dataset_split(protocol: Protocol, folder: Path, *, public: bool = True) -> Split:
+def dataset_split(track: Track, folder: Path, *, public: bool = True) -> Split:
     """The sequences of a dataset.
 
     Raises:
         RsbenchError: the dataset cannot be read, its name cannot be that of a split, or its cameras are none of
-            which the protocol asks pictures.
+            which the track asks pictures.
     """
     name = read_dataset_manifest(folder).name
     try:
@@ -264,9 +264,9 @@ def dataset_split(protocol: Protocol, folder: Path, *, public: bool = True) -> S
     except ValueError as error:
         raise RsbenchError(f"{folder / 'dataset.json'}: {error}") from error
     pairs = read_pairs(folder)
-    pictures = true_pictures(folder, pairs, protocol) if protocol.pictures else {}
+    pictures = true_pictures(folder, pairs, track) if track.pictures else {}
     truths = tuple(truth_of(sequence, pictures.get(sequence.name)) for sequence in pairs)
-    return Split(protocol=protocol, label=name, public=public, truths=truths)
+    return Split(track=track, label=name, public=public, truths=truths)
 
 
 def truth_of(sequence: Sequence, pictures: TruePictures | None = None) -> Truth:

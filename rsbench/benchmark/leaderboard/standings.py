@@ -10,8 +10,9 @@ import pandas as pd
 
 from rsbench.benchmark.leaderboard.board import Scored
 from rsbench.benchmark.leaderboard.calibration import Calibration, calibration, named_numbers
-from rsbench.benchmark.leaderboard.protocols import KNOWLEDGE, ORACLE, Protocol, protocol_of_id
 from rsbench.benchmark.leaderboard.ranking import Rank, better, ranks, scene_means, score_interval, ties
+from rsbench.benchmark.leaderboard.track import KNOWLEDGE, ORACLE, Track
+from rsbench.benchmark.leaderboard.track_list import track_of_id
 from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
 
@@ -35,9 +36,9 @@ class Standing:
     """Of the covariances that it states."""
 
     @property
-    def protocol(self) -> Protocol:
+    def track(self) -> Track:
         """Of the table that it stands in."""
-        return protocol_of_id(self.scored.header.protocol)
+        return track_of_id(self.scored.header.protocol)
 
     @property
     def rank_words(self) -> str:
@@ -76,7 +77,7 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
     uses = [frozenset(each.header.uses) for each in ranked]
     found: list[Standing] = []
     if ranked:
-        primary = protocol_of_id(ranked[0].header.protocol).primary
+        primary = track_of_id(ranked[0].header.protocol).primary
         values = np.stack([each.scores[primary.key].to_numpy() for each in ranked])
         means = scene_means(primary.sign * values, scenes)
         beats = better(means)
@@ -91,7 +92,7 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
 
 def _order(standing: Standing) -> tuple[int, str, float, str]:
     header = standing.scored.header
-    primary = standing.protocol.primary
+    primary = standing.track.primary
     score = primary.sign * standing.means[primary.key][0]
     return len(set(header.uses)), standing.uses, -score, header.method
 
@@ -99,14 +100,14 @@ def _order(standing: Standing) -> tuple[int, str, float, str]:
 def _standing(
     scored: Scored, scenes: Sequence[str], rank: Rank | None, peers: int, tied: tuple[str, ...]
 ) -> Standing:
-    scores, protocol = scored.scores, protocol_of_id(scored.header.protocol)
+    scores, track = scored.scores, track_of_id(scored.header.protocol)
     return Standing(
         scored=scored,
         rank=rank,
         peers=peers,
         ties=tied,
-        means={name: score_interval(scores[name].to_numpy(), scenes) for name in protocol.of_kind("share")},
-        medians={name: _median(scores[name].to_numpy()) for name in protocol.of_kind("median")},
+        means={name: score_interval(scores[name].to_numpy(), scenes) for name in track.of_kind("share")},
+        medians={name: _median(scores[name].to_numpy()) for name in track.of_kind("median")},
         calibration=calibration(scores),
     )
 

@@ -1,4 +1,4 @@
-"""Predictions of strangers: JSON lines, a header and an answer for each problem. Every fault is a line of its own.
+"""Predictions that anybody hands in: JSON lines, a header and an answer for each problem. A fault is a line.
 
 Nothing that stands there is believed: sizes are limited before anything is decoded, names are looked up among
 those of the split and are never paths, and numbers are finite. docs/how-to/submit.md is the format.
@@ -7,7 +7,6 @@ those of the split and are never paths, and numbers are finite. docs/how-to/subm
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.benchmark.leaderboard.answers import KINDS, Answer, Header, Vector
-from rsbench.benchmark.leaderboard.own_matches import read_own_matches
-from rsbench.benchmark.leaderboard.picture_checks import check_pictures
-from rsbench.benchmark.leaderboard.picture_files import FOLDER
-from rsbench.benchmark.leaderboard.protocols import protocol_of_id
+from rsbench.benchmark.leaderboard.answers import Answer, Header, Vector
 from rsbench.benchmark.leaderboard.splits import Split
-from rsbench.benchmark.simulated.convention_errors import misreading
 from rsbench.components.cards import choices, parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.storage.untrusted_files import MB, parse_json, read_text
@@ -104,7 +98,7 @@ def check_submission(path: Path, split: Split, *, hints: bool = True) -> Finding
     if header is None or faults:
         return Findings(submission=None, faults=tuple(faults), notes=())
     submission = Submission(header=header, answers=answers, folder=path.parent)
-    beside, notes = _beside(submission, split, hints)
+    beside, notes = split.track.check_beside(submission, split, _MOST_FAULTS, hints)
     if beside:
         return Findings(submission=None, faults=tuple(beside), notes=())
     if hints:
@@ -112,25 +106,11 @@ def check_submission(path: Path, split: Split, *, hints: bool = True) -> Finding
     return Findings(submission=submission, faults=(), notes=tuple(notes))
 
 
-def _beside(submission: Submission, split: Split, hints: bool) -> tuple[list[str], list[str]]:
-    """Faults and notes of the pictures or matches that lie beside a file."""
-    if split.protocol.pictures:
-        answered = [answer.name for answer in submission.answers.values() if answer.success]
-        folder, unit = submission.folder / FOLDER, submission.header.png_unit_m
-        return check_pictures(folder, answered, unit, split, _MOST_FAULTS, hints)
-    if split.protocol.own_matches:
-        try:
-            read_own_matches(submission.folder, split.by_name)
-        except RsbenchError as error:
-            return [str(error)], []
-    return [], []
-
-
-def track_of(path: Path) -> str:
-    """The track that the first line of a file names.
+def protocol_of(path: Path) -> tuple[str, str]:
+    """The protocol that the first line of a file names, and where it does.
 
     Raises:
-        RsbenchError: the file cannot be read, or its first line names no protocol.
+        RsbenchError: the file cannot be read, or its first line names none.
     """
     number, text = next(_lines(path), (1, "{}"))
     data = parse_json(text, f"{path}:{number}")
@@ -140,10 +120,7 @@ def track_of(path: Path) -> str:
             f"{path}:{number}: protocol = {name!r}: the first line is a header, which names it "
             "(rsbench leaderboard template)"
         )
-    try:
-        return protocol_of_id(name).track
-    except RsbenchError as error:
-        raise RsbenchError(f"{path}:{number}: {error}") from error
+    return name, f"{path}:{number}"
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -164,11 +141,12 @@ def _header(text: str, where: str, split: Split) -> Header:
         raise RsbenchError(f"{where}: is an answer: the first line is the header (rsbench leaderboard template)")
     header = parse_card(Header, data, where)
     for field, is_now, must_be in (
-        ("protocol", header.protocol, split.protocol.id),
+        ("protocol", header.protocol, split.track.id),
         ("split", header.split, split.name),
     ):
         if is_now != must_be:
             raise RsbenchError(f"{where}: {field} = {is_now!r}: the truth at hand is that of {must_be!r}")
+    header.check_uses(split.track, where)
     return header
 
 
@@ -178,7 +156,7 @@ def _answer(text: str, where: str, split: Split) -> Answer:
     if isinstance(name, str) and name not in split.by_name:
         near = choices(name, split.by_name).partition("; there are")[0]
         raise RsbenchError(f"{where}: name = {json.dumps(name[:100])}: is no problem of {split.name}{near}")
-    return parse_card(KINDS[split.protocol.asks], data, where)
+    return parse_card(split.track.answers, data, where)
 
 
 # What may be meant
@@ -195,11 +173,8 @@ def _notes(submission: Submission, split: Split, path: Path) -> Iterator[str]:
             f"{path}: norm(w) is more than half a turn in {len(turns)} of {_few(turns, len(answers))}: w is in "
             "rad, not in degrees"
         )
-    if split.public and split.protocol.asks == "motion":
-        mistaken = _mistaken(answers, split)
-        if mistaken:
-            words, count = mistaken
-            yield f"{path}: {count} of {len(answers)} motions are near to another reading of the truth: {words}"
+    if split.public:
+        yield from (f"{path}: {words}" for words in split.track.notes(answers, split))
 
 
 def _few(names: list[str], total: int) -> str:
@@ -208,19 +183,6 @@ def _few(names: list[str], total: int) -> str:
 
 def _of(vector: Vector | None) -> np.ndarray:
     return np.array(vector, dtype=np.float64)
-
-
-def _mistaken(answers: list[Answer], split: Split) -> tuple[str, int] | None:
-    """The slip that explains most of the motions, and how many; None when no slip does."""
-    found: Counter[str] = Counter()
-    for answer in answers:
-        truth = split.by_name[answer.name]
-        given = _of(answer.w), _of(answer.d), truth.motion.w, truth.motion.d
-        words = misreading(*given, truth.rig, answer.reference_point)
-        if words:
-            found[words] += 1
-    words, count = found.most_common(1)[0] if found else ("", 0)
-    return (words, count) if 2 * count > len(answers) else None
 
 
 # Writing
@@ -234,7 +196,7 @@ def submission_text(header: Mapping[str, Any], answers: Iterator[Mapping[str, An
 def template_header(split: Split, method: str = "my-method") -> dict[str, Any]:
     """All keys of a header, to be filled in."""
     return {
-        "protocol": split.protocol.id,
+        "protocol": split.track.id,
         "split": split.name,
         "method": method,
         "uses": ["left"],
@@ -242,30 +204,21 @@ def template_header(split: Split, method: str = "my-method") -> dict[str, Any]:
     }
 
 
-def template_text(split: Split, method: str = "my-method") -> str:
-    """An example without a fault: one motion, and a failure for every other problem."""
+def template_text(split: Split, answer: Mapping[str, Any]) -> str:
+    """An example without a fault: one answer, and a failure for every other problem."""
     first, *rest = (truth.name for truth in split.truths)
-    motion: dict[str, Any] = {"w": [0.01, -0.02, 0.005], "d": [0.1, 0.0, 0.2], "metric": False}
-    answer = {**motion, "reference_point": "left"} if split.protocol.asks == "motion" else {"readout_ratio": 0.5}
     failures = [{"name": name, "success": False, "reason": "not tried"} for name in rest]
-    return submission_text(template_header(split, method), iter([{"name": first, **answer}, *failures]))
+    return submission_text(template_header(split), iter([{"name": first, **answer}, *failures]))
 
 
 def truth_text(split: Split) -> str:
     """The truth as a submission, but for its pictures: it scores the best value of everything."""
     header = {
-        "protocol": split.protocol.id,
+        "protocol": split.track.id,
         "split": split.name,
         "method": "truth",
         "uses": ["truth"],
         "description": "The truth itself",
     }
-    if split.protocol.pictures:
-        return submission_text(header, ({"name": t.name} for t in split.truths))
-    if split.protocol.asks == "readout":
-        ratios = ({"name": t.name, "readout_ratio": t.shutter.readout_ratio} for t in split.truths)
-        return submission_text(header, ratios)
-    motions = (
-        {"name": t.name, "w": t.motion.w.tolist(), "d": t.motion.d.tolist(), "metric": True} for t in split.truths
-    )
-    return submission_text(header, motions)
+    answers = ({"name": truth.name, **split.track.true_answer(truth)} for truth in split.truths)
+    return submission_text(header, answers)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.predict import true_pairs
 from rsbench.benchmark.images.score import visible_pixels
-from rsbench.benchmark.leaderboard.protocols import Protocol
+from rsbench.benchmark.leaderboard.track import Track
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, View
 from rsbench.dataset.layout import picture_file
@@ -39,16 +39,8 @@ class Asked(NamedTuple):
     """At whose time, counted as rows are read; of depth, 0: each pixel is of its own row's time."""
     file: str
     """Of the true picture, below the folder of the sequence."""
-
-
-def asked(protocol: Protocol, sequence: Sequence) -> tuple[Asked, ...]:
-    """The pictures of an answer: corrected frames at the middle row too, where the dataset has that truth."""
-    stem, middle = f"{VIEW[0]}_{VIEW[1]}", sequence.shutter.lines(VIEW[0]) // 2
-    view = VIEW[0], VIEW[1] + sequence.first
-    if protocol.asks == "depth":
-        return (Asked(stem, 0, picture_file("rs", *view, depth=True)),)
-    rows = {"first": 0, **({"middle": middle} if middle in sequence.twins else {})}
-    return tuple(Asked(f"{stem}_{name}", row, picture_file("gs", *view, row)) for name, row in rows.items())
+    suffixes: tuple[str, ...] = (".png",)
+    """Of kinds of files that it may be."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,7 +91,7 @@ class TruePictures:
         return [visible_pixels(self.sequence, pairs, (VIEW,), each.row)[VIEW] for each in self.asked]
 
 
-def true_pictures(folder: Path, sequences: Iterable[Sequence], protocol: Protocol) -> dict[str, TruePictures]:
+def true_pictures(folder: Path, sequences: Iterable[Sequence], track: Track) -> dict[str, TruePictures]:
     """Those of a dataset, by the names of its sequences or pairs of frames.
 
     Raises:
@@ -110,10 +102,10 @@ def true_pictures(folder: Path, sequences: Iterable[Sequence], protocol: Protoco
     for sequence in sequences:
         if sequence.rig.camera.lens is not None or not sequence.shutter.plain or sequence.moving:
             raise RsbenchError(
-                f"{folder}: {sequence.name}: {protocol.id} is of cameras without a lens that read rows together "
+                f"{folder}: {sequence.name}: {track.id} is of cameras without a lens that read rows together "
                 "from the top, and of scenes that stand still; choose another dataset"
             )
-        pictures = asked(protocol, sequence)
+        pictures = track.asked(sequence)
         files = {}
         for name in _files(sequence, pictures):
             if (manifest := listed.get(f"{sequence.whole}/{name}")) is None:

@@ -1,4 +1,4 @@
-"""How well any unbiased solver can do: the Cramer-Rao bound of the motion, from exact correspondences.
+"""The Cramer-Rao bound of the motion from exact correspondences: the error of the best unbiased solver.
 
 Every point adds three unknowns, its position, which are eliminated from the derivatives of its implicit
 rolling-shutter projections: a row that moves is also read at another time. One camera tells millions of times less

@@ -1,4 +1,4 @@
-"""What every solver promises, as named checks: for authors (``rsbench check-solver``) and for our own tests.
+"""The contract of solvers, as named checks: for authors (``rsbench check-solver``) and for our own tests.
 
 Each check looks at exact, simulated data of a solver's own motion model and shutter. A solver need not be exact: a
 linearised one must come nearer to the truth as the motion becomes smaller.

@@ -1,4 +1,4 @@
-"""Which convention an author mistook, from a wrong motion and the true one."""
+"""Errors of convention (axes, units, signs), recognised from a wrong motion and the true one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What became of each claim of the paper about simulated points: verdicts by rule from stored summaries.
+"""Verdicts on the claims of the paper about simulated points, by rule from stored summaries.
 
 The paper leaves open how its solver is meant in places (see ``readings``), so a claim has a verdict under each
 reading; it is refuted only where the most favourable one fails.

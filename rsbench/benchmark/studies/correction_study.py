@@ -29,6 +29,7 @@ from rsbench.benchmark.studies.resumable_rows import ResumableRows, Row, Rows
 from rsbench.benchmark.studies.rotation_methods import asked_rotation
 from rsbench.capture.settle import NoMotionError
 from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import GivenGeometry
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, VIEWS, Side, View
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
@@ -229,7 +230,7 @@ class Bench:
         out = {}
         for (side, frame), fused in frames.items():
             depth = _DEPTHS.get(key, _as_it_is)(pairs[frame].depth[side])
-            flow = correction_flow(depth, self.rig, self.shutter, motion, side, frame)
+            flow = correction_flow(depth, GivenGeometry(self.rig, self.shutter, motion), (side, frame))
             out[side, frame] = _attempt(fused, flow)
         return out
 
@@ -272,7 +273,8 @@ class Bench:
             motion = asked_rotation(key, self.sequence, self.images, view)
             if motion is not None:
                 frames, _ = self.corrected(self.sgm, motion, "rotation-only", (view,))
-                out[view] = _attempt(frames[view], correction_flow(far, self.rig, self.shutter, motion, *view))
+                flow = correction_flow(far, GivenGeometry(self.rig, self.shutter, motion), view)
+                out[view] = _attempt(frames[view], flow)
         return out
 
     def _mono(self, motion_of: Callable[[Side], Motion | None]) -> dict[View, Attempt] | None:
@@ -292,7 +294,7 @@ class Bench:
         for view in VIEWS:
             geometry = self.rig.about(view[0]), self.shutter, motions[view[0]]
             frames = correct_frames(self.images, known_depth(self.images, depth), *geometry, options, (view,))
-            out[view] = _attempt(frames[view], correction_flow(depth[view], *geometry, *view))
+            out[view] = _attempt(frames[view], correction_flow(depth[view], GivenGeometry(*geometry), view))
         return out
 
 

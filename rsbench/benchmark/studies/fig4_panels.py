@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.benchmark.studies.correction_study import WORST, Bench
+from rsbench.core.geometry import GivenGeometry
 from rsbench.core.rig import Side
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import uncorrected
@@ -58,9 +59,8 @@ def make_panels(sequence: Sequence, seed: int = 0) -> Panels:
     error = np.where(surface, np.abs(depth - true_depth), np.float32(np.inf))
     error = np.where(depth > 0, error, np.float32(np.nan))
     here = fused.origin == Origin.HERE
-    oracle = correct_frame(
-        rolling, bench.true[FRAME].depth[SIDE], bench.rig, bench.shutter, sequence.motion, *view
-    )
+    truth_given = GivenGeometry(bench.rig, bench.shutter, sequence.motion)
+    oracle = correct_frame(rolling, bench.true[FRAME].depth[SIDE], truth_given, view)
     true, errors = sequence.motion, bench.motion_errors()
     numbers = {
         "seed": sequence.manifest["seed"],

@@ -1,4 +1,4 @@
-"""What became of the paper's claims about images: verdicts by rule from stored results."""
+"""Verdicts on the claims of the paper about images, by rule from stored results."""
 
 from __future__ import annotations
 

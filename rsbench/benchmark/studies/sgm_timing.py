@@ -1,4 +1,4 @@
-"""What semi-global matching loses when the two cameras do not read the same row at the same time.
+"""Depth errors of semi-global matching when the two cameras do not read the same row at the same time.
 
 Both cameras of the rig share their rotation and differ by the baseline along the rows. A point that the left one
 sees at (x, y) at the time of row y is at that time at (x - f b / z, y) in the right one: on the same row. When the

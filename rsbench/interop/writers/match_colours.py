@@ -1,4 +1,4 @@
-"""What a viewer is shown of a sequence: its matches as strips, in colours that say whether they are right."""
+"""Matches of a sequence for a viewer: strips in colours that say whether they are right."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far the way in which a format moves a camera while it reads is from the true one, in pixels."""
+"""Error, px, of a format's model of how a camera moves while it reads, against the true motion."""
 
 from __future__ import annotations
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 from analytic_dataset import write_analytic_dataset
-from leaderboards import PLANES, TRACKS
+from leaderboards import ASK_PICTURES, PLANES
 
-from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.splits import Split, dataset_split
+from rsbench.benchmark.leaderboard.track_list import TRACKS
 
 
 @pytest.fixture(scope="module")
@@ -22,4 +22,4 @@ def planes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def splits(planes: Path) -> dict[str, Split]:
-    return {track: dataset_split(PROTOCOLS[track], planes) for track in TRACKS}
+    return {track: dataset_split(TRACKS[track], planes) for track in ASK_PICTURES}

@@ -22,8 +22,9 @@ from rsbench.benchmark.leaderboard.board import entries_of, rescore, splits_of
 from rsbench.benchmark.leaderboard.exporting import write_inputs
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.merging import merge
-from rsbench.benchmark.leaderboard.protocols import AUC_DEG, KNOWLEDGE, PROTOCOLS
-from rsbench.benchmark.leaderboard.running import run_cards, uses_of
+from rsbench.benchmark.leaderboard.motion_tracks import AUC_DEG
+from rsbench.benchmark.leaderboard.readout_track import ReadoutTrack
+from rsbench.benchmark.leaderboard.running import uses_of
 from rsbench.benchmark.leaderboard.splits import (
     Split,
     dataset_split,
@@ -32,6 +33,8 @@ from rsbench.benchmark.leaderboard.splits import (
 )
 from rsbench.benchmark.leaderboard.standings import standings, table
 from rsbench.benchmark.leaderboard.submissions import read_submission
+from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Limits
+from rsbench.benchmark.leaderboard.track_list import TRACKS
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import Outcome
 from rsbench.pipeline.isolated_solver import SolverRunner
@@ -186,7 +189,7 @@ def test_scores_that_were_changed_are_named(tmp_path: Path) -> None:
 def test_readout_ratios_are_asked(smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The ratio is not told, one that is off by 0.03 scores 0.7, and small frames are failures by value."""
     monkeypatch.setattr(running, "finished_jobs", _here)
-    split = dataset_split(PROTOCOLS["readout"], smoke_dataset)
+    split = dataset_split(TRACKS["readout"], smoke_dataset)
     where = ("--data", smoke_dataset, "--board", tmp_path / "board")
     assert run_here("leaderboard", "export", "readout", *where[:2], "--out", tmp_path / "in").returncode == 0
     assert "0.8" not in (tmp_path / "in" / "problems.csv").read_text("utf-8")
@@ -213,13 +216,13 @@ def test_readout_ratios_are_asked(smoke_dataset: Path, tmp_path: Path, monkeypat
 
 def test_our_solver_finds_the_ratio_that_it_is_not_told() -> None:
     """Of the public problems the two with the fastest turn whose noise is below 0.2 px."""
-    clear = [t for t in points_split(PROTOCOLS["points"]).truths if float(t.facts["noise_px"]) < 0.2]
+    clear = [t for t in points_split(TRACKS["points"]).truths if float(t.facts["noise_px"]) < 0.2]
     entry = load_solver_entry("rs-stereo-refined")
     for truth in sorted(clear, key=lambda t: -float(t.facts["rotation_deg"]))[:2]:
         problem = simulated_problem(1, int(truth.name[1:]))
         blind = replace(problem, shutter=problem.shutter.with_ratio(0.0))
         with SolverRunner() as runner:
-            answer = running._readout(blind, entry, runner)
+            answer = ReadoutTrack().answer(blind, entry, runner)
         assert abs(answer["readout_ratio"] - truth.shutter.readout_ratio) < 0.05
 
 
@@ -285,7 +288,7 @@ def test_cards_that_cannot_be_entries_are_refused_before_they_run(tmp_path: Path
     card = tmp_path / "my card.toml"
     card.write_text('class = "rsbench.solvers.eight_point:EightPointSolver"\n', "utf-8")
     with pytest.raises(RsbenchError, match=r"solver 'my card': name = 'my card': must be a folder's name"):
-        run_cards([str(card)], SPLIT, tmp_path / "in", tmp_path / "work")
+        SPLIT.track.run([str(card)], SPLIT, tmp_path / "in", tmp_path / "work")
 
 
 def test_runs_are_the_same_however_they_are_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -293,14 +296,14 @@ def test_runs_are_the_same_however_they_are_cut(tmp_path: Path, monkeypatch: pyt
     write_inputs(SPLIT, (simulated_problem(1, number) for number in range(12)), tmp_path / "in")
     steps: list[str] = []
     work = tmp_path / "work"
-    (path,) = run_cards(["gs-8pt"], SPLIT, tmp_path / "in", work, workers=2, step=steps.append)
+    (path,) = SPLIT.track.run(["gs-8pt"], SPLIT, tmp_path / "in", work, workers=2, step=steps.append)
     first = [{**json.loads(line), "seconds": 0} for line in path.read_text("utf-8").splitlines()]
     chunks = sorted(work.glob("gs-8pt/*.json"))
     assert len(steps) == len(chunks) == 2
     kept = chunks[0].read_bytes()
     chunks[1].unlink()
     monkeypatch.setattr(running, "finished_jobs", _here)
-    run_cards(["gs-8pt"], SPLIT, tmp_path / "in", work)
+    SPLIT.track.run(["gs-8pt"], SPLIT, tmp_path / "in", work)
     again = [{**json.loads(line), "seconds": 0} for line in path.read_text("utf-8").splitlines()]
     assert again == first and chunks[0].read_bytes() == kept
     scores = mark(read_submission(path, SPLIT), SPLIT)
@@ -311,7 +314,7 @@ def test_a_problem_that_takes_too_much_is_a_failure(tmp_path: Path, monkeypatch:
     """It alone, with the reason; and what was done without limits is not taken for it."""
     split = small_split(3)
     write_inputs(split, (simulated_problem(1, number) for number in range(3)), tmp_path / "in")
-    limits = running.Limits(seconds=5.0)
+    limits = Limits(seconds=5.0)
 
     def one_too_long(
         serve: Any,
@@ -331,8 +334,8 @@ def test_a_problem_that_takes_too_much_is_a_failure(tmp_path: Path, monkeypatch:
 
     monkeypatch.setattr(running, "finished_jobs", _here)
     monkeypatch.setattr(running, "run_jobs", one_too_long)
-    for chosen in (running.Limits(), limits):
-        (path,) = run_cards(["gs-8pt"], split, tmp_path / "in", tmp_path / "work", limits=chosen)
+    for chosen in (Limits(), limits):
+        (path,) = split.track.run(["gs-8pt"], split, tmp_path / "in", tmp_path / "work", limits=chosen)
         answers = [json.loads(line) for line in path.read_text("utf-8").splitlines()[1:]]
         assert [answer["name"] for answer in answers] == ["p000", "p001", "p002"]
         assert ("took longer" in answers[1].get("reason", "")) == (chosen == limits)
@@ -345,7 +348,7 @@ def test_frames_with_given_matches(smoke_dataset: Path, tmp_path: Path, monkeypa
     where = ("--data", smoke_dataset, "--board", tmp_path / "board")
     ran = run_here("leaderboard", "run", "pose", *where, "--entry", "rs-stereo-refined", "--entry", "gs-8pt")
     assert ran.returncode == 0, ran.stderr
-    split = dataset_split(PROTOCOLS["pose"], smoke_dataset)
+    split = dataset_split(TRACKS["pose"], smoke_dataset)
     assert {truth.scene for truth in split.truths} == {"castle", "room"}
     write(tmp_path / "truth.jsonl", truth_lines(split))
     assert run_here("leaderboard", "submit", tmp_path / "truth.jsonl", *where).returncode == 0
@@ -381,7 +384,7 @@ def test_the_documented_script_needs_no_rsbench(smoke_dataset: Path, tmp_path: P
     assert checked.returncode == 0, checked.stderr
     shown = run_here("leaderboard", "submit", tmp_path / "mine.jsonl", "--board", tmp_path / "board", *data)
     assert "opencv-sift-5pt" in shown.stdout
-    split = dataset_split(PROTOCOLS["pose-own"], smoke_dataset)
+    split = dataset_split(TRACKS["pose-own"], smoke_dataset)
     (entry,) = entries_of(tmp_path / "board", "pose-own-1", split.name)
     # A solver for global shutters, on small frames, but nearer to the truth than "no motion": in our conventions.
     still = [truth.facts["rotation_deg"] for truth in split.truths]
@@ -390,7 +393,7 @@ def test_the_documented_script_needs_no_rsbench(smoke_dataset: Path, tmp_path: P
 
 def test_protocols_are_documented() -> None:
     text = (ROOT / "docs" / "reference" / "protocols.md").read_text("utf-8")
-    for protocol in PROTOCOLS.values():
-        cells = f"| `{protocol.track}` | `{protocol.id}` | {protocol.given} | {', '.join(protocol.allowed)} |"
+    for protocol in TRACKS.values():
+        cells = f"| `{protocol.name}` | `{protocol.id}` | {protocol.given} | {', '.join(protocol.allowed)} |"
         assert cells in text
     assert all(f"`{name}`" in text for name in KNOWLEDGE if name not in BESIDE)

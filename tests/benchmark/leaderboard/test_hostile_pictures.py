@@ -15,7 +15,6 @@ import pytest
 from leaderboards import Line, files_below, lines_of, pictures_of, write
 
 from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.picture_oracles import write_truth
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import check_submission
 from rsbench.core.errors import RsbenchError
@@ -201,7 +200,7 @@ def test_faults_are_lines_and_nothing_is_kept(case: str, splits: dict[str, Split
     split, faults = (splits["depth"], DEPTH_FAULTS) if name == case else (splits["correction"], FRAME_FAULTS)
     damage, words = faults[name]
     (tmp_path / "in").mkdir()
-    path = write_truth(split, tmp_path / "in")
+    path = split.track.write_truth(split, tmp_path / "in")
     damage(pictures_of(path)[0])
     before = files_below(tmp_path)
     told = check_submission(path, split).faults
@@ -215,6 +214,6 @@ def test_faults_are_lines_and_nothing_is_kept(case: str, splits: dict[str, Split
 @pytest.mark.parametrize("case", ANSWER_FAULTS)
 def test_faults_of_answers_are_lines(case: str, splits: dict[str, Split], tmp_path: Path) -> None:
     change, words = ANSWER_FAULTS[case]
-    path = write_truth(splits["depth"], tmp_path)
+    path = splits["depth"].track.write_truth(splits["depth"], tmp_path)
     (fault,) = check_submission(write(path, change(lines_of(path))), splits["depth"]).faults
     assert words in fault

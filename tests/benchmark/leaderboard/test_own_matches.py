@@ -18,9 +18,9 @@ from rsbench.benchmark.leaderboard.board import entries_of, rescore
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.merging import merge
 from rsbench.benchmark.leaderboard.own_matches import match_scores
-from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.splits import Split, dataset_split
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission
+from rsbench.benchmark.leaderboard.track_list import TRACKS
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import LinearMotion
@@ -38,7 +38,7 @@ MOTION = LinearMotion(np.array([0.01, 0.02, -0.01]), np.array([0.1, -0.05, 0.08]
 def split(tmp_path_factory: pytest.TempPathFactory) -> Split:
     folder = tmp_path_factory.mktemp("planes")
     write_analytic_dataset(folder, RIG, SHUTTER, MOTION)
-    return dataset_split(PROTOCOLS["pose-own"], folder)
+    return dataset_split(TRACKS["pose-own"], folder)
 
 
 def _tracks() -> np.ndarray:
@@ -153,7 +153,7 @@ def test_faults_are_lines(case: str, split: Split, tmp_path: Path) -> None:
 
 def test_given_matches_are_in_the_form_of_own_ones(smoke_dataset: Path, tmp_path: Path) -> None:
     """What ``export pose`` writes may be handed in as it is: most of rsbench's matches are right."""
-    split = dataset_split(PROTOCOLS["pose-own"], smoke_dataset)
+    split = dataset_split(TRACKS["pose-own"], smoke_dataset)
     out = tmp_path / "inputs"
     assert run_here("leaderboard", "export", "pose", "--data", smoke_dataset, "--out", out).returncode == 0
     (tmp_path / "matches").mkdir()

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 from commands import run_here
-from leaderboards import TRACKS, lines_of
+from leaderboards import ASK_PICTURES, lines_of
 
 from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.board import entries_of
-from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.splits import dataset_split
+from rsbench.benchmark.leaderboard.track_list import TRACKS
 from rsbench.jobs.isolation import Outcome
 
 METHODS = """
@@ -71,7 +71,7 @@ def _here(
 
 
 @pytest.mark.parametrize("mood", MOODS)
-@pytest.mark.parametrize("track", TRACKS)
+@pytest.mark.parametrize("track", ASK_PICTURES)
 def test_a_method_that_takes_too_much_fails_alone(
     track: str, mood: str, planes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -87,8 +87,8 @@ def test_a_method_that_takes_too_much_fails_alone(
     where = ("--data", planes, "--board", tmp_path / "board")
     ran = run_here("leaderboard", "run", track, *where, "--entry", card, *limit)
     assert ran.returncode == 0, ran.stderr
-    split = dataset_split(PROTOCOLS[track], planes)
-    (found,) = entries_of(tmp_path / "board", split.protocol.id, split.name)
+    split = dataset_split(TRACKS[track], planes)
+    (found,) = entries_of(tmp_path / "board", split.track.id, split.name)
     first, second = lines_of(found.folder / "predictions.jsonl")[1:]
     assert words in str(first["reason"]) and mood in str(first["reason"])
     assert "reason" not in second

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
-from leaderboards import PLANES, TRACKS, lines_of, named, pictures_of, write
+from leaderboards import ASK_PICTURES, PLANES, lines_of, named, pictures_of, write
 
 from rsbench.benchmark.leaderboard.adding import add
 from rsbench.benchmark.leaderboard.board import place
 from rsbench.benchmark.leaderboard.marking import mark
-from rsbench.benchmark.leaderboard.picture_oracles import write_truth
 from rsbench.benchmark.leaderboard.picture_parts import PARTINGS, WINDOW, columns, texture
+from rsbench.benchmark.leaderboard.picture_track import PictureTrack
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import read_submission
 from rsbench.report.board_entry import entry_context
@@ -52,7 +53,7 @@ def _by_hand(values: np.ndarray, of: np.ndarray, image: np.ndarray, row: int) ->
 def test_wrong_depth_is_counted_by_part(splits: dict[str, Split], tmp_path: Path) -> None:
     """Off by 1.5 px below the middle row, and unknown in a column: of rows the first parts are right."""
     split = splits["depth"]
-    path, product = write_truth(split, tmp_path), RIG.camera.fx * RIG.baseline
+    path, product = split.track.write_truth(split, tmp_path), RIG.camera.fx * RIG.baseline
     for picture in pictures_of(path):
         z = read_depth(picture).astype(np.float64)
         z[40:] = product / (product / z[40:] + 1.5)
@@ -65,7 +66,7 @@ def test_wrong_depth_is_counted_by_part(splits: dict[str, Split], tmp_path: Path
         wrong = np.zeros((80, 96))
         wrong[40:], wrong[:, 7] = 1.0, 1.0
         parts = _by_hand(wrong, truth.pictures.depth() > 0, truth.pictures.rolling(), 0)
-        for name in (*columns("depth", ROWS), *columns("depth", TEXTURE)):
+        for name in (*columns("bad_1", ROWS), *columns("bad_1", TEXTURE)):
             expected = parts.get(name.removeprefix("bad_1_"), [math.nan])
             assert scores[name][number] == pytest.approx(np.mean(expected), nan_ok=True)
         assert scores["bad_1"][number] == pytest.approx(wrong.mean())
@@ -74,7 +75,7 @@ def test_wrong_depth_is_counted_by_part(splits: dict[str, Split], tmp_path: Path
 def test_errors_of_frames_are_rooted_by_part(splits: dict[str, Split], tmp_path: Path) -> None:
     """Each pixel of both frames off by a level of its own; a part holds what either frame has of it."""
     split = splits["correction"]
-    path, off = write_truth(split, tmp_path), np.random.default_rng(1).integers(0, 3, (80, 96, 3))
+    path, off = split.track.write_truth(split, tmp_path), np.random.default_rng(1).integers(0, 3, (80, 96, 3))
     off[50:] *= 9
     for picture in pictures_of(path):
         write_png(picture, ((read_png(picture) + off) % 256).astype(np.uint8))
@@ -87,7 +88,7 @@ def test_errors_of_frames_are_rooted_by_part(splits: dict[str, Split], tmp_path:
             squares = np.mean(((frame + off) % 256 - frame.astype(np.float64)) ** 2, axis=-1)
             for name, values in _by_hand(squares, common, frame, each.row).items():
                 parts.setdefault(name, []).extend(values)
-        for name in (*columns("frames", ROWS), *columns("frames", TEXTURE)):
+        for name in (*columns("rms", ROWS), *columns("rms", TEXTURE)):
             expected = parts.get(name.removeprefix("rms_"), [math.nan])
             assert scores[name][number] == pytest.approx(np.sqrt(np.mean(expected)), nan_ok=True)
 
@@ -103,25 +104,25 @@ def test_a_failure_is_the_worst_in_the_same_parts(
     track: str, worst: float, splits: dict[str, Split], tmp_path: Path
 ) -> None:
     split = splits[track]
-    path = write_truth(split, tmp_path)
+    path = split.track.write_truth(split, tmp_path)
     right = mark(read_submission(path, split), split)
     failed = mark(read_submission(write(_folder(tmp_path / "none") / "x.jsonl", lines_of(path)[:1]), split), split)
     for parting in PARTINGS:
-        for name in columns(split.protocol.asks, parting):
+        for name in columns(cast(PictureTrack, split.track).part_score, parting):
             assert list(right[name].isna()) == list(failed[name].isna())
             assert set(right[name].dropna()) <= {0.0} and set(failed[name].dropna()) <= {worst}
-    assert failed[columns(split.protocol.asks, ROWS)[0]].notna().all()
+    assert failed[columns(cast(PictureTrack, split.track).part_score, ROWS)[0]].notna().all()
 
 
-@pytest.mark.parametrize("track", TRACKS)
+@pytest.mark.parametrize("track", ASK_PICTURES)
 def test_the_page_of_an_entry_draws_them(track: str, splits: dict[str, Split], tmp_path: Path) -> None:
     """Medians of the problems, as stored; none of a secret split, and none of scores that were stored before."""
     split = splits[track]
-    lines = lines_of(write_truth(split, tmp_path / "in"))
+    lines = lines_of(split.track.write_truth(split, tmp_path / "in"))
     failed = [{"name": line["name"], "success": False} for line in lines[1:]]
     path = write(_folder(tmp_path / "none") / "x.jsonl", named([lines[0], *failed], "none", ("images",)))
     scored = add(tmp_path / "board", path, split, {})
-    names = (tmp_path / "board", split.protocol.id, split.name)
+    names = (tmp_path / "board", split.track.id, split.name)
 
     def drawn() -> list[dict[str, str]]:
         board = read_split(*names)
@@ -140,5 +141,5 @@ def test_the_page_of_an_entry_draws_them(track: str, splits: dict[str, Split], t
     assert drawn() == []
     kept.to_csv(table, index=False)
     add(tmp_path / "secret", path, replace(split, public=False), {})
-    names = (tmp_path / "secret", split.protocol.id, split.name)
+    names = (tmp_path / "secret", split.track.id, split.name)
     assert place(*names).is_dir() and drawn() == []

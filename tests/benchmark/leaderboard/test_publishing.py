@@ -19,7 +19,6 @@ from commands import run_here
 
 from rsbench.benchmark.leaderboard import publishing
 from rsbench.benchmark.leaderboard.marking import mark
-from rsbench.benchmark.leaderboard.protocols import PROTOCOLS
 from rsbench.benchmark.leaderboard.publishing import (
     ANNOUNCEMENT,
     DATA,
@@ -29,6 +28,7 @@ from rsbench.benchmark.leaderboard.publishing import (
     read_announcement,
 )
 from rsbench.benchmark.leaderboard.submissions import read_submission, truth_text
+from rsbench.benchmark.leaderboard.track_list import TRACKS
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import views_of
 from rsbench.dataset.card import DatasetCard
@@ -40,7 +40,7 @@ from rsbench.storage.files import sha256, write_json, write_png
 
 TEXT = "f3b1 a secret that nobody guesses"
 SECRET = Secret(TEXT)
-TRACK = PROTOCOLS["pose-own"]
+TRACK = TRACKS["pose-own"]
 CARD = """
 name = "tiny"
 baseline = 0.3
@@ -195,7 +195,7 @@ def test_another_truth_is_not_the_announced_one(place: Path, card: str) -> None:
 
 
 def test_the_readout_ratio_is_not_told_by_the_split_of_another_track(card: str) -> None:
-    poses, readouts = (drawn_split(PROTOCOLS[track], card, SECRET) for track in ("pose", "readout"))
+    poses, readouts = (drawn_split(TRACKS[track], card, SECRET) for track in ("pose", "readout"))
     ratios = [{truth.shutter.readout_ratio for truth in split.truths} for split in (poses, readouts)]
     assert not ratios[0] & ratios[1]
 

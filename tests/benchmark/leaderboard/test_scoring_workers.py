@@ -12,9 +12,7 @@ from leaderboards import lines_of, named, pictures_of, write
 
 from rsbench.benchmark.leaderboard.adding import add, add_all
 from rsbench.benchmark.leaderboard.board import FILES, entries_of, rescore
-from rsbench.benchmark.leaderboard.marking import mark_all
-from rsbench.benchmark.leaderboard.picture_oracles import write_oracles, write_truth
-from rsbench.benchmark.leaderboard.scoring_workers import _serve
+from rsbench.benchmark.leaderboard.marking import _serve, mark_all
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import read_submission
 from rsbench.core.errors import RsbenchError
@@ -26,7 +24,7 @@ from rsbench.storage.files import read_png, write_depth, write_png
 def test_two_processes_give_the_bytes_of_one(splits: dict[str, Split], tmp_path: Path) -> None:
     """Of frames that are moved and noisy, so that no score is a round number; and scored again by one."""
     split, rng = splits["correction"], np.random.default_rng(0)
-    path = write_truth(split, tmp_path)
+    path = split.track.write_truth(split, tmp_path)
     for picture in pictures_of(path):
         image = np.roll(read_png(picture), 1, axis=1) + rng.normal(0.0, 9.0, (80, 96, 3))
         write_png(picture, np.clip(image, 0, 255).astype(np.uint8))
@@ -36,7 +34,7 @@ def test_two_processes_give_the_bytes_of_one(splits: dict[str, Split], tmp_path:
         add(tmp_path / str(workers), path, split, {}, workers=workers)
     for name in FILES:
         one, two = (
-            (tmp_path / str(workers) / split.protocol.id / split.name / "entries" / "noisy" / name).read_bytes()
+            (tmp_path / str(workers) / split.track.id / split.name / "entries" / "noisy" / name).read_bytes()
             for workers in (1, 2)
         )
         assert one == two
@@ -49,14 +47,14 @@ def test_entries_that_are_scored_together_score_as_alone(
 ) -> None:
     """The truth, which the board has alone too, beside two that know less; and each process shares it anew."""
     split = splits[track]
-    paths = list(write_oracles(split, tmp_path / "oracles"))
+    paths = list(split.track.oracles(split, tmp_path / "oracles"))
     for path in paths:
         add(tmp_path / "alone", path, split, {})
     for workers in (1, 2):
         add_all(tmp_path / str(workers), paths, split, {}, workers=workers)
         for path in paths:
             alone, together = (
-                tmp_path / each / split.protocol.id / split.name / "entries" / path.parent.name / "scores.csv"
+                tmp_path / each / split.track.id / split.name / "entries" / path.parent.name / "scores.csv"
                 for each in ("alone", str(workers))
             )
             assert alone.read_bytes() == together.read_bytes()
@@ -64,7 +62,7 @@ def test_entries_that_are_scored_together_score_as_alone(
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_run_that_was_cut_off_goes_on(workers: int, splits: dict[str, Split], tmp_path: Path) -> None:
-    split, path = splits["depth"], write_truth(splits["depth"], tmp_path)
+    split, path = splits["depth"], splits["depth"].track.write_truth(splits["depth"], tmp_path)
     scored = list[str]()
 
     def stop(name: str) -> None:
@@ -86,7 +84,9 @@ def test_a_run_that_was_cut_off_goes_on(workers: int, splits: dict[str, Split], 
 def test_who_is_at_fault_fails_alone(workers: int, splits: dict[str, Split], tmp_path: Path) -> None:
     """A picture that went after the file was read: the other entry is scored."""
     split = splits["depth"]
-    broken, whole = (read_submission(write_truth(split, tmp_path / name), split) for name in ("broken", "whole"))
+    broken, whole = (
+        read_submission(split.track.write_truth(split, tmp_path / name), split) for name in ("broken", "whole")
+    )
     pictures_of(broken.folder / "predictions.jsonl")[0].unlink()
     fault, table = mark_all([broken, whole], split, workers)
     assert isinstance(fault, RsbenchError) and "left_1.exr: is missing" in str(fault)
@@ -95,11 +95,11 @@ def test_who_is_at_fault_fails_alone(workers: int, splits: dict[str, Split], tmp
 
 def test_a_fault_is_told_after_the_others_are_on_the_board(splits: dict[str, Split], tmp_path: Path) -> None:
     split = splits["depth"]
-    paths = list(write_oracles(split, tmp_path / "oracles"))
+    paths = list(split.track.oracles(split, tmp_path / "oracles"))
     write_depth(pictures_of(paths[0])[0], np.full((80, 96), -1.0, dtype=np.float32))
     with pytest.raises(RsbenchError, match=r"left_1\.exr: 7680 pixels are negative"):
         add_all(tmp_path / "board", paths, split, {})
-    (entry,) = entries_of(tmp_path / "board", split.protocol.id, split.name)
+    (entry,) = entries_of(tmp_path / "board", split.track.id, split.name)
     assert entry.header.method == "constant"
 
 
@@ -110,7 +110,7 @@ def test_a_child_says_that_the_truth_has_changed(splits: dict[str, Split], tmp_p
     assert first.pictures is not None
     changed = replace(first.pictures, files=dict.fromkeys(first.pictures.files, "0" * 64))
     broken = replace(split, truths=(replace(first, pictures=changed), second))
-    run = _serve([read_submission(write_truth(split, tmp_path), split)], broken)
+    run = _serve([read_submission(split.track.write_truth(split, tmp_path), split)], broken)
     with pytest.raises(EntryFailure, match=r"is not the file that dataset\.json names"):
         run(first.name)
     (row,) = run(second.name)

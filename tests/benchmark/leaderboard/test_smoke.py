@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from commands import assert_refused, run_here
 
-from rsbench.benchmark.leaderboard.smoke import differences, read_scores
-from rsbench.benchmark.leaderboard.smoke_tracks import CARD, ENTRIES, metrics_of
+from rsbench.benchmark.leaderboard.smoke import CARD, ENTRIES, differences, read_scores
+from rsbench.benchmark.leaderboard.track_list import TRACKS
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
 
@@ -86,7 +86,7 @@ def test_the_stored_truth_errs_nowhere(track: str) -> None:
     rows = scores[scores["method"] == "truth"].to_dict("records")
     assert [row["problem"] for row in rows] == [sequence.name for sequence in load_dataset_card(CARD).sequence]
     for row in rows:
-        for key in metrics_of(track):
+        for key in TRACKS[track].smoke_metrics:
             expected = {"ssim": 1.0, "psnr": math.inf}.get(key[:4], best.get(key, 0.0))
             assert row[key] == pytest.approx(expected, abs=1e-6, nan_ok=True), (row["problem"], key)
     assert set(scores["method"]) == set(ENTRIES[track])

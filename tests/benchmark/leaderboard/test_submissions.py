@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from leaderboards import Line, named, small_split, truth_lines, write
 
+from rsbench.benchmark.leaderboard.motion_tracks import PointsTrack
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission, template_text
 from rsbench.core.errors import RsbenchError
@@ -138,7 +139,7 @@ def test_every_fault_is_told(tmp_path: Path) -> None:
 
 def test_the_template_and_the_truth_are_in_order(tmp_path: Path) -> None:
     path = tmp_path / "template.jsonl"
-    path.write_text(template_text(SPLIT), "utf-8")
+    path.write_text(template_text(SPLIT, PointsTrack.example), "utf-8")
     for file in (path, write(tmp_path / "truth.jsonl", TRUTH)):
         found = check_submission(file, SPLIT)
         assert (found.faults, found.notes) == ((), ()) and found.submission is not None
@@ -173,7 +174,7 @@ def test_slips_of_convention_are_told(
 
 def test_a_secret_truth_is_not_asked(tmp_path: Path) -> None:
     """A check that compares with a secret truth would tell it."""
-    secret = Split(protocol=SPLIT.protocol, label=SPLIT.label, public=False, truths=SPLIT.truths)
+    secret = Split(track=SPLIT.track, label=SPLIT.label, public=False, truths=SPLIT.truths)
     inverted = [HEAD, *({**line, "w": [-x for x in line["w"]]} for line in TRUTH[1:])]
     assert check_submission(write(tmp_path / "mine.jsonl", inverted), secret).notes == ()
     degrees = [HEAD, *({**line, "w": [1000.0 * x for x in line["w"]]} for line in TRUTH[1:])]

@@ -1,10 +1,13 @@
-"""Inputs from rendered frames: given matches, or the frames themselves."""
+"""Tracks of rendered frames: what is given of them, matches or the frames themselves."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
+from rsbench.benchmark.leaderboard.splits import Split, dataset_split
+from rsbench.benchmark.leaderboard.track import Track
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS
@@ -20,6 +23,25 @@ from rsbench.vision.feature_matcher import load_features
 
 FEATURES = "sift"
 """Whose matches the protocol pose-1 gives."""
+
+
+class FrameTrack(Track):
+    """A track whose problems are the sequences of a dataset."""
+
+    def split(self, data: Path | None, seed_file: Path | None = None, secret: bool = False) -> Split:
+        if data is None:
+            raise RsbenchError(
+                f"--data: the track {self.name!r} needs the folder of a dataset; make one with rsbench generate"
+            )
+        if seed_file is not None:
+            raise RsbenchError(
+                f"--seed-file {seed_file}: a dataset has its own seed; leave it out, and say --secret"
+            )
+        return dataset_split(self, data, public=not secret)
+
+    def problems(self, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
+        assert data is not None
+        return islice((bare_problems if self.gives_images else matched_problems)(data), count)
 
 
 def matched_problems(data: Path) -> Iterator[Problem]:

@@ -1,0 +1,291 @@
+"""The track that asks for depth maps: formulas of docs/reference/protocols.md, those of ``rsbench.vision``.
+
+What is unknown in a depth map is wrong there: nobody gains by leaving out what is difficult.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.benchmark.leaderboard.marking import Numbers
+from rsbench.benchmark.leaderboard.picture_files import FARTHEST, FOLDER, read_answer_depth
+from rsbench.benchmark.leaderboard.picture_parts import Parts, parts_within, shares
+from rsbench.benchmark.leaderboard.picture_running import CardChain, Making
+from rsbench.benchmark.leaderboard.picture_track import PictureTrack
+from rsbench.benchmark.leaderboard.splits import Split, Truth
+from rsbench.benchmark.leaderboard.submissions import Submission
+from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Score
+from rsbench.benchmark.leaderboard.true_pictures import VIEW, Asked, TruePictures
+from rsbench.core.errors import RsbenchError
+from rsbench.core.motion import Motion
+from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.layout import picture_file
+from rsbench.dataset.sequence import Sequence
+from rsbench.pipeline.chain import Given
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import metres, motion_disparities
+from rsbench.pipeline.frame_motion import match_frames, solve_frames
+from rsbench.storage.files import write_depth
+from rsbench.vision.stereo_depth import depth_metrics
+from rsbench.vision.stereo_matcher import load_matcher, needs_motion
+from rsbench.vision.undistortion import sensor_disparities
+
+_LIMITS_PX = (1, 2, 3)
+_WORST_PART: Numbers = {
+    **{f"bad_{n}": 1.0 for n in _LIMITS_PX},
+    "coverage": 0.0,
+    "abs_rel": math.inf,
+    "rmse_m": math.inf,
+}
+_NEAR = 0.1
+"""Relative error of depth below which another reading is near to the truth."""
+_RIGHT = 0.01
+"""One that is so near as it stands needs no other reading."""
+_SMALLER = 0.25
+"""Another reading's error must be below this part of that of what stands there."""
+_FAR_M = 300.0
+"""Median depth that is hardly one in metres."""
+_DEPTH = (
+    Score(
+        key="bad_1",
+        title="bad@1",
+        hint="share of surface wrong by over 1 px of disparity or unknown",
+        kind="share",
+    ),
+    *(
+        Score(key=f"bad_{limit}", title=f"bad@{limit}", hint=f"the same beyond {limit} px", kind="share")
+        for limit in (2, 3)
+    ),
+    Score(key="bad_1_visible", title="bad@1 visible", hint="bad@1 of what the right camera sees", kind="share"),
+    Score(key="bad_1_occluded", title="bad@1 occluded", hint="bad@1 of what it does not see", kind="share"),
+    Score(key="coverage", title="known", hint="share of surface with a depth", kind="share", better="higher"),
+    Score(key="on_sky", title="on sky", hint="share of pixels without a surface that have a depth", kind="share"),
+    FAILED,
+    Score(key="abs_rel", title="AbsRel", hint="median of the mean relative error, where known", kind="median"),
+    Score(
+        key="rmse_m", title="RMSE (m)", hint="median of the root mean squared error, where known", kind="median"
+    ),
+    *(
+        Score(key=f"{key}_{part}", title=f"{title} {part}", hint=f"{title} of the {part} part", kind="median")
+        for part in ("visible", "occluded")
+        for key, title in (("abs_rel", "AbsRel"), ("rmse_m", "RMSE"))
+    ),
+    SECONDS,
+)
+
+
+def _constant(pictures: TruePictures, place: Path) -> None:
+    depth = pictures.depth()
+    surface = depth[depth > 0.0]
+    _flat(pictures, place, float(np.median(surface)) if surface.size else 0.0)
+
+
+def _flat(pictures: TruePictures, place: Path, depth_m: float) -> None:
+    (each,) = pictures.asked
+    write_depth(place / f"{each.stem}.exr", np.full(pictures.size[::-1], depth_m, dtype=np.float32))
+
+
+class DepthTrack(PictureTrack):
+    """Depth of a rolling-shutter frame."""
+
+    name, id = "depth", "depth-1"
+    title = "Depth of rolling-shutter frames"
+    scores = _DEPTH
+    error, error_title = "bad_1", "bad@1"
+    part_score, part_title = "bad_1", "bad@1"
+    others = (("constant", ORACLE, "The median true depth of each sequence, everywhere", _constant),)
+    smoke = ("sgm", "sweep", "sgm-plain", "constant", ORACLE)
+    smoke_metrics = (
+        *(f"bad_{part}" for part in ("1", "2", "3", "1_visible", "1_occluded")),
+        "coverage",
+        "on_sky",
+        "abs_rel",
+        "rmse_m",
+    )
+
+    def asked(self, sequence: Sequence) -> tuple[Asked, ...]:
+        file = picture_file("rs", VIEW[0], VIEW[1] + sequence.first, depth=True)
+        return (Asked(f"{VIEW[0]}_{VIEW[1]}", 0, file, (".exr", ".png")),)
+
+    def hints(
+        self, folder: Path, truth: Truth, png_unit_m: float | None, split: Split, wanted: bool
+    ) -> Iterable[str]:
+        depth = read_answer_depth(folder, truth, png_unit_m)
+        if not wanted:
+            return ()
+        if split.public:
+            return _readings(depth, truth)
+        far = np.any(depth > 0.0) and np.median(depth[depth > 0.0]) > _FAR_M
+        return (f"half of it is above {_FAR_M:g} m: metres are asked, not millimetres",) if far else ()
+
+    def scorer(self, truth: Truth, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
+        true = TrueDepth.of(pictures)
+
+        def scores_of(submission: Submission, success: bool) -> Numbers:
+            folder, unit = submission.folder / FOLDER, submission.header.png_unit_m
+            return depth_scores(true, read_answer_depth(folder, truth, unit) if success else None)
+
+        return scores_of
+
+    def draw_example(self, pictures: TruePictures, place: Path) -> None:
+        _flat(pictures, place, 10.0)
+
+    def chain(self, card: str) -> CardChain:
+        matcher = load_matcher(card)
+        uses = self.allowed if needs_motion(matcher) else ("images", "stereo")
+        return CardChain(CorrectionOptions(matcher=matcher), matcher, matcher.key, uses)
+
+    def make(self, making: Making, chain: CorrectionOptions, place: Path) -> dict[str, Any]:
+        rig, (side, frame) = making.problem.rig, VIEW
+        shared = 0.0
+        try:
+            if needs_motion(chain.matcher):
+                motion = _motion(making, chain)
+                shared, start = sum(making.spent.values()), time.perf_counter()
+                found = motion_disparities(
+                    chain.matcher, making.images, rig, making.problem.shutter, motion, (VIEW,)
+                )
+                depth = metres(found[VIEW], rig)
+            else:
+                start = time.perf_counter()
+                pair = [making.images[each, frame] for each in SIDES]
+                disparity = sensor_disparities(chain.matcher, pair[0], pair[1], rig)[SIDES.index(side)]
+                depth = np.nan_to_num(rig.depth(disparity), nan=0.0)
+        except RsbenchError as error:
+            return {"success": False, "reason": str(error)[:300]}
+        seconds = shared + time.perf_counter() - start
+        place.mkdir(parents=True)
+        (each,) = making.asked
+        write_depth(place / f"{each.stem}.exr", np.where(depth > FARTHEST, 0.0, depth).astype(np.float32))
+        return {"seconds": round(seconds, 4)}
+
+
+def _motion(making: Making, chain: CorrectionOptions) -> Motion:
+    """That the default solver estimates, the same for all matchers: of frames that are looked at first.
+
+    Raises:
+        RsbenchError: see ``match_frames`` and ``solve_frames``.
+    """
+    rig, shutter, start = making.problem.rig, making.problem.shutter, time.perf_counter()
+    if making.given.motion is None:
+        matches = match_frames(making.images, rig, chain, shutter.scanning)
+        matched = time.perf_counter()
+        found = solve_frames(matches, rig, shutter.readout_ratio, chain, scanning=shutter.scanning).found
+        assert found is not None
+        making.given = Given(motion=found.motion)
+        making.spent = {"matching": matched - start, "motion": time.perf_counter() - matched}
+    assert making.given.motion is not None
+    return making.given.motion
+
+
+# Marking
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrueDepth:
+    """What depth maps of a problem are compared with."""
+
+    rig: StereoRig
+    depth: NDArray[np.float32]
+    """(H, W) m, 0 where there is no surface."""
+    seen: NDArray[np.bool_]
+    """(H, W) by both cameras."""
+    parts: Parts
+    """Of the surface."""
+
+    @classmethod
+    def of(cls, pictures: TruePictures) -> TrueDepth:
+        """Read it."""
+        depth, rig = pictures.depth(), pictures.sequence.rig
+        parts = parts_within(DepthTrack.part_score, pictures.rolling(), 0, depth > 0.0)
+        return cls(rig=rig, depth=depth, seen=pictures.seen_by_both(depth), parts=parts)
+
+
+def depth_scores(true: TrueDepth, depth: NDArray[np.float32] | None) -> Numbers:
+    """Of a depth map (H, W), m, 0 unknown; None: a failure."""
+    truth, rig, seen = true.depth, true.rig, true.seen
+    found = part_scores(depth, truth, rig, np.ones_like(seen))
+    for name, part in (("visible", seen), ("occluded", ~seen)):
+        scores = part_scores(depth, truth, rig, part)
+        found |= {f"{key}_{name}": scores[key] for key in ("bad_1", "abs_rel", "rmse_m")}
+    wrong = np.ones_like(seen) if depth is None else _wrong(depth, truth, rig)
+    found |= shares(true.parts, wrong)
+    sky = truth == 0.0
+    invented = 1.0 if depth is None else float(np.mean(depth[sky] > 0.0)) if np.any(sky) else 0.0
+    return {**found, "on_sky": invented}
+
+
+def _wrong(depth: NDArray[np.float32], truth: NDArray[np.float32], rig: StereoRig) -> NDArray[np.bool_]:
+    """(H, W) where the disparity is off by more than 1 px, or not known; of a surface."""
+    found, true = (rig.disparity(np.where(each > 0.0, each, 1.0).astype(np.float64)) for each in (depth, truth))
+    return (depth <= 0.0) | (np.abs(found - true) > 1.0)
+
+
+def part_scores(
+    depth: NDArray[np.float32] | None, truth: NDArray[np.float32], rig: StereoRig, part: NDArray[np.bool_]
+) -> Numbers:
+    """Of some pixels. Where none of them shows a surface nothing is wrong; errors in metres do not exist."""
+    if depth is None:
+        return _WORST_PART
+    surface = part & (truth > 0.0)
+    if not np.any(surface):
+        return {key: 0.0 if key.startswith("bad") else math.nan for key in _WORST_PART} | {"coverage": 1.0}
+    scores = depth_metrics(depth, truth, rig, part)
+    known = surface & (depth > 0.0)
+    if not np.any(known):
+        return _WORST_PART
+    error = np.abs(depth[known].astype(np.float64) - truth[known]) / truth[known]
+    return {
+        **{f"bad_{n}": 1.0 - scores["coverage"] * (1.0 - scores[f"bad_{n}px"]) for n in _LIMITS_PX},
+        "coverage": scores["coverage"],
+        "abs_rel": float(np.mean(error)),
+        "rmse_m": scores["rmse_m"],
+    }
+
+
+# What may be meant
+
+
+def _readings(depth: NDArray[np.float32], truth: Truth) -> Iterator[str]:
+    assert truth.pictures is not None
+    sequence = truth.pictures.sequence
+    rig, true = sequence.rig, truth.pictures.depth()
+    along = np.linalg.norm(rig.camera.unproject(rig.camera.pixel_grid()), axis=-1)
+    both = (depth > 0.0) & (true > 0.0)
+    if not np.any(both):
+        return
+    given, z, product = depth[both].astype(np.float64), true[both].astype(np.float64), rig.camera.fx * rig.baseline
+    stands = _error(given, z)
+    if stands < _RIGHT:
+        return
+    readings: dict[str, Callable[[], FloatArray]] = {
+        "it is in millimetres; metres are asked": lambda: given / 1000.0,
+        "it is in centimetres; metres are asked": lambda: given / 100.0,
+        "it is disparity in px; depth is fx * baseline / disparity": lambda: product / given,
+        "it is inverse depth, 1 / m; depth is asked": lambda: 1.0 / given,
+        "it is the distance along the ray; z of the camera is asked": lambda: given / along[both],
+    }
+    for words, reading in readings.items():
+        if _error(reading(), z) < min(_NEAR, _SMALLER * stands):
+            yield words
+            return
+    before = sequence.depth("rs", "left", 0)
+    there = (depth > 0.0) & (before > 0.0)
+    if _error(depth[there].astype(np.float64), before[there].astype(np.float64)) < _SMALLER * stands:
+        yield "it is that of frame 0; frame 1 is asked"
+    elif _error(given * np.median(z / given), z) < min(_NEAR, _SMALLER * stands):
+        yield "it is right up to a factor; metres are asked"
+
+
+def _error(depth: FloatArray, truth: FloatArray) -> float:
+    """Median relative error."""
+    return float(np.median(np.abs(depth - truth) / truth)) if truth.size else np.inf

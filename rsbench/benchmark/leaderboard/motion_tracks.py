@@ -1,0 +1,313 @@
+"""Tracks that ask for motions: from simulated matches, given matches, and matches of the method's own."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from rsbench.benchmark.leaderboard.answers import Answer
+from rsbench.benchmark.leaderboard.frame_inputs import FrameTrack
+from rsbench.benchmark.leaderboard.marking import last, named
+from rsbench.benchmark.leaderboard.own_matches import FOLDER, match_files, match_scores, read_own_matches
+from rsbench.benchmark.leaderboard.running import SolverTrack, answer_problem
+from rsbench.benchmark.leaderboard.splits import (
+    Split,
+    Truth,
+    exact_problem,
+    points_split,
+    seed_of,
+    simulated_problem,
+)
+from rsbench.benchmark.leaderboard.submissions import Submission, submission_text
+from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Row, Score
+from rsbench.benchmark.scoring import answered, pose_errors
+from rsbench.benchmark.seeds import generator
+from rsbench.benchmark.simulated.bound import motion_bound
+from rsbench.benchmark.simulated.convention_errors import misreading
+from rsbench.components.motion_models import make_motion
+from rsbench.core import so3
+from rsbench.core.errors import RsbenchError
+from rsbench.core.pose_errors import translation_of_offset
+from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.problem import Problem
+from rsbench.solvers.engine.registry import SolverEntry
+from rsbench.storage.files import write_bytes
+
+AUC_DEG = (1, 5, 10)
+"""Thresholds of the areas under the curve of max(e_R, e_T)."""
+FLIP_DEG = 90.0
+"""A direction that is wrong by more is the opposite one."""
+SUCCESS_DEG = (1.0, 5.0)
+"""A success errs by less in rotation and direction, as in the sweeps of simulated points."""
+BOUND = "cramer-rao"
+"""Name of the entry whose errors are drawn from the bound."""
+_TIMES = 33
+"""Row times, from the first row of frame 0 to the last of frame 1, at which poses are compared."""
+_MOTION = (
+    *(
+        Score(
+            key=f"auc_{limit}",
+            title=f"AUC@{limit}",
+            hint=f"area under the curve of max(e_R, e_T) to {limit} deg",
+            kind="share",
+            better="higher",
+        )
+        for limit in (5, 1, 10)
+    ),
+    Score(
+        key="within", title="success", hint="share with e_R < 1 deg and e_T < 5 deg", kind="share", better="higher"
+    ),
+    Score(key="flip", title="flips", hint="share with e_T above 90 deg", kind="share"),
+    FAILED,
+    Score(key="e_R_deg", title="e_R (deg)", hint="median angle of the rotation", kind="median"),
+    Score(key="e_T_deg", title="e_T (deg)", hint="median angle of the translation", kind="median"),
+    Score(key="e_row_deg", title="e_row (deg)", hint="median of the largest angle of a row's pose", kind="median"),
+    Score(key="e_s", title="e_s", hint="median |log| of the length, where metres are claimed", kind="median"),
+    Score(key="metres", title="metres", hint="median distance of d from the truth, where claimed", kind="median"),
+    SECONDS,
+)
+_MATCHES = (
+    Score(key="matches", title="matches", hint="median number of own matches", kind="median", better="higher"),
+    Score(
+        key="matches_1px",
+        title="right matches",
+        hint="median share of own matches within 1 px of the truth",
+        kind="median",
+        better="higher",
+    ),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Motion(Answer):
+    """An answer where a motion is asked."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("w", "d"):
+            if self.success and getattr(self, name) is None:
+                raise ValueError(f"{name}: a success needs three numbers; a failure says success = false")
+
+
+class MotionTrack(SolverTrack):
+    """The motion of a rig over one frame period."""
+
+    scores = _MOTION
+    error, error_title = "error_deg", "max(e_R, e_T) in degrees"
+    answers = _Motion
+    smoke = ("rs-stereo-refined", "gs-stereo-tracks-scaled", ORACLE)
+    smoke_metrics = ("e_R_deg", "e_T_deg", "e_s", "metres", "e_row_deg", "nees")
+    example = MappingProxyType(
+        {"w": [0.01, -0.02, 0.005], "d": [0.1, 0.0, 0.2], "metric": False, "reference_point": "left"}
+    )
+
+    def true_answer(self, truth: Truth) -> Mapping[str, Any]:
+        return {"w": truth.motion.w.tolist(), "d": truth.motion.d.tolist(), "metric": True}
+
+    def notes(self, answers: Sequence[Answer], split: Split) -> Iterator[str]:
+        if mistaken := _mistaken(answers, split):
+            words, count = mistaken
+            yield f"{count} of {len(answers)} motions are near to another reading of the truth: {words}"
+
+    def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
+        return answer_problem(problem, entry, runner)
+
+    def rows(self, submission: Submission, split: Split) -> list[Row]:
+        model, found = submission.header.motion_model, submission.answers
+        return [_motion_row(truth, found.get(truth.name), model) for truth in split.truths]
+
+
+class PointsTrack(MotionTrack):
+    """Of simulated matches."""
+
+    name, id = "points", "points-1"
+    title = "Motion from simulated matches"
+    allowed = ("left", "right", "links", "readout")
+    given = "tracks of random points, with noise and outliers"
+
+    def split(self, data: Path | None, seed_file: Path | None = None, secret: bool = False) -> Split:
+        if data is not None:
+            raise RsbenchError(f"--data {data}: the problems of points are simulated; leave it out")
+        if secret and seed_file is None:
+            raise RsbenchError("--secret: of the track 'points' a --seed-file makes a secret split; leave it out")
+        return points_split(self, seed_file)
+
+    def problems(self, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
+        seed = seed_of(seed_file)
+        return (simulated_problem(seed, number) for number in range(count))
+
+    def oracles(self, split: Split, folder: Path) -> Iterator[Path]:
+        yield from super().oracles(split, folder)
+        path = folder / BOUND / "predictions.jsonl"
+        path.parent.mkdir(parents=True)
+        write_bytes(path, bound_text(split, seed_of(None)).encode())
+        yield path
+
+
+class PoseTrack(FrameTrack, MotionTrack):
+    """Of rendered frames, with matches that are given."""
+
+    name, id = "pose", "pose-1"
+    title = "Motion from given matches of rendered frames"
+    allowed = ("left", "right", "links", "readout")
+    given = "matches of the frames by rsbench's SIFT"
+
+
+class OwnPoseTrack(FrameTrack, MotionTrack):
+    """Of rendered frames; matches of the method's own may be handed in."""
+
+    name, id = "pose-own", "pose-own-1"
+    title = "Motion from rendered frames"
+    allowed = ("left", "right", "links", "readout", "images")
+    given = "the four rolling-shutter frames"
+    own_matches = True
+    scores = _MOTION + _MATCHES
+    smoke_metrics = (*MotionTrack.smoke_metrics, "matches", "matches_1px")
+
+    def load(self, cards: Sequence[str]) -> None:
+        raise RsbenchError(
+            f"track {self.name!r}: solvers of cards take given matches; run them on the track 'pose'"
+        )
+
+    def files_of(self, submission: Submission, split: Split) -> Iterable[str]:
+        return [f"{FOLDER}/{name}" for name in match_files(submission.folder)]
+
+    def check_beside(
+        self, submission: Submission, split: Split, most: int, hints: bool
+    ) -> tuple[list[str], list[str]]:
+        try:
+            read_own_matches(submission.folder, split.by_name)
+        except RsbenchError as error:
+            return [str(error)], []
+        return [], []
+
+    def rows(self, submission: Submission, split: Split) -> list[Row]:
+        rows, own = super().rows(submission, split), read_own_matches(submission.folder, split.by_name)
+        for row, truth in zip(rows, split.truths, strict=True):
+            assert truth.sequence is not None
+            row |= match_scores(truth.sequence, None if own is None else own[truth.name])
+        return rows
+
+
+def _mistaken(answers: Sequence[Answer], split: Split) -> tuple[str, int] | None:
+    """The slip that explains most of the motions, and how many; None when no slip does."""
+    found: Counter[str] = Counter()
+    for answer in answers:
+        truth = split.by_name[answer.name]
+        given = *_vectors(answer), truth.motion.w, truth.motion.d
+        words = misreading(*given, truth.rig, answer.reference_point)
+        if words:
+            found[words] += 1
+    words, count = found.most_common(1)[0] if found else ("", 0)
+    return (words, count) if 2 * count > len(answers) else None
+
+
+def _motion_row(truth: Truth, answer: Answer | None, model: str) -> Row:
+    w, d = _vectors(answer)
+    success = answer is not None and bool(answered(w, d, answer.success))
+    point = "body" if answer is None else answer.reference_point
+    metric = answer is not None and answer.metric
+    errors = pose_errors(
+        w,
+        d,
+        true_w=truth.motion.w,
+        true_d=truth.motion.d,
+        rig=truth.rig,
+        success=success,
+        metric=metric,
+        reference_point=point,
+    )
+    found = {name: float(value) for name, value in errors.items()}
+    worst = float(np.fmax(found["e_R_deg"], found["e_T_deg"]))
+    return {
+        **named(truth, success),
+        **found,
+        "metres": _metres(d, truth, point) if success and metric else math.nan if success else math.inf,
+        "e_row_deg": _row_angle(w, d, truth, model) if success else 180.0,
+        "error_deg": worst,
+        **{f"auc_{limit}": max(0.0, 1.0 - worst / limit) for limit in AUC_DEG},
+        "within": float(found["e_R_deg"] < SUCCESS_DEG[0] and not found["e_T_deg"] >= SUCCESS_DEG[1]),
+        "flip": float(success and found["e_T_deg"] > FLIP_DEG),
+        "nees": _nees(answer, w, d, truth) if answer is not None and success and metric else math.nan,
+        **last(success, answer),
+    }
+
+
+def _vectors(answer: Answer | None) -> tuple[FloatArray, FloatArray]:
+    if answer is None or answer.w is None or answer.d is None:
+        return np.full(3, np.nan), np.full(3, np.nan)
+    return np.array(answer.w), np.array(answer.d)
+
+
+def _true_d(truth: Truth, point: str) -> FloatArray:
+    if point == "body":
+        return truth.motion.d
+    return translation_of_offset(truth.motion.w, truth.motion.d, truth.rig.offset("left"))
+
+
+def _metres(d: FloatArray, truth: Truth, point: str) -> float:
+    return float(np.linalg.norm(d - _true_d(truth, point)))
+
+
+def _row_angle(w: FloatArray, d: FloatArray, truth: Truth, model: str) -> float:
+    """The largest angle between estimated and true poses of a row, degrees."""
+    times = np.linspace(0.0, 1.0 + truth.shutter.readout_ratio, _TIMES)
+    estimated = make_motion(model, w, d).body_from_world(times).R
+    true = truth.motion.body_from_world(times).R
+    return float(np.rad2deg(np.max(so3.angle(estimated @ np.swapaxes(true, -1, -2)))))
+
+
+def _nees(answer: Answer, w: FloatArray, d: FloatArray, truth: Truth) -> float:
+    """Squared error of (w, d) by the covariance that was stated: on average 6 where that is right."""
+    if answer.covariance is None:
+        return math.nan
+    error = np.concatenate([w - truth.motion.w, d - _true_d(truth, answer.reference_point)])
+    values, vectors = np.linalg.eigh(np.array(answer.covariance))
+    if not values[0] > 0.0:
+        return math.inf
+    return float(np.sum((vectors.T @ error) ** 2 / values))
+
+
+# The bound
+
+
+def bound_text(split: Split, seed: int) -> str:
+    """Motions that err as little as the data allow, as a submission; ``seed`` is that of the split.
+
+    Errors are drawn from the Cramer-Rao bound of the matches without the outliers: what an unbiased method that
+    knows them, and uses all their links, could at best do.
+    """
+    header = {
+        "protocol": split.track.id,
+        "split": split.name,
+        "method": BOUND,
+        "uses": [ORACLE],
+        "description": "The true motion with errors drawn from the Cramer-Rao bound of all that is no outlier",
+    }
+    return submission_text(header, _at_the_bound(split, seed))
+
+
+def _at_the_bound(split: Split, seed: int) -> Iterator[dict[str, Any]]:
+    for number, truth in enumerate(split.truths):
+        exact, noise_px = exact_problem(seed, number)
+        bound = motion_bound(exact.correspondences, truth.rig, truth.shutter, truth.motion, noise_px)
+        covariance = bound.covariance
+        if covariance is None or not math.isfinite(bound.rotation):
+            yield {"name": truth.name, "success": False, "reason": "the matches do not determine the motion"}
+            continue
+        error = np.linalg.cholesky(covariance) @ generator(seed, "leaderboard", BOUND, number).standard_normal(6)
+        yield {
+            "name": truth.name,
+            "w": (truth.motion.w + error[:3]).tolist(),
+            "d": (truth.motion.d + error[3:]).tolist(),
+            "metric": True,
+            "covariance": covariance.tolist(),
+        }
