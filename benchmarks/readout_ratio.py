@@ -1,4 +1,4 @@
-"""How well readout ratio and motion model are found: on simulated matches beside the bound, and on rendered frames.
+"""How well readout ratio and motion model are found: on simulated matches beside the bound, and on rendered ones.
 
 python benchmarks/readout_ratio.py
 python benchmarks/readout_ratio.py --data data/moderate
@@ -76,8 +76,8 @@ def simulated(model: str, tracks: int, degrees: float, trials: int) -> str:
     scaled = np.array(errors) / np.array(stated)
     return (
         f"{model:9s} {tracks:5d} tracks, {degrees:g} deg: median error {np.median(np.abs(errors)):.4f}; RMS error "
-        f"over stated {_rms(scaled):.2f}, over the bound {_rms(np.array(errors) / np.array(bounds)):.2f}; within 3 "
-        f"stated deviations {np.mean(np.abs(scaled) < 3.0):.0%}; model found {np.mean(right):.0%}"
+        f"over stated {_rms(scaled):.2f}, over the bound {_rms(np.array(errors) / np.array(bounds)):.2f}; within "
+        f"3 stated deviations {np.mean(np.abs(scaled) < 3.0):.0%}; model found {np.mean(right):.0%}"
     )
 
 
