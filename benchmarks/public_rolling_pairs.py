@@ -1,9 +1,9 @@
 """Scores of corrections with one camera on twelve published pairs with ground truth.
 
 The frames are those in ``demo/`` of github.com/ethliup/DeepUnrollNet (Liu, Cui, Larsson, Pollefeys, Deep Shutter
-Unrolling Network, CVPR 2020): six pairs of Carla-RS (640 x 448, rendered, a field of view of 90 degrees) and six of
-Fastec-RS (640 x 480, rows of the frames of a high-speed camera of unknown focal length; 768 px are assumed). They
-are not ours to pass on: give the folder.
+Unrolling Network, CVPR 2020): six pairs of Carla-RS (640 x 448, rendered, a field of view of 90 degrees) and six
+of Fastec-RS (640 x 480, rows of the frames of a high-speed camera of unknown focal length; 768 px are assumed).
+They are not ours to pass on: give the folder.
 
     git clone https://github.com/ethliup/DeepUnrollNet
     python benchmarks/public_rolling_pairs.py DeepUnrollNet/demo
@@ -13,8 +13,8 @@ Carla-RS and rows 240 and 241 of Fastec-RS, two of which are read at once, are e
 masks for these pairs. ``covered`` are therefore, for every method alike, the pixels that the second frame shows
 when its optical flow moves it to that time.
 
-``flow`` is optical flow (DIS) scaled by the times of the rows; what it leaves empty is black in ``flow, black`` and
-invented from its surroundings in ``flow``. PSNR in dB over all channels, the mean of the pairs' values.
+``flow`` is optical flow (DIS) scaled by the times of the rows; what it leaves empty is black in ``flow, black``
+and invented from its surroundings in ``flow``. PSNR in dB over all channels, the mean of the pairs' values.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.footage import read_frame
-from rsbench.pipeline.mono_correction import MonoFusionCorrector, find_own_motion
+from rsbench.pipeline.mono_correction import find_own_motion
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.fusion import Origin, inpaint
 from rsbench.vision.mono_fusion import MonoFusion, MonoFusionOptions, OwnMotion, find_flows
@@ -77,6 +77,11 @@ def score_pair(folder: Path, focal: float) -> tuple[Scores, float]:
     return scores, seconds
 
 
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
 def main() -> int:
     """Print the table; 1 where a pair is worse than what the corrector promises."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -88,12 +93,12 @@ def main() -> int:
         for folder in sorted((arguments.demo / name).iterdir()):
             pairs[folder.name], seconds = score_pair(folder, focal)
             values = "  ".join("{:5.2f} / {:5.2f}".format(*pairs[folder.name][each]) for each in METHODS)
-            print(f"{name:7}{folder.name:8}{values}  {seconds:.2f} s", flush=True)
+            _say(f"{name:7}{folder.name:8}{values}  {seconds:.2f} s")
             scores = pairs[folder.name]
             good &= scores["mono-fusion"][0] > max(scores["flow"][0] - WORST_LOSS, scores["uncorrected"][0])
         means = [np.mean([scores[each] for scores in pairs.values()], axis=0) for each in METHODS]
-        print(f"{name:7}{'mean':8}" + "  ".join(f"{a:5.2f} / {b:5.2f}" for a, b in means), flush=True)
-    print(f"columns: {', '.join(METHODS)}; all pixels / covered ones, dB")
+        _say(f"{name:7}{'mean':8}" + "  ".join(f"{a:5.2f} / {b:5.2f}" for a, b in means))
+    _say(f"columns: {', '.join(METHODS)}; all pixels / covered ones, dB")
     return 0 if good else 1
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rsbench.cli.component_kinds import named
+from rsbench.cli.correct_one_camera import correct_one_camera
 
 if TYPE_CHECKING:
     from rsbench.capture.readout import ReadoutEstimate
@@ -75,12 +76,21 @@ def correct(
     features: Annotated[str, named("features", "Matches features: a name or a card.")] = "sift",
     corrector: Annotated[str, named("correctors", "Makes the corrected frames: a name or a card.")] = "fusion",
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
+    camera: Annotated[
+        Path | None, typer.Option(metavar="CAMERA.toml", help="Of one camera, in place of --rig.")
+    ] = None,
+    footage: Annotated[
+        Path | None, typer.Option("--frames", metavar="DIR|VIDEO", help="Frames of one camera.")
+    ] = None,
 ) -> None:
     """Correct your own rolling-shutter stereo frames: two times of a rig, or a whole sequence."""
     from rsbench.pipeline.frame_motion import NoMotionError
     from rsbench.pipeline.isolated_parts import Isolation
     from rsbench.vision.corrector import NotCorrectedError
 
+    if camera is not None:
+        correct_one_camera(frames, footage, camera, out, target, inpaint=True)
+        return
     given = _given(frames, rig, out, left, right)
     others = {"find_sky": sky, "inpaint": inpaint, "seed": seed, "motion_model": motion_model}
     options = _options(features, solver, matcher, corrector, fill, **others)
@@ -205,7 +215,7 @@ def _corrector(name: str, fill: bool) -> CorrectorEntry:
     return replace(entry, component=component, key=component_key(component, {}))
 
 
-def _target_row(target: str, height: int) -> float:
+def target_row(target: str, height: int) -> float:
     from rsbench.core.errors import RsbenchError
 
     named = {"first": 0.0, "middle": (height - 1) / 2, "last": height - 1.0}
@@ -234,7 +244,7 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
     images = read_four(dict(zip(order, paths, strict=True)))  # pyrefly: ignore[bad-argument-type]
     rig = _sized(card, images["left", 0])
     height = rig.camera.height
-    options = replace(options, target_row=_target_row(target, height))
+    options = replace(options, target_row=target_row(target, height))
     with fresh_folder(out) as folder:
         with progress_bar("correcting", 4) as advance:
             result = correct_four(
@@ -333,7 +343,7 @@ def _correct_sequence(
     from rsbench.pipeline.sequence_correction import correct_sequence, estimate_sequence_readout
 
     rig = _sized(card, next(iter(left)))
-    options = replace(options, target_row=_target_row(target, rig.camera.height))
+    options = replace(options, target_row=target_row(target, rig.camera.height))
     ratio, offset, readout = card.readout_ratio, card.disparity_offset, None
     check_cameras(rig, card.scanning, options, ratio, offset)
     with fresh_folder(out) as folder:

@@ -1,4 +1,4 @@
-"""Correction of one camera's frames by ``mono-fusion``: its motion from dense flow, up to scale, then both frames."""
+"""Correction of one camera's frames by ``mono-fusion``: its motion from dense flow, then both frames."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def flow_matches(flows: Flows, rng: np.random.Generator) -> FloatArray:
     height, width = flow.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     here = np.stack([x, y], axis=-1)
-    there = here + flow
+    there = here + flow.astype(np.float64)
     inside = np.all((there >= 0.0) & (there <= (width - 1, height - 1)), axis=-1)
     good = np.flatnonzero(inside & (flows.returns[1] < _RETURNS_PX))
     chosen = rng.choice(good, min(_MATCHES, good.size), replace=False)

@@ -109,7 +109,7 @@ def sweep_frames(
     codes = [census(grey) for grey in small]
 
     def search(frame: int) -> F32:
-        volume = np.empty((height, width, count), dtype=np.uint8)
+        volume = np.zeros((height, width, count), dtype=np.uint8)
         other = 1 - frame
         _fill_volume(small[frame], small[other], codes[frame], codes[other], *maps[frame], step, volume)
         volume = np.asarray(cv2.blur(volume, (options.window, options.window))).reshape(volume.shape)
@@ -136,7 +136,7 @@ def _resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
 
 
 def _poses(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int, height: int) -> Pose:
-    """``cam_from_world`` of the rows of a frame of ``height`` rows, each at the mean time of those it is made of."""
+    """``cam_from_world`` of the rows of a frame of ``height`` rows, each at the mean time of its own."""
     scale = shutter.height / height
     rows = (np.arange(height) + 0.5) * scale - 0.5
     tau = shutter.pixel_time(np.stack([np.zeros_like(rows), rows], axis=-1), frame, side)

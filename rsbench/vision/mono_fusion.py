@@ -27,7 +27,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.vision import forward_warp
 from rsbench.vision.compiled_camera import optics_of
 from rsbench.vision.correction import WarpOptions, relative_row_maps
-from rsbench.vision.curve_sweep import Swept, SweepOptions, sweep_frames
+from rsbench.vision.curve_sweep import SweepOptions, Swept, sweep_frames
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.fusion import Fused, Origin, inpaint
@@ -203,7 +203,7 @@ class MonoFusion:
         share = ((target_tau - here) / passed)[..., None]
         by_flow = np.concatenate([np.stack([x, y], axis=-1) + share * flow, layer.rho[..., None]], axis=-1)
         if own.motion is None:
-            return by_flow
+            return np.asarray(by_flow, dtype=np.float64)
         target = own.rig.cam_from_world(own.motion, target_tau, own.side)
         poses = row_poses(own.rig, own.shutter, own.motion, own.side, frame)
         M, b = relative_row_maps(own.rig.camera, poses, target)
