@@ -19,7 +19,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.footage import CameraCard, check_alike
 from rsbench.pipeline.mono_correction import FoundOwnMotion, MonoFusionCorrector, find_own_motion, refusal
 from rsbench.vision.fusion import Fused
-from rsbench.vision.mono_fusion import MonoFusion, find_flows
+from rsbench.vision.mono_fusion import MonoFusion, MonoFusionOptions, find_flows
 
 DEFAULT_FOCAL = 1.0
 """Focal length in widths of the image where nothing is said: a horizontal field of view of 53 degrees. On frames
@@ -123,6 +123,29 @@ def correct_frames(
     if first and first[0].fused.reason:
         raise RsbenchError(f"frames: {first[0].fused.reason}")
     yield from first
+
+
+def correct_all(
+    frames: Iterable[NDArray[Any]],
+    camera: PinholeCamera | float | None,
+    readout_ratio: float | None,
+    target_row: float | None = None,
+    *,
+    inpaint: bool = True,
+) -> list[Fused]:
+    """``correct_frames`` of a camera, a horizontal field of view in degrees, or None; its errors."""
+    known: dict[str, Any] = {}
+    if isinstance(camera, PinholeCamera):
+        known["camera"] = CameraCard(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy, lens=camera.lens)
+    elif camera is not None:
+        known["fov_deg"] = camera
+    try:
+        card = OneCameraCard(readout_ratio=readout_ratio, **known)
+    except ValueError as error:
+        raise RsbenchError(str(error)) from error
+    corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=inpaint))
+    moments = correct_frames(frames, card, MonoOptions(corrector=corrector, target_row=target_row))
+    return [moment.fused for moment in moments]
 
 
 def _corrected(

@@ -46,6 +46,8 @@ _SIGMA_PX = 0.3
 """What neither check of a flow sees: its standard deviation on rendered frames where both agree."""
 _RANGE_QUANTILE, _RANGE_MARGIN, _RANGE_PX = 0.999, 1.5, 2.0
 """Range of the search along the curves, from the inverse depths of consistent flow: times, and px of parallax."""
+_CONFIRMED = 16.0
+"""How much less flow counts where the search on the curve is confirmed by the other frame."""
 _SMOOTH_PX = 5
 _FLOW_BYTES = 100.0
 
@@ -172,10 +174,11 @@ class MonoFusion:
         still = (small_off < _RETURNS_PX) & (small_miss < _ON_CURVE_PX)
         found = np.where(swept.agrees, swept.rho, np.where(still, small_rho, np.float32(np.nan)))
         filled = cv2.resize(cv2.medianBlur(_filled(found), 5), full, interpolation=cv2.INTER_LINEAR)
-        # Where the sweep is confirmed geometry explains the frames; else the flow says how far it is from that.
-        wrong = np.where(swept.agrees, np.float32(0.0), np.maximum(small_miss - _ON_CURVE_PX, 0.0))
-        geometry = wrong.astype(np.float32) ** 2
+        # How far consistent flow ends off the curve says how far geometry is from explaining it, found or not.
+        wrong = np.maximum(small_miss - _ON_CURVE_PX, np.float32(0.0))
+        geometry = np.minimum(wrong, np.float32(1e3)) ** 2
         flow = (np.minimum(small_off, np.float32(1e3)) / _RETURNS_PX) ** 4 + _SIGMA_PX**2
+        flow = np.where(swept.agrees, flow * _CONFIRMED, flow)
         share = (geometry / (geometry + flow)).astype(np.float32)
         share = cv2.blur(cv2.medianBlur(share, 5), (_SMOOTH_PX, _SMOOTH_PX))
         return _Layer(np.asarray(filled), np.asarray(cv2.resize(share, full, interpolation=cv2.INTER_LINEAR)))
