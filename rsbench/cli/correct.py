@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rsbench.cli.component_kinds import named
-from rsbench.cli.correct_one_camera import correct_one_camera
+from rsbench.cli.correct_one_camera import CameraFile, Footage, correct_one_camera
 
 if TYPE_CHECKING:
     from rsbench.capture.readout import ReadoutEstimate
@@ -76,12 +76,8 @@ def correct(
     features: Annotated[str, named("features", "Matches features: a name or a card.")] = "sift",
     corrector: Annotated[str, named("correctors", "Makes the corrected frames: a name or a card.")] = "fusion",
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
-    camera: Annotated[
-        Path | None, typer.Option(metavar="CAMERA.toml", help="Of one camera, in place of --rig.")
-    ] = None,
-    footage: Annotated[
-        Path | None, typer.Option("--frames", metavar="DIR|VIDEO", help="Frames of one camera.")
-    ] = None,
+    camera: CameraFile = None,
+    footage: Footage = None,
 ) -> None:
     """Correct your own rolling-shutter stereo frames: two times of a rig, or a whole sequence."""
     from rsbench.pipeline.frame_motion import NoMotionError

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from rsbench.pipeline.footage import FrameSource
     from rsbench.pipeline.mono_sequence import MonoMoment, OneCameraCard
 
+CameraFile = Annotated[Path | None, typer.Option(metavar="CAMERA.toml", help="Of one camera, in place of --rig.")]
+Footage = Annotated[Path | None, typer.Option("--frames", metavar="DIR|VIDEO", help="Frames of one camera.")]
 _PAGE_FRAMES = 6
 _CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 

@@ -66,7 +66,9 @@ class MonoFusionOptions:
     """How two frames of a camera become one image."""
 
     sweep: SweepOptions = field(default_factory=SweepOptions)
+    """The search along the epipolar curves."""
     warp: WarpOptions = field(default_factory=WarpOptions)
+    """How pixels are taken from the source image; of ``tear_px`` no use is made."""
     fill: bool = True
     """Whether the other frame fills what the corrected one does not see."""
     inpaint: bool = True
