@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rsbench.cli.component_kinds import named
+from rsbench.cli.correct_input import given_frames, sized, target_row
+from rsbench.cli.correct_one_camera import CameraFile, Footage, correct_one_camera
 
 if TYPE_CHECKING:
     from rsbench.capture.estimate import Capture
-    from rsbench.core.rig import StereoRig
+    from rsbench.cli.correct_input import Given
     from rsbench.core.shutter import RollingShutter
     from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import FrameSource, RigCard
@@ -75,15 +76,24 @@ def correct(
     features: Annotated[str, named("features", "Matches features: a name or a card.")] = "sift",
     corrector: Annotated[str, named("correctors", "Makes the corrected frames: a name or a card.")] = "fusion",
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
+    camera: CameraFile = None,
+    footage: Footage = None,
 ) -> None:
-    """Correct your own rolling-shutter stereo frames: two times of a rig, or a whole sequence."""
+    """Correct your own rolling-shutter frames: of a stereo rig or of one camera, two times or a whole sequence."""
+    if camera is not None:
+        correct_one_camera(frames, footage, camera, out, target, inpaint=True)
+        return
+    given = given_frames(frames, rig, out, left, right)
+    others = {"find_sky": sky, "inpaint": inpaint, "seed": seed, "motion_model": motion_model}
+    _correct_given(given, target, _options(features, solver, matcher, corrector, fill, **others))
+
+
+def _correct_given(given: Given, target: str, options: CorrectionOptions) -> None:
+    """Exit 1 where no motion or no correction is found."""
     from rsbench.capture.settle import NoMotionError
     from rsbench.pipeline.isolated_parts import Isolation
     from rsbench.vision.corrector import NotCorrectedError
 
-    given = _given(frames, rig, out, left, right)
-    others = {"find_sky": sky, "inpaint": inpaint, "seed": seed, "motion_model": motion_model}
-    options = _options(features, solver, matcher, corrector, fill, **others)
     try:
         with Isolation() as isolation:
             options = isolation.chain(options)
@@ -94,76 +104,6 @@ def correct(
     except (NoMotionError, NotCorrectedError) as error:
         typer.echo(f"rsbench: not corrected: {error}", err=True)
         raise typer.Exit(1) from None
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Given:
-    """What is to be corrected, and where to."""
-
-    card: RigCard
-    out: Path
-    four: list[Path]
-    """Left 0, right 0, left 1, right 1; or, of footage, nothing."""
-    left: list[Path] | Path
-    """Its images, or a folder or video."""
-    right: list[Path] | Path
-
-    def footage(self) -> tuple[FrameSource, FrameSource]:
-        """Of the left and the right camera."""
-        from rsbench.pipeline.footage import FrameSource
-
-        left, right = (
-            FrameSource.of_files(each) if isinstance(each, list) else FrameSource(each)
-            for each in (self.left, self.right)
-        )
-        return left, right
-
-
-def _given(
-    frames: list[Path] | None, rig: Path | None, out: Path | None, left: Path | None, right: Path | None
-) -> _Given:
-    """Raises RsbenchError for another combination of arguments."""
-    from rsbench.core.errors import RsbenchError
-    from rsbench.pipeline.footage import read_rig_card
-
-    rendered = frames is not None and len(frames) == 1 and frames[0].is_dir()
-    if out is None or (rig is None and not rendered):
-        raise RsbenchError(f"--{'out' if rig is not None or rendered else 'rig'}: is required")
-    if frames and rendered:
-        if rig or left or right:
-            raise RsbenchError(f"{frames[0]}: is a sequence, which knows its frames and rig; leave the others out")
-        return _of_sequence(frames[0], out)
-    assert rig is not None
-    card = read_rig_card(rig)
-    if frames is not None and len(frames) == 4 and not (left or right):
-        return _Given(card=card, out=out, four=frames, left=[], right=[])
-    if frames or not (left and right):
-        count = f"{len(frames)} images; " if frames else ""
-        raise RsbenchError(
-            f"frames: {count}give LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right, or a sequence's folder"
-        )
-    return _Given(card=card, out=out, four=[], left=left, right=right)
-
-
-def _of_sequence(folder: Path, out: Path) -> _Given:
-    """The rolling-shutter frames of a sequence of a dataset."""
-    from rsbench.core.errors import RsbenchError
-    from rsbench.core.rig import SIDES
-    from rsbench.dataset.layout import picture_file
-    from rsbench.dataset.sequence import read_dataset_manifest, read_sequence
-    from rsbench.pipeline.footage import rig_card_of
-
-    if not (folder / "sequence.json").is_file():
-        names = read_dataset_manifest(folder).sequences
-        if len(names) > 1:
-            raise RsbenchError(f"{folder}: is a dataset; give one of its sequences: {', '.join(names)}")
-        folder = folder / names[0]
-    sequence = read_sequence(folder)
-    left, right = (
-        [folder / picture_file("rs", side, frame) for frame in range(sequence.frames)] for side in SIDES
-    )
-    card = rig_card_of(sequence.rig, sequence.shutter)
-    return _Given(card=card, out=out, four=[], left=left, right=right)
 
 
 def _options(
@@ -210,21 +150,6 @@ def _corrector(name: str, fill: bool) -> CorrectorEntry:
     return replace(entry, component=component, key=component_key(component, {}))
 
 
-def _target_row(target: str, height: int) -> float:
-    from rsbench.core.errors import RsbenchError
-
-    named = {"first": 0.0, "middle": (height - 1) / 2, "last": height - 1.0}
-    if target in named:
-        return named[target]
-    try:
-        row = float(target)
-    except ValueError:
-        row = -1.0
-    if not 0.0 <= row <= height - 1:
-        raise RsbenchError(f"--target {target}: must be first, middle, last or a row from 0 to {height - 1}")
-    return row
-
-
 def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, options: CorrectionOptions) -> None:
     from dataclasses import replace
 
@@ -237,9 +162,9 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
 
     order = (("left", 0), ("right", 0), ("left", 1), ("right", 1))
     images = read_four(dict(zip(order, paths, strict=True)))  # pyrefly: ignore[bad-argument-type]
-    rig = _sized(card, images["left", 0])
+    rig = sized(card, images["left", 0])
     height = rig.camera.height
-    options = replace(options, target_row=_target_row(target, height))
+    options = replace(options, target_row=target_row(target, height))
     with fresh_folder(out) as folder:
         with progress_bar("correcting", 4) as advance:
             result = correct_four(
@@ -263,16 +188,6 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
         cards = [card_of(f"{s} {f}", images[s, f], fused) for (s, f), fused in result.frames.items()]
         _page(folder, out, result.shutter, result.capture, record["motion"], cards)
     _say(out, result.shutter, result.capture, record["motion"])
-
-
-def _sized(card: RigCard, image: Any) -> StereoRig:
-    from rsbench.core.errors import RsbenchError
-
-    height, width = image.shape[:2]
-    try:
-        return card.rig(width, height)
-    except ValueError as error:
-        raise RsbenchError(f"--rig: of images of {width} x {height} pixels: {error}") from error
 
 
 def _page(
@@ -340,8 +255,8 @@ def _correct_sequence(
     from rsbench.pipeline.chain import check_cameras
     from rsbench.pipeline.sequence_correction import WINDOWS, correct_sequence, estimate_sequence_capture
 
-    rig = _sized(card, next(iter(left)))
-    options = replace(options, target_row=_target_row(target, rig.camera.height))
+    rig = sized(card, next(iter(left)))
+    options = replace(options, target_row=target_row(target, rig.camera.height))
     ratio, offset, scanning, capture = card.readout_ratio, card.disparity_offset, card.scanning, None
     check_cameras(rig, scanning or Scanning(), options, offset)
     with fresh_folder(out) as folder:

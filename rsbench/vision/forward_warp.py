@@ -256,3 +256,23 @@ def _cell(
                     buffer[row, column] = z
                     source_map[row, column, 0] = x + s
                     source_map[row, column, 1] = y + t
+
+
+@compiled(error_model="numpy")
+def draw_moved(moved: F64, joined: U8, source_map: F32, buffer: F32) -> None:
+    """``draw_mesh`` of pixel centres that are moved already: ``moved`` (H, W, 3) target x, y and inverse depth.
+
+    Whatever moved them; NaN is not drawn.
+    """
+    height, width = joined.shape
+    for y in range(1, height):
+        upper, lower = moved[y - 1], moved[y]
+        for x in range(width - 1):
+            top, bottom = joined[y - 1, x] & RIGHT != 0, joined[y, x] & RIGHT != 0
+            left, right = joined[y - 1, x] & BELOW != 0, joined[y - 1, x + 1] & BELOW != 0
+            whole = top and bottom and left and right
+            if (top and left) or (bottom and right):
+                first, second = whole or (top and left), whole or (bottom and right)
+                _quad(upper, lower, x, x + 1, y - 1, first, second, source_map, buffer)
+            if not whole and ((top and right) or (bottom and left)):
+                _quad(upper, lower, x + 1, x, y - 1, top and right, bottom and left, source_map, buffer)

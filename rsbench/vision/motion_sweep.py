@@ -64,7 +64,7 @@ def depth_from_motion(
     if gain == 0.0 or not any(np.any(mask) for mask in unknown):
         return found
     greys = [grey_u8(image) for image in images]
-    censuses = [_census(grey) for grey in greys]
+    censuses = [census(grey) for grey in greys]
     rhos = [inverse_depth(depth) for depth in depths]
     for frame in (0, 1):
         y, x = (places.astype(np.int32) for places in np.nonzero(unknown[frame]))
@@ -102,7 +102,7 @@ def _search(
     return np.where((least <= _ALIKE) & (best < count - 1), rho, np.nan).astype(np.float32)
 
 
-def _census(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
+def census(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
     """(H, W) of 24 bits: which of the 5 x 5 neighbours are darker than the pixel."""
     padded = cv2.copyMakeBorder(grey, 2, 2, 2, 2, cv2.BORDER_REPLICATE)
     height, width = grey.shape
@@ -114,7 +114,7 @@ def _census(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
 
 
 @compiled(error_model="numpy", inline="always")
-def _ones(bits: np.uint32) -> float:
+def ones(bits: np.uint32) -> float:
     """Number of bits that are 1 (Warren, "Hacker's delight", 2002)."""
     n = np.int64(bits)
     n -= (n >> 1) & 0x55555555
@@ -149,7 +149,7 @@ def _fill_costs(
         if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
             ty, tx = int(v + 0.5), int(u + 0.5)
             bits = census[y[i], x[i]] ^ other_census[ty, tx]
-            value = _ones(bits) + min(abs(float(grey[y[i], x[i]]) - float(other[ty, tx])), _LEVELS)
+            value = ones(bits) + min(abs(float(grey[y[i], x[i]]) - float(other[ty, tx])), _LEVELS)
         cost[y[i], x[i]] = value
 
 

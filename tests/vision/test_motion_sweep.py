@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from rsbench.core.motion import LinearMotion
-from rsbench.vision.motion_sweep import _census, _ones, depth_from_motion
+from rsbench.vision.motion_sweep import census as census_of
+from rsbench.vision.motion_sweep import depth_from_motion, ones
 
 Build = Callable[..., Any]
 
@@ -55,7 +56,7 @@ def test_without_a_translation_there_is_no_depth(world: Build, shapes: Any, u8: 
 
 def test_a_census_counts_the_darker_neighbours() -> None:
     grey = np.random.default_rng(0).integers(0, 255, (12, 14), dtype=np.uint8)
-    census = _census(grey)
+    census = census_of(grey)
     for y, x in ((2, 2), (5, 7), (9, 11)):
         darker = np.count_nonzero(grey[y - 2 : y + 3, x - 2 : x + 3] < grey[y, x])
-        assert _ones(census[y, x]) == bin(int(census[y, x])).count("1") == darker
+        assert ones(census[y, x]) == bin(int(census[y, x])).count("1") == darker

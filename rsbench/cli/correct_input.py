@@ -1,0 +1,108 @@
+"""What ``rsbench correct`` is given: frames of a rig, its card, the row at whose time they are wanted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rsbench.core.rig import StereoRig
+    from rsbench.pipeline.footage import FrameSource, RigCard
+
+
+@dataclass(frozen=True, kw_only=True)
+class Given:
+    """What is to be corrected, and where to."""
+
+    card: RigCard
+    out: Path
+    four: list[Path]
+    """Left 0, right 0, left 1, right 1; or, of footage, nothing."""
+    left: list[Path] | Path
+    """Its images, or a folder or video."""
+    right: list[Path] | Path
+
+    def footage(self) -> tuple[FrameSource, FrameSource]:
+        """Of the left and the right camera."""
+        from rsbench.pipeline.footage import FrameSource
+
+        left, right = (
+            FrameSource.of_files(each) if isinstance(each, list) else FrameSource(each)
+            for each in (self.left, self.right)
+        )
+        return left, right
+
+
+def given_frames(
+    frames: list[Path] | None, rig: Path | None, out: Path | None, left: Path | None, right: Path | None
+) -> Given:
+    """Raises RsbenchError for another combination of arguments."""
+    from rsbench.core.errors import RsbenchError
+    from rsbench.pipeline.footage import read_rig_card
+
+    rendered = frames is not None and len(frames) == 1 and frames[0].is_dir()
+    if out is None or (rig is None and not rendered):
+        raise RsbenchError(f"--{'out' if rig is not None or rendered else 'rig'}: is required")
+    if frames and rendered:
+        if rig or left or right:
+            raise RsbenchError(f"{frames[0]}: is a sequence, which knows its frames and rig; leave the others out")
+        return _of_sequence(frames[0], out)
+    assert rig is not None
+    card = read_rig_card(rig)
+    if frames is not None and len(frames) == 4 and not (left or right):
+        return Given(card=card, out=out, four=frames, left=[], right=[])
+    if frames or not (left and right):
+        count = f"{len(frames)} images; " if frames else ""
+        raise RsbenchError(
+            f"frames: {count}give LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right, or a sequence's folder"
+        )
+    return Given(card=card, out=out, four=[], left=left, right=right)
+
+
+def _of_sequence(folder: Path, out: Path) -> Given:
+    """The rolling-shutter frames of a sequence of a dataset."""
+    from rsbench.core.errors import RsbenchError
+    from rsbench.core.rig import SIDES
+    from rsbench.dataset.layout import picture_file
+    from rsbench.dataset.sequence import read_dataset_manifest, read_sequence
+    from rsbench.pipeline.footage import rig_card_of
+
+    if not (folder / "sequence.json").is_file():
+        names = read_dataset_manifest(folder).sequences
+        if len(names) > 1:
+            raise RsbenchError(f"{folder}: is a dataset; give one of its sequences: {', '.join(names)}")
+        folder = folder / names[0]
+    sequence = read_sequence(folder)
+    left, right = (
+        [folder / picture_file("rs", side, frame) for frame in range(sequence.frames)] for side in SIDES
+    )
+    card = rig_card_of(sequence.rig, sequence.shutter)
+    return Given(card=card, out=out, four=[], left=left, right=right)
+
+
+def target_row(target: str, height: int) -> float:
+    """The row that ``--target`` names; RsbenchError where there is none."""
+    from rsbench.core.errors import RsbenchError
+
+    named = {"first": 0.0, "middle": (height - 1) / 2, "last": height - 1.0}
+    if target in named:
+        return named[target]
+    try:
+        row = float(target)
+    except ValueError:
+        row = -1.0
+    if not 0.0 <= row <= height - 1:
+        raise RsbenchError(f"--target {target}: must be first, middle, last or a row from 0 to {height - 1}")
+    return row
+
+
+def sized(card: RigCard, image: Any) -> StereoRig:
+    """The rig with images like this one; RsbenchError where its lens cannot be one of such images."""
+    from rsbench.core.errors import RsbenchError
+
+    height, width = image.shape[:2]
+    try:
+        return card.rig(width, height)
+    except ValueError as error:
+        raise RsbenchError(f"--rig: of images of {width} x {height} pixels: {error}") from error

@@ -1,0 +1,142 @@
+"""Correction of one camera's frames by ``mono-fusion``: its motion from dense flow, then both frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.components.motion_models import make_motion
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.motion import InertialMotion
+from rsbench.core.rig import Side, StereoRig, View
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
+from rsbench.solvers.refined import RefinedSolver
+from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
+from rsbench.vision.fusion import Fused
+from rsbench.vision.images import eight_bit, grey_u8
+from rsbench.vision.mono_fusion import Flows, MonoFusion, MonoFusionOptions, OwnMotion, find_flows
+
+_MATCHES = 1500
+"""Of the dense flow, drawn at random: what a motion of six unknowns is solved from."""
+_FEWEST = 50
+_RETURNS_PX = 0.3
+"""Flow there and back ends so near where it began, for a match; DIS errs by about 0.1 px where it does."""
+_TEXTURE_LEVELS = 3.0
+"""Standard deviation of grey levels in a window, above which it shows something; noise of cameras is 1 to 2."""
+_TEXTURED = 0.01
+_STILL_PX, _MOST = 0.1, 0.95
+"""Flow below which, in most of the image, nothing moved: the noise of DIS."""
+_WINDOW = 9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FoundOwnMotion:
+    """The motion of one camera over two frames, or why there is none."""
+
+    own: OwnMotion
+    robust: RobustEstimate | None
+    """Where it comes from; None without matches."""
+    reason: str = ""
+    """Why everything goes its flow; empty with a motion."""
+
+
+def refusal(images: Sequence[NDArray[Any]], flows: Flows) -> str:
+    """Why two frames (H, W[, 3]) of one camera cannot be corrected; empty when they can."""
+    for name, image in zip(("first", "second"), eight_bit(list(images)), strict=True):
+        grey = grey_u8(image).astype(np.float32)
+        mean, square = (cv2.blur(each, (_WINDOW, _WINDOW)) for each in (grey, grey * grey))
+        if np.mean(square - mean * mean > _TEXTURE_LEVELS**2) < _TEXTURED:
+            return f"the {name} frame shows no texture: nothing to find its motion by"
+    if float(np.quantile(np.linalg.norm(flows.flow[1], axis=-1), _MOST)) < _STILL_PX:
+        return "nothing moves between the frames: a still camera needs no correction"
+    return ""
+
+
+def flow_matches(flows: Flows, rng: np.random.Generator) -> FloatArray:
+    """Matches (n, 4) x0, y0, x1, y1 at random pixels of frame 1 whose flow returns to where it began."""
+    flow = flows.flow[1]
+    height, width = flow.shape[:2]
+    x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    here = np.stack([x, y], axis=-1)
+    there = here + flow.astype(np.float64)
+    inside = np.all((there >= 0.0) & (there <= (width - 1, height - 1)), axis=-1)
+    good = np.flatnonzero(inside & (flows.returns[1] < _RETURNS_PX))
+    chosen = rng.choice(good, min(_MATCHES, good.size), replace=False)
+    return np.concatenate([there.reshape(-1, 2)[chosen], here.reshape(-1, 2)[chosen]], axis=-1)
+
+
+def find_own_motion(
+    flows: Flows, rig: StereoRig, shutter: RollingShutter, side: Side, robust: RobustOptions, seed: int = 0
+) -> FoundOwnMotion:
+    """Constant velocity in the world and constant rate of turn of one camera; its translation has length 1.
+
+    The more general models fit rendered and real pairs closer and predict them worse: two frames do not tell a
+    vibration.
+    """
+    own = rig.about(side)
+    nothing = OwnMotion(rig=own, shutter=shutter, side=side, motion=None)
+    matches = flow_matches(flows, np.random.default_rng(seed))
+    if len(matches) < _FEWEST:
+        return FoundOwnMotion(own=nothing, robust=None, reason=f"only {len(matches)} pixels have a certain flow")
+    solver = RefinedSolver(motion_model=InertialMotion.name, one_camera=True)
+    found = estimate_motion(
+        Correspondences(left=matches), own, shutter, solver, robust, np.random.default_rng(seed)
+    )
+    estimate, length = found.estimate, float(np.linalg.norm(found.estimate.d))
+    if not (estimate.success and length > 0.0):
+        return FoundOwnMotion(own=nothing, robust=found, reason=estimate.reason or "no translation is found")
+    motion = make_motion(InertialMotion.name, estimate.w, estimate.d / length)
+    return FoundOwnMotion(own=OwnMotion(rig=own, shutter=shutter, side=side, motion=motion), robust=found)
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class MonoFusionCorrector(Corrector):
+    """Each camera by itself: geometry where its rows' epipolar curves explain the flow, scaled flow elsewhere."""
+
+    fusion: MonoFusionOptions = field(default_factory=MonoFusionOptions)
+    """How two frames become one image."""
+    robust: RobustOptions = field(default_factory=RobustOptions)
+    """RANSAC of the motion."""
+    seed: int = 0
+    """Seed of the random samples."""
+
+    spec = CorrectorSpec(
+        needs=frozenset(),
+        reference="rsbench; flow: Kroeger et al., ECCV 2016; search: Hirschmueller, PAMI 2008",
+        assumes="one camera, two frames: constant velocity; what moves by itself does so evenly in the image",
+        sees={"time"},
+    )
+
+    def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
+        return self.correct_rows(problem, views, (problem.target_row,))[0]
+
+    def correct_rows(
+        self, problem: CorrectionProblem, views: Sequence[View], rows: Sequence[float]
+    ) -> list[dict[View, Fused]]:
+        ready = {side: self._ready(problem, side) for side in dict(views)}
+
+        def corrected(view: View, row: float) -> Fused:
+            side, frame = view
+            fusion = ready[side]
+            if isinstance(fusion, str):
+                return Fused.failed(problem.images[view], fusion)
+            return fusion.corrected(frame, float(problem.shutter.time_after(row, frame, side)))
+
+        return [{view: corrected(view, row) for view in views} for row in rows]
+
+    def _ready(self, problem: CorrectionProblem, side: Side) -> MonoFusion | str:
+        """The two frames of a camera; or why they cannot be corrected."""
+        images = [problem.images[side, frame] for frame in (0, 1)]
+        flows = find_flows(images)
+        if reason := refusal(images, flows):
+            return reason
+        found = find_own_motion(flows, problem.rig, problem.shutter, side, self.robust, self.seed)
+        return MonoFusion(images, found.own, flows, self.fusion)

@@ -1,0 +1,259 @@
+"""Two rolling-shutter frames of one camera to the image at one time: geometry where it holds, flow where not.
+
+A pixel of the standing scene has one unknown, its inverse depth: found along its own epipolar curve
+(``curve_sweep``), where the other frame confirms it; else by the dense flow, where that returns to its start and
+ends on the curve; else it is that of the farther neighbour in its row. What consistent flow carries beside the
+curve moves by itself: it goes its flow, scaled by the times of the rows. Both displacements are weighted by their
+variances. Each frame is drawn at the target, the nearer surface first, and what the first frame leaves empty is
+taken from the other one, moved to the same time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.components.compiled import compiled
+from rsbench.core.motion import Motion
+from rsbench.core.projection import row_poses
+from rsbench.core.rig import FRAMES, Side, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.vision import forward_warp
+from rsbench.vision.compiled_camera import optics_of
+from rsbench.vision.correction import WarpOptions, relative_row_maps
+from rsbench.vision.curve_sweep import SweepOptions, Swept, sweep_frames
+from rsbench.vision.flow import dense_flow
+from rsbench.vision.frame_threads import map_frames
+from rsbench.vision.fusion import Fused, Origin, inpaint
+from rsbench.vision.images import grey_u8
+from rsbench.vision.reprojection import Reprojection, parallax_gain, reprojection_of
+from rsbench.vision.resample import resample
+from rsbench.vision.stereo_depth import fill_holes
+
+F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+_RETURNS_PX = 1.0
+"""Distance from a pixel to where flow there and back ends, below which the flow is believed."""
+_ON_CURVE_PX = 1.5
+"""Distance between the end of the flow and the epipolar curve, below which the flow is that of a still point."""
+_SIGMA_PX = 0.3
+"""What neither check of a flow sees: its standard deviation on rendered frames where both agree."""
+_RANGE_QUANTILE, _RANGE_MARGIN, _RANGE_PX = 0.999, 1.5, 2.0
+"""Range of the search along the curves, from the inverse depths of consistent flow: times, and px of parallax."""
+_CONFIRMED = 16.0
+"""How much less flow counts where the search on the curve is confirmed by the other frame."""
+_SMOOTH_PX = 5
+_FLOW_BYTES = 100.0
+
+
+class Flows(NamedTuple):
+    """Dense flow of both frames of one camera."""
+
+    flow: tuple[F32, F32]
+    """(H, W, 2) px, of each frame to the other."""
+    returns: tuple[F32, F32]
+    """(H, W) px between a pixel and the end of its flow there and back, the flow of the border beyond it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MonoFusionOptions:
+    """How two frames of a camera become one image."""
+
+    sweep: SweepOptions = field(default_factory=SweepOptions)
+    """The search along the epipolar curves."""
+    warp: WarpOptions = field(default_factory=WarpOptions)
+    """How pixels are taken from the source image; of ``tear_px`` no use is made."""
+    fill: bool = True
+    """Whether the other frame fills what the corrected one does not see."""
+    inpaint: bool = True
+    """Whether what no frame shows is invented from its surroundings; it stays marked as seen by nobody."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OwnMotion:
+    """What one camera did over two frames."""
+
+    rig: StereoRig
+    """Its body is where that camera is; without a lens."""
+    shutter: RollingShutter
+    """Reads rows."""
+    side: Side
+    motion: Motion | None
+    """In its own unit of length; None: unknown, and everything goes its flow."""
+
+
+def find_flows(images: Sequence[NDArray[Any]]) -> Flows:
+    """Flow both ways between two frames (H, W[, 3]), uint8 or uint16."""
+    height, width = images[0].shape[:2]
+    ways = map_frames(lambda i: dense_flow(images[i], images[1 - i]), FRAMES, height * width, _FLOW_BYTES)
+    return Flows((ways[0], ways[1]), (_returns(*ways), _returns(*ways[::-1])))
+
+
+def _returns(flow: F32, back: F32) -> F32:
+    height, width = flow.shape[:2]
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    u, v = x + flow[..., 0], y + flow[..., 1]
+    there = cv2.remap(back, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(np.linalg.norm(flow + there, axis=-1), dtype=np.float32)
+
+
+class _Layer(NamedTuple):
+    """What is known of the pixels of one frame, whatever the target."""
+
+    rho: F32
+    """(H, W) inverse depth in each row's own camera."""
+    flow_share: F32
+    """(H, W) weight of the scaled flow beside that of the geometry, 0 to 1."""
+
+
+class MonoFusion:
+    """Two frames of one camera, ready to be corrected to any time."""
+
+    def __init__(
+        self,
+        images: Sequence[NDArray[Any]],
+        own: OwnMotion,
+        flows: Flows,
+        options: MonoFusionOptions | None = None,
+    ) -> None:
+        """Find the depth of both frames (H, W[, 3]), uint8 or uint16, of the motion ``own``."""
+        self.images, self.own, self.flows, self.options = images, own, flows, options or MonoFusionOptions()
+        self._layers = self._find_layers()
+
+    def corrected(self, frame: int, target_tau: float) -> Fused:
+        """The frame at a time, in frame periods; its depth is in the motion's unit."""
+        first = self._drawn(frame, target_tau)
+        image, buffer = first
+        origin = np.where(buffer >= 0.0, np.uint8(Origin.HERE), np.uint8(Origin.NOBODY))
+        if self.options.fill and np.any(origin == Origin.NOBODY):
+            other, behind = self._drawn(1 - frame, target_tau)
+            take = (origin == Origin.NOBODY) & (behind >= 0.0)
+            image[take], buffer[take], origin[take] = other[take], behind[take], Origin.OTHER_FRAME
+        empty = origin == Origin.NOBODY
+        if self.options.inpaint:
+            image = inpaint(image, empty)
+        with np.errstate(divide="ignore"):  # at infinity
+            depth = np.where(empty, np.float32(np.nan), np.float32(1.0) / np.maximum(buffer, np.float32(0.0)))
+        if self.own.motion is None:
+            depth = np.full_like(depth, np.nan)
+        return Fused(image=image, origin=origin, depth=depth.astype(np.float32))
+
+    def _find_layers(self) -> list[_Layer]:
+        own, shape = self.own, self.images[0].shape[:2]
+        if own.motion is None:
+            return [_Layer(np.zeros(shape, np.float32), np.ones(shape, np.float32)) for _ in FRAMES]
+        poses = [row_poses(own.rig, own.shutter, own.motion, own.side, frame) for frame in FRAMES]
+        maps = [reprojection_of(own.rig.camera, poses[frame], poses[1 - frame]) for frame in FRAMES]
+        met = [_triangulated(self.flows.flow[frame], maps[frame]) for frame in FRAMES]
+        greys = [grey_u8(image) for image in self.images]
+        most = self._range(met, parallax_gain(own.rig.camera, *maps))
+        swept = sweep_frames(greys, own.rig, own.shutter, own.motion, own.side, most, self.options.sweep)
+        return [self._layer(frame, swept[frame], *met[frame]) for frame in FRAMES]
+
+    def _range(self, met: Sequence[tuple[F32, F32]], gain: float) -> float:
+        """Largest inverse depth that is looked for."""
+        believed = [
+            rho[(off < _RETURNS_PX) & (miss < _ON_CURVE_PX)]
+            for off, (rho, miss) in zip(self.flows.returns, met, strict=True)
+        ]
+        known = np.concatenate(believed)
+        largest = float(np.quantile(known, _RANGE_QUANTILE)) if known.size else 0.0
+        return largest * _RANGE_MARGIN + _RANGE_PX / max(gain, 1e-9)
+
+    def _layer(self, frame: int, swept: Swept, rho: F32, miss: F32) -> _Layer:
+        """Depth and weights (H, W) of a frame; ``rho`` and ``miss`` (H, W) as of ``_triangulated``."""
+        off = self.flows.returns[frame]
+        size, full = swept.rho.shape[::-1], rho.shape[::-1]
+        small_rho, small_off, small_miss = (
+            np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_NEAREST)) for each in (rho, off, miss)
+        )
+        still = (small_off < _RETURNS_PX) & (small_miss < _ON_CURVE_PX)
+        found = np.where(swept.agrees, swept.rho, np.where(still, small_rho, np.float32(np.nan)))
+        filled = cv2.resize(cv2.medianBlur(_filled(found), 5), full, interpolation=cv2.INTER_LINEAR)
+        # How far consistent flow ends off the curve says how far geometry is from explaining it, found or not.
+        wrong = np.maximum(small_miss - _ON_CURVE_PX, np.float32(0.0))
+        geometry = np.minimum(wrong, np.float32(1e3)) ** 2
+        flow = (np.minimum(small_off, np.float32(1e3)) / _RETURNS_PX) ** 4 + _SIGMA_PX**2
+        flow = np.where(swept.agrees, flow * _CONFIRMED, flow)
+        share = (geometry / (geometry + flow)).astype(np.float32)
+        share = cv2.blur(cv2.medianBlur(share, 5), (_SMOOTH_PX, _SMOOTH_PX))
+        return _Layer(np.asarray(filled), np.asarray(cv2.resize(share, full, interpolation=cv2.INTER_LINEAR)))
+
+    def _drawn(self, frame: int, target_tau: float) -> tuple[NDArray[Any], F32]:
+        """Image (H, W[, C]) and inverse depth (H, W) of one frame at the target; -1 where it shows nothing."""
+        moved = self.places(frame, target_tau)
+        height, width = moved.shape[:2]
+        joined = np.full((height, width), forward_warp.RIGHT | forward_warp.BELOW, dtype=np.uint8)
+        source_map = np.full((height, width, 2), np.nan, dtype=np.float32)
+        buffer = np.full((height, width), -1.0, dtype=np.float32)
+        forward_warp.draw_moved(moved, joined, source_map, buffer)
+        return resample(self.images[frame], source_map, self.options.warp.interpolation), buffer
+
+    def places(self, frame: int, target_tau: float) -> FloatArray:
+        """(H, W, 3) target x, y, px, and inverse depth there, of every pixel of a frame."""
+        own, layer = self.own, self._layers[frame]
+        flow = self.flows.flow[frame]
+        height, width = flow.shape[:2]
+        x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+        # Rows are read evenly, so the time at the end of a flow is a line in it.
+        here, rate = own.shutter.pixel_time(np.stack([x, y], axis=-1), frame, own.side), own.shutter.rate(own.side)
+        passed = (1 - 2 * frame) + flow[..., 1] * rate[1]
+        passed = np.where(np.abs(passed) > 1e-3, passed, np.inf)
+        share = ((target_tau - here) / passed)[..., None]
+        by_flow = np.concatenate([np.stack([x, y], axis=-1) + share * flow, layer.rho[..., None]], axis=-1)
+        if own.motion is None:
+            return np.asarray(by_flow, dtype=np.float64)
+        target = own.rig.cam_from_world(own.motion, target_tau, own.side)
+        poses = row_poses(own.rig, own.shutter, own.motion, own.side, frame)
+        M, b = relative_row_maps(own.rig.camera, poses, target)
+        moved = np.zeros((3, height, width))
+        forward_warp.move_pixels(layer.rho, M, b, *optics_of(own.rig.camera), moved)
+        by_geometry = np.moveaxis(moved, 0, -1)
+        weight = layer.flow_share[..., None]
+        return np.ascontiguousarray(weight * by_flow + (1.0 - weight) * by_geometry)
+
+
+def _filled(rho: NDArray[Any]) -> F32:
+    """Inverse depth (h, w) with that of the farther neighbour in the row where it is NaN; then in the column."""
+    rows = fill_holes(rho.astype(np.float32))
+    return np.nan_to_num(fill_holes(rows.T).T, nan=0.0).astype(np.float32)
+
+
+def _triangulated(flow: F32, maps: Reprojection) -> tuple[F32, F32]:
+    """Inverse depth (H, W), at least 0, that fits a flow (H, W, 2) best, and px that the flow ends off it."""
+    rho, miss = np.zeros(flow.shape[:2], np.float32), np.zeros(flow.shape[:2], np.float32)
+    _triangulate(flow, maps.G, maps.c, maps.A, maps.B, rho, miss)
+    return rho, miss
+
+
+@compiled(error_model="numpy")
+def _triangulate(
+    flow: F32, G: FloatArray, c: FloatArray, A: FloatArray, B: FloatArray, rho: F32, miss: F32
+) -> None:
+    """Fill ``rho`` and ``miss`` (H, W): least squares of ``(a + rho T)_xy - end (a + rho T)_z``, in pixels."""
+    height, width = rho.shape
+    last = len(A) - 1
+    a, T = np.zeros(3), np.zeros(3)
+    for y in range(height):
+        for x in range(width):
+            u, v = x + flow[y, x, 0], y + flow[y, x, 1]
+            line = min(max(int(np.floor(v)), 0), max(last - 1, 0))
+            beside, part = min(line + 1, last), v - line
+            for i in range(3):
+                a[i], T[i] = 0.0, (1.0 - part) * B[line, i] + part * B[beside, i]
+                for j in range(3):
+                    m = (1.0 - part) * A[line, i, j] + part * A[beside, i, j]
+                    a[i] += m * (G[y, j, 0] * x + G[y, j, 1] * y + G[y, j, 2])
+                    T[i] += m * c[y, j]
+            px, py = a[0] - u * a[2], a[1] - v * a[2]
+            qx, qy = T[0] - u * T[2], T[1] - v * T[2]
+            found = max(-(px * qx + py * qy) / max(qx * qx + qy * qy, 1e-12), 0.0)
+            z = a[2] + found * T[2]
+            rho[y, x] = found
+            miss[y, x] = np.hypot(px + found * qx, py + found * qy) / z if z > 1e-3 else np.inf

@@ -1,0 +1,114 @@
+"""``rsbench correct --camera``: frames of one camera, as users meet it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from commands import assert_refused, run_here
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
+from rsbench.pipeline.mono_sequence import OneCameraCard, correct_all, correct_frames
+from rsbench.storage.files import read_png, write_png
+
+SPEED, SIZE = 12.0, (120, 160)
+"""px to the right per frame period, of a texture that reaches far beyond the frames; rows, columns."""
+
+
+def _texture() -> np.ndarray:
+    noise = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 255, (120, 320, 3)), (0, 0), 2.0)
+    return cv2.normalize(noise, np.zeros_like(noise), 0, 255, cv2.NORM_MINMAX).astype(np.float32)
+
+
+def _seen(tau: np.ndarray) -> np.ndarray:
+    """Image of rows read at times (120,): the texture has moved by SPEED times the time."""
+    x = np.arange(SIZE[1], dtype=np.float32) + 80.0 - (SPEED * tau[:, None]).astype(np.float32)
+    y = np.broadcast_to(np.arange(SIZE[0], dtype=np.float32)[:, None], x.shape)
+    seen = cv2.remap(_texture(), x.astype(np.float32), np.ascontiguousarray(y), cv2.INTER_CUBIC)
+    return np.clip(np.rint(seen), 0, 255).astype(np.uint8)
+
+
+def _rolling(frame: int) -> np.ndarray:
+    return _seen(frame + np.arange(SIZE[0]) / SIZE[0])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for frame in range(3):
+        write_png(tmp_path / f"{frame}.png", _rolling(frame))
+    (tmp_path / "camera.toml").write_text("readout_ratio = 1.0\nfov_deg = 60.0\n")
+    return tmp_path
+
+
+def _correct(folder: Path, *arguments: Any) -> Any:
+    camera = folder / "camera.toml"
+    return run_here("correct", *arguments, "--camera", camera, "--out", folder / "out", "--target", 60)
+
+
+def test_two_frames_become_upright(folder: Path) -> None:
+    result = _correct(folder, folder / "0.png", folder / "1.png")
+    assert result.returncode == 0, result.stderr
+    for frame in (0, 1):
+        truth = _seen(np.full(SIZE[0], frame + 0.5)).astype(float)
+        inner = np.s_[8:-8, 20:-20]  # what both frames show at that time
+        before = np.sqrt(np.mean((_rolling(frame) - truth)[inner] ** 2))
+        image = read_png(folder / "out" / "corrected" / f"{frame:06d}.png").astype(float)
+        # Rows are up to 6 px off before; a tenth of a pixel of flow and a second interpolation remain.
+        assert np.sqrt(np.mean((image - truth)[inner] ** 2)) < 0.25 * before
+    record = json.loads((folder / "out" / "motion.json").read_text())
+    assert record["camera"]["fx"] == pytest.approx(80.0 / np.tan(np.deg2rad(30.0)))
+    assert [frame["number"] for frame in record["frames"]] == [0, 1]
+    assert (folder / "out" / "report.html").is_file()
+
+
+def test_a_folder_gives_the_same_frames_in_order(folder: Path) -> None:
+    (folder / "in").mkdir()
+    for frame in range(3):
+        (folder / f"{frame}.png").rename(folder / "in" / f"{frame}.png")
+    assert _correct(folder, "--frames", folder / "in").returncode == 0
+    assert [file.name for file in sorted((folder / "out" / "corrected").iterdir())] == [
+        f"{frame:06d}.png" for frame in range(3)
+    ]
+
+
+def test_bad_input_is_refused_in_one_line_and_nothing_is_left(folder: Path) -> None:
+    write_png(folder / "small.png", _rolling(1)[:100])
+    write_png(folder / "flat.png", np.full((*SIZE, 3), 90, np.uint8))
+    first = folder / "0.png"
+    assert_refused(_correct(folder, first), "at least two")
+    assert_refused(_correct(folder, first, folder / "small.png"), "alike")
+    assert_refused(_correct(folder, first, first), "nothing moves")
+    assert_refused(_correct(folder, folder / "flat.png", folder / "flat.png"), "no texture")
+    assert_refused(_correct(folder), "--frames")
+    (folder / "camera.toml").write_text("fov_deg = 60.0\n")
+    assert_refused(_correct(folder, first, folder / "1.png"), "readout_ratio")
+    (folder / "camera.toml").write_text("readout_ratio = 1.0\nfov_deg = 180.0\n")
+    assert_refused(_correct(folder, first, folder / "1.png"), "fov_deg")
+    assert not (folder / "out").exists()
+
+
+def test_a_still_pair_among_others_is_a_mark_on_its_frame() -> None:
+    frames = [_rolling(0), _rolling(1), _rolling(1)]
+    moments = list(correct_frames(frames, OneCameraCard(readout_ratio=1.0)))
+    assert [moment.number for moment in moments] == [0, 1, 2]
+    assert [bool(moment.fused.reason) for moment in moments] == [False, False, True]
+    np.testing.assert_array_equal(moments[2].fused.image, frames[2])
+    with pytest.raises(RsbenchError, match="readout_ratio"):
+        list(correct_frames(frames, OneCameraCard()))
+
+
+def test_a_camera_may_be_intrinsics_a_field_of_view_or_nothing() -> None:
+    frames, focal = [_rolling(0), _rolling(1)], 80.0 / np.tan(np.deg2rad(30.0))
+    camera = PinholeCamera.centred(SIZE[1], SIZE[0], focal)
+    known, told = (correct_all(frames, each, 1.0)[1].image for each in (camera, 60.0))
+    np.testing.assert_array_equal(known, told)
+    # A motion parallel to the image is seen alike by any focal length.
+    difference = correct_all(frames, None, 1.0)[1].image[8:-8, 20:-20].astype(float) - known[8:-8, 20:-20]
+    assert np.sqrt(np.mean(difference**2)) < 3.0
+    with pytest.raises(RsbenchError, match="fov_deg"):
+        correct_all(frames, 200.0, 1.0)
