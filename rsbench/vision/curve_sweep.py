@@ -23,8 +23,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
-from rsbench.core.so3 import FloatArray
-from rsbench.vision.compiled_camera import Table, across_lines
+from rsbench.vision.compiled_camera import across_lines
 from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.motion_sweep import census, ones
 from rsbench.vision.reprojection import Reprojection, parallax_gain, reproject, reproject_pixels, reprojection_of
@@ -111,7 +110,7 @@ def sweep_frames(
     def search(frame: int) -> F32:
         volume = np.zeros((height, width, count), dtype=np.uint8)
         other = 1 - frame
-        _fill_volume(small[frame], small[other], codes[frame], codes[other], *maps[frame], step, volume)
+        _fill_volume(small[frame], small[other], codes[frame], codes[other], maps[frame], step, volume)
         volume = np.asarray(cv2.blur(volume, (options.window, options.window))).reshape(volume.shape)
         found = winners(aggregated(volume, options.p1, options.p2)) * np.float32(step)
         return np.asarray(cv2.medianBlur(np.maximum(found, np.float32(0.0)), _MEDIAN))
@@ -159,27 +158,20 @@ def _fill_volume(
     other: U8,
     code: NDArray[np.uint32],
     other_code: NDArray[np.uint32],
-    G: FloatArray,
-    c: FloatArray,
-    A: FloatArray,
-    B: FloatArray,
-    ideal: Table,
-    lens: Table,
-    columns: bool,
-    there: bool,
+    maps: Reprojection,
     step: float,
     volume: U8,
 ) -> None:
     """Costs (h, w, n) of the inverse depths 0, step, 2 step, ... of every pixel."""
     height, width, count = volume.shape
-    lines = len(A)
+    lines = len(maps.A)
     for y in range(height):
         for x in range(width):
             line = y
             for k in range(count):
                 # One plane further changes the row by one at most: its pose is that of the last landing.
-                u, v, _ = reproject(x, y, k * step, line, G, c, A, B, ideal, lens, columns)
-                along = across_lines(there, u, v)
+                u, v, _ = reproject(x, y, k * step, line, maps)
+                along = across_lines(maps.there, u, v)
                 if -lines < along < 2 * lines:
                     line = min(max(int(along + 0.5), 0), lines - 1)
                 volume[y, x, k] = _NOWHERE

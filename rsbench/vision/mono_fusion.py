@@ -25,8 +25,7 @@ from rsbench.core.rig import FRAMES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision import forward_warp
-from rsbench.vision.compiled_camera import optics_of
-from rsbench.vision.correction import WarpOptions, relative_row_maps
+from rsbench.vision.correction import WarpOptions, line_maps
 from rsbench.vision.curve_sweep import SweepOptions, Swept, sweep_frames
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.frame_threads import map_frames
@@ -211,9 +210,8 @@ class MonoFusion:
             return np.asarray(by_flow, dtype=np.float64)
         target = own.rig.cam_from_world(own.motion, target_tau, own.side)
         poses = row_poses(own.rig, own.shutter, own.motion, own.side, frame)
-        M, b = relative_row_maps(own.rig.camera, poses, target)
         moved = np.zeros((3, height, width))
-        forward_warp.move_pixels(layer.rho, M, b, *optics_of(own.rig.camera), moved)
+        forward_warp.move_pixels(layer.rho, line_maps(own.rig.camera, poses, target), moved)
         by_geometry = np.moveaxis(moved, 0, -1)
         weight = layer.flow_share[..., None]
         return np.ascontiguousarray(weight * by_flow + (1.0 - weight) * by_geometry)
