@@ -73,9 +73,10 @@ def estimate_sequence_capture(
         NoMotionError: the windows do not determine the shutter.
     """
     examined, refusals, known, doubt = list[Examined](), _Refusals(left), None, None
-    every, number = max((left.count - 1) // WINDOWS, 1), -1
+    every, number, first = max((left.count - 1) // WINDOWS, 1), -1, list[Correspondences]()
     for number, images in enumerate(_window_images(left, right)):
-        if number % every != 0 or len(examined) >= WINDOWS:
+        chosen = number % every == 0 and len(examined) < WINDOWS
+        if not (chosen or number < SUCCESSIVE):
             continue
         try:
             if scanning is None:
@@ -84,6 +85,10 @@ def estimate_sequence_capture(
                 matches = match_frames(images, rig, options, scanning, judge_rig=number < _JUDGED)
         except RefusedFramesError as error:
             refusals.add(number, error)
+            continue
+        if number < SUCCESSIVE:
+            first.append(matches)
+        if not chosen:
             continue
         if known is None:
             known = known_of(matches, rig, None, scanning, disparity_offset, models_asked(options.motion_model))
@@ -94,6 +99,10 @@ def estimate_sequence_capture(
     if not examined:
         raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
     capture = conclude(examined)
+    if options.motion_model == AUTO and len(first) + 1 >= _FEWEST_FRAMES:
+        scans = known_of(first[0], rig, None, scanning, 0.0).scans
+        if follows_no_model(capture, first, rig, options.seed):
+            capture = shutter_by_trajectory(capture, first, rig, scans, options.seed)
     shutter = shutter_found(capture, rig)
     if doubt is not None and shutter.rows_together:
         raise doubt
