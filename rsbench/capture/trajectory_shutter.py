@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from rsbench.capture import trajectory_banded as banded
-from rsbench.capture.estimate import Candidate, Capture
+from rsbench.capture.estimate import CERTAIN, Candidate, Capture
 from rsbench.capture.scans import GLOBAL, Scans
 from rsbench.capture.trajectory_data import TimedTracks, pack_windows
 from rsbench.capture.trajectory_estimate import TrajectoryOptions
@@ -124,6 +124,7 @@ def shutter_by_trajectory(
         return capture
     weights = scipy.special.softmax([weight for _, weight in candidates])
     found = [replace(each, probability=float(p)) for (each, _), p in zip(candidates, weights, strict=True)]
+    named = found[0].probability > CERTAIN
     return replace(
         capture,
         candidates=tuple(each for each in found if each.probability >= 0.01),

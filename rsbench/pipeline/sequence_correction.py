@@ -15,6 +15,9 @@ from rsbench.capture.hypotheses import Known
 from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.scans import GLOBAL
 from rsbench.capture.settle import AUTO, NoMotionError, known_of, shutter_found
+from rsbench.capture.trajectory_shutter import WINDOWS as SUCCESSIVE
+from rsbench.capture.trajectory_shutter import follows_no_model, shutter_by_trajectory
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, compose
