@@ -15,8 +15,7 @@ from rsbench.capture.hypotheses import Known
 from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.scans import GLOBAL
 from rsbench.capture.settle import AUTO, NoMotionError, known_of, shutter_found
-from rsbench.capture.trajectory_shutter import WINDOWS as SUCCESSIVE
-from rsbench.capture.trajectory_shutter import follows_no_model, shutter_by_trajectory
+from rsbench.capture.trajectory_check import SUCCESSIVE, shakes
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, StereoRig
@@ -33,6 +32,10 @@ from rsbench.vision.stereo_matcher import needs_motion
 
 WINDOWS = 8
 """At most, of those by which the shutter is found."""
+SHAKEN = (
+    "cannot tell the readout ratio: the rig shakes, and its frames follow none of the motion models under which it "
+    "shows. Give readout_ratio in the rig's card, or find it in frames in which the rig turns evenly"
+)
 _FEWEST_FRAMES = 4
 """Of a sequence through which a trajectory is fitted: fewer do not show what two frames shake alike."""
 _JUDGED = 3
@@ -102,11 +105,9 @@ def estimate_sequence_capture(
     if not examined:
         raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
     capture = conclude(examined)
-    if options.motion_model == AUTO and len(first) + 1 >= _FEWEST_FRAMES:
-        scans = known_of(first[0], rig, None, scanning, 0.0).scans
-        if follows_no_model(capture, first, rig, options.seed):
-            capture = shutter_by_trajectory(capture, first, rig, scans, options.seed)
     shutter = shutter_found(capture, rig)
+    if len(first) + 1 >= _FEWEST_FRAMES and shakes(capture, first, rig, options.seed):
+        raise NoMotionError(SHAKEN)
     if doubt is not None and shutter.rows_together:
         raise doubt
     return capture, shutter
