@@ -240,49 +240,42 @@ def correct(
     """The global-shutter frames that the cameras would have taken, from their four rolling-shutter frames.
 
     Args:
-        images: four images, as the sensor read them; the cameras look the same way, side by side.
-        rig: the cameras, with their lens where they have one; the result has it too.
+        images, rig: four images as the sensor read them; the cameras, with their lens where they have one.
         readout_ratio: readout time over frame period; None has it found, with the side that lines are read from.
         solver: finds the motion, in metres; as in ``estimate_motion``.
         motion_model: ``auto``, which the matches prefer, or a name; None is auto where the solver takes it.
-        matcher, features: names or cards of what finds depth, and the matches of the motion.
-        corrector: name or card of what makes the corrected frames.
+        matcher, features, corrector: names or cards of what finds depth and matches, and corrects.
         target_row: the time of this row of a frame is that of its corrected image.
-        inpaint, seed: invent what nobody saw; of the samples that the robust loop draws.
+        inpaint, seed: invent pixels that no frame shows; of the robust loop's samples.
         gyro: (n, 4) samples of a gyroscope, as of ``Correspondences``, for correctors that need them.
 
-    Returns:
-        ``frames["left", 0]`` and so on, each with ``image``, ``depth`` and ``origin``; ``motion``, ``shutter``.
+    Returns ``frames["left", 0]`` and so on, with ``image``, ``depth`` and ``origin``; ``motion`` and ``shutter``.
 
     Raises:
         ValueError: images of another type or size than the rig's cameras, a ratio or row out of its range.
-        RsbenchError: frames that cannot be what they are said to be, or no such component; NoMotionError: the
-            matches determine no motion or readout ratio, or the solver no metres; NotCorrectedError.
+        RsbenchError: frames that are not what they should be; no such component; no motion; no correction.
     """
-    from rsbench.capture.settle import AUTO
     from rsbench.pipeline.chain import Given, correct_four
     from rsbench.pipeline.correction_options import CorrectionOptions
-    from rsbench.pipeline.frame_motion import check_model, takes_models
+    from rsbench.pipeline.frame_motion import model_to_use
     from rsbench.pipeline.isolated_parts import Isolation
     from rsbench.vision.corrector import demand_corrected, load_corrector
     from rsbench.vision.feature_matcher import load_features
     from rsbench.vision.stereo_matcher import load_matcher
 
     entry = _entry(solver)
-    if motion_model is not None:
-        check_model(motion_model, entry)
     options = CorrectionOptions(
         features=load_features(features),
         solver=entry,
-        motion_model=motion_model or (AUTO if takes_models(entry) else None),
+        motion_model=model_to_use(motion_model, entry),
         matcher=load_matcher(matcher),
         corrector=load_corrector(corrector),
         target_row=target_row,
         inpaint=inpaint,
         seed=seed,
     )
-    views, given = arguments.four_images(images, rig), Given(gyro=arguments.gyro_samples(gyro))
     arguments.check_times(readout_ratio, target_row, rig)
+    views, given = arguments.four_images(images, rig), Given(gyro=arguments.gyro_samples(gyro))
     with Isolation() as isolation:
         found = correct_four(views, rig, readout_ratio, isolation.chain(options), given=given)
     demand_corrected(found.frames, options.corrector.name)
@@ -361,8 +354,7 @@ def evaluate(
     """Run solvers, depth and correction on a dataset and score them against its truth.
 
     Args:
-        folder: of the dataset.
-        out: folder of predictions and scores; current predictions that it holds are kept, and scored too.
+        folder, out: of the dataset; of predictions and scores: current ones that it holds are kept, and scored.
         solvers: names of ``list_solvers`` or paths of cards.
         correct_with: solver whose motion the correction uses.
         matcher, features, corrector, metrics: names or cards; the metrics are further ones.

@@ -111,9 +111,8 @@ def _options(
 ) -> CorrectionOptions:
     from dataclasses import replace
 
-    from rsbench.capture.settle import AUTO
     from rsbench.pipeline.correction_options import CorrectionOptions
-    from rsbench.pipeline.frame_motion import check_model, takes_models
+    from rsbench.pipeline.frame_motion import model_to_use
     from rsbench.solvers.engine.registry import load_solver_entry
     from rsbench.vision.feature_matcher import load_features
     from rsbench.vision.stereo_matcher import load_matcher
@@ -125,11 +124,7 @@ def _options(
         corrector=_corrector(corrector, fill),
         **others,
     )
-    if options.motion_model is not None:
-        check_model(options.motion_model, options.solver)
-    elif takes_models(options.solver):
-        options = replace(options, motion_model=AUTO)
-    return options
+    return replace(options, motion_model=model_to_use(options.motion_model, options.solver))
 
 
 def _corrector(name: str, fill: bool) -> CorrectorEntry:
@@ -283,7 +278,7 @@ def _correct_sequence(
     typer.echo(f"{len(corrected)} of {len(record['frames'])} times corrected")
     typer.echo(f"report: {(out / 'report.html').resolve()}")
     if skipped:
-        typer.echo(f"rsbench: corrected with the motion from the frame before: {skipped}", err=True)
+        typer.echo(f"rsbench: corrected with the motion of the frames around: {skipped}", err=True)
     if failed:
         typer.echo(f"rsbench: not corrected: {failed}", err=True)
         raise typer.Exit(1)

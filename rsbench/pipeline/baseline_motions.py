@@ -14,7 +14,7 @@ from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MotionEstimate, Solver
-from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 
 
@@ -76,3 +76,12 @@ def solved_alone(
 def _unit(d: FloatArray) -> FloatArray:
     length = float(np.linalg.norm(d))
     return d / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
+
+
+def kept_matches(matches: Correspondences, robust: RobustEstimate) -> Correspondences:
+    """The temporal matches and tracks that a robust estimate kept."""
+    return Correspondences(
+        left=matches.left[robust.inliers["left"]],
+        right=matches.right[robust.inliers["right"]],
+        tracks=matches.tracks[robust.inliers["tracks"]],
+    )

@@ -27,14 +27,14 @@ class CorrectionOptions:
     corrector: CorrectorEntry = field(default_factory=lambda: load_corrector("fusion"))
     robust: RobustOptions = field(default_factory=RobustOptions)
     motion_model: str | None = None
-    """``auto`` or a model to use instead of the solver's, see ``rsbench.capture.model_choice``."""
+    """``auto`` or a model to use instead of the solver's, see ``rsbench.capture.settle``."""
     target_row: float = 0.0
     """The time of this row of the frame is the time of its corrected image."""
     depth_from_motion: bool = True
     """Where the other camera gives no depth, take it from the flow to the other frame and the motion."""
     find_sky: bool = True
     inpaint: bool = False
-    """Invent what nobody saw; it stays marked."""
+    """Invent pixels that no frame shows; they stay marked."""
     seed: int = 0
 
     @property

@@ -268,6 +268,14 @@ def check_model(asked: str, entry: SolverEntry) -> None:
         raise RsbenchError(f"--motion-model {asked}: {known_to}; take rs-stereo-refined")
 
 
+def model_to_use(asked: str | None, entry: SolverEntry) -> str | None:
+    """The one that is asked for; else ``auto`` where the solver takes it. RsbenchError as of ``check_model``."""
+    if asked is not None:
+        check_model(asked, entry)
+        return asked
+    return AUTO if takes_models(entry) else None
+
+
 def entry_of(entry: SolverEntry, choice: ModelChoice) -> SolverEntry:
     """A refined solver with another motion model."""
     solver = entry.solver
@@ -293,15 +301,6 @@ def motion_of(estimate: MotionEstimate, entry: SolverEntry, rig: StereoRig) -> M
     if entry.solver.spec.metric:
         raise NoMotionError(f"solver {entry.name!r}: {motion}: more matches must be seen by both cameras")
     raise NoMotionError(f"solver {entry.name!r}: {motion}; a correction needs metres, as rs-stereo-refined finds")
-
-
-def kept_matches(matches: Correspondences, robust: RobustEstimate) -> Correspondences:
-    """The temporal matches and tracks that a robust estimate kept."""
-    return Correspondences(
-        left=matches.left[robust.inliers["left"]],
-        right=matches.right[robust.inliers["right"]],
-        tracks=matches.tracks[robust.inliers["tracks"]],
-    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

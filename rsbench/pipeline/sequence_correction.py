@@ -33,8 +33,8 @@ from rsbench.vision.stereo_matcher import needs_motion
 WINDOWS = 8
 """At most, of those by which the shutter is found."""
 SHAKEN = (
-    "cannot tell the readout ratio: the rig shakes, and its frames follow none of the motion models under which it "
-    "shows. Give readout_ratio in the rig's card, or find it in frames in which the rig turns evenly"
+    "cannot tell the readout ratio: the rig shakes, and its frames follow none of the motion models under which "
+    "it shows. Give readout_ratio in the rig's card, or find it in frames in which the rig turns evenly"
 )
 _FEWEST_FRAMES = 4
 """Of a sequence through which a trajectory is fitted: fewer do not show what two frames shake alike."""

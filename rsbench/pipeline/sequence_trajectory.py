@@ -26,7 +26,7 @@ from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.robust_motion import RobustEstimate
 from rsbench.solvers.engine.robust_problem import MatchCount
 
-BRIDGED = "few of the matches agree: the motion is that of the trajectory through the frames around"
+BRIDGED = "few of the matches agree with the motion"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,7 +68,8 @@ def on_one_trajectory(
     for streamed in stream_trajectory(matches(), rig, shutter, starts()):
         window = waiting.popleft()
         found = _found(window, streamed, options, offset)
-        yield replace(window, found=found, reason="", pose=streamed.body_from_world)
+        reason = "" if streamed.supported else window.reason or BRIDGED
+        yield replace(window, found=found, reason=reason, pose=streamed.body_from_world)
 
 
 def _found(window: Window, streamed: StreamedWindow, options: CorrectionOptions, offset: float) -> FoundMotion:

@@ -35,11 +35,11 @@ from rsbench.core.rig import SIDES, VIEWS, Side, View
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
 from rsbench.jobs.isolation import EntryFailure
 from rsbench.jobs.process_jobs import finished_jobs
-from rsbench.pipeline.baseline_motions import global_shutter_motion, monocular_motion, solved_alone
+from rsbench.pipeline.baseline_motions import global_shutter_motion, kept_matches, monocular_motion, solved_alone
 from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Pairs, frame_pairs, known_depth
-from rsbench.pipeline.frame_motion import FoundMotion, find_matches, find_motion, kept_matches
+from rsbench.pipeline.frame_motion import FoundMotion, find_matches, find_motion
 from rsbench.pipeline.one_camera import ZhuangCorrector, depth_alone
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 from rsbench.vision.baseline_depths import plane_depth

@@ -144,10 +144,7 @@ def _linearise(
         moved = plus(times(rho, rate), 1.0, cross(spin, turned))
         vx, vy = focal[0] * (moved[0] - u * moved[2]) / p[2], focal[1] * (moved[1] - v * moved[2]) / p[2]
         if i > 0:
-            first = plus(times(rho, rate0), 1.0, cross(spin0, turned))
-            work[4, 0, i - 1] = focal[0] * (first[0] - u * first[2]) / p[2]
-            work[4, 1, i - 1] = focal[1] * (first[1] - v * first[2]) / p[2]
-            work[5, 0, i - 1], work[5, 1, i - 1] = vx, vy
+            _fill_velocities(plus(times(rho, rate0), 1.0, cross(spin0, turned)), p, vx, vy, focal, work, i - 1)
         if weigh:
             _fill_weight(ends[i], vx, vy, W[i])
         whiten(W[i], focal[0] * (ends[i, 0] - u), focal[1] * (ends[i, 1] - v), i, e)
@@ -164,6 +161,16 @@ def _linearise(
             gx, gy = -focal[0] * (q[0] - u * q[2]) / p[2], -focal[1] * (q[1] - v * q[2]) / p[2]
             whiten(W[i], gx, gy, i, D[:, j])
     return True
+
+
+@compiled
+def _fill_velocities(
+    first: Vector, p: Vector, vx: float, vy: float, focal: FloatArray, work: FloatArray, column: int
+) -> None:
+    """Of a predicted pixel by the time of the first end, whose point moves by ``first``, and by its own."""
+    work[4, 0, column] = focal[0] * (first[0] - p[0] / p[2] * first[2]) / p[2]
+    work[4, 1, column] = focal[1] * (first[1] - p[1] / p[2] * first[2]) / p[2]
+    work[5, 0, column], work[5, 1, column] = vx, vy
 
 
 @compiled
