@@ -17,7 +17,7 @@ import scipy
 
 from rsbench.capture.evidence import Peak, WindowEvidence, window_evidence
 from rsbench.capture.hypotheses import DELAY, OFFSET, Hypothesis, Known
-from rsbench.capture.scans import ALL_SCANS, GLOBAL, Scans
+from rsbench.capture.scans import Scans
 from rsbench.capture.start import find_lag, find_start
 from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.motion import Motion
@@ -36,8 +36,10 @@ _LEAST_SHARE = 0.3
 """Of the matches, that must agree with what is told."""
 _STILL_PX = 1.0
 _UNLIKELY = 0.01
-_EXPECTED = {"global": 0.25, "together": 0.5, "apart": 0.25}
-"""Probability, before matches are seen, of a global shutter, of cameras that roll alike, and that do not."""
+_EXPECTED = {"top": 0.5, "global": 0.25, "bottom": 0.1, "left": 0.04, "right": 0.04}
+"""Probability, before matches are seen, of cameras that read alike, by where they begin."""
+_APART, _ONE_GLOBAL = 0.06, 0.01
+"""Probability of cameras that roll in different ways, and of one camera that rolls beside one that does not."""
 _LATE = 0.2
 """Probability, before matches are seen, that the right camera is late."""
 
@@ -248,11 +250,11 @@ def _product(peaks: Sequence[Peak], lost: float) -> _Sum:
 
 def _log_prior(key: Hypothesis) -> float:
     """Of how the cameras read; motion models are equally likely."""
-    late = _LATE if key.delayed else 1.0 - _LATE
-    if key.scans == GLOBAL:
-        return float(np.log(_EXPECTED["global"] * late))
-    alike = [each for each in ALL_SCANS if each.rolls and each.together == key.scans.together]
-    return float(np.log(_EXPECTED["together" if key.scans.together else "apart"] / len(alike) * late))
+    late, scans = _LATE if key.delayed else 1.0 - _LATE, key.scans
+    if scans.together:
+        return float(np.log(_EXPECTED[scans.left] * late))
+    one_global = "global" in (scans.left, scans.right)
+    return float(np.log((_ONE_GLOBAL / 8.0 if one_global else _APART / 12.0) * late))
 
 
 def _shares_by(shares: Mapping[Hypothesis, float], of: Callable[[Hypothesis], str]) -> dict[str, float]:

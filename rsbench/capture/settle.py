@@ -32,6 +32,8 @@ _MAX_SIGMA, _HARMLESS_PX = 0.1, 1.0
 _PRIOR_FACTOR, _LEAST_PRIOR_PX = 2.0, 0.1
 """Standard deviation of the disparity offset over the size of the row differences: rows show errors of roll and
 pitch, and the error of yaw, which shifts disparities, is of their kind. Below the second there is none to fit."""
+_NEARLY, _SMALL = 0.06, 0.15
+"""Readout ratio of nearly a global shutter, within two deviations, and at most."""
 _CLEARLY, LEAST_BACKWARDS = 0.999, 0.25
 """Probability of the opposite scan at which frames are refused, and the ratio from which their order shows."""
 _AXES = ("tilt", "pan", "roll", "sideways motion", "vertical motion", "forward motion")
@@ -85,6 +87,25 @@ def _stereo(matches: Correspondences) -> FloatArray:
     return pairs if len(pairs) else np.concatenate([tracks[:, :4], tracks[:, 4:]])
 
 
+def as_global(capture: Capture) -> Capture:
+    """A global shutter, where all that the matches allow is one or nearly one, whatever side it begins at.
+
+    Errors of a calibration are taken for small differences of times; no camera has a readout that short.
+    """
+    near = [
+        each for each in capture.candidates if each.ratio - 2.0 * each.sigma <= _NEARLY and each.ratio <= _SMALL
+    ]
+    probability = sum(each.probability for each in near)
+    if not near or probability < CERTAIN or near == [each for each in near if each.scans == GLOBAL]:
+        return capture
+    sigma = float(np.sqrt(sum(each.probability * (each.ratio**2 + each.sigma**2) for each in near) / probability))
+    still = Candidate(
+        scans=GLOBAL, probability=probability, ratio=0.0, sigma=min(sigma, _SMALL), delay=0.0, delay_sigma=0.0
+    )
+    others = tuple(each for each in capture.candidates if each not in near)
+    return replace(capture, candidates=(still, *others), named=True)
+
+
 def shutter_found(capture: Capture, rig: StereoRig) -> RollingShutter:
     """The shutter of the most probable candidate.
 
@@ -94,7 +115,7 @@ def shutter_found(capture: Capture, rig: StereoRig) -> RollingShutter:
     best = capture.likeliest
     if best is None:
         raise NoMotionError(f"cannot tell how the cameras read: {capture.reason}")
-    harmless = best.sigma * capture.moved_px <= _HARMLESS_PX
+    harmless = best.sigma * capture.moved_px <= _HARMLESS_PX or best.scans == GLOBAL
     named = best.probability >= CERTAIN or capture.moved_px <= _HARMLESS_PX
     if not named or not (best.sigma <= _MAX_SIGMA or harmless):
         raise NoMotionError(cannot_tell(capture))

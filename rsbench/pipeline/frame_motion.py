@@ -15,6 +15,7 @@ from rsbench.capture.settle import (
     LEAST_BACKWARDS,
     ModelChoice,
     NoMotionError,
+    as_global,
     backwards_known,
     choose_model,
     known_of,
@@ -270,10 +271,10 @@ def check_model(asked: str, entry: SolverEntry) -> None:
 
 def model_to_use(asked: str | None, entry: SolverEntry) -> str | None:
     """The one that is asked for; else ``auto`` where the solver takes it. RsbenchError as of ``check_model``."""
-    if asked is not None:
-        check_model(asked, entry)
-        return asked
-    return AUTO if takes_models(entry) else None
+    if asked is None:
+        return AUTO if takes_models(entry) else None
+    check_model(asked, entry)
+    return asked
 
 
 def entry_of(entry: SolverEntry, choice: ModelChoice) -> SolverEntry:
@@ -344,7 +345,9 @@ def solve_frames(
     """
     if readout_ratio is None:
         capture = find_capture(matches, rig, options, scanning, disparity_offset)
-        if scanning is not None and runs_backwards(capture, scans_of(_rolling(scanning, rig))):
+        if scanning is not None and runs_backwards(
+            capture, scans_of(scanning.shutter_of(rig.camera.width, rig.camera.height, 1.0))
+        ):
             raise RefusedFramesError(BACKWARDS)
         shutter = shutter_found(capture, rig)
         offset = (
@@ -378,11 +381,7 @@ def find_capture(
     if options.motion_model is None and isinstance(entry.solver, RefinedSolver):
         models = (entry.solver.motion_model,)
     known = known_of(matches, rig, None, scanning, disparity_offset, models)
-    return conclude([examine(matches, rig, known, options.robust, options.seed)])
-
-
-def _rolling(scanning: Scanning, rig: StereoRig) -> RollingShutter:
-    return scanning.shutter_of(rig.camera.width, rig.camera.height, 1.0)
+    return as_global(conclude([examine(matches, rig, known, options.robust, options.seed)]))
 
 
 def _runs_backwards(

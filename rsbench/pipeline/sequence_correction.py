@@ -14,7 +14,7 @@ from rsbench.capture.estimate import Window as Examined
 from rsbench.capture.hypotheses import Known
 from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.scans import GLOBAL
-from rsbench.capture.settle import AUTO, NoMotionError, known_of, shutter_found
+from rsbench.capture.settle import AUTO, NoMotionError, as_global, known_of, shutter_found
 from rsbench.capture.trajectory_check import SUCCESSIVE, shakes
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
@@ -104,7 +104,7 @@ def estimate_sequence_capture(
     refusals.end(number + 1)
     if not examined:
         raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
-    capture = conclude(examined)
+    capture = as_global(conclude(examined))
     shutter = shutter_found(capture, rig)
     if len(first) + 1 >= _FEWEST_FRAMES and shakes(capture, first, rig, options.seed):
         raise NoMotionError(SHAKEN)
