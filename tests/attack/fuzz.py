@@ -48,6 +48,7 @@ def _block(loader: Loader, first: int, size: int, seed: int, keep: Path, tally: 
     """Run one block in children; after a crash or a hang the next child goes on behind it."""
     done = 0
     while done < size:
+        before = done
         for word, text in _messages(loader, first, size, done, seed, keep):
             if word == "at":
                 done = int(text) + 1
@@ -57,6 +58,8 @@ def _block(loader: Loader, first: int, size: int, seed: int, keep: Path, tally: 
             tally.check(
                 word in ("read", "refused"), f"{loader.name}, input {first + done - 1} of seed {seed}: {text}"
             )
+        if done == before:  # as where a loader has no seeds
+            raise RuntimeError(f"{loader.name}: the child said nothing of input {first + done}")
 
 
 def _messages(

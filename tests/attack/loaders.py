@@ -76,7 +76,8 @@ def _cards(inputs: Path, folder: Path) -> Iterator[Loader]:
         "metrics": lambda path: load_metrics([path]),
     }
     for kind, load in readers.items():
-        seeds = [path.read_bytes() for path in sorted((ROOT / kind).glob("*.toml"))]
+        cards = ROOT / kind if (ROOT / kind).is_dir() else ROOT / "cards" / kind
+        seeds = [path.read_bytes() for path in sorted(cards.glob("*.toml"))]
         if kind in ("scenes", "datasets", "sweeps"):
             seeds.append(
                 (

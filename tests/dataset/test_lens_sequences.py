@@ -228,7 +228,6 @@ def _psnr(
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("readout_ratio = 0.8", "", "readout_ratio: must be given with camera.lens = 'brown-conrady'"),
         ("[camera]", "disparity_offset = 1.0\n[camera]", "disparity_offset = 1.0: must be 0 with camera.lens"),
         ("k1 = -0.22", "k1 = -0.9", "rig.toml: camera lens: the brown-conrady"),
     ],

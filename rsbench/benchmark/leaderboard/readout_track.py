@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -16,8 +16,11 @@ from rsbench.benchmark.leaderboard.splits import Split, Truth
 from rsbench.benchmark.leaderboard.submissions import Submission
 from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Row, Score
 from rsbench.capture.estimate import conclude, examine
+from rsbench.capture.scans import scans_of
 from rsbench.capture.settle import known_of
+from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.errors import RsbenchError
+from rsbench.core.rig import SIDES
 from rsbench.core.track_building import join_stereo
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import Problem
@@ -27,7 +30,7 @@ from rsbench.solvers.refined import RefinedSolver
 
 AUC_READOUT = {"auc_r10": 0.1, "auc_r02": 0.02}
 """Thresholds of the areas under the curve of the error, by the name of the column."""
-_MAX_SIGMA = 0.25
+_MAX_SIGMA = 0.2
 """Standard deviation, at most, of a ratio that an entry of ours answers with."""
 _WORST = 1.0
 """Error of a failure: between the two ends of what a ratio can be."""
@@ -88,7 +91,12 @@ class ReadoutTrack(FrameTrack, SolverTrack):
         solver = entry.solver
         assert isinstance(solver, RefinedSolver)
         matches, start = join_stereo(problem.correspondences).correspondences, time.perf_counter()
-        known = known_of(matches, problem.rig, None, problem.shutter.scanning, None, (solver.motion_model,))
+        if not solver.use_tracks:
+            left, right = (temporal_pairs(matches, side) for side in SIDES)
+            matches = Correspondences(left=left, right=right)
+        scanning = problem.shutter.scanning
+        known = known_of(matches, problem.rig, None, scanning, None, (solver.motion_model,))
+        known = replace(known, scans=(scans_of(replace(problem.shutter, readout_ratio=1.0)),))
         seed = seed_of_answer(problem, entry)
         capture = conclude([examine(matches, problem.rig, known, RobustOptions(), seed)])
         seconds, best = round(time.perf_counter() - start, 6), capture.likeliest
