@@ -54,6 +54,9 @@ class Candidate:
     sigma: float
     delay: float
     delay_sigma: float
+    offset: float = 0.0
+    """px by which disparities are too large."""
+    offset_sigma: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,9 +69,6 @@ class Capture:
     """Probability of each motion model, the most probable first."""
     peaks: Mapping[str, Peak]
     """Of each motion model under the most probable scans: of the last window, where there are several."""
-    offset: float
-    """px by which disparities are too large."""
-    offset_sigma: float
     reason: str
     """Why it cannot be told; empty where it is."""
     named: bool
@@ -90,6 +90,16 @@ class Capture:
     def likeliest(self) -> Candidate | None:
         """The most probable candidate, told or not."""
         return self.candidates[0] if self.candidates else None
+
+    @property
+    def offset(self) -> float:
+        """px by which disparities are too large, under the most probable candidate."""
+        return 0.0 if self.likeliest is None else self.likeliest.offset
+
+    @property
+    def offset_sigma(self) -> float:
+        """Standard deviation of ``offset``."""
+        return 0.0 if self.likeliest is None else self.likeliest.offset_sigma
 
     @property
     def motion_model(self) -> str:
@@ -162,14 +172,11 @@ def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA) -> Capture
     candidates = sorted((_candidate(each, sums, shares) for each in scans), key=lambda each: -each.probability)
     kept = sum(window.used for window in used)
     share = kept / sum(window.of for window in used)
-    best = max(shares, key=lambda key: shares[key])
     likely = sorted((key for key in sums if key.scans == candidates[0].scans), key=lambda key: shares[key])
     return Capture(
         candidates=tuple(each for each in candidates if each.probability >= _UNLIKELY),
         models=_shares_by(shares, lambda key: key.motion_model),
         peaks={key.motion_model: sums[key].last for key in likely},
-        offset=sums[best].mean[OFFSET],
-        offset_sigma=sums[best].sigmas[OFFSET],
         reason=_doubt(candidates, share, moved, max_sigma),
         named=share >= _LEAST_SHARE and candidates[0].probability >= CERTAIN,
         windows=len(used),
@@ -185,8 +192,6 @@ def _nothing(reason: str, matches: int, moved_px: float) -> Capture:
         candidates=(),
         models={},
         peaks={},
-        offset=0.0,
-        offset_sigma=0.0,
         reason=reason,
         named=False,
         windows=0,
@@ -272,6 +277,7 @@ def _candidate(scans: Scans, sums: Mapping[Hypothesis, _Sum], shares: Mapping[Hy
     weights = weights / probability if probability > 0.0 else np.full(len(keys), 1.0 / len(keys))
     ratio, sigma = _mixture(weights, [(sums[key].at, sums[key].sigma) for key in keys])
     delay, delay_sigma = _mixture(weights, [(sums[key].mean[DELAY], sums[key].sigmas[DELAY]) for key in keys])
+    offset, offset_sigma = _mixture(weights, [(sums[key].mean[OFFSET], sums[key].sigmas[OFFSET]) for key in keys])
     return Candidate(
         scans=scans,
         probability=probability,
@@ -279,6 +285,8 @@ def _candidate(scans: Scans, sums: Mapping[Hypothesis, _Sum], shares: Mapping[Hy
         sigma=sigma,
         delay=delay,
         delay_sigma=delay_sigma,
+        offset=offset,
+        offset_sigma=offset_sigma,
     )
 
 

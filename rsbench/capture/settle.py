@@ -99,8 +99,16 @@ def as_global(capture: Capture) -> Capture:
     if not near or probability < CERTAIN or near == [each for each in near if each.scans == GLOBAL]:
         return capture
     sigma = float(np.sqrt(sum(each.probability * (each.ratio**2 + each.sigma**2) for each in near) / probability))
+    own = next((each for each in near if each.scans == GLOBAL), near[0])  # its offset is that of a global shutter
     still = Candidate(
-        scans=GLOBAL, probability=probability, ratio=0.0, sigma=min(sigma, _SMALL), delay=0.0, delay_sigma=0.0
+        scans=GLOBAL,
+        probability=probability,
+        ratio=0.0,
+        sigma=min(sigma, _SMALL),
+        delay=0.0,
+        delay_sigma=0.0,
+        offset=own.offset,
+        offset_sigma=own.offset_sigma,
     )
     others = tuple(each for each in capture.candidates if each not in near)
     return replace(capture, candidates=(still, *others), named=True)
