@@ -6,13 +6,13 @@ not matter; else the message names what the matches leave open, what that trades
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from rsbench.capture.estimate import CERTAIN, Candidate, Capture
+from rsbench.capture.estimate import CERTAIN, Candidate, Capture, conclude, examine
 from rsbench.capture.evidence import Peak
 from rsbench.capture.hypotheses import ACCELERATION, MODELS, Known
 from rsbench.capture.rectification import row_pattern
@@ -87,10 +87,11 @@ def _stereo(matches: Correspondences) -> FloatArray:
     return pairs if len(pairs) else np.concatenate([tracks[:, :4], tracks[:, 4:]])
 
 
-def as_global(capture: Capture) -> Capture:
+def as_global(capture: Capture, windows: Sequence[Correspondences], rig: StereoRig, known: Known) -> Capture:
     """A global shutter, where all that the matches allow is one or nearly one, whatever side it begins at.
 
-    Errors of a calibration are taken for small differences of times; no camera has a readout that short.
+    Errors of a calibration are taken for small differences of times; no camera has a readout that short. What is
+    unknown beside is found again from the matches of the windows, under a global shutter.
     """
     near = [
         each for each in capture.candidates if each.ratio - 2.0 * each.sigma <= _NEARLY and each.ratio <= _SMALL
@@ -99,19 +100,13 @@ def as_global(capture: Capture) -> Capture:
     if not near or probability < CERTAIN or near == [each for each in near if each.scans == GLOBAL]:
         return capture
     sigma = float(np.sqrt(sum(each.probability * (each.ratio**2 + each.sigma**2) for each in near) / probability))
-    own = next((each for each in near if each.scans == GLOBAL), near[0])  # its offset is that of a global shutter
-    still = Candidate(
-        scans=GLOBAL,
-        probability=probability,
-        ratio=0.0,
-        sigma=min(sigma, _SMALL),
-        delay=0.0,
-        delay_sigma=0.0,
-        offset=own.offset,
-        offset_sigma=own.offset_sigma,
-    )
+    alone = replace(known, scans=(GLOBAL,), ratio=0.0, delay=0.0)
+    again = conclude([examine(each, rig, alone) for each in windows])
+    if again.likeliest is None:
+        return capture
+    still = replace(again.likeliest, probability=probability, sigma=min(sigma, _SMALL))
     others = tuple(each for each in capture.candidates if each not in near)
-    return replace(capture, candidates=(still, *others), named=True)
+    return replace(capture, candidates=(still, *others), models=again.models, peaks=again.peaks, named=True)
 
 
 def shutter_found(capture: Capture, rig: StereoRig) -> RollingShutter:

@@ -381,7 +381,8 @@ def find_capture(
     if options.motion_model is None and isinstance(entry.solver, RefinedSolver):
         models = (entry.solver.motion_model,)
     known = known_of(matches, rig, None, scanning, disparity_offset, models)
-    return as_global(conclude([examine(matches, rig, known, options.robust, options.seed)]))
+    capture = conclude([examine(matches, rig, known, options.robust, options.seed)])
+    return as_global(capture, [matches], rig, known)
 
 
 def _runs_backwards(

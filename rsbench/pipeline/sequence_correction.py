@@ -78,7 +78,8 @@ def estimate_sequence_capture(
         RefusedFramesError: the first windows cannot be what they are said to be.
         NoMotionError: the windows do not determine the shutter.
     """
-    examined, refusals, known, doubt = list[Examined](), _Refusals(left), None, None
+    examined, used = list[Examined](), list[Correspondences]()
+    refusals, known, doubt = _Refusals(left), None, None
     every, number, first = max((left.count - 1) // WINDOWS, 1), -1, list[Correspondences]()
     for number, images in enumerate(_window_images(left, right)):
         chosen = number % every == 0 and len(examined) < WINDOWS
@@ -99,12 +100,13 @@ def estimate_sequence_capture(
         if known is None:
             known = known_of(matches, rig, None, scanning, disparity_offset, models_asked(options.motion_model))
         examined.append(examine(matches, rig, known, options.robust, options.seed))
+        used.append(matches)
         advance(f"window {number}")
         known = _narrowed(known, conclude(examined))
     refusals.end(number + 1)
-    if not examined:
+    if known is None:
         raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
-    capture = as_global(conclude(examined))
+    capture = as_global(conclude(examined), used, rig, known)
     shutter = shutter_found(capture, rig)
     if len(first) + 1 >= _FEWEST_FRAMES and shakes(capture, first, rig, options.seed):
         raise NoMotionError(SHAKEN)
