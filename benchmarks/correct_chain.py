@@ -26,7 +26,8 @@ from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.chain import correct_frames, find_depth
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_motion import match_frames, solve_frames
+from rsbench.pipeline.frame_matches import match_frames
+from rsbench.pipeline.frame_motion import solve_frames
 
 BOUND_S = 3.0
 STEPS = ("match", "solve", "depth", "correct")

@@ -26,7 +26,8 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, read_frame
-from rsbench.pipeline.frame_motion import match_frames, solve_frames
+from rsbench.pipeline.frame_matches import match_frames
+from rsbench.pipeline.frame_motion import solve_frames
 from rsbench.pipeline.sequence_correction import estimate_sequence_capture
 
 Step = tuple[FloatArray, FloatArray]

@@ -185,7 +185,7 @@ def pose_errors(
     return {name: float(value) for name, value in errors.items()}
 
 
-def match(images: Series[Image], *, features: str | Path = "sift") -> Correspondences:
+def match(images: Series[Image], *, features: str | Path = "sift-refined") -> Correspondences:
     """Matches of the four images of a rig over two frames: over time, left to right, and through all four.
 
     Args:
@@ -197,7 +197,7 @@ def match(images: Series[Image], *, features: str | Path = "sift") -> Correspond
         RsbenchError: no such feature matcher.
     """
     from rsbench.pipeline.correction_options import CorrectionOptions
-    from rsbench.pipeline.frame_motion import find_matches
+    from rsbench.pipeline.frame_matches import find_matches
     from rsbench.vision.feature_matcher import load_features
 
     return find_matches(arguments.four_images(images), CorrectionOptions(features=load_features(features)))
@@ -230,7 +230,7 @@ def correct(
     solver: str | Path | Solver = "rs-stereo-refined",
     motion_model: str | None = None,
     matcher: str | Path = "sgm",
-    features: str | Path = "sift",
+    features: str | Path = "sift-refined",
     corrector: str | Path = "fusion",
     target_row: float = 0.0,
     inpaint: bool = False,

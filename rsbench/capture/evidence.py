@@ -112,12 +112,10 @@ def window_evidence(
     if screened is None:
         return None
     fits, likelihood = screened
-    best = min(fits, key=lambda fit: fit.cost)
-    everything = np.ones(first.count, dtype=np.bool_)
-    full = _distribution(timed[best.hypothesis.motion_model], everything, best, likelihood.scale)
-    if full is None:
+    sharpened = _sharpened(timed, known, fits, likelihood.scale)
+    if sharpened is None:
         return None
-    near = _near(_fitted(timed, known, full, fits, known.delays), full.scale)
+    full, near = sharpened
     sharp = _Slope(_cost(timed, full, known, near[0].hypothesis), near[0])
     dispersion = _dispersion(sharp, first.pixels[full.chosen]) if sharp.varies else 1.0
     near = _near(near, full.scale, _LIKELY * dispersion)
@@ -159,11 +157,7 @@ def _screened(
         return None
     judged = [_judged(timed, likelihood, known, fit) for fit, _ in found.values()]
     near = _near(judged, likelihood.scale, _UNSETTLED * _CLOSE)
-    models = _fitted(timed, known, likelihood, near, known.delays[-1:], known.models)
-    best = min(models, key=lambda fit: fit.cost)
-    sharper = _distribution(timed[best.hypothesis.motion_model], some, best, likelihood.scale) or likelihood
-    judged = [_judged(timed, sharper, known, fit) for fit in models]
-    return _near(judged, sharper.scale, _UNSETTLED * _CLOSE), sharper
+    return _of_each_model(timed, some, known, near)
 
 
 def _of_models(
@@ -173,15 +167,42 @@ def _of_models(
     first, scans = timed[known.models[0]], known.scans[0]
     hypothesis = Hypothesis(scans=scans, motion_model=known.models[0])
     start = known.start(hypothesis, 0.0, 0.0)
-    theta, some = first.packed(scans, start).theta(*motion), _some(first.count, 2 * _SCREENED)
+    theta, some = first.packed(scans, start).theta(*motion), _some(first.count, _SCREENED)
     wide = Likelihood(nu=_FIRST_NU, scale=_MOST_SCALE, chosen=some)
     cost = CaptureCost(first, hypothesis, wide, known.prior(hypothesis))
-    scale = min(cost.typical_error(theta, start), _MOST_SCALE)
-    fit = fit_capture(cost, theta, start, iterations=1)
-    likelihood = _distribution(first, some, replace(fit, theta=theta, unknowns=start), scale)
+    return _of_each_model(timed, some, known, [fit_capture(cost, theta, start, iterations=1)])
+
+
+def _of_each_model(
+    timed: Mapping[str, TimedMatches], some: BoolArray, known: Known, fits: Sequence[CaptureFit]
+) -> tuple[list[CaptureFit], Likelihood] | None:
+    """The fits of the first motion model, and those of the others on the same scans; and the errors of the best.
+
+    Each is fitted at the scale of its own errors: at the scale of another model's, far smaller, it would not move.
+    """
+    found = list[tuple[CaptureFit, float]]()
+    for fit, model in product(fits, known.models):
+        hypothesis = replace(fit.hypothesis, motion_model=model)
+        start = _start_from(timed, known, fit, hypothesis)
+        found.append(_settled(timed[model], some, hypothesis, known, start))
+    best, scale = min(found, key=lambda each: (each[1], each[0].cost))
+    likelihood = _distribution(timed[best.hypothesis.motion_model], some, best, scale)
     if likelihood is None:
         return None
-    return _near(_fitted(timed, known, likelihood, [fit], (False,), known.models), likelihood.scale), likelihood
+    judged = [_judged(timed, likelihood, known, fit) for fit, _ in found]
+    return _near(judged, likelihood.scale, _UNSETTLED * _CLOSE), likelihood
+
+
+def _start_from(
+    timed: Mapping[str, TimedMatches], known: Known, fit: CaptureFit, hypothesis: Hypothesis
+) -> tuple[FloatArray, FloatArray]:
+    """Where the fit of a hypothesis starts: at another one's of the same scans."""
+    scans, model = hypothesis.scans, hypothesis.motion_model
+    unknowns = known.start(hypothesis, *fit.unknowns[[RATIO, DELAY]])
+    unknowns[OFFSET] = fit.unknowns[OFFSET]
+    unknowns[ACCELERATION] = fit.unknowns[ACCELERATION] if model == fit.hypothesis.motion_model else 0.0
+    motion = timed[fit.hypothesis.motion_model].packed(scans, fit.unknowns).motion(fit.theta)
+    return timed[model].packed(scans, unknowns).theta(*motion), unknowns
 
 
 def _some(count: int, wanted: int) -> BoolArray:
@@ -251,25 +272,37 @@ def _fitted(
     likelihood: Likelihood,
     fits: Sequence[CaptureFit],
     delays: Sequence[bool],
-    models: Sequence[str] | None = None,
 ) -> list[CaptureFit]:
-    """The fits again, with and without a late right camera; or all models on their scans, from the nearest fit."""
+    """The fits again, with and without a late right camera, from the nearest fit."""
     out = []
     pairs = dict.fromkeys((fit.hypothesis.scans, fit.hypothesis.motion_model) for fit in fits)
-    if models is not None:
-        pairs = dict.fromkeys(product(dict.fromkeys(scans for scans, _ in pairs), models))
     for (scans, model), delayed in product(pairs, delays):
         hypothesis = Hypothesis(scans=scans, motion_model=model, delayed=delayed)
-        of_scans = [fit for fit in fits if fit.hypothesis.scans == scans]
-        start = min(of_scans, key=lambda fit: (fit.hypothesis.motion_model != model, fit.cost))
-        unknowns = known.start(hypothesis, *start.unknowns[[RATIO, DELAY]])
-        unknowns[OFFSET] = start.unknowns[OFFSET]
-        unknowns[ACCELERATION] = start.unknowns[ACCELERATION] if model == start.hypothesis.motion_model else 0.0
-        motion = timed[start.hypothesis.motion_model].packed(scans, start.unknowns).motion(start.theta)
-        theta = timed[model].packed(scans, unknowns).theta(*motion)
+        of_pair = [f for f in fits if (f.hypothesis.scans, f.hypothesis.motion_model) == (scans, model)]
+        start = _start_from(timed, known, min(of_pair, key=lambda fit: fit.cost), hypothesis)
         cost = _cost(timed, likelihood, known, hypothesis)
-        out.append(fit_capture(cost, theta, unknowns, iterations=8, still=_ROUGHLY))
+        out.append(fit_capture(cost, *start, iterations=8, still=_ROUGHLY))
     return out
+
+
+def _sharpened(
+    timed: Mapping[str, TimedMatches], known: Known, fits: list[CaptureFit], scale: float
+) -> tuple[Likelihood, list[CaptureFit]] | None:
+    """The fits on all matches, the best first, under the distribution of the best one's errors.
+
+    Its scale falls as the best one is fitted better, or another one becomes the best; none is put aside before.
+    """
+    everything = np.ones(timed[known.models[0]].count, dtype=np.bool_)
+    for _ in range(_FALLS):
+        best = min(fits, key=lambda fit: fit.cost)
+        full = _distribution(timed[best.hypothesis.motion_model], everything, best, scale)
+        if full is None:
+            return None
+        fits = _fitted(timed, known, full, fits, known.delays)
+        if full.scale > _STEADY * scale:
+            break
+        scale = full.scale
+    return full, _near(fits, full.scale)
 
 
 def _distribution(timed: TimedMatches, among: BoolArray, fit: CaptureFit, scale: float) -> Likelihood | None:

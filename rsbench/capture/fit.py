@@ -26,7 +26,7 @@ _LONGEST_STEP = np.array([0.4, 0.4, 2.0, 0.3])
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-8, 1e6
 """A motion makes up for most of a wrong ratio: more damping than this would hold the ratio where it is."""
 _MOTION = 6
-_MEDIAN, LEAST_SCALE_PX = 0.6, 0.02
+_MEDIAN, LEAST_SCALE_PX = 0.6, 0.005
 """Median of squared normal errors, one or five together; and what exact matches are taken for."""
 
 

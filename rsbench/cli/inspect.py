@@ -69,7 +69,7 @@ def inspect(
         float, typer.Option(min=0.0, help="Largest standard deviation of a readout ratio that is reported.")
     ] = 0.015,
     motion_model: Annotated[list[str] | None, typer.Option(metavar="NAME", help=_MODEL)] = None,
-    features: Annotated[str, named("features", "Feature matcher for frames: a name or a card.")] = "sift",
+    features: Annotated[str, named("features", "Feature matcher for frames: a name or a card.")] = "sift-refined",
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per rig, each on a line.")] = False,
 ) -> None:
@@ -188,7 +188,7 @@ def _frame_windows(left: FrameSource, right: FrameSource, rig: StereoRig, option
     from rsbench.core.shutter import Scanning
     from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import check_alike
-    from rsbench.pipeline.frame_motion import find_matches_of_rig
+    from rsbench.pipeline.frame_matches import find_matches_of_rig
     from rsbench.pipeline.isolated_parts import Isolation
     from rsbench.vision.feature_matcher import load_features
 

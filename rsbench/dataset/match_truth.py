@@ -24,7 +24,7 @@ from rsbench.dataset.matches import MATCHED, LabelledMatches, MatchClass, Matchi
 from rsbench.dataset.views import FAR
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Images
-from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.vision.feature_matcher import FeatureEntry, load_features
 

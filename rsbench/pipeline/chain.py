@@ -29,7 +29,8 @@ from rsbench.pipeline.frame_depth import (
     moving_pairs,
     timed_pairs,
 )
-from rsbench.pipeline.frame_motion import FoundMotion, match_frames, match_unknown, solve_frames
+from rsbench.pipeline.frame_matches import match_frames, match_unknown
+from rsbench.pipeline.frame_motion import FoundMotion, solve_frames
 from rsbench.vision.corrector import CorrectionProblem, find_corrected_rows
 from rsbench.vision.fusion import Fused, Origin, inpaint
 from rsbench.vision.stereo_matcher import needs_motion, refuse_motion

@@ -18,7 +18,7 @@ from rsbench.vision.stereo_matcher import MatcherEntry, load_matcher
 class CorrectionOptions:
     """The four components of the chain, each of which may be anybody's, and what happens between them."""
 
-    features: FeatureEntry = field(default_factory=lambda: load_features("sift"))
+    features: FeatureEntry = field(default_factory=lambda: load_features("sift-refined"))
     """Finds the matches that the motion is solved from."""
     solver: SolverEntry = field(default_factory=lambda: load_solver_entry("rs-stereo-refined"))
     """Any solver that gives the length of d."""

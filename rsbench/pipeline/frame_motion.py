@@ -1,4 +1,4 @@
-"""Matches, motion and shutter of four frames: found, or refused with the reason."""
+"""Motion and shutter of four frames, from their matches: found, or refused with the reason."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from rsbench.capture.estimate import Capture, conclude, examine
 from rsbench.capture.hypotheses import MODELS
-from rsbench.capture.rectification import RefusedFramesError, check_rig, without_offset
+from rsbench.capture.rectification import RefusedFramesError, without_offset
 from rsbench.capture.scans import scans_of
 from rsbench.capture.settle import (
     AUTO,
@@ -26,24 +26,19 @@ from rsbench.capture.settle import (
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
-from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_depth import Images
+from rsbench.pipeline.frame_matches import on_their_rows
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.kernel_type import load_kernel
 from rsbench.solvers.engine.registry import SolverEntry
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
-from rsbench.vision.feature_matcher import find_correspondences
-from rsbench.vision.features import ROW_TOLERANCE_PX, SiftMatcher
-from rsbench.vision.images import eight_bit
-from rsbench.vision.undistortion import undistorted, with_lens
 
-_FEWEST_MATCHES = 12
 BACKWARDS = (
     "time runs backwards in them: the two times are exchanged, or lines are read from the side opposite to what "
     "is said (scan in the rig's card)"
@@ -66,101 +61,6 @@ class FoundMotion:
     """What was taken from the disparities before, px."""
     choice: ModelChoice | None = None
     """How the motion model was chosen; None when it is the solver's."""
-
-
-def find_matches(images: Images, options: CorrectionOptions, sides: tuple[Side, Side] = SIDES) -> Correspondences:
-    """Correspondences of the four frames, whatever they are; ``sides`` says which images are taken for the left's.
-
-    Raises:
-        RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
-    """
-    order = [(side, frame) for frame in (0, 1) for side in sides]
-    levels = eight_bit([images[view] for view in order])
-    names = [(side, frame) for frame in (0, 1) for side in SIDES]
-    return find_correspondences(options.features, dict(zip(names, levels, strict=True)))
-
-
-def find_matches_of_rig(
-    images: Images, rig: StereoRig, scanning: Scanning, options: CorrectionOptions
-) -> Correspondences:
-    """``find_matches`` of cameras as they are, in pixels of their images.
-
-    Matchers see images without distortion. Where the cameras do not read rows together, a left-right match is of
-    two times, and its ends of two rows: rsbench's own matcher looks for it anywhere, and of others, which may look
-    along the row, only matches over time are kept.
-
-    Raises:
-        RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
-    """
-    camera = rig.camera
-    images = {view: undistorted(image, camera) for view, image in images.items()}
-    component = options.features.component
-    if not scanning.rows_together and isinstance(component, SiftMatcher):
-        apart = replace(options.features, component=replace(component, row_tolerance=None))
-        options = replace(options, features=apart)
-    matches = with_lens(find_matches(images, options), camera)
-    if scanning.rows_together or isinstance(component, SiftMatcher):
-        return matches
-    return Correspondences(left=matches.left, right=matches.right)
-
-
-def match_frames(
-    images: Images,
-    rig: StereoRig,
-    options: CorrectionOptions,
-    scanning: Scanning | None = None,
-    *,
-    judge_rig: bool = True,
-) -> Correspondences:
-    """``find_matches_of_rig`` of frames that a user says to be those of a rig.
-
-    Args:
-        scanning: how the cameras read; None: rows from the top, both at once.
-        judge_rig: whether to look if frame 0 is a rectified pair in the right order.
-
-    Raises:
-        RefusedFramesError: no texture, sides exchanged, not rectified, or not of one time.
-    """
-    scanning = scanning or Scanning()
-    if judge_rig and scanning.rows_together:
-        check_rig(images["left", 0], images["right", 0], rig)
-    return _enough(find_matches_of_rig(images, rig, scanning, options))
-
-
-def match_unknown(
-    images: Images, rig: StereoRig, options: CorrectionOptions, *, judge_rig: bool = True
-) -> tuple[Correspondences, RefusedFramesError | None]:
-    """``match_frames`` of cameras that may read in any way, and what speaks against a pair that reads as one.
-
-    Raises:
-        RefusedFramesError: no texture.
-    """
-    doubt = None
-    try:
-        if judge_rig:
-            check_rig(images["left", 0], images["right", 0], rig)
-    except RefusedFramesError as error:
-        doubt = error
-    anyhow = isinstance(options.features.component, SiftMatcher)
-    scanning = Scanning(scan="left") if anyhow else Scanning()
-    return _enough(find_matches_of_rig(images, rig, scanning, options)), doubt
-
-
-def on_their_rows(matches: Correspondences, rig: StereoRig) -> Correspondences:
-    """Without tracks whose left-right ends are not on one row, of cameras that read rows together."""
-    tracks = rig.camera.ideal_pixels(matches.tracks.reshape(-1, 2)).reshape(-1, 8)
-    off = np.maximum(np.abs(tracks[:, 1] - tracks[:, 3]), np.abs(tracks[:, 5] - tracks[:, 7]))
-    return replace(matches, tracks=matches.tracks[off <= ROW_TOLERANCE_PX])
-
-
-def _enough(matches: Correspondences) -> Correspondences:
-    temporal = max(len(matches.left) + len(matches.right), 2 * len(matches.tracks))
-    if temporal < _FEWEST_MATCHES:
-        raise RefusedFramesError(
-            f"only {temporal} matches between the two times; {_FEWEST_MATCHES} are needed: the frames show no "
-            "texture, or not the same scene"
-        )
-    return matches
 
 
 def find_motion(

@@ -25,7 +25,8 @@ from rsbench.pipeline.chain import Given, check_cameras, correct_known, find_dep
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, check_alike
 from rsbench.pipeline.frame_depth import Images, frame_pair
-from rsbench.pipeline.frame_motion import FoundMotion, match_frames, match_unknown, models_asked, solve_frames
+from rsbench.pipeline.frame_matches import match_frames, match_unknown
+from rsbench.pipeline.frame_motion import FoundMotion, models_asked, solve_frames
 from rsbench.pipeline.sequence_trajectory import Window, on_one_trajectory
 from rsbench.vision.fusion import Fused
 from rsbench.vision.stereo_matcher import needs_motion

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from rsbench.components import plugins
 from rsbench.components.plugins import Entry, Kind, RunOptions
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import SET_COLUMNS, Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import View
+from rsbench.vision.undistortion import undistorted, with_lens
 
 _OUTSIDE_PX = 1.0
 """How far beyond the centre of the outermost pixel a sub-pixel position may lie."""
@@ -29,6 +31,11 @@ class FeatureMatcher(ABC):
         Images (H, W) or (H, W, 3) RGB of one size; positions in pixels, the centre of the top-left one (0, 0).
         Sets may come out empty; the solver says what it needs. ``tracks`` are points seen in all four images.
         """
+
+    def match_with_lens(self, images: Mapping[View, NDArray[np.uint8]], camera: PinholeCamera) -> Correspondences:
+        """``match`` of images that have the lens of ``camera``, in their pixels: of the images without it."""
+        straight = {view: undistorted(image, camera) for view, image in images.items()}
+        return with_lens(self.match(straight), camera)
 
 
 FeatureEntry = Entry[FeatureMatcher, RunOptions]
@@ -49,15 +56,23 @@ def load_features(name_or_path: str | Path) -> FeatureEntry:
     return plugins.load_entry(FEATURE_MATCHERS, name_or_path)
 
 
-def find_correspondences(entry: FeatureEntry, images: Mapping[View, NDArray[np.uint8]]) -> Correspondences:
+def find_correspondences(
+    entry: FeatureEntry, images: Mapping[View, NDArray[np.uint8]], camera: PinholeCamera | None = None
+) -> Correspondences:
     """What a feature matcher finds in four images, checked: finite positions inside the images.
+
+    Args:
+        camera: whose lens the images have; None: they have none.
 
     Raises:
         RsbenchError: another package's matcher raised, or answered something else: one line with its name.
     """
     where = f"{FEATURE_MATCHERS.singular} {entry.name!r}"
     with plugins.blame(FEATURE_MATCHERS, entry):
-        found = entry.component.match(images)
+        if camera is None or camera.lens is None:
+            found = entry.component.match(images)
+        else:
+            found = entry.component.match_with_lens(images, camera)
     if not isinstance(found, Correspondences):
         raise RsbenchError(f"{where}: must return Correspondences, got {type(found).__name__}")
     height, width = images["left", 0].shape[:2]

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.arguments import check_ranges
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
@@ -26,6 +27,7 @@ from rsbench.vision.descriptor_search import best_two
 from rsbench.vision.feature_matcher import FeatureMatcher
 from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.images import grey_u8
+from rsbench.vision.patch_alignment import refine_matches
 
 Indices = NDArray[np.int64]
 _MOST_FEATURES = 100_000
@@ -67,6 +69,8 @@ class MatchOptions:
     """Largest disparity of left-right matches, px; None is the image width."""
     drop_contradicted: bool = True
     """Drop a temporal match when its loop through the other camera ends elsewhere."""
+    refine: bool = False
+    """Align the ends of matches by the grey levels around them, see ``patch_alignment``."""
     affine: bool = False
     """Give left matches affine frames: the similarity of the keypoints' sizes and orientations."""
 
@@ -80,17 +84,26 @@ class SiftMatcher(MatchOptions, FeatureMatcher):
     """SIFT features, matched by ``match_stereo_frames``."""
 
     def match(self, images: Mapping[View, NDArray[np.uint8]]) -> Correspondences:
-        return match_stereo_frames(
-            images["left", 0], images["right", 0], images["left", 1], images["right", 1], self
-        )
+        return self._matched(images, None)
+
+    def match_with_lens(self, images: Mapping[View, NDArray[np.uint8]], camera: PinholeCamera) -> Correspondences:
+        """Features are found in the images as they are: interpolating them would add a tenth to the noise."""
+        return self._matched(images, camera)
+
+    def _matched(self, images: Mapping[View, NDArray[np.uint8]], camera: PinholeCamera | None) -> Correspondences:
+        four = (images["left", 0], images["right", 0], images["left", 1], images["right", 1])
+        matches = match_stereo_frames(*four, self, camera)
+        return refine_matches(images, matches) if self.refine else matches
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Features:
-    """Keypoints of one image, in order of their rows."""
+    """Keypoints of one image, in order of the rows of their places."""
 
     points: FloatArray
     """(n, 2) px."""
+    places: FloatArray
+    """(n, 2) px where a camera without the lens sees them."""
     descriptors: NDArray[np.float32]
     """(n, 128), whole numbers from 0 to 255."""
     frames: FloatArray
@@ -106,8 +119,14 @@ class Gate:
     dy: tuple[float, float]
 
 
-def detect(image: NDArray[Any], options: MatchOptions | None = None) -> Features:
-    """SIFT features of an image (H, W) or (H, W, 3), uint8 or uint16; none in an image without texture."""
+def detect(
+    image: NDArray[Any], options: MatchOptions | None = None, camera: PinholeCamera | None = None
+) -> Features:
+    """SIFT features of an image (H, W) or (H, W, 3), uint8 or uint16; none in an image without texture.
+
+    Args:
+        camera: whose lens the image has; None: it has none. Features of which the lens shows no ray are dropped.
+    """
     options = options or MatchOptions()
     sift = cv2.SIFT.create(
         nfeatures=options.max_features or _MOST_FEATURES,
@@ -118,12 +137,14 @@ def detect(image: NDArray[Any], options: MatchOptions | None = None) -> Features
     keypoints, descriptors = sift.detectAndCompute(grey_u8(image), None)
     if not keypoints:
         empty = np.zeros((0, 2))
-        return Features(points=empty, descriptors=np.zeros((0, 128), dtype=np.float32), frames=empty)
+        return Features(points=empty, places=empty, descriptors=np.zeros((0, 128), dtype=np.float32), frames=empty)
     points = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
-    order = np.lexsort((points[:, 0], points[:, 1]))
+    places = points if camera is None else camera.ideal_pixels(points)
+    order = np.lexsort((places[:, 0], places[:, 1]))
+    order = order[np.all(np.isfinite(places[order]), axis=1)]
     size, angle = np.array([(k.size, np.deg2rad(k.angle)) for k in keypoints]).T[:, order]
     frames = size[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return Features(points=points[order], descriptors=descriptors[order], frames=frames)
+    return Features(points=points[order], places=places[order], descriptors=descriptors[order], frames=frames)
 
 
 def match(a: Features, b: Features, gate: Gate, options: MatchOptions | None = None) -> Indices:
@@ -133,7 +154,7 @@ def match(a: Features, b: Features, gate: Gate, options: MatchOptions | None = N
     same match several times; it is kept once.
     """
     options = options or MatchOptions()
-    best, nearest, second, back = best_two(a.points, a.descriptors, b.points, b.descriptors, gate.dx, gate.dy)
+    best, nearest, second, back = best_two(a.places, a.descriptors, b.places, b.descriptors, gate.dx, gate.dy)
     rows = np.flatnonzero(best >= 0)
     mutual = back[best[rows]] == rows
     distinct = nearest[rows] <= options.ratio**2 * second[rows]
@@ -150,9 +171,11 @@ def match_stereo_frames(
     left_1: NDArray[Any],
     right_1: NDArray[Any],
     options: MatchOptions | None = None,
+    camera: PinholeCamera | None = None,
 ) -> Correspondences:
     """Correspondences of the four images (H, W[, 3]), uint8 or uint16, of a rig over two frames.
 
+    Of images that have the lens of ``camera``, in their own pixels; the bounds of the options are without it.
     Tracks are points whose four matches close the loop L0-R0-R1-L1-L0. Sets may come out empty. Raises ValueError
     when the images differ in size or are of another type.
     """
@@ -170,7 +193,9 @@ def match_stereo_frames(
         beside = Gate(dx=(-disparity, -np.finfo(np.float64).tiny), dy=(-tolerance, tolerance))
     # OpenCV, the BLAS and the compiled loop let go of the GIL.
     pixels = left_0.shape[0] * left_0.shape[1]
-    l0, r0, l1, r1 = map_frames(lambda image: detect(image, options), images.values(), pixels, _DETECTION_BYTES)
+    l0, r0, l1, r1 = map_frames(
+        lambda image: detect(image, options, camera), images.values(), pixels, _DETECTION_BYTES
+    )
     tasks = ((l0, l1, anywhere), (r0, r1, anywhere), (l0, r0, beside), (l1, r1, beside))
     with ThreadPoolExecutor() as pool:
         left, right, stereo_0, stereo_1 = pool.map(lambda t: match(t[0], t[1], t[2], options), tasks)

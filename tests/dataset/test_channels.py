@@ -36,7 +36,7 @@ from rsbench.dataset.matches import MATCHED, MatchClass
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
 from rsbench.dataset.views import ImageView
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.renderers.electrons import Sensor
 from rsbench.renderers.image import to_srgb8
 from rsbench.scenes.load import load_scene

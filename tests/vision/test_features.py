@@ -196,8 +196,8 @@ def test_gate_of_one_candidate_needs_a_small_distance() -> None:
     far = np.zeros((1, 128), dtype=np.float32)
     far[0, 0] = 255
     at = np.zeros((1, 2))
-    a = Features(points=at, descriptors=np.zeros((1, 128), dtype=np.float32), frames=at)
-    b = Features(points=at, descriptors=far, frames=at)
+    a = Features(points=at, places=at, descriptors=np.zeros((1, 128), dtype=np.float32), frames=at)
+    b = Features(points=at, places=at, descriptors=far, frames=at)
     gate = Gate(dx=(-1.0, 1.0), dy=(-1.0, 1.0))
     assert len(match(a, b, gate, MatchOptions(max_distance=254.0))) == 0
     assert len(match(a, b, gate, MatchOptions(max_distance=256.0))) == 1

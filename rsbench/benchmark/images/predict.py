@@ -36,7 +36,7 @@ from rsbench.pipeline.frame_depth import (
     motion_disparities,
     pair_with_motion,
 )
-from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.registry import SOLVERS, SolverEntry

@@ -31,7 +31,7 @@ from rsbench.dataset import sequence as sequences
 from rsbench.dataset.layout import picture_file
 from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.storage.files import write_bytes
 from rsbench.vision.corrector import demand_corrected, load_corrector
 from rsbench.vision.flow import dense_flow

@@ -15,7 +15,7 @@ from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Images
-from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.pipeline.problem import Problem
 from rsbench.storage.files import read_png, write_bytes
 from rsbench.storage.untrusted_files import inside, read_bytes

@@ -34,7 +34,7 @@ from rsbench.dataset.sequence import read_dataset_manifest
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.jobs.process_jobs import finished_jobs
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.storage.files import read_table, write_bytes
 from rsbench.vision.feature_matcher import load_features

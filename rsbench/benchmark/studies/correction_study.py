@@ -39,7 +39,8 @@ from rsbench.pipeline.baseline_motions import global_shutter_motion, kept_matche
 from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Pairs, frame_pairs, known_depth
-from rsbench.pipeline.frame_motion import FoundMotion, find_matches, find_motion
+from rsbench.pipeline.frame_matches import find_matches
+from rsbench.pipeline.frame_motion import FoundMotion, find_motion
 from rsbench.pipeline.one_camera import ZhuangCorrector, depth_alone
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 from rsbench.vision.baseline_depths import plane_depth

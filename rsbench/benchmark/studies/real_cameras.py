@@ -29,7 +29,8 @@ from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.chain import correct_frames, find_depth
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Pairs, frame_pairs
-from rsbench.pipeline.frame_motion import FoundMotion, find_matches_of_rig, find_motion
+from rsbench.pipeline.frame_matches import find_matches_of_rig
+from rsbench.pipeline.frame_motion import FoundMotion, find_motion
 from rsbench.vision.fusion import Origin
 from rsbench.vision.quality import psnr
 

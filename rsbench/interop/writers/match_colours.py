@@ -14,7 +14,7 @@ from rsbench.dataset.matches import MATCHED, MatchClass
 from rsbench.dataset.sequence import Sequence
 from rsbench.interop.writers.image_poses import View
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.vision.feature_matcher import load_features
 
 _UNJUDGED, _RIGHT, _WRONG = (86, 180, 233), (0, 158, 115), (213, 94, 0)
