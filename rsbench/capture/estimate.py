@@ -243,12 +243,16 @@ def _product(peaks: Sequence[Peak], lost: float) -> _Sum:
         trade=peaks[-1].trade,
     )
     precisions = np.array([np.maximum(peak.fit.sigma, 1e-12) ** -2.0 for peak in peaks])
+    values, whole_precision = np.array([peak.fit.unknowns for peak in peaks]), np.sum(precisions, axis=0)
+    mean = np.sum(precisions * values, axis=0) / whole_precision
+    scatter = np.sum(precisions * (values - mean) ** 2, axis=0) / max(len(peaks) - 1, 1)
+    sigmas = np.sqrt(np.maximum(scatter, 1.0) / whole_precision)
     return _Sum(
         log_evidence=whole.log_evidence,
         at=at,
         sigma=whole.sigma,
-        mean=np.sum(precisions * [peak.fit.unknowns for peak in peaks], axis=0) / np.sum(precisions, axis=0),
-        sigmas=np.where(peaks[0].fit.sigma > 0.0, np.sum(precisions, axis=0) ** -0.5, 0.0),
+        mean=mean,
+        sigmas=np.where(peaks[0].fit.sigma > 0.0, sigmas, 0.0),
         last=peaks[-1],
     )
 

@@ -33,7 +33,8 @@ _PRIOR_FACTOR, _LEAST_PRIOR_PX = 2.0, 0.1
 """Standard deviation of the disparity offset over the size of the row differences: rows show errors of roll and
 pitch, and the error of yaw, which shifts disparities, is of their kind. Below the second there is none to fit."""
 _NEARLY, _SMALL = 0.06, 0.15
-"""Readout ratio of nearly a global shutter, within two deviations, and at most."""
+"""Readout ratio of nearly a global shutter, within two deviations; and the root mean square, at most, of the ratios
+that the matches then allow."""
 _CLEARLY, LEAST_BACKWARDS = 0.999, 0.25
 """Probability of the opposite scan at which frames are refused, and the ratio from which their order shows."""
 _AXES = ("tilt", "pan", "roll", "sideways motion", "vertical motion", "forward motion")
@@ -93,18 +94,18 @@ def as_global(capture: Capture, windows: Sequence[Correspondences], rig: StereoR
     Errors of a calibration are taken for small differences of times; no camera has a readout that short. What is
     unknown beside is found again from the matches of the windows, under a global shutter.
     """
-    near = [
-        each for each in capture.candidates if each.ratio - 2.0 * each.sigma <= _NEARLY and each.ratio <= _SMALL
-    ]
+    near = [each for each in capture.candidates if each.ratio - 2.0 * each.sigma <= _NEARLY]
     probability = sum(each.probability for each in near)
     if not near or probability < CERTAIN or near == [each for each in near if each.scans == GLOBAL]:
         return capture
     sigma = float(np.sqrt(sum(each.probability * (each.ratio**2 + each.sigma**2) for each in near) / probability))
+    if sigma > _SMALL:
+        return capture
     alone = replace(known, scans=(GLOBAL,), ratio=0.0, delay=0.0)
     again = conclude([examine(each, rig, alone) for each in windows])
     if again.likeliest is None:
         return capture
-    still = replace(again.likeliest, probability=probability, sigma=min(sigma, _SMALL))
+    still = replace(again.likeliest, probability=probability, sigma=sigma)
     others = tuple(each for each in capture.candidates if each not in near)
     return replace(capture, candidates=(still, *others), models=again.models, peaks=again.peaks, named=True)
 
