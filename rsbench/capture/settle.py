@@ -33,8 +33,8 @@ _PRIOR_FACTOR, _LEAST_PRIOR_PX = 2.0, 0.1
 """Standard deviation of the disparity offset over the size of the row differences: rows show errors of roll and
 pitch, and the error of yaw, which shifts disparities, is of their kind. Below the second there is none to fit."""
 _NEARLY, _SMALL = 0.06, 0.15
-"""Readout ratio of nearly a global shutter, within two deviations; and the root mean square, at most, of the ratios
-that the matches then allow."""
+"""Readout ratio of nearly a global shutter, within two deviations; and the root mean square, at most, of
+the ratios that the matches then allow."""
 _CLEARLY, LEAST_BACKWARDS = 0.999, 0.25
 """Probability of the opposite scan at which frames are refused, and the ratio from which their order shows."""
 _AXES = ("tilt", "pan", "roll", "sideways motion", "vertical motion", "forward motion")

@@ -129,7 +129,7 @@ def _of_problems(path: Path, options: _Options) -> Iterator[_Case | RsbenchError
             yield problem
             continue
         window = examine(problem.correspondences, problem.rig, Known(models=options.models), seed=options.seed)
-        yield _Case(problem.name, iter([window]), problem.shutter)
+        yield _Case(problem.name, iter([window]), problem.known_shutter)
 
 
 def _of_four(paths: list[Path], card: Path, options: _Options) -> _Case:

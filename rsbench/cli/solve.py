@@ -29,9 +29,9 @@ EPILOG = """[bold]Examples[/bold]
   cat problems.jsonl | rsbench solve - --json --with covariance,inliers
 
 A problem holds [bold]camera[/bold] (width, height, fx, fy, cx, cy), [bold]baseline[/bold] (m),
-[bold]readout_ratio[/bold] and matches in pixels: [bold]left[/bold] and [bold]right[/bold] (x0, y0, x1, y1),
-[bold]stereo_0[/bold] and [bold]stereo_1[/bold] (xl, yl, xr, yr), [bold]tracks[/bold] (xl0, yl0, xr0, yr0,
-xl1, yl1, xr1, yr1); absent sets are empty. The centre of the top-left pixel is (0, 0).
+[bold]readout_ratio[/bold] (absent: it is found) and matches in pixels: [bold]left[/bold], [bold]right[/bold]
+(x0, y0, x1, y1), [bold]stereo_0[/bold], [bold]stereo_1[/bold] (xl, yl, xr, yr), [bold]tracks[/bold] (xl0, yl0, xr0,
+yr0, xl1, yl1, xr1, yr1); absent sets are empty. The centre of the top-left pixel is (0, 0).
 
 Exit codes: 0 all solved, 1 one without a motion, 2 one that is wrong; the others are solved all the same.
 More: [bold]rsbench docs problem-format[/bold]"""
@@ -160,10 +160,24 @@ def _show_one(answer: dict[str, Any]) -> None:
     typer.echo(f"d  {_vector(answer['d'])} {unit}, of {whose}")
     typer.echo(f"inliers: {answer['inliers']} of {answer['matches']} matches")
     typer.echo(f"assumes: {answer['motion_model']} motion, {answer['shutter']} shutter; {answer['assumes']}")
+    if "readout" in answer:
+        typer.echo(f"readout: {_readout(answer)}")
     if answer.get("model_choice"):
         typer.echo(f"motion model: {answer['model_choice']['text']}")
     if answer["reason"]:
         typer.echo(f"note: {answer['reason']}")
+
+
+def _readout(answer: dict[str, Any]) -> str:
+    """What was found of the shutter, and what else the matches allow."""
+    found = answer["readout"]
+    sides = [found["left"]] if found["left"] == found["right"] else [found["left"], found["right"]]
+    text = f"ratio {answer['readout_ratio']:.3f} +- {found['readout_ratio_sigma']:.3f} from {' and '.join(sides)}"
+    second = next(iter(found["candidates"][1:]), None)
+    if second is None:
+        return f"{text}, found with the motion; nothing else is likely ({found['probability']:.1%})"
+    other = f"{second['left']} and {second['right']} {second['readout_ratio']:.2f} ({second['probability']:.1%})"
+    return f"{text} ({found['probability']:.1%}), found with the motion; next {other}"
 
 
 def _row(answer: dict[str, Any]) -> dict[str, str]:

@@ -51,6 +51,24 @@ class Scanning:
 
 
 @dataclass(frozen=True, kw_only=True)
+class StatedShutter(Scanning):
+    """What a user says of a shutter; what is left out is found from the frames or matches."""
+
+    scan: Scan | None = None  # pyrefly: ignore[bad-override]
+    """Side of the image at which the readout of both cameras begins. Absent: found with the readout ratio, or
+    ``top`` where that is given."""
+    readout_ratio: float | None = None
+    """Readout time over frame period, 0 to 1. Absent: estimated from the frames."""
+
+    @property
+    def scanning(self) -> Scanning | None:
+        """How the cameras read their lines; None where that is to be found with the readout ratio."""
+        said = (self.readout_ratio, self.scan, self.right_scan) != (None, None, None) or self.right_delay != 0.0
+        scan = self.scan or "top"
+        return Scanning(scan=scan, right_scan=self.right_scan, right_delay=self.right_delay) if said else None
+
+
+@dataclass(frozen=True, kw_only=True)
 class RollingShutter:
     """Lines are read evenly within ``readout_ratio`` of a frame period: rows from the top, unless said otherwise.
 

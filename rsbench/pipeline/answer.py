@@ -7,16 +7,26 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rsbench.capture.settle import ModelChoice
+from rsbench.capture.estimate import Capture, conclude, examine
+from rsbench.capture.settle import (
+    ModelChoice,
+    NoMotionError,
+    as_global,
+    choose_model,
+    known_of,
+    record_of,
+    shutter_found,
+)
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.track_building import join_stereo
 from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.frame_motion import chosen_model, entry_of, takes_models, widened
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import Problem
+from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.registry import SolverEntry
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions
 
@@ -44,10 +54,15 @@ def solve_problem(
         RsbenchError: there is no such motion model, or the solver can take no other than its own.
     """
     joined, spec, choice = join_stereo(problem.correspondences), entry.solver.spec, None
-    given = (joined.correspondences, problem.rig, problem.shutter, options, np.random.default_rng(seed))
-    result = runner.robust(entry, *given)
-    if motion_model is not None and takes_models(entry):
-        entry, result, choice = _under_model(motion_model, entry, result, runner, given, seed)
+    shutter, capture, doubt = _shutter_of(problem, joined.correspondences, entry, options, seed)
+    given = (joined.correspondences, problem.rig, shutter, options, np.random.default_rng(seed))
+    if doubt:
+        failed = MotionEstimate.failed(doubt)
+        result = RobustEstimate(estimate=failed, iterations=0, seconds=0.0, threshold_px=options.threshold_px)
+    else:
+        result = runner.robust(entry, *given)
+        if motion_model is not None and takes_models(entry):
+            entry, result, choice = _under_model(motion_model, entry, result, runner, given, capture, seed)
     estimate = result.estimate
     body = body_motion(estimate, spec, problem.rig)
     notes = [estimate.reason] if joined.note in estimate.reason else [estimate.reason, joined.note]
@@ -66,6 +81,8 @@ def solve_problem(
         "motion_model": spec.motion_model if choice is None else choice.used,
         **({} if motion_model is None else {"model_choice": None if choice is None else choice.record()}),
         "shutter": spec.shutter,
+        "readout_ratio": None if doubt else shutter.readout_ratio,
+        **({} if capture is None else {"readout": record_of(capture)}),
         "assumes": spec.assumes,
         "inliers": result.inlier_count,
         "matches": result.match_count,
@@ -80,15 +97,38 @@ def solve_problem(
 Given = tuple[Correspondences, StereoRig, RollingShutter, RobustOptions, np.random.Generator]
 
 
+def _shutter_of(
+    problem: Problem, matches: Correspondences, entry: SolverEntry, options: RobustOptions, seed: int
+) -> tuple[RollingShutter, Capture | None, str]:
+    """The shutter of a problem, how it was found where the problem does not say it, and why it cannot be told."""
+    camera = problem.rig.camera
+    still = Scanning().shutter_of(camera.width, camera.height, 0.0)
+    if problem.known_shutter is not None or entry.solver.spec.shutter == "global":
+        return problem.known_shutter or still, None, ""
+    known = known_of(matches, problem.rig, None, problem.scanning)
+    capture = conclude([examine(matches, problem.rig, known, options, seed)])
+    capture = as_global(capture, [matches], problem.rig, known)
+    try:
+        return shutter_found(capture, problem.rig), capture, ""
+    except NoMotionError as error:
+        return still, capture, str(error)
+
+
 def _under_model(
-    asked: str, entry: SolverEntry, result: RobustEstimate, runner: SolverRunner, given: Given, seed: int
+    asked: str,
+    entry: SolverEntry,
+    result: RobustEstimate,
+    runner: SolverRunner,
+    given: Given,
+    capture: Capture | None,
+    seed: int,
 ) -> tuple[SolverEntry, RobustEstimate, ModelChoice | None]:
     """The answer under the motion model that the matches prefer, or that is asked for."""
     matches, rig, shutter, options, _ = given
     start = body_motion(result.estimate, entry.solver.spec, rig)
-    choice = (
-        chosen_model(asked, start, matches, rig, shutter, options, seed) if isinstance(start, Motion) else None
-    )
+    choice = None if capture is None else choose_model(capture, asked)
+    if choice is None and isinstance(start, Motion):
+        choice = chosen_model(asked, start, matches, rig, shutter, options, seed)
     other = entry if choice is None else entry_of(entry, choice)
     result = result if other is entry else runner.robust(other, *given)
     return other, result if choice is None else widened(result, choice.spread), choice

@@ -21,7 +21,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.lens import Lens
 from rsbench.core.rig import StereoRig, View
-from rsbench.core.shutter import RollingShutter, Scan, Scanning
+from rsbench.core.shutter import RollingShutter, Scanning, StatedShutter
 from rsbench.storage.untrusted_files import check_image_size, check_size, read_bytes
 
 _SMALLEST = 32
@@ -49,7 +49,7 @@ class CameraCard:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RigCard(Scanning):
+class RigCard(StatedShutter):
     """What must be known of a rig to correct its frames; the size comes from the images."""
 
     SHORTHANDS: ClassVar = SHUTTER_KEY
@@ -58,11 +58,6 @@ class RigCard(Scanning):
     """Intrinsics of both cameras, which are the same."""
     baseline: float
     """Full distance between the cameras, metres."""
-    scan: Scan | None = None  # pyrefly: ignore[bad-override]
-    """Side of the image at which the readout of both cameras begins. Absent: found with the readout ratio, or
-    ``top`` where that is given."""
-    readout_ratio: float | None = None
-    """Readout time over frame period, 0 to 1. Absent: estimated from the frames."""
     disparity_offset: float | None = None
     """Pixels by which matched disparities are too large; absent: estimated with the readout ratio, else 0."""
 
@@ -76,18 +71,6 @@ class RigCard(Scanning):
             )
         if self.readout_ratio is not None and not 0.0 <= self.readout_ratio <= 1.0:
             raise ValueError(f"readout_ratio = {self.readout_ratio}: must lie in [0, 1], or be absent if unknown")
-
-    @property
-    def scanning(self) -> Scanning | None:
-        """How its cameras read their lines; None where that is to be found with the readout ratio."""
-        if (
-            self.readout_ratio is None
-            and self.scan is None
-            and self.right_scan is None
-            and self.right_delay == 0.0
-        ):
-            return None
-        return Scanning(scan=self.scan or "top", right_scan=self.right_scan, right_delay=self.right_delay)
 
     def rig(self, width: int, height: int) -> StereoRig:
         """The rig with images of this size; ValueError where its lens cannot be one of such images."""

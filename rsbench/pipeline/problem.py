@@ -15,7 +15,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.shutter import RollingShutter, Scanning, StatedShutter
 from rsbench.storage.untrusted_files import FILE_BYTES, check_amount, load_arrays, parse_json, read_text
 
 COLUMNS = {
@@ -48,14 +48,23 @@ class Problem:
     correspondences: Correspondences
     """As in the file: left-right matches are not joined yet."""
     rig: StereoRig
-    shutter: RollingShutter
+    known_shutter: RollingShutter | None
+    """None: its readout ratio is to be found with the motion."""
+    scanning: Scanning | None = None
+    """How the cameras of an unknown shutter read their lines; None: that is to be found too."""
+
+    @property
+    def shutter(self) -> RollingShutter:
+        """The shutter; RsbenchError where it is to be found."""
+        if self.known_shutter is None:
+            raise RsbenchError(f"{self.name}: readout_ratio is required")
+        return self.known_shutter
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Content(Scanning):
+class _Content(StatedShutter):
     camera: PinholeCamera
     baseline: float
-    readout_ratio: float
     name: str = ""
     left: _Rows = ()
     right: _Rows = ()
@@ -107,17 +116,23 @@ def read_problem(path: str | Path) -> Problem:
 
 def problem_record(problem: Problem) -> dict[str, Any]:
     """A problem as JSON holds it: ``parse_problem`` reads it. Sets without a match are left out, but not all."""
-    camera, shutter = problem.rig.camera, problem.shutter
+    camera = problem.rig.camera
     lens: dict[str, Any] = {} if camera.lens is None else {"lens": asdict(camera.lens)}
     sets = {key: getattr(problem.correspondences, key).tolist() for key in COLUMNS}
     return {
         "name": problem.name,
         "camera": {key: getattr(camera, key) for key in _CAMERA} | lens,
         "baseline": problem.rig.baseline,
-        "readout_ratio": shutter.readout_ratio,
-        **({} if shutter.plain else asdict(shutter.scanning)),
+        **_shutter_record(problem),
         **({key: rows for key, rows in sets.items() if rows} or {"left": []}),
     }
+
+
+def _shutter_record(problem: Problem) -> dict[str, Any]:
+    shutter, scanning = problem.known_shutter, problem.scanning
+    if shutter is None:
+        return {} if scanning is None else asdict(scanning)
+    return {"readout_ratio": shutter.readout_ratio, **({} if shutter.plain else asdict(shutter.scanning))}
 
 
 def _read_file(path: Path) -> Iterator[Problem | RsbenchError]:
@@ -199,7 +214,6 @@ def parse_problem(text: str, where: str, name: str = "") -> Problem:
     return _problem(
         content.camera,
         content.baseline,
-        content.readout_ratio,
         content,
         sets,
         content.name or name or where,
@@ -223,19 +237,20 @@ def _check_widths(rows: _Rows, name: str, columns: str, where: str) -> None:
 def _problem(
     camera: PinholeCamera,
     baseline: float,
-    ratio: float,
-    scanning: Scanning,
+    stated: StatedShutter,
     sets: Mapping[str, Any],
     name: str,
     where: str,
 ) -> Problem:
     try:
         rig = StereoRig(camera=camera, baseline=baseline)
-        shutter = scanning.shutter_of(camera.width, camera.height, ratio)
+        scanning, ratio = stated.scanning, stated.readout_ratio
+        known = (scanning or Scanning()).shutter_of(camera.width, camera.height, ratio or 0.0)
         matches = Correspondences(**{key: np.array(rows, dtype=np.float64) for key, rows in sets.items()})
     except ValueError as error:
         raise RsbenchError(f"{where}: {error}") from error
-    return Problem(name=name, correspondences=matches, rig=rig, shutter=shutter)
+    shutter = None if ratio is None else known
+    return Problem(name=name, correspondences=matches, rig=rig, known_shutter=shutter, scanning=scanning)
 
 
 def _from_npz(path: Path) -> Problem:
@@ -245,7 +260,7 @@ def _from_npz(path: Path) -> Problem:
     for key in arrays:
         if key not in known:
             raise RsbenchError(f"{path}: unknown key {key!r}{choices(key, known)}")
-    for key in known[:3]:
+    for key in known[:2]:
         if key not in arrays:
             raise RsbenchError(f"{path}: {key!r} is required")
     _check_sets(arrays, str(path))
@@ -256,12 +271,13 @@ def _from_npz(path: Path) -> Problem:
     if size.shape != (6,) or np.any(size[:2] != np.round(size[:2])):
         raise RsbenchError(f"{path}: camera = {size.tolist()}: must be {', '.join(_CAMERA)}, the first two whole")
     for key in ("baseline", "readout_ratio"):
-        if arrays[key].size != 1:
+        if key in arrays and arrays[key].size != 1:
             raise RsbenchError(f"{path}: {key} has shape {arrays[key].shape}: must be one number")
     width, height, *rest = size.tolist()
     values = {"width": int(width), "height": int(height), **dict(zip(_CAMERA[2:], rest, strict=True))}
     camera = parse_card(PinholeCamera, values, f"{path}: camera")
     sets = {key: arrays[key] for key in COLUMNS if key in arrays}
-    baseline, ratio = float(arrays["baseline"].item()), float(arrays["readout_ratio"].item())
+    baseline = float(arrays["baseline"].item())
+    ratio = float(arrays["readout_ratio"].item()) if "readout_ratio" in arrays else None
     name = str(arrays["name"]) if "name" in arrays else path.stem
-    return _problem(camera, baseline, ratio, Scanning(), sets, name, str(path))
+    return _problem(camera, baseline, StatedShutter(readout_ratio=ratio), sets, name, str(path))

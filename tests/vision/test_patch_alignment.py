@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from rsbench.core.correspondences import Correspondences, unlinked_pairs
+from rsbench.core.rig import SIDES, View
 from rsbench.vision.patch_alignment import aligned, refine_matches, smoothed
 
 _SIZE = 96
@@ -36,7 +38,7 @@ def _image(A: np.ndarray, t: np.ndarray, gain: float = 1.0, noise: float = 0.0, 
     shift=st.lists(st.floats(-0.45, 0.45), min_size=2, max_size=2),
     gain=st.floats(0.8, 1.0),
 )
-def test_patches_are_found_where_an_affine_map_takes_them(shear, shift, gain):
+def test_patches_follow_affine_maps(shear: list[float], shift: list[float], gain: float) -> None:
     """Rounding to whole levels alone is in the way: 0.29 levels, of gradients of some 10 levels a pixel."""
     A = np.eye(2) + np.reshape(shear, (2, 2))
     t = np.array(shift) + 48.0 - A @ [48.0, 48.0]
@@ -48,7 +50,7 @@ def test_patches_are_found_where_an_affine_map_takes_them(shear, shift, gain):
     assert np.max(np.abs(found - truth)[done]) < 0.05
 
 
-def test_noise_decides_how_well():
+def test_noise_decides_how_well() -> None:
     """At 1.5 levels of noise in each image, least squares leave 1.5 sqrt(2) over the root of the summed squares of
     the gradients, of which the smoothing and the weights keep a half: some 0.02 px here."""
     shift = np.array([0.3, -0.2])
@@ -61,7 +63,7 @@ def test_noise_decides_how_well():
 
 
 @pytest.mark.parametrize("levels", [128.0, None])
-def test_what_cannot_be_aligned_stays(levels):
+def test_what_cannot_be_aligned_stays(levels: float | None) -> None:
     """No texture, another scene, and a patch beyond the border."""
     a = smoothed(_image(np.eye(2), np.zeros(2)))
     other = np.random.default_rng(1).integers(0, 255, (_SIZE, _SIZE)).astype(np.uint8)
@@ -72,15 +74,15 @@ def test_what_cannot_be_aligned_stays(levels):
     np.testing.assert_array_equal(found, places)
 
 
-def test_a_track_stays_one_in_all_sets():
-    images = {
+def test_a_track_stays_one_in_all_sets() -> None:
+    images: dict[View, NDArray[np.uint8]] = {
         (side, frame): _image(np.eye(2), np.array([-1.5 * (side == "right") + 0.7 * frame, 0.4 * frame]))
-        for side in ("left", "right")
+        for side in SIDES
         for frame in (0, 1)
     }
     place = np.array([[40.2, 44.9], [55.1, 51.3], [61.0, 30.5]])
     ends = [[*place, -1.5 * right + 0.7 * frame, 0.4 * frame] for frame in (0, 1) for right in (0, 1)]
-    tracks = np.concatenate([ends[0], *(end + 0.2 for end in ends[1:])], axis=1)
+    tracks = np.concatenate([ends[0], *(np.add(end, 0.2) for end in ends[1:])], axis=1)
     matches = Correspondences(
         left=tracks[:, [0, 1, 4, 5]],
         right=tracks[:, [2, 3, 6, 7]],

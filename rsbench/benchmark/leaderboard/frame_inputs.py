@@ -84,7 +84,7 @@ def read_frames(inputs: Path, problem: Problem) -> Images:
 
 
 def _problem(sequence: Sequence, matches: Correspondences) -> Problem:
-    return Problem(name=sequence.name, correspondences=matches, rig=sequence.rig, shutter=sequence.shutter)
+    return Problem(name=sequence.name, correspondences=matches, rig=sequence.rig, known_shutter=sequence.shutter)
 
 
 def _matches(sequence: Sequence, options: CorrectionOptions) -> Correspondences:

@@ -103,7 +103,9 @@ def _rounded(content: Any) -> Any:
 
 
 def _identity(truth: Truth) -> dict[str, Any]:
-    problem = Problem(name=truth.name, correspondences=Correspondences(), rig=truth.rig, shutter=truth.shutter)
+    problem = Problem(
+        name=truth.name, correspondences=Correspondences(), rig=truth.rig, known_shutter=truth.shutter
+    )
     seen = {} if truth.pictures is None else {"files": truth.pictures.files}
     return {**problem_record(problem), "motion": _motion_identity(truth.motion), **seen}
 
@@ -157,7 +159,9 @@ def simulated_problem(seed: int, number: int) -> Problem:
         found = _simulated(setting, seed, number)
     except ValueError as error:
         raise RsbenchError(f"problem {_name(number)}: {error}; choose another seed") from error
-    return Problem(name=_name(number), correspondences=found.correspondences, rig=found.rig, shutter=found.shutter)
+    return Problem(
+        name=_name(number), correspondences=found.correspondences, rig=found.rig, known_shutter=found.shutter
+    )
 
 
 def exact_problem(seed: int, number: int) -> tuple[Problem, float]:
@@ -177,7 +181,7 @@ def exact_problem(seed: int, number: int) -> tuple[Problem, float]:
         name=_name(number),
         correspondences=Correspondences(tracks=right),
         rig=found.rig,
-        shutter=found.shutter,
+        known_shutter=found.shutter,
     )
     return problem, setting.noise_px
 

@@ -220,7 +220,7 @@ def test_our_solver_finds_the_ratio_that_it_is_not_told() -> None:
     entry = load_solver_entry("rs-stereo-refined")
     for truth in sorted(clear, key=lambda t: -float(t.facts["rotation_deg"]))[:2]:
         problem = simulated_problem(1, int(truth.name[1:]))
-        blind = replace(problem, shutter=problem.shutter.with_ratio(0.0))
+        blind = replace(problem, known_shutter=problem.shutter.with_ratio(0.0))
         with SolverRunner() as runner:
             answer = ReadoutTrack().answer(blind, entry, runner)
         assert abs(answer["readout_ratio"] - truth.shutter.readout_ratio) < 0.05
