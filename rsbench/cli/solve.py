@@ -30,8 +30,8 @@ EPILOG = """[bold]Examples[/bold]
 
 A problem holds [bold]camera[/bold] (width, height, fx, fy, cx, cy), [bold]baseline[/bold] (m),
 [bold]readout_ratio[/bold] (absent: it is found) and matches in pixels: [bold]left[/bold], [bold]right[/bold]
-(x0, y0, x1, y1), [bold]stereo_0[/bold], [bold]stereo_1[/bold] (xl, yl, xr, yr), [bold]tracks[/bold] (xl0, yl0, xr0,
-yr0, xl1, yl1, xr1, yr1); absent sets are empty. The centre of the top-left pixel is (0, 0).
+(x0, y0, x1, y1), [bold]stereo_0[/bold], [bold]stereo_1[/bold] (xl, yl, xr, yr), [bold]tracks[/bold] (xl0, yl0,
+xr0, yr0, xl1, yl1, xr1, yr1); absent sets are empty. The centre of the top-left pixel is (0, 0).
 
 Exit codes: 0 all solved, 1 one without a motion, 2 one that is wrong; the others are solved all the same.
 More: [bold]rsbench docs problem-format[/bold]"""
