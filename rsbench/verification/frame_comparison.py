@@ -16,6 +16,15 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import FAR, ImageView, Seen, points_of, seen_by, seen_from
+from rsbench.verification.compiled_reprojection import (
+    ROUNDING_PX,
+    Carried,
+    Surface,
+    carry,
+    optics_of_camera,
+    poses_of_source,
+    table_of_target,
+)
 
 DEPTH_TOLERANCE = 1e-4
 """Relative difference of two depths of one surface point that still agree."""
@@ -96,6 +105,13 @@ class DepthMap:
         with np.errstate(invalid="ignore"):
             return np.asarray(bend <= FLATNESS * self.inverse[1:-2, 1:-2])
 
+    @property
+    def surface(self) -> Surface:
+        """What ``carry`` looks at."""
+        bending = None if self.camera.lens is None else _bending(self.camera)
+        lens = (None, None) if bending is None else (self.slope, bending.ideal)
+        return Surface(self.inverse, self.flat_blocks, self.empty_blocks, *lens)
+
     @cached_property
     def empty_blocks(self) -> BoolArray:
         """(H-3, W-3) whether pixels [y, x] to [y + 3, x + 3] see no surface at all."""
@@ -145,19 +161,34 @@ class Reprojection(NamedTuple):
 
 def reproject(sequence: Sequence, source: DepthMap, target: DepthMap, stride: int = 1) -> Reprojection:
     """Carry every ``stride``-th pixel of the source, in both directions, into the target."""
+    depth = np.ascontiguousarray(source.depth[::stride, ::stride])
+    found = Reprojection(np.full((*depth.shape, 2), np.nan, np.float32), np.full(depth.shape, np.nan, np.float32))
+    labels = np.zeros(0) if source.labels is None else numbers_of(source.labels[::stride, ::stride])
+    for number in sorted({0, *np.unique(labels).tolist()}):
+        own, chosen = seen_from(sequence, int(number)), labels == number if labels.size else None
+        table = table_of_target(own, target.view)
+        if table is None:
+            _reproject_exactly(sequence, source, target, found, stride)
+            break
+        carried = Carried(depth, stride, FAR, chosen, *found)
+        carry(carried, poses_of_source(own, source.view), table, optics_of_camera(own), target.surface)
+    return found
+
+
+def _reproject_exactly(
+    sequence: Sequence, source: DepthMap, target: DepthMap, found: Reprojection, stride: int
+) -> None:
+    """The same with the pose at each pixel's own time."""
     grid = sequence.rig.camera.pixel_grid()[::stride, ::stride]
     depth = source.depth[::stride, ::stride].astype(np.float64)
-    pixels = np.full(grid.shape, np.nan, dtype=np.float32)
-    relative = np.full(depth.shape, np.nan, dtype=np.float32)
     step = max(1, _CHUNK_PIXELS // grid.shape[1])
     for first in range(0, len(grid), step):
         rows = slice(first, first + step)
         sky = depth[rows] == 0
         numbers = None if source.labels is None else numbers_of(source.labels[::stride, ::stride][rows])
         seen = seen_with(sequence, source.view, target.view, grid[rows], np.where(sky, FAR, depth[rows]), numbers)
-        pixels[rows] = seen.pixels
-        relative[rows] = relative_depth(target, seen.pixels, seen.depth, sky)
-    return Reprojection(pixels, relative)
+        found.pixels[rows] = seen.pixels
+        found.relative[rows] = relative_depth(target, seen.pixels, seen.depth, sky)
 
 
 def seen_with(
@@ -217,7 +248,7 @@ def relative_depth(target: DepthMap, pixels: FloatArray, z: FloatArray, sky: Boo
     """See ``Reprojection.relative``; of points (...) with depth ``z`` at ``pixels`` (..., 2) of the target."""
     height, width = target.depth.shape
     relative = np.full(z.shape, np.nan)
-    corner = np.floor(np.where(np.isfinite(pixels), pixels, -1.0)).astype(np.int64)
+    corner = np.floor(np.where(np.isfinite(pixels), pixels + ROUNDING_PX, -1.0)).astype(np.int64)
     x0, y0 = corner[..., 0], corner[..., 1]
     inner = (x0 >= 1) & (x0 < width - 2) & (y0 >= 1) & (y0 < height - 2)
     block = y0[inner] - 1, x0[inner] - 1

@@ -59,7 +59,7 @@ class EvaluationOptions:
     """How often each solver's robust loop is run, with other samples; the correction uses the first motion."""
     seed: int = 0
     rehash: bool = False
-    """Read all files of the dataset again, also those that have the size and times that they had, and score again."""
+    """Read all files of the dataset again, also those of the size and times that they had, and score again."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
