@@ -11,8 +11,6 @@ there is no table.
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import NamedTuple
 
@@ -25,6 +23,7 @@ from rsbench.core.geometry import MovingRig
 from rsbench.core.projection import ROW_TOLERANCE_PX
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.views import ImageView
+from rsbench.verification.row_bands import by_bands
 from rsbench.vision.compiled_camera import Table, across_lines, line_of, look, optics_of, see
 
 _ROTATION, _SHIFT = 1e-10, 1e-10
@@ -135,8 +134,8 @@ def _table(geometry: MovingRig, view: ImageView, parts: int) -> PoseTable:
     w_rate, speed = geometry.motion.velocity(tau)
     by_entry = shutter.rate(side)[shutter.axis(side)] / parts
     rates = so3.hat(w_rate) @ R * by_entry, np.asarray(speed) * by_entry
-    whole = (np.ascontiguousarray(each) for each in (R, t, *rates))
-    return PoseTable(*whole, -1.0, float(parts), shutter.axis(side) == 0)
+    R, t, R_rate, t_rate = (np.ascontiguousarray(each) for each in (R, t, *rates))
+    return PoseTable(R, t, R_rate, t_rate, -1.0, float(parts), shutter.axis(side) == 0)
 
 
 def _errors(geometry: MovingRig, view: ImageView, table: PoseTable) -> float:
@@ -153,13 +152,8 @@ def _errors(geometry: MovingRig, view: ImageView, table: PoseTable) -> float:
 
 
 def carry(carried: Carried, source: LinePoses, target: PoseTable, optics: Optics, surface: Surface) -> None:
-    """Fill in ``carried``, by as many threads as there are cores."""
-    height = len(carried.depth)
-    bands = max(1, min(4 * (os.cpu_count() or 1), height // 16))
-    ends = [height * k // bands for k in range(bands + 1)]
-    work = partial(_carry_rows, carried, source, target, optics, surface)
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        list(pool.map(work, ends[:-1], ends[1:]))
+    """Fill in ``carried``."""
+    by_bands(partial(_carry_rows, carried, source, target, optics, surface), len(carried.depth))
 
 
 def optics_of_camera(geometry: MovingRig) -> Optics:
