@@ -104,7 +104,7 @@ def _is_wide(pixels: F32, y: int, x: int, stride: int, least: float) -> bool:
 
 
 @compiled(error_model="numpy")
-def _mark_hole(u: float, v: float, holes: Bits, depth: F32, bit: int, centred: float) -> None:
+def _mark_hole(u: float, v: float, holes: Bits, depth: F32, bit: np.uint8, centred: float) -> None:
     """A pixel of the target without a surface although the middle of a flat one lies there."""
     if not np.isfinite(u):
         return
