@@ -91,13 +91,8 @@ def test_everything_makes_each_folder_of_results_once(
     monkeypatch.setattr(command, "_reproduce", lambda target, *rest: made.append(target.value))
     reproduce(Target.everything, tmp_path / "out", tmp_path / "data")
     folders = {folder.name for folder in (Path(__file__).parents[2] / "results").iterdir() if folder.is_dir()}
-    apart = {
-        "gyro",
-        "r6p",
-        "solvers",
-        "speed",
-        "tuning",
-    }  # made by programs in benchmarks/, which their provenance names
+    # Made by programs in benchmarks/, which their provenance names.
+    apart = {"gyro", "r6p", "solvers", "speed", "tuning"}
     # Claims make Figure 3 too, boards write beside leaderboard.
     assert {*made, "fig3"} == folders - apart | {"image-claims", "boards"}
     # Judged from what the others have stored.
