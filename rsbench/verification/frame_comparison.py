@@ -62,8 +62,7 @@ class DepthMap:
         by_pixel = np.stack([np.gradient(self.inverse, axis=axis) for axis in (1, 0)], axis=-1)
         return np.asarray(np.einsum("hwij,hwi->hwj", _bending(self.camera).by_ideal, by_pixel))
 
-    @cached_property
-    def bends(self) -> tuple[FloatArray, ...]:
+    def _bends(self) -> tuple[FloatArray, ...]:
         """Second differences of inverse depth: across (H, W-2), down (H-2, W), twist (H-1, W-1).
 
         Without what a lens adds: it bends the pixels of a plane.
@@ -81,29 +80,29 @@ class DepthMap:
     def flat(self) -> BoolArray:
         """(H, W) pixels whose 3 x 3 neighbourhood is one flat surface, too wide to slip between pixels."""
         flat = np.zeros(self.depth.shape, dtype=np.bool_)
-        flat[1:-1, 1:-1] = self._bend <= FLATNESS
+        flat[1:-1, 1:-1] = self._evenness[0] <= FLATNESS
         return flat
 
     @cached_property
-    def _bend(self) -> FloatArray:
-        """(H-2, W-2) relative second difference of inverse depth in 3 x 3 pixels, infinite beside no surface."""
-        across, down, _ = self.bends
+    def _evenness(self) -> tuple[FloatArray, BoolArray]:
+        """Relative second difference of inverse depth (H-2, W-2) in 3 x 3 pixels, infinite beside no surface, and
+        ``flat_blocks``: of one pass, as the differences take more memory than all else that is kept of a map."""
+        across, down, twist = self._bends()
         with np.errstate(invalid="ignore"):
             bend = np.maximum(_window_max(across, 3, 1), _window_max(down, 1, 3)) / self.inverse[1:-1, 1:-1]
-        return np.nan_to_num(bend, nan=np.inf)
+            widest = [_window_max(across, 4, 2), _window_max(down, 2, 4), _window_max(twist, 3, 3)]
+            blocks = np.maximum.reduce(widest) <= FLATNESS * self.inverse[1:-2, 1:-2]
+        return np.nan_to_num(bend, nan=np.inf), np.asarray(blocks)
 
     def share_of_edges(self, jump: float) -> float:
         """Share of the pixels with a surface around which inverse depth bends by more than ``jump`` of itself."""
         solid = self.depth[1:-1, 1:-1] > 0
-        return float(np.mean(self._bend[solid] > jump)) if np.any(solid) else 0.0
+        return float(np.mean(self._evenness[0][solid] > jump)) if np.any(solid) else 0.0
 
-    @cached_property
+    @property
     def flat_blocks(self) -> BoolArray:
         """(H-3, W-3) whether pixels [y, x] to [y + 3, x + 3] are one flat surface."""
-        across, down, twist = self.bends
-        bend = np.maximum.reduce([_window_max(across, 4, 2), _window_max(down, 2, 4), _window_max(twist, 3, 3)])
-        with np.errstate(invalid="ignore"):
-            return np.asarray(bend <= FLATNESS * self.inverse[1:-2, 1:-2])
+        return self._evenness[1]
 
     @property
     def surface(self) -> Surface:
@@ -126,7 +125,7 @@ class _Bending(NamedTuple):
     by_ideal: FloatArray
     """(H, W, 2, 2) [pixel, ideal]: turns central differences over pixels into a derivative by the ideal pixel."""
     differences: tuple[FloatArray, ...]
-    """Second differences of ``ideal``, as ``DepthMap.bends``."""
+    """Second differences of ``ideal``, as ``DepthMap._bends``."""
 
 
 @lru_cache(maxsize=2)
@@ -138,7 +137,7 @@ def _bending(camera: PinholeCamera) -> _Bending:
 
 
 def _second_differences(values: FloatArray) -> tuple[FloatArray, ...]:
-    """Of (H, W, ...) across, down and twist, as ``DepthMap.bends``."""
+    """Of (H, W, ...) across, down and twist, as ``DepthMap._bends``."""
     return np.diff(values, 2, axis=1), np.diff(values, 2, axis=0), np.diff(np.diff(values, axis=0), axis=1)
 
 

@@ -199,11 +199,9 @@ class Scorer:
         rig, truth = self.sequence.rig, self.sequence.depth("rs", side, frame)
         other: Side = "right" if side == "left" else "left"
         seen = seen_by_other(truth, self.sequence.depth("rs", other, frame), rig, side)
+        depth = None if disparity is None else depth_of(disparity, self.sequence, *view, timed=record["timed"])
         for name, part in (("all", np.ones_like(seen)), ("visible", seen), ("occluded", ~seen)):
-            case = None
-            if disparity is not None:
-                depth = depth_of(disparity, self.sequence, *view, timed=record["timed"])
-                case = DepthCase(depth=depth, truth=truth, pixels=part, rig=rig)
+            case = None if depth is None else DepthCase(depth=depth, truth=truth, pixels=part, rig=rig)
             keys: Row = {"matcher": record["matcher"], "side": side, "frame": frame, "pixels": name}
             keys["success"] = case is not None
             yield keys | self._metrics(case, DepthCase)
