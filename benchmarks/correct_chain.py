@@ -20,6 +20,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from rsbench.core.rig import VIEWS
@@ -29,7 +30,9 @@ from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import match_frames
 from rsbench.pipeline.frame_motion import solve_frames
 
-BOUND_S = 3.0
+BOUND = 10.0
+"""Times what OpenCV alone needs for features and disparities, in processor seconds: it was 5.4 to 6.7 on a busy
+machine on 2026-11-25. Until then the bound was 3 s of the clock, which another program on the machine decides."""
 STEPS = ("match", "solve", "depth", "correct")
 
 
@@ -53,6 +56,20 @@ def run(sequence: Sequence, options: CorrectionOptions) -> dict[str, tuple[float
     return times
 
 
+def opencv_alone(sequence: Sequence) -> Callable[[], None]:
+    """SIFT of the four frames and SGBM of the two pairs: what no chain of this kind does without."""
+    grey = {view: cv2.cvtColor(sequence.image("rs", *view), cv2.COLOR_RGB2GRAY) for view in VIEWS}
+    sift, matcher = cv2.SIFT_create(4000), cv2.StereoSGBM_create(0, 128, 5, P1=200, P2=800)
+
+    def work() -> None:
+        for image in grey.values():
+            sift.detectAndCompute(image, None)
+        for frame in (0, 1):
+            matcher.compute(grey["left", frame], grey["right", frame])
+
+    return work
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path("data/paper"), help="dataset; rendered when missing")
@@ -67,16 +84,22 @@ def main() -> None:
     sequence = next(one for one in read_dataset(arguments.data) if one.name == arguments.sequence)
     options = CorrectionOptions()
     run(sequence, options)  # compiles and warms up
-    runs = [run(sequence, options) for _ in range(arguments.runs)]
-    report(sequence, runs)
+    anchor, runs, anchors = opencv_alone(sequence), list[dict[str, tuple[float, float]]](), list[float]()
+    anchor()
+    for _ in range(arguments.runs):
+        runs.append(run(sequence, options))
+        begin = time.process_time()
+        anchor()
+        anchors.append(time.process_time() - begin)
+    report(sequence, runs, anchors)
     if arguments.profile:
         profile = cProfile.Profile()
         profile.runcall(run, sequence, options)
         pstats.Stats(profile, stream=sys.stdout).sort_stats("tottime").print_stats(15)
 
 
-def report(sequence: Sequence, runs: list[dict[str, tuple[float, float]]]) -> None:
-    """One line per step and the sum, and whether that is below the bound."""
+def report(sequence: Sequence, runs: list[dict[str, tuple[float, float]]], anchors: list[float]) -> None:
+    """One line per step and the sum, and whether its processor seconds over those of OpenCV keep the bound."""
     camera = sequence.rig.camera
     write = sys.stdout.write
     write(f"{camera.width} x {camera.height} px, 4 frames, {os.cpu_count()} cores, {len(runs)} runs\n")
@@ -87,7 +110,10 @@ def report(sequence: Sequence, runs: list[dict[str, tuple[float, float]]]) -> No
     totals = np.array([np.sum([times[step] for step in STEPS], axis=0) for times in runs])
     wall, cpu = totals.T
     write(f"{'all':10}{wall.min():15.2f}{np.median(wall):17.2f}{np.median(cpu):15.2f}\n")
-    write(f"bound: {BOUND_S:g} s: {'holds' if wall.min() < BOUND_S else 'FAILS'}\n")
+    ratios = cpu / np.array(anchors)
+    held = "holds" if np.median(ratios) < BOUND else "FAILS"
+    write(f"{np.median(ratios):.1f} [{ratios.min():.1f}, {ratios.max():.1f}] times OpenCV alone ")
+    write(f"(limit {BOUND:g}: {held})\n")
 
 
 if __name__ == "__main__":

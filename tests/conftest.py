@@ -39,6 +39,24 @@ LARGE_SCENES = (
 So each scene is built once, and those of child processes do not lie beside its own.
 """
 
+LONG = (
+    "test_lens_sequences.py",
+    "test_run_sweep.py",
+    "test_evaluation_entries.py",
+    "test_generation.py",
+    "test_correct_command.py",
+    "test_channels.py",
+    "test_interrupted.py",
+    "test_scoring_workers.py",
+    "test_sequence_jobs.py",
+    "test_board.py",
+    "test_bound.py",
+    "test_reproduce_simulated.py",
+    "test_command_line.py",
+)
+"""Files that take 20 s of a processor and more, the longest first: a process that gets one at the end works on
+alone."""
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What takes long comes first, so that no process works alone at the end."""
@@ -46,7 +64,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     def place(item: pytest.Item) -> int:
         if item.path.name in LARGE_SCENES:
             return LARGE_SCENES.index(item.path.name)
-        return len(LARGE_SCENES) + (item.get_closest_marker("slow") is None)
+        if item.path.name in LONG:
+            return len(LARGE_SCENES) + 1 + LONG.index(item.path.name)
+        return len(LARGE_SCENES) + (0 if item.get_closest_marker("slow") else 1 + len(LONG))
 
     items.sort(key=place)
 

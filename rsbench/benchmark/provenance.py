@@ -30,7 +30,7 @@ def provenance(command: str, **inputs: Any) -> dict[str, Any]:
         "commit": commit(),
         "source": own_source_version(),
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in _PACKAGES},
+        "packages": {name: package_version(name) for name in _PACKAGES},
         "machine": {
             "system": platform.system(),
             "architecture": platform.machine(),
@@ -43,7 +43,7 @@ def provenance(command: str, **inputs: Any) -> dict[str, Any]:
 
 def numeric_version() -> dict[str, str]:
     """What decides predictions beside the components and the data: our own source and the packages below it."""
-    return {"source": own_source_version(), **{name: _version(name) for name in _NUMERIC}}
+    return {"source": own_source_version(), **{name: package_version(name) for name in _NUMERIC}}
 
 
 def commit() -> str:
@@ -75,7 +75,7 @@ def processor() -> str:
 
 
 @cache
-def _version(name: str) -> str:
+def package_version(name: str) -> str:
     try:
         return version(name)
     except ModuleNotFoundError:  # PackageNotFoundError: an optional package of this platform

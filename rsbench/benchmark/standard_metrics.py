@@ -21,8 +21,11 @@ from rsbench.benchmark.metric_plugins import (
 from rsbench.benchmark.scoring import WORST_POSE, pose_errors
 from rsbench.core.errors import RsbenchError
 from rsbench.vision.published_quality import flip
-from rsbench.vision.quality import psnr, ssim
+from rsbench.vision.quality import LastSsim, psnr
 from rsbench.vision.stereo_depth import depth_metrics
+
+_SSIM = LastSsim()
+"""One picture is scored in several sets of its pixels."""
 
 
 @final
@@ -93,7 +96,7 @@ class Ssim(ImageMetric):
     columns = (Column(name="ssim", better="higher", worst=-1.0, title="SSIM"),)
 
     def compute(self, case: ImageCase) -> Mapping[str, float]:
-        return {"ssim": ssim(case.image, case.truth, case.pixels)}
+        return {"ssim": _SSIM.within(case.image, case.truth, case.pixels)}
 
 
 @final

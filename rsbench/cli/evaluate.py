@@ -84,7 +84,9 @@ def evaluate(
     force: Annotated[bool, typer.Option("--force", help="Predict again what is there already.")] = False,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each solver, with other RANSAC samples.")] = 1,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
-    rehash: Annotated[bool, typer.Option("--rehash", help="Read all data again, not only what changed.")] = False,
+    rehash: Annotated[
+        bool, typer.Option("--rehash", help="Read all data and score it again, not only what changed.")
+    ] = False,
     workers: _Workers = None,
     scheduler: Scheduler = None,
     layout: Annotated[

@@ -10,30 +10,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
-from numpy.typing import NDArray
 
 from rsbench.benchmark.images.evaluation import read_headings, read_scores
-from rsbench.benchmark.images.predict import depth_of, load_disparities
-from rsbench.benchmark.images.store import read_record
 from rsbench.benchmark.statistics import median_and_quartiles
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import View
-from rsbench.dataset.corrected_frames import read_origin
 from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.report import pictures
-from rsbench.report.pictures import Image
-from rsbench.storage.files import load_arrays, load_matches, read_json, read_png, write_bytes
+from rsbench.report.sequence_pictures import write_pictures
+from rsbench.storage.file_hashes import HASHES, FileHashes
+from rsbench.storage.files import read_json, read_png, write_bytes
 from rsbench.storage.work_folder import files_below, listed, named
-from rsbench.vision.fusion import Origin
 
-_LONGEST = 640
-"""Pixels of a picture in the page; enough to see a shift of two pixels at 900."""
 _OVERVIEW = 360
 """Pixels of a picture in the overview."""
-_SHOWN: View = ("left", 1)
-"""The frame that is drawn."""
-_DEPTH_ERROR_M = 2.0
-"""End of the scale of depth errors: the paper's limit of a good depth."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,14 +146,11 @@ def write_report(dataset: Path, out: Path) -> Path:
         date = str(record["date"])
     except (KeyError, TypeError, ValueError) as error:
         raise RsbenchError(f"{out / 'provenance.json'}: is not that of an evaluation; evaluate again") from error
-    sections = []
+    sections: list[dict[str, Any]] = []
+    hashes = FileHashes(dataset, out / HASHES)
     for sequence in read_pairs(dataset):
-        drawn = draw_sequence(sequence, out / "predictions" / sequence.name, chosen)
-        folder = out / "pictures" / sequence.name
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, (image, _) in drawn.items():
-            write_bytes(folder / f"{name}.jpg", pictures.encode_jpeg(pictures.shrink(image, _LONGEST)))
-        sections.append(_section(sequence, folder, drawn))
+        captions = write_pictures(sequence, out, chosen, hashes.sha256)
+        sections.append(_section(sequence, out / "pictures" / sequence.name, captions))
     environment = Environment(
         loader=PackageLoader("rsbench.report"),
         autoescape=select_autoescape(["html", "j2"]),
@@ -256,9 +242,6 @@ def markdown_table(frame: pd.DataFrame) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in [head, ["---"] * len(head), *rows])
 
 
-Drawn = dict[str, tuple[Image, str]]
-
-
 def correction_of(record: dict[str, Any]) -> dict[str, str]:
     """Names of the corrector, solver and matcher that an evaluation's pictures show, from its provenance."""
     chosen = {name: str(record["inputs"]["correction"][name]) for name in ("corrector", "solver", "matcher")}
@@ -267,81 +250,7 @@ def correction_of(record: dict[str, Any]) -> dict[str, str]:
     return chosen
 
 
-def draw_sequence(sequence: Sequence, folder: Path, chosen: dict[str, str]) -> Drawn:
-    """Pictures of the left camera's frame 1, as far as there are predictions: name to image and caption."""
-    rolling, truth = sequence.image("rs", *_SHOWN), sequence.image("gs", *_SHOWN)
-    drawn: Drawn = {
-        "rolling": (rolling, "Rolling-shutter frame (left, frame 1); hover: global-shutter truth"),
-        "global": (truth, "Global-shutter truth at row 0's pose"),
-        "rolling-over-global": (
-            pictures.overlay(rolling, truth),
-            "Rolling-shutter frame (red) over the truth (cyan): colours show the distortion",
-        ),
-    }
-    return (
-        drawn
-        | _draw_corrected(folder, chosen, truth)
-        | _draw_motion(sequence, folder, chosen)
-        | _draw_depth(sequence, folder, chosen["matcher"])
-    )
-
-
-def _draw_corrected(folder: Path, chosen: dict[str, str], truth: Image) -> Drawn:
-    stem = folder / "corrected" / ("+".join(chosen.values()) + f"-{_SHOWN[0]}_{_SHOWN[1]}")
-    if not stem.with_name(f"{stem.name}.png").is_file():
-        return {}
-    size = truth.shape[1], truth.shape[0]
-    corrected = read_png(stem.with_name(f"{stem.name}.png"), size)
-    mask = read_origin(stem.with_name(f"{stem.name}-origin.png"), size) != Origin.NOBODY
-    return {
-        "corrected": (
-            pictures.masked(corrected, mask),
-            "Corrected frame (dark: seen by nobody); hover: global-shutter truth",
-        ),
-        "corrected-over-global": (
-            pictures.overlay(corrected, truth, mask),
-            "Corrected frame (red) over the truth (cyan)",
-        ),
-    }
-
-
-def _draw_motion(sequence: Sequence, folder: Path, chosen: dict[str, str]) -> Drawn:
-    if not (folder / "matches.npz").is_file():
-        return {}
-    matches = load_matches(folder / "matches.npz").left
-    stored = folder / "motion" / f"{chosen['solver']}-inliers.npz"
-    inliers = load_arrays(stored).get("left") if stored.is_file() else None
-    keep = np.ones(len(matches), dtype=np.bool_)
-    if inliers is not None and inliers.shape == keep.shape and inliers.dtype == keep.dtype:
-        keep = inliers
-    image = pictures.draw_matches(sequence.image("rs", "left", 0), matches, keep)
-    return {"matches": (image, "Left matches over time; orange: rejected")}
-
-
-def _draw_depth(sequence: Sequence, folder: Path, matcher: str) -> Drawn:
-    truth = sequence.depth("rs", *_SHOWN)
-    surface = truth > 0
-    low, high = np.percentile(1.0 / truth[surface], [1, 99]) if np.any(surface) else (0.0, 1.0)
-
-    def inverse(depth: NDArray[np.float32]) -> Image:
-        return pictures.colour_map(np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), np.nan), low, high)
-
-    drawn: Drawn = {"depth-truth": (inverse(truth), "True depth of the rolling-shutter frame")}
-    stored = folder / "depth" / f"{matcher}.npz"
-    if stored.is_file():
-        found = load_disparities(stored, sequence.rig)
-        timed = bool((read_record(stored.with_suffix(".json")) or {}).get("timed"))
-        depth = depth_of(found[f"{_SHOWN[0]}_{_SHOWN[1]}"], sequence, *_SHOWN, timed=timed)
-        error = np.where(surface & (depth > 0), np.abs(depth - truth), np.nan)
-        drawn["depth"] = (inverse(depth), f"Depth by {matcher} (dark: invalid)")
-        drawn["depth-error"] = (
-            pictures.colour_map(error, 0.0, _DEPTH_ERROR_M, "inferno"),
-            f"Depth error, 0 to {_DEPTH_ERROR_M:g} m (dark grey: no depth)",
-        )
-    return drawn
-
-
-def _section(sequence: Sequence, folder: Path, drawn: Drawn) -> dict[str, Any]:
+def _section(sequence: Sequence, folder: Path, captions: dict[str, str]) -> dict[str, Any]:
     angle, length = np.rad2deg(np.linalg.norm(sequence.motion.w)), np.linalg.norm(sequence.motion.d)
     camera = sequence.rig.camera
     hover = {"rolling": "global", "corrected": "global"}
@@ -351,7 +260,7 @@ def _section(sequence: Sequence, folder: Path, drawn: Drawn) -> dict[str, Any]:
             "other": pictures.data_uri(folder / f"{hover[name]}.jpg") if name in hover else None,
             "caption": caption,
         }
-        for name, (_, caption) in drawn.items()
+        for name, caption in captions.items()
         if name != "global"
     ]
     text = (

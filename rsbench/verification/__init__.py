@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from rsbench.verification import manifest_checks
 from rsbench.verification.findings import DepthAgreement, Finding, Progress, SequenceReport
 from rsbench.verification.rerender import Rerender, Rerenderer
 from rsbench.verification.state import State
+from rsbench.verification.verifying_jobs import reports_apart
 from rsbench.verification.walk import STEPS, check_sequence, run_stage
 
 __all__ = [
@@ -35,6 +36,7 @@ def verify_dataset(
     *,
     rerender: Rerender = "no",
     scenes: Collection[Path] = (),
+    workers: int = 1,
 ) -> list[SequenceReport]:
     """Check every sequence of a dataset; faults are values, only an unreadable dataset raises.
 
@@ -44,24 +46,49 @@ def verify_dataset(
         progress: see ``Progress``; there are ``verification_steps`` in all.
         rerender: rows to render again where the scene can be built here.
         scenes: cards of scenes that are not rsbench's own, and mesh files of objects that move.
+        workers: processes that check a sequence each; 1 is this one, with all its threads.
 
     Returns:
         One report per sequence; before them one named dataset.json where that has faults of its own.
 
     Raises:
-        ValueError: ``stride`` or ``rerender`` is none of the allowed.
+        ValueError: ``stride``, ``rerender`` or ``workers`` is none of the allowed.
+        LostJobsError: the process of a sequence ended each time it was tried.
         RsbenchError: no dataset.json, or one that is not a JSON object; no card of a scene where one was named.
     """
     arguments.check_whole("stride", stride, 1)
     arguments.check_one_of("rerender", rerender, ("no", "auto", "all"))
+    arguments.check_whole("workers", workers, 1)
     manifest = read_json(folder / manifest_checks.DATASET)
     step = progress or (lambda name: None)
     listing = manifest_checks.Listing.of(folder, manifest)
     state = State(listing, manifest_checks.DATASET)
     run_stage(state, "dataset")
     reports = [SequenceReport(name=state.name, findings=tuple(state.findings))] if state.findings else []
-    again = None if rerender == "no" else Rerenderer(rerender, *_cards_and_files(scenes))
-    return reports + [verify_sequence(listing, name, stride, step, again) for name in listing.names]
+    given = stride, rerender, *_cards_and_files(scenes)
+    if workers == 1 or len(listing.names) < 2:
+        check = _checker(folder, *given, step)
+        return reports + [check(name) for name in listing.names]
+    found = {}
+    for report in reports_apart(_checker, list(listing.names), workers, rerender != "no", folder, *given):
+        found[report.name] = report
+        for _ in range(_steps(listing)):
+            step(report.name)
+    return reports + [found[name] for name in listing.names]
+
+
+def _checker(
+    folder: Path,
+    stride: int,
+    rerender: Rerender,
+    cards: Sequence[Path],
+    files: Sequence[Path],
+    step: Progress = lambda name: None,
+) -> Callable[[str], SequenceReport]:
+    """What checks a sequence of a dataset by its name, one after the other."""
+    listing = manifest_checks.Listing.of(folder, read_json(folder / manifest_checks.DATASET))
+    again = None if rerender == "no" else Rerenderer(rerender, cards, files)
+    return lambda name: verify_sequence(listing, name, stride, step, again)
 
 
 def _cards_and_files(named: Collection[Path]) -> tuple[list[Path], list[Path]]:

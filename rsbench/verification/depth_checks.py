@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -11,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.dataset.views import ImageView
+from rsbench.verification.compiled_comparison import Evidence, Limits, weigh_rows
 from rsbench.verification.findings import DepthAgreement, Finding
 from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Reprojection
+from rsbench.verification.row_bands import by_bands
 
 Bits = NDArray[np.uint8]
 
@@ -93,23 +96,25 @@ class MapFault:
 
 
 def compare(source: DepthEvidence, target: DepthEvidence, reprojection: Reprojection) -> DepthAgreement:
-    """Add what one pair shows to the evidence of both, and count how the flat surfaces of both agree."""
-    relative, stride = reprojection.relative, source.stride
-    wide = _wide(reprojection.pixels, stride)
-    flat = source.map.flat[::stride, ::stride] & source.surface & wide
-    with np.errstate(invalid="ignore"):
-        size = np.abs(relative)
-        agrees = size <= DEPTH_TOLERANCE
-        bit = source.bit(target.map.view)
-        source.confirmed |= np.where(agrees, bit, np.uint8(0))
-        # What is not flat may slip between the pixels of a partner that sees nothing there.
-        through = (relative < NEAR_MISS) & ~agrees & (flat | (np.isfinite(relative) & wide))
-        source.contradicted |= np.where(through, bit, np.uint8(0))
-        source.near |= through & (size < NEAR_MISS)
-        source.hidden |= np.where(relative >= NEAR_MISS, bit, np.uint8(0))
-        near = size[flat & (relative < NEAR_MISS)]
-    source.difference = np.fmin(source.difference, size)
-    _mark_holes(target, reprojection.pixels[flat], target.bit(source.map.view))
+    """Add what one pair shows to the evidence of both, and count how the flat surfaces of both agree.
+
+    What one source pixel spans must be half a pixel wide in the target in every direction: a surface seen at a
+    grazing angle there may slip between two pixels, however flat and large the source sees it. What is not flat
+    may slip between the pixels of a partner that sees nothing there.
+    """
+    apart = np.zeros(reprojection.relative.shape, dtype=np.float32)
+    work = partial(
+        weigh_rows,
+        (reprojection.pixels, reprojection.relative),
+        (source.map.flat, source.map.depth, source.stride),
+        Evidence(source.confirmed, source.contradicted, source.near, source.hidden, source.difference),
+        (target.holes, target.map.depth),
+        (int(source.bit(target.map.view)), int(target.bit(source.map.view))),
+        Limits(DEPTH_TOLERANCE, NEAR_MISS, _LEAST_WIDTH, _CENTRED),
+        apart,
+    )
+    by_bands(work, len(apart))
+    near = apart[apart >= 0.0]
     near_and_seen = near[np.isfinite(near)]
     return DepthAgreement(
         source=source.map.view.depth,
@@ -119,29 +124,6 @@ def compare(source: DepthEvidence, target: DepthEvidence, reprojection: Reprojec
         typical=float(np.median(near_and_seen)) if near_and_seen.size else float("nan"),
         p99=float(np.percentile(near_and_seen, 99)) if near_and_seen.size else float("nan"),
     )
-
-
-def _wide(pixels: NDArray[np.float32], stride: int) -> BoolArray:
-    """(h, w) whether what one source pixel spans is at least half a pixel wide in the target, in every direction.
-
-    A surface seen at a grazing angle there may slip between two pixels, however flat and large the source sees it.
-    """
-    across, down = np.gradient(pixels / stride, axis=1), np.gradient(pixels / stride, axis=0)
-    area = np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])
-    longest = np.sqrt(np.sum(across**2 + down**2, axis=-1))
-    with np.errstate(invalid="ignore"):
-        return np.asarray(area >= _LEAST_WIDTH * longest)
-
-
-def _mark_holes(target: DepthEvidence, pixels: NDArray[np.float32], bit: np.uint8) -> None:
-    """Pixels of the target without a surface although the middle of a flat one lies there."""
-    pixels = pixels[np.isfinite(pixels[:, 0])]
-    nearest = np.rint(pixels)
-    centred = nearest[np.max(np.abs(pixels - nearest), axis=1, initial=0.0) <= _CENTRED].astype(np.int64)
-    height, width = target.map.depth.shape
-    x, y = np.clip(centred[:, 0], 0, width - 1), np.clip(centred[:, 1], 0, height - 1)
-    missing = target.map.depth[y, x] == 0
-    target.holes[y[missing], x[missing]] |= bit
 
 
 def map_faults(

@@ -16,6 +16,15 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import FAR, ImageView, Seen, points_of, seen_by, seen_from
+from rsbench.verification.compiled_reprojection import (
+    ROUNDING_PX,
+    Carried,
+    Surface,
+    carry,
+    optics_of_camera,
+    poses_of_source,
+    table_of_target,
+)
 
 DEPTH_TOLERANCE = 1e-4
 """Relative difference of two depths of one surface point that still agree."""
@@ -53,8 +62,7 @@ class DepthMap:
         by_pixel = np.stack([np.gradient(self.inverse, axis=axis) for axis in (1, 0)], axis=-1)
         return np.asarray(np.einsum("hwij,hwi->hwj", _bending(self.camera).by_ideal, by_pixel))
 
-    @cached_property
-    def bends(self) -> tuple[FloatArray, ...]:
+    def _bends(self) -> tuple[FloatArray, ...]:
         """Second differences of inverse depth: across (H, W-2), down (H-2, W), twist (H-1, W-1).
 
         Without what a lens adds: it bends the pixels of a plane.
@@ -72,29 +80,36 @@ class DepthMap:
     def flat(self) -> BoolArray:
         """(H, W) pixels whose 3 x 3 neighbourhood is one flat surface, too wide to slip between pixels."""
         flat = np.zeros(self.depth.shape, dtype=np.bool_)
-        flat[1:-1, 1:-1] = self._bend <= FLATNESS
+        flat[1:-1, 1:-1] = self._evenness[0] <= FLATNESS
         return flat
 
     @cached_property
-    def _bend(self) -> FloatArray:
-        """(H-2, W-2) relative second difference of inverse depth in 3 x 3 pixels, infinite beside no surface."""
-        across, down, _ = self.bends
+    def _evenness(self) -> tuple[FloatArray, BoolArray]:
+        """Relative second difference of inverse depth (H-2, W-2) in 3 x 3 pixels, infinite beside no surface, and
+        ``flat_blocks``: of one pass, as the differences take more memory than all else that is kept of a map."""
+        across, down, twist = self._bends()
         with np.errstate(invalid="ignore"):
             bend = np.maximum(_window_max(across, 3, 1), _window_max(down, 1, 3)) / self.inverse[1:-1, 1:-1]
-        return np.nan_to_num(bend, nan=np.inf)
+            widest = [_window_max(across, 4, 2), _window_max(down, 2, 4), _window_max(twist, 3, 3)]
+            blocks = np.maximum.reduce(widest) <= FLATNESS * self.inverse[1:-2, 1:-2]
+        return np.nan_to_num(bend, nan=np.inf), np.asarray(blocks)
 
     def share_of_edges(self, jump: float) -> float:
         """Share of the pixels with a surface around which inverse depth bends by more than ``jump`` of itself."""
         solid = self.depth[1:-1, 1:-1] > 0
-        return float(np.mean(self._bend[solid] > jump)) if np.any(solid) else 0.0
+        return float(np.mean(self._evenness[0][solid] > jump)) if np.any(solid) else 0.0
 
-    @cached_property
+    @property
     def flat_blocks(self) -> BoolArray:
         """(H-3, W-3) whether pixels [y, x] to [y + 3, x + 3] are one flat surface."""
-        across, down, twist = self.bends
-        bend = np.maximum.reduce([_window_max(across, 4, 2), _window_max(down, 2, 4), _window_max(twist, 3, 3)])
-        with np.errstate(invalid="ignore"):
-            return np.asarray(bend <= FLATNESS * self.inverse[1:-2, 1:-2])
+        return self._evenness[1]
+
+    @property
+    def surface(self) -> Surface:
+        """What ``carry`` looks at."""
+        bending = None if self.camera.lens is None else _bending(self.camera)
+        lens = (None, None) if bending is None else (self.slope, bending.ideal)
+        return Surface(self.inverse, self.flat_blocks, self.empty_blocks, *lens)
 
     @cached_property
     def empty_blocks(self) -> BoolArray:
@@ -110,7 +125,7 @@ class _Bending(NamedTuple):
     by_ideal: FloatArray
     """(H, W, 2, 2) [pixel, ideal]: turns central differences over pixels into a derivative by the ideal pixel."""
     differences: tuple[FloatArray, ...]
-    """Second differences of ``ideal``, as ``DepthMap.bends``."""
+    """Second differences of ``ideal``, as ``DepthMap._bends``."""
 
 
 @lru_cache(maxsize=2)
@@ -122,7 +137,7 @@ def _bending(camera: PinholeCamera) -> _Bending:
 
 
 def _second_differences(values: FloatArray) -> tuple[FloatArray, ...]:
-    """Of (H, W, ...) across, down and twist, as ``DepthMap.bends``."""
+    """Of (H, W, ...) across, down and twist, as ``DepthMap._bends``."""
     return np.diff(values, 2, axis=1), np.diff(values, 2, axis=0), np.diff(np.diff(values, axis=0), axis=1)
 
 
@@ -145,19 +160,34 @@ class Reprojection(NamedTuple):
 
 def reproject(sequence: Sequence, source: DepthMap, target: DepthMap, stride: int = 1) -> Reprojection:
     """Carry every ``stride``-th pixel of the source, in both directions, into the target."""
+    depth = np.ascontiguousarray(source.depth[::stride, ::stride])
+    found = Reprojection(np.full((*depth.shape, 2), np.nan, np.float32), np.full(depth.shape, np.nan, np.float32))
+    labels = np.zeros(0) if source.labels is None else numbers_of(source.labels[::stride, ::stride])
+    for number in sorted({0, *np.unique(labels).tolist()}):
+        own, chosen = seen_from(sequence, int(number)), labels == number if labels.size else None
+        table = table_of_target(own, target.view)
+        if table is None:
+            _reproject_exactly(sequence, source, target, found, stride)
+            break
+        carried = Carried(depth, stride, FAR, chosen, *found)
+        carry(carried, poses_of_source(own, source.view), table, optics_of_camera(own), target.surface)
+    return found
+
+
+def _reproject_exactly(
+    sequence: Sequence, source: DepthMap, target: DepthMap, found: Reprojection, stride: int
+) -> None:
+    """The same with the pose at each pixel's own time."""
     grid = sequence.rig.camera.pixel_grid()[::stride, ::stride]
     depth = source.depth[::stride, ::stride].astype(np.float64)
-    pixels = np.full(grid.shape, np.nan, dtype=np.float32)
-    relative = np.full(depth.shape, np.nan, dtype=np.float32)
     step = max(1, _CHUNK_PIXELS // grid.shape[1])
     for first in range(0, len(grid), step):
         rows = slice(first, first + step)
         sky = depth[rows] == 0
         numbers = None if source.labels is None else numbers_of(source.labels[::stride, ::stride][rows])
         seen = seen_with(sequence, source.view, target.view, grid[rows], np.where(sky, FAR, depth[rows]), numbers)
-        pixels[rows] = seen.pixels
-        relative[rows] = relative_depth(target, seen.pixels, seen.depth, sky)
-    return Reprojection(pixels, relative)
+        found.pixels[rows] = seen.pixels
+        found.relative[rows] = relative_depth(target, seen.pixels, seen.depth, sky)
 
 
 def seen_with(
@@ -217,7 +247,7 @@ def relative_depth(target: DepthMap, pixels: FloatArray, z: FloatArray, sky: Boo
     """See ``Reprojection.relative``; of points (...) with depth ``z`` at ``pixels`` (..., 2) of the target."""
     height, width = target.depth.shape
     relative = np.full(z.shape, np.nan)
-    corner = np.floor(np.where(np.isfinite(pixels), pixels, -1.0)).astype(np.int64)
+    corner = np.floor(np.where(np.isfinite(pixels), pixels + ROUNDING_PX, -1.0)).astype(np.int64)
     x0, y0 = corner[..., 0], corner[..., 1]
     inner = (x0 >= 1) & (x0 < width - 2) & (y0 >= 1) & (y0 < height - 2)
     block = y0[inner] - 1, x0[inner] - 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import permutations
 
 import cv2
@@ -12,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.dataset.views import ImageView
+from rsbench.verification.compiled_comparison import Shown, costs_of_changes, every_nth, vote_rows
 from rsbench.verification.findings import Finding
 from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Reprojection
+from rsbench.verification.row_bands import by_bands
 
 Colours = NDArray[np.float32]
 _BEYOND = 6.0
@@ -41,6 +44,8 @@ _CHANCE = 3.0
 """Standard errors of a band's gain by which chance may favour one of the changes."""
 _TILE, _BAD_IN_TILE = 16, 0.6
 _SAMPLES = 60_000
+_REMAPPED = 512
+"""Places in a row of those that OpenCV is given: it takes no more than 32767."""
 
 _PERMUTATIONS = [order for order in permutations(range(3)) if order != (0, 1, 2)]
 
@@ -75,6 +80,7 @@ CHANGES = (
     Change("turned upside down", flip_x=True, flip_y=True),
     *(Change("channels exchanged", order=order) for order in _PERMUTATIONS),
 )
+_TABLE = np.array([[c.down, c.right, c.flip_x, c.flip_y, *c.order] for c in CHANGES], dtype=np.int64)
 _SHIFTS = slice(1, 5)
 """A path tracer's frame and its global-shutter twin, whose pixels have the same noise, cannot tell these: where
 the surface moves by about a pixel, the noise looks shifted."""
@@ -89,9 +95,9 @@ class Picture:
     """(H, W, 3) 8-bit codes."""
     noise: float
     """Standard deviation of what looks like noise in it, codes."""
-    low: Colours
-    """(H, W, 3) smallest of the 3 x 3 pixels around, less what noise may add; ``high`` likewise."""
-    high: Colours
+    low: NDArray[np.uint8]
+    """(H, W, 3) smallest of the 3 x 3 pixels around; ``high`` likewise."""
+    high: NDArray[np.uint8]
     noisy: bool = False
     """Whether a path tracer made it, so that what looks like noise is."""
 
@@ -99,15 +105,13 @@ class Picture:
     def of(cls, view: ImageView, image: NDArray[np.uint8], noisy: bool) -> Picture:
         colours = image.astype(np.float32)
         noise, around = noise_of(colours), np.ones((3, 3), np.uint8)
-        beyond = np.float32(_BEYOND + (_NOISE_FACTOR * noise if noisy else 0.0))
-        return cls(
-            view,
-            colours,
-            noise,
-            cv2.erode(colours, around) - beyond,
-            cv2.dilate(colours, around) + beyond,
-            noisy,
-        )
+        low, high = cv2.erode(image, around), cv2.dilate(image, around)
+        return cls(view, colours, noise, np.asarray(low), np.asarray(high), noisy)
+
+    @property
+    def beyond(self) -> float:
+        """Codes by which a colour may lie beyond ``low`` and ``high``."""
+        return _BEYOND + (_NOISE_FACTOR * self.noise if self.noisy else 0.0)
 
 
 def noise_of(colours: Colours) -> float:
@@ -198,6 +202,20 @@ def show(
     return y * stride, x * stride, shown[y, x]
 
 
+def _interpolated(colours: Colours, places: NDArray[np.float32]) -> Colours:
+    """Colours (n, 3) of an image at places (n, 2)."""
+    rows = -(-len(places) // _REMAPPED)
+    whole = np.zeros((rows * _REMAPPED, 2), np.float32)
+    whole[: len(places)] = places
+    whole = whole.reshape(rows, _REMAPPED, 2)
+    seen = (
+        cv2.remap(colours, whole, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        if rows
+        else np.zeros((0, 3), np.float32)
+    )
+    return np.asarray(seen.reshape(-1, 3)[: len(places)])
+
+
 def difference(colours: Colours, shown: Colours) -> Colours:
     """(n,) mean absolute difference of channels, capped."""
     return np.asarray(np.mean(np.minimum(np.abs(colours - shown), _CAP), axis=1))
@@ -212,53 +230,42 @@ def compare(
     stride: int = 1,
 ) -> ColourAgreement:
     """Compare the pixels that see one flat surface, or the sky, in both, of every ``stride``-th."""
-    y, x, shown = show(surface, target, reprojection, stride)
-    near = np.rint(reprojection.pixels[y // stride, x // stride]).astype(np.int64)
-    colours = source.colours[y, x]
-    height, width = surface.depth.shape
-    near_x, near_y = np.clip(near[:, 0], 0, width - 1), np.clip(near[:, 1], 0, height - 1)
-    spanned = (colours >= target.low[near_y, near_x]) & (colours <= target.high[near_y, near_x])
-    beyond = ~np.all(spanned, axis=1)
-    votes.seen[y, x] += 1
-    votes.against[y[beyond], x[beyond]] += 1
-    bands = band_of_row(height)
+    even = surface.flat | (surface.depth == 0)
+    shown = Shown(source.colours, even, reprojection.pixels, reprojection.relative, DEPTH_TOLERANCE, stride)
+    bands = band_of_row(len(even))
     count = int(bands[-1]) + 1
-    pixels = np.bincount(bands[y], minlength=count)
-    share = np.bincount(bands[y], weights=beyond, minlength=count) / np.maximum(pixels, 1)
-    every = slice(None, None, max(1, len(y) // _SAMPLES))
-    costs = _costs(source.colours, y[every], x[every], shown[every], bands[y[every]], count)
+    span, shape = (target.low, target.high, target.beyond), np.zeros((2, count), np.int64)
+    by_rows = partial(vote_rows, shown, span, (votes.seen, votes.against), (bands, shape))
+    pixels, beyond = np.sum(by_bands(by_rows, len(reprojection.relative)), axis=0)
+    costs = _costs(shown, target, bands, int(np.sum(pixels)))
     refuted = np.zeros(costs[0].shape, dtype=np.bool_)
     if source.noisy and source.view[1:3] == target.view[1:3]:
         refuted[_SHIFTS] = True
+    share = beyond / np.maximum(pixels, 1)
     return ColourAgreement(source.view, target.view, pixels.astype(np.float64), share, *costs, refuted)
 
 
 def _costs(
-    image: Colours,
-    y: NDArray[np.int64],
-    x: NDArray[np.int64],
-    shown: Colours,
-    bands: NDArray[np.int64],
-    count: int,
+    shown: Shown, target: Picture, bands: NDArray[np.int64], pixels: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Of the capped difference from ``shown`` (n, 3), means over the pixels of each band: (C, B) of each change,
-    (C, B) standard errors of its gain over none, (B,) of the band's middle colour."""
-    size = np.maximum(np.bincount(bands, minlength=count), 1)
-
-    def mean(values: Colours) -> NDArray[np.float64]:
-        return np.asarray(np.bincount(bands, weights=values, minlength=count) / size)
-
-    as_is = difference(image[y, x], shown)
-    costs, errors = list[NDArray[np.float64]](), list[NDArray[np.float64]]()
-    for change in CHANGES:
-        unlike = difference(change.undone(image, y, x), shown)
-        costs.append(mean(unlike))
-        spread = mean((as_is - unlike) ** 2) - (mean(as_is) - costs[-1]) ** 2
-        errors.append(np.sqrt(np.maximum(spread, 0.0) / size))
+    """Of the capped difference from what the target shows, means over pixels of each band: (C, B) of each change,
+    (C, B) standard errors of its gain over none, (B,) of the band's middle colour. Some of the ``pixels`` do."""
+    every, count = max(1, pixels // _SAMPLES), int(bands[-1]) + 1
+    places = np.zeros((pixels // every + 1, 2), dtype=np.int64)
+    places = places[: every_nth(shown, every, places)]
+    y, x = places.T
+    seen = _interpolated(target.colours, shown.pixels[y // shown.stride, x // shown.stride])
+    of = bands[y]
+    size = np.maximum(np.bincount(of, minlength=count), 1)
+    sums = np.zeros((2, len(CHANGES), count))
+    costs_of_changes(shown.colours, places, seen, of, _TABLE, _CAP, sums)
+    costs, squares = sums / size
+    errors = np.sqrt(np.maximum(squares - (costs[0] - costs) ** 2, 0.0) / size)
     middle = np.zeros((count, 3), np.float32)
-    for band in np.unique(bands):
-        middle[band] = np.median(shown[bands == band], axis=0)
-    return np.stack(costs), np.stack(errors), mean(difference(middle[bands], shown))
+    for band in np.unique(of):
+        middle[band] = np.median(seen[of == band], axis=0)
+    plain = np.bincount(of, weights=difference(middle[of], seen), minlength=count) / size
+    return costs, errors, np.asarray(plain)
 
 
 def without_refuted(agreements: list[ColourAgreement]) -> list[ColourAgreement]:

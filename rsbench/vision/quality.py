@@ -116,6 +116,24 @@ def ssim_within(
     return [float(np.mean(scores[windows])) if np.any(windows) else math.nan for windows in chosen]
 
 
+class LastSsim:
+    """``ssim`` of one pair of images within one mask after the other, at the cost of one."""
+
+    def __init__(self) -> None:
+        self._last: tuple[NDArray[Any], NDArray[Any], FloatArray] | None = None
+
+    def within(self, estimate: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.bool_]) -> float:
+        """As ``ssim``; images of the last call are known again as the same objects, which nobody may change."""
+        a, b = _pair(estimate, truth, (mask,))
+        windows = window_mask(truth.shape[:2], mask)
+        if not np.any(windows):
+            return math.nan
+        last = self._last
+        if last is None or last[0] is not estimate or last[1] is not truth:
+            last = self._last = estimate, truth, ssim_map(a, b, _GAUSSIAN)
+        return float(np.mean(last[2][windows]))
+
+
 def window_mask(size: tuple[int, ...], mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
     """(H, W) centres of the SSIM windows that lie inside the image and inside ``mask``."""
     covered = np.ones(size, dtype=np.uint8) if mask is None else mask.astype(np.uint8)

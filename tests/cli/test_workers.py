@@ -38,10 +38,10 @@ def evaluated(folder: Path, out: Path, *options: object) -> dict[str, bytes]:
     return contents(out)
 
 
-@pytest.mark.parametrize("seeds", [1, 2])  # scores come with predictions, or after the repeats
-def test_two_processes_evaluate_to_the_same_bytes(smoke_dataset: Path, tmp_path: Path, seeds: int) -> None:
-    one = evaluated(smoke_dataset, tmp_path / "one", "--seeds", seeds)
-    two = evaluated(smoke_dataset, tmp_path / "two", "--seeds", seeds, "--workers", 2)
+def test_two_processes_evaluate_to_the_same_bytes(smoke_dataset: Path, tmp_path: Path) -> None:
+    """With repeats: tests/benchmark/images/test_sequence_jobs.py."""
+    one = evaluated(smoke_dataset, tmp_path / "one")
+    two = evaluated(smoke_dataset, tmp_path / "two", "--workers", 2)
     assert {f"scores/{name}.csv" for name in ("pose", "depth", "correction", "failures")} <= one.keys()
     assert len(one) > 20 and one == two
 

@@ -96,6 +96,14 @@ def yard_card(folder: Path, **fields: object) -> DatasetCard:
     )
 
 
+ALONE = {
+    *("instances of the other camera", "instances exchanged", "an instance that the table lacks"),
+    *("timing of another readout", "timing of frames exchanged"),
+    *(f"affine frames {what}" for what in ("transposed", "stretched", "on another plane")),
+}
+"""Faults of files that other checks read: where those are wrong too, these are not looked for."""
+
+
 @pytest.fixture(scope="module")
 def yard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a dataset with every channel, below that of its scene."""
@@ -353,15 +361,38 @@ def test_sound_channels_pass(yard: Path) -> None:
     assert report.faults == () and "the same bits" in report.notes[0]
 
 
-@pytest.mark.parametrize("name", FAULTS)
-def test_a_planted_fault_is_named(yard: Path, tmp_path: Path, name: str) -> None:
-    plant, words = FAULTS[name]
+def rounds() -> list[list[str]]:
+    """Faults of different files lie in one dataset: checking it takes longer than planting them.
+
+    Those that rays alone find have one of their own.
+    """
+    found: list[dict[str, str]] = []
+    for name, (_, words) in FAULTS.items():
+        alone = "made again" in words or name in ALONE
+        fits = [each for each in found if words[0] not in each and "" not in each]
+        if alone or not fits:
+            found.append({})
+            fits = found[-1:]
+        fits[0][words[0]] = name
+        if alone:
+            fits[0][""] = name
+    return [list(dict.fromkeys(each.values())) for each in found]
+
+
+@pytest.mark.parametrize("names", rounds(), ids=lambda names: names[0])
+def test_planted_faults_are_named(yard: Path, tmp_path: Path, names: list[str]) -> None:
     shutil.copytree(yard, tmp_path / "data")
-    plant(tmp_path / "data/yard")
+    for name in names:
+        FAULTS[name][0](tmp_path / "data/yard")
     rehash(tmp_path / "data")
-    again: Rerender = "all" if "made again" in words else "no"
+    again: Rerender = "all" if any("made again" in FAULTS[name][1] for name in names) else "no"
     (report,) = verify_dataset(tmp_path / "data", rerender=again, scenes=[yard.parent / "yard.toml"])
-    assert any(all(word in fault for word in words) for fault in report.faults), report.faults
+    missed = [
+        name
+        for name in names
+        if not any(all(word in fault for word in FAULTS[name][1]) for fault in report.faults)
+    ]
+    assert missed == [], report.faults
 
 
 def test_a_map_that_others_contradict_is_acquitted_when_it_is_what_rays_meet(yard: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -162,3 +163,13 @@ def _update_checksum(folder: Path, relative: str) -> None:
     file = folder / relative
     manifest["files"][relative] = {"sha256": sha256(file), "size": file.stat().st_size}
     path.write_text(json.dumps(manifest))
+
+
+def test_two_processes_find_the_same(smoke_dataset: Path, tmp_path: Path) -> None:
+    data = Path(shutil.copytree(smoke_dataset, tmp_path / "data"))
+    path = data / "castle/rs_depth/left_0.exr"
+    write_depth(path, read_depth(path) * np.float32(1.001))
+    steps = [list[str](), list[str]()]
+    one, two = (verify_dataset(data, 4, steps[k].append, workers=k + 1) for k in (0, 1))
+    assert repr(one) == repr(two) and one[0].faults
+    assert sorted(steps[0]) == sorted(steps[1])

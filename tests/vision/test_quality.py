@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from rsbench.vision.quality import psnr, ssim, window_mask
+from rsbench.vision.quality import LastSsim, psnr, ssim, window_mask
 
 
 def _pair(shape: tuple[int, ...], seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -49,6 +49,15 @@ def test_identical_images() -> None:
     _, truth = _pair((30, 30))
     assert psnr(truth, truth) == math.inf
     assert ssim(truth, truth) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_one_pair_in_several_masks_scores_as_each_alone() -> None:
+    """To the last bit, whatever pair was scored before."""
+    last, rng = LastSsim(), np.random.default_rng(3)
+    (first, truth), (second, other) = _pair((40, 50, 3)), _pair((40, 50, 3), 1)
+    for estimate, against in ((first, truth), (second, truth), (second, other), (first, truth)):
+        for mask in (np.ones((40, 50), np.bool_), rng.random((40, 50)) > 0.001, np.zeros((40, 50), np.bool_)):
+            np.testing.assert_array_equal(last.within(estimate, against, mask), ssim(estimate, against, mask))
 
 
 def test_what_the_mask_hides_never_counts() -> None:

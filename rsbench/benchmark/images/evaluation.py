@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pandas as pd
 
+from rsbench.benchmark.images.kept_scores import KeptScores, Row, kept_scores_file
 from rsbench.benchmark.images.plan import EvaluationOptions, Places, Plan, make_plan
 from rsbench.benchmark.images.predict import Bench, Step, prediction_steps
 from rsbench.benchmark.images.repeats import repeat, repeats_of
-from rsbench.benchmark.images.score import AFTER, KEYS, TABLES, Row
+from rsbench.benchmark.images.score import AFTER, KEYS, TABLES
 from rsbench.benchmark.images.sequence_jobs import Scores, SequenceJob, done_apart, isolated
 from rsbench.benchmark.metric_plugins import DepthCase, ImageCase, PoseCase
 from rsbench.benchmark.provenance import dataset_record, provenance
@@ -80,7 +81,8 @@ class Evaluation:
             self._repeat(hashes, step, 1)
             for sequence in self.sequences:
                 places = Places(sequence, self._folder(sequence), plan.chain, hashes.sha256)
-                scored[sequence.name] = Scores.of(places, plan)
+                kept = KeptScores(kept_scores_file(self.out, sequence.name), self.options.rehash)
+                scored[sequence.name] = Scores.of(places, plan, kept)
                 step(f"{sequence.name}: scores")
         return scored
 

@@ -33,6 +33,8 @@ TRUE = "true"
 """Stands for a solver or a matcher where an oracle is given the truth instead; no entry may have this name."""
 NONE = "none"
 """Stands for a component that nothing was taken from; no entry may have this name."""
+SCORED = ("rs", "rs_depth", "gs")
+"""Folders of a sequence whose files scores and pictures come from."""
 _SEEDS = "seeds"
 """Folder of the motions by all samples of the robust loop but the first."""
 
@@ -57,7 +59,7 @@ class EvaluationOptions:
     """How often each solver's robust loop is run, with other samples; the correction uses the first motion."""
     seed: int = 0
     rehash: bool = False
-    """Read all files of the dataset again, also those that have the size and times that they had."""
+    """Read all files of the dataset again, also those of the size and times that they had, and score again."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -183,6 +185,12 @@ class Recipe:
         return [replace(self, true_motion=m, true_depth=d) for d in depths for m in motions]
 
 
+def hash_of_data(sequence: Sequence, folders: tuple[str, ...], hash_of: HashOf) -> str:
+    """Identity of sequence.json and of a sequence's frames in some folders; ``hash_of`` hashes a file."""
+    paths = [sequence.folder / "sequence.json", *sequence.frame_files(folders)]
+    return hashlib.sha256("".join(map(hash_of, paths)).encode()).hexdigest()
+
+
 class Places:
     """Where the predictions on a sequence are, with the identity that each must have to be current.
 
@@ -198,17 +206,17 @@ class Places:
     @cached_property
     def data(self) -> str:
         """Identity of what predictions may know: rig, shutter and rolling-shutter images."""
-        return self._hash_of("rs")
+        return hash_of_data(self.sequence, ("rs",), self._file_hash)
 
     @cached_property
     def truth(self) -> str:
         """Identity of what oracles know."""
-        return self._hash_of("rs", "rs_depth")
+        return hash_of_data(self.sequence, ("rs", "rs_depth"), self._file_hash)
 
-    def _hash_of(self, *channels: str) -> str:
-        folder = self.sequence.folder
-        paths = [folder / "sequence.json", *self.sequence.frame_files(channels)]
-        return hashlib.sha256("".join(map(self._file_hash, paths)).encode()).hexdigest()
+    @cached_property
+    def scored_truth(self) -> str:
+        """Identity of what scores of depth and of images compare with."""
+        return hash_of_data(self.sequence, SCORED, self._file_hash)
 
     def matches(self) -> Artefact:
         return self._artefact("matches", data=self.data, features=self.chain.features.key)

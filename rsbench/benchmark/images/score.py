@@ -1,14 +1,25 @@
-"""Scores of stored predictions against the truth; no solver runs here."""
+"""Scores of stored predictions against the truth; no solver runs here.
+
+Those of depth and of corrected frames are kept (``kept_scores``); those of motions take no time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import cached_property
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from functools import cached_property, partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.benchmark.images.kept_scores import (
+    KeptScores,
+    Row,
+    ScoredPart,
+    hash_of_prediction,
+    metric_keys,
+    scoring_version,
+)
 from rsbench.benchmark.images.plan import (
     NONE,
     Places,
@@ -18,7 +29,7 @@ from rsbench.benchmark.images.plan import (
     stored_motions,
 )
 from rsbench.benchmark.images.predict import depth_of, load_disparities, true_pairs
-from rsbench.benchmark.images.store import read_seconds
+from rsbench.benchmark.images.store import Artefact, identity_of, read_seconds
 from rsbench.benchmark.metric_plugins import Case, DepthCase, ImageCase, MetricEntry, PoseCase
 from rsbench.benchmark.scoring import answered, score
 from rsbench.core.errors import RsbenchError
@@ -33,7 +44,6 @@ from rsbench.vision.corrector import load_corrector
 from rsbench.vision.fusion import Origin
 from rsbench.vision.stereo_depth import seen_by_other
 
-Row = dict[str, Any]
 TABLES = ("pose", "depth", "correction", "failures", "seconds")
 KEYS = {
     "pose": ("sequence", "solver", "seed", "shutter", "data_model", "assumed_model", "uses", "success"),
@@ -45,16 +55,21 @@ KEYS = {
 """First columns of each table; the columns of the metrics follow."""
 AFTER = {"pose": ("inliers", "matches", "iterations", "reason")}
 """Columns after those of the metrics."""
+_SEES = "single-view"
+"""Corrector that says which places a frame saw."""
 
 
 class Scorer:
     """Rows of all tables for one sequence."""
 
-    def __init__(self, places: Places, plan: Plan) -> None:
+    def __init__(self, places: Places, plan: Plan, kept: KeptScores | None = None) -> None:
         self.places, self.plan, self.sequence = places, plan, places.sequence
+        self.kept = KeptScores() if kept is None else kept
         self.rows: dict[str, list[Row]] = {table: [] for table in TABLES}
         self.stale: list[str] = []
         """Predictions on disk that are not current, and not scored."""
+        self._failing: list[Row] = []
+        """What the part that is being scored adds to the failures."""
 
     def score(self) -> None:
         """Fill ``rows`` from what is stored and current."""
@@ -64,12 +79,39 @@ class Scorer:
         self._score_correction()
         seconds = read_seconds(self.places.folder).items()
         self._add("seconds", ({"prediction": name, "seconds": value} for name, value in seconds))
+        self.kept.save()
 
-    def _add(self, table: str, rows: Any) -> None:
+    def _add(self, table: str, rows: Iterable[Row]) -> None:
         self.rows[table] += [{"sequence": self.sequence.name, **row} for row in rows]
 
+    def _add_part(
+        self, table: str, name: str, files: list[Path], case: type[Case], rows: Callable[[], Iterable[Row]]
+    ) -> None:
+        """Add the rows of the prediction in ``files``, kept ones where nothing has changed that they came from."""
+        key = identity_of(
+            code=scoring_version(),
+            sequence=self.sequence.name,
+            table=table,
+            truth=self.places.scored_truth,
+            prediction=hash_of_prediction(files),
+            metrics=metric_keys(self.plan.metrics, case),
+            visible=load_corrector(_SEES).key,
+        )
+        part = self.kept.find(name, key)
+        if part is None:
+            self._failing = []
+            part = ScoredPart(list(rows()), self._failing)
+            if all(row["kind"] != "metric" for row in self._failing):
+                self.kept.keep(name, key, part)
+        else:
+            for row in part.failures:
+                self._fail(**row)
+        self._add(table, part.rows)
+
     def _fail(self, kind: str, name: str, reason: str) -> None:
-        row = {"sequence": self.sequence.name, "kind": kind, "name": name, "reason": reason}
+        about = {"kind": kind, "name": name, "reason": reason}
+        self._failing.append(about)
+        row = {"sequence": self.sequence.name, **about}
         if row not in self.rows["failures"]:
             self.rows["failures"].append(row)
 
@@ -138,25 +180,28 @@ class Scorer:
             if matcher is None:
                 self.stale.append(f"{self.sequence.name}/depth/{record.get('matcher')}")
                 continue
-            stored = None
-            if record["success"]:
-                stored = load_disparities(self.places.depth(matcher).file(".npz"), self.sequence.rig)
-            else:
-                self._fail("matcher", record["matcher"], record["reason"])
-            for view in VIEWS:
-                disparity = None if stored is None else stored[f"{view[0]}_{view[1]}"]
-                self._add("depth", self._depth_rows(record, view, disparity))
+            artefact = self.places.depth(matcher)
+            files = [artefact.file(".json"), artefact.file(".npz")]
+            self._add_part("depth", artefact.name, files, DepthCase, partial(self._depth_part, record, files[1]))
+
+    def _depth_part(self, record: Row, file: Path) -> Iterator[Row]:
+        stored = None
+        if record["success"]:
+            stored = load_disparities(file, self.sequence.rig)
+        else:
+            self._fail("matcher", record["matcher"], record["reason"])
+        for view in VIEWS:
+            disparity = None if stored is None else stored[f"{view[0]}_{view[1]}"]
+            yield from self._depth_rows(record, view, disparity)
 
     def _depth_rows(self, record: Row, view: View, disparity: NDArray[np.float32] | None) -> Iterator[Row]:
         side, frame = view
         rig, truth = self.sequence.rig, self.sequence.depth("rs", side, frame)
         other: Side = "right" if side == "left" else "left"
         seen = seen_by_other(truth, self.sequence.depth("rs", other, frame), rig, side)
+        depth = None if disparity is None else depth_of(disparity, self.sequence, *view, timed=record["timed"])
         for name, part in (("all", np.ones_like(seen)), ("visible", seen), ("occluded", ~seen)):
-            case = None
-            if disparity is not None:
-                depth = depth_of(disparity, self.sequence, *view, timed=record["timed"])
-                case = DepthCase(depth=depth, truth=truth, pixels=part, rig=rig)
+            case = None if depth is None else DepthCase(depth=depth, truth=truth, pixels=part, rig=rig)
             keys: Row = {"matcher": record["matcher"], "side": side, "frame": frame, "pixels": name}
             keys["success"] = case is not None
             yield keys | self._metrics(case, DepthCase)
@@ -164,31 +209,38 @@ class Scorer:
     def _score_correction(self) -> None:
         recipes = list(stored_corrections(self.places))
         if recipes:
-            for view in VIEWS:
-                rolling = self.sequence.image("rs", *view)
-                names = dict.fromkeys(("corrector", "solver", "matcher"), NONE)
-                self._add(
-                    "correction", self._image_rows(names, view, rolling, np.ones(rolling.shape[:2], np.bool_))
-                )
+            self._add_part("correction", "corrected/none", [], ImageCase, self._uncorrected_part)
         for record, recipe in recipes:
             names = {name: str(record.get(name)) for name in ("corrector", "solver", "matcher")}
             if recipe is None:
                 self.stale.append(f"{self.sequence.name}/corrected/{'+'.join(names.values())}")
                 continue
-            if not record["success"]:
-                self._fail("correction", "+".join(names.values()), record["reason"])
-            lost = record.get("failures", {})
-            for view, reason in lost.items():
-                self._fail("correction", "+".join(names.values()), f"{view}: {reason}")
             artefact = self.places.corrected(recipe)
-            size = self.sequence.rig.camera.width, self.sequence.rig.camera.height
-            for view in VIEWS:
-                image = drawn = None
-                end = f"-{view[0]}_{view[1]}"
-                if record["success"] and end[1:] not in lost:
-                    image = read_png(artefact.file(f"{end}.png"), size)
-                    drawn = read_origin(artefact.file(f"{end}-origin.png"), size) != Origin.NOBODY
-                self._add("correction", self._image_rows(names, view, image, drawn))
+            ends = [f"-{side}_{frame}{end}.png" for side, frame in VIEWS for end in ("", "-origin")]
+            files = [artefact.file(end) for end in (".json", *ends)]
+            rows = partial(self._corrected_part, record, names, artefact)
+            self._add_part("correction", artefact.name, files, ImageCase, rows)
+
+    def _uncorrected_part(self) -> Iterator[Row]:
+        names = dict.fromkeys(("corrector", "solver", "matcher"), NONE)
+        for view in VIEWS:
+            rolling = self.sequence.image("rs", *view)
+            yield from self._image_rows(names, view, rolling, np.ones(rolling.shape[:2], np.bool_))
+
+    def _corrected_part(self, record: Row, names: dict[str, str], artefact: Artefact) -> Iterator[Row]:
+        if not record["success"]:
+            self._fail("correction", "+".join(names.values()), record["reason"])
+        lost = record.get("failures", {})
+        for view, reason in lost.items():
+            self._fail("correction", "+".join(names.values()), f"{view}: {reason}")
+        size = self.sequence.rig.camera.width, self.sequence.rig.camera.height
+        for view in VIEWS:
+            image = drawn = None
+            end = f"-{view[0]}_{view[1]}"
+            if record["success"] and end[1:] not in lost:
+                image = read_png(artefact.file(f"{end}.png"), size)
+                drawn = read_origin(artefact.file(f"{end}-origin.png"), size) != Origin.NOBODY
+            yield from self._image_rows(names, view, image, drawn)
 
     def _image_rows(
         self, names: Row, view: View, image: NDArray[np.uint8] | None, drawn: NDArray[np.bool_] | None
@@ -224,9 +276,7 @@ def visible_pixels(
     """
     images = {(side, frame): pairs[frame].images[side] for side, frame in VIEWS}
     given = Given(motion=sequence.motion, pairs=pairs)
-    options = CorrectionOptions(
-        corrector=load_corrector("single-view"), depth_from_motion=False, target_row=target_row
-    )
+    options = CorrectionOptions(corrector=load_corrector(_SEES), depth_from_motion=False, target_row=target_row)
     ratio, scanning = sequence.shutter.readout_ratio, sequence.shutter.scanning
     found = correct_four(images, sequence.rig, ratio, options, given=given, views=views, scanning=scanning)
     return {view: fused.origin == Origin.HERE for view, fused in found.frames.items()}

@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from rsbench.benchmark.images.kept_scores import KeptScores, Row, kept_scores_file
 from rsbench.benchmark.images.plan import EvaluationOptions, Places, Plan, make_plan
 from rsbench.benchmark.images.predict import Bench
-from rsbench.benchmark.images.score import Row, Scorer
+from rsbench.benchmark.images.score import Scorer
 from rsbench.benchmark.isolated_metric import isolated_metrics
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import read_pairs
@@ -46,9 +47,9 @@ class Scores:
     """Predictions on disk that are not current, and not scored."""
 
     @classmethod
-    def of(cls, places: Places, plan: Plan) -> Scores:
-        """What is stored and current."""
-        scorer = Scorer(places, plan)
+    def of(cls, places: Places, plan: Plan, kept: KeptScores) -> Scores:
+        """What is stored and current; ``kept`` are those of the sequence that were computed before."""
+        scorer = Scorer(places, plan, kept)
         scorer.score()
         return cls(rows=scorer.rows, stale=scorer.stale)
 
@@ -114,7 +115,8 @@ def _serve(
             if job.predict:
                 Bench(sequence, folder, plan, runner, hashes.sha256).predict(lambda word: None)
             if job.score:
-                scores = vars(Scores.of(Places(sequence, folder, plan.chain, hashes.sha256), plan))
+                kept = KeptScores(kept_scores_file(out, job.sequence), options.rehash)
+                scores = vars(Scores.of(Places(sequence, folder, plan.chain, hashes.sha256), plan, kept))
         except RsbenchError as error:
             raise EntryFailure(str(error)) from error
         return scores, hashes.taken()

@@ -1,0 +1,202 @@
+"""Scores that are kept: computed again when anything changes that they depend on, and only then."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from evaluations import QUICK, contents, evaluate
+
+from rsbench.benchmark.images import kept_scores, score
+from rsbench.benchmark.images.kept_scores import KeptScores, Row, kept_scores_file
+from rsbench.benchmark.images.plan import Places, Plan, make_plan
+from rsbench.benchmark.images.score import Scorer
+from rsbench.benchmark.metric_plugins import DepthCase, ImageCase
+from rsbench.core.errors import RsbenchError
+from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.report.sequence_pictures import write_pictures
+from rsbench.storage.files import read_png, sha256, write_png
+
+RECIPES = 5
+"""Pictures of a frame that are scored: uncorrected, and with motion, depth, both or none from the truth."""
+ALL = {DepthCase: 4 * 3, ImageCase: 4 * 2 * RECIPES}
+"""Cases of a sequence: four frames, in three sets of pixels and in two."""
+
+
+class Bench:
+    """A sequence that is its own to change, with predictions that stand and scores that are kept."""
+
+    def __init__(self, data: Path, out: Path) -> None:
+        self.data, self.out = data, out
+        self.sequence: Sequence = read_dataset(data)[0]
+        self.plan: Plan = make_plan(QUICK, [self.sequence])
+        self.folder = out / "predictions" / self.sequence.name
+        self.file = kept_scores_file(out, self.sequence.name)
+
+    def rows(self, kept: KeptScores | None = None) -> dict[str, list[Row]]:
+        scorer = Scorer(Places(self.sequence, self.folder, self.plan.chain), self.plan, kept)
+        scorer.score()
+        return scorer.rows
+
+
+@pytest.fixture
+def bench(smoke_dataset: Path, copy: Path, tmp_path: Path) -> Bench:
+    data = tmp_path / "data"
+    shutil.copytree(smoke_dataset / "castle", data / "castle")
+    manifest = json.loads((smoke_dataset / "dataset.json").read_text())
+    (data / "dataset.json").write_text(json.dumps(manifest | {"sequences": ["castle"]}))
+    return Bench(data, copy)
+
+
+@pytest.fixture
+def computed(monkeypatch: pytest.MonkeyPatch) -> Counter[Any]:
+    """How many cases the first metric of each kind has been asked for."""
+    asked, real = Counter[Any](), score.score
+
+    def counted(metric: Any, case: Any) -> dict[str, float]:
+        asked[type(case)] += metric.name in ("depth", "psnr")
+        return real(metric, case)
+
+    monkeypatch.setattr(score, "score", counted)
+    return asked
+
+
+def repaint(path: Path) -> None:
+    """Another first pixel."""
+    image = read_png(path)
+    image[0, 0] ^= 1
+    write_png(path, image)
+
+
+def one_picture(bench: Bench, patch: pytest.MonkeyPatch) -> dict[type, int]:
+    repaint(bench.folder / "corrected/fusion+rs-stereo-refined+sgm-left_0.png")
+    return {ImageCase: 8}
+
+
+def one_record(bench: Bench, patch: pytest.MonkeyPatch) -> dict[type, int]:
+    path = bench.folder / "depth/sgm.json"
+    path.write_text(path.read_text() + "\n")
+    return {DepthCase: 12}
+
+
+def global_shutter_truth(bench: Bench, patch: pytest.MonkeyPatch) -> dict[type, int]:
+    repaint(bench.data / "castle/gs/right_1.png")
+    return ALL
+
+
+def metric_of_images(bench: Bench, patch: pytest.MonkeyPatch) -> dict[type, int]:
+    others = [replace(each, key="other") if each.name == "psnr" else each for each in bench.plan.metrics]
+    bench.plan = replace(bench.plan, metrics=tuple(others))
+    return {ImageCase: ALL[ImageCase]}
+
+
+def source(bench: Bench, patch: pytest.MonkeyPatch) -> dict[type, int]:
+    patch.setattr(kept_scores, "hash_of_files", lambda folder, files: "other")
+    kept_scores.scoring_version.cache_clear()
+    return ALL
+
+
+def package(bench: Bench, patch: pytest.MonkeyPatch) -> dict[type, int]:
+    patch.setattr(kept_scores, "package_version", lambda name: "other")
+    kept_scores.scoring_version.cache_clear()
+    return ALL
+
+
+def kept_file(bench: Bench, patch: pytest.MonkeyPatch) -> dict[type, int]:
+    text = bench.file.read_text()
+    number = text.index('"psnr": ') + len('"psnr": ')
+    other = "1" if text[number] != "1" else "2"
+    bench.file.write_text(text[:number] + other + text[number + 1 :])
+    return ALL
+
+
+def nothing(bench: Bench, patch: pytest.MonkeyPatch) -> dict[type, int]:
+    return {}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        nothing,
+        one_picture,
+        one_record,
+        global_shutter_truth,
+        metric_of_images,
+        source,
+        package,
+        kept_file,
+    ],
+)
+def test_a_change_of_anything_computes_what_depends_on_it(
+    bench: Bench,
+    computed: Counter[Any],
+    change: Callable[[Bench, pytest.MonkeyPatch], dict[type, int]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    try:
+        due = change(bench, monkeypatch)
+        computed.clear()
+        rows = bench.rows(KeptScores(bench.file))
+        found = {kind: computed[kind] for kind in ALL if computed[kind]}
+        assert found == due
+        assert repr(rows) == repr(bench.rows())  # as text, in which NaN equals itself
+    finally:
+        monkeypatch.undo()
+        kept_scores.scoring_version.cache_clear()
+
+
+def test_the_whole_source_counts() -> None:
+    files: list[Path] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kept_scores, "hash_of_files", lambda folder, found: files.extend(found) or "")
+        kept_scores.scoring_version.__wrapped__()
+    package = Path(kept_scores.__file__).parents[2]
+    assert set(files) == set(package.rglob("*.py"))
+
+
+def test_a_metric_that_failed_is_asked_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(metric: Any, case: Any) -> dict[str, float]:
+        raise RsbenchError("took too long")
+
+    bench.file.unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(score, "score", failing)
+        rows = bench.rows(KeptScores(bench.file))
+    assert {row["reason"] for row in rows["failures"]} == {"took too long"}
+    assert bench.rows(KeptScores(bench.file))["failures"] == []
+
+
+def test_rehash_scores_again_to_the_same_bytes(
+    smoke_dataset: Path, evaluated: Path, copy: Path, computed: Counter[Any]
+) -> None:
+    evaluate(smoke_dataset, copy)
+    assert not computed[ImageCase] and contents(copy) == contents(evaluated)
+    evaluate(smoke_dataset, copy, rehash=True)
+    assert computed[ImageCase] == 2 * ALL[ImageCase] and contents(copy) == contents(evaluated)
+
+
+def test_pictures_are_drawn_again_when_they_would_be_others(bench: Bench) -> None:
+    chosen = {"corrector": "fusion", "solver": "rs-stereo-refined", "matcher": "sgm"}
+    picture = bench.out / "pictures/castle/corrected.jpg"
+
+    def drawn() -> bool:
+        """Whether it was written, by another file of the name."""
+        before = picture.stat().st_ino
+        captions = write_pictures(bench.sequence, bench.out, chosen, sha256)
+        assert captions.keys() == {path.stem for path in picture.parent.iterdir()}
+        return picture.stat().st_ino != before
+
+    write_pictures(bench.sequence, bench.out, chosen, sha256)
+    assert not drawn()
+    repaint(bench.folder / "corrected/fusion+rs-stereo-refined+sgm-left_1.png")
+    assert drawn() and not drawn()
+    picture.write_bytes(b"")
+    assert drawn() and not drawn()
+    repaint(bench.data / "castle/gs/left_1.png")
+    assert drawn() and not drawn()

@@ -1,0 +1,115 @@
+"""The compiled reprojection against the row equation with the pose at each pixel's own time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.geometry import GivenGeometry
+from rsbench.core.lens import Lens
+from rsbench.core.motion import AcceleratedMotion, LinearMotion, Motion, TwistMotion
+from rsbench.core.moving_objects import MovingObject
+from rsbench.core.rig import StereoRig
+from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.spline_motion import SplineMotion
+from rsbench.dataset.views import VIEW_PAIRS, ImageView
+from rsbench.verification import frame_comparison
+from rsbench.verification.compiled_reprojection import table_of_target
+from rsbench.verification.frame_comparison import DepthMap, Reprojection, reproject
+
+W, D = [0.03, -0.05, 0.04], [0.2, -0.1, 0.25]
+CAMERA = PinholeCamera.centred(64, 48, 60.0)
+BROWN = Lens(model="brown-conrady", k1=-0.25, k2=0.06, p1=0.004, p2=-0.003)
+FISHEYE = Lens(model="kannala-brandt", k1=-0.06, k2=0.01)
+
+
+class Kinked(Motion):
+    """A motion that turns back in the middle of the frame, and shakes faster than any table of lines knows."""
+
+    name = "kinked"
+
+    def body_from_world(self, tau: Any) -> Pose:
+        tau = np.asarray(tau, dtype=np.float64)
+        found: Pose = LinearMotion(self.w, self.d).body_from_world(np.abs(tau - 0.3711) + 1e-6 * np.sin(1e4 * tau))
+        return found
+
+    def velocity(self, tau: Any) -> Any:
+        return LinearMotion(self.w, self.d).velocity(tau)
+
+
+def geometry_of(motion: Motion, lens: Lens | None = None, **shutter: Any) -> GivenGeometry:
+    rig = StereoRig(camera=replace(CAMERA, lens=lens), baseline=0.3)
+    whole: dict[str, Any] = {"height": 48, "width": 64, "readout_ratio": 0.9} | shutter
+    return GivenGeometry(rig, RollingShutter(**whole), motion, 2)
+
+
+def room(view: ImageView, camera: PinholeCamera) -> DepthMap:
+    """A slanted wall with a step and a hole through which the sky is seen."""
+    depth = 1.0 / (camera.unproject(camera.pixel_grid()) @ np.array([0.03, 0.12, 0.2]))
+    depth[10:20, 30:40] *= 0.7
+    depth[30:40, 10:30] = 0.0
+    return DepthMap(view, depth.astype(np.float32), camera)
+
+
+def both_ways(
+    geometry: Any, source: DepthMap, target: DepthMap, stride: int = 1
+) -> tuple[Reprojection, Reprojection]:
+    shape = source.depth[::stride, ::stride].shape
+    exact = Reprojection(np.full((*shape, 2), np.nan, np.float32), np.full(shape, np.nan, np.float32))
+    frame_comparison._reproject_exactly(geometry, source, target, exact, stride)
+    return reproject(geometry, source, target, stride), exact
+
+
+def check_alike(found: Reprojection, exact: Reprojection) -> None:
+    for quick, slow in zip(found, exact, strict=True):
+        np.testing.assert_array_equal(np.isnan(quick), np.isnan(slow))
+        # Pixels and shares of depth: float32 of 64 px rounds by 4e-6; a table may err by 1e-8 px here.
+        np.testing.assert_allclose(quick, slow, rtol=0, atol=8e-6)
+    inner = np.isfinite(exact.relative)
+    np.testing.assert_allclose(found.relative[inner], exact.relative[inner], rtol=0, atol=2e-9)
+    assert np.mean(inner) > 0.1
+
+
+@pytest.mark.parametrize(
+    "geometry",
+    [
+        pytest.param(geometry_of(LinearMotion(W, D)), id="linear"),
+        pytest.param(geometry_of(TwistMotion(W, D)), id="twist"),
+        pytest.param(geometry_of(AcceleratedMotion(W, D), BROWN, scan="bottom"), id="accelerated, lens"),
+        pytest.param(
+            geometry_of(SplineMotion(W, D, preset="handheld", seed=3), FISHEYE, scan="left"), id="spline"
+        ),
+        pytest.param(
+            geometry_of(SplineMotion(W, D, preset="drone", seed=1), right_scan="right", right_delay=0.2),
+            id="apart",
+        ),
+        pytest.param(geometry_of(LinearMotion(W, D), readout_ratio=0.0), id="global"),
+        pytest.param(geometry_of(Kinked(W, D)), id="no table"),
+    ],
+)
+def test_every_pixel_lands_where_the_row_equation_says(geometry: GivenGeometry) -> None:
+    camera = geometry.rig.camera
+    for source, target in VIEW_PAIRS[:: 1 if geometry.motion.name == "linear" else 5]:
+        check_alike(*both_ways(geometry, room(source, camera), room(target, camera), 2))
+
+
+def test_a_motion_that_no_table_follows_has_none() -> None:
+    assert table_of_target(geometry_of(Kinked(W, D)), ImageView("rs", "left", 0)) is None
+
+
+def test_what_moves_is_carried_along() -> None:
+    own = LinearMotion([0.0, 0.1, 0.0], [0.3, 0.0, 0.1])
+    geometry = geometry_of(TwistMotion(W, D))._replace(objects=(MovingObject(np.array([0.0, 0.0, 5.0]), own),))
+    source, target = (room(view, CAMERA) for view in VIEW_PAIRS[0])
+    labels = np.zeros(source.depth.shape, np.uint8)
+    labels[5:25, 5:60] = 1
+    moved = replace(source, labels=labels)
+    found, exact = both_ways(geometry, moved, target)
+    check_alike(found, exact)
+    still, _ = both_ways(geometry, source, target)
+    assert np.nanmax(np.abs(found.pixels - still.pixels)) > 1.0
