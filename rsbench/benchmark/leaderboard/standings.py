@@ -115,7 +115,7 @@ def _standing(
 def _median(values: FloatArray) -> float:
     """Of the values that there are, infinite ones too."""
     there = values[~np.isnan(values)]
-    return float(np.quantile(there, 0.5, method="inverted_cdf")) if there.size else float("nan")
+    return float(np.median(there)) if there.size else float("nan")
 
 
 def table(lines: Sequence[Standing]) -> pd.DataFrame:
