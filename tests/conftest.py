@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from skips import SkipReport
 
 from rsbench.components.imports import import_untried
 
@@ -38,6 +39,12 @@ LARGE_SCENES = (
 
 So each scene is built once, and those of child processes do not lie beside its own.
 """
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """The process that reports tells the skips of all."""
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(SkipReport())
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
