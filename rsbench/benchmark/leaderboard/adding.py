@@ -15,6 +15,7 @@ import pandas as pd
 from rsbench.benchmark.leaderboard.board import (
     FILES,
     FORMAT,
+    OWN,
     Scored,
     move_entry,
     open_board,
@@ -23,6 +24,7 @@ from rsbench.benchmark.leaderboard.board import (
     refuse_another,
     write_split,
 )
+from rsbench.benchmark.leaderboard.doubt import doubt_about, refuse_reserved
 from rsbench.benchmark.leaderboard.marking import mark_all
 from rsbench.benchmark.leaderboard.picture_files import copy_files
 from rsbench.benchmark.leaderboard.splits import Split
@@ -103,6 +105,8 @@ def add_all(
         taken = list[_Taken]()
         for number, (submission, data) in enumerate(read):
             method, new = submission.header.method, hidden / WORK / str(number)
+            if made.get("command") not in OWN:
+                refuse_reserved(submission.header, str(submission.folder))
             kept = copy_files(submission.folder, split.track.files_of(submission, split), new)
             if not replace(method):
                 refuse_another(entries / method, hashlib.sha256(data).hexdigest(), kept)
@@ -114,7 +118,8 @@ def add_all(
             if isinstance(scores, RsbenchError):
                 faults.append(scores)
             else:
-                scored.append(_put(each, scores, _record(each, split, made), entries))
+                doubt = doubt_about(scores, each.submission.header, split)
+                scored.append(_put(each, scores, _record(each, split, made) | {"doubt": doubt}, entries))
         remove(kept.parent)
     if faults:
         raise faults[0]
