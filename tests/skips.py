@@ -1,7 +1,7 @@
 """Which tests a run has skipped, and why: named in its last line; in CI, one that is not on the list fails.
 
 ``skips.txt`` beside this file has a line for each test that may skip, ``FILE::TEST: reason``, where the test may
-be ``*``. With CI set in the environment, on Linux, or ``NO_SKIPS`` for a run that must skip nothing, others fail the run.
+be ``*``. With CI set in the environment, on Linux, others fail the run; with ``NO_SKIPS`` any skip does.
 """
 
 from __future__ import annotations
