@@ -22,6 +22,7 @@ from rsbench.benchmark.leaderboard.board import (
     place,
     read_entry,
     refuse_another,
+    refuse_same_but_case,
     write_split,
 )
 from rsbench.benchmark.leaderboard.doubt import doubt_about, refuse_reserved
@@ -107,6 +108,7 @@ def add_all(
             method, new = submission.header.method, hidden / WORK / str(number)
             if made.get("command") not in OWN:
                 refuse_reserved(submission.header, str(submission.folder))
+            refuse_same_but_case(entries, method)
             kept = copy_files(submission.folder, split.track.files_of(submission, split), new)
             if not replace(method):
                 refuse_another(entries / method, hashlib.sha256(data).hexdigest(), kept)

@@ -160,6 +160,15 @@ def refuse_another(folder: Path, sha256: str, files: dict[str, str]) -> None:
         )
 
 
+def refuse_same_but_case(entries: Path, method: str) -> None:
+    """Raises RsbenchError where an entry has the name in other case: one folder on some systems, two on others."""
+    for folder in _folders(entries):
+        if folder.name != method and folder.name.lower() == method.lower():
+            raise RsbenchError(
+                f"method = {method!r}: differs from the entry {folder.name!r} in case alone; rename it"
+            )
+
+
 # Reading
 
 
