@@ -1,6 +1,7 @@
 # make help       this list
 # make demo       render, solve, correct and score one sequence; ends with the path of its report
 # make test       format, lint, types, layers and every test
+# make test-extras  install rerun-sdk and torch (700 MB and more), and run the tests that need them
 # make attack     kills, failing files, mutated inputs, hostile surroundings, faults for verify: hours
 # make docs       the documentation site, in build/docs; warnings are errors
 # make reference  docs/reference/commands.md and cards.md from the code
@@ -16,12 +17,12 @@ CANDIDATES = $(or $(PYTHON),python3 python3.14 python3.13 python3.12 python3.11)
 COMPILE := from rsbench.solvers.engine.warm_up import warm_up; warm_up(["linear", "twist"])
 SUITABLE := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: help demo test attack docs reference lock clean
+.PHONY: help demo test test-extras attack docs reference lock clean
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := demo
 
 help:
-	@sed -n 's/^# \(make [a-z]* \)/\1/p' $(firstword $(MAKEFILE_LIST))
+	@sed -n 's/^# \(make [a-z-]* \)/\1/p' $(firstword $(MAKEFILE_LIST))
 
 demo: $(STAMP)
 	@$(BIN)/rsbench demo
@@ -36,6 +37,13 @@ test: $(STAMP)
 	$(BIN)/python -c '$(COMPILE)' || { kill $$types; exit 1; }; \
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --no-loadscope-reorder; tests=$$?; \
 	wait $$types || { echo "types: failed, see above" >&2; exit 1; }; exit $$tests
+
+# Not locked: of these the newest that pyproject.toml allows.
+test-extras: $(STAMP)
+	@$(PIP) install --quiet -e '.[view,torch]' --no-build-isolation
+	@NO_SKIPS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest tests/interop/test_view.py \
+	  tests/interop/test_export_training.py tests/interop/test_export_colmap.py tests/jobs/test_dask_jobs.py \
+	  tests/storage/test_s3.py
 
 attack: $(STAMP)
 	@PYTHONPATH=tests $(BIN)/python -m attack --write docs/explanation/reliability.md

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.components import arguments
+from rsbench.core import given
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.projection import RSProjection, rs_project
@@ -52,9 +53,8 @@ def project(
         ``pixels`` (..., 2), ``depth`` (...) z in the camera of that row, ``tau`` (...) its time, ``status`` (...):
         0 seen, 1 never seen, 2 seen twice (the first is given), 3 not converged. NaN where nothing was seen.
     """
-    arguments.check_one_of("side", side, SIDES)
-    arguments.check_whole("frame", frame, 0)
-    arguments.check_rows(rig, shutter)
+    arguments.check_view(side, frame)
+    arguments.check_moving_rig(rig, shutter, motion)
     return rs_project(rig, shutter, motion, side, frame, arguments.world_points(points))
 
 
@@ -95,8 +95,8 @@ def simulate(
     options = SimulationOptions(
         pairs=pairs, tracks=tracks, noise_px=noise_px, outlier_ratio=outlier_ratio, depth=depth, shape=shape
     )
-    arguments.check_rows(rig, shutter)
-    arguments.check_whole("seed", seed, 0)
+    arguments.check_moving_rig(rig, shutter, motion)
+    given.check_whole("seed", seed, 0)
     return simulate_points(rig, shutter, motion, options, np.random.default_rng(seed))
 
 
@@ -130,10 +130,9 @@ def estimate_motion(
     from rsbench.solvers.engine.robust_motion import RobustOptions
     from rsbench.solvers.engine.robust_motion import estimate_motion as estimate_robustly
 
-    if not isinstance(correspondences, Correspondences):
-        raise ValueError(f"correspondences: must be rsbench.Correspondences, got {type(correspondences).__name__}")
+    given.check_type("correspondences", correspondences, Correspondences)
     arguments.check_rows(rig, shutter)
-    arguments.check_whole("seed", seed, 0)
+    given.check_whole("seed", seed, 0)
     options = RobustOptions()
     if threshold_px is not None:
         options = RobustOptions(threshold_px=threshold_px, adapt_threshold=False)
@@ -170,6 +169,7 @@ def pose_errors(
 
     if not isinstance(found, RobustEstimate | MotionEstimate):
         raise ValueError(f"found: must be what estimate_motion returned or a MotionEstimate, got {type(found)}")
+    arguments.check_motion(rig, motion)
     estimate = found if isinstance(found, MotionEstimate) else found.estimate
     point = "body" if isinstance(found, MotionEstimate) else found.reference_point
     errors = scoring.pose_errors(
@@ -216,7 +216,7 @@ def stereo_depth(
     """
     from rsbench.vision.stereo_matcher import find_disparities, load_matcher
 
-    arguments.check_one_of("side", side, SIDES)
+    given.check_one_of("side", side, SIDES)
     left, right = arguments.check_image("left", left, rig), arguments.check_image("right", right, rig)
     disparity = find_disparities(load_matcher(matcher), left, right, rig)[SIDES.index(side)]
     return np.nan_to_num(rig.depth(disparity), nan=0.0).astype(np.float32)
@@ -275,9 +275,9 @@ def correct(
         seed=seed,
     )
     arguments.check_times(readout_ratio, target_row, rig)
-    views, given = arguments.four_images(images, rig), Given(gyro=arguments.gyro_samples(gyro))
+    views, known = arguments.four_images(images, rig), Given(gyro=arguments.gyro_samples(gyro))
     with Isolation() as isolation:
-        found = correct_four(views, rig, readout_ratio, isolation.chain(options), given=given)
+        found = correct_four(views, rig, readout_ratio, isolation.chain(options), given=known)
     demand_corrected(found.frames, options.corrector.name)
     return found
 
@@ -308,7 +308,7 @@ def generate(card: str, out: AnyPath, *, sequences: Series[str] | None = None, w
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import generate_dataset
 
-    arguments.check_whole("workers", workers, 1)
+    given.check_whole("workers", workers, 1)
     dataset = load_dataset_card(card)
     if sequences is not None:
         dataset = dataset.only(list(arguments.names(sequences)))

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from skips import SkipReport
 
 from rsbench.components.imports import import_untried
 
@@ -56,6 +57,12 @@ LONG = (
 )
 """Files that take 20 s of a processor and more, the longest first: a process that gets one at the end works on
 alone."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """The process that reports tells the skips of all."""
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(SkipReport())
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -234,13 +234,13 @@ FEW_ROWS = rsbench.RollingShutter(height=9, readout_ratio=0.8)
         (lambda: rsbench.project([1, 2, 3], RIG, SHUTTER, MOTION, "middle"), "side = 'middle': must be"),  # pyrefly: ignore[bad-argument-type]
         (lambda: rsbench.project([1, 2, 3], RIG, SHUTTER, MOTION, "left", -1), "frame = -1: must be a whole"),
         (lambda: rsbench.simulate(RIG, FEW_ROWS, MOTION), "shutter.height = 9: must be .* 900 rows"),
-        (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, noise_px=-1), "noise_px = -1: must be a number at"),
+        (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, noise_px=-1), "noise_px = -1: must be a number from 0"),
         (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, pairs=-1), "pairs = -1: must be a whole number"),
         (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, outlier_ratio=2), "outlier_ratio = 2: must be"),
         (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, depth=(9, 2)), r"depth = \(9, 2\): must be two positive"),
         (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, shape="ball"), "shape = 'ball': must be one of 'box'"),  # pyrefly: ignore[bad-argument-type]
         (lambda: rsbench.simulate(RIG, SHUTTER, MOTION, seed=-1), "seed = -1"),
-        (lambda: rsbench.estimate_motion(np.zeros((9, 4)), RIG, SHUTTER), "correspondences: must be rsbench.C"),  # pyrefly: ignore[bad-argument-type]
+        (lambda: rsbench.estimate_motion(np.zeros((9, 4)), RIG, SHUTTER), "correspondences: must be an rsben"),  # pyrefly: ignore[bad-argument-type]
         (lambda: rsbench.estimate_motion(EMPTY, RIG, SHUTTER, 3), "solver: must be a name, the path of a card"),  # pyrefly: ignore[bad-argument-type]
         (lambda: rsbench.pose_errors({}, MOTION, RIG), "found: must be what estimate_motion returned"),  # pyrefly: ignore[bad-argument-type]
         (lambda: rsbench.match([FLAT] * 3), "got 3; four are needed"),

@@ -181,13 +181,15 @@ def rounded(value: float, digits: int) -> str:
 def median_and_quartiles(values: ArrayLike) -> str:
     """``median [lower, upper]`` with as many digits as their distance allows, at most three; one if they agree.
 
-    NaN is left out; of an even number of values the median is the lower middle one.
+    NaN is left out. The quartiles are values that there are: between one that is infinite and one that is not lies
+    nothing.
     """
     numbers = np.asarray(values, dtype=np.float64)
     found = numbers[~np.isnan(numbers)]
     if not found.size:
         return "–"
-    low, middle, high = np.quantile(found, [0.25, 0.5, 0.75], method="inverted_cdf")
+    low, high = np.quantile(found, [0.25, 0.75], method="inverted_cdf")
+    middle = float(np.median(found))
     if not np.isfinite(middle):
         return "inf"
     size = _exponent(middle)

@@ -140,6 +140,8 @@ def submit(
         typer.echo(f"note: {note}", err=True)
     scored = add(board, file, split, provenance("rsbench leaderboard submit"), replace=replace, workers=workers)
     _show(board, split.track.id, split.name, None, scored.header.method)
+    if scored.doubt:
+        typer.echo(f"in doubt, and not ranked: {scored.doubt}")
 
 
 @board_app.command()
@@ -337,12 +339,12 @@ def _number(value: float) -> str:
 
 
 def register(app: typer.Typer) -> None:
-    from rsbench.cli.leaderboard_secret import publish, score
+    from rsbench.cli.leaderboard_secret import accept, publish, score
     from rsbench.cli.leaderboard_smoke import EPILOG as SMOKE
     from rsbench.cli.leaderboard_smoke import smoke
 
     board_app.command(epilog=SMOKE)(smoke)
-    for command in (publish, score):
+    for command in (publish, score, accept):
         board_app.command()(command)
     app.add_typer(
         board_app,

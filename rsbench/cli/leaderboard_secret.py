@@ -1,4 +1,4 @@
-"""``rsbench leaderboard publish`` and ``score``: secret test splits of rendered frames."""
+"""What a keeper of a board does: ``publish`` and ``score`` of secret splits, ``accept`` of entries in doubt."""
 
 from __future__ import annotations
 
@@ -78,3 +78,20 @@ def score(
     made = provenance("rsbench leaderboard score")
     scored = add(board, file, split, made, replace=replace, workers=workers)
     typer.echo(f"entry: {scored.folder}")
+    if scored.doubt:
+        typer.echo(f"in doubt, and not ranked: {scored.doubt}")
+
+
+def accept(
+    method: Annotated[str, typer.Argument(metavar="METHOD", help="Name of the entry.")],
+    board: Annotated[Path, typer.Option(help="Folder of the board.")],
+    protocol: Annotated[str, typer.Option(metavar="ID", help="Such as points-1.")],
+    split: Annotated[str, typer.Option(metavar="NAME", help="Such as dev-f88c896f.")],
+    reason: Annotated[str, typer.Option(metavar="TEXT", help="Why it is believed; kept in its entry.json.")],
+) -> None:
+    """Rank an entry that is in doubt, its errors being below what its data allow."""
+    from rsbench.benchmark.leaderboard import board as boards
+
+    if not reason.strip():
+        raise RsbenchError("--reason '': must say why the entry is believed")
+    typer.echo(f"{method}: ranked all the same: {boards.accept(board, protocol, split, method, reason)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import warnings
 from typing import Annotated
 
 import typer
@@ -68,6 +69,13 @@ def _root(
     # Before OpenCV is imported, here and in children: what it warns of in a damaged image is in our line.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     be_quiet(quiet)
+    warnings.showwarning = _told
+
+
+def _told(message: Warning | str, category: type[Warning], *where: object, **more: object) -> None:
+    """A warning for users in a line; those for who writes programs are not theirs."""
+    if issubclass(category, FutureWarning):
+        typer.echo(f"rsbench: note: {message}", err=True)
 
 
 for module in (

@@ -73,7 +73,7 @@ def reproduce(
             "from stored results. sweeps: the other simulations. "
             "fig4: its Figure 4 in every scene, for three motions. correction: baselines, ours and oracles on "
             "mild, moderate, aggressive and poles. sgm: stereo matching when the cameras' rows are not in step. "
-            "real: the default pipeline on a real camera's frames, beside an ideal one's. "
+            "real: the default pipeline on rendered frames with lens, blur and noise, beside an ideal camera's. "
             "leaderboard: our solvers on the public split of points, its site, and the scores of the smoke run. "
             "boards: the same of the tracks of frames, on the dataset standard. "
             "everything: all of these, one after the other, with the time that each took."

@@ -122,7 +122,7 @@ def sgm(out: Path, data: Path) -> None:
 
 
 def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
-    """The default pipeline on a real camera's frames, beside an ideal one's."""
+    """The default pipeline on rendered frames with lens, blur and noise, beside an ideal camera's."""
     from dataclasses import asdict
 
     import pandas as pd

@@ -32,9 +32,9 @@ def fig3(out: Path, data: Path, workers: int | None) -> None:
     cards = {name: load_sweep(name) for name in SWEEPS}
     for name, card in cards.items():
         home = data / "simulated" / name
-        table = _confirmed(card, home, workers, command)
+        table = _summary(card, home, workers, command)
         write_table(folder / f"{name}.csv", table)
-        found = errors_of_rows(table, [home, _again(home)] if table.seed.nunique() > 1 else [home])
+        found = errors_of_rows(table, home)
         errors |= {f"{name}_{measure}": values for measure, values in found.items()}
     save_arrays(folder / "trials.npz", errors)
     settings = setting_table(list(cards.values()))
@@ -58,7 +58,7 @@ def sweeps(out: Path, data: Path, workers: int | None) -> None:
     cards = [load_sweep(name) for name in _OTHER_SWEEPS]
     tables = {}
     for card in cards:
-        tables[card.name] = _confirmed(card, data / "simulated" / card.name, workers, command)
+        tables[card.name] = _summary(card, data / "simulated" / card.name, workers, command)
         write_table(folder / f"{card.name}.csv", tables[card.name])
     write_bytes(folder / "README.md", sweeps_page(cards, tables).encode())
     write_json(folder / "provenance.json", provenance(command, sweeps=list(_OTHER_SWEEPS)))
@@ -81,7 +81,7 @@ def claims(out: Path, data: Path, workers: int | None) -> None:
     tables = _claim_tables(out / "fig3", folder, home, workers, command)
     (literal,) = write_cards(home / "readings", (LITERAL,))
     exact = replace(load_sweep("degenerate").with_setting(points=9), solvers=(literal,))
-    tables["9 + 9"]["degenerate"] = _confirmed(exact, home / "degenerate-9", workers, command)
+    tables["9 + 9"]["degenerate"] = _summary(exact, home / "degenerate-9", workers, command)
     readings = {reading.name: reading for name in SWEEPS for n in (9, 100) for reading in readings_of(name, n)}
     verdicts = judge_claims(tables, readings)
     write_table(folder / "claims.csv", verdicts)
@@ -126,7 +126,7 @@ def _with_readings(name: str, points: int | None, home: Path, workers: int | Non
     others = () if points == 100 else (OURS, GLOBAL)
     card = replace(load_sweep(name), solvers=(*write_cards(home / "readings", readings_of(name, points)), *others))
     folder = home / (f"{name}-readings" if points is None else f"{name}-{points}-readings")
-    return _confirmed(card if points is None else card.with_setting(points=points), folder, workers, command)
+    return _summary(card if points is None else card.with_setting(points=points), folder, workers, command)
 
 
 def readings(out: Path, data: Path, workers: int | None) -> None:
@@ -144,7 +144,7 @@ def readings(out: Path, data: Path, workers: int | None) -> None:
     chosen = (LITERAL, replace(LITERAL, extraction="symmetric"))
     solvers = (*write_cards(home / "readings", chosen), GLOBAL)
     tables = {
-        name: _confirmed(settings_card(load_sweep(name), solvers), home / f"{name}-settings", workers, command)
+        name: _summary(settings_card(load_sweep(name), solvers), home / f"{name}-settings", workers, command)
         for name in SWEEPS
     }
     judged = judge_settings(tables, {reading.name: reading for reading in chosen})
@@ -167,35 +167,11 @@ def image_claims(out: Path) -> None:
     typer.echo(f"claims: {page}")
 
 
-def _confirmed(card: SweepCard, folder: Path, workers: int | None, command: str) -> pd.DataFrame:
-    """Summary of a sweep whose trials stay in ``folder``; what lies below its bound is drawn again.
-
-    The rows of other draws have another seed; what is below the bound by chance is so once in forty.
-    """
-    import pandas as pd
-
-    from rsbench.benchmark.simulated.sweep_summary import below_bound
+def _summary(card: SweepCard, folder: Path, workers: int | None, command: str) -> pd.DataFrame:
+    """Summary of a sweep whose trials stay in ``folder``; one draw of all its rows, whatever comes out."""
     from rsbench.cli.simulate import run_and_summarise
 
-    table = run_and_summarise(card, folder, workers, command)
-    doubtful = below_bound(table)
-    if doubtful.empty or card.robust:
-        return table
-    again = replace(
-        card,
-        seed=card.seed + 1,
-        values=tuple(v for v in card.values if v in set(doubtful.value)),
-        variant=tuple(v for v in card.variant if v.name in set(doubtful.variant)),
-    )
-    fresh = run_and_summarise(again, _again(folder), workers, command)
-    keys = ["variant", "value", "solver"]
-    replaced = pd.merge(doubtful[keys].assign(place=doubtful.index), fresh, on=keys).set_index("place")
-    return pd.concat([table.drop(doubtful.index), replaced]).sort_index()[list(table.columns)]
-
-
-def _again(folder: Path) -> Path:
-    """Where the trials of other draws lie."""
-    return folder.with_name(f"{folder.name}-again")
+    return run_and_summarise(card, folder, workers, command)
 
 
 def _joined(*tables: pd.DataFrame) -> pd.DataFrame:

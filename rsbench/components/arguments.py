@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rsbench.core import given
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
+from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -18,36 +19,16 @@ from rsbench.core.so3 import FloatArray
 _IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16))
 
 
-def check_one_of(name: str, value: object, allowed: Collection[object]) -> None:
-    """Raises ValueError unless ``value`` is one of ``allowed``."""
-    if value not in allowed:
-        raise ValueError(f"{name} = {value!r}: must be one of {', '.join(map(repr, allowed))}")
-
-
-def check_number(name: str, value: float, least: float, most: float = math.inf) -> None:
-    """Raises ValueError unless ``value`` is a finite number from ``least`` to ``most``."""
-    if not (math.isfinite(value) and least <= value <= most):
-        allowed = f"at least {least:g}" if math.isinf(most) else f"from {least:g} to {most:g}"
-        raise ValueError(f"{name} = {value!r}: must be a number {allowed}")
-
-
 def check_times(readout_ratio: float | None, target_row: float, rig: StereoRig) -> None:
     """Raises ValueError unless the ratio (None: unknown) and the row of an image are in their ranges."""
     if readout_ratio is not None:
-        check_number("readout_ratio", readout_ratio, 0.0, 1.0)
-    check_number("target_row", target_row, 0.0, rig.camera.height - 1.0)
+        given.check_number("readout_ratio", readout_ratio, 0.0, 1.0)
+    given.check_number("target_row", target_row, 0.0, rig.camera.height - 1.0)
 
 
 def gyro_samples(samples: ArrayLike | None) -> FloatArray | None:
     """Samples (n, 4) as ``Correspondences`` has them; raises ValueError as it does."""
-    return None if samples is None else Correspondences(gyro=np.asarray(samples, dtype=np.float64)).gyro
-
-
-def check_whole(name: str, value: object, least: int, most: float = math.inf) -> None:
-    """Raises ValueError unless ``value`` is a whole number from ``least`` to ``most``."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
-        allowed = f"of at least {least}" if math.isinf(most) else f"from {least} to {most}"
-        raise ValueError(f"{name} = {value!r}: must be a whole number {allowed}")
+    return None if samples is None else Correspondences(gyro=given.real_array("gyro", samples)).gyro
 
 
 def check_ranges(component: object, ranges: Mapping[str, tuple[float, float]]) -> None:
@@ -77,8 +58,28 @@ def check_plain(rig: StereoRig, shutter: RollingShutter, what: str) -> None:
         )
 
 
+def check_view(side: str, frame: int) -> None:
+    """Raises ValueError unless there is such a side, and may be such a frame."""
+    given.check_one_of("side", side, SIDES)
+    given.check_whole("frame", frame, 0, given.LARGEST_SIZE)
+
+
+def check_motion(rig: StereoRig, motion: Motion) -> None:
+    """Raises ValueError unless they are what they are called."""
+    given.check_type("rig", rig, StereoRig)
+    given.check_type("motion", motion, Motion)
+
+
+def check_moving_rig(rig: StereoRig, shutter: RollingShutter, motion: Motion) -> None:
+    """Raises ValueError unless they are what they are called, and the shutter is of the rig's cameras."""
+    check_rows(rig, shutter)
+    check_motion(rig, motion)
+
+
 def check_rows(rig: StereoRig, shutter: RollingShutter) -> None:
     """Raises ValueError unless the shutter reads as many rows and columns as the cameras have."""
+    given.check_type("rig", rig, StereoRig)
+    given.check_type("shutter", shutter, RollingShutter)
     if shutter.width not in (None, rig.camera.width):
         raise ValueError(
             f"shutter.width = {shutter.width}: must be that of the camera, {rig.camera.width} columns"
@@ -91,7 +92,7 @@ def check_rows(rig: StereoRig, shutter: RollingShutter) -> None:
 
 def world_points(points: ArrayLike) -> FloatArray:
     """Points (..., 3) as float64; raises ValueError on another shape."""
-    array = np.asarray(points, dtype=np.float64)
+    array = given.real_array("points", points)
     if array.ndim == 0 or array.shape[-1] != 3:
         raise ValueError(f"points: must have shape (..., 3), got {array.shape}")
     return array

@@ -14,6 +14,7 @@ import json
 import math
 import os
 import tomllib
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -42,6 +43,9 @@ CardKind = Literal[
 FORMER_NAMES: Mapping[str, Mapping[str, str]] = {"solvers": {"rs-stereo": "rs-stereo-refined"}}
 """By kind, names that commands and files may still give, and what each is called now; no list shows them."""
 
+FORMER_UNTIL = "release 0.2"
+"""The first that does not read them: what is renamed warns for one release."""
+
 Extra = Literal["forbid", "ignore"]
 _LONGEST = 100
 """Characters of a value in a message."""
@@ -60,6 +64,15 @@ def current_name(kind: str | None, name: str) -> str:
     return FORMER_NAMES.get(kind or "", {}).get(name, name)
 
 
+def name_of_today(kind: str | None, name: str) -> str:
+    """``current_name`` of what a user gave, who is warned of a former one, which goes with the next release."""
+    now = current_name(kind, name)
+    if now != name:
+        text = f"{kind}: {name!r} is now called {now!r}; the old name is read until {FORMER_UNTIL}"
+        warnings.warn(text, FutureWarning, stacklevel=3)
+    return now
+
+
 def card_path(kind: CardKind, name_or_path: str | Path) -> Path:
     """File of a card: a value with a separator or ending in ``.toml`` is a path, anything else a name.
 
@@ -70,11 +83,11 @@ def card_path(kind: CardKind, name_or_path: str | Path) -> Path:
     if value.endswith(".toml") or "/" in value or os.sep in value:
         path = Path(value)
         if not path.is_file() and path == Path(kind, path.name):  # where cards of this kind were in 0.1
-            path = list_cards(kind).get(current_name(kind, path.stem), path)
+            path = list_cards(kind).get(name_of_today(kind, path.stem), path)
         if not path.is_file():
             raise RsbenchError(f"{kind} card {value}: no such file")
         return path
-    cards, name = list_cards(kind), current_name(kind, value)
+    cards, name = list_cards(kind), name_of_today(kind, value)
     if name not in cards:
         raise RsbenchError(f"{kind} card {value!r} does not exist{choices(value, cards)}; a path ends in .toml")
     return cards[name]

@@ -28,8 +28,8 @@ from rsbench.components.cards import (
     card_path,
     check_values,
     choices,
-    current_name,
     list_cards,
+    name_of_today,
     parse_card,
     read_toml,
 )
@@ -254,7 +254,8 @@ def _first_paragraph(cls: type) -> str:
 
 def _only_offer(kind: Kind[Any, Any], name: str, advice: str, where: str = "") -> Offer:
     everything = offers(kind)
-    found = [offer for offer in everything if offer.name in (name, current_name(kind.cards, name))]
+    names = {name, name_of_today(kind.cards, name)}
+    found = [offer for offer in everything if offer.name in names]
     if len(found) > 1:
         owners = " and of ".join(_owner(offer) for offer in found)
         raise RsbenchError(f"{where}{kind.singular} {name!r}: is the name of {owners}; rename one of them")

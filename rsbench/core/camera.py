@@ -7,12 +7,12 @@ sensor has it, distorted by the lens; "ideal" pixels are those of the same camer
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rsbench.core import given
 from rsbench.core.lens import Lens, inverse_2x2
 from rsbench.core.so3 import FloatArray
 
@@ -38,16 +38,14 @@ class PinholeCamera:
     """None: an ideal one, without distortion."""
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"camera size must be at least 1 x 1, got {self.width} x {self.height}")
+        for name in ("width", "height"):
+            given.check_whole(f"camera {name}", getattr(self, name), 1, given.LARGEST_SIZE)
         for name in ("fx", "fy"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"camera {name} must be a positive number of pixels, got {value}")
+            given.check_positive(f"camera {name}", getattr(self, name), given.LARGEST_PX, "pixels")
         for name in ("cx", "cy"):
-            if not math.isfinite(getattr(self, name)):
-                raise ValueError(f"camera {name} must be finite, got {getattr(self, name)}")
+            given.check_number(f"camera {name}", getattr(self, name), -given.LARGEST_PX, given.LARGEST_PX)
         if self.lens is not None:
+            given.check_type("camera lens", self.lens, Lens)
             self._check_lens(self.lens)
 
     def _check_lens(self, lens: Lens) -> None:

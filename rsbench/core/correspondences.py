@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rsbench.core import given
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.lens import inverse_2x2
 from rsbench.core.rig import Side
@@ -71,12 +72,12 @@ class Correspondences:
 
 
 def _matches(value: ArrayLike, name: str, columns: int) -> FloatArray:
-    rows = np.array(value, dtype=np.float64)
+    rows = given.real_array(name, value)
     if rows.size == 0:
         return _none(columns)
     if rows.ndim != 2 or rows.shape[1] != columns:
         raise ValueError(f"{name} must have {columns} numbers per match, got shape {rows.shape}")
-    bad = np.flatnonzero(~np.all(np.isfinite(rows), axis=1))
+    bad = np.flatnonzero(~np.all(np.abs(rows) <= given.LARGEST, axis=1))
     if len(bad):
         raise ValueError(f"{name}[{bad[0]}] must be finite numbers, got {rows[bad[0]].tolist()}")
     rows.setflags(write=False)

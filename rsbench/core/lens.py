@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rsbench.core import given
 from rsbench.core.so3 import FloatArray
 
 LensModel = Literal["brown-conrady", "kannala-brandt"]
@@ -62,11 +63,9 @@ class Lens:
     """Fourth radial coefficient; of ``kannala-brandt`` alone."""
 
     def __post_init__(self) -> None:
-        if self.model not in get_args(LensModel):
-            raise ValueError(f"lens model = {self.model!r}: must be one of {', '.join(get_args(LensModel))}")
+        given.check_one_of("lens model", self.model, get_args(LensModel))
         for field in fields(self)[1:]:
-            if not math.isfinite(getattr(self, field.name)):
-                raise ValueError(f"lens {field.name} must be finite, got {getattr(self, field.name)}")
+            given.check_number(f"lens {field.name}", getattr(self, field.name))
         for name in _UNUSED[self.model]:
             if getattr(self, name) != 0.0:
                 raise ValueError(f"lens {name} = {getattr(self, name)}: {self.model} has no such coefficient")

@@ -16,20 +16,12 @@ from typing import Any, ClassVar, Self, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rsbench.core import so3
+from rsbench.core import given, so3
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 
 _STEP = 1e-3
 """Frame periods between the velocities whose differences are accelerations where a model does not say its own."""
-
-
-def _vector(value: ArrayLike, name: str) -> FloatArray:
-    v = np.array(value, dtype=np.float64)
-    if v.shape != (3,) or not np.all(np.isfinite(v)):
-        raise ValueError(f"motion {name} must be 3 finite numbers, got {value!r}")
-    v.setflags(write=False)
-    return v
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -48,8 +40,8 @@ class Motion(ABC):
     name: ClassVar[str]
 
     def __init__(self, w: ArrayLike, d: ArrayLike) -> None:
-        object.__setattr__(self, "w", _vector(w, "w"))
-        object.__setattr__(self, "d", _vector(d, "d"))
+        object.__setattr__(self, "w", given.vector("motion w", w))
+        object.__setattr__(self, "d", given.vector("motion d", d))
 
     @abstractmethod
     def body_from_world(self, tau: ArrayLike) -> Pose:
@@ -223,8 +215,9 @@ class AcceleratedMotion(Motion):
 
     def __init__(self, w: ArrayLike, d: ArrayLike, acceleration: float = 0.2) -> None:
         super().__init__(w, d)
-        if not (np.isfinite(acceleration) and acceleration > -0.5):
-            raise ValueError(f"acceleration must be a finite number above -0.5, got {acceleration}")
+        given.check_number("acceleration", acceleration)
+        if not acceleration > -0.5:
+            raise ValueError(f"acceleration = {acceleration}: must be a number above -0.5")
         object.__setattr__(self, "acceleration", float(acceleration))
 
     def share(self, tau: ArrayLike) -> FloatArray:

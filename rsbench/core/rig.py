@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal
@@ -10,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rsbench.core import given
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.se3 import Pose
@@ -42,10 +42,9 @@ class StereoRig:
     """The point whose motion is described: the body's, in the middle of the baseline, or one camera's centre."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.baseline) and self.baseline > 0):
-            raise ValueError(f"baseline must be a positive number of metres, got {self.baseline}")
-        if self.origin not in ("middle", "left", "right"):
-            raise ValueError(f"origin must be middle, left or right, got {self.origin!r}")
+        given.check_type("camera", self.camera, PinholeCamera)
+        given.check_positive("baseline", self.baseline, given.LARGEST_M, "metres")
+        given.check_one_of("origin", self.origin, ("middle", "left", "right"))
 
     def offset(self, side: Side) -> FloatArray:
         """``x_in_cam = x_in_body + offset`` (3,): the camera stands at minus the offset."""

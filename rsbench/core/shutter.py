@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rsbench.core import given
 from rsbench.core.so3 import FloatArray
 
 Scan = Literal["top", "bottom", "left", "right"]
@@ -89,18 +89,14 @@ class RollingShutter:
     """Number of columns; needed where columns are read."""
 
     def __post_init__(self) -> None:
-        if self.height < 1:
-            raise ValueError(f"shutter height must be at least 1 row, got {self.height}")
-        if not (math.isfinite(self.readout_ratio) and 0.0 <= self.readout_ratio <= 1.0):
-            raise ValueError(f"readout_ratio must lie in [0, 1], got {self.readout_ratio}")
-        for name in ("scan", "right_scan"):
-            value = getattr(self, name)
-            if value not in get_args(Scan) and not (name == "right_scan" and value is None):
-                raise ValueError(f"{name} = {value!r}: must be one of {', '.join(get_args(Scan))}")
-        if not (math.isfinite(self.right_delay) and abs(self.right_delay) <= _LONGEST_DELAY):
-            raise ValueError(f"right_delay must lie in [-1, 1] frame periods, got {self.right_delay}")
-        if self.width is not None and self.width < 1:
-            raise ValueError(f"shutter width must be at least 1 column, got {self.width}")
+        given.check_whole("shutter height", self.height, 1, given.LARGEST_SIZE)
+        given.check_number("readout_ratio", self.readout_ratio, 0.0, 1.0)
+        given.check_one_of("scan", self.scan, get_args(Scan))
+        if self.right_scan is not None:
+            given.check_one_of("right_scan", self.right_scan, get_args(Scan))
+        given.check_number("right_delay", self.right_delay, -_LONGEST_DELAY, _LONGEST_DELAY)
+        if self.width is not None:
+            given.check_whole("shutter width", self.width, 1, given.LARGEST_SIZE)
         if self.width is None and not {self.scan, self.scan_of("right")} <= {"top", "bottom"}:
             raise ValueError("shutter width must be given where columns are read")
 

@@ -23,7 +23,7 @@ from typing import Any, ClassVar, NamedTuple, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rsbench.core import se3, so3
+from rsbench.core import given, se3, so3
 from rsbench.core.motion import Motion
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
@@ -100,9 +100,9 @@ class SplineMotion(Motion):
         super().__init__(w, d)
         if float(np.linalg.norm(self.w)) >= np.pi:
             raise ValueError(f"w of a spline must be below a half turn, got {self.w.tolist()}")
-        given = {"preset": preset, "seed": seed, "interval": interval, "shake": shake, "poses": poses}
-        given["periods"] = periods
-        parameters = {key: value for key, value in given.items() if value is not None}
+        chosen = {"preset": preset, "seed": seed, "interval": interval, "shake": shake, "poses": poses}
+        chosen["periods"] = periods
+        parameters = {key: value for key, value in chosen.items() if value is not None}
         fixed = self.endpoint(parameters)
         if fixed is not None and np.max(np.abs(np.concatenate(fixed) - [*self.w, *self.d])) > _SAME:
             raise ValueError("w and d of a spline with poses are those of its poses, and were given otherwise")
@@ -288,12 +288,12 @@ def least_poses(interval: float, periods: float = LAST) -> int:
 
 
 def _twists(value: ArrayLike, interval: float, name: str) -> FloatArray:
-    rows = np.array(value, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[1] != 6 or not np.all(np.isfinite(rows)):
+    rows = given.real_array(name, value)
+    if rows.ndim != 2 or rows.shape[1] != 6 or not np.all(np.abs(rows) <= given.LARGEST):
         raise ValueError(f"{name} must be rows of 6 finite numbers: rotation vector and translation")
     if len(rows) < least_poses(interval):
         raise ValueError(f"{name} has {len(rows)} rows; an interval of {interval:g} needs {least_poses(interval)}")
-    return np.asarray(rows, dtype=np.float64)
+    return rows
 
 
 def _times(interval: float, control: Pose) -> FloatArray:

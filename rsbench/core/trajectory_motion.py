@@ -17,7 +17,7 @@ from typing import Any, ClassVar, NamedTuple, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rsbench.core import so3
+from rsbench.core import given, so3
 from rsbench.core.motion import Motion
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
@@ -168,8 +168,8 @@ def _one_sign(quaternions: FloatArray) -> FloatArray:
 
 
 def _checked(value: ArrayLike, spans: bool = True) -> FloatArray:
-    rows = np.array(value, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[1] != 8 or len(rows) < 2 or not np.all(np.isfinite(rows)):
+    rows = given.real_array("poses", value)
+    if rows.ndim != 2 or rows.shape[1] != 8 or len(rows) < 2 or not np.all(np.abs(rows) <= given.LARGEST):
         raise ValueError("poses must be two or more rows of 8 finite numbers: time, x, y, z, qx, qy, qz, qw")
     if np.any(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0) > _UNIT):
         raise ValueError("poses: a quaternion is not of length 1")

@@ -108,7 +108,9 @@ class DatasetCard(Scanning):
         names = [sequence.name for sequence in self.sequence]
         if not names:
             raise ValueError("a dataset needs at least one [[sequence]]")
-        for name, count in Counter(names).items():
+        for name, count in Counter(
+            name.lower() for name in names
+        ).items():  # folders that many systems take for one
             if count > 1:
                 raise ValueError(f"two sequences are named {name!r}")
 

@@ -115,7 +115,9 @@ def write_scenes(name_or_path: str, secret: Secret, folder: Path) -> list[Path]:
         text = _SEED.sub("", read_text(path), count=1)
         folder.mkdir(parents=True, exist_ok=True)
         written.append(folder / f"{path.stem}.toml")
-        written[-1].write_text(f"seed = {secret.number('scene', path.stem)}\n{text}", encoding="utf-8")
+        written[-1].write_text(
+            f"seed = {secret.number('scene', path.stem)}\n{text}", encoding="utf-8", newline="\n"
+        )
     return written
 
 

@@ -140,7 +140,7 @@ class StoreDestination:
     def _learn(self, names: Iterable[str], sizes: Mapping[tuple[str, str], int]) -> None:
         """Read each sequence.json; files have the ``sizes`` of their paths and hashes, else those that they have
         there now."""
-        with (self.hidden / _OBJECTS).open("a", encoding="utf-8") as stream:
+        with (self.hidden / _OBJECTS).open("a", encoding="utf-8", newline="\n") as stream:
             for path, data in self._store.read([f"{name}/{_MANIFEST}" for name in names]):
                 name = path.partition("/")[0]
                 objects = self._objects[name]

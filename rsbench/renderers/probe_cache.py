@@ -39,7 +39,7 @@ def remember(key: str, version: str) -> None:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=file.parent, suffix=".tmp")
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as stream:
             json.dump(kept, stream, indent=1)
         os.replace(name, file)
     except OSError:

@@ -29,7 +29,12 @@ def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
     return {
         "header": header,
         "split": each.named,
-        "about": [("uses", line.uses), *((name, said[name]) for name in _ABOUT if said[name])],
+        "about": [
+            ("uses", line.uses),
+            ("answers", "handed in as a file" if line.scored.handed_in else "made by this board"),
+            *([("in_doubt", line.scored.doubt)] if line.scored.doubt else []),
+            *((name, said[name]) for name in _ABOUT if said[name]),
+        ],
         "scores": _scores(line),
         "ties": ", ".join(line.ties),
         "tables": [_by(each, line, name, kinds) for name, kinds in each.known() if _words(kinds)],

@@ -134,6 +134,8 @@ def _row(each: Board, line: Standing) -> dict[str, Any]:
         "method": header.method,
         "uses": line.uses.replace(" + ", " "),
         "oracle": rank is None,
+        "handed_in": line.scored.handed_in,
+        "doubt": line.scored.doubt,
         "page": f"{each.id}/{header.method}.html",
         "cells": cells,
         "ties": ", ".join(line.ties),

@@ -42,5 +42,5 @@ def _brief(lines: Sequence[Standing]) -> list[list[str]]:
     for line in lines:
         shares = [in_words(*line.means[key]) for key in (track.primary.key, "failure")]
         medians = [f"{line.medians[key]:.3g}" for key in track.of_kind("median")[:BRIEF]]
-        rows.append([line.scored.header.method, line.uses, line.rank_words, *shares, *medians])
+        rows.append([line.name, line.uses, line.rank_words, *shares, *medians])
     return rows

@@ -31,7 +31,7 @@ def write_study(folder: Path) -> list[Path]:
     """README.md and rows.svg from the tables in ``folder``; returns the files."""
     images, summary = pd.read_csv(folder / "views.csv"), pd.read_csv(folder / "summary.csv")
     page = folder / "README.md"
-    page.write_text(study_page(images, summary), "utf-8")
+    page.write_text(study_page(images, summary), "utf-8", newline="\n")
     return [page, _draw_rows(pd.read_csv(folder / "rows.csv"), folder / "rows.svg")]
 
 

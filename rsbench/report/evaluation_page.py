@@ -79,7 +79,7 @@ def _over_seeds(scores: pd.DataFrame, metrics: list[str]) -> tuple[pd.DataFrame,
     frame[counts] = frame[counts].round().astype(int)
     note = (
         "Median [lower quartile, upper quartile] over the runs of each solver with other RANSAC samples; one "
-        "number where the three agree in its digits; of an even number of runs the lower middle one. "
+        "number where the three agree in its digits. "
     )
     return frame.reset_index(), note
 

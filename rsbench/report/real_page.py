@@ -23,7 +23,7 @@ def write_real_page(folder: Path, card: dict[str, Any]) -> Path:
     """README.md from motions.csv and summary.csv in ``folder``; ``card`` is that of the real camera's dataset."""
     summary, motions = pd.read_csv(folder / "summary.csv"), pd.read_csv(folder / "motions.csv")
     page = folder / "README.md"
-    page.write_text(real_page(summary, motions, card), "utf-8")
+    page.write_text(real_page(summary, motions, card), "utf-8", newline="\n")
     return page
 
 

@@ -18,7 +18,7 @@ def write_sgm_page(folder: Path) -> list[Path]:
     """README.md and sgm.svg from sgm.csv in ``folder``; returns the files."""
     table = pd.read_csv(folder / "sgm.csv")
     page = folder / "README.md"
-    page.write_text(sgm_page(table), "utf-8")
+    page.write_text(sgm_page(table), "utf-8", newline="\n")
     return [page, _draw(table, folder / "sgm.svg")]
 
 

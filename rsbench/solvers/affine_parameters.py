@@ -21,11 +21,11 @@ from typing import final
 
 import numpy as np
 
-from rsbench.components.arguments import check_number
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import epipolar_gradient
+from rsbench.core.given import check_number
 from rsbench.core.projection import plane_basis
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter

@@ -16,9 +16,9 @@ from typing import Literal, final
 
 import numpy as np
 
-from rsbench.components.arguments import check_whole
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.given import check_whole
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray

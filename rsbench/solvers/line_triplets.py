@@ -23,9 +23,9 @@ from typing import NamedTuple, final
 import numpy as np
 import scipy
 
-from rsbench.components.arguments import check_number, check_whole
 from rsbench.core import so3
 from rsbench.core.correspondences import BoolArray, Correspondences
+from rsbench.core.given import check_number, check_whole
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter

@@ -12,8 +12,8 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from rsbench.components.arguments import check_number, check_whole
 from rsbench.core.correspondences import BoolArray, Correspondences
+from rsbench.core.given import check_number, check_whole
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray

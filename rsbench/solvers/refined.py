@@ -9,11 +9,11 @@ from typing import Any, Literal, final
 import cv2
 import numpy as np
 
-from rsbench.components.arguments import check_whole
 from rsbench.components.identity import source_version
 from rsbench.components.motion_models import motion_model
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, temporal_pairs
+from rsbench.core.given import check_whole
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray

@@ -82,7 +82,7 @@ class FileHashes:
         """Keep lines of ``taken``."""
         self._known |= _parsed(lines)
         if lines:
-            with self._store.open("a", encoding="utf-8") as stream:
+            with self._store.open("a", encoding="utf-8", newline="\n") as stream:
                 stream.write("\n" + "\n".join(lines) + "\n")  # the line before may have been cut by a kill
 
     def _keep(self, name: str, file: HashedFile) -> HashedFile:

@@ -6,8 +6,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rsbench.components import arguments
 from rsbench.components.cards import card_path
+from rsbench.core import given
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES
 from rsbench.storage.files import read_json
@@ -56,9 +56,9 @@ def verify_dataset(
         LostJobsError: the process of a sequence ended each time it was tried.
         RsbenchError: no dataset.json, or one that is not a JSON object; no card of a scene where one was named.
     """
-    arguments.check_whole("stride", stride, 1)
-    arguments.check_one_of("rerender", rerender, ("no", "auto", "all"))
-    arguments.check_whole("workers", workers, 1)
+    given.check_whole("stride", stride, 1)
+    given.check_one_of("rerender", rerender, ("no", "auto", "all"))
+    given.check_whole("workers", workers, 1)
     manifest = read_json(folder / manifest_checks.DATASET)
     step = progress or (lambda name: None)
     listing = manifest_checks.Listing.of(folder, manifest)

@@ -269,11 +269,16 @@ def test_no_list_shows_a_former_name_and_each_leads_to_a_component_of_today() ->
         assert not names.keys() & {*listed} and {*names.values()} <= {*listed}
 
 
+@pytest.mark.filterwarnings("ignore:.*is now called:FutureWarning")
 def test_a_former_name_stands_for_the_name_of_today(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    entry = load_solver_entry("rs-stereo")
+    with pytest.warns(
+        FutureWarning, match="'rs-stereo' is now called 'rs-stereo-refined'; the old name is read until"
+    ):
+        entry = load_solver_entry("rs-stereo")
     assert entry.name == "rs-stereo-refined" and entry.key == load_solver_entry("rs-stereo-refined").key
     monkeypatch.chdir(tmp_path)  # no card lies here: as in another's folder, or with a wheel
-    assert load_solver_entry("solvers/rs-stereo.toml").name == "rs-stereo-refined"
+    with pytest.warns(FutureWarning, match="is now called"):
+        assert load_solver_entry("solvers/rs-stereo.toml").name == "rs-stereo-refined"
     assert "formerly" in rsbench("show", "rs-stereo", COLUMNS="150").stdout
     about = answer("show", "rs-stereo")
     assert (about["name"], about["formerly"]) == ("rs-stereo-refined", ["rs-stereo"])

@@ -81,7 +81,10 @@ def test_many_problems_and_two_solvers_give_one_line_each(tmp_path: Path) -> Non
         "-", "--solver", "rs-stereo-refined", "--solver", "gs-8pt", "--json", "--with", "noise", text=many
     )
     assert result.returncode == 2
-    assert result.stderr == "rsbench: error: stdin:2: baseline must be a positive number of metres, got -1.0\n"
+    assert (
+        result.stderr
+        == "rsbench: error: stdin:2: baseline = -1.0: must be a positive number of metres, at most 1e+09\n"
+    )
     found = answers(result)
     pairs = [(answer["name"], answer["solver"]) for answer in found]
     assert pairs == [(name, solver) for name in ("p0", "p2", "few") for solver in ("rs-stereo-refined", "gs-8pt")]

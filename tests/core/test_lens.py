@@ -125,7 +125,7 @@ def test_behind_a_fisheye_there_is_no_pixel() -> None:
         ({"model": "pinhole"}, "lens model = 'pinhole'"),
         ({"model": "brown-conrady", "k4": 0.1}, "k4 = 0.1: brown-conrady has no"),
         ({"model": "kannala-brandt", "p1": 0.1}, "p1 = 0.1: kannala-brandt has no"),
-        ({"model": "brown-conrady", "k1": float("nan")}, "k1 must be finite"),
+        ({"model": "brown-conrady", "k1": float("nan")}, "k1 = nan: must be a number that is finite"),
     ],
 )
 def test_wrong_lenses_are_refused_by_name(values: dict[str, object], message: str) -> None:

@@ -135,7 +135,7 @@ def test_accelerated_motion_has_constant_acceleration(w: FloatArray, d: FloatArr
 
 @pytest.mark.parametrize("k", [-0.5, -3.0, np.nan, np.inf])
 def test_a_motion_that_would_turn_back_is_refused(k: float) -> None:
-    with pytest.raises(ValueError, match=r"acceleration must be a finite number above -0\.5"):
+    with pytest.raises(ValueError, match=r"acceleration = .*: must be a number (above -0\.5|that is finite)"):
         AcceleratedMotion(np.zeros(3), np.zeros(3), acceleration=k)
 
 

@@ -70,12 +70,12 @@ def test_rows_from_the_bottom_in_both_cameras_are_read_together() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"scan": "up"}, "scan = 'up': must be one of top, bottom, left, right"),
+        ({"scan": "up"}, "scan = 'up': must be one of 'top', 'bottom', 'left', 'right'"),
         ({"right_scan": "both"}, "right_scan = 'both'"),
         ({"right_scan": "left"}, "width must be given where columns are read"),
-        ({"right_delay": 1.5}, "right_delay must lie in"),
-        ({"right_delay": float("nan")}, "right_delay must lie in"),
-        ({"width": 0}, "width must be at least 1"),
+        ({"right_delay": 1.5}, "right_delay = .*: must be a number from -1 to 1"),
+        ({"right_delay": float("nan")}, "right_delay = .*: must be a number from -1 to 1"),
+        ({"width": 0}, "shutter width = 0: must be a whole number from 1"),
     ],
 )
 def test_shutters_that_cannot_be_are_refused_by_name(values: dict[str, object], message: str) -> None:

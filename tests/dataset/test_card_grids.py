@@ -99,7 +99,7 @@ def test_other_seeds_make_another_split(tmp_path: Path) -> None:
             "[grid.motion.mild]\nreadout = 0.3\n",
             "unknown key 'grid.motion.mild.readout' .did you mean 'readout_ratio'",
         ),
-        ("[grid.readout.all]\nreadout_ratio = 3\n", r"readout_ratio must lie in \[0, 1\]"),
+        ("[grid.readout.all]\nreadout_ratio = 3\n", r"readout_ratio = 3.0: must be a number from 0 to 1"),
         ('[grid.readout."a/b"]\nreadout_ratio = 0.3\n', "must be a folder's name"),
         ("[grid.sensor.slow]\nsensor = { exposure_s = 9 }\n", "longer than frame_period_s"),
     ],

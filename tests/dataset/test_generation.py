@@ -164,7 +164,7 @@ def test_unwritable_folder_is_named(small: Small, tmp_path: Path) -> None:
     [
         ('scene = "PLACE/a.toml"', 'scene = "castel"', "castel"),
         ('name = "a"', 'name = "a"\nviewpoint = "moon"', "no viewpoint 'moon'"),
-        ("baseline = 0.3", "baseline = -0.3", "baseline must be a positive"),
+        ("baseline = 0.3", "baseline = -0.3", "baseline = -0.3: must be a positive"),
         ("baseline = 0.3", "baselines = 0.3", "unknown key 'baselines'"),
         ("readout_ratio = 0.8", "readout_ratio = nan", "readout_ratio"),
         ("rotation_deg = 1.5", "rotation_deg = -1.5", "must not be negative"),

@@ -126,8 +126,8 @@ def test_pose_file_round_trip_is_exact_to_rounding(dataset: Path) -> None:
     ("key", "value", "message"),
     [
         ("format", 2, "format = 2"),
-        ("baseline", -1.0, "baseline must be a positive"),
-        ("readout_ratio", 1.5, "readout_ratio must lie in"),
+        ("baseline", -1.0, "baseline = -1.0: must be a positive"),
+        ("readout_ratio", 1.5, "readout_ratio = 1.5: must be a number from 0 to 1"),
         ("camera", {"width": 3}, "'camera.height' is required"),
         ("motion", {"model": "warp", "w": [0, 0, 0], "d": [0, 0, 0]}, "'warp'"),
     ],

@@ -15,14 +15,17 @@ import pandas as pd
 from rsbench.benchmark.leaderboard.board import (
     FILES,
     FORMAT,
+    OWN,
     Scored,
     move_entry,
     open_board,
     place,
     read_entry,
     refuse_another,
+    refuse_same_but_case,
     write_split,
 )
+from rsbench.benchmark.leaderboard.doubt import doubt_about, refuse_reserved
 from rsbench.benchmark.leaderboard.marking import mark_all
 from rsbench.benchmark.leaderboard.picture_files import copy_files
 from rsbench.benchmark.leaderboard.splits import Split
@@ -103,6 +106,9 @@ def add_all(
         taken = list[_Taken]()
         for number, (submission, data) in enumerate(read):
             method, new = submission.header.method, hidden / WORK / str(number)
+            if made.get("command") not in OWN:
+                refuse_reserved(submission.header, str(submission.folder))
+            refuse_same_but_case(entries, method)
             kept = copy_files(submission.folder, split.track.files_of(submission, split), new)
             if not replace(method):
                 refuse_another(entries / method, hashlib.sha256(data).hexdigest(), kept)
@@ -114,7 +120,8 @@ def add_all(
             if isinstance(scores, RsbenchError):
                 faults.append(scores)
             else:
-                scored.append(_put(each, scores, _record(each, split, made), entries))
+                doubt = doubt_about(scores, each.submission.header, split)
+                scored.append(_put(each, scores, _record(each, split, made) | {"doubt": doubt}, entries))
         remove(kept.parent)
     if faults:
         raise faults[0]

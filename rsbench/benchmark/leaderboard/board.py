@@ -17,11 +17,13 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.leaderboard.answers import Header
+from rsbench.benchmark.leaderboard.doubt import doubt_about
 from rsbench.benchmark.leaderboard.exporting import split_record
 from rsbench.benchmark.leaderboard.marking import mark_all
 from rsbench.benchmark.leaderboard.picture_files import file_bytes
@@ -39,6 +41,9 @@ from rsbench.storage.work_folder import work_folder
 FORMAT = 1
 RUN = "rsbench leaderboard run"
 """Entries that were made by it may be made again; what people handed in is not replaced in silence."""
+ORACLES = "rsbench leaderboard oracles"
+OWN = (RUN, ORACLES)
+"""Commands whose entries a board makes itself."""
 FILES = ("predictions.jsonl", "scores.csv", "entry.json")
 """Of an entry; the last one says of the others what they are."""
 
@@ -54,6 +59,12 @@ class Recorded:
     """Of the split."""
     files: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the pictures and matches of its answers, by their paths below the entry."""
+    doubt: str = ""
+    """Why it is not believed, see ``doubt.doubt_about``; empty where nothing speaks against it."""
+    accepted: str = ""
+    """Why the keeper of the board ranks it all the same."""
+    made: dict[str, Any] = field(default_factory=dict)
+    """How it came about; ``command`` tells."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +89,10 @@ class Scored:
     """One row for each problem, see ``marking.mark``."""
     files: dict[str, str]
     """SHA-256 of its pictures and matches, by paths below ``folder`` such as ``pictures/castle/left_1.exr``."""
+    doubt: str
+    """Why it has no rank; empty where it has one."""
+    handed_in: bool
+    """Whether the answers came as a file; else the board ran the method itself."""
 
 
 def made_by(board: Path, split: Split, method: str) -> str:
@@ -145,6 +160,15 @@ def refuse_another(folder: Path, sha256: str, files: dict[str, str]) -> None:
         )
 
 
+def refuse_same_but_case(entries: Path, method: str) -> None:
+    """Raises RsbenchError where an entry has the name in other case: one folder on some systems, two on others."""
+    for folder in _folders(entries):
+        if folder.name != method and folder.name.lower() == method.lower():
+            raise RsbenchError(
+                f"method = {method!r}: differs from the entry {folder.name!r} in case alone; rename it"
+            )
+
+
 # Reading
 
 
@@ -199,6 +223,8 @@ def read_entry(folder: Path) -> Scored:
         predictions_sha256=record.predictions_sha256,
         scores=_read_scores(folder, record.header.protocol),
         files=record.files,
+        doubt="" if record.accepted else record.doubt,
+        handed_in=record.made.get("command") not in (RUN, ORACLES),
     )
 
 
@@ -267,10 +293,34 @@ def rescore(
             with contextlib.suppress(RsbenchError):
                 old = _read_scores(folder, split.track.id)
             write_table(folder / FILES[1], scores)
+            _write_doubt(folder, doubt_about(scores, _read_record(folder).header, split))
             now = read_entry(folder).scores
             if columns := [str(name) for name in now if not now[name].equals(old.get(name, pd.Series()))]:
                 changed[folder.name] = columns
     return changed
+
+
+def accept(board: Path, protocol: str, split: str, method: str, reason: str) -> str:
+    """Rank an entry that is in doubt, because the keeper of the board says so; returns the doubt.
+
+    Raises:
+        RsbenchError: there is no such entry, or nothing speaks against it.
+    """
+    folder = place(board, protocol, split) / "entries" / method
+    if not folder.is_dir():
+        raise RsbenchError(f"{folder}: is no entry; rsbench leaderboard show --board {board} lists them")
+    with work_folder(board):
+        record = _read_record(folder)
+        if not record.doubt:
+            raise RsbenchError(f"{folder}: nothing speaks against it; it has a rank")
+        write_json(folder / FILES[2], {**read_json(folder / FILES[2]), "accepted": reason})
+    return record.doubt
+
+
+def _write_doubt(folder: Path, doubt: str) -> None:
+    record = read_json(folder / FILES[2])
+    if record.get("doubt", "") != doubt:
+        write_json(folder / FILES[2], {**record, "doubt": doubt})
 
 
 def _stored(folder: Path, split: Split) -> Submission:

@@ -118,6 +118,7 @@ class CorrectionTrack(PictureTrack):
     asks_rows = True
     scores = _FRAMES
     error, error_title = "error", "1 - SSIM"
+    exact = ("error", 1e-6)
     part_score, part_title = "rms", "RMS error of the common pixels, of 255"
     others = (
         ("uncorrected", "images", "The rolling-shutter frame as it is", _uncorrected),

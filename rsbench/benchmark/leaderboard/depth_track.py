@@ -102,6 +102,7 @@ class DepthTrack(PictureTrack):
     title = "Depth of rolling-shutter frames"
     scores = _DEPTH
     error, error_title = "bad_1", "bad@1"
+    exact = ("abs_rel", 1e-6)
     part_score, part_title = "bad_1", "bad@1"
     others = (("constant", ORACLE, "The median true depth of each sequence, everywhere", _constant),)
     smoke = ("sgm", "sweep", "sgm-plain", "constant", ORACLE)

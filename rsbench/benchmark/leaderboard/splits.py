@@ -70,6 +70,8 @@ class Split:
     public: bool
     """Whether the truth may be told."""
     truths: tuple[Truth, ...]
+    seed: int = PUBLIC_SEED
+    """Of problems that are simulated."""
 
     @cached_property
     def fingerprint(self) -> str:
@@ -129,7 +131,7 @@ def points_split(track: Track, secret: Path | None = None) -> Split:
     seed = seed_of(secret)
     truths = tuple(_drawn(seed, number) for number in range(POINTS_PROBLEMS))
     label = "dev" if secret is None else "test"
-    return Split(track=track, label=label, public=secret is None, truths=truths)
+    return Split(track=track, label=label, public=secret is None, truths=truths, seed=seed)
 
 
 def seed_of(path: Path | None) -> int:

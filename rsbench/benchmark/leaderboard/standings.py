@@ -23,7 +23,7 @@ class Standing:
 
     scored: Scored
     rank: Rank | None
-    """Among those that use no more; None of an oracle."""
+    """Among those that use no more; None of an oracle, and of an entry that is in doubt."""
     peers: int
     """How many those are, itself included."""
     ties: tuple[str, ...]
@@ -42,10 +42,17 @@ class Standing:
 
     @property
     def rank_words(self) -> str:
-        """Such as ``2 [1, 4] of 9``."""
+        """Such as ``2 [1, 4] of 9``; whom nobody is compared with has no place."""
         if self.rank is None:
-            return "oracle"
+            return "in doubt" if self.scored.doubt else "oracle"
+        if self.peers == 1:
+            return "alone"
         return f"{self.rank.place} [{self.rank.low}, {self.rank.high}] of {self.peers}"
+
+    @property
+    def name(self) -> str:
+        """As tables show it: they tell entries that were handed in from those that the board ran itself."""
+        return self.scored.header.method + (" (handed in)" if self.scored.handed_in else "")
 
     @property
     def uses(self) -> str:
@@ -72,7 +79,7 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
             raise RsbenchError(
                 f"{each.folder}: is scored on other problems than {kept[0].folder.name}; rescore the board"
             )
-    ranked = [each for each in kept if ORACLE not in each.header.uses]
+    ranked = [each for each in kept if ORACLE not in each.header.uses and not each.doubt]
     scenes = list(problems["scene"])
     uses = [frozenset(each.header.uses) for each in ranked]
     found: list[Standing] = []
@@ -86,7 +93,7 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
             tied = tuple(ranked[j].header.method for j in ties(beats, i) if j in peers)
             found.append(_standing(ranked[i], scenes, rank, len(peers), tied))
     found.sort(key=_order)
-    oracles = [_standing(each, scenes, None, 0, ()) for each in kept if ORACLE in each.header.uses]
+    oracles = [_standing(each, scenes, None, 0, ()) for each in kept if each not in ranked]
     return found + sorted(oracles, key=_order)
 
 
@@ -115,7 +122,7 @@ def _standing(
 def _median(values: FloatArray) -> float:
     """Of the values that there are, infinite ones too."""
     there = values[~np.isnan(values)]
-    return float(np.quantile(there, 0.5, method="inverted_cdf")) if there.size else float("nan")
+    return float(np.median(there)) if there.size else float("nan")
 
 
 def table(lines: Sequence[Standing]) -> pd.DataFrame:
@@ -124,6 +131,7 @@ def table(lines: Sequence[Standing]) -> pd.DataFrame:
     for line in lines:
         header = line.scored.header
         row: dict[str, object] = {"method": header.method, "uses": line.uses, "peers": line.peers or None}
+        row |= {"handed_in": line.scored.handed_in, "doubt": line.scored.doubt or None}
         row |= dict(zip(("rank", "rank_low", "rank_high"), line.rank or (None, None, None), strict=True))
         row |= _ends(line.means) | line.medians
         if "nees" in line.scored.scores:

@@ -18,6 +18,7 @@ import pandas as pd
 from rsbench.benchmark.leaderboard.answers import Answer
 from rsbench.components.cards import choices
 from rsbench.core.errors import RsbenchError
+from rsbench.core.so3 import FloatArray
 from rsbench.jobs.workers import Workers
 from rsbench.pipeline.problem import Problem
 
@@ -101,6 +102,8 @@ class Track(ABC):
     """The column of scores.csv that decides about the primary score."""
     error_title: ClassVar[str]
     """What figures call it."""
+    exact: ClassVar[tuple[str, float]]
+    """A column of scores.csv, and below which value it is that of the truth handed in: no method is so near."""
     answers: ClassVar[type[Answer]]
     """What a line of a file of predictions must hold."""
     pictures: ClassVar[bool] = False
@@ -207,6 +210,13 @@ class Track(ABC):
     @abstractmethod
     def oracles(self, split: Split, folder: Path) -> Iterator[Path]:
         """Files of predictions, below ``folder``, that show how much there is to gain: the truth, and others."""
+
+    def medians_at_bound(self, uses: Collection[str], split: Split) -> Mapping[str, FloatArray]:
+        """By column of scores.csv, the median (problems,) of errors at the Cramer-Rao bound of what a method uses.
+
+        Infinite where its data say nothing; no columns where no bound is known.
+        """
+        return {}
 
     def of_kind(self, kind: Kind) -> tuple[str, ...]:
         """Keys of the scores of a kind."""

@@ -12,10 +12,17 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.components.arguments import check_number, check_one_of, check_whole
 from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.given import (
+    LARGEST_M,
+    LARGEST_PX,
+    check_number,
+    check_one_of,
+    check_whole,
+    shown,
+)
 from rsbench.core.lens import inverse_2x2
 from rsbench.core.motion import Motion
 from rsbench.core.projection import (
@@ -32,6 +39,8 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
 SceneShape = Literal["box", "plane"]
+MOST_POINTS = 1_000_000
+"""Of each set: ten seconds of one core, and a gigabyte."""
 GYRO_RATE = 20
 """Samples of a gyroscope in a frame period, where a solver wants any: 600 Hz at 30 frames a second."""
 
@@ -82,12 +91,11 @@ class SimulationOptions:
     """Points at random depths, or on one slanted plane in the middle of the range."""
 
     def __post_init__(self) -> None:
-        check_whole("pairs", self.pairs, 0)
-        check_whole("tracks", self.tracks, 0)
-        check_whole("lines", self.lines, 0)
-        check_number("noise_px", self.noise_px, 0.0)
+        for name in ("pairs", "tracks", "lines"):
+            check_whole(name, getattr(self, name), 0, MOST_POINTS)
+        check_number("noise_px", self.noise_px, 0.0, LARGEST_PX)
         check_number("outlier_ratio", self.outlier_ratio, 0.0, 1.0)
-        check_number("outlier_px", self.outlier_px, 0.0)
+        check_number("outlier_px", self.outlier_px, 0.0, LARGEST_PX)
         check_whole("gyro_rate", self.gyro_rate, 0, 100_000)
         check_number("gyro_noise_deg", self.gyro_noise_deg, 0.0)
         check_number("gyro_bias_deg", self.gyro_bias_deg, 0.0)
@@ -95,9 +103,13 @@ class SimulationOptions:
         check_number("gravity_noise_deg", self.gravity_noise_deg, 0.0)
         check_number("affine_noise", self.affine_noise, 0.0)
         check_one_of("shape", self.shape, get_args(SceneShape))
-        near, far = self.depth
-        if not 0.0 < near <= far < np.inf:
-            raise ValueError(f"depth = {self.depth}: must be two positive distances in metres, the nearer first")
+        depth = self.depth
+        if np.shape(depth) != (2,):
+            raise ValueError(f"depth = {shown(depth)}: must be two distances in metres, the nearer first")
+        for distance in depth:
+            check_number("depth", distance, 0.0, LARGEST_M)
+        if not 0.0 < depth[0] <= depth[1]:
+            raise ValueError(f"depth = {depth}: must be two positive distances in metres, the nearer first")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

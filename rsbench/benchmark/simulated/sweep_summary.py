@@ -179,15 +179,6 @@ def over_bound(values: FloatArray, sigmas: FloatArray, seed: int) -> dict[str, f
     return {"rms": rms, "bound": bound, "over_bound": rms / bound, "over_bound_low": low, "over_bound_high": high}
 
 
-def below_bound(table: pd.DataFrame) -> pd.DataFrame:
-    """The rows of a summary whose errors lie below their bound, with an interval that excludes 1.
-
-    No unbiased solver does that; of the intervals of one that is at its bound, one in forty does by chance.
-    """
-    highest = table[["e_R_over_bound_high", "e_T_over_bound_high"]].astype(float)
-    return table[(highest < 1.0).any(axis=1)]
-
-
 def _rms_quotient(means: FloatArray) -> FloatArray:
     return np.sqrt(means[..., 0] / means[..., 1])
 

@@ -12,8 +12,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.components.arguments import check_whole
 from rsbench.core.errors import RsbenchError
+from rsbench.core.given import check_whole
 from rsbench.core.rig import SIDES, Side
 from rsbench.dataset.sequence import Sequence, read_dataset
 

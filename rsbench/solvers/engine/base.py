@@ -20,6 +20,7 @@ import numpy as np
 from rsbench.components.motion_models import check_parameters
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
+from rsbench.core.given import real_array
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -60,7 +61,7 @@ class MotionEstimate:
 
     def __post_init__(self) -> None:
         for name in ("w", "d"):
-            value = np.array(getattr(self, name), dtype=np.float64)
+            value = real_array(f"{name} of a motion estimate", getattr(self, name))
             if value.shape != (3,) or (self.success and not np.all(np.isfinite(value))):
                 raise ValueError(f"{name} of a motion estimate must be 3 finite numbers, got {value}")
             value.setflags(write=False)

@@ -14,6 +14,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core import given
 from rsbench.core.so3 import FloatArray
 
 Model = TypeVar("Model")
@@ -21,6 +22,7 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 _BATCH = 10
 """Samples drawn at a time: a compiled solver does a batch for little more than one."""
+_MOST_STEPS = 10**9
 
 
 class Estimator(Protocol[Model]):
@@ -62,8 +64,11 @@ class RansacOptions:
     """Probability that a wrong datum is an inlier of a given model: a consensus must be beyond chance."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.threshold) and self.threshold > 0.0):
-            raise ValueError(f"threshold must be positive, got {self.threshold}")
+        given.check_positive("threshold", self.threshold, given.LARGEST_PX, "pixels")
+        for name in ("confidence", "chance"):
+            given.check_number(name, getattr(self, name), 0.0, 1.0)
+        for name in ("min_iterations", "max_iterations", "lo_steps", "final_steps"):
+            given.check_whole(name, getattr(self, name), 0, _MOST_STEPS)
         if not 0.0 < self.confidence < 1.0:
             raise ValueError(f"confidence must lie between 0 and 1, got {self.confidence}")
         if not 0.0 < self.chance < 1.0:
@@ -72,10 +77,6 @@ class RansacOptions:
             raise ValueError(
                 "min_iterations must lie between 1 and max_iterations, got "
                 f"{self.min_iterations} and {self.max_iterations}"
-            )
-        if self.lo_steps < 0 or self.final_steps < 0:
-            raise ValueError(
-                f"lo_steps and final_steps cannot be negative, got {self.lo_steps} and {self.final_steps}"
             )
 
 

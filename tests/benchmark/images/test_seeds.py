@@ -67,7 +67,8 @@ def test_no_run_is_refused(smoke_dataset: Path, tmp_path: Path) -> None:
         ([0.0241, 0.0312, 0.0279, 0.0255, 0.0290], "0.0279 [0.0255, 0.0290]"),
         ([44.21, 12.02, 45.93, 48.17, 160.1], "45.9 [44.2, 48.2]"),
         ([1.0, 180.0, 180.0, 180.0, 180.0], "180"),
-        ([0.3, 0.5, np.inf, np.inf], "0.50 [0.30, inf]"),
+        ([0.3, 0.4, 0.5, np.inf], "0.45 [0.30, 0.50]"),  # of an even number the mean of the two in the middle
+        ([0.3, 0.5, np.inf, np.inf], "inf"),
         ([np.inf, np.inf], "inf"),
         ([np.nan], "–"),
         ([0.0, 0.0], "0.00"),

@@ -88,7 +88,7 @@ def test_motion_keeps_its_random_axes_while_magnitudes_change() -> None:
         ({"trials": 0}, ["trials = 0: must be a whole number from 1 to"]),
         ({"name": "a/b"}, ["name = 'a/b'"]),
         ({"setting": {**SETTING, "depth": [5.0, 2.0]}}, ["depth must be two positive numbers in order"]),
-        ({"setting": {**SETTING, "readout_ratio": 1.2}}, ["readout_ratio must lie in [0, 1]"]),
+        ({"setting": {**SETTING, "readout_ratio": 1.2}}, ["readout_ratio = 1.2: must be a number from 0 to 1"]),
         ({"setting": {**SETTING, "noise_px": -1.0}}, ["noise_px must not be negative"]),
         ({"setting": {**SETTING, "outlier_ratio": 1.0}}, ["outlier_ratio must lie in [0, 1)"]),
         (
@@ -96,10 +96,10 @@ def test_motion_keeps_its_random_axes_while_magnitudes_change() -> None:
             ["motion model 'spiral'", "linear, spline, trajectory, twist"],
         ),
         ({"setting": {**SETTING, "rotation_axis": [0.0, 0.0, 0.0]}}, ["rotation_axis must not be zero"]),
-        ({"setting": {**SETTING, "baseline": 0.0}}, ["baseline must be a positive number"]),
+        ({"setting": {**SETTING, "baseline": 0.0}}, ["baseline = 0.0: must be a positive number"]),
         ({"variant": [{"name": "a"}, {"name": "a"}]}, ["[[variant]] needs a name of its own"]),
         ({"variant": [{"name": "a", "setting": {"nois": 1}}]}, ["variant 'a'", "unknown key 'nois'"]),
-        ({"axis": "readout_ratio_error", "values": [0.5]}, ["readout_ratio_error = 0.5", "[0, 1]"]),
+        ({"axis": "readout_ratio_error", "values": [0.5]}, ["readout_ratio_error = 0.5", "from 0 to 1"]),
     ],
 )
 def test_bad_cards_are_refused_in_one_line(changes: dict[str, Any], parts: list[str]) -> None:

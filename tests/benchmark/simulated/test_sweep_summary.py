@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from rsbench.benchmark.simulated.sweep_card import Cell, Setting
 from rsbench.benchmark.simulated.sweep_summary import (
     at_bound,
-    below_bound,
     over_bound,
     score_trials,
     statistics,
@@ -127,11 +125,3 @@ def test_the_statistics_at_the_bound_are_those_of_errors_that_reach_it() -> None
         low, high = found[f"{name}_low"], found[f"{name}_high"]
         assert low is not None and high is not None
         assert low - 0.01 <= told[f"bound_{name}"] <= high + 0.01
-
-
-def test_ratios_that_no_solver_can_have_are_found() -> None:
-    rows = [{"solver": k, "e_R_over_bound_high": r, "e_T_over_bound_high": t} for k, r, t in NO_AND_YES]
-    assert list(below_bound(pd.DataFrame(rows)).solver) == ["rotation", "direction"]
-
-
-NO_AND_YES = (("rotation", 0.99, 1.1), ("direction", 1.2, 0.97), ("fine", 1.02, 1.0), ("none", np.nan, np.nan))

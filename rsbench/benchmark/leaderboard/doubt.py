@@ -1,0 +1,86 @@
+"""Entries nearer to the truth than their data allow are marked, and have no rank until the board's keeper says so.
+
+Two signs: answers that are exact, and errors below what the Cramer-Rao bound of what a method says it uses allows.
+An unbiased method errs by less than the median at the bound in at most half of the problems.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from rsbench.benchmark.leaderboard.answers import Header
+from rsbench.benchmark.leaderboard.splits import Split
+from rsbench.benchmark.leaderboard.track import ORACLE
+from rsbench.benchmark.seeds import generator
+from rsbench.benchmark.simulated.bound import Bound
+from rsbench.benchmark.statistics import share_interval
+from rsbench.components.cards import list_cards
+from rsbench.core.errors import RsbenchError
+from rsbench.core.so3 import FloatArray
+
+COVERAGE = 0.999
+"""Of the interval that must leave out one half: one honest method in two thousand at the bound is asked about."""
+_DRAWS = 4000
+"""Of errors at a bound: their median is known to 3 %."""
+_ORACLES = (ORACLE, "cramer-rao", "constant", "uncorrected", "fusion-true")
+_BUILT_IN = ("rs-stereo", "sgm", "sweep", "fusion")
+"""Names that were used, beside those of cards."""
+
+
+def refuse_reserved(header: Header, where: str) -> None:
+    """Raises RsbenchError where a name, but of an oracle, is that of a method of rsbench, which alone has it."""
+    method = header.method
+    if ORACLE in header.uses:
+        return
+    kinds = ("solvers", "matchers", "correctors")
+    if method.lower() in {*_ORACLES, *_BUILT_IN, *(name for kind in kinds for name in list_cards(kind))}:
+        raise RsbenchError(
+            f"{where}: method = {method!r}: is the name of a method of rsbench; choose another, such as "
+            f"'{method}-mine'"
+        )
+
+
+def doubt_about(scores: pd.DataFrame, header: Header, split: Split) -> str:
+    """Why an entry is not believed, in a line; empty where nothing speaks against it."""
+    if ORACLE in header.uses:
+        return ""
+    track = split.track
+    column, below = track.exact
+    exact = np.asarray(scores[column].to_numpy(dtype=np.float64) < below)
+    if 2 * np.count_nonzero(exact) > len(exact):
+        return f"{column} is below {below:g}, exact but for rounding, in {_words(exact, 0.95)} of the problems"
+    for name, medians in track.medians_at_bound(header.uses, split).items():
+        known = np.isfinite(medians)
+        nearer = scores[name].to_numpy(dtype=np.float64)[known] < medians[known]
+        if share_interval(int(np.count_nonzero(nearer)), len(nearer), COVERAGE).low > 0.5:
+            return (
+                f"{name} is below the median at the Cramer-Rao bound of {' + '.join(header.uses)} in "
+                f"{_words(nearer, COVERAGE)} of the problems; without bias it is so in half of them at most"
+            )
+    return ""
+
+
+def _words(hits: NDArray[np.bool_], coverage: float) -> str:
+    count = int(np.count_nonzero(hits))
+    low, high = share_interval(count, len(hits), coverage)
+    return f"{count / len(hits):.2f} [{low:.2f}, {high:.2f}]"
+
+
+def medians_of(bounds: Sequence[Bound], with_direction: bool) -> Mapping[str, FloatArray]:
+    """Medians (n,) of e_R_deg and e_T_deg of Gaussian errors at bounds; infinite where the data say nothing."""
+    draws = np.abs(generator(0, "leaderboard", "doubt").standard_normal((_DRAWS, 3)))
+    found = {"e_R_deg": np.array([_median(bound.rotation_axes, draws) for bound in bounds])}
+    if with_direction:
+        found["e_T_deg"] = np.array([_median(bound.direction_axes, draws) for bound in bounds])
+    return found
+
+
+def _median(axes: FloatArray, draws: FloatArray) -> float:
+    if not np.all(np.isfinite(axes)):
+        return np.inf
+    lengths = np.sqrt(np.sum((axes * draws[:, : len(axes)]) ** 2, axis=1))
+    return float(np.rad2deg(np.median(lengths)))

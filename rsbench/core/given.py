@@ -1,0 +1,126 @@
+"""What public constructors and functions are given, checked in one place: types, finite numbers, sizes.
+
+Every message is one line with the name, the value and what may be. Numbers are Python's or NumPy's own integers
+and floats: no truth values, no complex numbers, no text, no arrays of objects.
+"""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Collection, Sequence
+from typing import Any, TypeGuard
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rsbench.core.so3 import FloatArray
+
+LARGEST = 1e60
+"""Beyond it products of a few numbers overflow: no length, angle or coefficient is as large."""
+LARGEST_SIZE = 1_000_000
+"""Rows or columns of an image: ten times the largest stitched ones."""
+LARGEST_PX = 1e9
+"""Focal lengths and principal points, in pixels."""
+LARGEST_M = 1e9
+"""Lengths, in metres: beyond the moon."""
+_REAL = "iuf"
+
+
+def check_one_of(name: str, value: object, allowed: Collection[object]) -> None:
+    """Raises ValueError unless ``value`` is one of ``allowed``."""
+    if not isinstance(value, str | int | float | None) or value not in allowed:
+        raise ValueError(f"{name} = {shown(value)}: must be one of {', '.join(map(repr, allowed))}")
+
+
+def check_number(name: str, value: object, least: float = -LARGEST, most: float = LARGEST) -> None:
+    """Raises ValueError unless ``value`` is a finite number from ``least`` to ``most``."""
+    if not (is_number(value) and least <= _plain(value) <= most):
+        if least <= -LARGEST and most >= LARGEST:
+            allowed = "that is finite"
+        elif most >= LARGEST:
+            allowed = f"at least {least:g}"
+        else:
+            allowed = f"from {least:.10g} to {most:.10g}"
+        raise ValueError(f"{name} = {shown(value)}: must be a number {allowed}")
+
+
+def check_positive(name: str, value: object, most: float, unit: str) -> None:
+    """Raises ValueError unless ``value`` is a number above 0 and not above ``most``."""
+    if not (is_number(value) and 0.0 < _plain(value) <= most):
+        raise ValueError(f"{name} = {shown(value)}: must be a positive number of {unit}, at most {most:g}")
+
+
+def check_whole(name: str, value: object, least: int, most: float = math.inf) -> None:
+    """Raises ValueError unless ``value`` is a whole number from ``least`` to ``most``."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
+        allowed = f"of at least {least}" if math.isinf(most) else f"from {least} to {most}"
+        raise ValueError(f"{name} = {shown(value)}: must be a whole number {allowed}")
+
+
+def check_type(name: str, value: object, wanted: type) -> None:
+    """Raises ValueError unless ``value`` is of the type."""
+    if not isinstance(value, wanted):
+        raise ValueError(f"{name}: must be an rsbench {wanted.__name__}, got {shown(value)}")
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Whether it is one real number, finite or not."""
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
+def _plain(value: float) -> float:
+    """As Python's float: NumPy's short ones overflow where they are compared with large numbers."""
+    try:
+        return float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        return math.inf
+
+
+def real_array(name: str, value: ArrayLike) -> FloatArray:
+    """A copy as float64; raises ValueError unless it is an array of real numbers, finite or not."""
+    if isinstance(value, np.ndarray) and value.dtype == np.float64:
+        return np.array(value)
+    try:
+        array = np.asarray(value)
+    except (ValueError, TypeError):  # rows of unequal lengths
+        array = np.zeros((), dtype=object)
+    if array.dtype.kind not in _REAL and array.size > 0:
+        raise ValueError(f"{name} must be real numbers, got {_kind(array, value)}")
+    if isinstance(value, Sequence) and len(value) <= 16 and any(map(_is_truth, value)):
+        raise ValueError(f"{name} must be real numbers, got truth values: {shown(value)}")
+    return np.array(array, dtype=np.float64)
+
+
+def vector(name: str, value: ArrayLike) -> FloatArray:
+    """Three finite numbers (3,) as a read-only copy; raises ValueError on anything else."""
+    try:
+        v = real_array(name, value)
+    except ValueError as error:
+        raise ValueError(f"{name} must be 3 finite numbers, got {shown(value)}") from error
+    if v.shape != (3,) or not np.all(np.abs(v) <= LARGEST):
+        raise ValueError(f"{name} must be 3 finite numbers, got {shown(value)}")
+    v.setflags(write=False)
+    return v
+
+
+def shown(value: object) -> str:
+    """The value in one short line."""
+    if isinstance(value, np.ndarray) and value.size > 4:
+        return f"an array of {value.dtype} {value.shape}"
+    text = _SHORT.repr(value) if not isinstance(value, np.generic) else str(value)
+    line = " ".join(text.split())
+    return line if len(line) <= _WIDEST else f"{line[:_WIDEST]} ..."
+
+
+def _kind(array: np.ndarray[Any, Any], value: object) -> str:
+    return shown(value) if array.dtype == object and array.ndim == 0 else f"an array of {array.dtype}"
+
+
+def _is_truth(value: object) -> bool:
+    return isinstance(value, bool | np.bool_)
+
+
+_WIDEST = 120
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 60
