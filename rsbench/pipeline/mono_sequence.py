@@ -132,6 +132,7 @@ def correct_all(
     target_row: float | None = None,
     *,
     inpaint: bool = True,
+    seed: int = 0,
 ) -> list[Fused]:
     """``correct_frames`` of a camera, a horizontal field of view in degrees, or None; its errors."""
     known: dict[str, Any] = {}
@@ -143,7 +144,7 @@ def correct_all(
         card = OneCameraCard(readout_ratio=readout_ratio, **known)
     except ValueError as error:
         raise RsbenchError(str(error)) from error
-    corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=inpaint))
+    corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=inpaint), seed=seed)
     moments = correct_frames(frames, card, MonoOptions(corrector=corrector, target_row=target_row))
     return [moment.fused for moment in moments]
 

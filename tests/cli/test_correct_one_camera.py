@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from commands import assert_refused, run_here
 
+import rsbench
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.pipeline.mono_sequence import OneCameraCard, correct_all, correct_frames
+from rsbench.pipeline.mono_sequence import OneCameraCard, correct_frames
 from rsbench.storage.files import read_png, write_png
 
 SPEED, SIZE = 12.0, (120, 160)
@@ -105,10 +106,11 @@ def test_a_still_pair_among_others_is_a_mark_on_its_frame() -> None:
 def test_a_camera_may_be_intrinsics_a_field_of_view_or_nothing() -> None:
     frames, focal = [_rolling(0), _rolling(1)], 80.0 / np.tan(np.deg2rad(30.0))
     camera = PinholeCamera.centred(SIZE[1], SIZE[0], focal)
-    known, told = (correct_all(frames, each, 1.0)[1].image for each in (camera, 60.0))
+    known, told = (rsbench.correct(frames, camera=each, readout_ratio=1.0)[1].image for each in (camera, 60.0))
     np.testing.assert_array_equal(known, told)
     # A motion parallel to the image is seen alike by any focal length.
-    difference = correct_all(frames, None, 1.0)[1].image[8:-8, 20:-20].astype(float) - known[8:-8, 20:-20]
+    unknown = rsbench.correct(frames, camera="unknown", readout_ratio=1.0)[1].image
+    difference = (unknown.astype(float) - known)[8:-8, 20:-20]
     assert np.sqrt(np.mean(difference**2)) < 3.0
     with pytest.raises(RsbenchError, match="fov_deg"):
-        correct_all(frames, 200.0, 1.0)
+        rsbench.correct(frames, camera=200.0, readout_ratio=1.0)
