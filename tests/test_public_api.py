@@ -252,6 +252,10 @@ FEW_ROWS = rsbench.RollingShutter(height=9, readout_ratio=0.8)
         (lambda: rsbench.correct([FLAT] * 5, RIG), "got 5; four are needed"),
         (lambda: rsbench.correct([FLAT] * 4, RIG, 1.5), "readout_ratio = 1.5: must be a number from 0 to 1"),
         (lambda: rsbench.correct([FLAT] * 4, RIG, target_row=900), "target_row = 900: must be .* to 899"),
+        (lambda: rsbench.correct([FLAT] * 2), "rig: give a StereoRig, or camera"),  # pyrefly: ignore[no-matching-overload]
+        (lambda: rsbench.correct([FLAT] * 2, RIG, camera=60.0), "one of both"),  # pyrefly: ignore[unexpected-keyword]
+        (lambda: rsbench.correct([FLAT] * 2, camera=60.0, matcher="sgm-2"), "matcher = 'sgm-2': .* leave it out"),  # pyrefly: ignore[no-matching-overload]
+        (lambda: rsbench.correct([FLAT[:9]] * 2, camera=RIG.camera), "frame 0: is 900 x 9 pixels"),
         (lambda: rsbench.generate("smoke", "unused", workers=0), "workers = 0: must be a whole"),
         (lambda: rsbench.verify("unused", rerender="some"), "rerender = 'some': must be one of"),  # pyrefly: ignore[bad-argument-type]
         (lambda: rsbench.verify("unused", stride=0), "stride = 0: must be a whole number of at least 1"),

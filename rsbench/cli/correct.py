@@ -80,8 +80,8 @@ def correct(
     footage: Footage = None,
 ) -> None:
     """Correct your own rolling-shutter frames: of a stereo rig or of one camera, two times or a whole sequence."""
-    if camera is not None:
-        correct_one_camera(frames, footage, camera, out, target, inpaint=True)
+    if camera is not None or footage is not None:
+        correct_one_camera(frames, footage, camera, out, target, inpaint=True, seed=seed)
         return
     given = given_frames(frames, rig, out, left, right)
     others = {"find_sky": sky, "inpaint": inpaint, "seed": seed, "motion_model": motion_model}

@@ -165,6 +165,7 @@ def card_classes() -> dict[str, list[tuple[str, type]]]:
     from rsbench.components.shutters import ShutterCard
     from rsbench.dataset.card import DatasetCard
     from rsbench.pipeline.footage import RigCard
+    from rsbench.pipeline.one_camera_card import OneCameraCard
     from rsbench.renderers.options import RendererOptions
     from rsbench.scenes.load import SceneCard
 
@@ -175,6 +176,7 @@ def card_classes() -> dict[str, list[tuple[str, type]]]:
         "Sweep cards": [("", SweepCard)],
         "Shutter cards": [("", ShutterCard)],
         "rig.toml": [("", RigCard)],
+        "camera.toml": [("", OneCameraCard)],
         "Leaderboard predictions": [("First line", Header), ("Every other line", Answer)],
     }
     cards = [name for name in COMPONENTS if component_kind(name).cards is not None]
@@ -189,6 +191,7 @@ _ABOUT = {
     "Renderer cards": "Files in `renderers/`.",
     "Sweep cards": "Files in `cards/sweeps/`, for `rsbench simulate`.",
     "Shutter cards": "Files in `cards/shutters/`: measured readout times of real cameras.",
+    "camera.toml": "The card of `rsbench correct --camera`, of frames of one camera; `--frames` do without it.",
     "rig.toml": "The cameras of your own frames, for `rsbench correct` and `rsbench inspect`.",
     "Leaderboard predictions": "JSON lines, for `rsbench leaderboard submit`.",
     "Component cards": "Files in `solvers/`, `cards/matchers/`, `cards/features/`, `cards/correctors/` and "

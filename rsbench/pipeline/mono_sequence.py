@@ -1,62 +1,29 @@
-"""Frames of one camera, any number of them, corrected in order, each with the frame before it."""
+"""Frames of one camera, any number of them, corrected in order, each with the frame before it.
+
+A frame that does not go on from the one before it, as after a cut, is corrected with the one after it.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Iterator
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.components.cards import parse_card, read_toml
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.footage import CameraCard, check_alike
-from rsbench.pipeline.mono_correction import FoundOwnMotion, MonoFusionCorrector, find_own_motion, refusal
+from rsbench.pipeline.mono_correction import STILL, FoundOwnMotion, MonoFusionCorrector, find_own_motion, refusal
+from rsbench.pipeline.mono_shutter import find_shutter
+from rsbench.pipeline.one_camera_card import OneCameraCard
+from rsbench.pipeline.turned_frames import Turned, turned
 from rsbench.vision.fusion import Fused
 from rsbench.vision.mono_fusion import MonoFusion, MonoFusionOptions, find_flows
-
-DEFAULT_FOCAL = 1.0
-"""Focal length in widths of the image where nothing is said: a horizontal field of view of 53 degrees. On frames
-of a high-speed camera, from 0.8 to 2.5 widths moved the corrected pixels by less than 0.05 px."""
-_WIDEST_DEG = 170.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class OneCameraCard:
-    """What is known of a camera whose frames are corrected alone; the size comes from the images."""
-
-    readout_ratio: float | None = None
-    """Readout time over frame period, 0 to 1."""
-    fov_deg: float | None = None
-    """Horizontal field of view, degrees, in place of ``camera``. Absent both: a focal length of the width."""
-    camera: CameraCard | None = None
-    """Intrinsics."""
-
-    def __post_init__(self) -> None:
-        if self.readout_ratio is not None and not 0.0 <= self.readout_ratio <= 1.0:
-            raise ValueError(f"readout_ratio = {self.readout_ratio}: must lie in [0, 1]")
-        if self.fov_deg is not None and not 0.0 < self.fov_deg <= _WIDEST_DEG:
-            raise ValueError(f"fov_deg = {self.fov_deg}: must lie in (0, {_WIDEST_DEG:g}]")
-        if self.fov_deg is not None and self.camera is not None:
-            raise ValueError("fov_deg: leave it out beside [camera], which says the focal length")
-        if self.camera is not None and self.camera.lens is not None:
-            raise ValueError("camera.lens: leave it out; undistort frames of one camera first")
-
-    def camera_of(self, width: int, height: int) -> PinholeCamera:
-        """The camera of images of this size."""
-        if self.camera is not None:
-            c = self.camera
-            return PinholeCamera(width=width, height=height, fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy)
-        if self.fov_deg is not None:
-            focal = 0.5 * width / math.tan(math.radians(0.5 * self.fov_deg))
-            return PinholeCamera.centred(width, height, focal)
-        return PinholeCamera.centred(width, height, DEFAULT_FOCAL * width)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,11 +34,11 @@ class MonoMoment:
     image: NDArray[Any]
     """As it was read."""
     fused: Fused
-    """``fused.reason`` says why it is not corrected."""
+    """``fused.reason`` says why it is not corrected; it is then as it was read."""
     found: FoundOwnMotion | None
-    """The motion, of length 1, over the frame and the one before (of the first frame: after); None without one."""
-    camera: PinholeCamera
-    readout_ratio: float
+    """The motion, of length 1, over the frame and the one before, or else after; None without one."""
+    skipped: str = ""
+    """Why it was corrected with the frame after it in place of the one before; empty for the first frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,55 +50,64 @@ class MonoOptions:
     """The time of this row of a frame is that of its corrected image; None: of the middle one."""
 
 
-def read_one_camera(path: Path) -> OneCameraCard:
-    """Card of one camera: ``readout_ratio``, and ``[camera]`` (fx, fy, cx, cy), ``fov_deg``, or neither.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Pair:
+    """Two successive frames, ready to be corrected."""
 
-    Raises:
-        RsbenchError: one line with the file, the field, the value and what is allowed.
-    """
-    return parse_card(OneCameraCard, read_toml(path), str(path))
+    fusion: MonoFusion | None
+    found: FoundOwnMotion | None
+    reason: str
+    """Why they cannot be; empty where they can."""
 
 
 def correct_frames(
-    frames: Iterable[NDArray[Any]], card: OneCameraCard, options: MonoOptions | None = None
+    frames: Iterable[NDArray[Any]],
+    camera: PinholeCamera,
+    shutter: RollingShutter,
+    options: MonoOptions | None = None,
 ) -> Iterator[MonoMoment]:
     """Every frame (H, W[, 3]), uint8 or uint16, of one camera at the time of its target row, in order.
 
     Raises:
-        RsbenchError: fewer than two frames, frames of two sizes, no readout ratio, or two frames alone that
-            show no texture or no motion. Of more frames such a pair is a failure by value.
+        RsbenchError: fewer than two frames, frames of two sizes, or two frames alone that cannot be corrected. Of
+            more frames such a pair is a failure by value.
     """
     options = options or MonoOptions()
-    if card.readout_ratio is None:
-        raise RsbenchError("readout_ratio: must be given for one camera")
-    before: NDArray[Any] | None = None
-    first: list[MonoMoment] = []
-    number = -1
-    for number, image in enumerate(frames):
-        if before is not None:
-            check_alike({f"frame {number - 1}": before, f"frame {number}": image})
-            moments = _corrected((before, image), card, card.readout_ratio, options, number, first=number == 1)
-            if number == 1:
-                first = moments  # held until it is known whether they are all
-            else:
-                yield from first
-                yield from moments
-                first = []
-        before = image
-    if number < 1:
-        raise RsbenchError(f"frames: {number + 1} given; one camera shows its motion in at least two")
-    if first and first[0].fused.reason:
-        raise RsbenchError(f"frames: {first[0].fused.reason}")
-    yield from first
+    turn = turned(camera, shutter)
+    waits: MonoMoment | None = None
+    number = 0
+    for number, (before, image) in enumerate(itertools.pairwise(frames), start=1):
+        check_alike({f"frame {number - 1}": before, f"frame {number}": image})
+        pair = _ready([turn.image(before), turn.image(image)], turn, options)
+        if number == 1:
+            waits = _unmoved(0, before, pair.reason)
+        if waits is not None:
+            yield _corrected(0, waits, pair, turn, options) if pair.fusion else waits
+        now = _unmoved(number, image, pair.reason)
+        moment = _corrected(1, now, pair, turn, options) if pair.fusion else None
+        # A camera that stood still is in place; the same frame twice stands for one that was not taken.
+        stays = pair.reason == STILL and not np.array_equal(before, image)
+        waits = None
+        if moment is not None or stays:
+            yield moment or now
+        else:
+            waits = now
+    if number == 0:
+        raise RsbenchError("frames: fewer than two; one camera shows its motion in at least two")
+    if waits is not None:
+        if number == 1:
+            raise RsbenchError(f"frames: {waits.fused.reason}")
+        yield waits
 
 
 def correct_all(
-    frames: Iterable[NDArray[Any]],
+    frames: Sequence[NDArray[Any]],
     camera: PinholeCamera | float | None,
     readout_ratio: float | None,
     target_row: float | None = None,
     *,
     inpaint: bool = True,
+    seed: int = 0,
 ) -> list[Fused]:
     """``correct_frames`` of a camera, a horizontal field of view in degrees, or None; its errors."""
     known: dict[str, Any] = {}
@@ -143,48 +119,36 @@ def correct_all(
         card = OneCameraCard(readout_ratio=readout_ratio, **known)
     except ValueError as error:
         raise RsbenchError(str(error)) from error
-    corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=inpaint))
-    moments = correct_frames(frames, card, MonoOptions(corrector=corrector, target_row=target_row))
-    return [moment.fused for moment in moments]
+    corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=inpaint), seed=seed)
+    shutter = find_shutter(frames, len(frames), card, corrector.robust, seed).shutter
+    height, width = frames[0].shape[:2]
+    options = MonoOptions(corrector=corrector, target_row=target_row)
+    return [moment.fused for moment in correct_frames(frames, card.camera_of(width, height), shutter, options)]
 
 
-def _corrected(
-    pair: tuple[NDArray[Any], NDArray[Any]],
-    card: OneCameraCard,
-    readout_ratio: float,
-    options: MonoOptions,
-    number: int,
-    *,
-    first: bool,
-) -> list[MonoMoment]:
-    """The second frame of a pair, of this number, and before it the ``first`` one where it is wanted."""
-    height, width = pair[0].shape[:2]
-    camera = card.camera_of(width, height)
-    rig, shutter = (
-        StereoRig(camera=camera, baseline=1.0),
-        RollingShutter(height=height, readout_ratio=readout_ratio),
-    )
-    row = (height - 1) / 2 if options.target_row is None else options.target_row
-    flows = find_flows(pair)
-    found, fusion, reason = None, None, refusal(pair, flows)
-    if not reason:
-        corrector = options.corrector
-        found = find_own_motion(flows, rig, shutter, "left", corrector.robust, corrector.seed)
-        fusion = MonoFusion(pair, found.own, flows, corrector.fusion)
-    moments = []
-    for frame in (0, 1) if first else (1,):
-        fused = Fused.failed(pair[frame], reason)
-        if fusion is None:
-            fused = replace(fused, image=pair[frame].copy())
-        else:
-            fused = fusion.corrected(frame, float(shutter.time_after(row, frame, "left")))
-        at = number - 1 + frame
-        moments.append(
-            MonoMoment(
-                number=at, image=pair[frame], fused=fused, found=found, camera=camera, readout_ratio=readout_ratio
-            )
-        )
-    return moments
+def _ready(images: Sequence[NDArray[Any]], turn: Turned, options: MonoOptions) -> _Pair:
+    flows = find_flows(images)
+    if reason := refusal(images, flows):
+        return _Pair(fusion=None, found=None, reason=reason)
+    rig, corrector = StereoRig(camera=turn.camera, baseline=1.0), options.corrector
+    found = find_own_motion(flows, rig, turn.shutter, "left", corrector.robust, corrector.seed)
+    return _Pair(fusion=MonoFusion(images, found.own, flows, corrector.fusion), found=found, reason="")
+
+
+def _unmoved(number: int, image: NDArray[Any], reason: str) -> MonoMoment:
+    """A frame as it was read."""
+    fused = replace(Fused.failed(image, reason), image=image.copy())
+    return MonoMoment(number=number, image=image, fused=fused, found=None)
+
+
+def _corrected(place: int, unmoved: MonoMoment, pair: _Pair, turn: Turned, options: MonoOptions) -> MonoMoment:
+    """The first or second frame of a pair; the first of all has nothing before it to be skipped."""
+    assert pair.fusion is not None
+    row = options.target_row
+    line = (turn.camera.height - 1) / 2 if row is None else turn.line(row)
+    fused = pair.fusion.corrected(place, float(turn.shutter.time_after(line, place, "left")))
+    skipped = unmoved.fused.reason if place == 0 and unmoved.number > 0 else ""
+    return replace(unmoved, fused=turn.back(fused), found=turn.found(pair.found), skipped=skipped)
 
 
 def translation_record(found: FoundOwnMotion) -> dict[str, Any]:

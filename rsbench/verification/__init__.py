@@ -65,12 +65,12 @@ def verify_dataset(
     state = State(listing, manifest_checks.DATASET)
     run_stage(state, "dataset")
     reports = [SequenceReport(name=state.name, findings=tuple(state.findings))] if state.findings else []
-    given = stride, rerender, *_cards_and_files(scenes)
+    options = stride, rerender, *_cards_and_files(scenes)
     if workers == 1 or len(listing.names) < 2:
-        check = _checker(folder, *given, step)
+        check = _checker(folder, *options, step)
         return reports + [check(name) for name in listing.names]
     found = {}
-    for report in reports_apart(_checker, list(listing.names), workers, rerender != "no", folder, *given):
+    for report in reports_apart(_checker, list(listing.names), workers, rerender != "no", folder, *options):
         found[report.name] = report
         for _ in range(_steps(listing)):
             step(report.name)

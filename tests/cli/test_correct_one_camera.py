@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from commands import assert_refused, run_here
 
+import rsbench
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.pipeline.mono_sequence import OneCameraCard, correct_all, correct_frames
+from rsbench.core.shutter import RollingShutter, Scan
+from rsbench.pipeline.mono_sequence import MonoMoment, correct_frames
 from rsbench.storage.files import read_png, write_png
 
 SPEED, SIZE = 12.0, (120, 160)
@@ -48,6 +50,12 @@ def folder(tmp_path: Path) -> Path:
 def _correct(folder: Path, *arguments: Any) -> Any:
     camera = folder / "camera.toml"
     return run_here("correct", *arguments, "--camera", camera, "--out", folder / "out", "--target", 60)
+
+
+def _moments(frames: list[np.ndarray], scan: Scan = "top") -> list[MonoMoment]:
+    height, width = frames[0].shape[:2]
+    shutter = RollingShutter(height=height, width=width, readout_ratio=1.0, scan=scan)
+    return list(correct_frames(frames, PinholeCamera.centred(width, height, 160.0), shutter))
 
 
 def test_two_frames_become_upright(folder: Path) -> None:
@@ -86,7 +94,8 @@ def test_bad_input_is_refused_in_one_line_and_nothing_is_left(folder: Path) -> N
     assert_refused(_correct(folder, folder / "flat.png", folder / "flat.png"), "no texture")
     assert_refused(_correct(folder), "--frames")
     (folder / "camera.toml").write_text("fov_deg = 60.0\n")
-    assert_refused(_correct(folder, first, folder / "1.png"), "readout_ratio")
+    unknown = _correct(folder, first, folder / "1.png")  # this motion lies along the rows
+    assert unknown.returncode == 1 and "cannot tell the readout ratio" in unknown.stderr
     (folder / "camera.toml").write_text("readout_ratio = 1.0\nfov_deg = 180.0\n")
     assert_refused(_correct(folder, first, folder / "1.png"), "fov_deg")
     assert not (folder / "out").exists()
@@ -94,21 +103,49 @@ def test_bad_input_is_refused_in_one_line_and_nothing_is_left(folder: Path) -> N
 
 def test_a_still_pair_among_others_is_a_mark_on_its_frame() -> None:
     frames = [_rolling(0), _rolling(1), _rolling(1)]
-    moments = list(correct_frames(frames, OneCameraCard(readout_ratio=1.0)))
+    moments = _moments(frames)
     assert [moment.number for moment in moments] == [0, 1, 2]
     assert [bool(moment.fused.reason) for moment in moments] == [False, False, True]
     np.testing.assert_array_equal(moments[2].fused.image, frames[2])
-    with pytest.raises(RsbenchError, match="readout_ratio"):
-        list(correct_frames(frames, OneCameraCard()))
+
+
+def test_a_frame_after_a_cut_is_corrected_with_the_one_after_it() -> None:
+    other = [np.ascontiguousarray(_rolling(frame)[::-1, :, ::-1]) for frame in (5, 6)]
+    moments = _moments([_rolling(0), _rolling(1), *other])
+    assert [moment.number for moment in moments] == [0, 1, 2, 3]
+    assert not any(moment.fused.reason for moment in moments)
+    assert [bool(moment.skipped) for moment in moments] == [False, False, True, False]
+    assert "cut" in moments[2].skipped
+    alone = _moments(other)
+    np.testing.assert_array_equal(moments[2].fused.image, alone[0].fused.image)
+    # A last frame that nothing follows stays as it is, and says why.
+    last = _moments([_rolling(0), _rolling(1), other[0]])[2]
+    assert "cut" in last.fused.reason
+    np.testing.assert_array_equal(last.fused.image, other[0])
+
+
+@pytest.mark.parametrize("scan", ["bottom", "right"])
+def test_lines_may_be_read_from_any_side(scan: Scan) -> None:
+    """Frames turned like their camera, whose truth is turned alike."""
+
+    def turn(image: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(image[::-1] if scan == "bottom" else image.swapaxes(0, 1)[:, ::-1])
+
+    moments = _moments([turn(_rolling(frame)) for frame in (0, 1)], scan)
+    for frame, moment in enumerate(moments):
+        truth, inner = turn(_seen(np.full(SIZE[0], frame + 0.5))).astype(float), np.s_[20:-20, 20:-20]
+        before = np.sqrt(np.mean((moment.image - truth)[inner] ** 2))
+        assert np.sqrt(np.mean((moment.fused.image - truth)[inner] ** 2)) < 0.25 * before
 
 
 def test_a_camera_may_be_intrinsics_a_field_of_view_or_nothing() -> None:
     frames, focal = [_rolling(0), _rolling(1)], 80.0 / np.tan(np.deg2rad(30.0))
     camera = PinholeCamera.centred(SIZE[1], SIZE[0], focal)
-    known, told = (correct_all(frames, each, 1.0)[1].image for each in (camera, 60.0))
+    known, told = (rsbench.correct(frames, camera=each, readout_ratio=1.0)[1].image for each in (camera, 60.0))
     np.testing.assert_array_equal(known, told)
     # A motion parallel to the image is seen alike by any focal length.
-    difference = correct_all(frames, None, 1.0)[1].image[8:-8, 20:-20].astype(float) - known[8:-8, 20:-20]
+    unknown = rsbench.correct(frames, camera="unknown", readout_ratio=1.0)[1].image
+    difference = (unknown.astype(float) - known)[8:-8, 20:-20]
     assert np.sqrt(np.mean(difference**2)) < 3.0
     with pytest.raises(RsbenchError, match="fov_deg"):
-        correct_all(frames, 200.0, 1.0)
+        rsbench.correct(frames, camera=200.0, readout_ratio=1.0)

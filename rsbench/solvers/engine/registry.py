@@ -98,3 +98,12 @@ def load_solver_entry(name_or_path: str | Path) -> SolverEntry:
 def wrap_solver(solver: Solver) -> SolverEntry:
     """The entry of a solver that was made without a card; its class names it."""
     return SolverEntry(**vars(plugins.wrap(SOLVERS, solver)))
+
+
+def entry_of(solver: str | Path | Solver) -> SolverEntry:
+    """The entry of a solver by its name, the path of its card, or itself; ValueError for anything else."""
+    if isinstance(solver, str | Path):
+        return load_solver_entry(solver)
+    if not isinstance(solver, Solver):
+        raise ValueError(f"solver: must be a name, the path of a card or an rsbench.Solver, got {solver!r}")
+    return wrap_solver(solver)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rsbench.api.correcting import correct as correct
 from rsbench.components import arguments
 from rsbench.core import given
 from rsbench.core.correspondences import Correspondences
@@ -27,9 +28,7 @@ if TYPE_CHECKING:
 
     from rsbench.benchmark.simulated.simulation import Simulation
     from rsbench.dataset.sequence import Sequence
-    from rsbench.pipeline.chain import CorrectedFrames
     from rsbench.solvers.engine.base import MotionEstimate, Solver
-    from rsbench.solvers.engine.registry import SolverEntry
     from rsbench.solvers.engine.robust_motion import RobustEstimate
     from rsbench.verification import Rerender, SequenceReport
 
@@ -127,6 +126,7 @@ def estimate_motion(
         RsbenchError: no such solver.
         ValueError: an argument of another type or out of its range.
     """
+    from rsbench.solvers.engine.registry import entry_of
     from rsbench.solvers.engine.robust_motion import RobustOptions
     from rsbench.solvers.engine.robust_motion import estimate_motion as estimate_robustly
 
@@ -136,7 +136,7 @@ def estimate_motion(
     options = RobustOptions()
     if threshold_px is not None:
         options = RobustOptions(threshold_px=threshold_px, adapt_threshold=False)
-    entry, rng = _entry(solver), np.random.default_rng(seed)
+    entry, rng = entry_of(solver), np.random.default_rng(seed)
     return estimate_robustly(correspondences, rig, shutter, entry.solver, options, rng, entry.options.robust)
 
 
@@ -220,66 +220,6 @@ def stereo_depth(
     left, right = arguments.check_image("left", left, rig), arguments.check_image("right", right, rig)
     disparity = find_disparities(load_matcher(matcher), left, right, rig)[SIDES.index(side)]
     return np.nan_to_num(rig.depth(disparity), nan=0.0).astype(np.float32)
-
-
-def correct(
-    images: Series[Image],
-    rig: StereoRig,
-    readout_ratio: float | None = None,
-    *,
-    solver: str | Path | Solver = "rs-stereo-refined",
-    motion_model: str | None = None,
-    matcher: str | Path = "sgm",
-    features: str | Path = "sift-refined",
-    corrector: str | Path = "fusion",
-    target_row: float = 0.0,
-    inpaint: bool = False,
-    seed: int = 0,
-    gyro: ArrayLike | None = None,
-) -> CorrectedFrames:
-    """The global-shutter frames that the cameras would have taken, from their four rolling-shutter frames.
-
-    Args:
-        images, rig: four images as the sensor read them; the cameras, with their lens where they have one.
-        readout_ratio: readout time over frame period; None has it found, with the side that lines are read from.
-        solver: finds the motion, in metres; as in ``estimate_motion``.
-        motion_model: ``auto``, which the matches prefer, or a name; None is auto where the solver takes it.
-        matcher, features, corrector: names or cards of what finds depth and matches, and corrects.
-        target_row: the time of this row of a frame is that of its corrected image.
-        inpaint, seed: invent pixels that no frame shows; of the robust loop's samples.
-        gyro: (n, 4) samples of a gyroscope, as of ``Correspondences``, for correctors that need them.
-
-    Returns ``frames["left", 0]`` and so on, with ``image``, ``depth`` and ``origin``; ``motion`` and ``shutter``.
-
-    Raises:
-        ValueError: images of another type or size than the rig's cameras, a ratio or row out of its range.
-        RsbenchError: frames that are not what they should be; no such component; no motion; no correction.
-    """
-    from rsbench.pipeline.chain import Given, correct_four
-    from rsbench.pipeline.correction_options import CorrectionOptions
-    from rsbench.pipeline.frame_motion import model_to_use
-    from rsbench.pipeline.isolated_parts import Isolation
-    from rsbench.vision.corrector import demand_corrected, load_corrector
-    from rsbench.vision.feature_matcher import load_features
-    from rsbench.vision.stereo_matcher import load_matcher
-
-    entry = _entry(solver)
-    options = CorrectionOptions(
-        features=load_features(features),
-        solver=entry,
-        motion_model=model_to_use(motion_model, entry),
-        matcher=load_matcher(matcher),
-        corrector=load_corrector(corrector),
-        target_row=target_row,
-        inpaint=inpaint,
-        seed=seed,
-    )
-    arguments.check_times(readout_ratio, target_row, rig)
-    views, known = arguments.four_images(images, rig), Given(gyro=arguments.gyro_samples(gyro))
-    with Isolation() as isolation:
-        found = correct_four(views, rig, readout_ratio, isolation.chain(options), given=known)
-    demand_corrected(found.frames, options.corrector.name)
-    return found
 
 
 def read_dataset(folder: AnyPath) -> list[Sequence]:
@@ -387,14 +327,3 @@ def evaluate(
     )
     open_evaluation(Path(folder), Path(out), options).run("rsbench.evaluate", lambda word: None)
     return {table: read_scores(Path(out), table) for table in TABLES}
-
-
-def _entry(solver: str | Path | Solver) -> SolverEntry:
-    from rsbench.solvers.engine.base import Solver
-    from rsbench.solvers.engine.registry import load_solver_entry, wrap_solver
-
-    if isinstance(solver, str | Path):
-        return load_solver_entry(solver)
-    if not isinstance(solver, Solver):
-        raise ValueError(f"solver: must be a name, the path of a card or an rsbench.Solver, got {solver!r}")
-    return wrap_solver(solver)

@@ -1,0 +1,113 @@
+"""``rsbench.correct``: of a stereo rig, and of one camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, overload
+
+from numpy.typing import ArrayLike, NDArray
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.rig import StereoRig
+
+if TYPE_CHECKING:
+    from rsbench.pipeline.chain import CorrectedFrames
+    from rsbench.solvers.engine.base import Solver
+    from rsbench.vision.fusion import Fused
+
+_COMPONENTS = ("rs-stereo-refined", None, "sgm", "sift-refined", "fusion")
+"""What a rig has where nothing is said: solver, motion model, matcher, features and corrector."""
+
+
+@overload
+def correct(
+    images: Sequence[NDArray[Any]],
+    rig: StereoRig,
+    readout_ratio: float | None = None,
+    *,
+    solver: str | Path | Solver = "rs-stereo-refined",
+    motion_model: str | None = None,
+    matcher: str | Path = "sgm",
+    features: str | Path = "sift-refined",
+    corrector: str | Path = "fusion",
+    target_row: float = 0.0,
+    inpaint: bool = False,
+    seed: int = 0,
+    gyro: ArrayLike | None = None,
+) -> CorrectedFrames: ...
+
+
+@overload
+def correct(
+    images: Sequence[NDArray[Any]],
+    *,
+    camera: PinholeCamera | float | Literal["unknown"],
+    readout_ratio: float | None = None,
+    target_row: float = 0.0,
+    inpaint: bool = True,
+    seed: int = 0,
+) -> list[Fused]: ...
+
+
+def correct(
+    images: Sequence[NDArray[Any]],
+    rig: StereoRig | None = None,
+    readout_ratio: float | None = None,
+    *,
+    camera: PinholeCamera | float | Literal["unknown"] | None = None,
+    solver: str | Path | Solver = "rs-stereo-refined",
+    motion_model: str | None = None,
+    matcher: str | Path = "sgm",
+    features: str | Path = "sift-refined",
+    corrector: str | Path = "fusion",
+    target_row: float = 0.0,
+    inpaint: bool | None = None,
+    seed: int = 0,
+    gyro: ArrayLike | None = None,
+) -> CorrectedFrames | list[Fused]:
+    """The global-shutter frames that the cameras would have taken, from their rolling-shutter frames.
+
+    Of a stereo rig, give four images and ``rig``; of one camera, two or more in order, and ``camera``.
+
+    Args:
+        images: as the sensor read them.
+        rig: both cameras, with their lens where they have one.
+        readout_ratio: readout time over frame period; None has it found, with the side that lines are read from.
+        camera: one camera: its intrinsics, or its horizontal field of view in degrees, or "unknown". Of the other
+            arguments one camera takes readout_ratio, target_row, inpaint and seed.
+        solver: finds the motion, in metres; as in ``estimate_motion``.
+        motion_model: ``auto``, which the matches prefer, or a name; None is auto where the solver takes it.
+        matcher, features, corrector: names or cards of what finds depth and matches, and corrects.
+        target_row: the time of this row of a frame is that of its corrected image.
+        inpaint, seed: invent pixels that no frame shows; of the robust loop's samples.
+        gyro: (n, 4) samples of a gyroscope, as of ``Correspondences``, for correctors that need them.
+
+    Returns:
+        Of a rig ``frames["left", 0]`` and so on, with ``image``, ``depth`` and ``origin``; ``motion`` and
+        ``shutter``. Of one camera a list of such frames, whose unit of length is the camera's way over one frame
+        period; a frame that cannot be corrected, and is given back as it was, has a ``reason``.
+
+    Raises:
+        ValueError: images of another type or size than the rig's cameras, a ratio or row out of its range.
+        RsbenchError: frames that are not what they should be; no such component; no motion; no correction.
+    """
+    from rsbench.pipeline import array_correction
+
+    if (rig is None) == (camera is None):
+        raise ValueError("rig: give a StereoRig, or camera = a PinholeCamera, degrees or 'unknown'; one of both")
+    if rig is None:
+        _check_own(solver, motion_model, matcher, features, corrector)
+        known = None if camera == "unknown" else camera
+        return array_correction.of_one_camera(images, known, readout_ratio, target_row, inpaint is not False, seed)
+    components = solver, motion_model, matcher, features, corrector
+    options = array_correction.options_of(*components, target_row=target_row, inpaint=bool(inpaint), seed=seed)
+    return array_correction.of_rig(images, rig, readout_ratio, options, gyro)
+
+
+def _check_own(*components: object) -> None:
+    """ValueError where a component is named that one camera does not have."""
+    names = ("solver", "motion_model", "matcher", "features", "corrector")
+    for name, given, default in zip(names, components, _COMPONENTS, strict=True):
+        if given != default:
+            raise ValueError(f"{name} = {given!r}: is chosen for a stereo rig; leave it out with camera")

@@ -1,0 +1,79 @@
+"""Correction of arrays, as ``rsbench.correct`` does it: a stereo rig's four images, or one camera's in order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import ArrayLike, NDArray
+
+from rsbench.components import arguments
+from rsbench.core import given
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.rig import StereoRig
+from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_motion import model_to_use
+from rsbench.pipeline.isolated_parts import Isolation
+from rsbench.pipeline.mono_sequence import correct_all
+from rsbench.solvers.engine.base import Solver
+from rsbench.solvers.engine.registry import entry_of
+from rsbench.vision.corrector import demand_corrected, load_corrector
+from rsbench.vision.feature_matcher import load_features
+from rsbench.vision.fusion import Fused
+from rsbench.vision.stereo_matcher import load_matcher
+
+
+def options_of(
+    solver: str | Path | Solver,
+    motion_model: str | None,
+    matcher: str | Path,
+    features: str | Path,
+    corrector: str | Path,
+    **others: Any,
+) -> CorrectionOptions:
+    """Options with these components, by name or card; RsbenchError where there is none of a name."""
+    entry = entry_of(solver)
+    return CorrectionOptions(
+        features=load_features(features),
+        solver=entry,
+        motion_model=model_to_use(motion_model, entry),
+        matcher=load_matcher(matcher),
+        corrector=load_corrector(corrector),
+        **others,
+    )
+
+
+def of_rig(
+    images: Sequence[NDArray[Any]],
+    rig: StereoRig,
+    readout_ratio: float | None,
+    options: CorrectionOptions,
+    gyro: ArrayLike | None = None,
+) -> CorrectedFrames:
+    """Four images left 0, right 0, left 1, right 1, corrected; errors as of ``rsbench.correct``."""
+    arguments.check_times(readout_ratio, options.target_row, rig)
+    views, known = arguments.four_images(images, rig), Given(gyro=arguments.gyro_samples(gyro))
+    with Isolation() as isolation:
+        found = correct_four(views, rig, readout_ratio, isolation.chain(options), given=known)
+    demand_corrected(found.frames, options.corrector.name)
+    return found
+
+
+def of_one_camera(
+    images: Sequence[NDArray[Any]],
+    camera: PinholeCamera | float | None,
+    readout_ratio: float | None,
+    target_row: float,
+    inpaint: bool,
+    seed: int,
+) -> list[Fused]:
+    """Images of one camera in order, corrected; errors as of ``rsbench.correct``."""
+    known = StereoRig(camera=camera, baseline=1.0) if isinstance(camera, PinholeCamera) else None
+    for number, image in enumerate(images):
+        arguments.check_image(f"frame {number}", image, known)
+    if images:
+        given.check_number("target_row", target_row, 0.0, images[0].shape[0] - 1.0)
+    given.check_whole("seed", seed, 0)
+    return correct_all(images, camera, readout_ratio, target_row, inpaint=inpaint, seed=seed)

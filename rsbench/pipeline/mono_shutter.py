@@ -1,0 +1,139 @@
+"""How the camera of a video reads its lines: as its card says, or as its frames show."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.capture.camera_alone import conclude_alone, examine_alone, fits_backwards, known_alone, shutter_alone
+from rsbench.capture.estimate import Capture, Window
+from rsbench.capture.rectification import RefusedFramesError
+from rsbench.capture.scans import scans_of
+from rsbench.capture.settle import LEAST_BACKWARDS, NoMotionError, runs_backwards
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
+from rsbench.core.shutter import RollingShutter, Scan, Scanning
+from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.footage import check_alike
+from rsbench.pipeline.mono_correction import flow_matches, refusal
+from rsbench.pipeline.one_camera_card import OneCameraCard
+from rsbench.solvers.engine.robust_motion import RobustOptions
+from rsbench.vision.mono_fusion import find_flows
+
+WINDOWS = 8
+"""Pairs of frames, at most, by which the shutter is found; they lie evenly over the video."""
+_IN_ORDER = 3
+"""First pairs by which the order of the frames is judged where the shutter is known."""
+BACKWARDS = (
+    "time runs backwards in them: they are in the reverse order, or lines are read from the side opposite to what "
+    "is said (scan in the camera's card)"
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FoundShutter:
+    """How a camera reads, and where that is known from."""
+
+    shutter: RollingShutter
+    capture: Capture | None
+    """None where the card says it."""
+
+    @property
+    def scan(self) -> Scan:
+        """Where the readout begins."""
+        return self.shutter.scan_of("left")
+
+
+def find_shutter(
+    frames: Iterable[NDArray[Any]],
+    count: int,
+    card: OneCameraCard,
+    options: RobustOptions,
+    seed: int = 0,
+    advance: Callable[[str], None] = lambda word: None,
+) -> FoundShutter:
+    """The shutter of a camera, from its card or its frames (H, W[, 3]), and whether these are in order.
+
+    Args:
+        frames: in order; they are gone through once.
+        count: of the frames, about; 0 where nobody knows.
+        card: what is known.
+        options, seed: of the search for a motion.
+        advance: called for each pair that is looked at.
+
+    Raises:
+        NoMotionError: the frames do not show how their lines are read.
+        RefusedFramesError: time runs backwards in them.
+        RsbenchError: fewer than two frames, or frames of two sizes.
+    """
+    if card.readout_ratio is None:
+        return _found(frames, count, card, options, seed, advance)
+    scan, ratio = card.scan or "top", card.readout_ratio
+    windows, shutter = list[Window](), None
+    most = _IN_ORDER if ratio >= LEAST_BACKWARDS else 0
+    for matches, _, camera in _matched(frames, card, 1, most, seed):
+        shutter = shutter or Scanning(scan=scan).shutter_of(camera.width, camera.height, ratio)
+        if matches is not None and fits_backwards(matches, camera, shutter, options, seed):
+            windows.append(examine_alone(matches, camera, known_alone(scan), options, seed))
+    assert shutter is not None
+    if windows:
+        _refuse_backwards(conclude_alone(windows), shutter)
+    return FoundShutter(shutter=shutter, capture=None)
+
+
+def _refuse_backwards(capture: Capture, shutter: RollingShutter) -> None:
+    if runs_backwards(capture, scans_of(replace(shutter, readout_ratio=1.0))):
+        raise RefusedFramesError(BACKWARDS)
+
+
+def _found(
+    frames: Iterable[NDArray[Any]],
+    count: int,
+    card: OneCameraCard,
+    options: RobustOptions,
+    seed: int,
+    advance: Callable[[str], None],
+) -> FoundShutter:
+    """The shutter that the frames show."""
+    known, windows, camera, why = known_alone(card.scan), list[Window](), None, ""
+    for matches, reason, camera in _matched(frames, card, max((count - 1) // WINDOWS, 1), WINDOWS, seed):
+        why = why or reason
+        if matches is not None:
+            windows.append(examine_alone(matches, camera, known, options, seed))
+            advance(f"pair {len(windows)}")
+    assert camera is not None
+    if not windows:
+        raise NoMotionError(f"cannot tell the readout ratio: {why}. Give readout_ratio in the camera's card")
+    capture = conclude_alone(windows)
+    if card.scan is not None:
+        _refuse_backwards(capture, Scanning(scan=card.scan).shutter_of(camera.width, camera.height, 1.0))
+    return FoundShutter(shutter=shutter_alone(capture, camera), capture=capture)
+
+
+def _matched(
+    frames: Iterable[NDArray[Any]], card: OneCameraCard, every: int, most: int, seed: int
+) -> Iterator[tuple[FloatArray | None, str, PinholeCamera]]:
+    """Matches of at most so many pairs, each ``every``-th, or why a pair has none; and the camera.
+
+    Raises RsbenchError for fewer than two frames and for frames that are not alike.
+    """
+    number, found = 0, 0
+    for number, (before, image) in enumerate(itertools.pairwise(frames), start=1):
+        check_alike({f"frame {number - 1}": before, f"frame {number}": image})
+        camera = card.camera_of(image.shape[1], image.shape[0])
+        if (number - 1) % every == 0 and found < most:
+            flows = find_flows([before, image])
+            reason = refusal([before, image], flows)
+            found += not reason
+            yield None if reason else flow_matches(flows, np.random.default_rng(seed)), reason, camera
+        elif number == 1:
+            yield None, "", camera
+        if found >= most:
+            return
+    if number == 0:
+        raise RsbenchError("frames: fewer than two; one camera shows its motion in at least two")
