@@ -11,7 +11,7 @@ import pytest
 from leaderboards import lines_of, named, pictures_of, write
 
 from rsbench.benchmark.leaderboard.adding import add, add_all
-from rsbench.benchmark.leaderboard.board import FILES, entries_of, rescore
+from rsbench.benchmark.leaderboard.board import FILES, ORACLES, entries_of, rescore
 from rsbench.benchmark.leaderboard.marking import _serve, mark_all
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import read_submission
@@ -49,9 +49,9 @@ def test_entries_that_are_scored_together_score_as_alone(
     split = splits[track]
     paths = list(split.track.oracles(split, tmp_path / "oracles"))
     for path in paths:
-        add(tmp_path / "alone", path, split, {})
+        add(tmp_path / "alone", path, split, {"command": ORACLES})
     for workers in (1, 2):
-        add_all(tmp_path / str(workers), paths, split, {}, workers=workers)
+        add_all(tmp_path / str(workers), paths, split, {"command": ORACLES}, workers=workers)
         for path in paths:
             alone, together = (
                 tmp_path / each / split.track.id / split.name / "entries" / path.parent.name / "scores.csv"
