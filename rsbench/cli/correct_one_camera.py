@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 CameraFile = Annotated[Path | None, typer.Option(metavar="CAMERA.toml", help="Of one camera, in place of --rig.")]
 Footage = Annotated[Path | None, typer.Option("--frames", metavar="DIR|VIDEO", help="Frames of one camera.")]
 _PAGE_FRAMES = 6
+_ENTRIES = ".rsbench/frames"
+"""Folder, of those that are gone when all is written, of what motion.json will say of each frame."""
 _UNIT = "length of the translation over one frame period"
 
 
@@ -49,32 +51,67 @@ def correct_one_camera(
 
 
 def _correct(source: FrameSource, card: OneCameraCard, out: Path, options: MonoOptions) -> dict[str, Any]:
-    """What motion.json holds; exit 1 where the frames do not show how they were read."""
-    from rsbench.capture.settle import NoMotionError
-    from rsbench.cli.console import progress_bar
-    from rsbench.dataset.corrected_frames import fresh_folder, write_record
-    from rsbench.pipeline.mono_sequence import correct_frames
-    from rsbench.pipeline.mono_shutter import WINDOWS, find_shutter
+    """What motion.json holds, once all is written, as a folder or a video."""
+    from rsbench.dataset.corrected_frames import fresh_folder, read_corrected, write_record
+    from rsbench.dataset.corrected_video import fps_of, is_video, video_place, write_video
     from rsbench.report.corrected_page import write_page
 
-    height, width = next(iter(source)).shape[:2]
-    camera, corrector = card.camera_of(width, height), options.corrector
-    with fresh_folder(out) as folder:
-        try:
-            pairs = WINDOWS if card.readout_ratio is None else 0
-            with progress_bar("looking at the shutter", min(max(source.count - 1, 1), pairs)) as advance:
-                found = find_shutter(source, source.count, card, corrector.robust, corrector.seed, advance)
-        except NoMotionError as error:
-            typer.echo(f"rsbench: not corrected: {error}", err=True)
-            raise typer.Exit(1) from None
-        record = _known(card, camera, found, options)
-        with progress_bar("correcting", max(source.count, 1)) as advance:
-            moments = correct_frames(source, camera, found.shutter, options)
-            record["frames"], cards = _write(folder, moments, source.count, advance)
+    run = _run_key(source, card, options, is_video(out))
+    if is_video(out):
+        with video_place(out, run) as folder:
+            record = _correct_into(folder, source, card, options, whole=False)
+            images = (read_corrected(folder, f"{each['number']:06d}") for each in record["frames"])
+            write_video(out, folder, images, fps_of(source.path), record)
+        return record
+    with fresh_folder(out, run=run) as folder:
+        record = _correct_into(folder, source, card, options, whole=True)
         write_record(folder, record)
         facts = [("readout ratio", _readout(record)), ("focal length", _focal(record))]
         facts += [("unit of depth", _UNIT)]
+        cards = _cards(folder, source, len(record["frames"]))
         write_page(folder, f"rsbench correct: {out.name}", "Rolling shutter to global shutter", facts, cards)
+    return record
+
+
+def _run_key(source: FrameSource, card: OneCameraCard, options: MonoOptions, video: bool) -> str:
+    """Of all that decides what is written: a run with another key does not go on with what this one wrote."""
+    import hashlib
+
+    from rsbench.core.version import __version__
+
+    said = [__version__, repr(card), repr(options), repr(video), *source.identity()]
+    return hashlib.sha256("\n".join(said).encode()).hexdigest()
+
+
+def _correct_into(
+    folder: Path, source: FrameSource, card: OneCameraCard, options: MonoOptions, *, whole: bool
+) -> dict[str, Any]:
+    """Write every frame that is not there yet; exit 1 where the frames do not show how they were read.
+
+    Args:
+        whole: whether masks and depth are wanted, not the images alone.
+    """
+    from rsbench.capture.settle import NoMotionError
+    from rsbench.cli.console import progress_bar
+    from rsbench.pipeline.mono_sequence import correct_frames
+    from rsbench.pipeline.mono_shutter import WINDOWS, find_shutter
+
+    height, width = next(iter(source)).shape[:2]
+    camera, corrector = card.camera_of(width, height), options.corrector
+    pairs = WINDOWS if card.readout_ratio is None else 0
+    try:
+        with progress_bar("looking at the shutter", min(max(source.count - 1, 1), pairs)) as advance:
+            found = find_shutter(source, source.count, card, corrector.robust, corrector.seed, advance)
+    except NoMotionError as error:
+        typer.echo(f"rsbench: not corrected: {error}", err=True)
+        raise typer.Exit(1) from None
+    record = _known(card, camera, found, options)
+    entries = _written(folder)
+    with progress_bar("correcting", max(source.count, 1)) as advance:
+        for entry in entries:
+            advance(f"frame {entry['number']}")
+        moments = correct_frames(source, camera, found.shutter, options, len(entries))
+        record["frames"] = entries + _write(folder, moments, advance, whole=whole)
     return record
 
 
@@ -134,7 +171,8 @@ def _say(record: dict[str, Any], out: Path) -> None:
     corrected = sum("reason" not in each for each in record["frames"])
     typer.echo(f"readout ratio {_readout(record)}")
     typer.echo(f"{corrected} of {len(record['frames'])} frames corrected")
-    typer.echo(f"report: {(out / 'report.html').resolve()}")
+    place = out if out.is_file() else out / "report.html"
+    typer.echo(f"{'video' if out.is_file() else 'report'}: {place.resolve()}")
     if told["skipped"]:
         typer.echo(f"rsbench: corrected with the frame after them: {told['skipped']}", err=True)
     if told["reason"]:
@@ -142,25 +180,43 @@ def _say(record: dict[str, Any], out: Path) -> None:
         raise typer.Exit(1)
 
 
-def _write(folder: Path, moments: Any, count: int, advance: Any) -> tuple[list[dict[str, Any]], list[Any]]:
-    """Write every frame; returns what motion.json says of each, and some for the page."""
+def _written(folder: Path) -> list[dict[str, Any]]:
+    """What a run before this one said of the first frames, which it finished."""
+    from rsbench.storage.files import read_json
+    from rsbench.storage.work_folder import listed
+
+    return [read_json(path) for path in listed(folder / _ENTRIES, ".json")]
+
+
+def _write(folder: Path, moments: Any, advance: Any, *, whole: bool) -> list[dict[str, Any]]:
+    """Write every frame, and then what motion.json says of it: a frame that has that is complete."""
     from rsbench.dataset.corrected_frames import write_frame
     from rsbench.pipeline.mono_sequence import translation_record
-    from rsbench.report.corrected_page import card_of
+    from rsbench.storage.files import write_json
 
+    (folder / _ENTRIES).mkdir(parents=True, exist_ok=True)
     entries: list[dict[str, Any]] = []
-    cards: list[Any] = []
     moment: MonoMoment
     for moment in moments:
-        write_frame(folder, f"{moment.number:06d}", moment.fused)
+        name = f"{moment.number:06d}"
+        write_frame(folder, name, moment.fused, whole=whole)
         entry: dict[str, Any] = {"number": moment.number, **moment.fused.shares()}
         for key, words in (("reason", moment.fused.reason), ("skipped", moment.skipped)):
             if words:
                 entry[key] = words
         if moment.found is not None:
             entry["motion"] = translation_record(moment.found)
+        write_json(folder / _ENTRIES / f"{name}.json", entry)
         entries.append(entry)
-        if moment.number % max(count // _PAGE_FRAMES, 1) == 0 and len(cards) < _PAGE_FRAMES:
-            cards.append(card_of(f"frame {moment.number}", moment.image, moment.fused))
         advance(f"frame {moment.number}")
-    return entries, cards
+    return entries
+
+
+def _cards(folder: Path, source: FrameSource, count: int) -> list[dict[str, Any]]:
+    """Some frames for the page, from what was written."""
+    from rsbench.dataset.corrected_frames import read_fused
+    from rsbench.report.corrected_page import card_of
+
+    chosen = range(0, count, max(count // _PAGE_FRAMES, 1))[:_PAGE_FRAMES]
+    before = {number: image for number, image in enumerate(source) if number in chosen}
+    return [card_of(f"frame {n}", before[n], read_fused(folder, f"{n:06d}")) for n in chosen]

@@ -191,7 +191,7 @@ _ABOUT = {
     "Renderer cards": "Files in `renderers/`.",
     "Sweep cards": "Files in `cards/sweeps/`, for `rsbench simulate`.",
     "Shutter cards": "Files in `cards/shutters/`: measured readout times of real cameras.",
-    "camera.toml": "The card of `rsbench correct --camera`, of frames of one camera; `--frames` do without it.",
+    "camera.toml": "The camera of frames for `rsbench correct --camera`; with `--frames` it may be absent.",
     "rig.toml": "The cameras of your own frames, for `rsbench correct` and `rsbench inspect`.",
     "Leaderboard predictions": "JSON lines, for `rsbench leaderboard submit`.",
     "Component cards": "Files in `solvers/`, `cards/matchers/`, `cards/features/`, `cards/correctors/` and "

@@ -20,8 +20,9 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.footage import read_frame
 from rsbench.pipeline.frame_motion import FoundMotion
-from rsbench.storage.files import read_json, read_png, write_bytes, write_depth, write_json, write_png
+from rsbench.storage.files import read_depth, read_json, read_png, write_bytes, write_depth, write_json, write_png
 from rsbench.storage.work_folder import HIDDEN, WORK, files_below, named, remove, unknown_files, work_folder
 from rsbench.vision.fusion import Fused, Origin
 
@@ -34,13 +35,18 @@ MASK_VALUES = {
 }
 """Grey value of each origin in the mask files: the larger, the better founded."""
 MARKER = "motion.json"
+_HALF = "half"
+"""Name of the folder in the hidden one that a killed run is resumed from."""
 _LIST = f"{HIDDEN}/files.json"
 """All that was written, below the folder."""
 
 
 @contextmanager
-def fresh_folder(out: Path, by: str = "rsbench correct") -> Iterator[Path]:
+def fresh_folder(out: Path, by: str = "rsbench correct", run: str = "") -> Iterator[Path]:
     """A folder that takes the place and name of ``out`` when all is written; nothing is left after an error.
+
+    After a kill or an interruption of a ``run`` that has a key, the folder is what the next run of that key goes
+    on with.
 
     What the same command wrote there before is replaced: moved aside, and removed when the new is in its place.
     A kill in between leaves it aside, and the next run puts it back.
@@ -48,6 +54,7 @@ def fresh_folder(out: Path, by: str = "rsbench correct") -> Iterator[Path]:
     Args:
         out: see above.
         by: the command that writes.
+        run: key of all that decides what is written; without it nothing is resumed.
 
     Raises:
         RsbenchError: ``out`` cannot be written, holds something that this command did not write, is the working
@@ -62,14 +69,33 @@ def fresh_folder(out: Path, by: str = "rsbench correct") -> Iterator[Path]:
             os.rename(old, place)
         remove(old)
         _refuse_others(out, place, by)
-        fresh.mkdir()
-        yield fresh
+        if run:
+            fresh = half_folder(hidden, run)
+        else:
+            fresh.mkdir()
+        try:
+            yield fresh
+        except Exception:
+            remove(hidden / _HALF)
+            raise
+        remove(fresh / HIDDEN)
         files = files_below(fresh)
         (fresh / _LIST).parent.mkdir()
         write_json(fresh / _LIST, {"by": by, "files": files})
         _refuse_others(out, place, by)  # that came meanwhile
         _exchange(fresh, place, old)
         remove(old)
+        remove(hidden / _HALF)
+
+
+def half_folder(hidden: Path, run: str) -> Path:
+    """The folder in a hidden one of what a run of this key has written so far; empty where it was another's."""
+    half = hidden / _HALF
+    if not (half / "run").is_file() or (half / "run").read_text("utf-8") != run:
+        remove(half)
+        (half / "new").mkdir(parents=True)
+        write_bytes(half / "run", run.encode())
+    return half / "new"
 
 
 def _refuse_others(out: Path, place: Path, by: str) -> None:
@@ -98,14 +124,31 @@ def _exchange(fresh: Path, place: Path, old: Path) -> None:
         raise
 
 
-def write_frame(folder: Path, name: str, fused: Fused) -> None:
-    """corrected/NAME.png, mask/NAME.png and depth/NAME.exr below ``folder``."""
-    for part in ("corrected", "mask", "depth"):
+def write_frame(folder: Path, name: str, fused: Fused, *, whole: bool = True) -> None:
+    """corrected/NAME.png and, of a ``whole`` frame, mask/NAME.png and depth/NAME.exr below ``folder``."""
+    for part in ("corrected", "mask", "depth") if whole else ("corrected",):
         (folder / part).mkdir(parents=True, exist_ok=True)
     write_png(folder / "corrected" / f"{name}.png", fused.image)
+    if not whole:
+        return
     write_origin(folder / "mask" / f"{name}.png", fused.origin)
     depth = np.where(np.isfinite(fused.depth), fused.depth, np.float32(0.0))
     write_depth(folder / "depth" / f"{name}.exr", depth)
+
+
+def read_corrected(folder: Path, name: str) -> NDArray[Any]:
+    """The image of a frame that ``write_frame`` wrote, (H, W) or (H, W, 3), uint8 or uint16."""
+    return read_frame(folder / "corrected" / f"{name}.png")
+
+
+def read_fused(folder: Path, name: str) -> Fused:
+    """A whole frame that ``write_frame`` wrote; where it has no finite depth that is NaN."""
+    depth = read_depth(folder / "depth" / f"{name}.exr")
+    return Fused(
+        image=read_corrected(folder, name),
+        origin=read_origin(folder / "mask" / f"{name}.png"),
+        depth=np.where(depth > 0.0, depth, np.float32(np.nan)),
+    )
 
 
 def write_origin(path: Path, origin: NDArray[np.uint8]) -> None:

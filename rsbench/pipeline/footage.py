@@ -191,6 +191,11 @@ class FrameSource:
         source.path, source._files, source.count = files[0].parent, files, len(files)
         return source
 
+    def identity(self) -> list[str]:
+        """Of its files: paths, sizes and times of change."""
+        files = [(path.resolve(), path.stat()) for path in self._files or [self.path]]
+        return [f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in files]
+
     def _open(self) -> Any:
         video = cv2.VideoCapture(str(self.path))
         if not video.isOpened():

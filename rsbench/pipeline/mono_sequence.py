@@ -6,7 +6,9 @@ A frame that does not go on from the one before it, as after a cut, is corrected
 from __future__ import annotations
 
 import itertools
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -24,6 +26,9 @@ from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.pipeline.turned_frames import Turned, turned
 from rsbench.vision.fusion import Fused
 from rsbench.vision.mono_fusion import MonoFusion, MonoFusionOptions, find_flows
+
+_AT_ONCE = 2
+"""Pairs that are worked on at once: the rest of a pair's work fills the second of two cores."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,8 +70,17 @@ def correct_frames(
     camera: PinholeCamera,
     shutter: RollingShutter,
     options: MonoOptions | None = None,
+    done: int = 0,
 ) -> Iterator[MonoMoment]:
     """Every frame (H, W[, 3]), uint8 or uint16, of one camera at the time of its target row, in order.
+
+    Memory does not grow with the number of frames: a few pairs are worked on at once.
+
+    Args:
+        frames: in order; they are gone through once.
+        camera, shutter: of the frames.
+        options: how they are corrected.
+        done: so many first frames are left out.
 
     Raises:
         RsbenchError: fewer than two frames, frames of two sizes, or two frames alone that cannot be corrected. Of
@@ -76,10 +90,10 @@ def correct_frames(
     turn = turned(camera, shutter)
     waits: MonoMoment | None = None
     number = 0
-    for number, (before, image) in enumerate(itertools.pairwise(frames), start=1):
-        check_alike({f"frame {number - 1}": before, f"frame {number}": image})
-        pair = _ready([turn.image(before), turn.image(image)], turn, options)
-        if number == 1:
+    for number, before, image, pair in _pairs(frames, turn, options, done):
+        if pair is None:
+            continue
+        if number == 1 and done == 0:
             waits = _unmoved(0, before, pair.reason)
         if waits is not None:
             yield _corrected(0, waits, pair, turn, options) if pair.fusion else waits
@@ -98,6 +112,38 @@ def correct_frames(
         if number == 1:
             raise RsbenchError(f"frames: {waits.fused.reason}")
         yield waits
+
+
+def _pairs(
+    frames: Iterable[NDArray[Any]], turn: Turned, options: MonoOptions, done: int
+) -> Iterator[tuple[int, NDArray[Any], NDArray[Any], _Pair | None]]:
+    """Number of the second frame, both frames, and what is known of them, of all pairs in order; None: done."""
+
+    def ready(before: NDArray[Any], image: NDArray[Any]) -> _Pair:
+        return _ready([turn.image(before), turn.image(image)], turn, options)
+
+    waiting: deque[tuple[int, NDArray[Any], NDArray[Any], Future[_Pair] | None]] = deque()
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        try:
+            for number, (before, image) in enumerate(itertools.pairwise(frames), start=1):
+                check_alike({f"frame {number - 1}": before, f"frame {number}": image})
+                future = None if number < done else pool.submit(ready, before, image)
+                waiting.append((number, before, image, future))
+                if len(waiting) > _AT_ONCE:
+                    yield _result(waiting.popleft())
+            while waiting:
+                yield _result(waiting.popleft())
+        finally:
+            for *_, future in waiting:
+                if future is not None:
+                    future.cancel()
+
+
+def _result(
+    each: tuple[int, NDArray[Any], NDArray[Any], Future[_Pair] | None],
+) -> tuple[int, NDArray[Any], NDArray[Any], _Pair | None]:
+    number, before, image, future = each
+    return number, before, image, None if future is None else future.result()
 
 
 def correct_all(

@@ -199,22 +199,44 @@ class MonoFusion:
         own, layer = self.own, self._layers[frame]
         flow = self.flows.flow[frame]
         height, width = flow.shape[:2]
-        x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-        # Rows are read evenly, so the time at the end of a flow is a line in it.
-        here, rate = own.shutter.pixel_time(np.stack([x, y], axis=-1), frame, own.side), own.shutter.rate(own.side)
-        passed = (1 - 2 * frame) + flow[..., 1] * rate[1]
-        passed = np.where(np.abs(passed) > 1e-3, passed, np.inf)
-        share = ((target_tau - here) / passed)[..., None]
-        by_flow = np.concatenate([np.stack([x, y], axis=-1) + share * flow, layer.rho[..., None]], axis=-1)
-        if own.motion is None:
-            return np.asarray(by_flow, dtype=np.float64)
-        target = own.rig.cam_from_world(own.motion, target_tau, own.side)
-        poses = row_poses(own.rig, own.shutter, own.motion, own.side, frame)
-        moved = np.zeros((3, height, width))
-        forward_warp.move_pixels(layer.rho, line_maps(own.rig.camera, poses, target), moved)
-        by_geometry = np.moveaxis(moved, 0, -1)
-        weight = layer.flow_share[..., None]
-        return np.ascontiguousarray(weight * by_flow + (1.0 - weight) * by_geometry)
+        rows = np.stack([np.zeros(height), np.arange(height)], axis=-1)
+        here, rate = own.shutter.pixel_time(rows, frame, own.side), float(own.shutter.rate(own.side)[1])
+        moved, weight = np.zeros((3, height, width)), np.ones_like(layer.flow_share)
+        if own.motion is not None:
+            target = own.rig.cam_from_world(own.motion, target_tau, own.side)
+            poses = row_poses(own.rig, own.shutter, own.motion, own.side, frame)
+            forward_warp.move_pixels(layer.rho, line_maps(own.rig.camera, poses, target), moved)
+            weight = layer.flow_share
+        places = np.zeros((height, width, 3))
+        _weigh(flow, layer.rho, weight, moved, target_tau - here, float(1 - 2 * frame), rate, places)
+        return places
+
+
+@compiled(error_model="numpy")
+def _weigh(
+    flow: F32,
+    rho: F32,
+    weight: F32,
+    moved: FloatArray,
+    ahead: FloatArray,
+    period: float,
+    rate: float,
+    places: FloatArray,
+) -> None:
+    """Fill ``places`` (H, W, 3) with the mean of scaled flow, of this ``weight`` (H, W), and ``moved`` (3, H, W).
+
+    ``ahead`` (H,) is the time from each row to the target. Rows are read evenly, ``rate`` each, so the time that
+    passes along the flow is a line in it; a flow that ends at the time where it began has no speed.
+    """
+    height, width = rho.shape
+    for y in range(height):
+        for x in range(width):
+            passed = period + flow[y, x, 1] * rate
+            share = ahead[y] / passed if abs(passed) > 1e-3 else 0.0
+            of_flow = float(weight[y, x])
+            places[y, x, 0] = of_flow * (x + share * flow[y, x, 0]) + (1.0 - of_flow) * moved[0, y, x]
+            places[y, x, 1] = of_flow * (y + share * flow[y, x, 1]) + (1.0 - of_flow) * moved[1, y, x]
+            places[y, x, 2] = of_flow * rho[y, x] + (1.0 - of_flow) * moved[2, y, x]
 
 
 def _filled(rho: NDArray[Any]) -> F32:

@@ -15,6 +15,7 @@ import rsbench
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.shutter import RollingShutter, Scan
+from rsbench.dataset import corrected_frames
 from rsbench.pipeline.mono_sequence import MonoMoment, correct_frames
 from rsbench.storage.files import read_png, write_png
 
@@ -82,6 +83,61 @@ def test_a_folder_gives_the_same_frames_in_order(folder: Path) -> None:
     assert [file.name for file in sorted((folder / "out" / "corrected").iterdir())] == [
         f"{frame:06d}.png" for frame in range(3)
     ]
+
+
+def _bytes_below(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_an_interrupted_run_goes_on_where_it_was(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "out"
+    (folder / "in").mkdir()
+    for frame in range(3):
+        (folder / f"{frame}.png").rename(folder / "in" / f"{frame}.png")
+    given = (
+        "correct",
+        "--frames",
+        folder / "in",
+        "--camera",
+        folder / "camera.toml",
+        "--target",
+        "middle",
+        "--out",
+    )
+    for part in ("whole", "halves"):
+        (folder / part).mkdir()
+    assert run_here(*given, folder / "whole" / name).returncode == 0
+    written, write = list[str](), corrected_frames.write_frame
+
+    def until_the_second(to: Path, frame: str, *rest: Any, **more: Any) -> None:
+        if written:
+            raise KeyboardInterrupt
+        written.append(frame)
+        write(to, frame, *rest, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(corrected_frames, "write_frame", until_the_second)
+        assert run_here(*given, folder / "halves" / name).returncode != 0
+    with monkeypatch.context() as patch:
+        patch.setattr(corrected_frames, "write_frame", lambda to, frame, *rest, **more: (
+            written.append(frame), write(to, frame, *rest, **more)))  # fmt: skip
+        assert run_here(*given, folder / "halves" / name).returncode == 0
+    assert written == [f"{frame:06d}" for frame in range(3)]
+    assert _bytes_below(folder / "halves") == _bytes_below(folder / "whole")
+
+
+def test_a_video_may_come_out(folder: Path) -> None:
+    given = ("correct", folder / "0.png", folder / "1.png", "--camera", folder / "camera.toml", "--out")
+    result = run_here(*given, folder / "out.avi", "--target", "middle")
+    assert result.returncode == 0 and "out.avi" in result.stdout
+    video = cv2.VideoCapture(str(folder / "out.avi"))
+    shown = [video.read() for _ in range(3)]
+    assert [ok for ok, _ in shown] == [True, True, False]
+    truth = _seen(np.full(SIZE[0], 0.5))[..., ::-1].astype(float)
+    # JPEG's loss, and the correction's own.
+    assert np.sqrt(np.mean((shown[0][1] - truth)[8:-8, 20:-20] ** 2)) < 8.0
+    (folder / "out.json").unlink()
+    assert_refused(run_here(*given, folder / "out.avi"), "was not written by")
 
 
 def test_bad_input_is_refused_in_one_line_and_nothing_is_left(folder: Path) -> None:
