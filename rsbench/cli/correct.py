@@ -161,12 +161,14 @@ def _correct_four(
 
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.corrected_frames import fresh_folder, motion_record, rig_record, write_frame, write_record
+    from rsbench.dataset.corrected_video import refuse_video
     from rsbench.pipeline.chain import correct_four
     from rsbench.pipeline.footage import read_four
     from rsbench.report.corrected_page import card_of
     from rsbench.vision.corrector import demand_corrected
 
     order = (("left", 0), ("right", 0), ("left", 1), ("right", 1))
+    refuse_video(out)
     images = read_four(dict(zip(order, paths, strict=True)))  # pyrefly: ignore[bad-argument-type]
     rig = sized(card, images["left", 0])
     height = rig.camera.height
@@ -264,7 +266,8 @@ def _correct_sequence(
 
     from rsbench.cli.console import progress_bar
     from rsbench.core.shutter import Scanning
-    from rsbench.dataset.corrected_frames import fresh_folder, rig_record, write_record, write_trajectory
+    from rsbench.dataset.corrected_frames import fresh_folder, rig_record
+    from rsbench.dataset.corrected_video import is_video, video_place
     from rsbench.pipeline.chain import check_cameras
     from rsbench.pipeline.sequence_correction import WINDOWS, correct_sequence, estimate_sequence_capture
 
@@ -272,7 +275,7 @@ def _correct_sequence(
     options = replace(options, target_row=target_row(target, rig.camera.height))
     ratio, offset, scanning, capture = card.readout_ratio, card.disparity_offset, card.scanning, None
     check_cameras(rig, scanning or Scanning(), options, offset)
-    with fresh_folder(out) as folder:
+    with video_place(out) if is_video(out) else fresh_folder(out) as folder:
         if ratio is None:
             windows = min(max(left.count - 1, 1), WINDOWS)
             with progress_bar("looking at the shutter", windows) as advance:
@@ -285,21 +288,53 @@ def _correct_sequence(
         with progress_bar("correcting", max(left.count, 1)) as advance:
             moments = correct_sequence(left, right, rig, ratio, options, offset or 0.0, scanning)
             record["frames"], cards, poses = _write_moments(folder, moments, left, advance, finish)
-        if poses:
-            write_trajectory(folder / "trajectory.csv", poses)
-        write_record(folder, record)
-        _page(folder, out, shutter, capture, None, cards)
-    failed = _told(record["frames"], "reason")
-    skipped = _told(record["frames"], "skipped")
-    typer.echo(f"readout ratio {_readout(shutter, capture)}")
-    corrected = [frame for frame in record["frames"] if "reason" not in frame]
-    typer.echo(f"{len(corrected)} of {len(record['frames'])} times corrected")
-    typer.echo(f"report: {(out / 'report.html').resolve()}")
+        if is_video(out):
+            _write_both(out, folder, (left, right), record)
+        else:
+            _write_rest(folder, record, poses)
+            _page(folder, out, shutter, capture, None, cards)
+    _say_sequence(out, f"readout ratio {_readout(shutter, capture)}", record["frames"])
+
+
+def _say_sequence(out: Path, first: str, frames: list[dict[str, Any]]) -> None:
+    """Exit 1 where a time is not corrected."""
+    from rsbench.dataset.corrected_video import is_video
+
+    failed, skipped = _told(frames, "reason"), _told(frames, "skipped")
+    typer.echo(first)
+    typer.echo(f"{sum('reason' not in frame for frame in frames)} of {len(frames)} times corrected")
+    typer.echo(f"video: {out.resolve()}" if is_video(out) else f"report: {(out / 'report.html').resolve()}")
     if skipped:
         typer.echo(f"rsbench: corrected with the motion of the frames around: {skipped}", err=True)
     if failed:
         typer.echo(f"rsbench: not corrected: {failed}", err=True)
         raise typer.Exit(1)
+
+
+def _write_rest(folder: Path, record: dict[str, Any], poses: dict[int, Any]) -> None:
+    from rsbench.dataset.corrected_frames import write_record, write_trajectory
+
+    if poses:
+        write_trajectory(folder / "trajectory.csv", poses)
+    write_record(folder, record)
+
+
+def _write_both(out: Path, folder: Path, sources: tuple[FrameSource, FrameSource], record: dict[str, Any]) -> None:
+    """A video of both cameras side by side; a time that is not corrected is there as it was read."""
+    import numpy as np
+
+    from rsbench.dataset.corrected_frames import read_corrected
+    from rsbench.dataset.corrected_video import fps_of, write_video
+
+    def shown(side: str, number: int, image: Any) -> Any:
+        name = f"{side}_{number:06d}"
+        return read_corrected(folder, name) if (folder / "corrected" / f"{name}.png").is_file() else image
+
+    both = (
+        np.hstack([shown("left", number, left), shown("right", number, right)])
+        for number, (left, right) in enumerate(zip(*sources, strict=True))
+    )
+    write_video(out, folder, both, fps_of(sources[0].path), record)
 
 
 def _told(frames: list[dict[str, Any]], key: str) -> str:
