@@ -32,7 +32,7 @@ def correct(
     features: str | Path = "sift-refined",
     corrector: str | Path = "fusion",
     target_row: float = 0.0,
-    inpaint: bool = False,
+    inpaint: bool | None = None,
     seed: int = 0,
     gyro: ArrayLike | None = None,
 ) -> CorrectedFrames: ...
@@ -45,7 +45,7 @@ def correct(
     camera: PinholeCamera | float | Literal["unknown"],
     readout_ratio: float | None = None,
     target_row: float = 0.0,
-    inpaint: bool = True,
+    inpaint: bool | None = None,
     seed: int = 0,
 ) -> list[Fused]: ...
 
@@ -80,7 +80,8 @@ def correct(
         motion_model: ``auto``, which the matches prefer, or a name; None is auto where the solver takes it.
         matcher, features, corrector: names or cards of what finds depth and matches, and corrects.
         target_row: the time of this row of a frame is that of its corrected image.
-        inpaint, seed: invent pixels that no frame shows; of the robust loop's samples.
+        inpaint: invent all pixels that no frame shows, or none; None closes specks and slits alone.
+        seed: of the robust loop's samples.
         gyro: (n, 4) samples of a gyroscope, as of ``Correspondences``, for correctors that need them.
 
     Returns:
@@ -99,10 +100,10 @@ def correct(
     if rig is None:
         _check_own(solver, motion_model, matcher, features, corrector)
         known = None if camera == "unknown" else camera
-        return array_correction.of_one_camera(images, known, readout_ratio, target_row, inpaint is not False, seed)
+        return array_correction.of_one_camera(images, known, readout_ratio, target_row, inpaint, seed)
     components = solver, motion_model, matcher, features, corrector
     options = array_correction.options_of(*components, target_row=target_row, inpaint=bool(inpaint), seed=seed)
-    return array_correction.of_rig(images, rig, readout_ratio, options, gyro)
+    return array_correction.of_rig(images, rig, readout_ratio, options, gyro, close=inpaint is None)
 
 
 def _check_own(*components: object) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from rsbench.pipeline.footage import FrameSource, RigCard
     from rsbench.pipeline.sequence_correction import CorrectedMoment
     from rsbench.vision.corrector import CorrectorEntry
+    from rsbench.vision.fusion import Fused
+
+    Finish: TypeAlias = Callable[[Fused], Fused]
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -46,9 +50,11 @@ Names: rsbench list solvers, matchers, features or correctors; a card's path end
 
 DIR gets [bold]report.html[/bold] (before and after), [bold]corrected/*.png[/bold], [bold]depth/*.exr[/bold]
 (of the corrected frames, metres), [bold]mask/*.png[/bold] (255 seen in the frame, 192 at a guessed depth, 128 from
-the other camera, 64 from the other frame, 0 seen by nobody) and [bold]motion.json[/bold]."""
+the other camera, 64 from the other frame, 32 a narrow hole closed from around it, 0 seen by nobody) and
+[bold]motion.json[/bold]."""
 
 _PAGE_FRAMES = 6
+_INPAINT = "Invent all pixels that no frame shows, or none. Default: specks and slits alone"
 _SOLVER = "rs-stereo-refined"
 _MODEL = "Motion model: auto, which the matches prefer, or a name. Default: auto where the solver takes it"
 
@@ -67,7 +73,7 @@ def correct(
     target: Annotated[
         str, typer.Option(help="Time of the corrected frame: first, middle or last row, or a row's number.")
     ] = "first",
-    inpaint: Annotated[bool, typer.Option("--inpaint", help="Invent pixels that no frame shows.")] = False,
+    inpaint: Annotated[bool | None, typer.Option(help=_INPAINT)] = None,
     sky: Annotated[bool, typer.Option(help="Detect sky, which moves by rotation alone.")] = True,
     fill: Annotated[bool, typer.Option(help="Fill pixels a frame lacks from other frames.")] = True,
     solver: Annotated[str, named("solvers", "Estimates the motion, in metres: name or card.")] = _SOLVER,
@@ -81,26 +87,29 @@ def correct(
 ) -> None:
     """Correct your own rolling-shutter frames: of a stereo rig or of one camera, two times or a whole sequence."""
     if camera is not None or footage is not None:
-        correct_one_camera(frames, footage, camera, out, target, inpaint=True, seed=seed)
+        correct_one_camera(frames, footage, camera, out, target, inpaint, seed)
         return
     given = given_frames(frames, rig, out, left, right)
-    others = {"find_sky": sky, "inpaint": inpaint, "seed": seed, "motion_model": motion_model}
-    _correct_given(given, target, _options(features, solver, matcher, corrector, fill, **others))
+    others = {"find_sky": sky, "inpaint": bool(inpaint), "seed": seed, "motion_model": motion_model}
+    options = _options(features, solver, matcher, corrector, fill, **others)
+    _correct_given(given, target, options, inpaint is None)
 
 
-def _correct_given(given: Given, target: str, options: CorrectionOptions) -> None:
-    """Exit 1 where no motion or no correction is found."""
+def _correct_given(given: Given, target: str, options: CorrectionOptions, close: bool) -> None:
+    """Exit 1 where no motion or no correction is found; ``close``: narrow holes of corrected frames."""
     from rsbench.capture.settle import NoMotionError
     from rsbench.pipeline.isolated_parts import Isolation
+    from rsbench.vision.closing import close_narrow
     from rsbench.vision.corrector import NotCorrectedError
 
+    finish: Finish = close_narrow if close else lambda fused: fused
     try:
         with Isolation() as isolation:
             options = isolation.chain(options)
             if given.four:
-                _correct_four(given.four, given.card, given.out, target, options)
+                _correct_four(given.four, given.card, given.out, target, options, finish)
             else:
-                _correct_sequence(*given.footage(), given.card, given.out, target, options)
+                _correct_sequence(*given.footage(), given.card, given.out, target, options, finish)
     except (NoMotionError, NotCorrectedError) as error:
         typer.echo(f"rsbench: not corrected: {error}", err=True)
         raise typer.Exit(1) from None
@@ -145,17 +154,21 @@ def _corrector(name: str, fill: bool) -> CorrectorEntry:
     return replace(entry, component=component, key=component_key(component, {}))
 
 
-def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, options: CorrectionOptions) -> None:
+def _correct_four(
+    paths: list[Path], card: RigCard, out: Path, target: str, options: CorrectionOptions, finish: Finish
+) -> None:
     from dataclasses import replace
 
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.corrected_frames import fresh_folder, motion_record, rig_record, write_frame, write_record
+    from rsbench.dataset.corrected_video import refuse_video
     from rsbench.pipeline.chain import correct_four
     from rsbench.pipeline.footage import read_four
     from rsbench.report.corrected_page import card_of
     from rsbench.vision.corrector import demand_corrected
 
     order = (("left", 0), ("right", 0), ("left", 1), ("right", 1))
+    refuse_video(out)
     images = read_four(dict(zip(order, paths, strict=True)))  # pyrefly: ignore[bad-argument-type]
     rig = sized(card, images["left", 0])
     height = rig.camera.height
@@ -172,15 +185,16 @@ def _correct_four(paths: list[Path], card: RigCard, out: Path, target: str, opti
                 scanning=card.scanning,
             )
         demand_corrected(result.frames, options.corrector.name)
-        for (side, frame), fused in result.frames.items():
+        frames = {view: finish(fused) for view, fused in result.frames.items()}
+        for (side, frame), fused in frames.items():
             write_frame(folder, f"{side}_{frame}", fused)
         offset = (card.disparity_offset or 0.0) if result.found is None else result.found.disparity_offset
         record = rig_record(rig, result.shutter, result.capture, options, offset)
         record["motion"] = None if result.found is None else motion_record(result.found)
-        record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in result.frames.items()}
+        record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in frames.items()}
         record["seconds"] = result.seconds
         write_record(folder, record)
-        cards = [card_of(f"{s} {f}", images[s, f], fused) for (s, f), fused in result.frames.items()]
+        cards = [card_of(f"{s} {f}", images[s, f], fused) for (s, f), fused in frames.items()]
         _page(folder, out, result.shutter, result.capture, record["motion"], cards)
     _say(out, result.shutter, result.capture, record["motion"])
 
@@ -240,13 +254,20 @@ def _say(out: Path, shutter: RollingShutter, capture: Capture | None, motion: di
 
 
 def _correct_sequence(
-    left: FrameSource, right: FrameSource, card: RigCard, out: Path, target: str, options: CorrectionOptions
+    left: FrameSource,
+    right: FrameSource,
+    card: RigCard,
+    out: Path,
+    target: str,
+    options: CorrectionOptions,
+    finish: Finish,
 ) -> None:
     from dataclasses import replace
 
     from rsbench.cli.console import progress_bar
     from rsbench.core.shutter import Scanning
-    from rsbench.dataset.corrected_frames import fresh_folder, rig_record, write_record, write_trajectory
+    from rsbench.dataset.corrected_frames import fresh_folder, rig_record
+    from rsbench.dataset.corrected_video import is_video, video_place
     from rsbench.pipeline.chain import check_cameras
     from rsbench.pipeline.sequence_correction import WINDOWS, correct_sequence, estimate_sequence_capture
 
@@ -254,7 +275,7 @@ def _correct_sequence(
     options = replace(options, target_row=target_row(target, rig.camera.height))
     ratio, offset, scanning, capture = card.readout_ratio, card.disparity_offset, card.scanning, None
     check_cameras(rig, scanning or Scanning(), options, offset)
-    with fresh_folder(out) as folder:
+    with video_place(out) if is_video(out) else fresh_folder(out) as folder:
         if ratio is None:
             windows = min(max(left.count - 1, 1), WINDOWS)
             with progress_bar("looking at the shutter", windows) as advance:
@@ -266,22 +287,54 @@ def _correct_sequence(
         record = rig_record(rig, shutter, capture, options, offset or 0.0)
         with progress_bar("correcting", max(left.count, 1)) as advance:
             moments = correct_sequence(left, right, rig, ratio, options, offset or 0.0, scanning)
-            record["frames"], cards, poses = _write_moments(folder, moments, left, advance)
-        if poses:
-            write_trajectory(folder / "trajectory.csv", poses)
-        write_record(folder, record)
-        _page(folder, out, shutter, capture, None, cards)
-    failed = _told(record["frames"], "reason")
-    skipped = _told(record["frames"], "skipped")
-    typer.echo(f"readout ratio {_readout(shutter, capture)}")
-    corrected = [frame for frame in record["frames"] if "reason" not in frame]
-    typer.echo(f"{len(corrected)} of {len(record['frames'])} times corrected")
-    typer.echo(f"report: {(out / 'report.html').resolve()}")
+            record["frames"], cards, poses = _write_moments(folder, moments, left, advance, finish)
+        if is_video(out):
+            _write_both(out, folder, (left, right), record)
+        else:
+            _write_rest(folder, record, poses)
+            _page(folder, out, shutter, capture, None, cards)
+    _say_sequence(out, f"readout ratio {_readout(shutter, capture)}", record["frames"])
+
+
+def _say_sequence(out: Path, first: str, frames: list[dict[str, Any]]) -> None:
+    """Exit 1 where a time is not corrected."""
+    from rsbench.dataset.corrected_video import is_video
+
+    failed, skipped = _told(frames, "reason"), _told(frames, "skipped")
+    typer.echo(first)
+    typer.echo(f"{sum('reason' not in frame for frame in frames)} of {len(frames)} times corrected")
+    typer.echo(f"video: {out.resolve()}" if is_video(out) else f"report: {(out / 'report.html').resolve()}")
     if skipped:
         typer.echo(f"rsbench: corrected with the motion of the frames around: {skipped}", err=True)
     if failed:
         typer.echo(f"rsbench: not corrected: {failed}", err=True)
         raise typer.Exit(1)
+
+
+def _write_rest(folder: Path, record: dict[str, Any], poses: dict[int, Any]) -> None:
+    from rsbench.dataset.corrected_frames import write_record, write_trajectory
+
+    if poses:
+        write_trajectory(folder / "trajectory.csv", poses)
+    write_record(folder, record)
+
+
+def _write_both(out: Path, folder: Path, sources: tuple[FrameSource, FrameSource], record: dict[str, Any]) -> None:
+    """A video of both cameras side by side; a time that is not corrected is there as it was read."""
+    import numpy as np
+
+    from rsbench.dataset.corrected_frames import read_corrected
+    from rsbench.dataset.corrected_video import fps_of, write_video
+
+    def shown(side: str, number: int, image: Any) -> Any:
+        name = f"{side}_{number:06d}"
+        return read_corrected(folder, name) if (folder / "corrected" / f"{name}.png").is_file() else image
+
+    both = (
+        np.hstack([shown("left", number, left), shown("right", number, right)])
+        for number, (left, right) in enumerate(zip(*sources, strict=True))
+    )
+    write_video(out, folder, both, fps_of(sources[0].path), record)
 
 
 def _told(frames: list[dict[str, Any]], key: str) -> str:
@@ -290,7 +343,7 @@ def _told(frames: list[dict[str, Any]], key: str) -> str:
 
 
 def _write_moments(
-    folder: Path, moments: Any, left: FrameSource, advance: Any
+    folder: Path, moments: Any, left: FrameSource, advance: Any, finish: Finish
 ) -> tuple[list[dict[str, Any]], list[Any], dict[int, Any]]:
     """Write every corrected time; returns what motion.json says of each, some for the page, and poses."""
     from rsbench.dataset.corrected_frames import motion_record, write_frame
@@ -303,7 +356,8 @@ def _write_moments(
     moment: CorrectedMoment
     for moment in moments:
         entry: dict[str, Any] = {"number": moment.number}
-        for side, fused in moment.frames.items():
+        frames = {side: finish(fused) for side, fused in moment.frames.items()}
+        for side, fused in frames.items():
             write_frame(folder, f"{side}_{moment.number:06d}", fused)
             entry[side] = fused.shares()
         if not moment.frames:
@@ -315,7 +369,7 @@ def _write_moments(
                 entry["motion"] = motion_record(moment.found)
             if moment.number % every == 0 and len(cards) < _PAGE_FRAMES:
                 title = f"left, frame {moment.number}"
-                cards.append(card_of(title, moment.images["left"], moment.frames["left"]))
+                cards.append(card_of(title, moment.images["left"], frames["left"]))
         if moment.pose is not None:
             poses[moment.number] = moment.pose
         records.append(entry)

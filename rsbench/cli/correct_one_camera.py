@@ -28,7 +28,7 @@ def correct_one_camera(
     camera: Path | None,
     out: Path | None,
     target: str,
-    inpaint: bool,
+    inpaint: bool | None,
     seed: int,
 ) -> None:
     """Correct images, or a folder or video, of one camera; exit 1 where some of many frames are not corrected.
@@ -115,15 +115,12 @@ def _correct_into(
     return record
 
 
-def _options(source: FrameSource, target: str, inpaint: bool, seed: int) -> MonoOptions:
+def _options(source: FrameSource, target: str, inpaint: bool | None, seed: int) -> MonoOptions:
     from rsbench.cli.correct_input import target_row
-    from rsbench.pipeline.mono_correction import MonoFusionCorrector
     from rsbench.pipeline.mono_sequence import MonoOptions
-    from rsbench.vision.mono_fusion import MonoFusionOptions
 
     height = next(iter(source)).shape[0]
-    corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=inpaint), seed=seed)
-    return MonoOptions(corrector=corrector, target_row=None if target == "middle" else target_row(target, height))
+    return MonoOptions.of(inpaint, seed, None if target == "middle" else target_row(target, height))
 
 
 def _known(

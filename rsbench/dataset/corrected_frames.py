@@ -28,6 +28,7 @@ from rsbench.vision.fusion import Fused, Origin
 
 MASK_VALUES = {
     Origin.NOBODY: 0,
+    Origin.INVENTED: 32,
     Origin.OTHER_FRAME: 64,
     Origin.OTHER_CAMERA: 128,
     Origin.GUESSED: 192,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,13 +30,19 @@ def is_video(out: Path) -> bool:
     return out.suffix.lower() in _CODECS
 
 
+def refuse_video(out: Path) -> None:
+    """Raise RsbenchError for a name that looks like a video where frames are no video."""
+    if is_video(out):
+        raise RsbenchError(f"--out {out}: four images are no video; give a folder, or --left and --right")
+
+
 @contextmanager
-def video_place(out: Path, run: str) -> Iterator[Path]:
+def video_place(out: Path, run: str = "") -> Iterator[Path]:
     """A folder to work in for a video ``out``, from which ``write_video`` takes its frames; kept after a kill.
 
     Args:
         out: the file.
-        run: key of all that decides what is written, as of ``fresh_folder``.
+        run: key of all that decides what is written, as of ``fresh_folder``; without it nothing is resumed.
 
     Raises:
         RsbenchError: another file of that name, which this command did not write, or the place cannot be written.
@@ -43,7 +50,7 @@ def video_place(out: Path, run: str) -> Iterator[Path]:
     place = out.resolve()
     with work_folder(place.parent, place.with_name(f".{place.name}{HIDDEN}")) as hidden:
         _refuse_others(out)
-        half = half_folder(hidden, run)
+        half = half_folder(hidden, run or secrets.token_hex())
         try:
             yield half
         except Exception:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.pipeline.mono_sequence import correct_all
 from rsbench.solvers.engine.base import Solver
 from rsbench.solvers.engine.registry import entry_of
+from rsbench.vision.closing import close_narrow
 from rsbench.vision.corrector import demand_corrected, load_corrector
 from rsbench.vision.feature_matcher import load_features
 from rsbench.vision.fusion import Fused
@@ -51,14 +53,21 @@ def of_rig(
     readout_ratio: float | None,
     options: CorrectionOptions,
     gyro: ArrayLike | None = None,
+    *,
+    close: bool = False,
 ) -> CorrectedFrames:
-    """Four images left 0, right 0, left 1, right 1, corrected; errors as of ``rsbench.correct``."""
+    """Four images left 0, right 0, left 1, right 1, corrected; errors as of ``rsbench.correct``.
+
+    ``close``: narrow holes too.
+    """
     arguments.check_times(readout_ratio, options.target_row, rig)
     views, known = arguments.four_images(images, rig), Given(gyro=arguments.gyro_samples(gyro))
     with Isolation() as isolation:
         found = correct_four(views, rig, readout_ratio, isolation.chain(options), given=known)
     demand_corrected(found.frames, options.corrector.name)
-    return found
+    if not close:
+        return found
+    return replace(found, frames={view: close_narrow(fused) for view, fused in found.frames.items()})
 
 
 def of_one_camera(
@@ -66,7 +75,7 @@ def of_one_camera(
     camera: PinholeCamera | float | None,
     readout_ratio: float | None,
     target_row: float,
-    inpaint: bool,
+    inpaint: bool | None,
     seed: int,
 ) -> list[Fused]:
     """Images of one camera in order, corrected; errors as of ``rsbench.correct``."""

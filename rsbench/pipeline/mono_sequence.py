@@ -24,6 +24,7 @@ from rsbench.pipeline.mono_correction import STILL, FoundOwnMotion, MonoFusionCo
 from rsbench.pipeline.mono_shutter import find_shutter
 from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.pipeline.turned_frames import Turned, turned
+from rsbench.vision.closing import close_narrow
 from rsbench.vision.fusion import Fused
 from rsbench.vision.mono_fusion import MonoFusion, MonoFusionOptions, find_flows
 
@@ -53,6 +54,14 @@ class MonoOptions:
     corrector: MonoFusionCorrector = field(default_factory=MonoFusionCorrector)
     target_row: float | None = None
     """The time of this row of a frame is that of its corrected image; None: of the middle one."""
+    close: bool = True
+    """Whether narrow holes that the corrector leaves are closed (``close_narrow``)."""
+
+    @classmethod
+    def of(cls, inpaint: bool | None, seed: int, target_row: float | None) -> MonoOptions:
+        """``inpaint``: whether all that no frame shows is invented, or nothing; None: what is narrow."""
+        corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=bool(inpaint)), seed=seed)
+        return cls(corrector=corrector, target_row=target_row, close=inpaint is None)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -152,7 +161,7 @@ def correct_all(
     readout_ratio: float | None,
     target_row: float | None = None,
     *,
-    inpaint: bool = True,
+    inpaint: bool | None = None,
     seed: int = 0,
 ) -> list[Fused]:
     """``correct_frames`` of a camera, a horizontal field of view in degrees, or None; its errors."""
@@ -165,10 +174,9 @@ def correct_all(
         card = OneCameraCard(readout_ratio=readout_ratio, **known)
     except ValueError as error:
         raise RsbenchError(str(error)) from error
-    corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=inpaint), seed=seed)
-    shutter = find_shutter(frames, len(frames), card, corrector.robust, seed).shutter
+    options = MonoOptions.of(inpaint, seed, target_row)
+    shutter = find_shutter(frames, len(frames), card, options.corrector.robust, seed).shutter
     height, width = frames[0].shape[:2]
-    options = MonoOptions(corrector=corrector, target_row=target_row)
     return [moment.fused for moment in correct_frames(frames, card.camera_of(width, height), shutter, options)]
 
 
@@ -193,6 +201,7 @@ def _corrected(place: int, unmoved: MonoMoment, pair: _Pair, turn: Turned, optio
     row = options.target_row
     line = (turn.camera.height - 1) / 2 if row is None else turn.line(row)
     fused = pair.fusion.corrected(place, float(turn.shutter.time_after(line, place, "left")))
+    fused = close_narrow(fused) if options.close else fused
     skipped = unmoved.fused.reason if place == 0 and unmoved.number > 0 else ""
     return replace(unmoved, fused=turn.back(fused), found=turn.found(pair.found), skipped=skipped)
 

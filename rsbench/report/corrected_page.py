@@ -20,6 +20,7 @@ from rsbench.vision.fusion import Fused, Origin
 
 _COLOURS = {
     Origin.NOBODY: (200, 40, 40),
+    Origin.INVENTED: (240, 150, 150),
     Origin.OTHER_FRAME: (240, 170, 60),
     Origin.OTHER_CAMERA: (80, 150, 240),
     Origin.GUESSED: (170, 120, 200),
@@ -30,6 +31,7 @@ _LEGEND = {
     Origin.GUESSED: "seen in this frame, depth guessed from neighbours",
     Origin.OTHER_CAMERA: "from the other camera",
     Origin.OTHER_FRAME: "from the other frame",
+    Origin.INVENTED: "seen by nobody, closed from around",
     Origin.NOBODY: "seen by nobody",
 }
 _LONGEST = 900

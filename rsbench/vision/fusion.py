@@ -42,6 +42,8 @@ class Origin(IntEnum):
     """The other camera's frame of the same time."""
     OTHER_FRAME = 4
     """A frame of the other time, of either camera."""
+    INVENTED = 5
+    """No frame: a hole so narrow that it was closed from its surroundings (``close_narrow``)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

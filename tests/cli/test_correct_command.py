@@ -130,6 +130,14 @@ def test_a_sequence_of_folders(tmp_path: Path, frames: list[Path], rig: Path) ->
         assert (out / "corrected" / f"{name}.png").is_file()
     record = json.loads((out / "motion.json").read_text("utf-8"))
     assert [frame["number"] for frame in record["frames"]] == [0, 1]
+    # The same as a video without loss: both cameras side by side.
+    film = tmp_path / "film.mkv"
+    assert correct(*[film if each == out else each for each in arguments]).returncode == 0
+    video = cv2.VideoCapture(str(film))
+    for number in (0, 1):
+        sides = [cv2.imread(str(out / "corrected" / f"{side}_{number:06d}.png")) for side in ("left", "right")]
+        np.testing.assert_array_equal(video.read()[1], np.hstack(sides))
+    assert not video.read()[0] and (tmp_path / "film.json").is_file()
 
 
 def test_a_bad_window_is_bridged_and_told(tmp_path: Path, castle: Sequence, rig: Path) -> None:
@@ -163,6 +171,7 @@ def test_bad_calls_are_refused_and_leave_nothing(tmp_path: Path, frames: list[Pa
     flat = tmp_path / "flat.png"
     cv2.imwrite(str(flat), np.full((96, 128), 128, np.uint8))
     assert_refused(correct(*frames[:3], *common), "3 images")
+    assert_refused(correct(*frames, "--rig", rig, "--out", tmp_path / "film.mp4"), "give a folder")
     assert_refused(correct(*frames[:3], small, *common), "small.png", "128 x 60", "128 x 96")
     assert_refused(correct(*frames[:3], tmp_path / "none.png", *common), "none.png", "No such file")
     assert_refused(correct(*[flat] * 4, *common), "no texture")
