@@ -31,6 +31,7 @@ class Target(StrEnum):
     GSPLAT = "gsplat"
     KITTI = "kitti"
     CARLA_RS = "carla-rs"
+    FASTEC_RS = "fastec-rs"
     WEBDATASET = "webdataset"
 
 

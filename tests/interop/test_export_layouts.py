@@ -200,6 +200,25 @@ def test_carla_rs_velocities_and_radial_depth(tmp_path: Path, turning: bool) -> 
     assert "ROW_READOUT_TIME(ms): 1.63265" in (out / "planes/rs_calib.txt").read_text()  # 80 ms / 49
 
 
+def test_fastec_rs_has_the_frames_that_its_loader_asks_for(tmp_path: Path) -> None:
+    data = dataset(tmp_path / "data", frames=3)
+    out, note = exported(data, "fastec-rs", tmp_path / "out")
+    sequence = only(data)
+    for side in SIDES:
+        place = out / f"planes_{side}"
+        # As dataset_fastec_rs.py finds them: NNN_rolling.png from 000 on.
+        assert sorted(path.name for path in place.glob("*_rolling.png")) == [
+            f"{i:03d}_rolling.png" for i in range(3)
+        ]
+        for frame in range(3):
+            for name, kind in (("rolling", "rs"), ("global_first", "gs")):
+                shown = cv2.imread(str(place / f"{frame:03d}_{name}.png"))[..., ::-1]
+                np.testing.assert_array_equal(shown, sequence.image(kind, side, frame))
+            middle = data / "planes" / "gs_twin" / "0024" / f"{side}_{frame}.png"
+            assert (place / f"{frame:03d}_global_middle.png").read_bytes() == middle.read_bytes()
+    assert note["told"] == ["the readout ratio is 0.8, where those who use the layout assume 1"]
+
+
 @pytest.mark.parametrize(
     ("name", "lens", "scanning", "images", "words"),
     [

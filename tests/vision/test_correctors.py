@@ -179,7 +179,7 @@ def _raise(view: View, image: np.ndarray) -> Any:
         (_changed(image=np.zeros((4, 5, 3), np.uint8)), ("image", "(160, 200, 3)", "(4, 5, 3)")),
         (_changed(image=np.zeros((160, 200, 3), np.float32)), ("image", "uint8", "float32")),
         (_changed(origin=None), ("origin", "NoneType")),
-        (_changed(origin=np.full((160, 200), 9, np.uint8)), ("origin", "0 to 4", "9")),
+        (_changed(origin=np.full((160, 200), 9, np.uint8)), ("origin", "0 to 5", "9")),
         (_changed(depth=np.zeros((160, 200), np.float32)), ("depth", "above 0")),
         (_changed(depth=np.ones((160, 200))), ("depth", "float64")),
         (_changed(reason=None), ("reason", "NoneType")),

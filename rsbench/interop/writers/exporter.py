@@ -35,6 +35,7 @@ FORMATS = {
     "gsplat": Format("gsplat_arrays", ("rs", "gs")),
     "kitti": Format("kitti_folders", ("gs", "rs")),
     "carla-rs": Format("carla_folders", ()),
+    "fastec-rs": Format("fastec_folders", ()),
     "webdataset": Format("webdataset_shards", ()),
 }
 
