@@ -56,13 +56,9 @@ def solve_problem(
     joined, spec, choice = join_stereo(problem.correspondences), entry.solver.spec, None
     shutter, capture, doubt = _shutter_of(problem, joined.correspondences, entry, options, seed)
     given = (joined.correspondences, problem.rig, shutter, options, np.random.default_rng(seed))
-    if doubt:
-        failed = MotionEstimate.failed(doubt)
-        result = RobustEstimate(estimate=failed, iterations=0, seconds=0.0, threshold_px=options.threshold_px)
-    else:
-        result = runner.robust(entry, *given)
-        if motion_model is not None and takes_models(entry):
-            entry, result, choice = _under_model(motion_model, entry, result, runner, given, capture, seed)
+    result = _unsolved(doubt, options) if doubt else runner.robust(entry, *given)
+    if motion_model is not None and takes_models(entry) and not doubt:
+        entry, result, choice = _under_model(motion_model, entry, result, runner, given, capture, seed)
     estimate = result.estimate
     body = body_motion(estimate, spec, problem.rig)
     notes = [estimate.reason] if joined.note in estimate.reason else [estimate.reason, joined.note]
@@ -112,6 +108,11 @@ def _shutter_of(
         return shutter_found(capture, problem.rig), capture, ""
     except NoMotionError as error:
         return still, capture, str(error)
+
+
+def _unsolved(reason: str, options: RobustOptions) -> RobustEstimate:
+    failed = MotionEstimate.failed(reason)
+    return RobustEstimate(estimate=failed, iterations=0, seconds=0.0, threshold_px=options.threshold_px)
 
 
 def _under_model(
