@@ -32,6 +32,7 @@ from rsbench.vision.patch_alignment import refine_matches
 Indices = NDArray[np.int64]
 _MOST_FEATURES = 100_000
 ROW_TOLERANCE_PX = 1.5
+_STILL_PX = 0.01
 _DETECTION_BYTES = 300.0
 """Per pixel: the pyramids of twice the size, float32, and of their differences."""
 _RANGES = {
@@ -93,7 +94,7 @@ class SiftMatcher(MatchOptions, FeatureMatcher):
     def _matched(self, images: Mapping[View, NDArray[np.uint8]], camera: PinholeCamera | None) -> Correspondences:
         four = (images["left", 0], images["right", 0], images["left", 1], images["right", 1])
         matches = match_stereo_frames(*four, self, camera)
-        return refine_matches(images, matches) if self.refine else matches
+        return refine_matches(images, matches) if self.refine and not _still(matches) else matches
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -210,6 +211,12 @@ def match_stereo_frames(
         stereo_1=_positions((l1, r1), stereo_1),
         tracks=_positions((l0, r0, l1, r1), tracks),
     )
+
+
+def _still(matches: Correspondences) -> bool:
+    """Whether nothing moves over time: errors that are all alike would leave solvers no noise to judge by."""
+    moved = np.concatenate([each[:, 2:] - each[:, :2] for each in (matches.left, matches.right)])
+    return len(moved) == 0 or float(np.median(np.abs(moved))) < _STILL_PX
 
 
 def _similarities(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -44,6 +44,7 @@ from rsbench.storage.files import read_grey_png, write_png
 from rsbench.verification import Rerender, verify_dataset
 from rsbench.verification.content import Comparison, read_content
 from rsbench.verification.rerender import Rerenderer
+from rsbench.vision.feature_matcher import load_features
 
 Array = NDArray[np.float64]
 SCENE = """
@@ -258,7 +259,9 @@ def test_matches_are_labelled_as_rays_say(sequence: Sequence, triangles: Array) 
 def test_matches_are_those_that_a_solver_is_given(sequence: Sequence) -> None:
     matches = sequence.matches()
     images = {view: sequence.image("rs", *view) for view in VIEWS}
-    found = find_matches_of_rig(images, sequence.rig, sequence.shutter.scanning, CorrectionOptions())
+    found = find_matches_of_rig(
+        images, sequence.rig, sequence.shutter.scanning, CorrectionOptions(features=load_features("sift"))
+    )
     given, tracks = matches.correspondences(), matches.tracks
     assert np.array_equal(given.tracks, found.tracks) and len(found.tracks) >= 3
     for name in MATCHED:

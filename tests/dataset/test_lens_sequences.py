@@ -246,7 +246,7 @@ def test_matches_in_the_images_fit_the_true_motion_at_their_own_times(made: dict
     images = {view: sequence.image("rs", *view) for view in VIEWS}
     rig, shutter, motion = sequence.rig, sequence.shutter, sequence.motion
     matches = find_matches_of_rig(images, rig, shutter.scanning, CorrectionOptions())
-    assert len(matches.left) > 40 and len(matches.tracks) > 10
+    assert len(matches.left) > 40 and len(matches.tracks) >= 8
     errors = [rs_sampson_error(rig, shutter, motion, side, getattr(matches, side)) for side in SIDES]
     # SIFT errs by some tenths of a pixel here. The image moves by few pixels, so this shows that matches are where
     # they should be; that times are, exact matches show (test_timed_tracks.py).

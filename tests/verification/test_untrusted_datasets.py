@@ -118,7 +118,7 @@ def test_links_within_a_dataset_are_followed(dataset: Path) -> None:
         ("camera", [], "camera = []"),
         ("camera.width", "24", "camera.width = '24'"),
         ("camera.width", True, "camera.width = True"),
-        ("camera.width", 2_000_000_000, "camera: 2000000000 x 16 pixels"),
+        ("camera.width", 2_000_000_000, "camera width = 2000000000"),
         ("camera.fx", float("nan"), "camera.fx = nan: numbers must be finite"),
         ("baseline", None, "baseline = None"),
         ("baseline", "0.3", "baseline = '0.3'"),

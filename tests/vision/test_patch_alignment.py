@@ -81,7 +81,7 @@ def test_a_track_stays_one_in_all_sets() -> None:
         for frame in (0, 1)
     }
     place = np.array([[40.2, 44.9], [55.1, 51.3], [61.0, 30.5]])
-    ends = [[*place, -1.5 * right + 0.7 * frame, 0.4 * frame] for frame in (0, 1) for right in (0, 1)]
+    ends = [np.add(place, (-1.5 * right + 0.7 * frame, 0.4 * frame)) for frame in (0, 1) for right in (0, 1)]
     tracks = np.concatenate([ends[0], *(np.add(end, 0.2) for end in ends[1:])], axis=1)
     matches = Correspondences(
         left=tracks[:, [0, 1, 4, 5]],
