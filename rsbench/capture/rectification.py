@@ -7,7 +7,7 @@ with disparity; images of two times leave no pattern at all.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,7 +143,8 @@ def without_offset(matches: Correspondences, offset: float) -> Correspondences:
     """The matches with ``offset`` px less disparity: half of it taken from either camera."""
     half = 0.5 * offset
     stereo = np.array([-half, 0.0, half, 0.0])
-    return Correspondences(
+    return replace(
+        matches,
         left=matches.left - np.array([half, 0.0, half, 0.0]),
         right=matches.right + np.array([half, 0.0, half, 0.0]),
         stereo_0=matches.stereo_0 + stereo,

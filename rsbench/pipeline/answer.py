@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rsbench.capture.estimate import Capture, conclude, examine
+from rsbench.capture.rectification import without_offset
 from rsbench.capture.settle import (
     ModelChoice,
     NoMotionError,
@@ -55,7 +56,8 @@ def solve_problem(
     """
     joined, spec, choice = join_stereo(problem.correspondences), entry.solver.spec, None
     shutter, capture, doubt = _shutter_of(problem, joined.correspondences, entry, options, seed)
-    given = (joined.correspondences, problem.rig, shutter, options, np.random.default_rng(seed))
+    matches = joined.correspondences if capture is None else _at_rest(joined.correspondences, shutter, capture)
+    given = (matches, problem.rig, shutter, options, np.random.default_rng(seed))
     result = _unsolved(doubt, options) if doubt else runner.robust(entry, *given)
     if motion_model is not None and takes_models(entry) and not doubt:
         entry, result, choice = _under_model(motion_model, entry, result, runner, given, capture, seed)
@@ -77,7 +79,7 @@ def solve_problem(
         "motion_model": spec.motion_model if choice is None else choice.used,
         **({} if motion_model is None else {"model_choice": None if choice is None else choice.record()}),
         "shutter": spec.shutter,
-        "readout_ratio": None if doubt else shutter.readout_ratio,
+        "readout_ratio": shutter.readout_ratio if _says(problem, capture, doubt) else None,
         **({} if capture is None else {"readout": record_of(capture)}),
         "assumes": spec.assumes,
         "inliers": result.inlier_count,
@@ -108,6 +110,16 @@ def _shutter_of(
         return shutter_found(capture, problem.rig), capture, ""
     except NoMotionError as error:
         return still, capture, str(error)
+
+
+def _at_rest(matches: Correspondences, shutter: RollingShutter, capture: Capture) -> Correspondences:
+    """The matches without the disparity offset that was found with the shutter."""
+    return without_offset(matches, capture.offset) if shutter.rows_together else matches
+
+
+def _says(problem: Problem, capture: Capture | None, doubt: str) -> bool:
+    """Whether a ratio was given or found; solvers of a global shutter look for none."""
+    return not doubt and (problem.known_shutter is not None or capture is not None)
 
 
 def _unsolved(reason: str, options: RobustOptions) -> RobustEstimate:
