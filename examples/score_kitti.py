@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rsbench.capture.calibration import NO_ERRORS
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
@@ -146,20 +147,22 @@ def score(given: argparse.Namespace) -> list[str]:
         raise RsbenchError(
             f"{given.folder}: {len(files[0])} left and {len(files[1])} right images, {len(poses)} poses"
         )
-    ratio, offset, lines = given.ratio, 0.0, []
-    if ratio is None:
-        capture, shutter = estimate_sequence_capture(sources[0], sources[1], rig, options)
-        ratio, offset, best = shutter.readout_ratio, capture.offset, capture.likeliest
-        assert best is not None
+    ratio, lines = given.ratio, []
+    capture, shutter = estimate_sequence_capture(sources[0], sources[1], rig, options, ratio)
+    best, calibration = None, NO_ERRORS
+    if capture is not None:
+        best, calibration = capture.likeliest, capture.calibration
+    if best is not None:
+        ratio = shutter.readout_ratio
         lines.append(f"readout ratio {best.ratio:.3f} +- {best.sigma:.3f}, {best.scans}")
-        lines.append(f"disparity offset {offset:+.2f} +- {capture.offset_sigma:.2f} px")
+        lines.append(f"disparity offset {capture.offset:+.2f} +- {capture.offset_sigma:.2f} px")
     rows, steps, refused = [], [], 0
     for k in range(0, len(poses) - 1, given.every):
         images = {
             (side, n): read_frame(files[i][k + n]) for n in (0, 1) for i, side in enumerate(("left", "right"))
         }
         try:
-            motion = solve_frames(match_frames(images, rig, options), rig, ratio, options, offset).found
+            motion = solve_frames(match_frames(images, rig, options), rig, ratio, options, calibration).found
             assert motion is not None
         except RsbenchError as error:
             refused += 1

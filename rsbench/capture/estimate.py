@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy
 
+from rsbench.capture.calibration import NO_ERRORS, OFFSET
 from rsbench.capture.evidence import Peak, WindowEvidence, window_evidence
-from rsbench.capture.hypotheses import DELAY, OFFSET, Hypothesis, Known
+from rsbench.capture.hypotheses import CALIBRATION, DELAY, Hypothesis, Known
 from rsbench.capture.scans import Scans
 from rsbench.capture.start import find_lag, find_start
 from rsbench.core.correspondences import Correspondences, temporal_pairs
@@ -54,9 +56,9 @@ class Candidate:
     sigma: float
     delay: float
     delay_sigma: float
-    offset: float = 0.0
-    """px by which disparities are too large."""
-    offset_sigma: float = 0.0
+    calibration: tuple[float, ...] = NO_ERRORS
+    """What the calibration is wrong by, see ``calibration.TERMS``."""
+    calibration_sigma: tuple[float, ...] = NO_ERRORS
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,12 +96,17 @@ class Capture:
     @property
     def offset(self) -> float:
         """px by which disparities are too large, under the most probable candidate."""
-        return 0.0 if self.likeliest is None else self.likeliest.offset
+        return self.calibration[OFFSET]
 
     @property
     def offset_sigma(self) -> float:
         """Standard deviation of ``offset``."""
-        return 0.0 if self.likeliest is None else self.likeliest.offset_sigma
+        return 0.0 if self.likeliest is None else self.likeliest.calibration_sigma[OFFSET]
+
+    @property
+    def calibration(self) -> tuple[float, ...]:
+        """What the calibration is wrong by, under the most probable candidate."""
+        return NO_ERRORS if self.likeliest is None else self.likeliest.calibration
 
     @property
     def motion_model(self) -> str:
@@ -210,7 +217,7 @@ class _Sum:
     at: float
     sigma: float
     mean: FloatArray
-    """(4,) of the unknowns; of delay and offset, which the windows share."""
+    """(10,) of the unknowns; of delay and calibration, which the windows share."""
     sigmas: FloatArray
     last: Peak
 
@@ -281,24 +288,26 @@ def _candidate(scans: Scans, sums: Mapping[Hypothesis, _Sum], shares: Mapping[Hy
     weights = weights / probability if probability > 0.0 else np.full(len(keys), 1.0 / len(keys))
     ratio, sigma = _mixture(weights, [(sums[key].at, sums[key].sigma) for key in keys])
     delay, delay_sigma = _mixture(weights, [(sums[key].mean[DELAY], sums[key].sigmas[DELAY]) for key in keys])
-    offset, offset_sigma = _mixture(weights, [(sums[key].mean[OFFSET], sums[key].sigmas[OFFSET]) for key in keys])
+    errors, errors_sigma = _mixture(
+        weights, [(sums[key].mean[CALIBRATION], sums[key].sigmas[CALIBRATION]) for key in keys]
+    )
     return Candidate(
         scans=scans,
         probability=probability,
         ratio=float(np.clip(ratio, 0.0, 1.0)),
-        sigma=sigma,
-        delay=delay,
-        delay_sigma=delay_sigma,
-        offset=offset,
-        offset_sigma=offset_sigma,
+        sigma=float(sigma),
+        delay=float(delay),
+        delay_sigma=float(delay_sigma),
+        calibration=tuple(errors.tolist()),
+        calibration_sigma=tuple(errors_sigma.tolist()),
     )
 
 
-def _mixture(weights: FloatArray, parts: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Mean and deviation, of means and deviations."""
-    means, sigmas = np.array(parts).T
-    mean = float(weights @ means)
-    return mean, float(np.sqrt(weights @ (sigmas**2 + (means - mean) ** 2)))
+def _mixture(weights: FloatArray, parts: Sequence[tuple[Any, Any]]) -> tuple[FloatArray, FloatArray]:
+    """Means and deviations (...), of those of the parts."""
+    means, sigmas = np.moveaxis(np.array(parts), 1, 0)
+    mean = np.asarray(weights @ means)
+    return mean, np.sqrt(weights @ (sigmas**2 + (means - mean) ** 2))
 
 
 def _doubt(candidates: Sequence[Candidate], share: float, moved_px: float, max_sigma: float) -> str:

@@ -7,12 +7,12 @@ with disparity; images of two times leave no pattern at all.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.correspondences import Correspondences
+from rsbench.capture.calibration import lens_terms, row_terms
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
@@ -48,6 +48,10 @@ class RowPattern:
 
     systematic_px: float
     """Root mean square of its part without distortion, less what noise would give."""
+    term_sizes: FloatArray
+    """(4,) root mean square of each of its terms for 1 px, see ``calibration.row_terms``."""
+    bend_sizes: FloatArray
+    lens_sizes: FloatArray
     distortion: float
     """Coefficient k of a lens that maps radius r to r (1 + k r^2), in focal lengths."""
     distortion_sigma: float
@@ -64,7 +68,7 @@ def row_pattern(stereo: FloatArray, rig: StereoRig) -> RowPattern | None:
     camera = rig.camera
     xl, xr = (stereo[:, 0] - camera.cx) / camera.fx, (stereo[:, 2] - camera.cx) / camera.fx
     x, y = 0.5 * (xl + xr), (0.5 * (stereo[:, 1] + stereo[:, 3]) - camera.cy) / camera.fy
-    columns = np.stack([np.ones(len(x)), x, y, x * y, camera.fy * y * (xl**2 - xr**2)], axis=1)
+    columns = np.column_stack([row_terms(x, y), camera.fy * y * (xl**2 - xr**2)])
     difference = stereo[:, 1] - stereo[:, 3]
     near = np.abs(difference) < _FAR_OFF_PX
     keep, noise, fit = near, _LEAST_PX, np.zeros(columns.shape[1])
@@ -81,8 +85,12 @@ def row_pattern(stereo: FloatArray, rig: StereoRig) -> RowPattern | None:
     leverage = np.einsum("ij,ji->i", columns[keep], hat)
     left_out = hat[-1] * (difference - columns @ fit)[keep] / np.maximum(1.0 - leverage, 1e-6)
     excess = float(np.mean(smooth**2)) - 4.0 * noise**2 / len(smooth)
+    lens = camera.fx * np.sqrt(np.mean(np.sum(lens_terms(x[keep], y[keep]) ** 2, axis=-1), axis=0))
     return RowPattern(
+        lens_sizes=lens,
         systematic_px=float(np.sqrt(max(excess, 0.0))),
+        term_sizes=np.sqrt(np.mean(columns[keep, :4] ** 2, axis=0)),
+        bend_sizes=np.sqrt(np.mean(np.column_stack([x, y, x * x, x * y, y * y])[keep] ** 2, axis=0)),
         distortion=float(fit[-1]),
         distortion_sigma=max(float(np.linalg.norm(left_out)), noise * float(np.linalg.norm(hat[-1]))),
         noise_px=noise,
@@ -137,17 +145,3 @@ def _is_distorted(pattern: RowPattern, share: float) -> bool:
     # Images of two times fit any pattern badly, and then its coefficients mean nothing.
     clear = abs(pattern.distortion) > max(_DISTORTED, _CLEARLY * pattern.distortion_sigma)
     return clear and pattern.noise_px < 0.5 and share > 0.6
-
-
-def without_offset(matches: Correspondences, offset: float) -> Correspondences:
-    """The matches with ``offset`` px less disparity: half of it taken from either camera."""
-    half = 0.5 * offset
-    stereo = np.array([-half, 0.0, half, 0.0])
-    return replace(
-        matches,
-        left=matches.left - np.array([half, 0.0, half, 0.0]),
-        right=matches.right + np.array([half, 0.0, half, 0.0]),
-        stereo_0=matches.stereo_0 + stereo,
-        stereo_1=matches.stereo_1 + stereo,
-        tracks=matches.tracks + np.concatenate([stereo, stereo]),
-    )

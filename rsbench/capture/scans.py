@@ -9,6 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from rsbench.capture.calibration import ray_shifts
 from rsbench.core.correspondences import BoolArray, Correspondences, unlinked_pairs
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
@@ -20,6 +21,8 @@ from rsbench.solvers.engine.packed import Packed, pack
 Start = Literal["global", "top", "bottom", "left", "right"]
 """The side of the image at which a camera begins to read, or ``global`` for all lines at once."""
 _FRAMES = np.array([0.0, 1.0])
+_FIRST_ERROR = 3
+"""Of the unknowns, the first error of the calibration; before it are ratio, delay and acceleration."""
 STARTS: tuple[Start, ...] = get_args(Start)
 _ENDS: dict[Side, tuple[int, int]] = {"left": (0, 2), "right": (1, 3)}
 """Ends of a track, of frame 0 and of frame 1, that a camera sees."""
@@ -122,12 +125,21 @@ class TimedMatches:
         sets = [getattr(matches, side)[unlinked_pairs(matches, side)] for side in SIDES]
         self.pixels: FloatArray = np.concatenate([*(each[:, :2] for each in sets), matches.tracks[:, :2]])
         """(count, 2) where each is seen in frame 0."""
+        self._shifts = self._ray_shifts()
         self._lines["global"] = _Lines(
             pairs=np.zeros((pairs, 2)),
             slopes=np.zeros((pairs, 2)),
             tracks=np.zeros((tracks, 4)),
             track_slopes=np.zeros((tracks, 4, 2)),
         )
+
+    def _ray_shifts(self) -> tuple[FloatArray, FloatArray]:
+        """(n, 2, 7, 2) of the pairs' ends and (m, 4, 7, 2) of the tracks', see ``ray_shifts``."""
+        base, focal = self._base, float(self._base.focal[0])
+        pairs = base.pairs[:, :4].reshape(-1, 2, 2)
+        either = [ray_shifts(pairs, side, focal) for side in SIDES]
+        tracks = [ray_shifts(base.tracks[:, k, :2], SIDES[k % 2], focal) for k in range(4)]
+        return np.where(self.left[:, None, None, None], *either), np.stack(tracks, axis=1)
 
     def under(self, motion_model: str) -> TimedMatches:
         """The same matches under another motion model."""
@@ -145,6 +157,7 @@ class TimedMatches:
             self.pixels[chosen],
             int(np.count_nonzero(chosen)),
         )
+        other._shifts = self._shifts[0][pairs], self._shifts[1][tracks]
         other._lines = {
             start: _Lines(
                 pairs=lines.pairs[pairs],
@@ -161,10 +174,10 @@ class TimedMatches:
 
         Args:
             scans: where each camera begins to read.
-            unknowns: (4,) readout ratio; frame periods by which the right camera is late; px by which disparities
-                are too large; the motion's acceleration, 0 of a model without one.
+            unknowns: (10,) readout ratio; frame periods by which the right camera is late; the motion's
+                acceleration, 0 of a model without one; what the calibration is wrong by.
         """
-        ratio, delay, offset, acceleration = map(float, unknowns)
+        ratio, delay, acceleration, *errors = map(float, unknowns)
         pairs, tracks = self._base.pairs.copy(), self._base.tracks.copy()
         for side in SIDES:
             lines, late = self._lines[scans.start(side)], delay if side == "right" else 0.0
@@ -174,11 +187,9 @@ class TimedMatches:
             ends = list(_ENDS[side])
             tracks[:, ends, 2] = _FRAMES + late + ratio * lines.tracks[:, ends]
             tracks[:, ends, 7:9] = ratio * lines.track_slopes[:, ends]
-            if offset:  # half of it is the left camera's, half the right one's
-                shift = (0.5 if side == "left" else -0.5) * offset / self._base.focal[0]
-                pairs[mine, 0] -= shift
-                pairs[mine, 2] -= shift
-                tracks[:, ends, 0] -= shift
+        if any(errors):
+            pairs[:, :4] -= np.einsum("nkcx,c->nkx", self._shifts[0], errors).reshape(-1, 4)
+            tracks[:, :, :2] -= np.einsum("mkcx,c->mkx", self._shifts[1], errors)
         return replace(self._base, pairs=pairs, tracks=tracks, h=0.0, kernel=self._kernel(acceleration))
 
     def _kernel(self, acceleration: float) -> MotionKernel:
@@ -195,7 +206,11 @@ class TimedMatches:
         pairs = np.zeros((len(packed.pairs), 2, len(free), 3))
         tracks = np.zeros((len(packed.tracks), 4, len(free), 3))
         for k, unknown in enumerate(free):
-            if unknown == 3:
+            if unknown >= _FIRST_ERROR:
+                pairs[:, :, k, :2] = -self._shifts[0][:, :, unknown - _FIRST_ERROR]
+                tracks[:, :, k, :2] = -self._shifts[1][:, :, unknown - _FIRST_ERROR]
+                continue
+            if unknown == 2:
                 for by, tau in ((pairs, packed.pairs[:, 4:6]), (tracks, packed.tracks[:, :, 2])):
                     by[:, :, k, 2] = (tau**2 - tau) / ((2.0 + acceleration) * (1.0 + acceleration * tau))
                 continue
@@ -204,11 +219,8 @@ class TimedMatches:
                 if unknown == 0:
                     lines = self._lines[scans.start(side)]
                     pairs[mine, :, k, 2], tracks[:, ends, k, 2] = lines.pairs[mine], lines.tracks[:, ends]
-                elif unknown == 1:
-                    pairs[mine, :, k, 2] = tracks[:, ends, k, 2] = float(side == "right")
                 else:
-                    shift = (-0.5 if side == "left" else 0.5) / self._base.focal[0]
-                    pairs[mine, :, k, 0] = tracks[:, ends, k, 0] = shift
+                    pairs[mine, :, k, 2] = tracks[:, ends, k, 2] = float(side == "right")
         return pairs, tracks
 
 

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from rsbench.capture.calibration import BENDS, LENS, NO_ERRORS, OFFSET, ROWS, TERMS
 from rsbench.capture.estimate import CERTAIN, Candidate, Capture, conclude, examine
 from rsbench.capture.evidence import Peak
-from rsbench.capture.hypotheses import ACCELERATION, MODELS, Known
+from rsbench.capture.hypotheses import ACCELERATION, CALIBRATION, MODELS, Known
 from rsbench.capture.rectification import row_pattern
 from rsbench.capture.scans import ALL_SCANS, GLOBAL, Scans, scans_of
 from rsbench.components.motion_models import make_motion
@@ -29,7 +30,7 @@ from rsbench.solvers.engine.kernel_type import load_kernel
 AUTO = "auto"
 _MAX_SIGMA, _HARMLESS_PX = 0.1, 1.0
 """Standard deviation of a ratio that frames are corrected with, at most; more where it moves no pixel by this."""
-_PRIOR_FACTOR, _LEAST_PRIOR_PX = 2.0, 0.1
+_PRIOR_FACTOR, _LEAST_PRIOR_PX, _MOST_PRIOR_PX = 2.0, 0.1, 2.0
 """Standard deviation of the disparity offset over the size of the row differences: rows show errors of roll and
 pitch, and the error of yaw, which shifts disparities, is of their kind. Below the second there is none to fit."""
 _NEARLY, _SMALL = 0.06, 0.15
@@ -49,19 +50,23 @@ def known_of(
     rig: StereoRig,
     readout_ratio: float | None,
     scanning: Scanning | None,
-    disparity_offset: float | None = None,
+    calibration: tuple[float, ...] | None = None,
     models: tuple[str, ...] = MODELS,
 ) -> Known:
     """What is known before the matches are asked; None of it is looked for.
 
-    An unknown offset is looked for with an unknown ratio, as large as the row differences of the left-right
-    matches allow: they come from the same calibration.
+    Errors of the calibration are looked for where the row differences of the left-right matches show some, and are
+    expected to be as large as these: they come from the same calibration.
     """
-    offset_sigma = 0.0
-    if disparity_offset is None and readout_ratio is None and rig.camera.lens is None:
+    sigmas = np.zeros(len(TERMS))
+    if calibration is None and rig.camera.lens is None:
         pattern = row_pattern(_stereo(matches), rig)
-        sigma = 0.0 if pattern is None else _PRIOR_FACTOR * pattern.systematic_px
-        offset_sigma = sigma if sigma > _LEAST_PRIOR_PX else 0.0
+        sigma = 0.0 if pattern is None else min(_PRIOR_FACTOR * pattern.systematic_px, _MOST_PRIOR_PX)
+        if pattern is not None and sigma > _LEAST_PRIOR_PX:
+            sigmas[ROWS] = sigma / np.maximum(pattern.term_sizes, 1e-3)
+            sigmas[BENDS] = sigma / np.maximum(pattern.bend_sizes, 1e-3)
+            sigmas[LENS] = sigma / np.maximum(pattern.lens_sizes, 1.0)
+            sigmas[OFFSET] = sigma
     scans = ALL_SCANS
     if scanning is not None:
         width, height = rig.camera.width, rig.camera.height
@@ -75,8 +80,8 @@ def known_of(
         ratio=readout_ratio,
         scans=scans,
         delay=None if scanning is None else scanning.right_delay,
-        offset=disparity_offset or 0.0,
-        offset_sigma=offset_sigma,
+        calibration=calibration or NO_ERRORS,
+        calibration_sigma=tuple(sigmas.tolist()),
         models=models,
     )
 
@@ -155,7 +160,7 @@ def cannot_tell(capture: Capture) -> str:
 
 def trade(peak: Peak) -> str:
     """The parameter of the motion, or the offset, that takes up most of a change of the ratio, with its amount."""
-    w, d, offset = peak.trade[:3], peak.trade[3:6], float(peak.trade[8])
+    w, d, offset = peak.trade[:3], peak.trade[3:6], float(peak.trade[6 + CALIBRATION.start + OFFSET])
     depth = 10.0 * max(float(np.linalg.norm(peak.fit.theta[3:])), 1e-6)
     share = np.abs(np.concatenate([w, d / depth]))
     k = int(np.argmax(share))

@@ -264,6 +264,7 @@ def _correct_sequence(
 ) -> None:
     from dataclasses import replace
 
+    from rsbench.capture.calibration import NO_ERRORS, OFFSET
     from rsbench.cli.console import progress_bar
     from rsbench.core.shutter import Scanning
     from rsbench.dataset.corrected_frames import fresh_folder, rig_record
@@ -273,20 +274,20 @@ def _correct_sequence(
 
     rig = sized(card, next(iter(left)))
     options = replace(options, target_row=target_row(target, rig.camera.height))
-    ratio, offset, scanning, capture = card.readout_ratio, card.disparity_offset, card.scanning, None
-    check_cameras(rig, scanning or Scanning(), options, offset)
+    ratio, calibration, scanning, capture = card.readout_ratio, card.calibration, card.scanning, None
+    check_cameras(rig, scanning or Scanning(), options, card.disparity_offset)
     with video_place(out) if is_video(out) else fresh_folder(out) as folder:
-        if ratio is None:
+        if ratio is None or calibration is None:
             windows = min(max(left.count - 1, 1), WINDOWS)
             with progress_bar("looking at the shutter", windows) as advance:
-                found = estimate_sequence_capture(left, right, rig, options, scanning, offset, advance)
+                found = estimate_sequence_capture(left, right, rig, options, ratio, scanning, calibration, advance)
             capture, shutter = found
             ratio, scanning = shutter.readout_ratio, shutter.scanning
-            offset = capture.offset if offset is None and shutter.rows_together else offset
+            calibration = NO_ERRORS if capture is None or not shutter.rows_together else capture.calibration
         shutter = (scanning or Scanning()).shutter_of(rig.camera.width, rig.camera.height, ratio)
-        record = rig_record(rig, shutter, capture, options, offset or 0.0)
+        record = rig_record(rig, shutter, capture, options, (calibration or NO_ERRORS)[OFFSET])
         with progress_bar("correcting", max(left.count, 1)) as advance:
-            moments = correct_sequence(left, right, rig, ratio, options, offset or 0.0, scanning)
+            moments = correct_sequence(left, right, rig, ratio, options, calibration or NO_ERRORS, scanning)
             record["frames"], cards, poses = _write_moments(folder, moments, left, advance, finish)
         if is_video(out):
             _write_both(out, folder, (left, right), record)

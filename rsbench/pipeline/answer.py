@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from rsbench.capture.calibration import recalibrated
 from rsbench.capture.estimate import Capture, conclude, examine
-from rsbench.capture.rectification import without_offset
 from rsbench.capture.settle import (
     ModelChoice,
     NoMotionError,
@@ -56,7 +56,11 @@ def solve_problem(
     """
     joined, spec, choice = join_stereo(problem.correspondences), entry.solver.spec, None
     shutter, capture, doubt = _shutter_of(problem, joined.correspondences, entry, options, seed)
-    matches = joined.correspondences if capture is None else _at_rest(joined.correspondences, shutter, capture)
+    matches = (
+        joined.correspondences
+        if capture is None
+        else _at_rest(joined.correspondences, problem.rig, shutter, capture)
+    )
     given = (matches, problem.rig, shutter, options, np.random.default_rng(seed))
     result = _unsolved(doubt, options) if doubt else runner.robust(entry, *given)
     if motion_model is not None and takes_models(entry) and not doubt:
@@ -112,9 +116,11 @@ def _shutter_of(
         return still, capture, str(error)
 
 
-def _at_rest(matches: Correspondences, shutter: RollingShutter, capture: Capture) -> Correspondences:
-    """The matches without the disparity offset that was found with the shutter."""
-    return without_offset(matches, capture.offset) if shutter.rows_together else matches
+def _at_rest(
+    matches: Correspondences, rig: StereoRig, shutter: RollingShutter, capture: Capture
+) -> Correspondences:
+    """The matches without the errors of the calibration that were found with the shutter."""
+    return recalibrated(matches, rig, capture.calibration) if shutter.rows_together else matches
 
 
 def _says(problem: Problem, capture: Capture | None, doubt: str) -> bool:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rsbench.capture.calibration import of_offset
 from rsbench.capture.estimate import Capture
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
@@ -96,7 +97,8 @@ def correct_four(
         step: called with the name of each of the 4 steps done.
         given: what is known already.
         views: the frames that are wanted.
-        disparity_offset: see ``solve_frames``.
+        disparity_offset: px by which disparities are too large, of a calibration that is right otherwise; None has
+            its errors found where the row differences of the matches show some.
         scanning: how the cameras read their lines; None: found with the readout ratio, or where that is given,
             rows from the top, both at once.
         rows: further target rows, at whose times the frames are wanted too.
@@ -210,8 +212,9 @@ def _solve(
     elif matches is None:
         matches = match_frames(images, rig, options, scanning)
     clock("matching")
+    calibration = None if disparity_offset is None else of_offset(disparity_offset)
     solved = solve_frames(
-        matches, rig, readout_ratio, options, disparity_offset, scanning, doubt=doubt, with_motion=wanted
+        matches, rig, readout_ratio, options, calibration, scanning, doubt=doubt, with_motion=wanted
     )
     clock("motion")
     return solved.matches, solved.found, solved.shutter, solved.capture

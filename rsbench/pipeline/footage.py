@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.capture.calibration import of_offset
 from rsbench.components.cards import parse_card, read_toml
 from rsbench.components.shutters import SHUTTER_KEY, with_shutter
 from rsbench.core.camera import PinholeCamera
@@ -59,7 +60,7 @@ class RigCard(StatedShutter):
     baseline: float
     """Full distance between the cameras, metres."""
     disparity_offset: float | None = None
-    """Pixels by which matched disparities are too large; absent: estimated with the readout ratio, else 0."""
+    """Pixels by which matched disparities are too large; absent: found, where the matches show errors."""
 
     def __post_init__(self) -> None:
         self.rig(1, 1)
@@ -71,6 +72,11 @@ class RigCard(StatedShutter):
             )
         if self.readout_ratio is not None and not 0.0 <= self.readout_ratio <= 1.0:
             raise ValueError(f"readout_ratio = {self.readout_ratio}: must lie in [0, 1], or be absent if unknown")
+
+    @property
+    def calibration(self) -> tuple[float, ...] | None:
+        """What the calibration is wrong by; None where it is looked for."""
+        return None if self.disparity_offset is None else of_offset(self.disparity_offset)
 
     def rig(self, width: int, height: int) -> StereoRig:
         """The rig with images of this size; ValueError where its lens cannot be one of such images."""

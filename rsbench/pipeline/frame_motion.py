@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rsbench.capture.calibration import NO_ERRORS, OFFSET, recalibrated
 from rsbench.capture.estimate import Capture, conclude, examine
 from rsbench.capture.hypotheses import MODELS
-from rsbench.capture.rectification import RefusedFramesError, without_offset
+from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.scans import scans_of
 from rsbench.capture.settle import (
     AUTO,
@@ -57,10 +58,15 @@ class FoundMotion:
     """Name of the solver's entry."""
     reference_point: str
     """The point whose translation ``robust.estimate.d`` is."""
-    disparity_offset: float = 0.0
-    """What was taken from the disparities before, px."""
+    calibration: tuple[float, ...] = NO_ERRORS
+    """What was taken from the matches before, see ``calibration.TERMS``."""
     choice: ModelChoice | None = None
     """How the motion model was chosen; None when it is the solver's."""
+
+    @property
+    def disparity_offset(self) -> float:
+        """px that were taken from the disparities."""
+        return self.calibration[OFFSET]
 
 
 def find_motion(
@@ -138,7 +144,7 @@ def chosen_model(
         asked: ``auto`` or the one to take.
         start: a motion near theirs, of any model.
     """
-    known = known_of(matches, rig, shutter.readout_ratio, shutter.scanning, 0.0)
+    known = known_of(matches, rig, shutter.readout_ratio, shutter.scanning, NO_ERRORS)
     capture = conclude([examine(matches, rig, known, robust, seed, start)])
     if asked not in (AUTO, *capture.peaks):  # one that the matches exclude, or another package's
         alone = conclude([examine(matches, rig, replace(known, models=(asked,)), robust, seed, start)])
@@ -222,7 +228,7 @@ def solve_frames(
     rig: StereoRig,
     readout_ratio: float | None,
     options: CorrectionOptions,
-    disparity_offset: float | None = None,
+    calibration: tuple[float, ...] | None = None,
     scanning: Scanning | None = None,
     *,
     doubt: RefusedFramesError | None = None,
@@ -232,8 +238,8 @@ def solve_frames(
     """Motion and shutter from matches; what is None of the shutter is found with the motion.
 
     Args:
-        disparity_offset: what a disparity is too large by, px; None has it estimated with the readout ratio,
-            and is 0 where that is known.
+        calibration: what the calibration is wrong by, see ``calibration.TERMS``; None has it found where the row
+            differences of the matches show that it is wrong.
         scanning: how the cameras read; None: found with the readout ratio; rows from the top where that is given.
         doubt: raised where the cameras read rows together, see ``match_unknown``.
         in_order: whether the frames are known to be in the order of time.
@@ -244,45 +250,63 @@ def solve_frames(
         NoMotionError: no motion explains the matches, or they do not determine the shutter.
     """
     if readout_ratio is None:
-        capture = find_capture(matches, rig, options, scanning, disparity_offset)
+        capture = find_capture(matches, rig, options, None, scanning, calibration)
         if scanning is not None and runs_backwards(
             capture, scans_of(scanning.shutter_of(rig.camera.width, rig.camera.height, 1.0))
         ):
             raise RefusedFramesError(BACKWARDS)
         shutter = shutter_found(capture, rig)
-        offset = (
-            (capture.offset if disparity_offset is None else disparity_offset) if shutter.rows_together else 0.0
-        )
+        used, errors = capture, capture.calibration if shutter.rows_together else NO_ERRORS
         if shutter.rows_together:
             if doubt is not None:
                 raise doubt
             matches = on_their_rows(matches, rig)
     else:
-        scanning, capture, offset = scanning or Scanning(), None, disparity_offset or 0.0
+        scanning, capture = scanning or Scanning(), None
         shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
+        used, errors = _calibrated(matches, rig, readout_ratio, options, scanning, calibration)
     if not with_motion:
         return SolvedFrames(found=None, shutter=shutter, matches=matches, capture=capture)
-    at_rest = without_offset(matches, offset)
-    found = replace(find_motion(at_rest, rig, shutter, options, capture=capture), disparity_offset=offset)
+    at_rest = recalibrated(matches, rig, errors)
+    found = replace(find_motion(at_rest, rig, shutter, options, capture=used), calibration=errors)
     if capture is None and not in_order and _runs_backwards(at_rest, rig, found.motion, shutter, options):
         raise RefusedFramesError(BACKWARDS)
     return SolvedFrames(found=found, shutter=shutter, matches=matches, capture=capture)
+
+
+def _calibrated(
+    matches: Correspondences,
+    rig: StereoRig,
+    readout_ratio: float,
+    options: CorrectionOptions,
+    scanning: Scanning,
+    calibration: tuple[float, ...] | None,
+) -> tuple[Capture | None, tuple[float, ...]]:
+    """What the matches say of a calibration that may be wrong, with a known shutter; None where it is right."""
+    if calibration is not None or not scanning.rows_together:
+        return None, calibration or NO_ERRORS
+    known = known_of(matches, rig, readout_ratio, scanning)
+    if not any(known.calibration_sigma):
+        return None, NO_ERRORS
+    capture = find_capture(matches, rig, options, readout_ratio, scanning)
+    return (capture, capture.calibration) if capture.peaks else (None, NO_ERRORS)
 
 
 def find_capture(
     matches: Correspondences,
     rig: StereoRig,
     options: CorrectionOptions,
-    scanning: Scanning | None,
-    disparity_offset: float | None = None,
+    readout_ratio: float | None = None,
+    scanning: Scanning | None = None,
+    calibration: tuple[float, ...] | None = None,
 ) -> Capture:
-    """What the matches of two times say of an unknown readout ratio, and of the scans where they are None."""
+    """What the matches of two times say of the motion, and of what is None of the shutter and the calibration."""
     entry, models = options.solver, models_asked(options.motion_model)
     if options.motion_model is None and isinstance(entry.solver, RefinedSolver):
         models = (entry.solver.motion_model,)
-    known = known_of(matches, rig, None, scanning, disparity_offset, models)
+    known = known_of(matches, rig, readout_ratio, scanning, calibration, models)
     capture = conclude([examine(matches, rig, known, options.robust, options.seed)])
-    return as_global(capture, [matches], rig, known)
+    return as_global(capture, [matches], rig, known) if readout_ratio is None else capture
 
 
 def _runs_backwards(

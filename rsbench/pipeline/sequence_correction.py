@@ -9,6 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from rsbench.capture.calibration import NO_ERRORS, OFFSET
 from rsbench.capture.estimate import CERTAIN, Capture, conclude, examine
 from rsbench.capture.estimate import Window as Examined
 from rsbench.capture.hypotheses import Known
@@ -65,28 +66,78 @@ def estimate_sequence_capture(
     right: FrameSource,
     rig: StereoRig,
     options: CorrectionOptions,
+    readout_ratio: float | None = None,
     scanning: Scanning | None = None,
-    disparity_offset: float | None = None,
+    calibration: tuple[float, ...] | None = None,
     advance: Callable[[str], None] = lambda word: None,
-) -> tuple[Capture, RollingShutter]:
+) -> tuple[Capture | None, RollingShutter]:
     """How the cameras of a sequence read, from windows that lie evenly over it: their shutter does not change.
 
+    With a known ratio the calibration alone is looked for; no capture where the first window shows no errors.
+
     Args:
-        scanning, disparity_offset: see ``solve_frames``.
+        readout_ratio, scanning, calibration: see ``solve_frames``.
         advance: called for each window.
 
     Raises:
         RefusedFramesError: the first windows cannot be what they are said to be.
         NoMotionError: the windows do not determine the shutter.
     """
-    examined, used = list[Examined](), list[Correspondences]()
-    refusals, known, doubt = _Refusals(left), None, None
-    every, number, first = max((left.count - 1) // WINDOWS, 1), -1, list[Correspondences]()
+    models = models_asked(options.motion_model)
+    scanning = scanning if readout_ratio is None else scanning or Scanning()
+    examined, used, known, first = list[Examined](), list[Correspondences](), None, list[Correspondences]()
+    speaks_against = list[RefusedFramesError]()
+    for number, matches, doubt in _some_matches(left, right, rig, options, scanning):
+        if number < SUCCESSIVE:
+            first.append(matches)
+        if doubt is not None:
+            speaks_against.append(doubt)
+        if number % _every(left) or len(examined) == WINDOWS:
+            continue
+        known = known or known_of(matches, rig, readout_ratio, scanning, calibration, models)
+        if readout_ratio is not None and not any(known.calibration_sigma):
+            break
+        examined.append(examine(matches, rig, known, options.robust, options.seed))
+        used.append(matches)
+        advance(f"window {number}")
+        known = _narrowed(known, conclude(examined))
+    if readout_ratio is not None:
+        shutter = (scanning or Scanning()).shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
+        return (conclude(examined) if examined else None), shutter
+    if known is None:
+        raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
+    capture = as_global(conclude(examined), used, rig, known)
+    shutter = shutter_found(capture, rig)
+    if len(first) + 1 >= _FEWEST_FRAMES and shakes(capture, first, rig, options.seed):
+        raise NoMotionError(SHAKEN)
+    if speaks_against and shutter.rows_together:
+        raise speaks_against[-1]
+    return capture, shutter
+
+
+def _every(left: FrameSource) -> int:
+    """Windows from one that is looked at to the next."""
+    return max((left.count - 1) // WINDOWS, 1)
+
+
+def _some_matches(
+    left: FrameSource,
+    right: FrameSource,
+    rig: StereoRig,
+    options: CorrectionOptions,
+    scanning: Scanning | None,
+) -> Iterator[tuple[int, Correspondences, RefusedFramesError | None]]:
+    """Number and matches of the first windows and of some over the whole, and what speaks against a pair.
+
+    Raises:
+        RefusedFramesError: the first windows, or all, are refused.
+    """
+    refusals, number = _Refusals(left), -1
     for number, images in enumerate(_window_images(left, right)):
-        chosen = number % every == 0 and len(examined) < WINDOWS
-        if not (chosen or number < SUCCESSIVE):
+        if number % _every(left) and number >= SUCCESSIVE:
             continue
         try:
+            doubt = None
             if scanning is None:
                 matches, doubt = match_unknown(images, rig, options, judge_rig=number < _JUDGED)
             else:
@@ -94,26 +145,8 @@ def estimate_sequence_capture(
         except RefusedFramesError as error:
             refusals.add(number, error)
             continue
-        if number < SUCCESSIVE:
-            first.append(matches)
-        if not chosen:
-            continue
-        if known is None:
-            known = known_of(matches, rig, None, scanning, disparity_offset, models_asked(options.motion_model))
-        examined.append(examine(matches, rig, known, options.robust, options.seed))
-        used.append(matches)
-        advance(f"window {number}")
-        known = _narrowed(known, conclude(examined))
+        yield number, matches, doubt
     refusals.end(number + 1)
-    if known is None:
-        raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
-    capture = as_global(conclude(examined), used, rig, known)
-    shutter = shutter_found(capture, rig)
-    if len(first) + 1 >= _FEWEST_FRAMES and shakes(capture, first, rig, options.seed):
-        raise NoMotionError(SHAKEN)
-    if doubt is not None and shutter.rows_together:
-        raise doubt
-    return capture, shutter
 
 
 def _narrowed(known: Known, capture: Capture) -> Known:
@@ -130,7 +163,7 @@ def correct_sequence(
     rig: StereoRig,
     readout_ratio: float,
     options: CorrectionOptions,
-    disparity_offset: float = 0.0,
+    calibration: tuple[float, ...] = NO_ERRORS,
     scanning: Scanning | None = None,
 ) -> Iterator[CorrectedMoment]:
     """Every frame of a sequence corrected, in order; the last one with the motion from the one before.
@@ -139,7 +172,7 @@ def correct_sequence(
     back uncorrected. Both say why.
 
     Args:
-        disparity_offset: what a disparity is too large by, px.
+        calibration: what the calibration is wrong by, see ``calibration.TERMS``.
         scanning: how the cameras read their lines; None: rows from the top, both at once.
 
     Raises:
@@ -147,14 +180,14 @@ def correct_sequence(
         RsbenchError: frames that differ in size, or cannot be read; cameras that the options do not take.
     """
     scanning = scanning or Scanning()
-    check_cameras(rig, scanning, options, disparity_offset)
+    check_cameras(rig, scanning, options, calibration[OFFSET])
     shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
     last: Window | None = None
     number = -1
-    windows = _windows(left, right, rig, shutter, options, disparity_offset)
+    windows = _windows(left, right, rig, shutter, options, calibration)
     if _has_trajectory(left, shutter, options):
-        alone = _windows(left, right, rig, shutter, replace(options, motion_model=None), disparity_offset)
-        windows = on_one_trajectory(alone, rig, shutter, options, disparity_offset)
+        alone = _windows(left, right, rig, shutter, replace(options, motion_model=None), calibration)
+        windows = on_one_trajectory(alone, rig, shutter, options, calibration)
     for number, window in enumerate(windows):
         yield _moment(number, 0, [window] if last is None else [window, last], rig, shutter, options)
         last = window
@@ -198,9 +231,10 @@ def _windows(
     rig: StereoRig,
     shutter: RollingShutter,
     options: CorrectionOptions,
-    offset: float,
+    calibration: tuple[float, ...],
 ) -> Iterator[Window]:
     needs, refusals, second = options.corrector.component.spec.needs, _Refusals(left), None
+    offset = calibration[OFFSET]
     number = -1
     for number, images in enumerate(_window_images(left, right)):
         pairs = None
@@ -215,7 +249,7 @@ def _windows(
                 matches = match_frames(images, rig, options, scanning, judge_rig=judged)
                 if "motion" in needs:
                     ratio = shutter.readout_ratio
-                    found = solve_frames(matches, rig, ratio, options, offset, scanning, in_order=True).found
+                    found = solve_frames(matches, rig, ratio, options, calibration, scanning, in_order=True).found
             except NoMotionError as error:
                 reason = str(error)
             except RefusedFramesError as error:

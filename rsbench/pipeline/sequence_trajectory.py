@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.capture.rectification import without_offset
+from rsbench.capture.calibration import recalibrated
 from rsbench.capture.trajectory_stream import StreamedWindow, stream_trajectory
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
@@ -45,20 +45,24 @@ class Window:
 
 
 def on_one_trajectory(
-    windows: Iterable[Window], rig: StereoRig, shutter: RollingShutter, options: CorrectionOptions, offset: float
+    windows: Iterable[Window],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    options: CorrectionOptions,
+    calibration: tuple[float, ...],
 ) -> Iterator[Window]:
     """Windows with the motion of one trajectory in place of that of each; those without matches are bridged.
 
     Args:
         windows: in order; their own motions are where the search starts.
-        offset: px by which disparities are too large.
+        calibration: what the calibration is wrong by, see ``calibration.TERMS``.
     """
     waiting = deque[Window]()
 
     def matches() -> Iterator[Correspondences]:
         for window in windows:
             waiting.append(window)
-            yield without_offset(window.matches or Correspondences(), offset)
+            yield recalibrated(window.matches or Correspondences(), rig, calibration)
 
     def starts() -> Iterator[Motion | None]:
         while True:
@@ -67,12 +71,14 @@ def on_one_trajectory(
 
     for streamed in stream_trajectory(matches(), rig, shutter, starts()):
         window = waiting.popleft()
-        found = _found(window, streamed, options, offset)
+        found = _found(window, streamed, options, calibration)
         reason = "" if streamed.supported else window.reason or BRIDGED
         yield replace(window, found=found, reason=reason, pose=streamed.body_from_world)
 
 
-def _found(window: Window, streamed: StreamedWindow, options: CorrectionOptions, offset: float) -> FoundMotion:
+def _found(
+    window: Window, streamed: StreamedWindow, options: CorrectionOptions, calibration: tuple[float, ...]
+) -> FoundMotion:
     motion, right = streamed.motion, int(np.count_nonzero(streamed.inliers))
     estimate = MotionEstimate(
         w=motion.w,
@@ -91,5 +97,5 @@ def _found(window: Window, streamed: StreamedWindow, options: CorrectionOptions,
         threshold_px=0.0 if window.found is None else window.found.robust.threshold_px,
     )
     return FoundMotion(
-        motion=motion, robust=robust, solver=options.solver.name, reference_point="body", disparity_offset=offset
+        motion=motion, robust=robust, solver=options.solver.name, reference_point="body", calibration=calibration
     )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rsbench.capture.rectification import RefusedFramesError, judge_stereo, row_pattern, without_offset
+from rsbench.capture.calibration import of_offset, recalibrated
+from rsbench.capture.rectification import RefusedFramesError, judge_stereo, row_pattern
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
@@ -58,7 +59,7 @@ def test_good_pairs_pass_and_bad_ones_are_told_apart() -> None:
 def test_an_offset_is_taken_from_the_disparity_alone() -> None:
     stereo = _matches()
     c = Correspondences(left=stereo, right=stereo, tracks=np.concatenate([stereo, stereo], axis=1))
-    moved = without_offset(c, 0.6)
+    moved = recalibrated(c, RIG, of_offset(0.6))
     np.testing.assert_allclose(moved.tracks[:, 0] - moved.tracks[:, 2], stereo[:, 0] - stereo[:, 2] - 0.6)
     np.testing.assert_allclose(moved.tracks[:, 0] + moved.tracks[:, 2], stereo[:, 0] + stereo[:, 2])
     np.testing.assert_allclose(moved.tracks[:, 0], moved.left[:, 0])

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.capture.calibration import NO_ERRORS, OFFSET, of_offset, recalibrated
 from rsbench.capture.estimate import Capture, conclude, examine
 from rsbench.capture.fit import CaptureCost, Likelihood
 from rsbench.capture.hypotheses import MODELS, Hypothesis, Known
-from rsbench.capture.rectification import RefusedFramesError, without_offset
+from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.scans import GLOBAL, Scans, TimedMatches, scans_of
 from rsbench.capture.settle import (
     AUTO,
@@ -149,12 +150,13 @@ def test_frames_in_the_wrong_order_are_noticed() -> None:
 def test_a_disparity_offset_is_found_with_the_ratio() -> None:
     """Rows tilted by 0.5 px allow an offset; without it the ratio of a global shutter comes out wrong."""
     data, offset = simulated(9, 0.0, 1.0, 1500, noise=0.1), 0.7
-    c = without_offset(data.correspondences, -offset)
+    c = recalibrated(data.correspondences, RIG, of_offset(-offset))
     tracks = c.tracks.copy()
     tracks[:, [3, 7]] += 0.5 * (tracks[:, [2, 6]] / 450.0 - 1.0)
     c = Correspondences(left=c.left, right=c.right, tracks=tracks)
     known = known_of(c, RIG, None, TOP, None, ("linear",))
-    assert known.offset_sigma > 0.1 and known_of(c, RIG, None, TOP, 0.0).offset_sigma == 0.0
+    assert known.calibration_sigma[OFFSET] > 0.1
+    assert known_of(c, RIG, None, TOP, of_offset(0.0)).calibration_sigma == NO_ERRORS
     capture = conclude([examine(c, RIG, known)])
     assert abs(capture.offset - offset) < 4.0 * capture.offset_sigma < 0.6
 

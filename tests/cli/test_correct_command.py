@@ -16,6 +16,7 @@ import pytest
 from commands import assert_refused, run_here
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
+from rsbench.capture.calibration import of_offset
 from rsbench.capture.estimate import conclude, examine
 from rsbench.capture.hypotheses import Known
 from rsbench.capture.scans import Scans
@@ -256,7 +257,7 @@ def test_one_window_of_a_rig_that_is_off_says_how_far_it_errs() -> None:
     motion = LinearMotion(w=np.radians([1.2, -0.7, 1.5]), d=[0.1, -0.15, 0.1])
     matches = simulate(rig, shutter, motion, options, np.random.default_rng(0)).correspondences
     known = Known(scans=(Scans("top", "top"),), delay=0.0, models=("linear",))
-    window = examine(matches, rig, replace(known, offset_sigma=0.5))
+    window = examine(matches, rig, replace(known, calibration_sigma=of_offset(0.5)))
     assert "twice" in _readout(shutter, conclude([window]))
     assert "twice" not in _readout(shutter, conclude([window, window]))
     assert "twice" not in _readout(shutter, conclude([examine(matches, rig, known)]))

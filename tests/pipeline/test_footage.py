@@ -160,7 +160,7 @@ def test_the_readout_of_a_sequence_is_that_of_its_windows(folders: Folders, cast
     except NoMotionError as refusal:
         assert "readout_ratio" in str(refusal)
     else:
-        assert capture.likeliest is not None
+        assert capture is not None and capture.likeliest is not None
         assert abs(shutter.readout_ratio - castle.shutter.readout_ratio) < 4 * capture.likeliest.sigma
 
 

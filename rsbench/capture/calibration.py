@@ -1,0 +1,100 @@
+"""What the calibration of a rig may be wrong by: smooth errors of its pixels, each known by one number.
+
+Real rectified pairs leave row differences of some tenths of a pixel that change slowly over the image, disparities
+that are too large or too small by a constant, and focal lengths and lenses that are not quite those of the card.
+Here each is a shift of the rays of both cameras, linear in its number, so that it can be found with the motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import Side, StereoRig
+from rsbench.core.so3 import FloatArray
+
+TERMS = (
+    "offset",
+    "offset_x",
+    "offset_y",
+    "offset_xx",
+    "offset_xy",
+    "offset_yy",
+    "row",
+    "row_x",
+    "row_y",
+    "row_xy",
+    "focal",
+    "radial",
+    "tangential_x",
+    "tangential_y",
+)
+"""Disparity offset, px; row differences, px, as a function 1, x, y, xy of the ray (to first order errors of the
+relative rotation and of the focal lengths); relative error of the focal length; radial distortion k1."""
+OFFSET, FOCAL = 0, 10
+LENS = slice(11, 14)
+BENDS = slice(1, 6)
+ROWS = slice(6, 10)
+NO_ERRORS = (0.0,) * len(TERMS)
+_HALF: dict[Side, float] = {"left": 0.5, "right": -0.5}
+
+
+def ray_shifts(rays: FloatArray, side: Side, focal: float) -> FloatArray:
+    """(..., 7, 2) by which measured rays x, y (..., 2) of one camera are too large for 1 of each of ``TERMS``.
+
+    Half of an offset and of a row difference is the left camera's, half the right one's.
+    """
+    x, y, out = rays[..., 0], rays[..., 1], np.zeros((*rays.shape[:-1], len(TERMS), 2))
+    half = _HALF[side] / focal
+    out[..., OFFSET, 0] = half
+    out[..., BENDS, 0] = half * np.stack([x, y, x * x, x * y, y * y], axis=-1)
+    out[..., ROWS, 1] = half * row_terms(x, y)
+    out[..., FOCAL, :] = rays
+    out[..., LENS, :] = lens_terms(x, y)
+    return out
+
+
+def lens_terms(x: FloatArray, y: FloatArray) -> FloatArray:
+    """(..., 3, 2) of ``LENS`` at rays x, y (...): OpenCV's k1, p2 and p1."""
+    square = x**2 + y**2
+    radial = np.stack([square * x, square * y], axis=-1)
+    across = np.stack([square + 2.0 * x * x, 2.0 * x * y], axis=-1)
+    along = np.stack([2.0 * x * y, square + 2.0 * y * y], axis=-1)
+    return np.stack([radial, across, along], axis=-2)
+
+
+def row_terms(x: FloatArray, y: FloatArray) -> FloatArray:
+    """(..., 4) of ``ROWS`` at rays x, y (...)."""
+    return np.stack([np.ones_like(x), x, y, x * y], axis=-1)
+
+
+def of_offset(offset: float) -> tuple[float, ...]:
+    """The errors of a calibration whose disparities alone are wrong, too large by ``offset`` px."""
+    return (offset, *NO_ERRORS[1:])
+
+
+def recalibrated(matches: Correspondences, rig: StereoRig, errors: Sequence[float]) -> Correspondences:
+    """The matches, px, with the errors (7,) of their calibration taken from them; of cameras without a lens."""
+    if not np.any(errors):
+        return matches
+    camera = rig.camera
+    centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
+
+    def taken(ends: FloatArray, sides: tuple[Side, ...]) -> FloatArray:
+        points = ends.reshape(-1, len(sides), 2)
+        rays = (points - centre) / focal
+        shifts = [ray_shifts(rays[:, k], side, camera.fx) for k, side in enumerate(sides)]
+        moved = np.stack([np.einsum("ncx,c->nx", each, errors) for each in shifts], axis=1) * focal
+        return np.asarray((points - moved).reshape(ends.shape))
+
+    return replace(
+        matches,
+        left=taken(matches.left, ("left", "left")),
+        right=taken(matches.right, ("right", "right")),
+        stereo_0=taken(matches.stereo_0, ("left", "right")),
+        stereo_1=taken(matches.stereo_1, ("left", "right")),
+        tracks=taken(matches.tracks, ("left", "right", "left", "right")),
+    )

@@ -1,0 +1,93 @@
+"""Errors of a calibration: what they do to pixels, and that they are found with motion and shutter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
+from rsbench.capture.calibration import FOCAL, LENS, NO_ERRORS, OFFSET, ROWS, TERMS, ray_shifts, recalibrated
+from rsbench.capture.estimate import conclude, examine
+from rsbench.capture.settle import known_of
+from rsbench.core import so3
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.lens import Lens
+from rsbench.core.motion import LinearMotion, TwistMotion
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.so3 import FloatArray
+
+RIG = StereoRig(camera=PinholeCamera.centred(1200, 400, 700.0), baseline=0.5)
+REAL = dict(
+    offset=-1.0, offset_xx=-2.4, offset_yy=4.5, row=-0.2, row_x=0.45, row_y=-0.5, row_xy=-7.2, radial=0.015
+)
+"""px and as TERMS have them: about what two excerpts of KITTI odometry show."""
+
+
+def rays(n: int = 40) -> FloatArray:
+    return np.random.default_rng(0).uniform((-0.85, -0.28), (0.85, 0.28), (n, 2))
+
+
+def test_row_terms_are_what_a_turned_right_camera_leaves() -> None:
+    """To first order: pitch gives 1 + y^2, roll x, yaw xy."""
+    v, turn = rays(), np.array([2e-6, 3e-6, -4e-6])
+    turned = np.column_stack([v, np.ones(len(v))]) @ so3.exp(turn).T
+    left_minus_right = v[:, 1] - turned[:, 1] / turned[:, 2]
+    errors = np.zeros(len(TERMS))
+    errors[ROWS] = turn[0], -turn[2], 0.0, -turn[1]
+    shifts = [np.einsum("ncx,c->nx", ray_shifts(v, side, 1.0), errors)[:, 1] for side in ("left", "right")]
+    extra = turn[0] * v[:, 1] ** 2  # of a pitch, which is no term: below a twelfth of it here
+    np.testing.assert_allclose(shifts[0] - shifts[1] + extra, left_minus_right, atol=5e-11)
+
+
+def test_focal_and_lens_terms_are_those_of_cameras() -> None:
+    """A camera whose focal length and lens are not the card's, against OpenCV's model of the lens."""
+    v, small = rays(), 1e-5
+    pixels = PinholeCamera.centred(1200, 400, 700.0 * (1.0 + small)).project(np.column_stack([v, np.ones(40)]))
+    seen = RIG.camera.unproject(pixels)[:, :2]
+    np.testing.assert_allclose(seen - v, small * ray_shifts(v, "left", 700.0)[:, FOCAL], atol=1e-9)
+    k1, p2, p1 = 1e-5, 2e-5, -1e-5
+    lens = Lens(model="brown-conrady", k1=k1, p1=p1, p2=p2)
+    camera = PinholeCamera(width=1200, height=400, fx=700.0, fy=700.0, cx=599.5, cy=199.5, lens=lens)
+    seen = RIG.camera.unproject(camera.project(np.column_stack([v, np.ones(40)])))[:, :2]
+    expected = np.einsum("ncx,c->nx", ray_shifts(v, "right", 700.0)[:, LENS], [k1, p2, p1])
+    np.testing.assert_allclose(seen - v, expected, atol=1e-9)
+
+
+def wrong(matches: Correspondences) -> tuple[Correspondences, tuple[float, ...]]:
+    """Matches of a rig whose calibration errs as real ones do: to first order the opposite of taking it back."""
+    errors = tuple(REAL.get(name, 0.0) for name in TERMS)
+    return recalibrated(matches, RIG, [-e for e in errors]), errors
+
+
+@pytest.mark.parametrize(("ratio", "seed"), [(0.0, 0), (0.7, 1)])
+def test_errors_as_large_as_real_ones_are_found_with_the_shutter(ratio: float, seed: int) -> None:
+    """Within four deviations; taken for none they are errors of 0.5 px and more in matches of 0.1 px."""
+    shutter = RollingShutter(height=400, readout_ratio=ratio)
+    motion = TwistMotion(w=np.radians([0.4, 1.8, 0.2]), d=[0.02, 0.03, 1.0])
+    if ratio == 0.0:
+        motion = LinearMotion(w=motion.w, d=motion.d)
+    options = SimulationOptions(tracks=400, noise_px=0.1)
+    exact = simulate(RIG, shutter, motion, options, np.random.default_rng(seed)).correspondences
+    matches, errors = wrong(exact)
+    known = known_of(matches, RIG, None, Scanning())
+    capture = conclude([examine(matches, RIG, known)])
+    best = capture.likeliest
+    assert best is not None and capture.noise_px < 0.15
+    assert best.scans.rolls == (ratio > 0.0) and abs(best.ratio - ratio) <= 4.0 * best.sigma
+    off = np.abs(np.array(best.calibration) - errors)
+    for k in (OFFSET, *range(ROWS.start, ROWS.stop)):
+        assert off[k] < 4.0 * best.calibration_sigma[k] + 0.02, TERMS[k]  # 0.02 px: the second order
+    blind = conclude([examine(matches, RIG, known_of(matches, RIG, None, Scanning(), NO_ERRORS))])
+    assert blind.noise_px > 0.2
+
+
+def test_a_good_calibration_is_left_alone() -> None:
+    shutter, motion = (
+        RollingShutter(height=400, readout_ratio=0.7),
+        LinearMotion(w=[0.0, 0.02, 0.0], d=[0.0, 0.0, 1.0]),
+    )
+    options = SimulationOptions(tracks=400, noise_px=0.1)
+    matches = simulate(RIG, shutter, motion, options, np.random.default_rng(2)).correspondences
+    assert known_of(matches, RIG, None, Scanning()).calibration_sigma == NO_ERRORS
