@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.capture.calibration_errors import NO_ERRORS
 from rsbench.capture.estimate import Capture, conclude, examine
 from rsbench.capture.fit import CaptureCost, Likelihood
-from rsbench.capture.hypotheses import MODELS, RATIO, Hypothesis
+from rsbench.capture.hypotheses import MODELS, RATIO, UNKNOWNS, Hypothesis
 from rsbench.capture.scans import Scans, TimedMatches
 from rsbench.capture.settle import known_of
 from rsbench.components.motion_models import make_motion
@@ -36,7 +37,7 @@ NOISE_PX, NORMAL = 0.3, 1e6
 
 def found_in(matches: Correspondences, rig: StereoRig, seed: int = 0) -> Capture:
     """With the scan known."""
-    return conclude([examine(matches, rig, known_of(matches, rig, None, Scanning(), 0.0), seed=seed)])
+    return conclude([examine(matches, rig, known_of(matches, rig, None, Scanning(), NO_ERRORS), seed=seed)])
 
 
 def bound(data: Simulation, model: str, ratio: float) -> float:
@@ -51,8 +52,9 @@ def bound(data: Simulation, model: str, ratio: float) -> float:
         Hypothesis(scans=Scans("top", "top"), motion_model=model),
     )
     likelihood = Likelihood(nu=NORMAL, scale=NOISE_PX, chosen=np.ones(timed.count, dtype=np.bool_))
-    cost = CaptureCost(timed, hypothesis, likelihood, np.array([np.inf, 0.0, 0.0, 0.0]))
-    unknowns = np.array([ratio, 0.0, 0.0, 0.0])
+    unknowns, prior = np.zeros(UNKNOWNS), np.zeros(UNKNOWNS)
+    unknowns[RATIO], prior[RATIO] = ratio, np.inf
+    cost = CaptureCost(timed, hypothesis, likelihood, prior)
     theta = timed.packed(hypothesis.scans, unknowns).theta(data.motion.w, data.motion.d)
     _, _, H = cost.local(theta, unknowns, [RATIO])
     return NOISE_PX * float(np.sqrt(np.linalg.inv(H)[6, 6]))

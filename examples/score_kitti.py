@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rsbench.capture.calibration import NO_ERRORS
+from rsbench.capture.calibration_errors import NO_ERRORS
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError

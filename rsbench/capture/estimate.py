@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from rsbench.capture.calibration import NO_ERRORS, OFFSET
+from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET
 from rsbench.capture.evidence import Peak, WindowEvidence, window_evidence
 from rsbench.capture.hypotheses import CALIBRATION, DELAY, Hypothesis, Known
 from rsbench.capture.scans import Scans
@@ -57,7 +57,7 @@ class Candidate:
     delay: float
     delay_sigma: float
     calibration: tuple[float, ...] = NO_ERRORS
-    """What the calibration is wrong by, see ``calibration.TERMS``."""
+    """What the calibration is wrong by, see ``calibration_errors.TERMS``."""
     calibration_sigma: tuple[float, ...] = NO_ERRORS
 
 
@@ -217,7 +217,7 @@ class _Sum:
     at: float
     sigma: float
     mean: FloatArray
-    """(10,) of the unknowns; of delay and calibration, which the windows share."""
+    """(16,) of the unknowns; of delay and calibration, which the windows share."""
     sigmas: FloatArray
     last: Peak
 

@@ -11,16 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from rsbench.capture.fit import BEYOND_RATIO, LEAST_SCALE_PX, CaptureCost, CaptureFit, Likelihood, fit_capture
-from rsbench.capture.hypotheses import (
-    ACCELERATION,
-    CALIBRATION,
-    DELAY,
-    LEAST_RATIO,
-    RATIO,
-    UNKNOWNS,
-    Hypothesis,
-    Known,
-)
+from rsbench.capture.hypotheses import ACCELERATION, CALIBRATION, DELAY, LEAST_RATIO, RATIO, Hypothesis, Known
 from rsbench.capture.scans import GLOBAL, Scans, TimedMatches
 from rsbench.capture.start import Lag, first_shutter, largest_ratio
 from rsbench.core.correspondences import BoolArray, Correspondences
@@ -67,7 +58,7 @@ class Peak:
     fit: CaptureFit
     """At the best ratio; its deviations are those at that ratio."""
     trade: FloatArray
-    """(16,) derivative of motion and unknowns by the ratio, all else fitted; zeros where the ratio is known."""
+    """(22,) derivative of motion and unknowns by the ratio, all else fitted; zeros where the ratio is known."""
 
     @property
     def sigma(self) -> float:
@@ -147,7 +138,7 @@ def _screened(
     """What some of the matches allow, and the distribution of their errors: first scans, then motion models."""
     first = timed[known.models[0]]
     some = _some(first.count, _SCREENED)
-    theta = first.packed(GLOBAL, np.zeros(UNKNOWNS)).theta(*motion)
+    theta = first.packed(GLOBAL, known.start(Hypothesis(scans=GLOBAL, motion_model=""), 0.0, 0.0)).theta(*motion)
     found = dict[Scans, tuple[CaptureFit, float]]()
     for scans in sorted(known.scans, key=lambda each: (each != GLOBAL, not each.together)):
         if _is_excluded(scans, lag, found):
@@ -376,7 +367,7 @@ class _Slope:
             at=self.at,
             information=self.curvature / unit + 1.0 / _WIDE**2 if self.varies else 0.0,
             fit=replace(self.best, sigma=self.best.sigma * spread, spread=self.best.spread * spread**2),
-            trade=(high - low) / apart if apart > 0.0 else np.zeros(6 + UNKNOWNS),
+            trade=(high - low) / apart if apart > 0.0 else np.zeros_like(high),
         )
 
     def scores(self) -> FloatArray:

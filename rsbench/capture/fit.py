@@ -20,9 +20,9 @@ from rsbench.solvers.engine.heavy_tails import HeavyTailed
 BEYOND_RATIO = 1.2
 """No ratio is beyond 1, but the top of what noise makes of one near 1 may be."""
 _MAX_TRANSLATION_M = 50.0
-_LEAST = np.array([LEAST_RATIO, -1.0, -0.45, *10 * [-50.0], -0.5, *3 * [-2.0]])
-_MOST = np.array([BEYOND_RATIO, 1.0, 3.0, *10 * [50.0], 0.5, *3 * [2.0]])
-_LONGEST_STEP = np.array([0.4, 0.4, 0.3, 2.0, *9 * [20.0], 0.1, *3 * [0.2]])
+_LEAST = np.array([LEAST_RATIO, -1.0, -0.45, *10 * [-50.0], *3 * [-2.0]])
+_MOST = np.array([BEYOND_RATIO, 1.0, 3.0, *10 * [50.0], *3 * [2.0]])
+_LONGEST_STEP = np.array([0.4, 0.4, 0.3, 2.0, *9 * [20.0], *3 * [0.2]])
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-8, 1e6
 """A motion makes up for most of a wrong ratio: more damping than this would hold the ratio where it is."""
 _MOTION = 6
@@ -51,11 +51,11 @@ class CaptureFit:
     theta: FloatArray
     """(6,) of the motion."""
     unknowns: FloatArray
-    """(10,)."""
+    """(16,)."""
     cost: float
     """Negative logarithm of likelihood and prior, times the squared scale, px^2."""
     sigma: FloatArray
-    """(10,) standard deviations of the unknowns; the ratio's is 0 where it was held."""
+    """(16,) standard deviations of the unknowns; the ratio's is 0 where it was held."""
     spread: FloatArray
     """(6, 6) what not knowing them, but for a ratio that was held, adds to the covariance of theta."""
     occam: float
@@ -66,7 +66,7 @@ class CaptureCost:
     """The cost of one hypothesis as a function of the motion and the unknowns.
 
     Args:
-        prior: (10,) standard deviations of the unknowns about 0; 0 holds an unknown where it starts, and infinity
+        prior: (16,) standard deviations of the unknowns about 0; 0 holds an unknown where it starts, and infinity
             says nothing of it.
     """
 
@@ -82,7 +82,7 @@ class CaptureCost:
         self._trust = np.ones(count) if likelihood.trust is None else likelihood.trust
 
     def tailed(self, unknowns: FloatArray) -> HeavyTailed:
-        """The measurements at some unknowns (10,)."""
+        """The measurements at some unknowns (16,)."""
         packed = self._matches.packed(self.hypothesis.scans, unknowns)
         return HeavyTailed(**vars(packed), nu=self.likelihood.nu, scale=self.likelihood.scale, trust=self._trust)
 
@@ -127,7 +127,7 @@ def fit_capture(
     still: float = 1e-4,
     hold_ratio: bool = False,
 ) -> CaptureFit:
-    """Newton's method, damped, from a start (6,), (10,).
+    """Newton's method, damped, from a start (6,), (16,).
 
     Args:
         still: decrease of the cost, in squared scales of the errors, at which to stop.

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsbench.capture.calibration import NO_ERRORS, TERMS
+from rsbench.capture.calibration_errors import NO_ERRORS, TERMS
 from rsbench.capture.scans import ALL_SCANS, Scans
 from rsbench.core.so3 import FloatArray
 
 RATIO, DELAY, ACCELERATION = range(3)
 """Places of the first unknowns: readout ratio, delay of the right camera (frame periods), k."""
 CALIBRATION = slice(3, 3 + len(TERMS))
-"""Places of what the calibration is wrong by, see ``calibration.TERMS``."""
+"""Places of what the calibration is wrong by, see ``calibration_errors.TERMS``."""
 UNKNOWNS = CALIBRATION.stop
 LEAST_RATIO = 0.05
 """Readout ratios below this are taken for a global shutter's."""
@@ -45,20 +45,20 @@ class Known:
     delay: float | None = None
     """Frame periods by which the right camera is late."""
     calibration: tuple[float, ...] = NO_ERRORS
-    """What the calibration is wrong by, see ``calibration.TERMS``."""
+    """What the calibration is wrong by, see ``calibration_errors.TERMS``."""
     calibration_sigma: tuple[float, ...] = NO_ERRORS
     """Standard deviation of each of them, about 0; 0: it is known."""
     models: tuple[str, ...] = MODELS
 
     def prior(self, hypothesis: Hypothesis) -> FloatArray:
-        """(10,) standard deviations of the unknowns, as ``CaptureCost`` takes them."""
+        """(16,) standard deviations of the unknowns, as ``CaptureCost`` takes them."""
         ratio = np.inf if self.ratio is None and hypothesis.scans.rolls else 0.0
         delay = DELAY_SIGMA if hypothesis.delayed else 0.0
         acceleration = ACCELERATION_SIGMA if hypothesis.motion_model == "accelerated" else 0.0
         return np.array([ratio, delay, acceleration, *self.calibration_sigma])
 
     def start(self, hypothesis: Hypothesis, ratio: float, delay: float) -> FloatArray:
-        """(10,) unknowns of a hypothesis, of which these are guesses."""
+        """(16,) unknowns of a hypothesis, of which these are guesses."""
         out = np.zeros(UNKNOWNS)
         out[RATIO], out[DELAY] = ratio, delay if hypothesis.delayed else self.delay or 0.0
         out[CALIBRATION] = self.calibration

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration import lens_terms, row_terms
+from rsbench.capture.calibration_errors import row_terms
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
@@ -48,10 +48,6 @@ class RowPattern:
 
     systematic_px: float
     """Root mean square of its part without distortion, less what noise would give."""
-    term_sizes: FloatArray
-    """(4,) root mean square of each of its terms for 1 px, see ``calibration.row_terms``."""
-    bend_sizes: FloatArray
-    lens_sizes: FloatArray
     distortion: float
     """Coefficient k of a lens that maps radius r to r (1 + k r^2), in focal lengths."""
     distortion_sigma: float
@@ -85,12 +81,8 @@ def row_pattern(stereo: FloatArray, rig: StereoRig) -> RowPattern | None:
     leverage = np.einsum("ij,ji->i", columns[keep], hat)
     left_out = hat[-1] * (difference - columns @ fit)[keep] / np.maximum(1.0 - leverage, 1e-6)
     excess = float(np.mean(smooth**2)) - 4.0 * noise**2 / len(smooth)
-    lens = camera.fx * np.sqrt(np.mean(np.sum(lens_terms(x[keep], y[keep]) ** 2, axis=-1), axis=0))
     return RowPattern(
-        lens_sizes=lens,
         systematic_px=float(np.sqrt(max(excess, 0.0))),
-        term_sizes=np.sqrt(np.mean(columns[keep, :4] ** 2, axis=0)),
-        bend_sizes=np.sqrt(np.mean(np.column_stack([x, y, x * x, x * y, y * y])[keep] ** 2, axis=0)),
         distortion=float(fit[-1]),
         distortion_sigma=max(float(np.linalg.norm(left_out)), noise * float(np.linalg.norm(hat[-1]))),
         noise_px=noise,

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from rsbench.capture.calibration import ray_shifts
+from rsbench.capture.calibration_errors import ray_shifts
 from rsbench.core.correspondences import BoolArray, Correspondences, unlinked_pairs
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
@@ -134,7 +134,7 @@ class TimedMatches:
         )
 
     def _ray_shifts(self) -> tuple[FloatArray, FloatArray]:
-        """(n, 2, 7, 2) of the pairs' ends and (m, 4, 7, 2) of the tracks', see ``ray_shifts``."""
+        """(n, 2, 13, 2) of the pairs' ends and (m, 4, 13, 2) of the tracks', see ``ray_shifts``."""
         base, focal = self._base, float(self._base.focal[0])
         pairs = base.pairs[:, :4].reshape(-1, 2, 2)
         either = [ray_shifts(pairs, side, focal) for side in SIDES]
@@ -174,7 +174,7 @@ class TimedMatches:
 
         Args:
             scans: where each camera begins to read.
-            unknowns: (10,) readout ratio; frame periods by which the right camera is late; the motion's
+            unknowns: (16,) readout ratio; frame periods by which the right camera is late; the motion's
                 acceleration, 0 of a model without one; what the calibration is wrong by.
         """
         ratio, delay, acceleration, *errors = map(float, unknowns)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.capture.calibration import BENDS, LENS, NO_ERRORS, OFFSET, ROWS, TERMS
+from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET, term_sizes
 from rsbench.capture.estimate import CERTAIN, Candidate, Capture, conclude, examine
 from rsbench.capture.evidence import Peak
 from rsbench.capture.hypotheses import ACCELERATION, CALIBRATION, MODELS, Known
@@ -30,9 +30,12 @@ from rsbench.solvers.engine.kernel_type import load_kernel
 AUTO = "auto"
 _MAX_SIGMA, _HARMLESS_PX = 0.1, 1.0
 """Standard deviation of a ratio that frames are corrected with, at most; more where it moves no pixel by this."""
-_PRIOR_FACTOR, _LEAST_PRIOR_PX, _MOST_PRIOR_PX = 2.0, 0.1, 2.0
-"""Standard deviation of the disparity offset over the size of the row differences: rows show errors of roll and
-pitch, and the error of yaw, which shifts disparities, is of their kind. Below the second there is none to fit."""
+_PRIOR_FACTOR, _LEAST_PRIOR_PX, _MOST_PRIOR_PX, _FEWEST = 2.0, 0.1, 2.0, 200
+"""Standard deviation of each error of a calibration over the size of the row differences, px: rows show some,
+and the others come from the same calibration. From 0.1 px on there are any to find, of as many left-right matches:
+rendered pairs show 0.02 px at most, two excerpts of KITTI odometry 1.1 px."""
+_LEAST_SIZE = 1e-3
+"""px that 1 of a term moves a pixel by, at least: of an image of a narrow field there is little of the others."""
 _NEARLY, _SMALL = 0.06, 0.15
 """Readout ratio of nearly a global shutter, within two deviations; and the root mean square, at most, of
 the ratios that the matches then allow."""
@@ -58,15 +61,6 @@ def known_of(
     Errors of the calibration are looked for where the row differences of the left-right matches show some, and are
     expected to be as large as these: they come from the same calibration.
     """
-    sigmas = np.zeros(len(TERMS))
-    if calibration is None and rig.camera.lens is None:
-        pattern = row_pattern(_stereo(matches), rig)
-        sigma = 0.0 if pattern is None else min(_PRIOR_FACTOR * pattern.systematic_px, _MOST_PRIOR_PX)
-        if pattern is not None and sigma > _LEAST_PRIOR_PX:
-            sigmas[ROWS] = sigma / np.maximum(pattern.term_sizes, 1e-3)
-            sigmas[BENDS] = sigma / np.maximum(pattern.bend_sizes, 1e-3)
-            sigmas[LENS] = sigma / np.maximum(pattern.lens_sizes, 1.0)
-            sigmas[OFFSET] = sigma
     scans = ALL_SCANS
     if scanning is not None:
         width, height = rig.camera.width, rig.camera.height
@@ -81,9 +75,21 @@ def known_of(
         scans=scans,
         delay=None if scanning is None else scanning.right_delay,
         calibration=calibration or NO_ERRORS,
-        calibration_sigma=tuple(sigmas.tolist()),
+        calibration_sigma=_errors_expected(matches, rig) if calibration is None else NO_ERRORS,
         models=models,
     )
+
+
+def _errors_expected(matches: Correspondences, rig: StereoRig) -> tuple[float, ...]:
+    """Standard deviation of each error of a calibration: the row differences show how large they are."""
+    stereo = _stereo(matches)
+    pattern = row_pattern(stereo, rig) if rig.camera.lens is None and len(stereo) >= _FEWEST else None
+    sigma = 0.0 if pattern is None else min(_PRIOR_FACTOR * pattern.systematic_px, _MOST_PRIOR_PX)
+    if pattern is None or sigma <= _LEAST_PRIOR_PX:
+        return NO_ERRORS
+    camera = rig.camera
+    rays = (0.5 * (stereo[:, :2] + stereo[:, 2:]) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    return tuple((sigma / np.maximum(term_sizes(rays, camera.fx), _LEAST_SIZE)).tolist())
 
 
 def _stereo(matches: Correspondences) -> FloatArray:

@@ -264,7 +264,7 @@ def _correct_sequence(
 ) -> None:
     from dataclasses import replace
 
-    from rsbench.capture.calibration import NO_ERRORS, OFFSET
+    from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET
     from rsbench.cli.console import progress_bar
     from rsbench.core.shutter import Scanning
     from rsbench.dataset.corrected_frames import fresh_folder, rig_record

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rsbench.capture.calibration import recalibrated
+from rsbench.capture.calibration_errors import recalibrated
 from rsbench.capture.estimate import Capture, conclude, examine
 from rsbench.capture.settle import (
     ModelChoice,
@@ -56,11 +56,7 @@ def solve_problem(
     """
     joined, spec, choice = join_stereo(problem.correspondences), entry.solver.spec, None
     shutter, capture, doubt = _shutter_of(problem, joined.correspondences, entry, options, seed)
-    matches = (
-        joined.correspondences
-        if capture is None
-        else _at_rest(joined.correspondences, problem.rig, shutter, capture)
-    )
+    matches = _at_rest(joined.correspondences, problem.rig, shutter, capture)
     given = (matches, problem.rig, shutter, options, np.random.default_rng(seed))
     result = _unsolved(doubt, options) if doubt else runner.robust(entry, *given)
     if motion_model is not None and takes_models(entry) and not doubt:
@@ -117,10 +113,12 @@ def _shutter_of(
 
 
 def _at_rest(
-    matches: Correspondences, rig: StereoRig, shutter: RollingShutter, capture: Capture
+    matches: Correspondences, rig: StereoRig, shutter: RollingShutter, capture: Capture | None
 ) -> Correspondences:
     """The matches without the errors of the calibration that were found with the shutter."""
-    return recalibrated(matches, rig, capture.calibration) if shutter.rows_together else matches
+    if capture is None or not shutter.rows_together:
+        return matches
+    return recalibrated(matches, rig, capture.calibration)
 
 
 def _says(problem: Problem, capture: Capture | None, doubt: str) -> bool:

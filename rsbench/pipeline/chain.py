@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.capture.calibration import of_offset
+from rsbench.capture.calibration_errors import of_offset
 from rsbench.capture.estimate import Capture
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration import of_offset
+from rsbench.capture.calibration_errors import of_offset
 from rsbench.components.cards import parse_card, read_toml
 from rsbench.components.shutters import SHUTTER_KEY, with_shutter
 from rsbench.core.camera import PinholeCamera

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.capture.calibration import NO_ERRORS, OFFSET, recalibrated
+from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET, recalibrated
 from rsbench.capture.estimate import Capture, conclude, examine
 from rsbench.capture.hypotheses import MODELS
 from rsbench.capture.rectification import RefusedFramesError
@@ -59,7 +59,7 @@ class FoundMotion:
     reference_point: str
     """The point whose translation ``robust.estimate.d`` is."""
     calibration: tuple[float, ...] = NO_ERRORS
-    """What was taken from the matches before, see ``calibration.TERMS``."""
+    """What was taken from the matches before, see ``calibration_errors.TERMS``."""
     choice: ModelChoice | None = None
     """How the motion model was chosen; None when it is the solver's."""
 
@@ -238,8 +238,8 @@ def solve_frames(
     """Motion and shutter from matches; what is None of the shutter is found with the motion.
 
     Args:
-        calibration: what the calibration is wrong by, see ``calibration.TERMS``; None has it found where the row
-            differences of the matches show that it is wrong.
+        calibration: what the calibration is wrong by (``calibration_errors.TERMS``); None has it found where the
+            row differences of the matches show that it is wrong.
         scanning: how the cameras read; None: found with the readout ratio; rows from the top where that is given.
         doubt: raised where the cameras read rows together, see ``match_unknown``.
         in_order: whether the frames are known to be in the order of time.

@@ -9,7 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration import NO_ERRORS, OFFSET
+from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET
 from rsbench.capture.estimate import CERTAIN, Capture, conclude, examine
 from rsbench.capture.estimate import Window as Examined
 from rsbench.capture.hypotheses import Known
@@ -172,7 +172,7 @@ def correct_sequence(
     back uncorrected. Both say why.
 
     Args:
-        calibration: what the calibration is wrong by, see ``calibration.TERMS``.
+        calibration: what the calibration is wrong by, see ``calibration_errors.TERMS``.
         scanning: how the cameras read their lines; None: rows from the top, both at once.
 
     Raises:

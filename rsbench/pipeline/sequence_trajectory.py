@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.capture.calibration import recalibrated
+from rsbench.capture.calibration_errors import recalibrated
 from rsbench.capture.trajectory_stream import StreamedWindow, stream_trajectory
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
@@ -55,7 +55,7 @@ def on_one_trajectory(
 
     Args:
         windows: in order; their own motions are where the search starts.
-        calibration: what the calibration is wrong by, see ``calibration.TERMS``.
+        calibration: what the calibration is wrong by, see ``calibration_errors.TERMS``.
     """
     waiting = deque[Window]()
 

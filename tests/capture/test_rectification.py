@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rsbench.capture.calibration import of_offset, recalibrated
+from rsbench.capture.calibration_errors import of_offset, recalibrated
 from rsbench.capture.rectification import RefusedFramesError, judge_stereo, row_pattern
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
-from rsbench.capture.calibration import NO_ERRORS, OFFSET, of_offset, recalibrated
+from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET, of_offset, recalibrated
 from rsbench.capture.estimate import Capture, conclude, examine
 from rsbench.capture.fit import CaptureCost, Likelihood
-from rsbench.capture.hypotheses import MODELS, Hypothesis, Known
+from rsbench.capture.hypotheses import ACCELERATION, MODELS, RATIO, UNKNOWNS, Hypothesis, Known
 from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.scans import GLOBAL, Scans, TimedMatches, scans_of
 from rsbench.capture.settle import (
@@ -78,16 +78,17 @@ def test_the_gradient_is_that_of_differences(model: str, scans: Scans) -> None:
     timed = TimedMatches(matches, rig, model)
     likelihood = Likelihood(nu=4.0, scale=0.05, chosen=np.ones(timed.count, dtype=np.bool_))
     hypothesis = Hypothesis(scans=scans, motion_model=model, delayed=True)
-    free = [0, 1, 2, 3] if model == "accelerated" else [0, 1, 2]
-    cost = CaptureCost(timed, hypothesis, likelihood, np.array([np.inf, 0.3, 1.0, 0.2]))
-    unknowns = np.array([0.7, 0.0, 0.0, 0.15 if model == "accelerated" else 0.0])
+    free = [k for k in range(UNKNOWNS) if k != ACCELERATION or model == "accelerated"]
+    cost = CaptureCost(timed, hypothesis, likelihood, np.where(np.arange(UNKNOWNS) == RATIO, np.inf, 1.0))
+    unknowns = np.zeros(UNKNOWNS)
+    unknowns[RATIO], unknowns[ACCELERATION] = 0.7, 0.15 if model == "accelerated" else 0.0
     theta = timed.packed(scans, unknowns).theta(truth.w, truth.d)
     at = np.concatenate([theta + 2e-5, unknowns + 1e-4])
     value, gradient, H = cost.local(at[:6], at[6:], free)
     assert value == pytest.approx(cost(at[:6], at[6:]), rel=1e-9)
-    steps = np.concatenate([np.full(6, 1e-6), np.full(4, 1e-5)])
+    steps = np.concatenate([np.full(6, 1e-6), np.full(UNKNOWNS, 1e-5)])
     for k, j in enumerate([*range(6), *(6 + each for each in free)]):
-        step = steps[j] * np.eye(10)[j]
+        step = steps[j] * np.eye(6 + UNKNOWNS)[j]
         above, below = (cost(*np.split(at + s * step, [6])) for s in (1.0, -1.0))
         slope = (above - below) / (2.0 * steps[j])
         assert gradient[k] == pytest.approx(slope, rel=0.03, abs=0.02 * np.sqrt(H[k, k]) * likelihood.scale)

@@ -16,7 +16,7 @@ import pytest
 from commands import assert_refused, run_here
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-from rsbench.capture.calibration import of_offset
+from rsbench.capture.calibration_errors import of_offset
 from rsbench.capture.estimate import conclude, examine
 from rsbench.capture.hypotheses import Known
 from rsbench.capture.scans import Scans

@@ -1,7 +1,7 @@
 """What the calibration of a rig may be wrong by: smooth errors of its pixels, each known by one number.
 
 Real rectified pairs leave row differences of some tenths of a pixel that change slowly over the image, disparities
-that are too large or too small by a constant, and focal lengths and lenses that are not quite those of the card.
+that are too large or too small in such a pattern too, and lenses that were not quite undistorted.
 Here each is a shift of the rays of both cameras, linear in its number, so that it can be found with the motion.
 """
 
@@ -27,23 +27,20 @@ TERMS = (
     "row_x",
     "row_y",
     "row_xy",
-    "focal",
     "radial",
     "tangential_x",
     "tangential_y",
 )
-"""Disparity offset, px; row differences, px, as a function 1, x, y, xy of the ray (to first order errors of the
-relative rotation and of the focal lengths); relative error of the focal length; radial distortion k1."""
-OFFSET, FOCAL = 0, 10
-LENS = slice(11, 14)
-BENDS = slice(1, 6)
-ROWS = slice(6, 10)
+"""px by which disparities are too large, as a function 1, x, y, xx, xy, yy of the ray; row differences, px, as one
+of 1, x, y, xy (to first order errors of the relative rotation and focal lengths); k1, p2, p1 of both lenses."""
+OFFSET = 0
+BENDS, ROWS, LENS = slice(1, 6), slice(6, 10), slice(10, 13)
 NO_ERRORS = (0.0,) * len(TERMS)
 _HALF: dict[Side, float] = {"left": 0.5, "right": -0.5}
 
 
 def ray_shifts(rays: FloatArray, side: Side, focal: float) -> FloatArray:
-    """(..., 7, 2) by which measured rays x, y (..., 2) of one camera are too large for 1 of each of ``TERMS``.
+    """(..., 13, 2) by which measured rays x, y (..., 2) of one camera are too large for 1 of each of ``TERMS``.
 
     Half of an offset and of a row difference is the left camera's, half the right one's.
     """
@@ -52,9 +49,15 @@ def ray_shifts(rays: FloatArray, side: Side, focal: float) -> FloatArray:
     out[..., OFFSET, 0] = half
     out[..., BENDS, 0] = half * np.stack([x, y, x * x, x * y, y * y], axis=-1)
     out[..., ROWS, 1] = half * row_terms(x, y)
-    out[..., FOCAL, :] = rays
     out[..., LENS, :] = lens_terms(x, y)
     return out
+
+
+def term_sizes(rays: FloatArray, focal: float) -> FloatArray:
+    """(13,) px, root mean square over rays (n, 2), that 1 of each of ``TERMS`` moves the ends of a match by."""
+    size = focal * np.sqrt(np.mean(np.sum(ray_shifts(rays, "left", focal) ** 2, axis=-1), axis=0))
+    size[: ROWS.stop] *= 2.0  # either end by half of it
+    return np.asarray(size)
 
 
 def lens_terms(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -77,7 +80,7 @@ def of_offset(offset: float) -> tuple[float, ...]:
 
 
 def recalibrated(matches: Correspondences, rig: StereoRig, errors: Sequence[float]) -> Correspondences:
-    """The matches, px, with the errors (7,) of their calibration taken from them; of cameras without a lens."""
+    """The matches, px, with the errors (13,) of their calibration taken from them; of cameras without a lens."""
     if not np.any(errors):
         return matches
     camera = rig.camera

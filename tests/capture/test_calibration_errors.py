@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-from rsbench.capture.calibration import FOCAL, LENS, NO_ERRORS, OFFSET, ROWS, TERMS, ray_shifts, recalibrated
+from rsbench.capture.calibration_errors import (
+    LENS,
+    NO_ERRORS,
+    OFFSET,
+    ROWS,
+    TERMS,
+    ray_shifts,
+    recalibrated,
+)
 from rsbench.capture.estimate import conclude, examine
 from rsbench.capture.settle import known_of
 from rsbench.core import so3
@@ -41,12 +49,9 @@ def test_row_terms_are_what_a_turned_right_camera_leaves() -> None:
     np.testing.assert_allclose(shifts[0] - shifts[1] + extra, left_minus_right, atol=5e-11)
 
 
-def test_focal_and_lens_terms_are_those_of_cameras() -> None:
-    """A camera whose focal length and lens are not the card's, against OpenCV's model of the lens."""
-    v, small = rays(), 1e-5
-    pixels = PinholeCamera.centred(1200, 400, 700.0 * (1.0 + small)).project(np.column_stack([v, np.ones(40)]))
-    seen = RIG.camera.unproject(pixels)[:, :2]
-    np.testing.assert_allclose(seen - v, small * ray_shifts(v, "left", 700.0)[:, FOCAL], atol=1e-9)
+def test_lens_terms_are_those_of_cameras() -> None:
+    """Against a camera with a small lens in OpenCV's model."""
+    v = rays()
     k1, p2, p1 = 1e-5, 2e-5, -1e-5
     lens = Lens(model="brown-conrady", k1=k1, p1=p1, p2=p2)
     camera = PinholeCamera(width=1200, height=400, fx=700.0, fy=700.0, cx=599.5, cy=199.5, lens=lens)
