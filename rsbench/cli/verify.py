@@ -84,9 +84,9 @@ def _verify_ours(
     import pandas as pd
 
     from rsbench.cli.console import print_table, progress_bar, say
+    from rsbench.dataset.manifest import DATASET
     from rsbench.storage.files import read_json
     from rsbench.verification import verification_steps, verify_dataset
-    from rsbench.verification.manifest_checks import DATASET
 
     with progress_bar("verifying", verification_steps(read_json(folder / "dataset.json"))) as advance:
         reports = verify_dataset(folder, stride, advance, rerender=rerender.value, scenes=scenes, workers=workers)
