@@ -344,6 +344,26 @@ def test_doctor_reports_and_outlives_everything_broken(monkeypatch: pytest.Monke
     assert any("everything is broken" in row.detail for row in broken_rows)
 
 
+def row(component: str, status: Any = "ok", detail: str = "") -> diagnosis.DoctorRow:
+    return diagnosis.DoctorRow(component, status, detail)
+
+
+def test_the_doctor_says_what_to_do_on_each_kind_of_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    good = [row("llvm_ad_rgb"), row("cuda_ad_rgb", "warn"), row("scalar_rgb")]
+    monkeypatch.setattr(diagnosis.sys, "platform", "linux")
+    monkeypatch.setattr(diagnosis.platform, "machine", lambda: "x86_64")
+    assert diagnosis.advice(good) == ["renders with llvm_ad_rgb; next: rsbench demo"]
+    faster, last = diagnosis.advice([row("llvm_ad_rgb", "warn"), *good[1:]])
+    assert "faster than scalar_rgb: install LLVM 17" in faster and last.startswith("renders with scalar_rgb")
+    lines = diagnosis.advice(
+        [row("scipy", "fail", "not installed"), row("OpenEXR works", "fail", "no file"), *good]
+    )
+    assert lines[0].startswith("install scipy: pip install") and lines[1] == "mend OpenEXR works: no file"
+    monkeypatch.setattr(diagnosis.platform, "machine", lambda: "arm64")
+    assert "tested on Linux x86-64 alone" in diagnosis.advice(good)[0]
+    assert diagnosis.advice([row(each.component, "fail", "x") for each in good])[-1].startswith("nothing renders")
+
+
 def test_importing_options_and_render_is_cheap() -> None:
     code = (
         "import sys, rsbench.renderers.options, rsbench.renderers.render\n"
