@@ -238,7 +238,7 @@ def render_camera(
     poses, twins = row_poses(rig, shutter, motion, side, frame), card.twins_of(sequence)
     write_poses(folder / "poses" / f"{side}_{frame}.csv", shutter.line_times(frame, side), poses)
     keep = _stack_writer(folder / "gs_stack" / f"{side}_{frame}", options) if options.full_frames else None
-    still = [] if rolling_alone else [0, *twins]
+    still: tuple[int, ...] = () if rolling_alone else (0, *twins)
     for view in (ImageView("rs", side, frame), *(ImageView("gs", side, frame, row) for row in still)):
         kind = view.shutter
         rendered = render_view(scene, geometry, view, poses, options, keep if kind == "rs" else None)
