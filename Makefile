@@ -1,7 +1,7 @@
 # make help       this list
 # make demo       render, solve, correct and score one sequence; ends with the path of its report
 # make test       format, lint, types, layers and every test
-# make test-extras  install rerun-sdk and torch (700 MB and more), and run the tests that need them
+# make test-extras  install rerun-sdk, torch and datasets (1 GB and more), and run the tests that need them
 # make attack     kills, failing files, mutated inputs, hostile surroundings, faults for verify: hours
 # make docs       the documentation site, in build/docs; warnings are errors
 # make reference  docs/reference/commands.md and cards.md from the code
@@ -40,7 +40,7 @@ test: $(STAMP)
 
 # Not locked: of these the newest that pyproject.toml allows.
 test-extras: $(STAMP)
-	@$(PIP) install --quiet -e '.[view,torch]' --no-build-isolation
+	@$(PIP) install --quiet -e '.[view,torch]' datasets --no-build-isolation
 	@NO_SKIPS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest tests/interop/test_view.py \
 	  tests/interop/test_export_training.py tests/interop/test_export_colmap.py tests/jobs/test_dask_jobs.py \
 	  tests/storage/test_s3.py

@@ -8,7 +8,6 @@ import itertools
 import re
 import subprocess
 import sys
-import zipfile
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
@@ -311,24 +310,6 @@ def test_the_documented_entry_point_is_found(documented_solver: Path) -> None:
 
 
 # Packaging
-
-
-def test_the_wheel_carries_cards_documents_and_type_marker(tmp_path: Path) -> None:
-    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
-    subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=60)
-    (wheel,) = tmp_path.glob("*.whl")
-    assert rsbench.__version__ in wheel.name
-    names = set(zipfile.ZipFile(wheel).namelist())
-    expected = {
-        f"rsbench/_cards/{kind}/{path.name}" for kind in get_args(CardKind) for path in list_cards(kind).values()
-    }
-    expected |= {str(path.relative_to(ROOT)) for path in SOURCES} | {"rsbench/py.typed"}
-    expected |= {str(path.relative_to(ROOT)) for path in (ROOT / "rsbench").rglob("*.j2")}
-    expected |= {f"rsbench/_docs/{path.relative_to(DOCS)}" for path in DOCS.rglob("*.md")}
-    expected |= {f"rsbench/_docs/examples/{path.name}" for path in (ROOT / "examples").iterdir() if path.is_file()}
-    assert expected <= names
-    assert any(name.endswith("licenses/LICENSE") for name in names)
-    assert not any("__pycache__" in name or name.startswith("tests/") for name in names)
 
 
 def test_no_two_modules_have_one_name() -> None:

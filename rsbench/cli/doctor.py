@@ -6,14 +6,19 @@ import typer
 
 
 def doctor() -> None:
-    """Try every rendering backend in a child process and list the versions that matter."""
+    """Try every rendering backend in a child process, list the versions that matter, and say what to do."""
     import pandas as pd
 
     from rsbench.cli.console import print_table
-    from rsbench.renderers.diagnosis import doctor_report
+    from rsbench.renderers.diagnosis import advice, doctor_report
 
-    rows = [{"component": row.component, "status": row.status, "detail": row.detail} for row in doctor_report()]
+    report = doctor_report()
+    rows = [{"component": row.component, "status": row.status, "detail": row.detail} for row in report]
     print_table("rsbench doctor", pd.DataFrame(rows))
+    for line in advice(report):
+        typer.echo(line)
+    if any(row.status == "fail" and row.component != "libLLVM" for row in report):  # without it, others render
+        raise typer.Exit(1)
 
 
 def register(app: typer.Typer) -> None:

@@ -33,6 +33,7 @@ class Target(StrEnum):
     CARLA_RS = "carla-rs"
     FASTEC_RS = "fastec-rs"
     WEBDATASET = "webdataset"
+    HUGGINGFACE = "huggingface"
 
 
 class Pictures(StrEnum):

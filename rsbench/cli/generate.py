@@ -77,6 +77,14 @@ _Seed = Annotated[
     list[int] | None,
     typer.Option(min=0, help="In place of the card's seeds: other motions and noise. Repeatable."),
 ]
+_Split = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="Another split of the card, such as train: each sequence with a scene, motion and noise of its own, "
+        "drawn from this name. Cards of its scenes go to DIR-scenes.",
+    ),
+]
 _Rehash = Annotated[
     bool, typer.Option("--rehash", help="Read all that is there again, not only what has another size or time.")
 ]
@@ -99,6 +107,7 @@ def generate(
     channels: _Channels = None,
     trajectory: _Trajectory = None,
     seed: _Seed = None,
+    split: _Split = None,
     rehash: _Rehash = False,
     estimate: _Estimate = False,
 ) -> None:
@@ -112,7 +121,9 @@ def generate(
     from rsbench.storage.object_store import path_or_url, shown
 
     processes, place = chosen_workers(workers, scheduler), shared_path(path_or_url(out), scheduler)
-    dataset = _chosen(load_dataset_card(card, trajectory, tuple(seed or ())), sequence, shard, channels)
+    own = load_dataset_card(card, trajectory, tuple(seed or ()))
+    whole = own if split is None else _split(card, split, place, bool(trajectory or seed))
+    dataset = _chosen(whole, sequence, shard, channels)
     if not estimate:
         _ = check_out(place) if isinstance(place, Path) else store_for(place, processes)
     backend = start_backend()
@@ -128,6 +139,24 @@ def generate(
         )
     words = f"{len(dataset.sequence)} sequences, {len(rendered)} rendered now"
     typer.echo(f"{shown(str(place))}: {words}")
+
+
+def _split(card: str, name: str, place: Path | str, changed: bool) -> DatasetCard:
+    """A split of a card, with the cards of its scenes beside the dataset."""
+    from rsbench.core.errors import RsbenchError
+    from rsbench.dataset.secret_split import open_split, secret_card, write_scenes
+    from rsbench.storage.untrusted_files import NAME
+
+    if not NAME.fullmatch(name) or name == "test":
+        raise RsbenchError(
+            f"--split {name}: must be a name, but not test, which rsbench leaderboard publish draws"
+        )
+    if changed or not isinstance(place, Path):
+        raise RsbenchError("--split: not with --seed, --trajectory or a URL: it draws both, and writes scenes")
+    drawn, scenes = open_split(card, name), place.absolute().with_name(f"{place.name}-scenes")
+    found = secret_card(card, drawn, scenes, split=name)
+    write_scenes(card, drawn, scenes)
+    return found
 
 
 def _chosen(

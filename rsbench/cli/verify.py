@@ -59,6 +59,13 @@ def verify(
         int | None,
         typer.Option(min=1, help="Processes that check a sequence each, with a scene each. Default: 1."),
     ] = None,
+    reference: Annotated[
+        bool,
+        typer.Option(
+            "--reference",
+            help="Compare with the reference copy too, which rsbench has of standard: the same bytes, or alike.",
+        ),
+    ] = False,
     layout: Annotated[
         str | None,
         typer.Option(
@@ -72,21 +79,40 @@ def verify(
     if layout is not None:
         _verify_others(folder, layout)
     else:
+        more = _reference_faults(folder) if reference else []
         stride, rerender = (max(stride, _FAST_STRIDE), Rerender.NO) if fast else (stride, rerender)
         left_out = _LEFT_OUT.format(stride=stride) if fast else ""
-        _verify_ours(folder, stride, rerender, [Path(each) for each in scene or []], workers or 1, left_out)
+        _verify_ours(folder, stride, rerender, [Path(each) for each in scene or []], workers or 1, left_out, more)
+
+
+def _reference_faults(folder: Path) -> list[str]:
+    """What differs from the reference copy, after telling what does not."""
+    from rsbench.verification.reference_copy import against_reference
+
+    found = list(against_reference(folder))
+    same = sum(each.same for each in found)
+    faults = [f"{each.name}: {each.fault}" for each in found if each.fault]
+    alike = len(found) - same - len(faults)
+    typer.echo(f"reference copy: {same} of {len(found)} sequences have its bytes, {alike} are alike")
+    return faults
 
 
 def _verify_ours(
-    folder: Path, stride: int, rerender: Rerender, scenes: Sequence[Path], workers: int, left_out: str
+    folder: Path,
+    stride: int,
+    rerender: Rerender,
+    scenes: Sequence[Path],
+    workers: int,
+    left_out: str,
+    more: list[str],
 ) -> None:
-    """Each channel against all others, and rows rendered again."""
+    """Each channel against all others, and rows rendered again; ``more``: faults that were found before."""
     import pandas as pd
 
     from rsbench.cli.console import print_table, progress_bar, say
+    from rsbench.dataset.manifest import DATASET
     from rsbench.storage.files import read_json
     from rsbench.verification import verification_steps, verify_dataset
-    from rsbench.verification.manifest_checks import DATASET
 
     with progress_bar("verifying", verification_steps(read_json(folder / "dataset.json"))) as advance:
         reports = verify_dataset(folder, stride, advance, rerender=rerender.value, scenes=scenes, workers=workers)
@@ -108,7 +134,7 @@ def _verify_ours(
         [left_out] if left_out else []
     ):
         say(note)
-    faults = [f"{report.name}: {fault}" for report in reports for fault in report.faults]
+    faults = more + [f"{report.name}: {fault}" for report in reports for fault in report.faults]
     for fault in faults:
         typer.echo(f"fault: {fault}", err=True)
     typer.echo(f"{folder}: {sum(report.name != DATASET for report in reports)} sequences, {len(faults)} faults")

@@ -43,7 +43,7 @@ CardKind = Literal[
 FORMER_NAMES: Mapping[str, Mapping[str, str]] = {"solvers": {"rs-stereo": "rs-stereo-refined"}}
 """By kind, names that commands and files may still give, and what each is called now; no list shows them."""
 
-FORMER_UNTIL = "release 0.2"
+FORMER_UNTIL = "release 1.1"
 """The first that does not read them: what is renamed warns for one release."""
 
 Extra = Literal["forbid", "ignore"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product
@@ -51,6 +52,8 @@ class DatasetCard(Scanning):
     """Name of the dataset."""
     description: str = ""
     """One line for ``rsbench list datasets``."""
+    license: str = "CC-BY-4.0"
+    """SPDX name of the licence of the data: another one where meshes or textures of yours ask for it."""
     camera: CameraCard
     """Image size, focal length and lens of both cameras."""
     baseline: float
@@ -90,6 +93,8 @@ class DatasetCard(Scanning):
     """The sequences, each a table ``[[sequence]]``; at least one."""
 
     def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9.+-]{0,63}", self.license):
+            raise ValueError(f"license = {self.license!r}: must be an SPDX name, such as CC-BY-4.0")
         check_size("camera", (self.camera.width, self.camera.height))
         if not len(FRAMES) <= self.frames <= MOST_FRAMES:
             raise ValueError(f"frames = {self.frames}: must lie in [{len(FRAMES)}, {MOST_FRAMES}]")

@@ -51,7 +51,7 @@ def estimate_dataset(card: DatasetCard, progress: Callable[[str], None]) -> Esti
         found.append(_of_scene(card, list(group), options, warm))
         progress(scene)
     total = _sum(found)
-    return replace(total, files=total.files + 1, bytes=total.bytes + _LISTED_BYTES * (total.files + 1))
+    return replace(total, files=total.files + 2, bytes=total.bytes + _LISTED_BYTES * (total.files + 2))
 
 
 def _sum(parts: list[Estimate]) -> Estimate:

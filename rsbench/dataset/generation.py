@@ -220,6 +220,8 @@ def render_camera(
     frame: int,
     folder: Path,
     later: Later,
+    *,
+    rolling_alone: bool = False,
 ) -> Iterator[None]:
     """One camera at one time: the rolling-shutter frame, then the global-shutter frames at poses of its rows.
 
@@ -236,7 +238,8 @@ def render_camera(
     poses, twins = row_poses(rig, shutter, motion, side, frame), card.twins_of(sequence)
     write_poses(folder / "poses" / f"{side}_{frame}.csv", shutter.line_times(frame, side), poses)
     keep = _stack_writer(folder / "gs_stack" / f"{side}_{frame}", options) if options.full_frames else None
-    for view in (ImageView("rs", side, frame), *(ImageView("gs", side, frame, row) for row in (0, *twins))):
+    still: tuple[int, ...] = () if rolling_alone else (0, *twins)
+    for view in (ImageView("rs", side, frame), *(ImageView("gs", side, frame, row) for row in still)):
         kind = view.shutter
         rendered = render_view(scene, geometry, view, poses, options, keep if kind == "rs" else None)
         if not np.any(rendered.depth):
@@ -253,8 +256,7 @@ def render_camera(
             write_mask(folder / view.gloss, rendered.gloss)
         if kind == "rs" and sensor:
             own, period = sensor.of(side, frame), card.period_of(sequence)
-            seen = sensed_rows(scene, geometry, (side, frame), own, period, options)
-            write_png(folder / view.image, seen)
+            write_png(folder / view.image, sensed_rows(scene, geometry, (side, frame), own, period, options))
         if kind == "rs":
             write_channels(folder, card.channels, geometry, view, rendered, SceneRays(scene, things), later, twins)
         if view.row == 0:

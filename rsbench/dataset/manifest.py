@@ -13,18 +13,25 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES
 from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard
+from rsbench.dataset.croissant import CROISSANT, croissant_of
 from rsbench.dataset.sequence import FORMAT, UNITS
 from rsbench.storage.file_hashes import HashedFile
-from rsbench.storage.files import write_json
+from rsbench.storage.files import sha256, write_json
 from rsbench.storage.untrusted_files import read_bytes
 
+DATASET = "dataset.json"
 Files = dict[str, HashedFile]
 """The files of a sequence by their paths below its folder, in the order of dataset.json."""
 
 
 def write_manifest(card: DatasetCard, out: Path, made: Mapping[str, Files]) -> None:
-    """Write dataset.json, unless it says this already; ``made``: the files of each sequence."""
-    content, path = manifest_of(card, made), out / "dataset.json"
+    """Write dataset.json and croissant.json where they do not say this already; ``made``: files of sequences."""
+    content = manifest_of(card, made)
+    _write(out / DATASET, content)
+    _write(out / CROISSANT, croissant_of(content, sha256(out / DATASET)))
+
+
+def _write(path: Path, content: dict[str, Any]) -> None:
     try:
         stands = says(read_bytes(path), content)
     except RsbenchError:
@@ -44,6 +51,7 @@ def manifest_of(card: DatasetCard, made: Mapping[str, Files]) -> dict[str, Any]:
         "format": FORMAT,
         "name": card.name,
         "description": card.description,
+        "license": card.license,
         "rsbench": __version__,
         "mitsuba": version("mitsuba"),
         "units": UNITS,

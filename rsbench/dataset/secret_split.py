@@ -68,7 +68,14 @@ def read_secret(path: Path) -> Secret:
     return Secret(text)
 
 
-def secret_card(name_or_path: str, secret: Secret, scenes: Path | None = None) -> DatasetCard:
+def open_split(name_or_path: str, word: str) -> Secret:
+    """What a split of a name that all know is drawn from: the same for whoever names the same card and split."""
+    return Secret(f"open split {word} of {card_path('datasets', name_or_path).stem}")
+
+
+def secret_card(
+    name_or_path: str, secret: Secret, scenes: Path | None = None, *, split: str = "test"
+) -> DatasetCard:
     """A card of which every sequence has a motion and noise of its own, and a name without meaning.
 
     Each combination of the card's sequences, grid and seeds is there, in a secret order. Sequences do not share a
@@ -79,6 +86,7 @@ def secret_card(name_or_path: str, secret: Secret, scenes: Path | None = None) -
         secret: from which all is drawn.
         scenes: folder of the scenes that ``write_scenes`` wrote; without it the card keeps the names of its own,
             and is good for its motions alone.
+        split: what stands behind the name of the card.
 
     Raises:
         RsbenchError: the card cannot be read, or something that a split must hide is fixed in it.
@@ -96,7 +104,7 @@ def secret_card(name_or_path: str, secret: Secret, scenes: Path | None = None) -
         made = [replace(each, scene=str(scenes / f"{_scene(each.scene).stem}.toml")) for each in made]
     digits = len(str(len(made) - 1))
     named = tuple(replace(each, name=f"s{number:0{digits}d}") for number, each in enumerate(made))
-    return replace(card, name=f"{card.name}-test", sequence=named, grid={}, seeds=())
+    return replace(card, name=f"{card.name}-{split}", sequence=named, grid={}, seeds=())
 
 
 def write_scenes(name_or_path: str, secret: Secret, folder: Path) -> list[Path]:

@@ -141,6 +141,8 @@ class DatasetManifest:
     files: dict[str, FileManifest]
     """By the path below the dataset's folder."""
     name: str = ""
+    license: str = "CC-BY-4.0"
+    """SPDX name; data of rsbench 0.1 do not say it, and are under this one."""
     card: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -20,19 +20,19 @@ from typing import NamedTuple
 
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import DatasetCard, SequenceCard
+from rsbench.dataset.croissant import CROISSANT, croissant_of
 from rsbench.dataset.layout import is_of_sequence
-from rsbench.dataset.manifest import Files, manifest_of, says
+from rsbench.dataset.manifest import DATASET, Files, manifest_of, says
 from rsbench.dataset.scene_hashes import SceneHashes
 from rsbench.dataset.sequence_identity import Plan, check_same, hashes_in, wanted_files
 from rsbench.jobs.workers import Cluster, Workers
 from rsbench.storage.caches import temporary
 from rsbench.storage.file_hashes import HashedFile
-from rsbench.storage.files import write_json
+from rsbench.storage.files import sha256, write_json
 from rsbench.storage.object_store import Listed, Store, cache_of, key_of, open_store
 from rsbench.storage.work_folder import WORK, files_below, named, remove, work_folder
 
 _OBJECTS = "objects.jsonl"
-_DATASET = "dataset.json"
 _MANIFEST = "sequence.json"
 _REHASHED = 8
 """Files in memory at once."""
@@ -112,11 +112,13 @@ class StoreDestination:
         return known.files
 
     def finish(self, card: DatasetCard, made: Mapping[str, Files]) -> None:
-        content = manifest_of(card, made)
-        there = self._store.read([_DATASET]) if self._has_dataset else ()
+        content, work = manifest_of(card, made), self.hidden / WORK
+        there = self._store.read([DATASET]) if self._has_dataset else ()
         if not any(says(data, content) for _, data in there):
-            write_json(self.hidden / WORK / _DATASET, content)
-            self._store.upload({_DATASET: self.hidden / WORK / _DATASET})
+            write_json(work / DATASET, content)
+            write_json(work / CROISSANT, croissant_of(content, sha256(work / DATASET)))
+            self._store.upload({CROISSANT: work / CROISSANT})
+            self._store.upload({DATASET: work / DATASET})
 
     def _list(self, folder: str, names: Iterable[str]) -> None:
         """See what the store has of these sequences; dataset.json is of the sequence without a name."""
@@ -125,7 +127,7 @@ class StoreDestination:
             name, _, file = path.partition("/")
             if name in found:
                 found[name][file] = listed
-            elif path == _DATASET:
+            elif path == DATASET:
                 found[""] = {path: listed}
         self._objects = found
 
@@ -158,7 +160,7 @@ class StoreDestination:
     def _sizes_of_dataset(self) -> dict[tuple[str, str], int]:
         """What dataset.json says of paths and hashes, as far as it can be read."""
         with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, RecursionError):
-            for _, data in self._store.read([_DATASET]):
+            for _, data in self._store.read([DATASET]):
                 files = json.loads(data)["files"].items()
                 return {(path, str(file["sha256"])): int(file["size"]) for path, file in files}
         return {}

@@ -6,7 +6,7 @@ import importlib.metadata
 import os
 import platform
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -87,6 +87,31 @@ def doctor_report() -> list[DoctorRow]:
         except Exception as error:  # a doctor must outlive whatever is ill
             rows.append(DoctorRow(name, "fail", f"check broke: {type(error).__name__}: {error}"))
     return rows
+
+
+def advice(rows: Sequence[DoctorRow]) -> list[str]:
+    """What to do on this machine, a line each; the last says with what it renders.
+
+    Args:
+        rows: of ``doctor_report``.
+    """
+    found = {row.component: row for row in rows}
+    lines = []
+    if missing := [row.component for row in rows if row.status == "fail" and row.detail == "not installed"]:
+        lines.append(f"install {', '.join(missing)}: pip install --force-reinstall rsbench brings what is missing")
+    broken = [row for row in rows if row.status == "fail" and row.component not in (*missing, "libLLVM")]
+    lines += [f"mend {row.component}: {row.detail}" for row in broken]
+    if sys.platform != "linux" or platform.machine() != "x86_64":
+        lines.append("rsbench is tested on Linux x86-64 alone: please tell us what pytest says on this machine")
+    works = [name for name in VARIANTS.values() if name in found and found[name].status == "ok"]
+    llvm_variant, scalar = VARIANTS["llvm"], VARIANTS["scalar"]
+    if llvm_variant not in works:
+        lines.append(f"to render tens of times faster than {scalar}: {llvm.REMEDY}")
+    if works:
+        lines.append(f"renders with {next(iter(works))}; next: rsbench demo")
+    else:
+        lines.append("nothing renders here; solve, simulate and leaderboard work all the same")
+    return lines
 
 
 def _python() -> Iterator[DoctorRow]:

@@ -14,16 +14,17 @@ from rsbench.components.cards import list_cards, load_card, parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard, SequenceCard
+from rsbench.dataset.croissant import CROISSANT, croissant_of
 from rsbench.dataset.layout import RELATIVE_FILES, files_of
+from rsbench.dataset.manifest import DATASET, says
 from rsbench.dataset.sequence import FORMAT, UNITS, Sequence, sequence_manifest
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import read_scene_card
 from rsbench.storage.files import read_json, sha256
-from rsbench.storage.untrusted_files import NAME, inside
+from rsbench.storage.untrusted_files import NAME, inside, read_bytes
 from rsbench.storage.work_folder import files_below
 from rsbench.verification.findings import MISSING, Finding
 
-DATASET = "dataset.json"
 _TEXTS = ("name", "description", "rsbench", "mitsuba")
 _MOST_NAMES = 5
 """Files that one finding names."""
@@ -77,11 +78,12 @@ def dataset_faults(listing: Listing) -> Iterator[Finding]:
         yield Finding(DATASET, f"units = {manifest.get('units')!r}: {UNITS} is needed")
     yield from _name_faults(manifest.get("sequences"))
     yield from _listing_faults(listing)
+    yield from _croissant_faults(listing)
     if isinstance(card, Finding):
         yield card
         return
-    for key, value in (("name", card.name), ("description", card.description)):
-        if manifest.get(key) != value:
+    for key, value in (("name", card.name), ("description", card.description), ("license", card.license)):
+        if manifest.get(key, card.license) != value:  # data of rsbench 0.1 do not name their licence
             yield Finding(DATASET, f"{key} = {manifest.get(key)!r}, its card says {value!r}")
     made = [sequence.name for sequence in card.sequence]
     if manifest.get("sequences") != made:
@@ -112,9 +114,22 @@ def _listing_faults(listing: Listing) -> Iterator[Finding]:
     if strange:
         yield Finding(DATASET, f"files lists what belongs to none of its sequences: {_some(strange)}")
     there = {path for path in files_below(folder) if not _hidden(Path(path))}
-    extra = sorted(there - {DATASET, *files})
+    extra = sorted(there - {DATASET, CROISSANT, *files})
     if extra:
         yield Finding(DATASET, f"lies there but is not listed in files: {_some(extra)}")
+
+
+def _croissant_faults(listing: Listing) -> Iterator[Finding]:
+    """croissant.json against dataset.json, where there is one that this version wrote."""
+    path = listing.folder / CROISSANT
+    if not path.is_file() or listing.manifest.get("rsbench") != __version__:
+        return
+    try:
+        wanted = croissant_of(listing.manifest, sha256(listing.folder / DATASET))
+        if not says(read_bytes(path), wanted):
+            yield Finding(CROISSANT, f"does not describe {DATASET}: run rsbench generate again, which writes it")
+    except (RsbenchError, KeyError, TypeError, ValueError):
+        yield Finding(CROISSANT, f"cannot be compared with {DATASET}, which lacks what it tells")
 
 
 def _stays_inside(path: str) -> bool:

@@ -312,6 +312,7 @@ def _dataset_faults() -> Iterator[Fault]:
     yield dataset("no name", drop("name"), "name = None")
     yield dataset("another description", put("description", "other"), "description")
     yield dataset("another format", put("format", 2), "format = 2")
+    yield dataset("another licence", put("license", "CC0-1.0"), "license = 'CC0-1.0'")
     yield dataset("other units", put("units", "length", "mm"), "units")
     yield dataset("no card", drop("card"), "card")
     for name, path, words in (
@@ -345,6 +346,8 @@ def _dataset_faults() -> Iterator[Fault]:
     yield dataset("a path outside", put("files", "../x.png", {"sha256": "", "size": 1}), "../x.png", fit=False)
     yield dataset("an entry without a size", drop("files", file, "size"), "size and sha256", fit=False)
     yield dataset("an entry of another type", put("files", file, 3), "size and sha256", fit=False)
+    licence = manifest_of("croissant.json", put("license", "of another"))
+    yield Fault("croissant.json of another licence", licence, ("does not describe dataset.json",), rehash=False)
     yield Fault(
         "another size",
         manifest_of("dataset.json", put("files", file, "size", 1)),

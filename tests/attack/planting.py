@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from attack.wet_castle import WET_CASTLE
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
+from rsbench.dataset.croissant import croissant_of
 from rsbench.dataset.sequence import Sequence, read_sequence, sequence_manifest
 from rsbench.dataset.timing import write_timing
 from rsbench.storage.files import (
@@ -68,6 +70,9 @@ def rehash(folder: Path) -> None:
             file = folder / name / path
             listed[f"{name}/{path}"] = {"sha256": sha256(file), "size": file.stat().st_size}
     write_json(folder / "dataset.json", manifest | {"files": listed})
+    with suppress(KeyError, TypeError, AttributeError):  # the fault is in what it tells
+        said = croissant_of(manifest | {"files": listed}, sha256(folder / "dataset.json"))
+        write_json(folder / "croissant.json", said)
 
 
 def planted(fault: Fault, sound: Path, out: Path) -> Path:

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run_here
 
 from rsbench.benchmark.leaderboard.splits import seed_of
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import DatasetCard, load_dataset_card
-from rsbench.dataset.secret_split import Secret, read_secret, secret_card, write_scenes
+from rsbench.dataset.secret_split import Secret, open_split, read_secret, secret_card, write_scenes
 from rsbench.scenes.load import load_scene, read_scene_card
 
 TEXT = "f3b1 a secret that nobody guesses"
@@ -97,14 +98,36 @@ def test_scenes_are_others_in_the_same_places(tmp_path: Path) -> None:
     assert {each.scene for each in card.sequence} == set(map(str, paths))
 
 
-def test_a_scene_of_a_secret_seed_can_be_built(tmp_path: Path) -> None:
-    """Its seed is within what builders, TOML and the cache of scenes take."""
-    path = next(each for each in write_scenes("standard", Secret(TEXT), tmp_path) if each.stem == "corridor")
-    own, open_one = load_scene(path), load_scene("corridor")
-    textures = [
-        [m.material.texture for m in each.meshes if m.material.texture is not None] for each in (own, open_one)
-    ]
-    assert len(textures[0]) and not all(map(np.array_equal, *textures))
+def test_train_and_dev_share_no_seed_motion_scene_or_texture(tmp_path: Path) -> None:
+    """Textures of two scenes, those that are built soonest; the seeds of scenes are read from all nine."""
+    train, dev = open_split("standard", "train"), load_dataset_card("standard")
+    paths = write_scenes("standard", train, tmp_path)
+    card = secret_card("standard", train, tmp_path, split="train")
+    assert card.name == "standard-train" and {each.scene for each in card.sequence} == set(map(str, paths))
+    assert not {each.seed for each in card.sequence} & {each.seed for each in dev.sequence}
+    assert not set(motions(card).ravel()) & set(motions(dev).ravel())
+    assert all(
+        read_scene_card(path)[0].seed != read_scene_card(Path("scenes", path.name))[0].seed for path in paths
+    )
+    assert open_split("standard", "other").number("sequence") != train.number("sequence")
+    for name in ("corridor", "street"):
+        path = next(each for each in paths if each.stem == name)
+        drawn, known = (
+            {m.material.texture.tobytes() for m in load_scene(each).meshes if m.material.texture is not None}
+            for each in (path, name)
+        )
+        assert len(drawn) == len(known) >= 10 and not drawn & known
+
+
+def test_splits_of_what_is_not_drawn_are_refused(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for words, said in (
+        (["standard", "--split", "test"], "--split test: must be a name"),
+        (["standard", "--split", "train", "--seed", "3"], "--split: not with --seed"),
+        (["smoke", "--split", "train"], "a secret split needs both axes"),
+    ):
+        ran = run_here("generate", *words, "--out", out)
+        assert ran.returncode == 2 and said in ran.stderr
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import hashlib
+import json
 import warnings
 from collections import Counter
 from pathlib import Path
@@ -19,6 +20,7 @@ from rsbench.core.rig import SIDES
 from rsbench.interop.writers import webdataset_shards
 from rsbench.interop.writers.frame_samples import FrameSamples
 from rsbench.storage import untrusted_files
+from rsbench.storage.files import read_depth, read_png
 
 
 @pytest.fixture(scope="module")
@@ -147,3 +149,33 @@ def test_tensors_are_what_the_files_hold(made: Path) -> None:
     np.testing.assert_array_equal(image, sequence.image("gs", "right", 3))
     np.testing.assert_array_equal(sample["left_rs_depth"][0].numpy(), sequence.depth("rs", "left", 2))
     assert sample["left_poses"].shape == (2, 49, 3, 4) and sample["left_poses"].dtype == torch.float64
+
+
+# Hugging Face
+
+
+def test_the_folder_of_hugging_face_names_every_file_and_its_truth(made: Path, tmp_path: Path) -> None:
+    out, note = exported(made, "huggingface", tmp_path / "out")
+    lines = [json.loads(line) for line in (out / "metadata.jsonl").read_text("utf-8").splitlines()]
+    assert note["lines"] == len(lines) == 10 and (out / "README.md").read_text("utf-8").startswith(
+        "---\nlicense: "
+    )
+    sequence = only(made)
+    for line in lines:
+        view = line["side"], line["frame"]
+        np.testing.assert_array_equal(read_png(out / line["gs_file_name"]), sequence.image("gs", *view))
+        np.testing.assert_array_equal(read_depth(out / line["depth"]), sequence.depth("rs", *view))
+        assert line["motion"]["model"] == "linear" and (out / line["poses"]).is_file()
+
+
+def test_hugging_face_loads_both_images_of_a_line(made: Path, tmp_path: Path) -> None:
+    datasets: Any = pytest.importorskip("datasets")
+    out, _ = exported(made, "huggingface", tmp_path / "out")
+    loaded = datasets.load_dataset(
+        "imagefolder", data_dir=str(out), split="train", cache_dir=str(tmp_path / "cache")
+    )
+    assert len(loaded) == 10
+    for line in loaded:
+        view = line["side"], line["frame"]
+        np.testing.assert_array_equal(np.asarray(line["image"]), only(made).image("rs", *view))
+        np.testing.assert_array_equal(np.asarray(line["gs"]), only(made).image("gs", *view))

@@ -101,7 +101,7 @@ def stored(memory: Any) -> dict[str, bytes]:
 
 def test_a_store_gets_the_bytes_of_a_folder(card: DatasetCard, dataset: dict[str, bytes], memory: Any) -> None:
     assert generate_dataset(card, URL) == ["a", "b"]
-    assert len(dataset) == 43 and stored(memory) == dataset
+    assert len(dataset) == 44 and stored(memory) == dataset
 
 
 @pytest.mark.usefixtures("quick")

@@ -37,6 +37,7 @@ FORMATS = {
     "carla-rs": Format("carla_folders", ()),
     "fastec-rs": Format("fastec_folders", ()),
     "webdataset": Format("webdataset_shards", ()),
+    "huggingface": Format("huggingface_folder", ()),
 }
 
 

@@ -1,0 +1,121 @@
+"""docs/report.md: every figure in it is read from the results; what is left holds no digit but of settings."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rsbench.benchmark.studies.claims import CLAIMS
+
+ROOT = Path(__file__).parents[1]
+REPORT = (ROOT / "docs" / "report.md").read_text("utf-8")
+TEXT = " ".join(REPORT.split())
+SETTINGS = (
+    *("release 1.0", "2020", "0.001 px", "0.81 px", "0.3 px, 100 matches", "rotation of 2 deg", "twist of 2 deg"),
+    *("up to 5 deg", "AUC@5", "Figure 3", "Figure 4", "x86-64"),
+)
+"""Sizes of experiments, names and years."""
+
+
+def table(name: str) -> list[dict[str, str]]:
+    return list(csv.DictReader((ROOT / "results" / name).read_text("utf-8").splitlines()))
+
+
+def claims() -> Iterator[str]:
+    """Verdicts (claim, matches, the literal and the best reading at both noises) as on the page of results, whose
+    rows test_house holds to results/."""
+    lines = (ROOT / "docs/results-paper.md").read_text("utf-8").splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    rows = [row for row in cells if row[0] in {claim.key for claim in CLAIMS} and len(row) == 6]
+    assert len(rows) == len(CLAIMS) == 13
+    literal, best, _, best_noisy = (sum(row[k] == "holds" for row in rows) for k in range(2, 6))
+    yield f"{literal} of 13 claims hold in the literal reading and {best} of 13 in the best one"
+    yield f"{best_noisy} of 13 hold in the best reading"
+    for row in rows:
+        assert row[4:] == ["fails", "fails"] or "better than" not in row[0]
+
+
+def medians() -> Iterator[str]:
+    pose = [row for row in table("images/scores/pose.csv") if row["sequence"] == "castle"]
+
+    def e_T(solver: str) -> float:
+        found = [float(row["e_T_deg"]) for row in pose if row["solver"] == solver]
+        assert len(found) == 20
+        return float(np.median(found))
+
+    linear, refined = e_T("rs-stereo-linear"), e_T("rs-stereo-refined")
+    yield f"over twenty runs is {linear:.3g} deg, that of `rs-stereo-refined` {refined:.2g} deg"
+    wrong = {
+        row["solver"]: float(row["e_T_median"])
+        for row in table("sweeps/wrong-motion.csv")
+        if (row["variant"], float(row["value"])) == ("twist", 2.0)
+    }
+    own, twist, ignoring = (
+        wrong[name] for name in ("rs-stereo-refined", "rs-stereo-refined-twist", "gs-stereo-tracks")
+    )
+    yield f"median e_T of {own:.2g} deg, worse than the {ignoring:.2g} deg"
+    yield f"assumes a twist has {twist:.2g} deg"
+    views = {
+        tuple(row[key] for key in ("stratum", "sequence", "side", "frame", "method")): float(row["psnr_covered"])
+        for row in table("correction/views.csv")
+    }
+    cost = max(value - views[(*key[:4], "ours")] for key, value in views.items() if key[4] == "true-motion")
+    yield f"at most {cost:.2f} dB in any view"
+
+
+def bounds() -> Iterator[str]:
+    """The solver's table: lines of the page of results, which test_house holds to results/."""
+    page = (ROOT / "docs/results-solvers.md").read_text("utf-8").splitlines()
+    found = [line for line in REPORT.splitlines() if re.match(r"\| [gr]s-", line)]
+    assert len(found) == 4 and set(found) <= set(page)
+    yield from found
+
+
+def cameras() -> Iterator[str]:
+    boards = [next((ROOT / "results/leaderboard/site").glob(f"{name}-1--*.csv")) for name in ("points", "pose")]
+    rows = [{row["method"]: row for row in table(f"leaderboard/site/{board.name}")} for board in boards]
+    shown = re.findall(r"^\| .*: `(.*?)` \| (.*) \| (.*) \|$", REPORT, re.MULTILINE)
+    assert len(shown) == 4
+    for method, *cells in shown:
+        for cell, board in zip(cells, rows, strict=True):
+            value, low, high = (float(board[method][f"auc_5{end}"]) for end in ("", "_low", "_high"))
+            digits = 3 if high - low < 0.06 else 2
+            assert cell == f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]", method
+            yield cell
+    pairs, mono = (rows[0][name] for name in ("rs-stereo-refined-pairs", "rs-mono-refined"))
+    assert float(pairs["auc_5_low"]) < float(mono["auc_5_high"]), "the intervals overlap"
+
+
+def corrections() -> Iterator[str]:
+    rows = {(row["stratum"], row["method"]): float(row["psnr_covered"]) for row in table("correction/summary.csv")}
+    methods = {
+        "frame as it is": "none",
+        "one camera, constant velocity": "mono",
+        "two cameras": "ours",
+        "true motion, true depth": "truth",
+    }
+    for title, key in methods.items():
+        values = " | ".join(f"{rows[stratum, key]:.1f}" for stratum in ("mild", "moderate", "aggressive"))
+        yield f"| {title} | {values} |"
+
+
+def test_every_figure_of_the_report_is_one_of_the_results() -> None:
+    left = TEXT
+    facts = [*claims(), *medians(), *bounds(), *cameras(), *corrections()]
+    for fact in facts:
+        assert fact in TEXT, fact
+        left = left.replace(fact, " ")
+    left = re.sub(r"\]\(.*?\)", "]", re.sub(r"!\[.*?\]\(.*?\)", "", left))
+    for words in SETTINGS:
+        assert words in TEXT, words
+        left = left.replace(words, " ")
+    assert re.findall(r".{0,20}\d+.{0,20}", left) == []
+
+
+def test_the_report_has_four_pages_at_most() -> None:
+    """A page has some 500 words where it has a table or a figure too."""
+    assert len(TEXT.split()) < 4 * 500 and REPORT.count("![") == 3
