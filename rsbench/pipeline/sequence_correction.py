@@ -16,6 +16,7 @@ from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.scans import GLOBAL
 from rsbench.capture.settle import AUTO, NoMotionError, as_global, known_of, shutter_found
 from rsbench.capture.trajectory_check import SUCCESSIVE, shakes
+from rsbench.capture.trajectory_shutter import LONGEST, capture_of_sequence
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, StereoRig
@@ -33,10 +34,6 @@ from rsbench.vision.stereo_matcher import needs_motion
 
 WINDOWS = 8
 """At most, of those by which the shutter is found."""
-SHAKEN = (
-    "cannot tell the readout ratio: the rig shakes, and its frames follow none of the motion models under which "
-    "it shows. Give readout_ratio in the rig's card, or find it in frames in which the rig turns evenly"
-)
 _FEWEST_FRAMES = 4
 """Of a sequence through which a trajectory is fitted: fewer do not show what two frames shake alike."""
 _JUDGED = 3
@@ -79,12 +76,12 @@ def estimate_sequence_capture(
         RefusedFramesError: the first windows cannot be what they are said to be.
         NoMotionError: the windows do not determine the shutter.
     """
-    examined, used = list[Examined](), list[Correspondences]()
-    refusals, known, doubt = _Refusals(left), None, None
-    every, number, first = max((left.count - 1) // WINDOWS, 1), -1, list[Correspondences]()
+    look, refusals, doubt = _Look(rig, options, scanning, disparity_offset), _Refusals(left), None
+    every, number = max((left.count - 1) // WINDOWS, 1), -1
     for number, images in enumerate(_window_images(left, right)):
-        chosen = number % every == 0 and len(examined) < WINDOWS
-        if not (chosen or number < SUCCESSIVE):
+        look.judge(number)
+        chosen = not look.shaken and number % every == 0 and len(look.used) < WINDOWS
+        if not (chosen or number < look.successive):
             continue
         try:
             if scanning is None:
@@ -93,27 +90,60 @@ def estimate_sequence_capture(
                 matches = match_frames(images, rig, options, scanning, judge_rig=number < _JUDGED)
         except RefusedFramesError as error:
             refusals.add(number, error)
-            continue
-        if number < SUCCESSIVE:
-            first.append(matches)
-        if not chosen:
-            continue
-        if known is None:
-            known = known_of(matches, rig, None, scanning, disparity_offset, models_asked(options.motion_model))
-        examined.append(examine(matches, rig, known, options.robust, options.seed))
-        used.append(matches)
-        advance(f"window {number}")
-        known = _narrowed(known, conclude(examined))
+            matches, chosen = Correspondences(), False
+        look.add(number, matches, chosen)
+        if chosen:
+            advance(f"window {number}")
     refusals.end(number + 1)
-    if known is None:
-        raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
-    capture = as_global(conclude(examined), used, rig, known)
+    capture = look.concluded()
     shutter = shutter_found(capture, rig)
-    if len(first) + 1 >= _FEWEST_FRAMES and shakes(capture, first, rig, options.seed):
-        raise NoMotionError(SHAKEN)
     if doubt is not None and shutter.rows_together:
         raise doubt
     return capture, shutter
+
+
+class _Look:
+    """What windows so far say of a shutter."""
+
+    def __init__(
+        self, rig: StereoRig, options: CorrectionOptions, scanning: Scanning | None, offset: float | None
+    ) -> None:
+        self._rig, self._options, self._scanning, self._offset = rig, options, scanning, offset
+        self._examined, self.used, self._first = list[Examined](), list[Correspondences](), list[Correspondences]()
+        self._known: Known | None = None
+        self.shaken = False
+
+    @property
+    def successive(self) -> int:
+        """How many of the first windows are looked at, whichever others are."""
+        return LONGEST if self.shaken else SUCCESSIVE
+
+    def judge(self, number: int) -> None:
+        """Whether the rig shakes, once there are enough windows before ``number``: no motion model helps then."""
+        if number + 1 == _FEWEST_FRAMES and self._examined:
+            self.shaken = shakes(conclude(self._examined), self._first, self._rig, self._options.seed)
+
+    def add(self, number: int, matches: Correspondences, chosen: bool) -> None:
+        """A window; ``chosen``: to be judged under the motion models."""
+        options, models = self._options, models_asked(self._options.motion_model)
+        if number < self.successive:
+            self._first.append(matches)
+        if chosen:
+            known = self._known or known_of(matches, self._rig, None, self._scanning, self._offset, models)
+            self._examined.append(examine(matches, self._rig, known, options.robust, options.seed))
+            self.used.append(matches)
+            self._known = _narrowed(known, conclude(self._examined))
+
+    def concluded(self) -> Capture:
+        """What all say: under the motion models, or, of a rig that shakes, along one trajectory."""
+        if self._known is None:
+            raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
+        capture = as_global(conclude(self._examined), self.used, self._rig, self._known)
+        if len(self._first) + 1 < _FEWEST_FRAMES:
+            return capture
+        if self.shaken or shakes(capture, self._first, self._rig, self._options.seed):
+            return capture_of_sequence(capture, self._first, self._rig, self._scanning, self._options.seed)
+        return capture
 
 
 def _narrowed(known: Known, capture: Capture) -> Known:
