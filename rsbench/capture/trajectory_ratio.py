@@ -16,7 +16,7 @@ import numpy as np
 
 from rsbench.capture import trajectory_banded as banded
 from rsbench.capture.trajectory_choice import choose
-from rsbench.capture.trajectory_data import TimedTracks, pack_windows
+from rsbench.capture.trajectory_data import TimedTracks, pack_windows, thinned
 from rsbench.capture.trajectory_estimate import TrajectoryOptions, noise_px
 from rsbench.capture.trajectory_fit import Fit, fit, log_evidence
 from rsbench.capture.trajectory_kernels import Tails
@@ -75,7 +75,7 @@ def ratio_of_sequence(
     """
     if sum(len(each.tracks) for each in windows) < _FEWEST * len(windows):
         return None
-    few, found = _thinned(windows, _SOME), dict[int, tuple[float, float]]()
+    few, found = thinned(windows, _SOME), dict[int, tuple[float, float]]()
     for number, scanning in enumerate(scannings):
         profile = _Profile(few, rig, scanning)
         try:
@@ -88,18 +88,13 @@ def ratio_of_sequence(
         return None
     best = max(found, key=lambda each: found[each][0])
     others = sum(np.exp(found[each][0] - found[best][0]) for each in found)
-    profile, ratio = _Profile(_thinned(windows, _TRACKS), rig, scannings[best]), found[best][1]
+    profile, ratio = _Profile(thinned(windows, _TRACKS), rig, scannings[best]), found[best][1]
     try:
         profile.begin(ratio, seed)
         profile.settle(_peak(profile, ratio)[0])
         return _told(profile, *_peak(profile, profile.settled), 1.0 / float(others))
     except banded.NotDefiniteError:
         return None
-
-
-def _thinned(windows: Sequence[Correspondences], count: int) -> list[Correspondences]:
-    """About so many tracks of each window."""
-    return [Correspondences(tracks=each.tracks[:: max(len(each.tracks) // count, 1)]) for each in windows]
 
 
 class _Profile:

@@ -9,10 +9,11 @@ import numpy as np
 
 from rsbench.capture.estimate import CERTAIN, MAX_SIGMA, Candidate, Capture
 from rsbench.capture.scans import GLOBAL, Scans, scans_of
+from rsbench.capture.settle import shutter_found
 from rsbench.capture.trajectory_ratio import SequenceRatio, ratio_of_sequence
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import Scanning
+from rsbench.core.shutter import RollingShutter, Scanning
 
 LONGEST = 12
 """Successive windows that are looked at, at most: what is left open then is less than what noise leaves."""
@@ -57,6 +58,29 @@ def capture_of_sequence(
         used=2 * found.used,
         noise_px=found.noise_px,
     )
+
+
+def shutter_of_sequence(windows: Sequence[Correspondences], rig: StereoRig, seed: int = 0) -> RollingShutter:
+    """The shutter of cameras that read alike, from successive windows of any motion, of which some are looked at.
+
+    Raises:
+        NoMotionError: the matches do not tell it.
+    """
+    pairs = np.concatenate([np.concatenate([each.tracks[:, [0, 1, 4, 5]] for each in windows]), np.zeros((0, 4))])
+    moved = float(np.median(np.linalg.norm(pairs[:, 2:] - pairs[:, :2], axis=1))) if len(pairs) else 0.0
+    nothing = Capture(
+        candidates=(),
+        models={},
+        peaks={},
+        reason="too few matches agree with any motion",
+        named=False,
+        windows=0,
+        matches=0,
+        used=0,
+        noise_px=float("nan"),
+        moved_px=moved,
+    )
+    return shutter_found(capture_of_sequence(nothing, windows[:LONGEST], rig, None, seed), rig)
 
 
 def _scannings(capture: Capture) -> tuple[Scanning, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from rsbench.capture.trajectory_choice import choose
-from rsbench.capture.trajectory_data import Past, TimedTracks, pack_windows
+from rsbench.capture.trajectory_data import Past, TimedTracks, pack_windows, thinned
 from rsbench.capture.trajectory_estimate import TrajectoryOptions, is_supported, noise_px
 from rsbench.capture.trajectory_fit import ANCHORED, Fit, fit, held, normal_equations
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, part, span_of
@@ -28,6 +28,8 @@ from rsbench.core.so3 import FloatArray
 
 _ADVANCE, _LAG = 4, 6
 """Windows that leave together, and those behind them that they wait for."""
+_JUDGED_BY = 250
+"""Tracks of a window, about, by which knots and prior are chosen."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,9 +99,8 @@ class _State:
         tracks = self._pack(count)
         last = span_of(self.first + count, self.shutter)[1]
         if self.curve is None or self.fit is None:
-            curve = first_curve(self.motions, tracks, span_of(count, self.shutter), options.intervals[0])
-            found = fit(curve, tracks, options.prior, options.learn)
-            found = choose(found, tracks, options.intervals) if options.learn else found
+            found = self._begun(count)
+            found = fit(found.curve, tracks, found.prior, options.learn, found.tails)
         else:
             start = self.first + count - self.fresh
             ahead = self.motions[count - self.fresh :]
@@ -109,6 +110,14 @@ class _State:
             tracks = self._pack(count, [found.trust[each] for each in tracks.members])
             found = fit(found.curve, tracks, found.prior, options.learn, found.tails)
         return found, tracks
+
+    def _begun(self, count: int) -> Fit:
+        """The first spline: some of the tracks say which knots and which prior."""
+        windows, options = thinned(self.windows[:count], _JUDGED_BY), self.options
+        tracks = pack_windows(windows, self.rig, self.shutter)
+        curve = first_curve(self.motions, tracks, span_of(count, self.shutter), options.intervals[0])
+        found = fit(curve, tracks, options.prior, options.learn)
+        return choose(found, tracks, options.intervals) if options.learn else found
 
     def told(self, found: Fit, tracks: TimedTracks, count: int) -> Iterator[StreamedWindow]:
         """The first so many windows."""
