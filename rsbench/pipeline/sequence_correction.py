@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.capture.estimate import CERTAIN, Capture, conclude, examine
@@ -55,6 +56,8 @@ class CorrectedMoment:
     when this is the last frame."""
     pose: Pose | None = None
     """Body from world at the start of the frame, where a trajectory was found; the world is the first body."""
+    line_poses: Pose | None = None
+    """(lines, 3, 3), (lines, 3) likewise, at the time of each line of the left camera, in order of time."""
 
 
 def estimate_sequence_capture(
@@ -294,6 +297,7 @@ def _moment(
         found=window.found,
         reason=here.reason if frame == 0 else "",
         pose=_pose_at(here, frame),
+        line_poses=_line_poses(here, frame, shutter),
     )
 
 
@@ -302,6 +306,13 @@ def _pose_at(window: Window, frame: int) -> Pose | None:
     if window.pose is None or window.found is None or frame == 0:
         return window.pose
     return compose(window.found.motion.body_from_world(float(frame)), window.pose)
+
+
+def _line_poses(window: Window, frame: int, shutter: RollingShutter) -> Pose | None:
+    """Of the body at the times of the left camera's lines, in order of time."""
+    if window.pose is None or window.found is None:
+        return None
+    return compose(window.found.motion.body_from_world(np.sort(shutter.line_times(frame, "left"))), window.pose)
 
 
 def _both(left: FrameSource, right: FrameSource) -> Iterator[dict[Side, NDArray[Any]]]:

@@ -81,6 +81,7 @@ def _found(window: Window, streamed: StreamedWindow, options: CorrectionOptions,
         reason="" if streamed.supported else BRIDGED,
         metric=True,
         noise_px=streamed.noise_px,
+        covariance=streamed.covariance,
     )
     robust = RobustEstimate(
         estimate=estimate,
