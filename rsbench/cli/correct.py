@@ -208,6 +208,7 @@ def _page(
     capture: Capture | None,
     motion: dict[str, Any] | None,
     cards: list[Any],
+    trajectory: dict[str, Any] | None = None,
 ) -> None:
     from rsbench.report.corrected_page import write_page
 
@@ -219,7 +220,9 @@ def _page(
             facts += [("motion model", motion["model_choice"]["text"])]
         facts += [("matches that agree", _agreeing(motion))]
         facts += [("noise of a match", f"{motion['noise_px'] or float('nan'):.2f} px")]
-    write_page(folder, f"rsbench correct: {out.name}", "Rolling shutter to global shutter", facts, cards)
+    write_page(
+        folder, f"rsbench correct: {out.name}", "Rolling shutter to global shutter", facts, cards, trajectory
+    )
 
 
 def _agreeing(motion: dict[str, Any]) -> str:
@@ -264,6 +267,7 @@ def _correct_sequence(given: Given, target: str, options: CorrectionOptions, fin
     from rsbench.dataset.corrected_video import is_video, video_place
     from rsbench.pipeline.chain import check_cameras
     from rsbench.pipeline.sequence_correction import WINDOWS, correct_sequence, estimate_sequence_capture
+    from rsbench.report.trajectory_picture import draw_trajectory
 
     (left, right), card, out = given.footage(), given.card, given.out
     rig = sized(card, next(iter(left)))
@@ -288,7 +292,7 @@ def _correct_sequence(given: Given, target: str, options: CorrectionOptions, fin
             _write_both(out, folder, (left, right), record)
         else:
             _write_rest(folder, record, poses)
-            _page(folder, out, shutter, capture, None, cards)
+            _page(folder, out, shutter, capture, None, cards, draw_trajectory(poses, record["frames"]))
     _say_sequence(out, f"readout ratio {_readout(shutter, capture)}", record["frames"])
 
 

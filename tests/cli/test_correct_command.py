@@ -162,6 +162,8 @@ def test_a_bad_window_is_bridged_and_told(tmp_path: Path, castle: Sequence, rig:
     assert "5 of 5 times corrected" in result.stdout
     lines = [line.split() for line in (out / "trajectory.csv").read_text().splitlines()[1:]]
     assert [float(line[0]) for line in lines] == [0.0, 1.0, 2.0, 3.0, 4.0] and {len(line) for line in lines} == {8}
+    page = (out / "report.html").read_text("utf-8")
+    assert page.count("<polyline") == 6 and page.count("<rect") == 4  # three axes; two windows, in two drawings
     # Row 0 of a frame is at the frame's own time, and all rows within the readout.
     rows = np.loadtxt(out / "row_poses.csv")
     assert rows.shape == (5 * 96, 8) and np.all(np.diff(rows[:, 0]) > 0.0) and rows[-1, 0] < 5.0
