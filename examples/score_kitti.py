@@ -4,8 +4,9 @@ python examples/score_kitti.py FOLDER [--left image_0 --right image_1] [--ratio 
 
 FOLDER holds calib.txt (projection matrices, the first two of the left and the right camera), poses.txt (3 x 4
 matrices world_from_left, one line a frame) and two folders of rectified images. Global-shutter footage has the
-readout ratio 0; --ratio none has it estimated, with the disparity offset, from all windows. A wrong --ratio or
---focal (a factor) shows what becomes of a wrong card. When every window was solved, the last line tells the drift.
+readout ratio 0; --ratio none has it estimated, with the disparity offset, from windows spread over all. A wrong
+--ratio or --focal (a factor) shows what becomes of a wrong card. When every window was solved, the last line tells
+the drift. --trajectory fits one trajectory through all windows instead of a motion to each.
 """
 
 from __future__ import annotations
@@ -18,12 +19,15 @@ from pathlib import Path
 
 import numpy as np
 
-from rsbench.capture.calibration_errors import NO_ERRORS
+from rsbench.capture.calibration_errors import NO_ERRORS, recalibrated
+from rsbench.capture.trajectory_stream import stream_trajectory
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, read_frame
@@ -128,6 +132,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--ratio", type=readout_ratio, default=0.0, help="readout ratio from 0 to 1, or none")
     parser.add_argument("--focal", type=factor, default=1.0, help="tried focal length over the card's, 0.5 to 2")
     parser.add_argument("--every", type=step, default=1, help="score every n-th window")
+    parser.add_argument("--trajectory", action="store_true", help="one trajectory through all windows")
     given = parser.parse_args(arguments)
     try:
         sys.stdout.writelines(f"{line}\n" for line in score(given))
@@ -135,6 +140,36 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"score_kitti: error: {error}\n")
         return 2
     return 0
+
+
+def _along_one_trajectory(
+    files: Sequence[Sequence[Path]],
+    poses: FloatArray,
+    rig: StereoRig,
+    ratio: float,
+    calibration: tuple[float, ...],
+) -> list[str]:
+    """Medians, drift, and the windows that the spline bridges."""
+    shutter = RollingShutter(height=rig.camera.height, readout_ratio=ratio)
+    windows, options = list[Correspondences](), CorrectionOptions()
+    for k in range(len(poses) - 1):
+        images = {
+            (side, n): read_frame(files[i][k + n]) for n in (0, 1) for i, side in enumerate(("left", "right"))
+        }
+        windows.append(recalibrated(match_frames(images, rig, options), rig, calibration))
+    steps, errors, bridged = [], [], 0
+    for window in stream_trajectory(windows, rig, shutter):
+        R, d = true_motion(poses[window.number], poses[window.number + 1], rig)
+        w_est, d_est = window.motion.w, window.motion.d
+        steps.append(((so3.exp(w_est), d_est), (R, d)))
+        bridged += not window.supported
+        errors.append((rotation_error(w_est, so3.log(R)), translation_error(d_est, d)))
+    median = np.rad2deg(np.median(errors, axis=0))
+    return [
+        "median  e_R {:.3f} deg  e_T {:.2f} deg".format(*median),
+        drift(steps),
+        f"{bridged} of {len(steps)} windows bridged",
+    ]
 
 
 def score(given: argparse.Namespace) -> list[str]:
@@ -156,6 +191,8 @@ def score(given: argparse.Namespace) -> list[str]:
         ratio = shutter.readout_ratio
         lines.append(f"readout ratio {best.ratio:.3f} +- {best.sigma:.3f}, {best.scans}")
         lines.append(f"disparity offset {capture.offset:+.2f} +- {capture.offset_sigma:.2f} px")
+    if given.trajectory:
+        return [*lines, *_along_one_trajectory(files, poses, rig, ratio, calibration)]
     rows, steps, refused = [], [], 0
     for k in range(0, len(poses) - 1, given.every):
         images = {

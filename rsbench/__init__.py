@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rsbench.api import (
         correct,
         estimate_motion,
+        estimate_trajectory,
         evaluate,
         generate,
         match,
@@ -49,6 +50,7 @@ __all__ = [
     "TwistMotion",
     "correct",
     "estimate_motion",
+    "estimate_trajectory",
     "evaluate",
     "generate",
     "list_solvers",

@@ -39,6 +39,7 @@ NAMES = [
     "TwistMotion",
     "correct",
     "estimate_motion",
+    "estimate_trajectory",
     "evaluate",
     "generate",
     "list_solvers",
@@ -58,7 +59,7 @@ MOTION = rsbench.LinearMotion([0.012, -0.02, 0.016], [0.2, -0.12, 0.18])
 
 def test_the_public_names_are_these() -> None:
     assert rsbench.__all__ == NAMES
-    assert len(NAMES) <= 25
+    assert len(NAMES) <= 28
     assert dir(rsbench) == sorted([*NAMES, "__version__"])
 
 

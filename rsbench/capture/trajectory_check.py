@@ -1,7 +1,8 @@
 """Whether a rig shakes: its frames then follow none of the motion models, and a ratio found under them is wrong.
 
 A spline follows any motion that is slow against its knots (``trajectory_fit``), and leaves far smaller errors
-then. It does not tell the readout ratio instead: an arbitrary motion within the readout looks the same at any.
+then, whatever the ratio: an arbitrary motion within a readout looks the same at any. ``trajectory_ratio`` tells
+the ratio of such a rig.
 """
 
 from __future__ import annotations

@@ -64,6 +64,12 @@ class TimedTracks:
         return np.minimum.reduceat(taus, self.starts[:-1]), np.maximum.reduceat(taus, self.starts[:-1])
 
 
+def thinned(windows: Sequence[Correspondences], count: int) -> list[Correspondences]:
+    """About so many tracks of each window, and no pairs where there are as many as that."""
+    few = [Correspondences(tracks=each.tracks[:: max(len(each.tracks) // count, 1)]) for each in windows]
+    return [some if len(some.tracks) >= count else each for some, each in zip(few, windows, strict=True)]
+
+
 def pack_windows(
     windows: Sequence[Correspondences],
     rig: StereoRig,

@@ -83,6 +83,8 @@ class Trajectory(TrajectoryBound):
 
     motion: ContinuousMotion
     """body_from_world at any time of the sequence, frame periods."""
+    shutter: RollingShutter
+    """Given or found."""
     noise_px: float
     """Of a coordinate, as of a normal error: two in three are below it."""
     nu: float
@@ -110,17 +112,19 @@ def estimate_trajectory(
     shutter: RollingShutter,
     motions: Sequence[Motion | None] | None = None,
     options: TrajectoryOptions | None = None,
+    seed: int = 0,
 ) -> Trajectory:
     """The trajectory of a rig, from matches with outliers.
 
     Args:
         windows: of the frames 0 and 1, 1 and 2, ...
         motions: of each window, to begin with; None: they are searched.
+        seed: of that search, where there are no options.
 
     Raises:
         ValueError: no windows, or no tracks in any.
     """
-    options = options or TrajectoryOptions()
+    options = options or TrajectoryOptions(seed=seed)
     if not any(len(window.tracks) for window in windows):
         raise ValueError("a trajectory needs tracks: matches of both cameras over time")
     if motions is None:
@@ -134,7 +138,7 @@ def estimate_trajectory(
     if options.link:
         tracks = pack_windows(windows, rig, shutter, [found.trust[each] for each in tracks.members])
         found = fit(found.curve, tracks, found.prior, options.learn, found.tails)
-    return _told(found, tracks, windows)
+    return _told(found, tracks, windows, shutter)
 
 
 def _fitted(
@@ -152,11 +156,14 @@ def _fitted(
     return fit(curve, tracks, prior, options.learn), tracks
 
 
-def _told(found: Fit, tracks: TimedTracks, windows: Sequence[Correspondences]) -> Trajectory:
+def _told(
+    found: Fit, tracks: TimedTracks, windows: Sequence[Correspondences], shutter: RollingShutter
+) -> Trajectory:
     masks = tuple(found.trust[each] > 0.0 for each in tracks.members)
     inliers = tuple(mask[: len(window.tracks)] for mask, window in zip(masks, windows, strict=True))
     return Trajectory(
         motion=ContinuousMotion.of(found.curve),
+        shutter=shutter,
         noise_px=noise_px(found.tails),
         nu=found.tails.nu,
         prior=found.prior,

@@ -13,12 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from rsbench.capture import trajectory_banded as banded
 from rsbench.capture.trajectory_choice import choose
-from rsbench.capture.trajectory_data import Past, TimedTracks, pack_windows
+from rsbench.capture.trajectory_covariance import covariance_between
+from rsbench.capture.trajectory_data import Past, TimedTracks, pack_windows, thinned
 from rsbench.capture.trajectory_estimate import TrajectoryOptions, is_supported, noise_px
-from rsbench.capture.trajectory_fit import ANCHORED, Fit, fit, held, normal_equations
+from rsbench.capture.trajectory_fit import ANCHORED, Fit, fit, held, information, normal_equations
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, part, span_of
 from rsbench.capture.trajectory_start import continued, first_curve, window_motions
+from rsbench.core import so3
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
@@ -28,6 +31,8 @@ from rsbench.core.so3 import FloatArray
 
 _ADVANCE, _LAG = 4, 6
 """Windows that leave together, and those behind them that they wait for."""
+_JUDGED_BY = 250
+"""Tracks of a window, about, by which knots and prior are chosen."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,6 +46,8 @@ class StreamedWindow:
     """Of that time; the world is the body at time 0 of the sequence."""
     inliers: BoolArray
     """(n,) which tracks are right."""
+    covariance: FloatArray | None
+    """(6, 6) of w and d of ``motion``; None where no track spans a period."""
     supported: bool
     """Whether its own tracks carry it; else the spline bridges it."""
     noise_px: float
@@ -97,9 +104,8 @@ class _State:
         tracks = self._pack(count)
         last = span_of(self.first + count, self.shutter)[1]
         if self.curve is None or self.fit is None:
-            curve = first_curve(self.motions, tracks, span_of(count, self.shutter), options.intervals[0])
-            found = fit(curve, tracks, options.prior, options.learn)
-            found = choose(found, tracks, options.intervals) if options.learn else found
+            found = self._begun(count)
+            found = fit(found.curve, tracks, found.prior, options.learn, found.tails)
         else:
             start = self.first + count - self.fresh
             ahead = self.motions[count - self.fresh :]
@@ -110,9 +116,18 @@ class _State:
             found = fit(found.curve, tracks, found.prior, options.learn, found.tails)
         return found, tracks
 
+    def _begun(self, count: int) -> Fit:
+        """The first spline: some of the tracks say which knots and which prior."""
+        windows, options = thinned(self.windows[:count], _JUDGED_BY), self.options
+        tracks = pack_windows(windows, self.rig, self.shutter)
+        curve = first_curve(self.motions, tracks, span_of(count, self.shutter), options.intervals[0])
+        found = fit(curve, tracks, options.prior, options.learn)
+        return choose(found, tracks, options.intervals) if options.learn else found
+
     def told(self, found: Fit, tracks: TimedTracks, count: int) -> Iterator[StreamedWindow]:
         """The first so many windows."""
         start, end = span_of(1, self.shutter)
+        inverse = banded.inverse_band(information(found.curve, tracks, found.tails, found.prior, found.trust))
         for k in range(count):
             inliers = found.trust[tracks.members[k]][: len(self.windows[k].tracks)] > 0.0
             number = self.first + k
@@ -120,6 +135,7 @@ class _State:
                 number=number,
                 motion=ContinuousMotion.of(part(found.curve, number + start, number + end, float(number))),
                 body_from_world=evaluate(found.curve, float(number))[0],
+                covariance=_covariance(found.curve, inverse, float(number)),
                 inliers=inliers,
                 supported=is_supported(inliers),
                 noise_px=noise_px(found.tails),
@@ -141,6 +157,22 @@ class _State:
         self.fit = found
         self.windows, self.motions = self.windows[count:], self.motions[count:]
         self.first, self.fresh = self.first + count, 0
+
+
+def _covariance(curve: Curve, inverse: FloatArray, start: float) -> FloatArray | None:
+    """Covariance (6, 6) of w and d, of the motion over a period, seen from the body at its start."""
+    (here, there), _, _ = evaluate(curve, np.array([start, start + 1.0]))
+    R = here[1] @ here[0].T
+    t = there[1] - R @ there[0]
+    # w moves by J^-1 of a turn of the body about its own axes, and t = -R p by that turn and by p.
+    by = np.zeros((6, 6))
+    by[:3, :3] = np.linalg.inv(so3.left_jacobian(so3.log(R)))
+    by[3:, :3], by[3:, 3:] = -so3.hat(t), -R
+    try:
+        between = covariance_between(curve, inverse, start, np.array([start + 1.0]))[0]
+    except ValueError:  # the band is too narrow
+        return None
+    return np.asarray(by @ between @ by.T)
 
 
 def _marginal(found: Fit, gone: TimedTracks, trust: FloatArray, drop: int) -> Past:

@@ -55,6 +55,7 @@ the other camera, 64 from the other frame, 32 a narrow hole closed from around i
 
 _PAGE_FRAMES = 6
 _INPAINT = "Invent all pixels that no frame shows, or none. Default: specks and slits alone"
+_ROW_POSES = "Of a sequence, write the pose at every row too: row_poses.csv, in TUM's format."
 _SOLVER = "rs-stereo-refined"
 _MODEL = "Motion model: auto, which the matches prefer, or a name. Default: auto where the solver takes it"
 
@@ -82,6 +83,7 @@ def correct(
     features: Annotated[str, named("features", "Matches features: a name or a card.")] = "sift-refined",
     corrector: Annotated[str, named("correctors", "Makes the corrected frames: a name or a card.")] = "fusion",
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
+    row_poses: Annotated[bool, typer.Option("--row-poses", help=_ROW_POSES)] = False,
     camera: CameraFile = None,
     footage: Footage = None,
 ) -> None:
@@ -89,7 +91,7 @@ def correct(
     if camera is not None or footage is not None:
         correct_one_camera(frames, footage, camera, out, target, inpaint, seed)
         return
-    given = given_frames(frames, rig, out, left, right)
+    given = given_frames(frames, rig, out, left, right, row_poses)
     others = {"find_sky": sky, "inpaint": bool(inpaint), "seed": seed, "motion_model": motion_model}
     options = _options(features, solver, matcher, corrector, fill, **others)
     _correct_given(given, target, options, inpaint is None)
@@ -109,7 +111,7 @@ def _correct_given(given: Given, target: str, options: CorrectionOptions, close:
             if given.four:
                 _correct_four(given.four, given.card, given.out, target, options, finish)
             else:
-                _correct_sequence(*given.footage(), given.card, given.out, target, options, finish)
+                _correct_sequence(given, target, options, finish)
     except (NoMotionError, NotCorrectedError) as error:
         typer.echo(f"rsbench: not corrected: {error}", err=True)
         raise typer.Exit(1) from None
@@ -206,6 +208,7 @@ def _page(
     capture: Capture | None,
     motion: dict[str, Any] | None,
     cards: list[Any],
+    trajectory: dict[str, Any] | None = None,
 ) -> None:
     from rsbench.report.corrected_page import write_page
 
@@ -217,7 +220,9 @@ def _page(
             facts += [("motion model", motion["model_choice"]["text"])]
         facts += [("matches that agree", _agreeing(motion))]
         facts += [("noise of a match", f"{motion['noise_px'] or float('nan'):.2f} px")]
-    write_page(folder, f"rsbench correct: {out.name}", "Rolling shutter to global shutter", facts, cards)
+    write_page(
+        folder, f"rsbench correct: {out.name}", "Rolling shutter to global shutter", facts, cards, trajectory
+    )
 
 
 def _agreeing(motion: dict[str, Any]) -> str:
@@ -253,15 +258,7 @@ def _say(out: Path, shutter: RollingShutter, capture: Capture | None, motion: di
     typer.echo(f"report: {(out / 'report.html').resolve()}")
 
 
-def _correct_sequence(
-    left: FrameSource,
-    right: FrameSource,
-    card: RigCard,
-    out: Path,
-    target: str,
-    options: CorrectionOptions,
-    finish: Finish,
-) -> None:
+def _correct_sequence(given: Given, target: str, options: CorrectionOptions, finish: Finish) -> None:
     from dataclasses import replace
 
     from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET
@@ -271,7 +268,9 @@ def _correct_sequence(
     from rsbench.dataset.corrected_video import is_video, video_place
     from rsbench.pipeline.chain import check_cameras
     from rsbench.pipeline.sequence_correction import WINDOWS, correct_sequence, estimate_sequence_capture
+    from rsbench.report.trajectory_picture import draw_trajectory
 
+    (left, right), card, out = given.footage(), given.card, given.out
     rig = sized(card, next(iter(left)))
     options = replace(options, target_row=target_row(target, rig.camera.height))
     ratio, calibration, scanning, capture = card.readout_ratio, card.calibration, card.scanning, None
@@ -288,12 +287,13 @@ def _correct_sequence(
         record = rig_record(rig, shutter, capture, options, (calibration or NO_ERRORS)[OFFSET])
         with progress_bar("correcting", max(left.count, 1)) as advance:
             moments = correct_sequence(left, right, rig, ratio, options, calibration or NO_ERRORS, scanning)
-            record["frames"], cards, poses = _write_moments(folder, moments, left, advance, finish)
+            rows = shutter if given.row_poses else None
+            record["frames"], cards, poses = _write_moments(folder, moments, left, advance, finish, rows)
         if is_video(out):
             _write_both(out, folder, (left, right), record)
         else:
             _write_rest(folder, record, poses)
-            _page(folder, out, shutter, capture, None, cards)
+            _page(folder, out, shutter, capture, None, cards, draw_trajectory(poses, record["frames"]))
     _say_sequence(out, f"readout ratio {_readout(shutter, capture)}", record["frames"])
 
 
@@ -344,10 +344,16 @@ def _told(frames: list[dict[str, Any]], key: str) -> str:
 
 
 def _write_moments(
-    folder: Path, moments: Any, left: FrameSource, advance: Any, finish: Finish
+    folder: Path, moments: Any, left: FrameSource, advance: Any, finish: Finish, rows: RollingShutter | None
 ) -> tuple[list[dict[str, Any]], list[Any], dict[int, Any]]:
-    """Write every corrected time; returns what motion.json says of each, some for the page, and poses."""
-    from rsbench.dataset.corrected_frames import motion_record, write_frame
+    """Write every corrected time; returns what motion.json says of each, some for the page, and poses.
+
+    Args:
+        rows: the shutter, where the pose at every row is wanted.
+    """
+    import numpy as np
+
+    from rsbench.dataset.corrected_frames import append_line_poses, motion_record, write_frame
     from rsbench.report.corrected_page import card_of
 
     every = max(left.count // _PAGE_FRAMES, 1)
@@ -373,6 +379,9 @@ def _write_moments(
                 cards.append(card_of(title, moment.images["left"], frames["left"]))
         if moment.pose is not None:
             poses[moment.number] = moment.pose
+        if rows is not None and moment.line_poses is not None:
+            taus = np.sort(rows.line_times(moment.number, "left"))
+            append_line_poses(folder / "row_poses.csv", taus, moment.line_poses)
         records.append(entry)
         advance(f"frame {moment.number}")
     return records, cards, poses

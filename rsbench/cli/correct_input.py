@@ -22,6 +22,8 @@ class Given:
     left: list[Path] | Path
     """Its images, or a folder or video."""
     right: list[Path] | Path
+    row_poses: bool = False
+    """Whether the pose at every row of a sequence is wanted."""
 
     def footage(self) -> tuple[FrameSource, FrameSource]:
         """Of the left and the right camera."""
@@ -35,7 +37,12 @@ class Given:
 
 
 def given_frames(
-    frames: list[Path] | None, rig: Path | None, out: Path | None, left: Path | None, right: Path | None
+    frames: list[Path] | None,
+    rig: Path | None,
+    out: Path | None,
+    left: Path | None,
+    right: Path | None,
+    row_poses: bool = False,
 ) -> Given:
     """Raises RsbenchError for another combination of arguments."""
     from rsbench.core.errors import RsbenchError
@@ -47,8 +54,10 @@ def given_frames(
     if frames and rendered:
         if rig or left or right:
             raise RsbenchError(f"{frames[0]}: is a sequence, which knows its frames and rig; leave the others out")
-        return _of_sequence(frames[0], out)
+        return _of_sequence(frames[0], out, row_poses)
     assert rig is not None
+    if row_poses and frames:
+        raise RsbenchError("--row-poses: two times have no trajectory; give --left and --right of four and more")
     card = read_rig_card(rig)
     if frames is not None and len(frames) == 4 and not (left or right):
         return Given(card=card, out=out, four=frames, left=[], right=[])
@@ -57,10 +66,10 @@ def given_frames(
         raise RsbenchError(
             f"frames: {count}give LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right, or a sequence's folder"
         )
-    return Given(card=card, out=out, four=[], left=left, right=right)
+    return Given(card=card, out=out, four=[], left=left, right=right, row_poses=row_poses)
 
 
-def _of_sequence(folder: Path, out: Path) -> Given:
+def _of_sequence(folder: Path, out: Path, row_poses: bool) -> Given:
     """The rolling-shutter frames of a sequence of a dataset."""
     from rsbench.core.errors import RsbenchError
     from rsbench.core.rig import SIDES
@@ -78,7 +87,7 @@ def _of_sequence(folder: Path, out: Path) -> Given:
         [folder / picture_file("rs", side, frame) for frame in range(sequence.frames)] for side in SIDES
     )
     card = rig_card_of(sequence.rig, sequence.shutter)
-    return Given(card=card, out=out, four=[], left=left, right=right)
+    return Given(card=card, out=out, four=[], left=left, right=right, row_poses=row_poses)
 
 
 def target_row(target: str, height: int) -> float:

@@ -19,6 +19,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose, inverse
 from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import read_frame
 from rsbench.pipeline.frame_motion import FoundMotion
@@ -26,6 +27,7 @@ from rsbench.storage.files import read_depth, read_json, read_png, write_bytes, 
 from rsbench.storage.work_folder import HIDDEN, WORK, files_below, named, remove, unknown_files, work_folder
 from rsbench.vision.fusion import Fused, Origin
 
+_TUM = "# frame periods, metres: the body in the world, which is the body at the start of the first frame\n"
 MASK_VALUES = {
     Origin.NOBODY: 0,
     Origin.INVENTED: 32,
@@ -228,12 +230,25 @@ def write_trajectory(path: Path, poses: Mapping[int, Pose]) -> None:
     Args:
         poses: body from world, by the frame's number, which is its time in frame periods.
     """
-    lines = ["# frame periods, metres: the body in the world, which is the body at the start of the first frame"]
-    for number, pose in poses.items():
-        R, position = inverse(pose)
-        a, b, c, d = so3.quaternion(R)
-        lines.append(" ".join(f"{value:.9g}" for value in (number, *position, b, c, d, a)))
-    write_bytes(path, ("\n".join(lines) + "\n").encode())
+    lines = [_line(number, pose) for number, pose in poses.items()]
+    write_bytes(path, "".join([_TUM, *lines]).encode())
+
+
+def append_line_poses(path: Path, taus: FloatArray, poses: Pose) -> None:
+    """Poses of the body, body from world, at the times (n,) of one frame's lines, after those that are there.
+
+    Frame by frame, so that footage may be of any length. TUM's format, as ``write_trajectory`` has it.
+    """
+    head = "" if path.exists() else _TUM
+    lines = [_line(tau, Pose(R, t)) for tau, R, t in zip(taus, poses.R, poses.t, strict=True)]
+    with path.open("a", encoding="utf-8") as file:
+        file.write("".join([head, *lines]))
+
+
+def _line(tau: float, pose: Pose) -> str:
+    R, position = inverse(pose)
+    a, b, c, d = so3.quaternion(R)
+    return " ".join(f"{value:.9g}" for value in (tau, *position, b, c, d, a)) + "\n"
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET
@@ -17,6 +18,7 @@ from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.scans import GLOBAL
 from rsbench.capture.settle import AUTO, NoMotionError, as_global, known_of, shutter_found
 from rsbench.capture.trajectory_check import SUCCESSIVE, shakes
+from rsbench.capture.trajectory_shutter import LONGEST, capture_of_sequence
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, StereoRig
@@ -34,10 +36,6 @@ from rsbench.vision.stereo_matcher import needs_motion
 
 WINDOWS = 8
 """At most, of those by which the shutter is found."""
-SHAKEN = (
-    "cannot tell the readout ratio: the rig shakes, and its frames follow none of the motion models under which "
-    "it shows. Give readout_ratio in the rig's card, or find it in frames in which the rig turns evenly"
-)
 _FEWEST_FRAMES = 4
 """Of a sequence through which a trajectory is fitted: fewer do not show what two frames shake alike."""
 _JUDGED = 3
@@ -59,6 +57,8 @@ class CorrectedMoment:
     when this is the last frame."""
     pose: Pose | None = None
     """Body from world at the start of the frame, where a trajectory was found; the world is the first body."""
+    line_poses: Pose | None = None
+    """(lines, 3, 3), (lines, 3) likewise, at the time of each line of the left camera, in order of time."""
 
 
 def estimate_sequence_capture(
@@ -83,70 +83,98 @@ def estimate_sequence_capture(
         RefusedFramesError: the first windows cannot be what they are said to be.
         NoMotionError: the windows do not determine the shutter.
     """
-    models = models_asked(options.motion_model)
     scanning = scanning if readout_ratio is None else scanning or Scanning()
-    examined, used, known, first = list[Examined](), list[Correspondences](), None, list[Correspondences]()
-    speaks_against = list[RefusedFramesError]()
-    for number, matches, doubt in _some_matches(left, right, rig, options, scanning):
-        if number < SUCCESSIVE:
-            first.append(matches)
-        if doubt is not None:
-            speaks_against.append(doubt)
-        if number % _every(left) or len(examined) == WINDOWS:
-            continue
-        known = known or known_of(matches, rig, readout_ratio, scanning, calibration, models)
-        if readout_ratio is not None and not any(known.calibration_sigma):
-            break
-        examined.append(examine(matches, rig, known, options.robust, options.seed))
-        used.append(matches)
-        advance(f"window {number}")
-        known = _narrowed(known, conclude(examined))
-    if readout_ratio is not None:
-        shutter = (scanning or Scanning()).shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
-        return (conclude(examined) if examined else None), shutter
-    if known is None:
-        raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
-    capture = as_global(conclude(examined), used, rig, known)
-    shutter = shutter_found(capture, rig)
-    if len(first) + 1 >= _FEWEST_FRAMES and shakes(capture, first, rig, options.seed):
-        raise NoMotionError(SHAKEN)
-    if speaks_against and shutter.rows_together:
-        raise speaks_against[-1]
-    return capture, shutter
-
-
-def _every(left: FrameSource) -> int:
-    """Windows from one that is looked at to the next."""
-    return max((left.count - 1) // WINDOWS, 1)
-
-
-def _some_matches(
-    left: FrameSource,
-    right: FrameSource,
-    rig: StereoRig,
-    options: CorrectionOptions,
-    scanning: Scanning | None,
-) -> Iterator[tuple[int, Correspondences, RefusedFramesError | None]]:
-    """Number and matches of the first windows and of some over the whole, and what speaks against a pair.
-
-    Raises:
-        RefusedFramesError: the first windows, or all, are refused.
-    """
-    refusals, number = _Refusals(left), -1
+    look, refusals = _Look(rig, options, readout_ratio, scanning, calibration), _Refusals(left)
+    doubts = list[RefusedFramesError | None]()
+    every, number = max((left.count - 1) // WINDOWS, 1), -1
     for number, images in enumerate(_window_images(left, right)):
-        if number % _every(left) and number >= SUCCESSIVE:
+        look.judge(number)
+        chosen = not look.shaken and number % every == 0 and len(look.used) < WINDOWS
+        if not (chosen or number < look.successive):
             continue
         try:
-            doubt = None
             if scanning is None:
                 matches, doubt = match_unknown(images, rig, options, judge_rig=number < _JUDGED)
+                doubts.append(doubt)
             else:
                 matches = match_frames(images, rig, options, scanning, judge_rig=number < _JUDGED)
         except RefusedFramesError as error:
             refusals.add(number, error)
-            continue
-        yield number, matches, doubt
+            matches, chosen = Correspondences(), False
+        look.add(number, matches, chosen)
+        if look.is_right:
+            break
+        if chosen:
+            advance(f"window {number}")
     refusals.end(number + 1)
+    if readout_ratio is not None:
+        shutter = (scanning or Scanning()).shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
+        return (None if look.is_right else look.concluded()), shutter
+    capture = look.concluded()
+    shutter, doubt = shutter_found(capture, rig), next(filter(None, doubts), None)
+    if doubt is not None and shutter.rows_together:
+        raise doubt
+    return capture, shutter
+
+
+class _Look:
+    """What windows so far say of a shutter."""
+
+    def __init__(
+        self,
+        rig: StereoRig,
+        options: CorrectionOptions,
+        readout_ratio: float | None,
+        scanning: Scanning | None,
+        calibration: tuple[float, ...] | None,
+    ) -> None:
+        self._rig, self._options, self._ratio = rig, options, readout_ratio
+        self._scanning, self._calibration = scanning, calibration
+        self._examined, self.used, self._first = list[Examined](), list[Correspondences](), list[Correspondences]()
+        self._known: Known | None = None
+        self.shaken = False
+
+    @property
+    def successive(self) -> int:
+        """How many of the first windows are looked at, whichever others are."""
+        return LONGEST if self.shaken else SUCCESSIVE
+
+    @property
+    def is_right(self) -> bool:
+        """Whether there is nothing to look for: the ratio is known, and matches show no error of the calibration."""
+        return self._ratio is not None and self._known is not None and not any(self._known.calibration_sigma)
+
+    def judge(self, number: int) -> None:
+        """Whether the rig shakes, once there are enough windows before ``number``: no motion model helps then."""
+        if number + 1 == _FEWEST_FRAMES and self._examined and self._ratio is None:
+            self.shaken = shakes(conclude(self._examined), self._first, self._rig, self._options.seed)
+
+    def add(self, number: int, matches: Correspondences, chosen: bool) -> None:
+        """A window; ``chosen``: to be judged under the motion models."""
+        options, models = self._options, models_asked(self._options.motion_model)
+        if number < self.successive:
+            self._first.append(matches)
+        if chosen:
+            asked = (self._ratio, self._scanning, self._calibration)
+            known = self._known = self._known or known_of(matches, self._rig, *asked, models)
+            if self.is_right:
+                return
+            self._examined.append(examine(matches, self._rig, known, options.robust, options.seed))
+            self.used.append(matches)
+            self._known = _narrowed(known, conclude(self._examined))
+
+    def concluded(self) -> Capture:
+        """What all say: under the motion models, or, of a rig that shakes, along one trajectory."""
+        if self._known is None:
+            raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
+        capture = conclude(self._examined)
+        if self._ratio is None:
+            capture = as_global(capture, self.used, self._rig, self._known)
+        if self._ratio is not None or len(self._first) + 1 < _FEWEST_FRAMES:
+            return capture
+        if self.shaken or shakes(capture, self._first, self._rig, self._options.seed):
+            return capture_of_sequence(capture, self._first, self._rig, self._scanning, self._options.seed)
+        return capture
 
 
 def _narrowed(known: Known, capture: Capture) -> Known:
@@ -298,6 +326,7 @@ def _moment(
         found=window.found,
         reason=here.reason if frame == 0 else "",
         pose=_pose_at(here, frame),
+        line_poses=_line_poses(here, frame, shutter),
     )
 
 
@@ -306,6 +335,13 @@ def _pose_at(window: Window, frame: int) -> Pose | None:
     if window.pose is None or window.found is None or frame == 0:
         return window.pose
     return compose(window.found.motion.body_from_world(float(frame)), window.pose)
+
+
+def _line_poses(window: Window, frame: int, shutter: RollingShutter) -> Pose | None:
+    """Of the body at the times of the left camera's lines, in order of time."""
+    if window.pose is None or window.found is None:
+        return None
+    return compose(window.found.motion.body_from_world(np.sort(shutter.line_times(frame, "left"))), window.pose)
 
 
 def _both(left: FrameSource, right: FrameSource) -> Iterator[dict[Side, NDArray[Any]]]:

@@ -87,6 +87,7 @@ def _found(
         reason="" if streamed.supported else BRIDGED,
         metric=True,
         noise_px=streamed.noise_px,
+        covariance=streamed.covariance,
     )
     robust = RobustEstimate(
         estimate=estimate,

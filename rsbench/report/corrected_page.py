@@ -65,8 +65,15 @@ def card_of(title: str, before: NDArray[Any], fused: Fused) -> dict[str, Any]:
     }
 
 
-def write_page(folder: Path, title: str, subtitle: str, facts: list[tuple[str, str]], cards: list[Any]) -> None:
-    """report.html: opens from disk, needs no other file."""
+def write_page(
+    folder: Path,
+    title: str,
+    subtitle: str,
+    facts: list[tuple[str, str]],
+    cards: list[Any],
+    trajectory: dict[str, Any] | None = None,
+) -> None:
+    """report.html: opens from disk, needs no other file; ``trajectory`` is of ``draw_trajectory``."""
     environment = Environment(
         loader=PackageLoader("rsbench.report"),
         autoescape=select_autoescape(["html", "j2"]),
@@ -74,7 +81,12 @@ def write_page(folder: Path, title: str, subtitle: str, facts: list[tuple[str, s
     )
     record = read_json(folder / MARKER)
     page = environment.get_template("correct.html.j2").render(
-        title=title, subtitle=subtitle, facts=facts, cards=cards, record=json.dumps(record, indent=1)[:20000]
+        title=title,
+        subtitle=subtitle,
+        facts=facts,
+        cards=cards,
+        trajectory=trajectory,
+        record=json.dumps(record, indent=1)[:20000],
     )
     write_bytes(folder / "report.html", page.encode())
 

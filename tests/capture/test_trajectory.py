@@ -179,6 +179,15 @@ def test_a_stream_says_what_the_whole_sequence_does() -> None:
     whole = estimate_trajectory(windows, RIG, SHUTTER)
     parts = list(stream_trajectory(windows, RIG, SHUTTER))
     assert [each.number for each in parts] == list(range(19))
+    nees = list[float]()
+    for each in parts:
+        R, p = law(np.array([each.number, each.number + 1.0]))
+        w, d = Rotation.from_matrix(R[1] @ R[0].T).as_rotvec(), R[1] @ (p[0] - p[1])
+        off = np.concatenate([each.motion.w - w, each.motion.d - d])
+        assert each.covariance is not None
+        nees.append(float(off @ np.linalg.solve(each.covariance, off)))
+    # Windows share frames, so that few of the 19 are on their own: six degrees of freedom, within a factor.
+    assert 3.0 < np.mean(nees) < 12.0
     errors, tau = list[FloatArray](), times(np.arange(0.0, HEIGHT, 48.0), 0)
     for each in parts:
         ours, truth = each.motion.body_from_world(tau).R, law(each.number + tau)[0]

@@ -152,7 +152,8 @@ def test_a_bad_window_is_bridged_and_told(tmp_path: Path, castle: Sequence, rig:
                 image = castle.image("rs", side, frame)
             write_png(tmp_path / side / f"{number}.png", image)
     out = tmp_path / "out"
-    result = correct("--left", tmp_path / "left", "--right", tmp_path / "right", "--rig", rig, "--out", out)
+    footage = ("--left", tmp_path / "left", "--right", tmp_path / "right", "--rig", rig, "--out", out)
+    result = correct(*footage, "--row-poses")
     assert result.returncode == 0, result.stderr
     bridged = result.stderr.strip().splitlines()[-1]
     assert "corrected with the motion of the frames around: frame 1 (only 0 matches" in bridged
@@ -162,6 +163,12 @@ def test_a_bad_window_is_bridged_and_told(tmp_path: Path, castle: Sequence, rig:
     assert "5 of 5 times corrected" in result.stdout
     lines = [line.split() for line in (out / "trajectory.csv").read_text().splitlines()[1:]]
     assert [float(line[0]) for line in lines] == [0.0, 1.0, 2.0, 3.0, 4.0] and {len(line) for line in lines} == {8}
+    page = (out / "report.html").read_text("utf-8")
+    assert page.count("<polyline") == 6 and page.count("<rect") == 4  # three axes; two windows, in two drawings
+    # Row 0 of a frame is at the frame's own time, and all rows within the readout.
+    rows = np.loadtxt(out / "row_poses.csv")
+    assert rows.shape == (5 * 96, 8) and np.all(np.diff(rows[:, 0]) > 0.0) and rows[-1, 0] < 5.0
+    np.testing.assert_allclose(rows[::96], np.array(lines, dtype=float), atol=1e-7)  # nine digits
 
 
 def test_bad_calls_are_refused_and_leave_nothing(tmp_path: Path, frames: list[Path], rig: Path) -> None:
@@ -177,6 +184,7 @@ def test_bad_calls_are_refused_and_leave_nothing(tmp_path: Path, frames: list[Pa
     assert_refused(correct(*frames[:3], tmp_path / "none.png", *common), "none.png", "No such file")
     assert_refused(correct(*[flat] * 4, *common), "no texture")
     assert_refused(correct(*frames, *common, "--target", "500"), "--target 500", "95")
+    assert_refused(correct(*frames, *common, "--row-poses"), "two times have no trajectory")
     assert_refused(correct(*frames, "--out", out), "--rig")
     assert_refused(correct(*frames, *common, "--solver", "nobody"), "nobody", "does not exist")
     assert_refused(correct(*frames, "--rig", tmp_path / "no.toml", "--out", out), "no.toml")

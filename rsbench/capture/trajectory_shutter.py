@@ -1,0 +1,100 @@
+"""How the cameras of a rig read that shakes: a capture as the motion models give it of one that does not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import astuple, replace
+
+import numpy as np
+
+from rsbench.capture.estimate import CERTAIN, MAX_SIGMA, Candidate, Capture
+from rsbench.capture.scans import GLOBAL, Scans, scans_of
+from rsbench.capture.settle import shutter_found
+from rsbench.capture.trajectory_ratio import SequenceRatio, ratio_of_sequence
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter, Scanning
+
+LONGEST = 12
+"""Successive windows that are looked at, at most: what is left open then is less than what noise leaves."""
+_NEARLY = 0.06
+"""Readout ratio of nearly a global shutter, within two deviations."""
+_TOGETHER = tuple(Scanning(scan=scan) for scan in ("top", "bottom", "left", "right"))
+
+
+def capture_of_sequence(
+    capture: Capture,
+    windows: Sequence[Correspondences],
+    rig: StereoRig,
+    scanning: Scanning | None = None,
+    seed: int = 0,
+) -> Capture:
+    """The shutter from one trajectory through successive windows; motion models then have no part in it.
+
+    Args:
+        capture: what the motion models say, which is kept where no trajectory explains the tracks.
+        windows: of the frames 0 and 1, 1 and 2, ...
+        scanning: how the cameras read, where that is known; None: both alike, at once, from one of four sides, or
+            as the motion models have it.
+    """
+    scannings = _scannings(capture) if scanning is None else (scanning,)
+    found = ratio_of_sequence(windows, rig, scannings, seed)
+    if found is None:
+        return capture
+    candidate = _candidate(found, rig)
+    doubt = ""
+    if candidate.probability < CERTAIN or candidate.sigma > MAX_SIGMA:
+        text = f"{candidate.ratio:.2f} +- {candidate.sigma:.2f}"
+        doubt = f"the rig shakes, and {len(windows) + 1} frames of it do not determine how fast: {text}"
+    return replace(
+        capture,
+        candidates=(candidate,),
+        models={},
+        peaks={},
+        reason=doubt,
+        named=candidate.probability >= CERTAIN,
+        windows=len(windows),
+        matches=sum(2 * len(each.tracks) for each in windows),
+        used=2 * found.used,
+        noise_px=found.noise_px,
+    )
+
+
+def shutter_of_sequence(windows: Sequence[Correspondences], rig: StereoRig, seed: int = 0) -> RollingShutter:
+    """The shutter of cameras that read alike, from successive windows of any motion, of which some are looked at.
+
+    Raises:
+        NoMotionError: the matches do not tell it.
+    """
+    pairs = np.concatenate([np.concatenate([each.tracks[:, [0, 1, 4, 5]] for each in windows]), np.zeros((0, 4))])
+    moved = float(np.median(np.linalg.norm(pairs[:, 2:] - pairs[:, :2], axis=1))) if len(pairs) else 0.0
+    nothing = Capture(
+        candidates=(),
+        models={},
+        peaks={},
+        reason="too few matches agree with any motion",
+        named=False,
+        windows=0,
+        matches=0,
+        used=0,
+        noise_px=float("nan"),
+        moved_px=moved,
+    )
+    return shutter_found(capture_of_sequence(nothing, windows[:LONGEST], rig, None, seed), rig)
+
+
+def _scannings(capture: Capture) -> tuple[Scanning, ...]:
+    best = capture.likeliest
+    if best is None or best.scans.together or "global" in astuple(best.scans):
+        return _TOGETHER
+    return *_TOGETHER, Scanning(scan=best.scans.left, right_scan=best.scans.right)  # pyrefly: ignore[bad-argument-type]
+
+
+def _candidate(found: SequenceRatio, rig: StereoRig) -> Candidate:
+    shutter = found.scanning.shutter_of(rig.camera.width, rig.camera.height, 1.0)
+    scans: Scans = scans_of(shutter)
+    ratio, sigma, probability = found.ratio, found.sigma, found.probability
+    if ratio - 2.0 * sigma <= _NEARLY and ratio + 2.0 * sigma < 3.0 * _NEARLY:
+        scans, ratio, sigma, probability = GLOBAL, 0.0, float(np.hypot(ratio, sigma)), 1.0
+    delay = found.scanning.right_delay
+    return Candidate(scans=scans, probability=probability, ratio=ratio, sigma=sigma, delay=delay, delay_sigma=0.0)

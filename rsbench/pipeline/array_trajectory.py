@@ -1,0 +1,52 @@
+"""The trajectory of arrays, as ``rsbench.estimate_trajectory`` finds it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+from rsbench.capture.trajectory_estimate import Trajectory, estimate_trajectory
+from rsbench.capture.trajectory_shutter import shutter_of_sequence
+from rsbench.components import arguments
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_matches import find_matches
+from rsbench.vision.feature_matcher import load_features
+
+FEWEST_FRAMES = 4
+"""Of a sequence that shows its shutter."""
+
+
+def matches_of(frames: Sequence[Any], rig: StereoRig, features: str) -> list[Correspondences]:
+    """Of each two successive times; frames are (left, right) images.
+
+    Raises:
+        ValueError: not two images of each time, not of the rig's size, or of one time only.
+        RsbenchError: no such feature matcher.
+    """
+    options = CorrectionOptions(features=load_features(features))
+    for number, both in enumerate(frames):
+        if isinstance(both, Correspondences) or len(both) != 2:
+            raise ValueError(f"sequence[{number}]: must be Correspondences, as all others, or two images")
+        for side, image in zip(("left", "right"), both, strict=True):
+            arguments.check_image(f"sequence[{number}], {side}", image, rig)
+    if len(frames) < 2:
+        raise ValueError(f"sequence: {len(frames)} times, at least 2 are needed")
+    return [find_matches(arguments.four_images([*a, *b]), options) for a, b in itertools.pairwise(frames)]
+
+
+def trajectory_of(
+    windows: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter | None, seed: int
+) -> Trajectory:
+    """The trajectory, and the shutter where that is not known.
+
+    Raises:
+        ValueError: no tracks; or, without a shutter, too few frames.
+        NoMotionError: the matches do not tell the shutter.
+    """
+    if shutter is None and len(windows) + 1 < FEWEST_FRAMES:
+        raise ValueError(f"shutter: is found of {FEWEST_FRAMES} frames and more; these are {len(windows) + 1}")
+    return estimate_trajectory(windows, rig, shutter or shutter_of_sequence(windows, rig, seed), seed=seed)

@@ -1,0 +1,89 @@
+"""The way of a rig through a sequence as a picture of the page of ``rsbench correct``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from rsbench.core import so3
+from rsbench.core.se3 import Pose, inverse
+from rsbench.core.so3 import FloatArray
+
+_WIDE, _HIGH, _LEFT, _TOP = 520.0, 200.0, 64.0, 10.0
+_COLOURS = {"x": "#c0392b", "y": "#27855a", "z": "#0b6bcb"}
+
+
+def draw_trajectory(poses: Mapping[int, Pose], frames: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Drawings (SVG) of rotation and position, and what is said below; None where there is no trajectory.
+
+    Args:
+        poses: body from world at the starts of frames, by their numbers.
+        frames: what motion.json says of each.
+    """
+    if len(poses) < 2:
+        return None
+    numbers, first = np.array(list(poses), dtype=np.float64), next(iter(poses.values()))
+    turns = np.stack([so3.log(pose.R @ first.R.T) for pose in poses.values()])
+    places = np.stack([inverse(pose)[1] for pose in poses.values()])
+    bridged = [int(frame["number"]) for frame in frames if "skipped" in frame]
+    return {
+        "drawings": [
+            _drawing(numbers, np.rad2deg(turns), bridged, "rotation since the first frame (deg)"),
+            _drawing(numbers, places, bridged, "position (m)"),
+        ],
+        "caption": _caption(frames, bridged),
+    }
+
+
+def _caption(frames: Sequence[Mapping[str, Any]], bridged: Sequence[int]) -> str:
+    covariances = [(frame.get("motion") or {}).get("covariance_w_d") for frame in frames]
+    known = [np.sqrt(np.diagonal(np.array(each))) for each in covariances if each is not None]
+    text = "Red x, green y, blue z."
+    if known:
+        w, d = np.max(np.stack(known)[:, :3], axis=1), np.max(np.stack(known)[:, 3:], axis=1)
+        text += (
+            f" Standard deviation of the motion over a frame period, about or along the worst axis: "
+            f"{np.rad2deg(np.median(w)):.2g} deg, {1000.0 * np.median(d):.2g} mm in the median; "
+            f"{np.rad2deg(np.max(w)):.2g} deg, {1000.0 * np.max(d):.2g} mm at most."
+        )
+    return text + (" Grey: windows that it bridges." if bridged else "")
+
+
+def _drawing(numbers: FloatArray, values: FloatArray, bridged: Sequence[int], title: str) -> Markup:
+    """Three lines over the frames, with bars where windows are bridged."""
+    low, high = float(np.min(values)), float(np.max(values))
+    spread = max(high - low, 1e-9)
+    low, high = low - 0.05 * spread, high + 0.05 * spread
+
+    def across(number: FloatArray | float) -> FloatArray:
+        return np.asarray(_LEFT + (number - numbers[0]) / (numbers[-1] - numbers[0]) * (_WIDE - _LEFT - 10.0))
+
+    def down(value: FloatArray | float) -> FloatArray:
+        return np.asarray(_TOP + (high - value) / (high - low) * (_HIGH - _TOP - 40.0))
+
+    bars = [
+        f'<rect x="{across(k):.1f}" y="{_TOP}" width="{across(k + 1.0) - across(float(k)):.1f}" '
+        f'height="{_HIGH - _TOP - 40.0}" fill="#c8ced4"/>'
+        for k in bridged
+        if k < numbers[-1]
+    ]
+    lines = []
+    for column, colour in zip(values.T, _COLOURS.values(), strict=True):
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(across(numbers), down(column), strict=True))
+        lines.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.8"/>')
+    ticks = [
+        f'<text x="{_LEFT - 6}" y="{down(each) + 4:.1f}" text-anchor="end">{each:.3g}</text>'
+        f'<line x1="{_LEFT}" x2="{_WIDE - 10}" y1="{down(each):.1f}" y2="{down(each):.1f}" stroke="#d8dde2"/>'
+        for each in np.linspace(float(np.min(values)), float(np.max(values)), 4)
+    ]
+    ends = "".join(
+        f'<text x="{across(each):.1f}" y="{_HIGH - 14}" text-anchor="middle">{each:.0f}</text>'
+        for each in (numbers[0], numbers[-1])
+    )
+    middle = 0.5 * (_LEFT + _WIDE)
+    title = f'<text x="{middle}" y="{_HIGH - 14}" text-anchor="middle">frame &#8594; {title}</text>'
+    inner = "".join([*bars, *ticks, *lines, ends, title])
+    return Markup(f'<svg viewBox="0 0 {_WIDE} {_HIGH}" font-size="11" role="img">{inner}</svg>')

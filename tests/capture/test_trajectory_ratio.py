@@ -1,0 +1,46 @@
+"""The readout ratio of a rig that shakes. Truth: points projected at their rows' times (``shaken_rig``)."""
+
+import numpy as np
+from shaken_rig import RATIO, RIG, SHAKES, matches, sines
+
+from rsbench.capture.estimate import Capture
+from rsbench.capture.trajectory_ratio import ratio_of_sequence
+from rsbench.capture.trajectory_shutter import capture_of_sequence
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.shutter import Scanning
+
+NOTHING = Capture(
+    candidates=(),
+    models={},
+    peaks={},
+    reason="nothing",
+    named=False,
+    windows=0,
+    matches=0,
+    used=0,
+    noise_px=float("nan"),
+    moved_px=20.0,
+)
+
+
+def test_a_sequence_shows_the_ratio_that_its_windows_do_not() -> None:
+    """Sines, which no spline of ours is."""
+    rng = np.random.default_rng(102)
+    windows, _ = matches(sines(rng, *SHAKES["strong"]), 5, rng, count=80)
+    found = ratio_of_sequence(windows, RIG, [Scanning(), Scanning(scan="bottom")])
+    assert found is not None and found.scanning == Scanning() and found.probability > 0.99
+    assert abs(found.ratio - RATIO) < 3.0 * found.sigma
+    assert found.sigma < 0.03  # frames that allow no more would be no use
+
+
+def test_few_frames_say_that_they_are_few() -> None:
+    rng = np.random.default_rng(103)
+    windows, _ = matches(sines(rng, *SHAKES["walk"]), 4, rng, count=60, noise=1.0)
+    capture = capture_of_sequence(NOTHING, windows, RIG, Scanning())
+    best = capture.likeliest
+    assert best is not None and abs(best.ratio - RATIO) < 3.0 * best.sigma
+    assert not capture.told and "4 frames of it do not determine" in capture.reason
+
+
+def test_nothing_is_told_where_nothing_is_seen() -> None:
+    assert capture_of_sequence(NOTHING, [Correspondences()] * 4, RIG) is NOTHING
