@@ -141,7 +141,7 @@ class _Look:
 
     @property
     def is_right(self) -> bool:
-        """Whether there is nothing to look for: the ratio is known, and matches show no error of the calibration."""
+        """Whether there is nothing to look for: the ratio is known, and the calibration shows no errors."""
         return self._ratio is not None and self._known is not None and not any(self._known.calibration_sigma)
 
     def judge(self, number: int) -> None:
