@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.api.correcting import correct as correct
-from rsbench.api.trajectory import estimate_trajectory as estimate_trajectory
+from rsbench.api.estimating import estimate_trajectory as estimate_trajectory
 from rsbench.components import arguments
 from rsbench.core import given
 from rsbench.core.correspondences import Correspondences

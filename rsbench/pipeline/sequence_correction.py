@@ -132,6 +132,7 @@ class _Look:
         self._scanning, self._calibration = scanning, calibration
         self._examined, self.used, self._first = list[Examined](), list[Correspondences](), list[Correspondences]()
         self._known: Known | None = None
+        self._waiting = list[Correspondences]()
         self.shaken = False
 
     @property
@@ -148,13 +149,22 @@ class _Look:
         """Whether the rig shakes, once there are enough windows before ``number``: no motion model helps then."""
         if number + 1 == _FEWEST_FRAMES and self._examined and self._ratio is None:
             self.shaken = shakes(conclude(self._examined), self._first, self._rig, self._options.seed)
+            if not self.shaken:
+                self._examine_waiting()
 
     def add(self, number: int, matches: Correspondences, chosen: bool) -> None:
         """A window; ``chosen``: to be judged under the motion models."""
-        options, models = self._options, models_asked(self._options.motion_model)
         if number < self.successive:
             self._first.append(matches)
-        if chosen:
+        if not chosen:
+            return
+        self._waiting.append(matches)
+        if not self._examined or number + 1 >= _FEWEST_FRAMES:  # those between wait for ``judge``: they take long
+            self._examine_waiting()
+
+    def _examine_waiting(self) -> None:
+        options, models = self._options, models_asked(self._options.motion_model)
+        for matches in self._waiting:
             asked = (self._ratio, self._scanning, self._calibration)
             known = self._known = self._known or known_of(matches, self._rig, *asked, models)
             if self.is_right:
@@ -162,9 +172,12 @@ class _Look:
             self._examined.append(examine(matches, self._rig, known, options.robust, options.seed))
             self.used.append(matches)
             self._known = _narrowed(known, conclude(self._examined))
+        self._waiting.clear()
 
     def concluded(self) -> Capture:
         """What all say: under the motion models, or, of a rig that shakes, along one trajectory."""
+        if not self.shaken:
+            self._examine_waiting()
         if self._known is None:
             raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
         capture = conclude(self._examined)

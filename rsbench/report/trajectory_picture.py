@@ -84,6 +84,6 @@ def _drawing(numbers: FloatArray, values: FloatArray, bridged: Sequence[int], ti
         for each in (numbers[0], numbers[-1])
     )
     middle = 0.5 * (_LEFT + _WIDE)
-    title = f'<text x="{middle}" y="{_HIGH - 14}" text-anchor="middle">frame &#8594; {title}</text>'
+    title = f'<text x="{middle}" y="{_HIGH - 14}" text-anchor="middle">{title}, by frame</text>'
     inner = "".join([*bars, *ticks, *lines, ends, title])
     return Markup(f'<svg viewBox="0 0 {_WIDE} {_HIGH}" font-size="11" role="img">{inner}</svg>')
