@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from rsbench.capture.calibration_errors import NO_ERRORS, recalibrated
+from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.trajectory_stream import stream_trajectory
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
@@ -183,12 +184,16 @@ def score(given: argparse.Namespace) -> list[str]:
             f"{given.folder}: {len(files[0])} left and {len(files[1])} right images, {len(poses)} poses"
         )
     ratio, lines = given.ratio, []
-    capture, shutter = estimate_sequence_capture(sources[0], sources[1], rig, options, ratio)
-    best, calibration = None, NO_ERRORS
-    if capture is not None:
-        best, calibration = capture.likeliest, capture.calibration
-    if best is not None:
+    capture, calibration = None, NO_ERRORS
+    try:
+        capture, shutter = estimate_sequence_capture(sources[0], sources[1], rig, options, ratio)
         ratio = shutter.readout_ratio
+    except RefusedFramesError:
+        if ratio is None:
+            raise  # else every window says so
+    best = None if capture is None else capture.likeliest
+    if capture is not None and best is not None:
+        calibration = capture.calibration
         lines.append(f"readout ratio {best.ratio:.3f} +- {best.sigma:.3f}, {best.scans}")
         lines.append(f"disparity offset {capture.offset:+.2f} +- {capture.offset_sigma:.2f} px")
     if given.trajectory:

@@ -79,6 +79,19 @@ def of_offset(offset: float) -> tuple[float, ...]:
     return (offset, *NO_ERRORS[1:])
 
 
+def in_words(errors: Sequence[float], rig: StereoRig) -> str:
+    """What errors (13,) do to the images of a rig; empty where there are none."""
+    if not np.any(errors):
+        return ""
+    camera, values = rig.camera, np.asarray(errors)
+    corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height], [0, 0]])
+    corners[-1] = round(camera.cx), round(camera.cy)
+    x, y = ((corners - (camera.cx, camera.cy)) / (camera.fx, camera.fy)).T
+    rows = float(np.max(np.abs(row_terms(x, y) @ values[ROWS])))
+    lens = f"; k1 {values[LENS][0]:+.3f}" if np.any(values[LENS]) else ""
+    return f"disparities {values[OFFSET]:+.2f} px in the middle; rows by up to {rows:.1f} px{lens}"
+
+
 def recalibrated(matches: Correspondences, rig: StereoRig, errors: Sequence[float]) -> Correspondences:
     """The matches, px, with the errors (13,) of their calibration taken from them; of cameras without a lens."""
     if not np.any(errors):

@@ -47,7 +47,7 @@ class RowPattern:
     """The row differences of left-right matches, ``y_left - y_right``, as a smooth function of the image."""
 
     systematic_px: float
-    """Root mean square of its part without distortion, less what noise would give."""
+    """Root mean square of what 1, x, y and x y fit of it, less what noise would give."""
     distortion: float
     """Coefficient k of a lens that maps radius r to r (1 + k r^2), in focal lengths."""
     distortion_sigma: float
@@ -75,7 +75,8 @@ def row_pattern(stereo: FloatArray, rig: StereoRig) -> RowPattern | None:
         left = np.abs(difference - columns @ fit)
         noise = max(1.4826 * float(np.median(left[keep])), _LEAST_PX)
         keep = near & (left < _SIGMAS * noise)
-    smooth = columns[keep, :4] @ fit[:4]
+    # Without distortion, which at one disparity is the same as x y, and would be balanced by it.
+    smooth = columns[keep, :4] @ np.linalg.lstsq(columns[keep, :4], difference[keep], rcond=None)[0]
     # By leaving out one match after the other: a wrong one of large disparity may make up the coefficient alone.
     hat = np.linalg.pinv(columns[keep])
     leverage = np.einsum("ij,ji->i", columns[keep], hat)

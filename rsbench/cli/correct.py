@@ -161,6 +161,7 @@ def _correct_four(
 ) -> None:
     from dataclasses import replace
 
+    from rsbench.capture.calibration_errors import NO_ERRORS
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.corrected_frames import fresh_folder, motion_record, rig_record, write_frame, write_record
     from rsbench.dataset.corrected_video import refuse_video
@@ -190,15 +191,15 @@ def _correct_four(
         frames = {view: finish(fused) for view, fused in result.frames.items()}
         for (side, frame), fused in frames.items():
             write_frame(folder, f"{side}_{frame}", fused)
-        offset = (card.disparity_offset or 0.0) if result.found is None else result.found.disparity_offset
-        record = rig_record(rig, result.shutter, result.capture, options, offset)
+        calibration = (card.calibration or NO_ERRORS) if result.found is None else result.found.calibration
+        record = rig_record(rig, result.shutter, result.capture, options, calibration)
         record["motion"] = None if result.found is None else motion_record(result.found)
         record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in frames.items()}
         record["seconds"] = result.seconds
         write_record(folder, record)
         cards = [card_of(f"{s} {f}", images[s, f], fused) for (s, f), fused in frames.items()]
         _page(folder, out, result.shutter, result.capture, record["motion"], cards)
-    _say(out, result.shutter, result.capture, record["motion"])
+    _say(out, f"readout ratio {_readout(result.shutter, result.capture)}", record)
 
 
 def _page(
@@ -240,15 +241,20 @@ def _readout(shutter: RollingShutter, capture: Capture | None) -> str:
         text += f"; matches move by {capture.moved_px:.1f} px, so that it hardly matters"
     if shutter.right_delay:
         text += f"; right camera late by {best.delay:+.3f} +- {best.delay_sigma:.3f} frame periods"
-    if capture.offset_sigma > 0.0:
-        text += f"; disparity offset {capture.offset:+.2f} +- {capture.offset_sigma:.2f} px"
-        if capture.windows == 1:
-            text += "; a rig like this errs by twice the deviations of one window"
+    if capture.offset_sigma > 0.0 and capture.windows == 1:
+        text += "; a rig whose calibration errs may err by more than one window says"
     return text
 
 
-def _say(out: Path, shutter: RollingShutter, capture: Capture | None, motion: dict[str, Any] | None) -> None:
-    typer.echo(f"readout ratio {_readout(shutter, capture)}")
+def _say_calibration(record: dict[str, Any]) -> None:
+    if record["calibration_note"]:
+        typer.echo(f"errors of the calibration, taken from the matches: {record['calibration_note']}")
+
+
+def _say(out: Path, first: str, record: dict[str, Any]) -> None:
+    motion = record["motion"]
+    typer.echo(first)
+    _say_calibration(record)
     if motion is not None:
         typer.echo(f"motion {motion['rotation_deg']:.4f} deg, {motion['translation']:.4f} m per frame period")
         if motion["model_choice"]:
@@ -261,7 +267,7 @@ def _say(out: Path, shutter: RollingShutter, capture: Capture | None, motion: di
 def _correct_sequence(given: Given, target: str, options: CorrectionOptions, finish: Finish) -> None:
     from dataclasses import replace
 
-    from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET
+    from rsbench.capture.calibration_errors import NO_ERRORS
     from rsbench.cli.console import progress_bar
     from rsbench.core.shutter import Scanning
     from rsbench.dataset.corrected_frames import fresh_folder, rig_record
@@ -284,7 +290,7 @@ def _correct_sequence(given: Given, target: str, options: CorrectionOptions, fin
             ratio, scanning = shutter.readout_ratio, shutter.scanning
             calibration = NO_ERRORS if capture is None or not shutter.rows_together else capture.calibration
         shutter = (scanning or Scanning()).shutter_of(rig.camera.width, rig.camera.height, ratio)
-        record = rig_record(rig, shutter, capture, options, (calibration or NO_ERRORS)[OFFSET])
+        record = rig_record(rig, shutter, capture, options, calibration or NO_ERRORS)
         with progress_bar("correcting", max(left.count, 1)) as advance:
             moments = correct_sequence(left, right, rig, ratio, options, calibration or NO_ERRORS, scanning)
             rows = shutter if given.row_poses else None
@@ -294,15 +300,17 @@ def _correct_sequence(given: Given, target: str, options: CorrectionOptions, fin
         else:
             _write_rest(folder, record, poses)
             _page(folder, out, shutter, capture, None, cards, draw_trajectory(poses, record["frames"]))
-    _say_sequence(out, f"readout ratio {_readout(shutter, capture)}", record["frames"])
+    _say_sequence(out, f"readout ratio {_readout(shutter, capture)}", record)
 
 
-def _say_sequence(out: Path, first: str, frames: list[dict[str, Any]]) -> None:
+def _say_sequence(out: Path, first: str, record: dict[str, Any]) -> None:
     """Exit 1 where a time is not corrected."""
     from rsbench.dataset.corrected_video import is_video
 
+    frames = record["frames"]
     failed, skipped = _told(frames, "reason"), _told(frames, "skipped")
     typer.echo(first)
+    _say_calibration(record)
     typer.echo(f"{sum('reason' not in frame for frame in frames)} of {len(frames)} times corrected")
     typer.echo(f"video: {out.resolve()}" if is_video(out) else f"report: {(out / 'report.html').resolve()}")
     if skipped:

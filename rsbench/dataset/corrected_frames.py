@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET, TERMS, in_words
 from rsbench.capture.estimate import Capture
 from rsbench.capture.settle import record_of
 from rsbench.core import so3
@@ -201,7 +202,7 @@ def rig_record(
     shutter_: RollingShutter,
     capture: Capture | None,
     options: CorrectionOptions,
-    disparity_offset: float = 0.0,
+    calibration: tuple[float, ...] = NO_ERRORS,
 ) -> dict[str, Any]:
     """What the correction assumed or found, and which components it was made with, ready for JSON."""
     camera, best = rig.camera, None if capture is None else capture.likeliest
@@ -215,8 +216,10 @@ def rig_record(
         "readout_ratio": shutter_.readout_ratio,
         "readout_ratio_sigma": None if best is None else best.sigma,
         "readout_ratio_estimated": capture is not None,
-        "disparity_offset": disparity_offset,
+        "disparity_offset": calibration[OFFSET],
         "disparity_offset_sigma": None if capture is None else capture.offset_sigma,
+        "calibration_errors": dict(zip(TERMS, calibration, strict=True)) if any(calibration) else None,
+        "calibration_note": in_words(calibration, rig),
         "capture": None if capture is None else record_of(capture),
         "target_row": options.target_row,
         "components": components,
