@@ -155,6 +155,20 @@ def test_every_public_motion_can_be_simulated_and_solved_with_its_own_name_in_th
         assert 1e-6 < errors["e_R_deg"] < 1.0, motion
 
 
+def test_the_motion_model_is_chosen_where_that_is_asked_for() -> None:
+    """On a twist the linear model's error is of interpolation, the chosen one's of noise alone."""
+    motion = rsbench.TwistMotion(np.radians([1.0, 2.0, -1.0]), [0.1, 0.05, 0.3])
+    matches = rsbench.simulate(RIG, SHUTTER, motion, pairs=0, tracks=150, noise_px=0.1).correspondences
+    found = rsbench.estimate_motion(matches, RIG, SHUTTER, motion_model="auto")
+    assert found.motion_model == "twist"
+    linear = rsbench.estimate_motion(matches, RIG, SHUTTER)
+    assert linear.motion_model == "" and linear.estimate.covariance is not None
+    e_T = [rsbench.pose_errors(each, motion, RIG)["e_T_deg"] for each in (found, linear)]
+    assert e_T[0] < 0.3 * e_T[1]
+    with pytest.raises(rsbench.RsbenchError, match="knows only linear motion"):
+        rsbench.estimate_motion(matches, RIG, SHUTTER, "rs-stereo-linear", motion_model="auto")
+
+
 def test_a_solver_is_taken_by_name_by_card_and_as_it_is(tmp_path: Path) -> None:
     data = rsbench.simulate(RIG, SHUTTER, MOTION, pairs=40, tracks=0, noise_px=0.1)
     assert "gs-8pt" in rsbench.list_solvers()

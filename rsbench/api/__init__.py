@@ -106,6 +106,7 @@ def estimate_motion(
     shutter: RollingShutter,
     solver: str | Path | Solver = "rs-stereo-refined",
     *,
+    motion_model: str | None = None,
     threshold_px: float | None = None,
     seed: int = 0,
 ) -> RobustEstimate:
@@ -115,6 +116,7 @@ def estimate_motion(
         correspondences: matches, px.
         rig, shutter: the cameras and how they read their rows.
         solver: a name of ``list_solvers``, the path of a card, or a solver.
+        motion_model: ``auto``, the one that the matches prefer, or a name; None: the one that the solver assumes.
         threshold_px: largest error of an inlier; None follows the noise that the inliers show.
         seed: of the samples that the robust loop draws.
 
@@ -124,9 +126,10 @@ def estimate_motion(
         count each match once.
 
     Raises:
-        RsbenchError: no such solver.
+        RsbenchError: no such solver or motion model, or the solver can take no other than its own.
         ValueError: an argument of another type or out of its range.
     """
+    from rsbench.api.estimating import under_model
     from rsbench.solvers.engine.registry import entry_of
     from rsbench.solvers.engine.robust_motion import RobustOptions
     from rsbench.solvers.engine.robust_motion import estimate_motion as estimate_robustly
@@ -138,7 +141,10 @@ def estimate_motion(
     if threshold_px is not None:
         options = RobustOptions(threshold_px=threshold_px, adapt_threshold=False)
     entry, rng = entry_of(solver), np.random.default_rng(seed)
-    return estimate_robustly(correspondences, rig, shutter, entry.solver, options, rng, entry.options.robust)
+    found = estimate_robustly(correspondences, rig, shutter, entry.solver, options, rng, entry.options.robust)
+    if motion_model is None:
+        return found
+    return under_model(motion_model, found, entry, correspondences, rig, shutter, options, seed)
 
 
 def pose_errors(

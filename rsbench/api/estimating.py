@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components import arguments
@@ -15,6 +17,8 @@ from rsbench.core.shutter import RollingShutter
 
 if TYPE_CHECKING:
     from rsbench.capture.trajectory_estimate import Trajectory
+    from rsbench.solvers.engine.registry import SolverEntry
+    from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions
 
 
 def estimate_trajectory(
@@ -57,3 +61,33 @@ def estimate_trajectory(
     if len(windows) < len(sequence):
         windows = matches_of(sequence, rig, features)
     return trajectory_of(windows, rig, shutter, seed)
+
+
+def under_model(
+    asked: str,
+    found: RobustEstimate,
+    entry: SolverEntry,
+    matches: Correspondences,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    options: RobustOptions,
+    seed: int,
+) -> RobustEstimate:
+    """An estimate again, under the motion model that is asked for or that the matches prefer (``auto``).
+
+    Raises:
+        RsbenchError: no such model, or the solver can take no other than its own.
+    """
+    from rsbench.pipeline.frame_motion import check_model, chosen_model, entry_of, motion_of, widened
+    from rsbench.solvers.engine.robust_motion import estimate_motion
+
+    check_model(asked, entry)
+    if not found.estimate.success:
+        return found
+    start = motion_of(found.estimate, entry, rig)
+    choice = chosen_model(asked, start, matches, rig, shutter, options, seed)
+    if choice is None:
+        return found
+    solver, rng = entry_of(entry, choice).solver, np.random.default_rng(seed)
+    again = estimate_motion(matches, rig, shutter, solver, options, rng, entry.options.robust)
+    return replace(widened(again, choice.spread), motion_model=choice.used)

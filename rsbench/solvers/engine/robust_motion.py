@@ -77,6 +77,8 @@ class RobustEstimate:
     """The threshold that the inliers have passed."""
     reference_point: Literal["body", "left"] = "body"
     """The point of the rig whose translation the estimate gives: that of its solver's spec."""
+    motion_model: str = ""
+    """The one that was chosen; empty: the one that the solver assumes."""
 
     @property
     def inlier_count(self) -> int:
