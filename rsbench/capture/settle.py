@@ -39,6 +39,8 @@ _LEAST_SIZE = 1e-3
 _NEARLY, _SMALL = 0.06, 0.15
 """Readout ratio of nearly a global shutter, within two deviations; and the root mean square, at most, of
 the ratios that the matches then allow."""
+_SAME_DEG, _SAME_PERCENT = 1e-3, 1e-3
+"""Differences of motions that say nothing, as between all models under a global shutter."""
 _CLEARLY, LEAST_BACKWARDS = 0.999, 0.25
 """Probability of the opposite scan at which frames are refused, and the ratio from which their order shows."""
 _AXES = ("tilt", "pan", "roll", "sideways motion", "vertical motion", "forward motion")
@@ -236,6 +238,8 @@ class ModelChoice:
         head = self.used if self.decided else f"cannot tell, so {self.used} is used"
         if not self.rival:
             return head
+        if self.d_angle_deg < _SAME_DEG and abs(self.d_length_percent) < _SAME_PERCENT:
+            return f"{self.used}; the others give the same motion"
         change = f"with {self.rival} d turns by {self.d_angle_deg:.2g} deg and its length changes by "
         return f"{head} ({shares}); {change}{self.d_length_percent:+.2g} %"
 

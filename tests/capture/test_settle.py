@@ -165,6 +165,13 @@ def test_a_disparity_offset_is_found_with_the_ratio() -> None:
 # Motion models
 
 
+def test_a_global_shutter_leaves_nothing_to_choose() -> None:
+    data = simulated(9, 0.0, 1.0, 600, noise=0.1)
+    known = known_of(data.correspondences, RIG, 0.0, TOP, NO_ERRORS)
+    choice = choose_model(conclude([examine(data.correspondences, RIG, known)]))
+    assert str(choice) == "linear; the others give the same motion"
+
+
 def matches_of(model: str, seed: int = 0) -> Correspondences:
     truth = make_motion(model, W, D, {"acceleration": 0.1} if model == "accelerated" else {})
     shutter = RollingShutter(height=900, readout_ratio=0.8)
