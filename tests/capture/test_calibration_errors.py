@@ -12,6 +12,7 @@ from rsbench.capture.calibration_errors import (
     OFFSET,
     ROWS,
     TERMS,
+    in_words,
     ray_shifts,
     recalibrated,
 )
@@ -86,6 +87,15 @@ def test_errors_as_large_as_real_ones_are_found_with_the_shutter(ratio: float, s
         assert off[k] < 4.0 * best.calibration_sigma[k] + 0.02, TERMS[k]  # 0.02 px: the second order
     blind = conclude([examine(matches, RIG, known_of(matches, RIG, None, Scanning(), NO_ERRORS))])
     assert blind.noise_px > 0.2
+
+
+def test_errors_are_told_by_what_they_do_to_the_images() -> None:
+    """In the corner of largest error: x = -600 / 700, y = -200 / 700."""
+    x, y = -600.0 / 700.0, -200.0 / 700.0
+    rows = abs(-0.2 + 0.45 * x - 0.5 * y - 7.2 * x * y)
+    errors = tuple(REAL.get(name, 0.0) for name in TERMS)
+    assert in_words(errors, RIG) == f"disparities -1.00 px in the middle; rows by up to {rows:.1f} px; k1 +0.015"
+    assert in_words(NO_ERRORS, RIG) == ""
 
 
 def test_a_good_calibration_is_left_alone() -> None:
