@@ -236,7 +236,8 @@ def _readout(shutter: RollingShutter, capture: Capture | None) -> str:
     best = None if capture is None else capture.likeliest
     if capture is None or best is None:
         return f"{shutter.readout_ratio:.3f} (given)"
-    text = f"{best.ratio:.3f} +- {best.sigma:.3f}, {best.scans} (found, {100.0 * best.probability:.0f} % sure)"
+    sure = f"{100.0 * best.probability:.0f} % sure" + "".join(f"; else {c.scans}" for c in capture.candidates[1:2])
+    text = f"{best.ratio:.3f} +- {best.sigma:.3f}, {best.scans} (found, {sure})"
     if not capture.told and capture.moved_px < 1.0:
         text += f"; matches move by {capture.moved_px:.1f} px, so that it hardly matters"
     if shutter.right_delay:
