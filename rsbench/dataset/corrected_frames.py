@@ -244,7 +244,7 @@ def append_line_poses(path: Path, taus: FloatArray, poses: Pose) -> None:
     """
     head = "" if path.exists() else _TUM
     lines = [_line(tau, Pose(R, t)) for tau, R, t in zip(taus, poses.R, poses.t, strict=True)]
-    with path.open("a", encoding="utf-8") as file:
+    with path.open("a", encoding="utf-8", newline="\n") as file:
         file.write("".join([head, *lines]))
 
 

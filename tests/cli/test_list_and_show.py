@@ -179,11 +179,19 @@ def commands() -> list[str]:
 
 
 def test_help_is_quick(tmp_path: Path) -> None:
-    """Processor time, which a busy machine does not lengthen: 0.2 s measured; imports of numbers cost 0.5 s."""
-    start = os.times()
-    assert rsbench("--help", path=tmp_path).returncode == 0
-    end = os.times()
-    assert end.children_user + end.children_system - start.children_user - start.children_system < 0.6
+    """Processor time, the least of three: 0.2 s measured, on a busy machine twice that; imports of numbers cost
+    0.5 s more."""
+
+    def spent() -> float:
+        now = os.times()
+        return now.children_user + now.children_system
+
+    seconds = list[float]()
+    for _ in range(3):
+        start = spent()
+        assert rsbench("--help", path=tmp_path).returncode == 0
+        seconds.append(spent() - start)
+    assert min(seconds) < 0.6
 
 
 @pytest.mark.parametrize("command", commands())
