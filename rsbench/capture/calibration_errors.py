@@ -84,8 +84,7 @@ def in_words(errors: Sequence[float], rig: StereoRig) -> str:
     if not np.any(errors):
         return ""
     camera, values = rig.camera, np.asarray(errors)
-    corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height], [0, 0]])
-    corners[-1] = round(camera.cx), round(camera.cy)
+    corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]])
     x, y = ((corners - (camera.cx, camera.cy)) / (camera.fx, camera.fy)).T
     rows = float(np.max(np.abs(row_terms(x, y) @ values[ROWS])))
     lens = f"; k1 {values[LENS][0]:+.3f}" if np.any(values[LENS]) else ""

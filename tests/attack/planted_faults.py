@@ -348,18 +348,12 @@ def _dataset_faults() -> Iterator[Fault]:
     yield dataset("an entry of another type", put("files", file, 3), "size and sha256", fit=False)
     licence = manifest_of("croissant.json", put("license", "of another"))
     yield Fault("croissant.json of another licence", licence, ("does not describe dataset.json",), rehash=False)
-    yield Fault(
-        "another size",
-        manifest_of("dataset.json", put("files", file, "size", 1)),
-        ("left_0.png", "it says 1"),
-        rehash=False,
+    size, hashed = (
+        manifest_of("dataset.json", put("files", file, key, value))
+        for key, value in (("size", 1), ("sha256", "0"))
     )
-    yield Fault(
-        "another hash",
-        manifest_of("dataset.json", put("files", file, "sha256", "0")),
-        ("left_0.png", "checksum"),
-        rehash=False,
-    )
+    yield Fault("another size", size, ("left_0.png", "it says 1"), rehash=False)
+    yield Fault("another hash", hashed, ("left_0.png", "checksum"), rehash=False)
 
 
 def _own_list_faults() -> Iterator[Fault]:

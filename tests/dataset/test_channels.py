@@ -11,17 +11,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import trimesh
 from attack.planting import rehash
 from channel_faults import FAULTS
 from numpy.typing import NDArray
 from traced_truth import first_hit, look, rays, row_seeing, truth
+from yard_dataset import rounds, write_yard, yard_card
 
 from rsbench.components.cards import parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES, SIDES, VIEWS
 from rsbench.dataset.affine import jacobians_of
-from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
+from rsbench.dataset.card import DatasetCard
 from rsbench.dataset.channels import (
     CHANNELS,
     PAIR_CHANNELS,
@@ -37,7 +37,6 @@ from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
 from rsbench.dataset.views import ImageView
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import find_matches_of_rig
-from rsbench.renderers.electrons import Sensor
 from rsbench.renderers.image import to_srgb8
 from rsbench.scenes.load import load_scene
 from rsbench.storage.files import read_grey_png, write_png
@@ -47,62 +46,6 @@ from rsbench.verification.rerender import Rerenderer
 from rsbench.vision.feature_matcher import load_features
 
 Array = NDArray[np.float64]
-SCENE = """
-name = "yard"
-builder = "mesh"
-[parameters]
-file = "yard.glb"
-up_axis = "z"
-[viewpoints.default]
-eye = [0.0, -4.0, 1.2]
-target = [0.2, 3.0, 0.9]
-"""
-
-
-def write_yard(folder: Path) -> Path:
-    """Ground, a wall, a post and two boxes below an open sky: every class of pixel occurs."""
-    parts = []
-    for size, place in (
-        ((14.0, 12.0, 0.1), (0.0, 3.0, -0.05)),
-        ((5.0, 0.3, 3.0), (2.0, 7.0, 1.5)),
-        ((0.7, 0.7, 1.1), (-0.8, 0.5, 0.55)),
-        ((1.2, 0.5, 0.8), (1.3, 2.0, 0.4)),
-        ((0.15, 0.15, 2.6), (0.3, -0.8, 1.3)),
-    ):
-        box = trimesh.creation.box(size)
-        box.apply_transform(trimesh.transformations.rotation_matrix(0.3, (0, 0, 1)))
-        box.apply_translation(place)
-        parts.append(box)
-    trimesh.Scene({f"part{number}": part for number, part in enumerate(parts)}).export(folder / "yard.glb")
-    (folder / "yard.toml").write_text(SCENE)
-    return folder / "yard.toml"
-
-
-def yard_card(folder: Path, **fields: object) -> DatasetCard:
-    return DatasetCard(
-        name="yard",
-        camera=CameraCard(width=64, height=48, focal=60.0),
-        baseline=0.3,
-        readout_ratio=0.9,
-        motion=MotionCard(
-            rotation_deg=4.0,
-            rotation_axis=(0.5, 1.0, -0.6),
-            translation=0.3,
-            translation_axis=(-0.7, 0.3, -0.6),
-        ),
-        renderer="preview",
-        sensor=Sensor(exposure_s=0.004, full_well=6000, photon_noise=True, read_noise=2.5),
-        sequence=(SequenceCard(name="yard", scene=str(folder / "yard.toml")),),
-        **fields,  # pyrefly: ignore[bad-argument-type]
-    )
-
-
-ALONE = {
-    *("instances of the other camera", "instances exchanged", "an instance that the table lacks"),
-    *("timing of another readout", "timing of frames exchanged"),
-    *(f"affine frames {what}" for what in ("transposed", "stretched", "on another plane")),
-}
-"""Faults of files that other checks read: where those are wrong too, these are not looked for."""
 
 
 @pytest.fixture(scope="module")
@@ -362,24 +305,6 @@ def test_values_that_are_no_class_are_refused(sequence: Sequence, monkeypatch: p
 def test_sound_channels_pass(yard: Path) -> None:
     (report,) = verify_dataset(yard, rerender="all", scenes=[yard.parent / "yard.toml"])
     assert report.faults == () and "the same bits" in report.notes[0]
-
-
-def rounds() -> list[list[str]]:
-    """Faults of different files lie in one dataset: checking it takes longer than planting them.
-
-    Those that rays alone find have one of their own.
-    """
-    found: list[dict[str, str]] = []
-    for name, (_, words) in FAULTS.items():
-        alone = "made again" in words or name in ALONE
-        fits = [each for each in found if words[0] not in each and "" not in each]
-        if alone or not fits:
-            found.append({})
-            fits = found[-1:]
-        fits[0][words[0]] = name
-        if alone:
-            fits[0][""] = name
-    return [list(dict.fromkeys(each.values())) for each in found]
 
 
 @pytest.mark.parametrize("names", rounds(), ids=lambda names: names[0])

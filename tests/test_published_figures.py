@@ -1,0 +1,99 @@
+"""Figures on the results pages and in README are those of the committed results."""
+
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+
+from rsbench.benchmark.studies.claims import CLAIMS
+from rsbench.benchmark.studies.correction_methods import METHODS
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+RESULTS = {path.name: path.read_text("utf-8") for path in sorted((ROOT / "docs").glob("results*.md"))}
+
+
+def _table(name: str) -> list[dict[str, str]]:
+    return list(csv.DictReader((ROOT / "results" / name).read_text("utf-8").splitlines()))
+
+
+def test_readme_is_short_and_shows_rows_of_the_results_pages() -> None:
+    readme = (ROOT / "README.md").read_text("utf-8")
+    assert readme.count("\n") <= 150
+    pages = {line for text in RESULTS.values() for line in text.splitlines()}
+    rows = [line for line in readme.splitlines() if line.startswith("|")]
+    assert len(rows) > 12 and set(rows) <= pages
+    assert (DOCS / "before-after.gif").stat().st_size < 1.5e6
+
+
+def test_figures_shown_are_those_of_the_committed_results() -> None:
+    published = {
+        line for path in (ROOT / "results").rglob("*.md") for line in path.read_text("utf-8").splitlines()
+    }
+    shown = "|".join(
+        ["castle", "old-town", "room", "[gr]s-[a-z0-9-]+", *(re.escape(claim.key) for claim in CLAIMS)]
+    )
+    rows = re.findall(rf"^\| (?:{shown}) \|.*$", "\n".join(RESULTS.values()), re.MULTILINE)
+    assert {claim.key for claim in CLAIMS} <= {row.split(" | ")[0].removeprefix("| ") for row in rows}
+    assert len(rows) > 60
+    assert [row for row in rows if row not in published] == []
+
+
+def test_real_cameras_shown_are_those_of_the_study() -> None:
+    section = RESULTS["results-correction.md"].partition("## Cameras with lens")[2].partition("\n## ")[0]
+    published = (ROOT / "results" / "real" / "README.md").read_text("utf-8")
+    rows = [
+        line.removesuffix("|")
+        for line in section.splitlines()
+        if re.match(r"\| [a-z-]+, (mild|aggressive) ", line)
+    ]
+    assert len(rows) == 8 and all(row in published for row in rows)
+    assert max(float(row["sigmas"]) for row in _table("real/summary.csv")) < 4.0, "64 of 64"
+
+
+def test_the_cost_of_a_wrong_motion_model_is_that_of_the_sweep() -> None:
+    sweep = {
+        (row["variant"], row["value"], row["solver"]): float(row["e_T_median"])
+        for row in _table("sweeps/wrong-motion.csv")
+    }
+    section = RESULTS["results-solvers.md"].partition("## A wrong motion model")[2].partition("\n## ")[0]
+    header, _, *rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")]
+    solvers = [cell.strip("`") for cell in header[2:]]
+    shown = {(data, value, s): float(e) for data, value, *es in rows for s, e in zip(solvers, es, strict=True)}
+    assert shown.keys() == sweep.keys()
+    assert all(shown[key] == float(f"{sweep[key]:.2g}") for key in sweep)
+
+
+def test_the_cost_of_estimated_motion_is_that_of_the_study() -> None:
+    """At most 0.03 dB in any view on covered pixels, 0.16 dB on all."""
+    views = {
+        (v["stratum"], v["sequence"], v["side"], v["frame"], v["method"]): v
+        for v in _table("correction/views.csv")
+    }
+    for column, figure in (("psnr_covered", "0.03 dB"), ("psnr_all", "0.16 dB")):
+        worst = max(
+            float(view[column]) - float(views[*key[:4], "ours"][column])
+            for key, view in views.items()
+            if key[4] == "true-motion"
+        )
+        assert f"{worst:.2f} dB" == figure
+        assert f"at most {figure}" in " ".join(RESULTS["results-correction.md"].split())
+
+
+def test_corrections_shown_are_those_of_the_study() -> None:
+    """Covered / all PSNR, and the interval of what ours gains on the covered pixels, of each stratum."""
+    rows = {(row["stratum"], row["method"]): row for row in _table("correction/summary.csv")}
+    keys = {method.title: method.key for method in METHODS}
+    section = RESULTS["results-correction.md"].partition("## Correction against")[2].partition("\n## ")[0]
+    shown = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")][2:]
+    assert len(shown) > 5
+    for title, *cells in shown:
+        key = keys[title.removesuffix(" (oracle)").strip("*")]
+        for stratum, cell in zip(("mild", "moderate", "aggressive"), cells, strict=True):
+            row = rows[stratum, key]
+            expected = f"{float(row['psnr_covered']):.1f} / {float(row['psnr_all']):.1f}"
+            if key != "ours":
+                low, high = (round(float(row[f"gain_{end}"]), 1) + 0.0 for end in ("low", "high"))  # no -0.0
+                expected += f" [{low:.1f}, {high:.1f}]"
+            assert cell == expected, (title, stratum)
