@@ -1,6 +1,6 @@
 """``rsbench.estimate_trajectory``. Truth: points projected at their rows' times (``shaken_rig``)."""
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -27,5 +27,7 @@ def test_what_is_no_sequence_is_refused() -> None:
     with pytest.raises(ValueError, match=r"sequence\[1\]: must be"):
         mixed: Any = [np.zeros((2, 480, 640), np.uint8), rsbench.Correspondences()]
         rsbench.estimate_trajectory(mixed, RIG, SHUTTER)
+    with pytest.raises(ValueError, match=r"sequence\[0\]: must be"):
+        rsbench.estimate_trajectory(cast("Any", [1, 2]), RIG, SHUTTER)
     with pytest.raises(ValueError, match="needs tracks"):
         rsbench.estimate_trajectory([rsbench.Correspondences()], RIG, SHUTTER)

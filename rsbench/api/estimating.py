@@ -52,15 +52,13 @@ def estimate_trajectory(
     from rsbench.pipeline.array_trajectory import matches_of, trajectory_of
 
     given.check_whole("seed", seed, 0)
+    given.check_type("rig", rig, StereoRig)
     if shutter is not None:
         arguments.check_rows(rig, shutter)
-    windows = list[Correspondences]()
-    for number, each in enumerate(sequence):
-        if len(windows) == number and isinstance(each, Correspondences):
-            windows.append(each)
-    if len(windows) < len(sequence):
-        windows = matches_of(sequence, rig, features)
-    return trajectory_of(windows, rig, shutter, seed)
+    windows = [each for each in sequence if isinstance(each, Correspondences)]
+    if len(windows) == len(sequence):
+        return trajectory_of(windows, rig, shutter, seed)
+    return trajectory_of(matches_of(sequence, rig, features), rig, shutter, seed)
 
 
 def under_model(
