@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence, Sized
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from rsbench.capture.trajectory_estimate import Trajectory, estimate_trajectory
@@ -29,7 +29,7 @@ def matches_of(frames: Sequence[Any], rig: StereoRig, features: str) -> list[Cor
     """
     options = CorrectionOptions(features=load_features(features))
     for number, both in enumerate(frames):
-        if isinstance(both, Correspondences) or not isinstance(both, Sized) or len(both) != 2:
+        if isinstance(both, Correspondences) or not isinstance(both, Collection) or len(both) != 2:
             raise ValueError(f"sequence[{number}]: must be Correspondences, as all others, or two images")
         for side, image in zip(("left", "right"), both, strict=True):
             arguments.check_image(f"sequence[{number}], {side}", image, rig)
