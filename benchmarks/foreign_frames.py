@@ -268,6 +268,9 @@ ROWS: dict[str, Callable[[np.random.Generator], Case]] = {
     "strong": _shaken(1.0, 0.15, 0.45),
     "tremor": _shaken(0.25, 0.15, 0.45),
     "walk": _shaken(1.0, 0.06, 0.18),
+    "long-strong": _shaken(1.0, 0.15, 0.45, frames=60),
+    "long-tremor": _shaken(0.25, 0.15, 0.45, frames=60),
+    "long-walk": _shaken(1.0, 0.06, 0.18, frames=60),
 }
 
 

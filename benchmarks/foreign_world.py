@@ -26,6 +26,10 @@ _LARGEST = 1600
 """Texels along a texture's side."""
 _CLEAR = 1.4
 """Metres that boards and posts keep from the path of the rig."""
+_LONG, _APART = 3.0, 0.4
+"""Metres of a path that boards in front of its start are enough for, and a further board for so many more."""
+_ROOM = np.array([2.0, 0.5, 2.0])
+"""Metres between the path and the right wall, the ground and the front, at least."""
 _PHOTOGRAPHS = ("astronaut", "brick", "camera", "chelsea", "coffee", "coins", "grass", "gravel", "motorcycle_left")
 
 
@@ -88,13 +92,17 @@ def assemble(quads: list[Quad], textures: list[Image]) -> World:
 def random_world(
     rng: np.random.Generator, path: Array, focal: float, photographs: list[Image] | None = None
 ) -> World:
-    """A closed room with boards and posts that keep clear of the rig's path (n, 3)."""
-    quads = _room(rng)
+    """A closed room with boards and posts that keep clear of the rig's path (n, 3); more along a long one."""
+    beyond = max(float(np.linalg.norm(path[-1] - path[0])) - _LONG, 0.0)
+    quads = _room(rng, path if beyond else path[:1])
     walls = len(quads)
     wanted = walls + int(rng.integers(9, 19))
     posts = walls + int(rng.integers(2, 6))
-    while len(quads) < wanted:
+    all_along = wanted + int(beyond / _APART)
+    while len(quads) < all_along:
         quad = _post(rng) if len(quads) < posts else _board(rng)
+        if len(quads) >= wanted:
+            quad = Quad(quad.corner + path[rng.integers(len(path))], quad.across, quad.down)
         gaps = np.linalg.norm(quad.grid()[:, None] - path, axis=-1)
         if np.min(gaps) > _CLEAR:
             quads.append(quad)
@@ -107,12 +115,15 @@ def random_world(
     return assemble(quads, textures)
 
 
-def _room(rng: np.random.Generator) -> list[Quad]:
-    """Front, back, ground, ceiling, left and right."""
+def _room(rng: np.random.Generator, path: Array) -> list[Quad]:
+    """Front, back, ground, ceiling, left and right, around a path (n, 3)."""
     front, back = rng.uniform(8.0, 15.0), -4.0
     ground, ceiling = rng.uniform(1.3, 1.9), -rng.uniform(2.0, 4.0)
     left, right = -rng.uniform(4.0, 7.0), rng.uniform(4.0, 7.0)
-    wide, high, deep = (
+    low, high = path.min(axis=0), path.max(axis=0)
+    left, ceiling, back = (min(a, float(b) - 2.0) for a, b in zip((left, ceiling, back), low, strict=True))
+    right, ground, front = (max(a, float(b)) for a, b in zip((right, ground, front), high + _ROOM, strict=True))
+    wide, tall, deep = (
         np.array([right - left, 0, 0]),
         np.array([0, ground - ceiling, 0]),
         np.array([0, 0, front - back]),
@@ -120,12 +131,12 @@ def _room(rng: np.random.Generator) -> list[Quad]:
     start = np.array([left, ceiling, front])
     near = np.array([left, ceiling, back])
     return [
-        Quad(start, wide, high),
-        Quad(near, wide, high),
-        Quad(start + high, wide, -deep),
+        Quad(start, wide, tall),
+        Quad(near, wide, tall),
+        Quad(start + tall, wide, -deep),
         Quad(near, wide, deep),
-        Quad(near, deep, high),
-        Quad(near + wide, deep, high),
+        Quad(near, deep, tall),
+        Quad(near + wide, deep, tall),
     ]
 
 

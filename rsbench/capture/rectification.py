@@ -98,10 +98,9 @@ def check_rig(left: NDArray[np.generic], right: NDArray[np.generic], rig: Stereo
     Raises:
         RefusedFramesError: the sides are exchanged, the lens is not undistorted, or the rows do not agree.
     """
-    height, width = left.shape[:2]
-    options, camera = MatchOptions(), rig.camera
+    options, camera, reach = MatchOptions(), rig.camera, float(max(left.shape[:2]))
     a, b = (detect(undistorted(level, camera), options) for level in eight_bit([left, right]))
-    anywhere = Gate(dx=(-float(width), float(width)), dy=(-float(height), float(height)))
+    anywhere = Gate(dx=(-reach, reach), dy=(-reach, reach))
     pairs = match(a, b, anywhere, options)
     ends = a.points[pairs[:, 0]], b.points[pairs[:, 1]]
     # Beyond the borders of what the lens shows there is a mirror of it.

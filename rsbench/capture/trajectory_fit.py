@@ -34,6 +34,8 @@ _LEAST_WIDTH = 5
 """Control poses that the prior ties."""
 ANCHORED = 1e4
 """Precision of the pose at time 0, in those of the most certain control pose."""
+_TELLING = 2.0
+"""Accelerations that tracks must determine, at least, to say how strong they are."""
 _STRENGTHS = (1e-10, 1e2)
 """Least and largest, of both kinds: far below and far above what anybody holds a camera with."""
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-6, 1e8
@@ -175,6 +177,12 @@ def squared_errors(curve: Curve, tracks: TimedTracks) -> FloatArray:
     return squares
 
 
+def near(found: Fit, tracks: TimedTracks) -> FloatArray:
+    """(n,) which tracks are right by a fit to others, 1 or 0."""
+    reach = tracks.freedom * (_REACH * found.tails.scale) ** 2
+    return (squared_errors(found.curve, tracks) <= reach).astype(np.float64)
+
+
 def descend(
     curve: Curve, tracks: TimedTracks, tails: Tails, prior: Prior, trust: FloatArray, steps: int
 ) -> tuple[Curve, Equations]:
@@ -255,7 +263,7 @@ def _strengths(here: Equations, lower: FloatArray, prior: Prior) -> tuple[float,
     inverse, old = banded.inverse_band(lower), np.array([prior.rotation, prior.position])
     tied = np.array([banded.inner(inverse, band) for band in here.rough.bands]) / old
     determined = np.maximum(here.rough.count - tied, 1e-3)
-    new = np.clip(here.rough.squares / determined, *_STRENGTHS)
+    new = np.where(determined > _TELLING, np.clip(here.rough.squares / determined, *_STRENGTHS), old)
     used = len(lower) - 6.0 - float(np.sum(tied))
     return used, determined, prior._replace(rotation=float(new[0]), position=float(new[1]))
 

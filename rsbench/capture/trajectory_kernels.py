@@ -71,9 +71,9 @@ class Scratch(NamedTuple):
     block: FloatArray
     """(2, 24) derivatives of one end by four control poses."""
     Q: FloatArray
-    """(m, 3) mixed part of the normal matrix."""
+    """(3, m) mixed part of the normal matrix."""
     H: FloatArray
-    """(m, m) normal matrix of the control poses that the track feels."""
+    """(m, m) upper half of the normal matrix of the control poses that the track feels."""
     g: FloatArray
     """(m,) gradient."""
 
@@ -94,7 +94,7 @@ def _scratch(ends: int, size: int) -> Scratch:
         np.zeros((3, 3)),
         np.zeros((6, 3, 3)),
         np.zeros((2, 24)),
-        np.zeros((size, 3)),
+        np.zeros((3, size)),
         np.zeros((size, size)),
         np.zeros(size),
     )
@@ -289,10 +289,9 @@ def _add_track(
         low, high = min(low, s.views.index[n]), max(high, s.views.index[n])
     size = 6 * (high - low + 4)
     H, Q, g = s.H, s.Q, s.g
-    for i in range(size):
-        g[i] = Q[i, 0] = Q[i, 1] = Q[i, 2] = 0.0
-        for j in range(i + 1):
-            H[i, j] = 0.0
+    g[:size] = 0.0
+    Q[:, :size] = 0.0
+    H[:size, :size] = 0.0
     for n in range(len(track)):
         _fill_block(track[n], n, focal, s)
         first = 6 * (s.views.index[n] - low)
@@ -300,9 +299,10 @@ def _add_track(
             a, b = s.block[0, i], s.block[1, i]
             g[first + i] += a * s.e[n, 0] + b * s.e[n, 1]
             for j in range(3):
-                Q[first + i, j] += a * s.D[n, 0, j] + b * s.D[n, 1, j]
-            for j in range(i + 1):
-                H[first + i, first + j] += a * s.block[0, j] + b * s.block[1, j]
+                Q[j, first + i] += a * s.D[n, 0, j] + b * s.D[n, 1, j]
+            row, c, d = H[first + i, first:], s.block[0], s.block[1]
+            for j in range(i, 24):
+                row[j] += a * c[j] + b * d[j]
     _reduce(s, size, weight, 6 * low, band, gradient)
 
 
@@ -333,11 +333,14 @@ def _reduce(s: Scratch, size: int, weight: float, first: int, band: FloatArray, 
     """Add the weighted equations (size) to the band from unknown ``first`` on, without the point."""
     Q = s.Q
     for i in range(size):
-        q = _forward(s.L, (Q[i, 0], Q[i, 1], Q[i, 2]))
-        Q[i, 0], Q[i, 1], Q[i, 2] = q
+        q = _forward(s.L, (Q[0, i], Q[1, i], Q[2, i]))
+        Q[0, i], Q[1, i], Q[2, i] = q
     best = _forward(s.L, (s.left[0], s.left[1], s.left[2]))
+    x, y, z = Q[0], Q[1], Q[2]
     for j in range(size):
-        gradient[first + j] += weight * (s.g[j] - Q[j, 0] * best[0] - Q[j, 1] * best[1] - Q[j, 2] * best[2])
-        for i in range(j, size):
-            reduced = s.H[i, j] - Q[i, 0] * Q[j, 0] - Q[i, 1] * Q[j, 1] - Q[i, 2] * Q[j, 2]
-            band[first + j, i - j] += weight * reduced
+        a, b, c = x[j], y[j], z[j]
+        gradient[first + j] += weight * (s.g[j] - a * best[0] - b * best[1] - c * best[2])
+        row, out = s.H[j, j:], band[first + j]
+        xs, ys, zs = x[j:], y[j:], z[j:]
+        for i in range(size - j):
+            out[i] += weight * (row[i] - xs[i] * a - ys[i] * b - zs[i] * c)

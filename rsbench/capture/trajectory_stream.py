@@ -18,7 +18,7 @@ from rsbench.capture.trajectory_choice import choose
 from rsbench.capture.trajectory_covariance import covariance_between
 from rsbench.capture.trajectory_data import Past, TimedTracks, pack_windows, thinned
 from rsbench.capture.trajectory_estimate import TrajectoryOptions, is_supported, noise_px
-from rsbench.capture.trajectory_fit import ANCHORED, Fit, fit, held, information, normal_equations
+from rsbench.capture.trajectory_fit import ANCHORED, Fit, fit, held, information, near, normal_equations
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, part, span_of
 from rsbench.capture.trajectory_start import continued, first_curve, window_motions
 from rsbench.core import so3
@@ -29,8 +29,9 @@ from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
-_ADVANCE, _LAG = 4, 6
+_ADVANCE, _LAG = 6, 5
 """Windows that leave together, and those behind them that they wait for."""
+_FAR = 1_000_000
 _JUDGED_BY = 250
 """Tracks of a window, about, by which knots and prior are chosen."""
 
@@ -48,29 +49,32 @@ class StreamedWindow:
     """(n,) which tracks are right."""
     covariance: FloatArray | None
     """(6, 6) of w and d of ``motion``; None where no track spans a period."""
-    supported: bool
-    """Whether its own tracks carry it; else the spline bridges it."""
+    apart: int
+    """Windows to the nearest one that its own tracks carry, before or after; 0: it is one itself."""
     noise_px: float
+
+    @property
+    def supported(self) -> bool:
+        """Whether its own tracks carry it; else the spline bridges it."""
+        return self.apart == 0
 
 
 def stream_trajectory(
     windows: Iterable[Correspondences],
     rig: StereoRig,
     shutter: RollingShutter,
-    motions: Iterable[Motion | None] | None = None,
+    seed: int = 0,
     options: TrajectoryOptions | None = None,
 ) -> Iterator[StreamedWindow]:
     """As ``estimate_trajectory``, for windows that come one after the other.
 
     Args:
-        motions: of each window, to begin with; None: they are searched.
+        seed: of the search for motions of single windows, where there are no options.
     """
-    options = options or TrajectoryOptions()
-    given = None if motions is None else iter(motions)
+    options = options or TrajectoryOptions(seed=seed)
     state = _State(rig, shutter, options)
     for window in windows:
-        motion = window_motions([window], rig, shutter, options.seed)[0] if given is None else next(given)
-        state.add(window, motion)
+        state.add(window, *window_motions([window], rig, shutter, options.seed))
         if len(state.windows) == _ADVANCE + _LAG:
             found, tracks = state.solve()
             yield from state.told(found, tracks, _ADVANCE)
@@ -89,38 +93,39 @@ class _State:
         self.curve: Curve | None = None
         self.past: Past | None = None
         self.fit: Fit | None = None
+        self._carried = -_FAR
+        """Number of the last window that its own tracks carry, of those that have left."""
 
     def add(self, window: Correspondences, motion: Motion | None) -> None:
         self.windows.append(window)
         self.motions.append(motion)
         self.fresh += 1
 
-    def _pack(self, count: int, right: Sequence[FloatArray] | None = None) -> TimedTracks:
-        return pack_windows(self.windows[:count], self.rig, self.shutter, right, self.first, self.past)
+    def _pack(self, windows: Sequence[Correspondences], right: Sequence[FloatArray] | None = None) -> TimedTracks:
+        return pack_windows(windows, self.rig, self.shutter, right, self.first, self.past)
 
     def solve(self) -> tuple[Fit, TimedTracks]:
-        """The spline of all that is remembered."""
+        """The spline of all that is remembered; some of the tracks say first which are right."""
         count, options = len(self.windows), self.options
-        tracks = self._pack(count)
-        last = span_of(self.first + count, self.shutter)[1]
+        few = thinned(self.windows, _JUDGED_BY)
         if self.curve is None or self.fit is None:
-            found = self._begun(count)
-            found = fit(found.curve, tracks, found.prior, options.learn, found.tails)
+            found = self._begun(few)
         else:
             start = self.first + count - self.fresh
             ahead = self.motions[count - self.fresh :]
+            last = span_of(self.first + count, self.shutter)[1]
             curve = continued(self.curve, ahead, start, last) if ahead else self.curve
-            found = fit(curve, tracks, self.fit.prior, options.learn, self.fit.tails)
+            found = fit(curve, self._pack(few), self.fit.prior, options.learn, self.fit.tails)
+        tracks = self._pack(self.windows)
+        trust = near(found, tracks)
         if options.link:
-            tracks = self._pack(count, [found.trust[each] for each in tracks.members])
-            found = fit(found.curve, tracks, found.prior, options.learn, found.tails)
-        return found, tracks
+            tracks = self._pack(self.windows, [trust[each] for each in tracks.members])
+        return fit(found.curve, tracks, found.prior, options.learn, found.tails), tracks
 
-    def _begun(self, count: int) -> Fit:
+    def _begun(self, few: Sequence[Correspondences]) -> Fit:
         """The first spline: some of the tracks say which knots and which prior."""
-        windows, options = thinned(self.windows[:count], _JUDGED_BY), self.options
-        tracks = pack_windows(windows, self.rig, self.shutter)
-        curve = first_curve(self.motions, tracks, span_of(count, self.shutter), options.intervals[0])
+        options, tracks = self.options, pack_windows(few, self.rig, self.shutter)
+        curve = first_curve(self.motions, tracks, span_of(len(few), self.shutter), options.intervals[0])
         found = fit(curve, tracks, options.prior, options.learn)
         return choose(found, tracks, options.intervals) if options.learn else found
 
@@ -128,23 +133,26 @@ class _State:
         """The first so many windows."""
         start, end = span_of(1, self.shutter)
         inverse = banded.inverse_band(information(found.curve, tracks, found.tails, found.prior, found.trust))
+        windows = enumerate(self.windows)
+        right = [found.trust[tracks.members[k]][: len(each.tracks)] > 0.0 for k, each in windows]
+        carried = [self._carried, *(self.first + k for k, each in enumerate(right) if is_supported(each))]
         for k in range(count):
-            inliers = found.trust[tracks.members[k]][: len(self.windows[k].tracks)] > 0.0
             number = self.first + k
             yield StreamedWindow(
                 number=number,
                 motion=ContinuousMotion.of(part(found.curve, number + start, number + end, float(number))),
                 body_from_world=evaluate(found.curve, float(number))[0],
                 covariance=_covariance(found.curve, inverse, float(number)),
-                inliers=inliers,
-                supported=is_supported(inliers),
+                inliers=right[k],
+                apart=min(abs(number - each) for each in carried),
                 noise_px=noise_px(found.tails),
             )
+        self._carried = max(each for each in carried if each < self.first + count)
 
     def leave(self, found: Fit, tracks: TimedTracks, count: int) -> None:
         """Forget the first so many windows, but for what they say of those that stay."""
         right = [found.trust[each] for each in tracks.members[:count]]
-        gone = self._pack(count, right if self.options.link else None)
+        gone = self._pack(self.windows[:count], right if self.options.link else None)
         trust = np.zeros(len(gone))
         for members, each in zip(gone.members, right, strict=True):
             trust[members] = each

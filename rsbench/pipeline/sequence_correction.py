@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -31,6 +31,7 @@ from rsbench.pipeline.frame_depth import Images, frame_pair
 from rsbench.pipeline.frame_matches import match_frames, match_unknown
 from rsbench.pipeline.frame_motion import FoundMotion, models_asked, solve_frames
 from rsbench.pipeline.sequence_trajectory import Window, on_one_trajectory
+from rsbench.vision.frame_threads import ahead, map_ahead
 from rsbench.vision.fusion import Fused
 from rsbench.vision.stereo_matcher import needs_motion
 
@@ -38,6 +39,8 @@ WINDOWS = 8
 """At most, of those by which the shutter is found."""
 _FEWEST_FRAMES = 4
 """Of a sequence through which a trajectory is fitted: fewer do not show what two frames shake alike."""
+_AHEAD = 4
+"""Windows that are matched, and frames that are corrected, ahead: as many as leave a trajectory together."""
 _JUDGED = 3
 """First windows whose rig is looked at; when all of them are refused, so is the sequence."""
 
@@ -223,17 +226,24 @@ def correct_sequence(
     scanning = scanning or Scanning()
     check_cameras(rig, scanning, options, calibration[OFFSET])
     shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
-    last: Window | None = None
-    number = -1
-    windows = _windows(left, right, rig, shutter, options, calibration)
-    if _has_trajectory(left, shutter, options):
-        alone = _windows(left, right, rig, shutter, replace(options, motion_model=None), calibration)
-        windows = on_one_trajectory(alone, rig, shutter, options, calibration)
+    along = _has_trajectory(left, shutter, options)
+    windows = ahead(_windows(left, right, rig, shutter, options, calibration, not along), _AHEAD)
+    if along:
+        windows = on_one_trajectory(windows, rig, shutter, options, calibration)
+    places = _places(_with_depth(windows, rig, shutter, options, calibration[OFFSET]))
+    # Nothing is known of whether another package's may run twice at a time.
+    threads = 2 if options.corrector.built_in and options.matcher.built_in else 1
+    yield from map_ahead(lambda each: _moment(*each, rig, shutter, options), places, _AHEAD, threads)
+
+
+def _places(windows: Iterable[Window]) -> Iterator[tuple[int, int, list[Window]]]:
+    """Number of each frame, its number in the first of the windows that show it, and these."""
+    last, number = None, 0
     for number, window in enumerate(windows):
-        yield _moment(number, 0, [window] if last is None else [window, last], rig, shutter, options)
+        yield number, 0, [window] if last is None else [window, last]
         last = window
     if last is not None:
-        yield _moment(number + 1, 1, [last], rig, shutter, options)
+        yield number + 1, 1, [last]
 
 
 def _has_trajectory(left: FrameSource, shutter: RollingShutter, options: CorrectionOptions) -> bool:
@@ -273,22 +283,18 @@ def _windows(
     shutter: RollingShutter,
     options: CorrectionOptions,
     calibration: tuple[float, ...],
+    with_motion: bool,
 ) -> Iterator[Window]:
-    needs, refusals, second = options.corrector.component.spec.needs, _Refusals(left), None
-    offset = calibration[OFFSET]
+    """The windows of a sequence, each for itself; ``with_motion``: with a motion where the corrector needs one."""
+    needs, refusals = options.corrector.component.spec.needs, _Refusals(left)
     number = -1
     for number, images in enumerate(_window_images(left, right)):
-        pairs = None
-        if "depth" in needs and shutter.rows_together and not needs_motion(options.matcher):
-            first = second or frame_pair(images["left", 0], images["right", 0], rig, options, offset)
-            second = frame_pair(images["left", 1], images["right", 1], rig, options, offset)
-            pairs = first, second
         found, reason, matches = None, "", None
         if needs & {"motion", "matches"}:
             try:
                 judged, scanning = number < _JUDGED, shutter.scanning
                 matches = match_frames(images, rig, options, scanning, judge_rig=judged)
-                if "motion" in needs:
+                if "motion" in needs and with_motion:
                     ratio = shutter.readout_ratio
                     found = solve_frames(matches, rig, ratio, options, calibration, scanning, in_order=True).found
             except NoMotionError as error:
@@ -296,8 +302,24 @@ def _windows(
             except RefusedFramesError as error:
                 refusals.add(number, error)
                 reason = error.reason
-        yield Window(images=images, pairs=pairs, found=found, reason=reason, matches=matches)
+        yield Window(images=images, pairs=None, found=found, reason=reason, matches=matches)
     refusals.end(number + 1)
+
+
+def _with_depth(
+    windows: Iterable[Window], rig: StereoRig, shutter: RollingShutter, options: CorrectionOptions, offset: float
+) -> Iterator[Window]:
+    """The windows with depth from the other camera, that of each frame found once."""
+    apart = not shutter.rows_together or needs_motion(options.matcher)
+    if apart or "depth" not in options.corrector.component.spec.needs:
+        yield from windows
+        return
+    second = None
+    for window in windows:
+        images = window.images
+        first = second or frame_pair(images["left", 0], images["right", 0], rig, options, offset)
+        second = frame_pair(images["left", 1], images["right", 1], rig, options, offset)
+        yield replace(window, pairs=(first, second))
 
 
 def _moment(

@@ -15,7 +15,6 @@ import numpy as np
 from rsbench.capture.calibration_errors import recalibrated
 from rsbench.capture.trajectory_stream import StreamedWindow, stream_trajectory
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
@@ -27,6 +26,9 @@ from rsbench.solvers.engine.robust_motion import RobustEstimate
 from rsbench.solvers.engine.robust_problem import MatchCount
 
 BRIDGED = "few of the matches agree with the motion"
+_LONGEST_BRIDGE = 2
+"""Windows from the nearest one with matches up to which a spline is believed: the middle one of eight without any
+is wrong by 1 deg where a hand turns by 1.5 deg a frame, that of four by 0.16 deg."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,7 +56,7 @@ def on_one_trajectory(
     """Windows with the motion of one trajectory in place of that of each; those without matches are bridged.
 
     Args:
-        windows: in order; their own motions are where the search starts.
+        windows: in order.
         calibration: what the calibration is wrong by, see ``calibration_errors.TERMS``.
     """
     waiting = deque[Window]()
@@ -64,21 +66,17 @@ def on_one_trajectory(
             waiting.append(window)
             yield recalibrated(window.matches or Correspondences(), rig, calibration)
 
-    def starts() -> Iterator[Motion | None]:
-        while True:
-            found = waiting[-1].found
-            yield None if found is None else found.motion
-
-    for streamed in stream_trajectory(matches(), rig, shutter, starts()):
+    for streamed in stream_trajectory(matches(), rig, shutter, options.seed):
         window = waiting.popleft()
-        found = _found(window, streamed, options, calibration)
+        found = _found(streamed, options, calibration)
         reason = "" if streamed.supported else window.reason or BRIDGED
-        yield replace(window, found=found, reason=reason, pose=streamed.body_from_world)
+        pose = streamed.body_from_world
+        if streamed.apart > _LONGEST_BRIDGE:
+            found = pose = None
+        yield replace(window, found=found, reason=reason, pose=pose)
 
 
-def _found(
-    window: Window, streamed: StreamedWindow, options: CorrectionOptions, calibration: tuple[float, ...]
-) -> FoundMotion:
+def _found(streamed: StreamedWindow, options: CorrectionOptions, calibration: tuple[float, ...]) -> FoundMotion:
     motion, right = streamed.motion, int(np.count_nonzero(streamed.inliers))
     estimate = MotionEstimate(
         w=motion.w,
@@ -95,7 +93,7 @@ def _found(
         counts={"tracks": MatchCount(inliers=right, matches=len(streamed.inliers))},
         iterations=0,
         seconds=0.0,
-        threshold_px=0.0 if window.found is None else window.found.robust.threshold_px,
+        threshold_px=0.0,
     )
     return FoundMotion(
         motion=motion, robust=robust, solver=options.solver.name, reference_point="body", calibration=calibration

@@ -28,6 +28,7 @@ from rsbench.vision.feature_matcher import FeatureMatcher
 from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.images import grey_u8
 from rsbench.vision.patch_alignment import refine_matches
+from rsbench.vision.recent import Recent, content_key
 
 Indices = NDArray[np.int64]
 _MOST_FEATURES = 100_000
@@ -120,6 +121,10 @@ class Gate:
     dy: tuple[float, float]
 
 
+_DETECTED, _PAIRED = Recent[Features](28), Recent[Indices](56)
+"""A sequence asks for each image in two windows, and again after its shutter is known: of 12 windows at most."""
+
+
 def detect(
     image: NDArray[Any], options: MatchOptions | None = None, camera: PinholeCamera | None = None
 ) -> Features:
@@ -128,14 +133,19 @@ def detect(
     Args:
         camera: whose lens the image has; None: it has none. Features of which the lens shows no ray are dropped.
     """
-    options = options or MatchOptions()
+    options, grey = options or MatchOptions(), grey_u8(image)
+    key = content_key(grey), options.max_features, options.contrast_threshold, options.edge_threshold, camera
+    return _DETECTED.get(key, lambda: _detected(grey, options, camera))
+
+
+def _detected(grey: NDArray[np.uint8], options: MatchOptions, camera: PinholeCamera | None) -> Features:
     sift = cv2.SIFT.create(
         nfeatures=options.max_features or _MOST_FEATURES,
         contrastThreshold=options.contrast_threshold,
         edgeThreshold=options.edge_threshold,
         enable_precise_upscale=True,
     )
-    keypoints, descriptors = sift.detectAndCompute(grey_u8(image), None)
+    keypoints, descriptors = sift.detectAndCompute(grey, None)
     if not keypoints:
         empty = np.zeros((0, 2))
         return Features(points=empty, places=empty, descriptors=np.zeros((0, 128), dtype=np.float32), frames=empty)
@@ -155,6 +165,11 @@ def match(a: Features, b: Features, gate: Gate, options: MatchOptions | None = N
     same match several times; it is kept once.
     """
     options = options or MatchOptions()
+    key = a, b, gate, options.ratio, options.max_distance
+    return _PAIRED.get(key, lambda: _paired(a, b, gate, options))
+
+
+def _paired(a: Features, b: Features, gate: Gate, options: MatchOptions) -> Indices:
     best, nearest, second, back = best_two(a.places, a.descriptors, b.places, b.descriptors, gate.dx, gate.dy)
     rows = np.flatnonzero(best >= 0)
     mutual = back[best[rows]] == rows

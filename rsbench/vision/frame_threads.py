@@ -1,10 +1,11 @@
-"""The same work on several frames at once, as many as the memory is for."""
+"""Work on several frames at once: the same on all, as many as the memory is for, or what comes next ahead."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -23,3 +24,33 @@ def map_frames(work: Callable[[T], R], items: Iterable[T], pixels: int, bytes_pe
     most = max(1, min(os.cpu_count() or 1, int(_BYTES / (pixels * bytes_per_pixel))))
     with ThreadPoolExecutor(most) as pool:
         return list(pool.map(work, items))
+
+
+def ahead(items: Iterator[T], most: int) -> Iterator[T]:
+    """The items, in order, of which a thread makes up to ``most`` before they are asked for."""
+    last = object()
+    with ThreadPoolExecutor(1) as pool:
+        waiting = deque(pool.submit(next, items, last) for _ in range(most))
+        try:
+            while (item := waiting.popleft().result()) is not last:
+                waiting.append(pool.submit(next, items, last))
+                yield item  # pyrefly: ignore[invalid-yield]
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def map_ahead(work: Callable[[T], R], items: Iterable[T], most: int, threads: int) -> Generator[R]:
+    """``work`` on each item, in order, by threads; up to ``most`` wait for those before them."""
+    waiting = deque[Future[R]]()
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for item in items:
+                waiting.append(pool.submit(work, item))
+                if len(waiting) > most:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()

@@ -24,16 +24,18 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.vision.compiled_camera import across_lines, line_of
 from rsbench.vision.correction import inverse_depth
 from rsbench.vision.images import grey_u8
-from rsbench.vision.reprojection import Reprojection, parallax_gain, reproject, reprojection_of
+from rsbench.vision.reprojection import Reprojection, homography, land, parallax_gain, reproject, reprojection_of
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 _REACH = 0.2
 """Of the image's longer side: the largest parallax that is searched."""
 _WINDOW = 5
-_NOWHERE = 40.0
+_NOWHERE = 40
 """Cost of a place outside the frame; inside it is at most 24 bits and ``_LEVELS``."""
-_LEVELS = 16.0
+_LEVELS = 16
+_BAND = 32
+"""Rows whose costs of all depths are kept at a time."""
 _ALIKE = 14.0
 """Largest mean cost in the window of a depth that counts; unlike places cost about 20."""
 _AGREE_PX = 1.5
@@ -67,7 +69,7 @@ def depth_from_motion(
     censuses = [census(grey) for grey in greys]
     rhos = [inverse_depth(depth) for depth in depths]
     for frame in (0, 1):
-        y, x = (places.astype(np.int32) for places in np.nonzero(unknown[frame]))
+        y, x = np.nonzero(unknown[frame])
         both = (greys[frame], greys[1 - frame], censuses[frame], censuses[1 - frame])
         rhos[frame][y, x] = _search(y, x, both, maps[frame], count, 1.0 / gain)
     for frame in (0, 1):
@@ -76,25 +78,21 @@ def depth_from_motion(
 
 
 def _search(
-    y: NDArray[np.int32],
-    x: NDArray[np.int32],
+    y: NDArray[np.int64],
+    x: NDArray[np.int64],
     both: tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint32], NDArray[np.uint32]],
     maps: Reprojection,
     count: int,
     step: float,
 ) -> F32:
-    """Inverse depth (n,) at which pixels (n,) look most alike, of multiples of ``step``; NaN: none does."""
-    size, window = both[0].shape, (_WINDOW, _WINDOW)
-    cost, weight = np.zeros(size, dtype=np.float32), np.zeros(size, dtype=np.float32)
-    weight[y, x] = 1.0
-    weight = cv2.boxFilter(weight, -1, window, borderType=cv2.BORDER_CONSTANT)[y, x]
-    lines, best = (x if maps.columns else y).copy(), np.full(len(y), -1, dtype=np.int32)
-    costs = np.full((len(y), 4), np.inf, dtype=np.float32)
-    for k in range(count):
-        _fill_costs(y, x, lines, *both, maps, k * step, cost)
-        mean = cv2.boxFilter(cost, -1, window, borderType=cv2.BORDER_CONSTANT)[y, x] / weight
-        _keep_best(k, mean, best, costs)
-    before, least, after = costs[:, 1], costs[:, 0], costs[:, 2]
+    """Inverse depth (n,) at which pixels (n,), in order of rows, look most alike, of multiples of ``step``; NaN:
+    none does."""
+    numbers = np.full(both[0].shape, -1, dtype=np.int64)
+    numbers[y, x] = np.arange(len(y))
+    best, costs = np.zeros(len(y), dtype=np.int64), np.zeros((len(y), 3), dtype=np.float32)
+    firsts = np.searchsorted(y, np.arange(len(numbers) + 1))
+    _find_best(y, x, numbers, firsts, *both, maps, count, step, best, costs)
+    before, least, after = costs.T
     with np.errstate(invalid="ignore", divide="ignore"):
         bend = before - 2.0 * least + after
         offset = np.where(np.isfinite(bend) & (bend > 0.0), 0.5 * (before - after) / bend, 0.0)
@@ -114,55 +112,109 @@ def census(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
 
 
 @compiled(error_model="numpy", inline="always")
-def ones(bits: np.uint32) -> float:
+def ones(bits: np.uint32) -> int:
     """Number of bits that are 1 (Warren, "Hacker's delight", 2002)."""
     n = np.int64(bits)
     n -= (n >> 1) & 0x55555555
     n = (n & 0x33333333) + ((n >> 2) & 0x33333333)
     n = (n + (n >> 4)) & 0x0F0F0F0F
-    return float(((n * 0x01010101) & 0xFFFFFFFF) >> 24)
+    return int((n * 0x01010101) & 0xFFFFFFFF) >> 24
 
 
 @compiled(error_model="numpy")
-def _fill_costs(
-    y: NDArray[np.int32],
-    x: NDArray[np.int32],
-    lines: NDArray[np.int32],
+def _find_best(
+    y: NDArray[np.int64],
+    x: NDArray[np.int64],
+    numbers: NDArray[np.int64],
+    firsts: NDArray[np.int64],
     grey: NDArray[np.uint8],
     other: NDArray[np.uint8],
     census: NDArray[np.uint32],
     other_census: NDArray[np.uint32],
     maps: Reprojection,
-    rho: float,
-    cost: F32,
+    count: int,
+    step: float,
+    best: NDArray[np.int64],
+    costs: F32,
 ) -> None:
-    """Cost of one inverse depth at every pixel (n,); ``lines`` (n,) are those where the last one landed."""
+    """Number of the best inverse depth of each pixel (n,), and the mean costs in its window (n, 3) of that before
+    it, of itself, and of that after it; infinite of none.
+
+    Args:
+        numbers: (H, W) of the pixels, -1 of those that are not searched.
+        firsts: (H + 1,) number of the first pixel of each row.
+    """
     height, width = grey.shape
-    count = len(maps.A)
-    for i in range(len(y)):
-        # One step along the curve changes the line by one at most: its pose is that of the last landing.
-        u, v, _ = reproject(x[i], y[i], rho, lines[i], maps)
-        along = across_lines(maps.there, u, v)
-        if -count < along < 2 * count:
-            lines[i] = min(max(int(along + 0.5), 0), count - 1)
-        value = _NOWHERE
-        if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
-            ty, tx = int(v + 0.5), int(u + 0.5)
-            bits = census[y[i], x[i]] ^ other_census[ty, tx]
-            value = ones(bits) + min(abs(float(grey[y[i], x[i]]) - float(other[ty, tx])), _LEVELS)
-        cost[y[i], x[i]] = value
+    reach = _WINDOW // 2
+    most = 0
+    for top in range(0, height, _BAND):
+        low, high = firsts[max(top - reach, 0)], firsts[min(top + _BAND + reach, height)]
+        most = max(most, high - low)
+    volume = np.zeros((most, count), dtype=np.uint8)
+    total = np.zeros(count, dtype=np.uint16)
+    for top in range(0, height, _BAND):
+        low, high = firsts[max(top - reach, 0)], firsts[min(top + _BAND + reach, height)]
+        for i in range(low, high):
+            here = grey[y[i], x[i]], census[y[i], x[i]]
+            _fill_costs(y[i], x[i], here[0], here[1], other, other_census, maps, step, volume[i - low])
+        for i in range(firsts[top], firsts[min(top + _BAND, height)]):
+            total[:] = 0
+            weight = 0
+            for v in range(max(y[i] - reach, 0), min(y[i] + reach + 1, height)):
+                for u in range(max(x[i] - reach, 0), min(x[i] + reach + 1, width)):
+                    if numbers[v, u] >= 0:
+                        weight += 1
+                        row = volume[numbers[v, u] - low]
+                        for k in range(count):
+                            total[k] += row[k]
+            best[i] = _least(total, np.float32(weight), costs[i])
 
 
 @compiled(error_model="numpy")
-def _keep_best(k: int, mean: F32, best: NDArray[np.int32], costs: F32) -> None:
-    """``costs`` (n, 4): the least so far, those before and after it, and the last."""
-    for i in range(len(mean)):
-        if best[i] == k - 1:
-            costs[i, 2] = mean[i]
-        if mean[i] < costs[i, 0]:
-            costs[i, 0], costs[i, 1], costs[i, 2] = mean[i], costs[i, 3], np.inf
-            best[i] = k
-        costs[i, 3] = mean[i]
+def _least(total: NDArray[np.uint16], weight: np.float32, costs: F32) -> int:
+    """The first number of the least cost; fills it and those beside it."""
+    best = 0
+    for k in range(1, len(total)):
+        if total[k] < total[best]:
+            best = k
+    costs[0] = total[best - 1] / weight if best > 0 else np.inf
+    costs[1] = total[best] / weight
+    costs[2] = total[best + 1] / weight if best + 1 < len(total) else np.inf
+    return best
+
+
+@compiled(error_model="numpy")
+def _fill_costs(
+    y: int,
+    x: int,
+    level: np.uint8,
+    bits: np.uint32,
+    other: NDArray[np.uint8],
+    other_census: NDArray[np.uint32],
+    maps: Reprojection,
+    step: float,
+    cost: NDArray[np.uint8],
+) -> None:
+    """Cost of each inverse depth (count,) at a pixel."""
+    height, width = other.shape
+    lines = len(maps.A)
+    line = line_of(maps.columns, x, y)
+    M, b = homography(x, y, line, maps)
+    for k in range(len(cost)):
+        # One step along the curve changes the line by one at most: its pose is that of the last landing.
+        u, v, _ = land(M, b, k * step, maps.lens)
+        along = across_lines(maps.there, u, v)
+        if -lines < along < 2 * lines:
+            landed = min(max(int(along + 0.5), 0), lines - 1)
+            if landed != line:
+                line = landed
+                M, b = homography(x, y, line, maps)
+        value = _NOWHERE
+        if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
+            ty, tx = int(v + 0.5), int(u + 0.5)
+            unlike = abs(np.int64(level) - np.int64(other[ty, tx]))
+            value = ones(bits ^ other_census[ty, tx]) + min(unlike, _LEVELS)
+        cost[k] = value
 
 
 @compiled(error_model="numpy")

@@ -17,6 +17,7 @@ from rsbench.components.compiled import compiled
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.vectors import Vector, apply
 from rsbench.vision.compiled_camera import Table, across_lines, line_of, look, optics_of, see
 
 F32 = NDArray[np.float32]
@@ -94,6 +95,25 @@ def _seen_from(
     u = (A[0, 0] * p + A[0, 1] * q + A[0, 2] * r + rho * B[0]) * s
     v = (A[1, 0] * p + A[1, 1] * q + A[1, 2] * r + rho * B[1]) * s
     u, v = see(lens, u, v)
+    return u, v, s
+
+
+@compiled(error_model="numpy", inline="always")
+def homography(x: int, y: int, line: int, maps: Reprojection) -> tuple[Vector, Vector]:
+    """M and b of a pixel and a line of the other view: it sees the pixel's point at M + rho b, homogeneous."""
+    G, c, A, B, own = maps.G, maps.c, maps.A[line], maps.B[line], line_of(maps.columns, x, y)
+    gx, gy = look(maps.ideal, x, y)
+    ray = apply(G[own], (gx, gy, 1.0))
+    centre = apply(A, (c[own, 0], c[own, 1], c[own, 2]))
+    return apply(A, ray), (centre[0] + B[0], centre[1] + B[1], centre[2] + B[2])
+
+
+@compiled(error_model="numpy", inline="always")
+def land(M: Vector, b: Vector, rho: float, lens: Table) -> tuple[float, float, float]:
+    """Pixel and depth factor there of ``homography``; NaN behind the camera."""
+    z = M[2] + rho * b[2]
+    s = 1.0 / z if z > 0.0 else np.nan
+    u, v = see(lens, (M[0] + rho * b[0]) * s, (M[1] + rho * b[1]) * s)
     return u, v, s
 
 

@@ -199,3 +199,19 @@ def test_a_stream_says_what_the_whole_sequence_does() -> None:
     turned = Rotation.from_matrix(parts[18].body_from_world.R @ R.T).as_rotvec()
     assert np.all(np.abs(turned) < 2.0 * sigma[:3])
     assert np.linalg.norm(parts[18].body_from_world.t - t) < 3.0 * np.linalg.norm(sigma[3:])
+
+
+def test_a_stream_outlives_frames_that_match_nothing() -> None:
+    """The trajectory before and after is as good; what lies between says how far it is from any matches."""
+    rng = np.random.default_rng(15)
+    law = sines(rng, *SHAKES["walk"])
+    windows, _ = matches(law, 24, rng)
+    silent = range(6, 19)
+    broken = [Correspondences() if k in silent else each for k, each in enumerate(windows)]
+    parts = list(stream_trajectory(broken, RIG, SHUTTER))
+    assert [each.supported for each in parts] == [k not in silent for k in range(23)]
+    assert parts[7].apart == parts[17].apart == 2 < min(each.apart for each in parts[8:17])
+    for each in (parts[3], parts[21]):
+        R = law(np.array([each.number, each.number + 1.0]))[0]
+        w = Rotation.from_matrix(R[1] @ R[0].T).as_rotvec()
+        assert np.rad2deg(np.linalg.norm(each.motion.w - w)) < 0.02
