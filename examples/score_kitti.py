@@ -34,7 +34,7 @@ from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, read_frame
 from rsbench.pipeline.frame_matches import match_frames
 from rsbench.pipeline.frame_motion import solve_frames
-from rsbench.pipeline.sequence_correction import estimate_sequence_capture
+from rsbench.pipeline.sequence_capture import estimate_sequence_capture
 
 Step = tuple[FloatArray, FloatArray]
 """Rotation (3, 3) and translation (3,), metres, of the body from one frame to the next."""

@@ -12,6 +12,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NoReturn
 
 import pytest
@@ -65,3 +66,10 @@ def assert_refused(result: subprocess.CompletedProcess[str], *words: str) -> Non
     (line,) = [line for line in result.stderr.splitlines() if "rsbench: error:" in line]
     for word in words:
         assert word in line, line
+
+
+def bytes_below(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder, by its path there."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
+    }

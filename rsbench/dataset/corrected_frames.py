@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET, TERMS, in_words
 from rsbench.capture.estimate import Capture
@@ -25,7 +25,16 @@ from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import read_frame
 from rsbench.pipeline.frame_motion import FoundMotion
 from rsbench.storage.files import read_depth, read_json, read_png, write_bytes, write_depth, write_json, write_png
-from rsbench.storage.work_folder import HIDDEN, WORK, files_below, named, remove, unknown_files, work_folder
+from rsbench.storage.work_folder import (
+    HIDDEN,
+    WORK,
+    files_below,
+    listed,
+    named,
+    remove,
+    unknown_files,
+    work_folder,
+)
 from rsbench.vision.fusion import Fused, Origin
 
 _TUM = "# frame periods, metres: the body in the world, which is the body at the start of the first frame\n"
@@ -41,6 +50,7 @@ MASK_VALUES = {
 MARKER = "motion.json"
 _HALF = "half"
 """Name of the folder in the hidden one that a killed run is resumed from."""
+_ENTRIES = f"{HIDDEN}/frames"
 _LIST = f"{HIDDEN}/files.json"
 """All that was written, below the folder."""
 
@@ -227,25 +237,45 @@ def rig_record(
     }
 
 
-def write_trajectory(path: Path, poses: Mapping[int, Pose]) -> None:
-    """Poses of the body at the starts of frames in TUM's format: lines ``tau tx ty tz qx qy qz qw``.
+def written_entries(folder: Path) -> list[dict[str, Any]]:
+    """What a run before this one said of the first frames, which it finished."""
+    return [read_json(path) for path in listed(folder / _ENTRIES, ".json")]
+
+
+def write_entry(folder: Path, entry: dict[str, Any]) -> None:
+    """What motion.json will say of a frame, after all that belongs to it: ``written_entries`` reads it back."""
+    (folder / _ENTRIES).mkdir(parents=True, exist_ok=True)
+    write_json(folder / _ENTRIES / f"{entry['number']:06d}.json", entry)
+
+
+def write_poses(folder: Path, name: str, number: int, taus: ArrayLike, poses: Pose) -> None:
+    """The part that a frame has in a file of poses, for ``join_poses``.
 
     Args:
-        poses: body from world, by the frame's number, which is its time in frame periods.
+        taus: (n,) times of the poses, frame periods.
+        poses: body from world, (n, 3, 3), (n, 3) or one.
     """
-    lines = [_line(number, pose) for number, pose in poses.items()]
-    write_bytes(path, "".join([_TUM, *lines]).encode())
+    R, t = poses.R.reshape(-1, 3, 3), poses.t.reshape(-1, 3)
+    lines = [_line(float(tau), Pose(*each)) for tau, *each in zip(np.atleast_1d(taus), R, t, strict=True)]
+    place = folder / HIDDEN / name
+    place.mkdir(parents=True, exist_ok=True)
+    write_bytes(place / f"{number:06d}.csv", "".join(lines).encode())
 
 
-def append_line_poses(path: Path, taus: FloatArray, poses: Pose) -> None:
-    """Poses of the body, body from world, at the times (n,) of one frame's lines, after those that are there.
+def join_poses(folder: Path, name: str) -> FloatArray:
+    """NAME.csv in TUM's format, lines ``tau tx ty tz qx qy qz qw``, of the parts of all frames; no file of none.
 
-    Frame by frame, so that footage may be of any length. TUM's format, as ``write_trajectory`` has it.
+    Returns:
+        Those lines, (n, 8), of a file that is small enough to draw.
     """
-    head = "" if path.exists() else _TUM
-    lines = [_line(tau, Pose(R, t)) for tau, R, t in zip(taus, poses.R, poses.t, strict=True)]
-    with path.open("a", encoding="utf-8", newline="\n") as file:
-        file.write("".join([head, *lines]))
+    parts = listed(folder / HIDDEN / name, ".csv")
+    if not parts:
+        return np.zeros((0, 8))
+    with (folder / f"{name}.csv").open("wb") as file:
+        file.write(_TUM.encode())
+        for part in parts:
+            file.write(part.read_bytes())
+    return np.loadtxt(folder / f"{name}.csv", ndmin=2)
 
 
 def _line(tau: float, pose: Pose) -> str:

@@ -9,25 +9,23 @@ import numpy as np
 from markupsafe import Markup
 
 from rsbench.core import so3
-from rsbench.core.se3 import Pose, inverse
 from rsbench.core.so3 import FloatArray
 
 _WIDE, _HIGH, _LEFT, _TOP = 520.0, 200.0, 64.0, 10.0
 _COLOURS = {"x": "#c0392b", "y": "#27855a", "z": "#0b6bcb"}
 
 
-def draw_trajectory(poses: Mapping[int, Pose], frames: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+def draw_trajectory(poses: FloatArray, frames: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """Drawings (SVG) of rotation and position, and what is said below; None where there is no trajectory.
 
     Args:
-        poses: body from world at the starts of frames, by their numbers.
+        poses: (n, 8) of the body at the starts of frames, as TUM's format has them: tau, position, quaternion.
         frames: what motion.json says of each.
     """
     if len(poses) < 2:
         return None
-    numbers, first = np.array(list(poses), dtype=np.float64), next(iter(poses.values()))
-    turns = np.stack([so3.log(pose.R @ first.R.T) for pose in poses.values()])
-    places = np.stack([inverse(pose)[1] for pose in poses.values()])
+    numbers, places, R = poses[:, 0], poses[:, 1:4], so3.from_quaternion(poses[:, [7, 4, 5, 6]])
+    turns = so3.log(np.swapaxes(R, 1, 2) @ R[0])
     bridged = [int(frame["number"]) for frame in frames if "skipped" in frame]
     return {
         "drawings": [

@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,18 +14,19 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from commands import assert_refused, run_here
+from commands import assert_refused, bytes_below, run_here
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.capture.calibration_errors import of_offset
 from rsbench.capture.estimate import conclude, examine
 from rsbench.capture.hypotheses import Known
 from rsbench.capture.scans import Scans
-from rsbench.cli.correct import _readout
+from rsbench.cli.correct_said import readout_words
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
+from rsbench.dataset import corrected_frames
 from rsbench.dataset.corrected_frames import MASK_VALUES, fresh_folder
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.storage.files import read_depth, read_png, write_png
@@ -141,25 +143,55 @@ def test_a_sequence_of_folders(tmp_path: Path, frames: list[Path], rig: Path) ->
     assert not video.read()[0] and (tmp_path / "film.json").is_file()
 
 
-def test_a_bad_window_is_bridged_and_told(tmp_path: Path, castle: Sequence, rig: Path) -> None:
-    """The third of five frames is blank: the trajectory through its neighbours bridges it, and the end says so."""
-    order = (0, 1, None, 0, 1)
+@pytest.fixture
+def footage(tmp_path: Path, castle: Sequence, rig: Path) -> tuple[object, ...]:
+    """The third of five frames is blank."""
     for side in ("left", "right"):
         (tmp_path / side).mkdir()
-        for number, frame in enumerate(order):
+        for number, frame in enumerate((0, 1, None, 0, 1)):
             image = np.full_like(castle.image("rs", "left", 0), 128)
             if frame is not None:
                 image = castle.image("rs", side, frame)
             write_png(tmp_path / side / f"{number}.png", image)
+    given = ("--left", tmp_path / "left", "--right", tmp_path / "right", "--rig", rig)
+    return (*given, "--row-poses", "--out")
+
+
+def test_a_killed_run_of_footage_goes_on_to_the_same_bytes(
+    tmp_path: Path, footage: tuple[object, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for part in ("whole", "halves"):
+        (tmp_path / part).mkdir()
+    assert correct(*footage, tmp_path / "whole" / "out").returncode == 0
+    written, write = list[int](), corrected_frames.write_entry
+
+    def until(last: int) -> Callable[[Path, dict[str, Any]], None]:
+        def write_or_stop(folder: Path, entry: dict[str, Any]) -> None:
+            if entry["number"] == last:
+                raise KeyboardInterrupt
+            written.append(entry["number"])
+            write(folder, entry)
+
+        return write_or_stop
+
+    for last, code in ((1, 130), (4, 130), (5, 0)):
+        with monkeypatch.context() as patch:
+            patch.setattr(corrected_frames, "write_entry", until(last))
+            assert correct(*footage, tmp_path / "halves" / "out").returncode == code
+    assert written == [0, 1, 2, 3, 4]
+    assert bytes_below(tmp_path / "halves") == bytes_below(tmp_path / "whole")
+
+
+def test_a_bad_window_is_bridged_and_told(tmp_path: Path, footage: tuple[object, ...]) -> None:
+    """The trajectory through the neighbours of a blank frame bridges it, and the end says so."""
     out = tmp_path / "out"
-    footage = ("--left", tmp_path / "left", "--right", tmp_path / "right", "--rig", rig, "--out", out)
-    result = correct(*footage, "--row-poses")
+    result = correct(*footage, out)
     assert result.returncode == 0, result.stderr
     bridged = result.stderr.strip().splitlines()[-1]
     assert "corrected with the motion of the frames around: frame 1 (only 0 matches" in bridged
     assert "frame 2 (only 0 matches" in bridged and bridged.count("frame ") == 2
     frames = json.loads((out / "motion.json").read_text())["frames"]
-    assert ["skipped" in frame for frame in frames] == [number in (1, 2) for number in range(len(order))]
+    assert ["skipped" in frame for frame in frames] == [number in (1, 2) for number in range(5)]
     assert "5 of 5 times corrected" in result.stdout
     lines = [line.split() for line in (out / "trajectory.csv").read_text().splitlines()[1:]]
     assert [float(line[0]) for line in lines] == [0.0, 1.0, 2.0, 3.0, 4.0] and {len(line) for line in lines} == {8}
@@ -266,6 +298,6 @@ def test_one_window_of_a_rig_that_is_off_says_how_far_it_errs() -> None:
     matches = simulate(rig, shutter, motion, options, np.random.default_rng(0)).correspondences
     known = Known(scans=(Scans("top", "top"),), delay=0.0, models=("linear",))
     window = examine(matches, rig, replace(known, calibration_sigma=of_offset(0.5)))
-    assert "may err" in _readout(shutter, conclude([window]))
-    assert "may err" not in _readout(shutter, conclude([window, window]))
-    assert "may err" not in _readout(shutter, conclude([examine(matches, rig, known)]))
+    assert "may err" in readout_words(shutter, conclude([window]))
+    assert "may err" not in readout_words(shutter, conclude([window, window]))
+    assert "may err" not in readout_words(shutter, conclude([examine(matches, rig, known)]))

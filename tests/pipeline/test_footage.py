@@ -17,7 +17,8 @@ from rsbench.pipeline.chain import correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, check_alike, read_frame, read_rig_card
 from rsbench.pipeline.frame_motion import solve_frames
-from rsbench.pipeline.sequence_correction import correct_sequence, estimate_sequence_capture
+from rsbench.pipeline.sequence_capture import estimate_sequence_capture
+from rsbench.pipeline.sequence_correction import correct_sequence
 
 Folders = tuple[FrameSource, FrameSource]
 

@@ -1,0 +1,204 @@
+"""``rsbench correct`` of the footage of a rig: each frame is written once, and a killed run goes on after them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from rsbench.cli.correct_input import sized, target_row
+from rsbench.cli.correct_said import readout_words, say_calibration, write_page_of
+
+if TYPE_CHECKING:
+    from rsbench.capture.estimate import Capture
+    from rsbench.cli.correct_input import Given
+    from rsbench.core.rig import StereoRig
+    from rsbench.core.shutter import RollingShutter
+    from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.pipeline.footage import FrameSource, RigCard
+    from rsbench.pipeline.sequence_correction import CorrectedMoment
+    from rsbench.vision.fusion import Fused
+
+    Sources = tuple[FrameSource, FrameSource]
+    Found = tuple[RollingShutter, tuple[float, ...], Capture | None]
+
+_PAGE_FRAMES = 6
+
+
+def correct_sequence_given(given: Given, target: str, options: CorrectionOptions, close: bool) -> None:
+    """Exit 1 where a time is not corrected; ``close``: narrow holes of corrected frames."""
+    from dataclasses import replace
+
+    from rsbench.core.shutter import Scanning
+    from rsbench.dataset.corrected_frames import fresh_folder, rig_record
+    from rsbench.dataset.corrected_video import is_video, video_place
+    from rsbench.pipeline.chain import check_cameras
+
+    sources, card, out = given.footage(), given.card, given.out
+    rig = sized(card, next(iter(sources[0])))
+    options = replace(options, target_row=target_row(target, rig.camera.height))
+    check_cameras(rig, card.scanning or Scanning(), options, card.disparity_offset)
+    run = _run_key(given, sources, options, close)
+    with video_place(out, run) if is_video(out) else fresh_folder(out, run=run) as folder:
+        shutter, calibration, capture = found = _look(sources, rig, card, options)
+        record = rig_record(rig, shutter, capture, options, calibration)
+        record["frames"] = _correct_into(folder, sources, rig, found, options, close, given.row_poses)
+        if is_video(out):
+            _write_both(out, folder, sources, record)
+        else:
+            _write_rest(folder, out, sources[0], record, found)
+    _say(out, f"readout ratio {readout_words(shutter, capture)}", record)
+
+
+def _run_key(given: Given, sources: Sources, options: CorrectionOptions, close: bool) -> str:
+    """Of all that decides what is written: a run with another key does not go on with what this one wrote."""
+    import hashlib
+
+    from rsbench.core.version import __version__
+    from rsbench.dataset.corrected_video import is_video
+
+    flags = close, given.row_poses, is_video(given.out)
+    said = [__version__, repr(given.card), repr(options), repr(flags)]
+    said += [each for source in sources for each in source.identity()]
+    return hashlib.sha256("\n".join(said).encode()).hexdigest()
+
+
+def _look(sources: Sources, rig: StereoRig, card: RigCard, options: CorrectionOptions) -> Found:
+    """The shutter, what the calibration is wrong by, and how both were found; None where they are given."""
+    from rsbench.capture.calibration_errors import NO_ERRORS
+    from rsbench.cli.console import progress_bar
+    from rsbench.core.shutter import Scanning
+    from rsbench.pipeline.sequence_capture import WINDOWS, estimate_sequence_capture
+
+    ratio, calibration, scanning = card.readout_ratio, card.calibration, card.scanning
+    if ratio is not None and calibration is not None:
+        return (scanning or Scanning()).shutter_of(rig.camera.width, rig.camera.height, ratio), calibration, None
+    with progress_bar("looking at the shutter", min(max(sources[0].count - 1, 1), WINDOWS)) as advance:
+        capture, shutter = estimate_sequence_capture(*sources, rig, options, ratio, scanning, calibration, advance)
+    nothing = capture is None or not shutter.rows_together
+    return shutter, NO_ERRORS if nothing else capture.calibration, capture
+
+
+def _correct_into(
+    folder: Path,
+    sources: Sources,
+    rig: StereoRig,
+    found: Found,
+    options: CorrectionOptions,
+    close: bool,
+    row_poses: bool,
+) -> list[dict[str, Any]]:
+    """Write every frame that is not there yet; returns what motion.json says of each.
+
+    The matches of frames that are there are found again: the trajectory of the others rests on them.
+    """
+    from rsbench.cli.console import progress_bar
+    from rsbench.dataset.corrected_frames import written_entries
+    from rsbench.pipeline.sequence_correction import correct_sequence
+
+    shutter, calibration, _ = found
+    entries, taken = written_entries(folder), (shutter.readout_ratio, options, calibration, shutter.scanning)
+    with progress_bar("correcting", max(sources[0].count, 1)) as advance:
+        for entry in entries:
+            advance(f"frame {entry['number']}")
+        for moment in correct_sequence(*sources, rig, *taken, first=len(entries)):
+            entries.append(_write(folder, moment, close, shutter if row_poses else None))
+            advance(f"frame {moment.number}")
+    return entries
+
+
+def _write(folder: Path, moment: CorrectedMoment, close: bool, rows: RollingShutter | None) -> dict[str, Any]:
+    """Write a corrected time, and then what is said of it: a time that has that is complete.
+
+    Args:
+        rows: the shutter, where the pose at every row is wanted.
+    """
+    import numpy as np
+
+    from rsbench.dataset.corrected_frames import motion_record, write_entry, write_frame, write_poses
+    from rsbench.vision.closing import close_narrow
+
+    finish: Callable[[Fused], Fused] = close_narrow if close else lambda fused: fused
+    entry: dict[str, Any] = {"number": moment.number}
+    for side, fused in moment.frames.items():
+        finished = finish(fused)
+        write_frame(folder, f"{side}_{moment.number:06d}", finished)
+        entry[side] = finished.shares()
+    if not moment.frames:
+        entry["reason"] = moment.reason
+    elif moment.reason:
+        entry["skipped"] = moment.reason
+    if moment.frames and moment.found is not None:
+        entry["motion"] = motion_record(moment.found)
+    if moment.pose is not None:
+        write_poses(folder, "trajectory", moment.number, [float(moment.number)], moment.pose)
+    if rows is not None and moment.line_poses is not None:
+        taus = np.sort(rows.line_times(moment.number, "left"))
+        write_poses(folder, "row_poses", moment.number, taus, moment.line_poses)
+    write_entry(folder, entry)
+    return entry
+
+
+def _write_rest(folder: Path, out: Path, left: FrameSource, record: dict[str, Any], found: Found) -> None:
+    from rsbench.dataset.corrected_frames import join_poses, write_record
+    from rsbench.report.trajectory_picture import draw_trajectory
+
+    poses = join_poses(folder, "trajectory")
+    join_poses(folder, "row_poses")
+    write_record(folder, record)
+    shutter, _, capture = found
+    cards = _cards(folder, left, record["frames"])
+    write_page_of(folder, out, shutter, capture, None, cards, draw_trajectory(poses, record["frames"]))
+
+
+def _cards(folder: Path, left: FrameSource, frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Some frames for the page, from what was written."""
+    from rsbench.dataset.corrected_frames import read_fused
+    from rsbench.report.corrected_page import card_of
+
+    chosen = [each["number"] for each in frames[:: max(len(frames) // _PAGE_FRAMES, 1)] if "left" in each]
+    before = {number: image for number, image in enumerate(left) if number in chosen[:_PAGE_FRAMES]}
+    fused = {number: read_fused(folder, f"left_{number:06d}") for number in before}
+    return [card_of(f"left, frame {number}", image, fused[number]) for number, image in before.items()]
+
+
+def _write_both(out: Path, folder: Path, sources: Sources, record: dict[str, Any]) -> None:
+    """A video of both cameras side by side; a time that is not corrected is there as it was read."""
+    import numpy as np
+
+    from rsbench.dataset.corrected_frames import read_corrected
+    from rsbench.dataset.corrected_video import fps_of, write_video
+
+    def shown(side: str, number: int, image: Any) -> Any:
+        name = f"{side}_{number:06d}"
+        return read_corrected(folder, name) if (folder / "corrected" / f"{name}.png").is_file() else image
+
+    both = (
+        np.hstack([shown("left", number, left), shown("right", number, right)])
+        for number, (left, right) in enumerate(zip(*sources, strict=True))
+    )
+    write_video(out, folder, both, fps_of(sources[0].path), record)
+
+
+def _say(out: Path, first: str, record: dict[str, Any]) -> None:
+    """Exit 1 where a time is not corrected."""
+    from rsbench.dataset.corrected_video import is_video
+
+    frames = record["frames"]
+    failed, skipped = _told(frames, "reason"), _told(frames, "skipped")
+    typer.echo(first)
+    say_calibration(record)
+    typer.echo(f"{sum('reason' not in frame for frame in frames)} of {len(frames)} times corrected")
+    typer.echo(f"video: {out.resolve()}" if is_video(out) else f"report: {(out / 'report.html').resolve()}")
+    if skipped:
+        typer.echo(f"rsbench: corrected with the motion of the frames around: {skipped}", err=True)
+    if failed:
+        typer.echo(f"rsbench: not corrected: {failed}", err=True)
+        raise typer.Exit(1)
+
+
+def _told(frames: list[dict[str, Any]], key: str) -> str:
+    """Which frames have a reason under ``key``, with it."""
+    return "; ".join(f"frame {frame['number']} ({frame[key]})" for frame in frames if key in frame)

@@ -1,0 +1,165 @@
+"""How the cameras of a sequence read, from some of its windows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from rsbench.capture.estimate import CERTAIN, Capture, conclude, examine
+from rsbench.capture.estimate import Window as Examined
+from rsbench.capture.hypotheses import Known
+from rsbench.capture.rectification import RefusedFramesError
+from rsbench.capture.scans import GLOBAL
+from rsbench.capture.settle import NoMotionError, as_global, known_of, shutter_found
+from rsbench.capture.trajectory_check import SUCCESSIVE, shakes
+from rsbench.capture.trajectory_shutter import LONGEST, capture_of_sequence
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.footage import FrameSource
+from rsbench.pipeline.frame_matches import match_frames, match_unknown
+from rsbench.pipeline.frame_motion import models_asked
+from rsbench.pipeline.sequence_windows import JUDGED, Refusals, window_images
+
+WINDOWS = 8
+"""At most, of those by which the shutter is found."""
+FEWEST_FRAMES = 4
+"""Of a sequence through which a trajectory is fitted: fewer do not show what two frames shake alike."""
+
+
+def estimate_sequence_capture(
+    left: FrameSource,
+    right: FrameSource,
+    rig: StereoRig,
+    options: CorrectionOptions,
+    readout_ratio: float | None = None,
+    scanning: Scanning | None = None,
+    calibration: tuple[float, ...] | None = None,
+    advance: Callable[[str], None] = lambda word: None,
+) -> tuple[Capture | None, RollingShutter]:
+    """How the cameras of a sequence read, from windows that lie evenly over it: their shutter does not change.
+
+    With a known ratio the calibration alone is looked for; no capture where the first window shows no errors.
+
+    Args:
+        readout_ratio, scanning, calibration: see ``solve_frames``.
+        advance: called for each window.
+
+    Raises:
+        RefusedFramesError: the first windows cannot be what they are said to be.
+        NoMotionError: the windows do not determine the shutter.
+    """
+    scanning = scanning if readout_ratio is None else scanning or Scanning()
+    look, refusals = _Look(rig, options, readout_ratio, scanning, calibration), Refusals(left)
+    doubts = list[RefusedFramesError | None]()
+    every, number = max((left.count - 1) // WINDOWS, 1), -1
+    for number, images in enumerate(window_images(left, right)):
+        look.judge(number)
+        chosen = not look.shaken and number % every == 0 and len(look.used) < WINDOWS
+        if not (chosen or number < look.successive):
+            continue
+        try:
+            if scanning is None:
+                matches, doubt = match_unknown(images, rig, options, judge_rig=number < JUDGED)
+                doubts.append(doubt)
+            else:
+                matches = match_frames(images, rig, options, scanning, judge_rig=number < JUDGED)
+        except RefusedFramesError as error:
+            refusals.add(number, error)
+            matches, chosen = Correspondences(), False
+        look.add(number, matches, chosen)
+        if look.is_right:
+            break
+        if chosen:
+            advance(f"window {number}")
+    refusals.end(number + 1)
+    if readout_ratio is not None:
+        shutter = (scanning or Scanning()).shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
+        return (None if look.is_right else look.concluded()), shutter
+    capture = look.concluded()
+    shutter, doubt = shutter_found(capture, rig), next(filter(None, doubts), None)
+    if doubt is not None and shutter.rows_together:
+        raise doubt
+    return capture, shutter
+
+
+class _Look:
+    """What windows so far say of a shutter."""
+
+    def __init__(
+        self,
+        rig: StereoRig,
+        options: CorrectionOptions,
+        readout_ratio: float | None,
+        scanning: Scanning | None,
+        calibration: tuple[float, ...] | None,
+    ) -> None:
+        self._rig, self._options, self._ratio = rig, options, readout_ratio
+        self._scanning, self._calibration = scanning, calibration
+        self._examined, self.used, self._first = list[Examined](), list[Correspondences](), list[Correspondences]()
+        self._known: Known | None = None
+        self._waiting = list[Correspondences]()
+        self.shaken = False
+
+    @property
+    def successive(self) -> int:
+        """How many of the first windows are looked at, whichever others are."""
+        return LONGEST if self.shaken else SUCCESSIVE
+
+    @property
+    def is_right(self) -> bool:
+        """Whether there is nothing to look for: the ratio is known, and the calibration shows no errors."""
+        return self._ratio is not None and self._known is not None and not any(self._known.calibration_sigma)
+
+    def judge(self, number: int) -> None:
+        """Whether the rig shakes, once there are enough windows before ``number``: no motion model helps then."""
+        if number + 1 == FEWEST_FRAMES and self._examined and self._ratio is None:
+            self.shaken = shakes(conclude(self._examined), self._first, self._rig, self._options.seed)
+            if not self.shaken:
+                self._examine_waiting()
+
+    def add(self, number: int, matches: Correspondences, chosen: bool) -> None:
+        """A window; ``chosen``: to be judged under the motion models."""
+        if number < self.successive:
+            self._first.append(matches)
+        if not chosen:
+            return
+        self._waiting.append(matches)
+        if not self._examined or number + 1 >= FEWEST_FRAMES:  # those between wait for ``judge``: they take long
+            self._examine_waiting()
+
+    def _examine_waiting(self) -> None:
+        options, models = self._options, models_asked(self._options.motion_model)
+        for matches in self._waiting:
+            asked = (self._ratio, self._scanning, self._calibration)
+            known = self._known = self._known or known_of(matches, self._rig, *asked, models)
+            if self.is_right:
+                return
+            self._examined.append(examine(matches, self._rig, known, options.robust, options.seed))
+            self.used.append(matches)
+            self._known = _narrowed(known, conclude(self._examined))
+        self._waiting.clear()
+
+    def concluded(self) -> Capture:
+        """What all say: under the motion models, or, of a rig that shakes, along one trajectory."""
+        if not self.shaken:
+            self._examine_waiting()
+        if self._known is None:
+            raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
+        capture = conclude(self._examined)
+        if self._ratio is None:
+            capture = as_global(capture, self.used, self._rig, self._known)
+        if self._ratio is not None or len(self._first) + 1 < FEWEST_FRAMES:
+            return capture
+        if self.shaken or shakes(capture, self._first, self._rig, self._options.seed):
+            return capture_of_sequence(capture, self._first, self._rig, self._scanning, self._options.seed)
+        return capture
+
+
+def _narrowed(known: Known, capture: Capture) -> Known:
+    """Without scans that the windows so far exclude."""
+    if not capture.candidates or capture.candidates[0].probability < CERTAIN:
+        return known
+    left = {candidate.scans for candidate in capture.candidates} | {GLOBAL}
+    return replace(known, scans=tuple(each for each in known.scans if each in left))
