@@ -109,6 +109,8 @@ def find_own_motion(
 class MonoFusionCorrector(Corrector):
     """Each camera by itself: geometry where its rows' epipolar curves explain the flow, scaled flow elsewhere."""
 
+    geometry: bool = True
+    """Whether depth and motion are looked for; without, everything goes its flow, scaled by the times of rows."""
     fusion: MonoFusionOptions = field(default_factory=MonoFusionOptions)
     """How two frames become one image."""
     robust: RobustOptions = field(default_factory=RobustOptions)
@@ -146,5 +148,7 @@ class MonoFusionCorrector(Corrector):
         flows = find_flows(images)
         if reason := refusal(images, flows):
             return reason
-        found = find_own_motion(flows, problem.rig, problem.shutter, side, self.robust, self.seed)
-        return MonoFusion(images, found.own, flows, self.fusion)
+        own = OwnMotion(rig=problem.rig.about(side), shutter=problem.shutter, side=side, motion=None)
+        if self.geometry:
+            own = find_own_motion(flows, problem.rig, problem.shutter, side, self.robust, self.seed).own
+        return MonoFusion(images, own, flows, self.fusion)
