@@ -51,6 +51,8 @@ class FoundOwnMotion:
     """Where it comes from; None without matches."""
     reason: str = ""
     """Why everything goes its flow; empty with a motion."""
+    unused: str = ""
+    """Why the samples of a gyroscope were given and not used; empty otherwise."""
 
 
 def refusal(images: Sequence[NDArray[Any]], flows: Flows) -> str:
