@@ -52,7 +52,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One sequence with a gyroscope, and the truth of three rows."""
     folder = tmp_path_factory.mktemp("rendered")
     (folder / "card.toml").write_text(CARD, encoding="utf-8")
-    generate_dataset(load_dataset_card(folder / "card.toml"), folder / "data")
+    generate_dataset(load_dataset_card(str(folder / "card.toml")), folder / "data")
     return folder / "data"
 
 
@@ -113,7 +113,7 @@ def test_nobody_looks_to_the_right(name: str, rendered: Path) -> None:
     """Black images of the right camera give the same frames."""
     split = dataset_split(TRACK, rendered)
     (problem,) = TRACK.problems(rendered, None, 1)
-    pictures, made = split.truths[0].pictures, []
+    pictures, made = split.truths[0].pictures, list[np.ndarray]()
     assert pictures is not None
     images = {view: pictures.sequence.image("rs", *view) for view in VIEWS}
     for seen in (images, {view: image * (view[0] == "left") for view, image in images.items()}):
@@ -123,7 +123,7 @@ def test_nobody_looks_to_the_right(name: str, rendered: Path) -> None:
         )
         assert len(frames) == 3 and seconds > 0.0
         made.append(np.stack([frame["left", 1].image for frame in frames]))
-    np.testing.assert_array_equal(*made)
+    np.testing.assert_array_equal(made[0], made[1])
 
 
 def test_rows_are_asked_where_their_truth_is(tmp_path: Path) -> None:
