@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from rsbench.core.camera import PinholeCamera
     from rsbench.core.so3 import FloatArray
     from rsbench.pipeline.footage import FrameSource
@@ -29,6 +31,7 @@ GyroOffset = Annotated[
     float, typer.Option(metavar="SECONDS", help="What --gyro's clock shows at the first row of the first frame.")
 ]
 _MOST = 1e9
+_MOST_LISTED = 8
 _PAGE_FRAMES = 6
 _ENTRIES = ".rsbench/frames"
 """Folder, of those that are gone when all is written, of what motion.json will say of each frame."""
@@ -158,11 +161,11 @@ def _correct_into(
     from rsbench.capture.settle import NoMotionError
     from rsbench.cli.console import progress_bar
     from rsbench.pipeline.mono_sequence import correct_frames
-    from rsbench.pipeline.mono_shutter import WINDOWS, find_shutter
+    from rsbench.pipeline.mono_shutter import IN_ORDER, WINDOWS, find_shutter
 
     height, width = next(iter(source)).shape[:2]
     camera, corrector = card.camera_of(width, height), options.corrector
-    pairs = WINDOWS if card.readout_ratio is None else 0
+    pairs = WINDOWS if card.readout_ratio is None else IN_ORDER
     try:
         with progress_bar("looking at the shutter", min(max(source.count - 1, 1), pairs)) as advance:
             found = find_shutter(source, source.count, card, corrector.robust, corrector.seed, advance)
@@ -226,23 +229,30 @@ def _focal(record: dict[str, Any]) -> str:
 def _say(record: dict[str, Any], out: Path) -> None:
     """Exit 1 where some frames are not corrected."""
     told = {
-        key: "; ".join(f"frame {each['number']} ({each[key]})" for each in record["frames"] if key in each)
+        key: _listed((each["number"], each[key]) for each in record["frames"] if key in each)
         for key in ("skipped", "reason")
     }
-    unused = [each for each in record["frames"] if "gyro" in each.get("motion", {})]
+    motions = ((each["number"], each.get("motion", {})) for each in record["frames"])
+    told["gyro"] = _listed((number, motion["gyro"]) for number, motion in motions if "gyro" in motion)
     corrected = sum("reason" not in each for each in record["frames"])
     typer.echo(f"readout ratio {_readout(record)}")
     typer.echo(f"{corrected} of {len(record['frames'])} frames corrected")
     place = out if out.is_file() else out / "report.html"
     typer.echo(f"{'video' if out.is_file() else 'report'}: {place.resolve()}")
-    if unused:
-        names = "; ".join(f"frame {each['number']} ({each['motion']['gyro']})" for each in unused)
-        typer.echo(f"rsbench: corrected without the gyroscope: {names}", err=True)
+    if told["gyro"]:
+        typer.echo(f"rsbench: corrected without the gyroscope: {told['gyro']}", err=True)
     if told["skipped"]:
         typer.echo(f"rsbench: corrected with the frame after them: {told['skipped']}", err=True)
     if told["reason"]:
         typer.echo(f"rsbench: not corrected: {told['reason']}", err=True)
         raise typer.Exit(1)
+
+
+def _listed(frames: Iterable[tuple[int, str]]) -> str:
+    """Numbers of frames and why; of many the first ones."""
+    words = [f"frame {number} ({why})" for number, why in frames]
+    more = [f"and {len(words) - _MOST_LISTED} more, see motion.json"] if len(words) > _MOST_LISTED else []
+    return "; ".join(words[:_MOST_LISTED] + more)
 
 
 def _written(folder: Path) -> list[dict[str, Any]]:

@@ -109,28 +109,32 @@ def correct_frames(
     options = options or MonoOptions()
     turn = turned(camera, shutter)
     waits: MonoMoment | None = None
+    held = list[MonoMoment]()  # of a first pair that is refused where no other frame follows
     number = 0
     for number, before, image, pair in _pairs(frames, turn, options, done, gyro):
+        yield from held
+        held.clear()
         if pair is None:
             continue
         if number == 1 and done == 0:
             waits = _unmoved(0, before, pair.reason)
         if waits is not None:
-            yield _corrected(0, waits, pair, turn, options) if pair.fusion else waits
-        now = _unmoved(number, image, pair.reason)
-        moment = _corrected(1, now, pair, turn, options) if pair.fusion else None
+            held.append(_corrected(0, waits, pair, turn, options) if pair.fusion else waits)
+        now, waits = _unmoved(number, image, pair.reason), None
         # A camera that stood still is in place; the same frame twice stands for one that was not taken.
         stays = pair.reason == STILL and not np.array_equal(before, image)
-        waits = None
-        if moment is not None or stays:
-            yield moment or now
+        if pair.fusion or stays:
+            held.append(_corrected(1, now, pair, turn, options) if pair.fusion else now)
         else:
             waits = now
+        if number > 1 or pair.fusion:
+            yield from held
+            held.clear()
     if number == 0:
         raise RsbenchError("frames: fewer than two; one camera shows its motion in at least two")
+    if held:
+        raise RsbenchError(f"frames: {held[0].fused.reason}")
     if waits is not None:
-        if number == 1:
-            raise RsbenchError(f"frames: {waits.fused.reason}")
         yield waits
 
 
@@ -138,7 +142,6 @@ def _pairs(
     frames: Iterable[NDArray[Any]], turn: Turned, options: MonoOptions, done: int, gyro: FloatArray | None
 ) -> Iterator[tuple[int, NDArray[Any], NDArray[Any], _Pair | None]]:
     """Number of the second frame, both frames, and what is known of them, of all pairs in order; None: done."""
-
     turned_gyro = None if gyro is None else turn.gyro(gyro)
 
     def ready(before: NDArray[Any], image: NDArray[Any], first: int) -> _Pair:
