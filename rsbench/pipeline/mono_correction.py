@@ -59,18 +59,23 @@ class FoundOwnMotion:
 
 def refusal(images: Sequence[NDArray[Any]], flows: Flows) -> str:
     """Why two frames (H, W[, 3]) of one camera cannot be corrected; empty when they can."""
-    for name, image in zip(("first", "second"), eight_bit(list(images)), strict=True):
-        grey = grey_u8(image).astype(np.float32)
-        mean, square = (cv2.blur(each, (_WINDOW, _WINDOW)) for each in (grey, grey * grey))
-        variance = square - mean * mean
+    variances = [_variance(image) for image in eight_bit(list(images))]
+    for name, variance in zip(("first", "second"), variances, strict=True):
         if np.mean(variance > _TEXTURE_LEVELS**2) < _TEXTURED:
             return f"the {name} frame shows no texture: nothing to find its motion by"
-    clear = variance >= np.quantile(variance, 1.0 - _CLEAREST)
+    clear = variances[1] >= np.quantile(variances[1], 1.0 - _CLEAREST)
     if float(np.quantile(np.linalg.norm(flows.flow[1][clear], axis=-1), _MOST)) < _STILL_PX:
         return STILL
     if float(np.mean(flows.returns[1] < _RETURNS_PX)) < _FOLLOWED:
         return CUT
     return ""
+
+
+def _variance(image: NDArray[Any]) -> NDArray[np.float32]:
+    """(H, W) of the grey levels around each pixel of an 8-bit image (H, W[, 3])."""
+    grey = grey_u8(image).astype(np.float32)
+    mean, square = (cv2.blur(each, (_WINDOW, _WINDOW)) for each in (grey, grey * grey))
+    return np.asarray(square - mean * mean)
 
 
 def flow_matches(flows: Flows, rng: np.random.Generator) -> FloatArray:

@@ -83,9 +83,13 @@ def test_a_gyroscope_tells_what_two_frames_do_not(
     assert np.rad2deg(np.linalg.norm(motion.w - scene.motion.w)) < 0.15
 
 
-def test_a_gyroscope_of_another_sign_is_not_believed(world: Any, shapes: Any, u8: Any) -> None:
+@pytest.mark.parametrize("factor", [-1.0, 50.0])
+def test_a_gyroscope_of_another_sign_or_unit_is_not_believed(
+    world: Any, shapes: Any, u8: Any, factor: float
+) -> None:
     scene = shaken(world, shapes, "handheld")
-    without, given = corrected(scene, u8, None), corrected(scene, u8, measured(scene) * [1.0, -1.0, -1.0, -1.0])
+    wrong = measured(scene) * [1.0, factor, factor, factor]
+    without, given = corrected(scene, u8, None), corrected(scene, u8, wrong)
     assert given.found is not None and given.found.unused == CONTRADICTED
     np.testing.assert_array_equal(given.fused.image, without.fused.image)
 
