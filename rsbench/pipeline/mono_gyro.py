@@ -43,7 +43,7 @@ _WORSE, _BIASED, _FAR_WORSE = 1.15, 2.0, 2.0
 """A gyroscope contradicts the frames where it fits them by so much worse than a constant rate of turn does, at a
 bias of so many standard deviations, or by far worse. On shakes of three kinds in a closed-form world, right
 samples had one of the first two at most, and 1.63 times the error; those with another sign, axes or time that
-fitted worse than a constant rate had both, but one of 20."""
+fitted so much worse had both."""
 
 
 def around(samples: FloatArray, first: float, last: float) -> FloatArray | None:
