@@ -47,6 +47,7 @@ def correct(
     target_row: float = 0.0,
     inpaint: bool | None = None,
     seed: int = 0,
+    gyro: ArrayLike | None = None,
 ) -> list[Fused]: ...
 
 
@@ -75,14 +76,15 @@ def correct(
         rig: both cameras, with their lens where they have one.
         readout_ratio: readout time over frame period; None has it found, with the side that lines are read from.
         camera: one camera: its intrinsics, or its horizontal field of view in degrees, or "unknown". Of the other
-            arguments one camera takes readout_ratio, target_row, inpaint and seed.
+            arguments one camera takes readout_ratio, target_row, inpaint, seed and gyro.
         solver: finds the motion, in metres; as in ``estimate_motion``.
         motion_model: ``auto``, which the matches prefer, or a name; None is auto where the solver takes it.
         matcher, features, corrector: names or cards of what finds depth and matches, and corrects.
         target_row: the time of this row of a frame is that of its corrected image.
         inpaint: invent all pixels that no frame shows, or none; None closes specks and slits alone.
         seed: of the robust loop's samples.
-        gyro: (n, 4) samples of a gyroscope, as of ``Correspondences``, for correctors that need them.
+        gyro: (n, 4) samples of a gyroscope, as of ``Correspondences``: of a rig for correctors that need them; of
+            one camera they are its rotation, tau 0 the first row of the first frame.
 
     Returns:
         Of a rig ``frames["left", 0]`` and so on, with ``image``, ``depth`` and ``origin``; ``motion`` and
@@ -100,7 +102,7 @@ def correct(
     if rig is None:
         _check_own(solver, motion_model, matcher, features, corrector)
         known = None if camera == "unknown" else camera
-        return array_correction.of_one_camera(images, known, readout_ratio, target_row, inpaint, seed)
+        return array_correction.of_one_camera(images, known, readout_ratio, target_row, inpaint, seed, gyro)
     components = solver, motion_model, matcher, features, corrector
     options = array_correction.options_of(*components, target_row=target_row, inpaint=bool(inpaint), seed=seed)
     return array_correction.of_rig(images, rig, readout_ratio, options, gyro, close=inpaint is None)

@@ -9,8 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import typer
 
 from rsbench.cli.component_kinds import named
-from rsbench.cli.correct_input import given_frames, sized, target_row
-from rsbench.cli.correct_one_camera import CameraFile, Footage, correct_one_camera
+from rsbench.cli.correct_input import EPILOG, given_frames, sized, target_row
+from rsbench.cli.correct_one_camera import (
+    CameraFile,
+    Footage,
+    Fps,
+    GyroFile,
+    GyroGiven,
+    GyroOffset,
+    correct_one_camera,
+)
 from rsbench.cli.correct_said import readout_words, say_calibration, write_page_of
 from rsbench.cli.correct_sequence import correct_sequence_given
 
@@ -22,35 +30,6 @@ if TYPE_CHECKING:
     from rsbench.vision.fusion import Fused
 
     Finish: TypeAlias = Callable[[Fused], Fused]
-
-EPILOG = """[bold]Examples[/bold]
-
-  rsbench correct l0.png r0.png l1.png r1.png --rig rig.toml --out corrected
-
-  rsbench correct --left left.mp4 --right right.mp4 --rig rig.toml --out corrected --target middle
-
-  rsbench correct l0.png r0.png l1.png r1.png --rig rig.toml --out corrected --motion-model twist
-
-  rsbench correct data/footage/castle --out corrected     [dim](a sequence of a dataset, which knows its rig)[/dim]
-
-RIG.toml, for images of cameras side by side (pixels, metres; without readout_ratio and scan both are found):
-
-  baseline = 0.12
-  readout_ratio = 0.8        [dim]# readout time / frame period; or shutter = "gopro-hero6-4k30", of a real
-                             # camera's mode (rsbench list shutters)[/dim]
-  \\[camera]
-  fx = 812.3
-  fy = 812.3
-  cx = 479.5
-  cy = 269.5
-  lens = { model = "brown-conrady", k1 = -0.2 }   [dim]# or kannala-brandt; without it: no distortion[/dim]
-
-Names: rsbench list solvers, matchers, features or correctors; a card's path ends in .toml.
-
-DIR gets [bold]report.html[/bold] (before and after), [bold]corrected/*.png[/bold], [bold]depth/*.exr[/bold]
-(of the corrected frames, metres), [bold]mask/*.png[/bold] (255 seen in the frame, 192 at a guessed depth, 128 from
-the other camera, 64 from the other frame, 32 a narrow hole closed from around it, 0 seen by nobody) and
-[bold]motion.json[/bold]."""
 
 _INPAINT = "Invent all pixels that no frame shows, or none. Default: specks and slits alone"
 _ROW_POSES = "Of a sequence, write the pose at every row too: row_poses.csv, in TUM's format."
@@ -84,11 +63,17 @@ def correct(
     row_poses: Annotated[bool, typer.Option("--row-poses", help=_ROW_POSES)] = False,
     camera: CameraFile = None,
     footage: Footage = None,
+    gyro: GyroFile = None,
+    fps: Fps = None,
+    gyro_offset: GyroOffset = 0.0,
 ) -> None:
     """Correct your own rolling-shutter frames: of a stereo rig or of one camera, two times or a whole sequence."""
     if camera is not None or footage is not None:
-        correct_one_camera(frames, footage, camera, out, target, inpaint, seed)
+        log = GyroGiven(file=gyro, fps=fps, offset_s=gyro_offset)
+        correct_one_camera(frames, footage, camera, out, target, inpaint, seed, log)
         return
+    if gyro is not None:
+        raise typer.BadParameter("is used with --camera or --frames, of one camera", param_hint="--gyro")
     given = given_frames(frames, rig, out, left, right, row_poses)
     others = {"find_sky": sky, "inpaint": bool(inpaint), "seed": seed, "motion_model": motion_model}
     options = _options(features, solver, matcher, corrector, fill, **others)

@@ -10,6 +10,35 @@ if TYPE_CHECKING:
     from rsbench.core.rig import StereoRig
     from rsbench.pipeline.footage import FrameSource, RigCard
 
+EPILOG = """[bold]Examples[/bold]
+
+  rsbench correct l0.png r0.png l1.png r1.png --rig rig.toml --out corrected
+
+  rsbench correct --left left.mp4 --right right.mp4 --rig rig.toml --out corrected --target middle
+
+  rsbench correct l0.png r0.png l1.png r1.png --rig rig.toml --out corrected --motion-model twist
+
+  rsbench correct data/footage/castle --out corrected     [dim](a sequence of a dataset, which knows its rig)[/dim]
+
+RIG.toml, for images of cameras side by side (pixels, metres; without readout_ratio and scan both are found):
+
+  baseline = 0.12
+  readout_ratio = 0.8        [dim]# readout time / frame period; or shutter = "gopro-hero6-4k30", of a real
+                             # camera's mode (rsbench list shutters)[/dim]
+  \\[camera]
+  fx = 812.3
+  fy = 812.3
+  cx = 479.5
+  cy = 269.5
+  lens = { model = "brown-conrady", k1 = -0.2 }   [dim]# or kannala-brandt; without it: no distortion[/dim]
+
+Names: rsbench list solvers, matchers, features or correctors; a card's path ends in .toml.
+
+DIR gets [bold]report.html[/bold] (before and after), [bold]corrected/*.png[/bold], [bold]depth/*.exr[/bold]
+(of the corrected frames, metres), [bold]mask/*.png[/bold] (255 seen in the frame, 192 at a guessed depth, 128 from
+the other camera, 64 from the other frame, 32 a narrow hole closed from around it, 0 seen by nobody) and
+[bold]motion.json[/bold]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Given:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from rsbench.core.camera import PinholeCamera
+    from rsbench.core.so3 import FloatArray
     from rsbench.pipeline.footage import FrameSource
     from rsbench.pipeline.mono_sequence import MonoMoment, MonoOptions
     from rsbench.pipeline.mono_shutter import FoundShutter
@@ -16,9 +20,19 @@ if TYPE_CHECKING:
 
 CameraFile = Annotated[Path | None, typer.Option(metavar="CAMERA.toml", help="Of one camera, in place of --rig.")]
 Footage = Annotated[Path | None, typer.Option("--frames", metavar="DIR|VIDEO", help="Frames of one camera.")]
+GyroFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="LOG.gcsv|LOG.csv", help="Of one camera: what a gyroscope measured; needs --fps or a video."
+    ),
+]
+Fps = Annotated[float | None, typer.Option(help="Frames a second, for --gyro. Default: what the video says.")]
+GyroOffset = Annotated[
+    float, typer.Option(metavar="SECONDS", help="What --gyro's clock shows at the first row of the first frame.")
+]
+_MOST = 1e9
+_MOST_LISTED = 8
 _PAGE_FRAMES = 6
-_ENTRIES = ".rsbench/frames"
-"""Folder, of those that are gone when all is written, of what motion.json will say of each frame."""
 _UNIT = "length of the translation over one frame period"
 
 
@@ -30,6 +44,7 @@ def correct_one_camera(
     target: str,
     inpaint: bool | None,
     seed: int,
+    gyro: GyroGiven,
 ) -> None:
     """Correct images, or a folder or video, of one camera; exit 1 where some of many frames are not corrected.
 
@@ -46,25 +61,66 @@ def correct_one_camera(
         raise RsbenchError("frames: with --camera give FRAME_0 FRAME_1 and so on, or --frames DIR|VIDEO")
     card = OneCameraCard() if camera is None else read_one_camera(camera)
     source = FrameSource.of_files(frames) if frames is not None else FrameSource(footage or Path())
-    record = _correct(source, card, out, _options(source, target, inpaint, seed))
+    record = _correct(source, card, out, _options(source, target, inpaint, seed), gyro.samples(source))
     _say(record, out)
 
 
-def _correct(source: FrameSource, card: OneCameraCard, out: Path, options: MonoOptions) -> dict[str, Any]:
+@dataclass(frozen=True, kw_only=True)
+class GyroGiven:
+    """The options of a gyroscope."""
+
+    file: Path | None
+    fps: float | None
+    offset_s: float
+
+    def samples(self, source: FrameSource) -> FloatArray | None:
+        """(n, 4) tau, w; None without a log.
+
+        Raises:
+            RsbenchError: a log that cannot be read, is of another time, or frames whose rate nobody says.
+        """
+        from rsbench.core.errors import RsbenchError
+        from rsbench.dataset.corrected_video import said_fps
+        from rsbench.interop.readers.gyro_log import read_gyro_log
+
+        if self.file is None:
+            if self.fps is not None or self.offset_s != 0.0:
+                raise RsbenchError("--fps, --gyro-offset: are of a gyroscope's log; give --gyro too")
+            return None
+        fps = said_fps(source.path) if self.fps is None else self.fps
+        if fps is None:
+            raise RsbenchError("--fps: is required with --gyro and images, which do not say it")
+        if not 0.0 < fps < _MOST:
+            raise RsbenchError(f"--fps {fps:g}: must lie in (0, {_MOST:g})")
+        if not abs(self.offset_s) < _MOST:
+            raise RsbenchError(f"--gyro-offset {self.offset_s:g}: must lie within {_MOST:g} seconds")
+        samples = read_gyro_log(self.file).samples(fps, self.offset_s)
+        last = max(source.count, 2)
+        if samples[-1, 0] <= 0.0 or samples[0, 0] >= last:
+            raise RsbenchError(
+                f"{self.file}: lasts from {samples[0, 0] / fps:.3g} to {samples[-1, 0] / fps:.3g} s after the "
+                f"first frame, and the frames {last / fps:.3g} s: give --gyro-offset"
+            )
+        return samples
+
+
+def _correct(
+    source: FrameSource, card: OneCameraCard, out: Path, options: MonoOptions, gyro: FloatArray | None
+) -> dict[str, Any]:
     """What motion.json holds, once all is written, as a folder or a video."""
     from rsbench.dataset.corrected_frames import fresh_folder, read_corrected, write_record
     from rsbench.dataset.corrected_video import fps_of, is_video, video_place, write_video
     from rsbench.report.corrected_page import write_page
 
-    run = _run_key(source, card, options, is_video(out))
+    run = _run_key(source, card, options, is_video(out), gyro)
     if is_video(out):
         with video_place(out, run) as folder:
-            record = _correct_into(folder, source, card, options, whole=False)
+            record = _correct_into(folder, source, card, options, gyro, whole=False)
             images = (read_corrected(folder, f"{each['number']:06d}") for each in record["frames"])
             write_video(out, folder, images, fps_of(source.path), record)
         return record
     with fresh_folder(out, run=run) as folder:
-        record = _correct_into(folder, source, card, options, whole=True)
+        record = _correct_into(folder, source, card, options, gyro, whole=True)
         write_record(folder, record)
         facts = [("readout ratio", _readout(record)), ("focal length", _focal(record))]
         facts += [("unit of depth", _UNIT)]
@@ -73,18 +129,27 @@ def _correct(source: FrameSource, card: OneCameraCard, out: Path, options: MonoO
     return record
 
 
-def _run_key(source: FrameSource, card: OneCameraCard, options: MonoOptions, video: bool) -> str:
+def _run_key(
+    source: FrameSource, card: OneCameraCard, options: MonoOptions, video: bool, gyro: FloatArray | None
+) -> str:
     """Of all that decides what is written: a run with another key does not go on with what this one wrote."""
     import hashlib
 
     from rsbench.core.version import __version__
 
     said = [__version__, repr(card), repr(options), repr(video), *source.identity()]
+    said += [] if gyro is None else [hashlib.sha256(gyro.tobytes()).hexdigest()]
     return hashlib.sha256("\n".join(said).encode()).hexdigest()
 
 
 def _correct_into(
-    folder: Path, source: FrameSource, card: OneCameraCard, options: MonoOptions, *, whole: bool
+    folder: Path,
+    source: FrameSource,
+    card: OneCameraCard,
+    options: MonoOptions,
+    gyro: FloatArray | None,
+    *,
+    whole: bool,
 ) -> dict[str, Any]:
     """Write every frame that is not there yet; exit 1 where the frames do not show how they were read.
 
@@ -93,24 +158,25 @@ def _correct_into(
     """
     from rsbench.capture.settle import NoMotionError
     from rsbench.cli.console import progress_bar
+    from rsbench.dataset.corrected_frames import written_entries
     from rsbench.pipeline.mono_sequence import correct_frames
-    from rsbench.pipeline.mono_shutter import WINDOWS, find_shutter
+    from rsbench.pipeline.mono_shutter import IN_ORDER, WINDOWS, find_shutter
 
     height, width = next(iter(source)).shape[:2]
     camera, corrector = card.camera_of(width, height), options.corrector
-    pairs = WINDOWS if card.readout_ratio is None else 0
+    pairs = WINDOWS if card.readout_ratio is None else IN_ORDER
     try:
         with progress_bar("looking at the shutter", min(max(source.count - 1, 1), pairs)) as advance:
             found = find_shutter(source, source.count, card, corrector.robust, corrector.seed, advance)
     except NoMotionError as error:
         typer.echo(f"rsbench: not corrected: {error}", err=True)
         raise typer.Exit(1) from None
-    record = _known(card, camera, found, options)
-    entries = _written(folder)
+    record = {**_known(card, camera, found, options), "gyro": gyro is not None}
+    entries = written_entries(folder)
     with progress_bar("correcting", max(source.count, 1)) as advance:
         for entry in entries:
             advance(f"frame {entry['number']}")
-        moments = correct_frames(source, camera, found.shutter, options, len(entries))
+        moments = correct_frames(source, camera, found.shutter, options, len(entries), gyro)
         record["frames"] = entries + _write(folder, moments, advance, whole=whole)
     return record
 
@@ -162,14 +228,18 @@ def _focal(record: dict[str, Any]) -> str:
 def _say(record: dict[str, Any], out: Path) -> None:
     """Exit 1 where some frames are not corrected."""
     told = {
-        key: "; ".join(f"frame {each['number']} ({each[key]})" for each in record["frames"] if key in each)
+        key: _listed((each["number"], each[key]) for each in record["frames"] if key in each)
         for key in ("skipped", "reason")
     }
+    motions = ((each["number"], each.get("motion", {})) for each in record["frames"])
+    told["gyro"] = _listed((number, motion["gyro"]) for number, motion in motions if "gyro" in motion)
     corrected = sum("reason" not in each for each in record["frames"])
     typer.echo(f"readout ratio {_readout(record)}")
     typer.echo(f"{corrected} of {len(record['frames'])} frames corrected")
     place = out if out.is_file() else out / "report.html"
     typer.echo(f"{'video' if out.is_file() else 'report'}: {place.resolve()}")
+    if told["gyro"]:
+        typer.echo(f"rsbench: corrected without the gyroscope: {told['gyro']}", err=True)
     if told["skipped"]:
         typer.echo(f"rsbench: corrected with the frame after them: {told['skipped']}", err=True)
     if told["reason"]:
@@ -177,21 +247,18 @@ def _say(record: dict[str, Any], out: Path) -> None:
         raise typer.Exit(1)
 
 
-def _written(folder: Path) -> list[dict[str, Any]]:
-    """What a run before this one said of the first frames, which it finished."""
-    from rsbench.storage.files import read_json
-    from rsbench.storage.work_folder import listed
-
-    return [read_json(path) for path in listed(folder / _ENTRIES, ".json")]
+def _listed(frames: Iterable[tuple[int, str]]) -> str:
+    """Numbers of frames and why; of many the first ones."""
+    words = [f"frame {number} ({why})" for number, why in frames]
+    more = [f"and {len(words) - _MOST_LISTED} more, see motion.json"] if len(words) > _MOST_LISTED else []
+    return "; ".join(words[:_MOST_LISTED] + more)
 
 
 def _write(folder: Path, moments: Any, advance: Any, *, whole: bool) -> list[dict[str, Any]]:
     """Write every frame, and then what motion.json says of it: a frame that has that is complete."""
-    from rsbench.dataset.corrected_frames import write_frame
+    from rsbench.dataset.corrected_frames import write_entry, write_frame
     from rsbench.pipeline.mono_sequence import translation_record
-    from rsbench.storage.files import write_json
 
-    (folder / _ENTRIES).mkdir(parents=True, exist_ok=True)
     entries: list[dict[str, Any]] = []
     moment: MonoMoment
     for moment in moments:
@@ -203,7 +270,7 @@ def _write(folder: Path, moments: Any, advance: Any, *, whole: bool) -> list[dic
                 entry[key] = words
         if moment.found is not None:
             entry["motion"] = translation_record(moment.found)
-        write_json(folder / _ENTRIES / f"{name}.json", entry)
+        write_entry(folder, entry)
         entries.append(entry)
         advance(f"frame {moment.number}")
     return entries

@@ -11,7 +11,12 @@ from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at, s
 from rsbench.cli.component_kinds import complete
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import pandas as pd
+
     from rsbench.benchmark.images.plan import EvaluationOptions
+    from rsbench.dataset.recording import Recording
     from rsbench.jobs.workers import Workers
 
 EPILOG = """[bold]Examples[/bold]
@@ -54,6 +59,7 @@ _Features = Annotated[
 _Corrector = Annotated[
     str, typer.Option(help="Corrector, a name or a card.", autocompletion=complete("correctors"))
 ]
+_OF_A_RIG = "fusion"
 _Metrics = Annotated[
     list[str] | None,
     typer.Option(
@@ -78,7 +84,7 @@ def evaluate(
     correct_with: _CorrectWith = "rs-stereo-refined",
     matcher: _Matcher = "sgm",
     features: _Features = "sift",
-    corrector: _Corrector = "fusion",
+    corrector: _Corrector = _OF_A_RIG,
     metric: _Metrics = None,
     only: _Only = None,
     force: Annotated[bool, typer.Option("--force", help="Predict again what is there already.")] = False,
@@ -91,13 +97,13 @@ def evaluate(
     scheduler: Scheduler = None,
     layout: Annotated[
         str | None,
-        typer.Option("--from", metavar="LAYOUT", help="DIR is of others: carla-rs, colmap, euroc, kitti, ..."),
+        typer.Option("--from", metavar="LAYOUT", help="DIR is of others: carla-rs, colmap, euroc, fastec-rs, ..."),
     ] = None,
 ) -> None:
     """Score pose, depth and correction against the truth of a dataset, and write a report."""
     if layout is not None:
         with results_at(out, scheduler) as place:
-            _evaluate_others(folder, place, layout, matcher, seed)
+            _evaluate_others(folder, place, layout, matcher, corrector, seed)
         return
     from rsbench.benchmark.images.plan import EvaluationOptions
 
@@ -119,10 +125,10 @@ def evaluate(
         evaluate_dataset(shared_path(folder, scheduler), place, options, command, processes)
 
 
-def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, seed: int) -> None:
-    """Depth of pairs with disparities, and motion of one camera with poses: two tables."""
+def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, corrector: str, seed: int) -> None:
+    """Depth of pairs with disparities, motion of one camera with poses, its frames with their truth: tables."""
     from rsbench.benchmark.recordings import depth_scores, pose_scores
-    from rsbench.cli.console import print_table
+    from rsbench.cli.console import print_table, say
     from rsbench.core.errors import RsbenchError
     from rsbench.interop.readers.formats import read_others
     from rsbench.storage.files import check_out, write_table
@@ -131,18 +137,49 @@ def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, seed: i
 
     check_out(out)
     recordings = read_others(folder, layout)
+    for note in dict.fromkeys(note for recording in recordings for note in recording.notes):
+        say(note)
     tables = {
         "depth": depth_scores(recordings, load_matcher(matcher)),
         "pose": pose_scores(recordings, seed),
+        "correction": _correction_scores(recordings, corrector),
     }
     if all(table.empty for table in tables.values()):
-        raise RsbenchError(f"{folder}: has neither pairs with disparities nor successive frames with poses")
+        raise RsbenchError(
+            f"{folder}: has neither pairs with disparities nor successive frames with poses or a global shutter's "
+            "images"
+        )
     for name, table in tables.items():
         if not table.empty:
             (out / "scores").mkdir(parents=True, exist_ok=True)
             write_table(out / "scores" / f"{name}.csv", table)
-            print_table(name, table)
+            print_table(name, table if name != "correction" else _means(table))
     typer.echo(f"scores: {name_of(out / 'scores')}")
+
+
+def _correction_scores(recordings: Sequence[Recording], corrector: str) -> pd.DataFrame:
+    """Of one camera's correctors: scaled flow and ``corrector``, or ours where that is the default of a rig."""
+    from rsbench.benchmark.recorded_corrections import check_sees_one_camera, correction_scores, pairs_with_truth
+    from rsbench.cli.console import progress_bar
+    from rsbench.vision.corrector import load_corrector
+
+    names = dict.fromkeys(("flow-scaled", "mono-fusion" if corrector == _OF_A_RIG else corrector))
+    pairs, entries = pairs_with_truth(recordings), [load_corrector(name) for name in names]
+    if not pairs:
+        return correction_scores([], [])
+    for entry in entries:
+        check_sees_one_camera(entry)
+    with progress_bar("correcting", len(pairs)) as advance:
+        return correction_scores(pairs, entries, advance)
+
+
+def _means(table: pd.DataFrame) -> pd.DataFrame:
+    """Of the pairs, by target and method."""
+    groups = table.groupby(["row", "method"], sort=False)
+    means = groups[["psnr", "ssim", "psnr_mask", "ssim_deepunroll"]].mean().dropna(axis="columns")
+    means.insert(0, "frames", groups.size())
+    means.insert(1, "failed", groups["success"].agg(lambda each: int((~each).sum())))
+    return means.reset_index()
 
 
 _ON_REQUEST = (

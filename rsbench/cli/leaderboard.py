@@ -150,7 +150,7 @@ def run(
     entry: Annotated[
         list[str],
         typer.Option(
-            help="Solver, stereo matcher (depth) or corrector (correction), a name or a card; repeatable.",
+            help="Solver, stereo matcher (depth) or corrector (correction, -mono), a name or a card; repeatable.",
             autocompletion=complete("solvers"),
         ),
     ],

@@ -12,7 +12,9 @@ if TYPE_CHECKING:
 
 Track = Annotated[
     str,
-    typer.Argument(help="points, pose (given matches), pose-own (own matches), readout, depth or correction."),
+    typer.Argument(
+        help="points, pose (given matches), pose-own (own matches), readout, depth, correction or correction-mono."
+    ),
 ]
 Data = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Dataset (a dataset.json) of all tracks but points.")

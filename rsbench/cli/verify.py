@@ -71,7 +71,7 @@ def verify(
         typer.Option(
             "--from",
             metavar="LAYOUT",
-            help="Layout of DIR, where it is not rsbench's: carla-rs, colmap, euroc, kitti, ...",
+            help="Layout of DIR, where it is not rsbench's: carla-rs, colmap, euroc, fastec-rs, ...",
         ),
     ] = None,
 ) -> None:

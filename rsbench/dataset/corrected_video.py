@@ -110,9 +110,14 @@ def write_video(out: Path, half: Path, frames: Iterable[NDArray[Any]], fps: floa
 
 def fps_of(path: Path) -> float:
     """Frames per second of a video file; a default for a folder or where the file does not say."""
+    return said_fps(path) or DEFAULT_FPS
+
+
+def said_fps(path: Path) -> float | None:
+    """Frames per second of a video file; None for a folder or where the file does not say."""
     if not path.is_file():
-        return DEFAULT_FPS
+        return None
     video = cv2.VideoCapture(str(path))
     fps = float(video.get(cv2.CAP_PROP_FPS))
     video.release()
-    return fps if np.isfinite(fps) and 1.0 <= fps <= 1000.0 else DEFAULT_FPS
+    return fps if np.isfinite(fps) and 1.0 <= fps <= 1000.0 else None

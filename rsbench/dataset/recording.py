@@ -39,6 +39,10 @@ class Recording:
     """(H, W) px, such that ``fx baseline / disparity`` is z; NaN where there is none."""
     sightings: Mapping[View, Callable[[], tuple[FloatArray, FloatArray]]] = field(default_factory=dict)
     """Pixels (n, 2) and the points (n, 3) of the world that the layout says are seen there."""
+    truths: Mapping[tuple[Side, int, int], Path] = field(default_factory=dict)
+    """Images of a global shutter: of a camera, a frame, and the row at whose time it was taken."""
+    masks: Mapping[View, Path] = field(default_factory=dict)
+    """Images with the weight of each pixel in the layout's own scores of a corrected frame; 0 is none."""
     notes: tuple[str, ...] = ()
     """What the layout leaves open, and how it was taken."""
 

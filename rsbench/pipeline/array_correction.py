@@ -77,6 +77,7 @@ def of_one_camera(
     target_row: float,
     inpaint: bool | None,
     seed: int,
+    gyro: ArrayLike | None = None,
 ) -> list[Fused]:
     """Images of one camera in order, corrected; errors as of ``rsbench.correct``."""
     known = StereoRig(camera=camera, baseline=1.0) if isinstance(camera, PinholeCamera) else None
@@ -85,4 +86,5 @@ def of_one_camera(
     if images:
         given.check_number("target_row", target_row, 0.0, images[0].shape[0] - 1.0)
     given.check_whole("seed", seed, 0)
-    return correct_all(images, camera, readout_ratio, target_row, inpaint=inpaint, seed=seed)
+    samples = arguments.gyro_samples(gyro)
+    return correct_all(images, camera, readout_ratio, target_row, inpaint=inpaint, seed=seed, gyro=samples)

@@ -125,7 +125,7 @@ def correct_four(
     )
     clock("depth")
     known = replace(given, matches=matches, motion=motion, pairs=pairs)
-    frames, *at_rows = _correct_rows(
+    frames, *at_rows = correct_known_rows(
         images, known, rig, shutter, options, views, offset, (options.target_row, *rows)
     )
     clock("correction")
@@ -282,10 +282,10 @@ def correct_known(
             failed, see ``find_corrected``.
     """
     rows = (options.target_row,)
-    return _correct_rows(images, known, rig, shutter, options, views, disparity_offset, rows)[0]
+    return correct_known_rows(images, known, rig, shutter, options, views, disparity_offset, rows)[0]
 
 
-def _correct_rows(
+def correct_known_rows(
     images: Images,
     known: Given,
     rig: StereoRig,
@@ -295,7 +295,7 @@ def _correct_rows(
     disparity_offset: float,
     rows: Sequence[float],
 ) -> list[dict[View, Fused]]:
-    """``correct_known`` at the times of several target rows, in place of that of the options."""
+    """``correct_known`` at the times of several target rows, in place of that of the options; its errors."""
     pairs, needs = known.pairs, options.corrector.component.spec.needs
     if shutter.readout_ratio == 0.0:
         return [uncorrected(images, views, pairs) for _ in rows]

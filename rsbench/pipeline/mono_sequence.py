@@ -19,8 +19,17 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import CameraCard, check_alike
-from rsbench.pipeline.mono_correction import STILL, FoundOwnMotion, MonoFusionCorrector, find_own_motion, refusal
+from rsbench.pipeline.mono_correction import (
+    CUT,
+    STILL,
+    FoundOwnMotion,
+    MonoFusionCorrector,
+    find_own_motion,
+    refusal,
+)
+from rsbench.pipeline.mono_gyro import NOT_COVERED, around, rotation_alone, with_gyro
 from rsbench.pipeline.mono_shutter import find_shutter
 from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.pipeline.turned_frames import Turned, turned
@@ -80,6 +89,7 @@ def correct_frames(
     shutter: RollingShutter,
     options: MonoOptions | None = None,
     done: int = 0,
+    gyro: FloatArray | None = None,
 ) -> Iterator[MonoMoment]:
     """Every frame (H, W[, 3]), uint8 or uint16, of one camera at the time of its target row, in order.
 
@@ -90,6 +100,7 @@ def correct_frames(
         camera, shutter: of the frames.
         options: how they are corrected.
         done: so many first frames are left out.
+        gyro: (n, 4) tau, w of a gyroscope, as of ``Correspondences``: tau 0 is the first row of the first frame.
 
     Raises:
         RsbenchError: fewer than two frames, frames of two sizes, or two frames alone that cannot be corrected. Of
@@ -98,45 +109,57 @@ def correct_frames(
     options = options or MonoOptions()
     turn = turned(camera, shutter)
     waits: MonoMoment | None = None
+    held = list[MonoMoment]()  # of a first pair that is refused where no other frame follows
     number = 0
-    for number, before, image, pair in _pairs(frames, turn, options, done):
+    for number, before, image, pair in _pairs(frames, turn, options, done, gyro):
+        yield from held
+        held.clear()
         if pair is None:
             continue
         if number == 1 and done == 0:
             waits = _unmoved(0, before, pair.reason)
         if waits is not None:
-            yield _corrected(0, waits, pair, turn, options) if pair.fusion else waits
-        now = _unmoved(number, image, pair.reason)
-        moment = _corrected(1, now, pair, turn, options) if pair.fusion else None
+            held.append(_corrected(0, waits, pair, turn, options) if pair.fusion else waits)
+        now, waits = _unmoved(number, image, pair.reason), None
         # A camera that stood still is in place; the same frame twice stands for one that was not taken.
         stays = pair.reason == STILL and not np.array_equal(before, image)
-        waits = None
-        if moment is not None or stays:
-            yield moment or now
+        if pair.fusion or stays:
+            held.append(_corrected(1, now, pair, turn, options) if pair.fusion else now)
         else:
             waits = now
+        if number > 1 or pair.fusion:
+            yield from held
+            held.clear()
     if number == 0:
         raise RsbenchError("frames: fewer than two; one camera shows its motion in at least two")
+    if held:
+        raise RsbenchError(f"frames: {held[0].fused.reason}")
     if waits is not None:
-        if number == 1:
-            raise RsbenchError(f"frames: {waits.fused.reason}")
         yield waits
 
 
 def _pairs(
-    frames: Iterable[NDArray[Any]], turn: Turned, options: MonoOptions, done: int
+    frames: Iterable[NDArray[Any]], turn: Turned, options: MonoOptions, done: int, gyro: FloatArray | None
 ) -> Iterator[tuple[int, NDArray[Any], NDArray[Any], _Pair | None]]:
     """Number of the second frame, both frames, and what is known of them, of all pairs in order; None: done."""
+    turned_gyro = None if gyro is None else turn.gyro(gyro)
 
-    def ready(before: NDArray[Any], image: NDArray[Any]) -> _Pair:
-        return _ready([turn.image(before), turn.image(image)], turn, options)
+    def ready(before: NDArray[Any], image: NDArray[Any], first: int) -> _Pair:
+        samples = None
+        if turned_gyro is not None:
+            samples = around(turned_gyro, first, first + 1.0 + turn.shutter.readout_ratio)
+        local = None if samples is None else samples - [first, 0.0, 0.0, 0.0]
+        pair = _ready([turn.image(before), turn.image(image)], turn, options, local)
+        if gyro is None or samples is not None or pair.found is None:
+            return pair
+        return replace(pair, found=replace(pair.found, unused=NOT_COVERED))
 
     waiting: deque[tuple[int, NDArray[Any], NDArray[Any], Future[_Pair] | None]] = deque()
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         try:
             for number, (before, image) in enumerate(itertools.pairwise(frames), start=1):
                 check_alike({f"frame {number - 1}": before, f"frame {number}": image})
-                future = None if number < done else pool.submit(ready, before, image)
+                future = None if number < done else pool.submit(ready, before, image, number - 1)
                 waiting.append((number, before, image, future))
                 if len(waiting) > _AT_ONCE:
                     yield _result(waiting.popleft())
@@ -163,6 +186,7 @@ def correct_all(
     *,
     inpaint: bool | None = None,
     seed: int = 0,
+    gyro: FloatArray | None = None,
 ) -> list[Fused]:
     """``correct_frames`` of a camera, a horizontal field of view in degrees, or None; its errors."""
     known: dict[str, Any] = {}
@@ -177,15 +201,22 @@ def correct_all(
     options = MonoOptions.of(inpaint, seed, target_row)
     shutter = find_shutter(frames, len(frames), card, options.corrector.robust, seed).shutter
     height, width = frames[0].shape[:2]
-    return [moment.fused for moment in correct_frames(frames, card.camera_of(width, height), shutter, options)]
+    moments = correct_frames(frames, card.camera_of(width, height), shutter, options, gyro=gyro)
+    return [moment.fused for moment in moments]
 
 
-def _ready(images: Sequence[NDArray[Any]], turn: Turned, options: MonoOptions) -> _Pair:
+def _ready(images: Sequence[NDArray[Any]], turn: Turned, options: MonoOptions, gyro: FloatArray | None) -> _Pair:
+    """``gyro``: samples (n, 4) as this camera turns, tau 0 the first row of the first of both frames."""
     flows = find_flows(images)
+    rig, corrector, shutter = StereoRig(camera=turn.camera, baseline=1.0), options.corrector, turn.shutter
     if reason := refusal(images, flows):
-        return _Pair(fusion=None, found=None, reason=reason)
-    rig, corrector = StereoRig(camera=turn.camera, baseline=1.0), options.corrector
-    found = find_own_motion(flows, rig, turn.shutter, "left", corrector.robust, corrector.seed)
+        if gyro is None or reason in (STILL, CUT):
+            return _Pair(fusion=None, found=None, reason=reason)
+        found = rotation_alone(rig, shutter, "left", gyro)
+    else:
+        found = find_own_motion(flows, rig, shutter, "left", corrector.robust, corrector.seed)
+        if gyro is not None:
+            found = with_gyro(found, flows, gyro, corrector.robust, corrector.seed)
     return _Pair(fusion=MonoFusion(images, found.own, flows, corrector.fusion), found=found, reason="")
 
 
@@ -209,15 +240,19 @@ def _corrected(place: int, unmoved: MonoMoment, pair: _Pair, turn: Turned, optio
 def translation_record(found: FoundOwnMotion) -> dict[str, Any]:
     """The motion of a camera over one frame period, ready for JSON; its unit of length is the translation's."""
     motion = found.own.motion
-    if motion is None or found.robust is None:
-        return {"reason": found.reason}
-    estimate = found.robust.estimate
-    return {
+    unused = {"gyro": found.unused} if found.unused else {}
+    if motion is None:
+        return {"reason": found.reason, **unused}
+    record = {
         "model": motion.name,
         "w": motion.w.tolist(),
         "d": motion.d.tolist(),
         "rotation_deg": float(np.rad2deg(np.linalg.norm(motion.w))),
-        "noise_px": estimate.noise_px,
-        "inliers": found.robust.inlier_count,
-        "matches": found.robust.match_count,
     }
+    if found.robust is not None:
+        record |= {
+            "noise_px": found.robust.estimate.noise_px,
+            "inliers": found.robust.inlier_count,
+            "matches": found.robust.match_count,
+        }
+    return {**record, **unused}

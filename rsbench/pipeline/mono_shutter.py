@@ -27,7 +27,7 @@ from rsbench.vision.mono_fusion import find_flows
 
 WINDOWS = 8
 """Pairs of frames, at most, by which the shutter is found; they lie evenly over the video."""
-_IN_ORDER = 3
+IN_ORDER = 3
 """First pairs by which the order of the frames is judged where the shutter is known."""
 BACKWARDS = (
     "time runs backwards in them: they are in the reverse order, or lines are read from the side opposite to what "
@@ -75,9 +75,11 @@ def find_shutter(
         return _found(frames, count, card, options, seed, advance)
     scan, ratio = card.scan or "top", card.readout_ratio
     windows, shutter = list[Window](), None
-    most = _IN_ORDER if ratio >= LEAST_BACKWARDS else 0
+    most = IN_ORDER if ratio >= LEAST_BACKWARDS else 0
     for matches, _, camera in _matched(frames, card, 1, most, seed):
         shutter = shutter or Scanning(scan=scan).shutter_of(camera.width, camera.height, ratio)
+        if matches is not None:
+            advance("order of the frames")
         if matches is not None and fits_backwards(matches, camera, shutter, options, seed):
             windows.append(examine_alone(matches, camera, known_alone(scan), options, seed))
     assert shutter is not None

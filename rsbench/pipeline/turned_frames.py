@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.gyro_motion import GyroMotion
+from rsbench.core.motion import Motion
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.mono_correction import FoundOwnMotion
@@ -55,12 +57,25 @@ class Turned:
             return found
         motion, P = found.own.motion, self._axes()
         w, d = np.linalg.det(P) * P.T @ motion.w, P.T @ motion.d
-        return replace(found, own=replace(found.own, motion=make_motion(motion.name, w, d, motion.parameters)))
+        if isinstance(motion, GyroMotion):
+            real: Motion = GyroMotion(_axial(motion.samples, P.T), d)
+        else:
+            real = make_motion(motion.name, w, d, motion.parameters)
+        return replace(found, own=replace(found.own, motion=real))
+
+    def gyro(self, samples: FloatArray) -> FloatArray:
+        """Samples (n, 4) tau, w of a gyroscope as this camera turns."""
+        return _axial(samples, self._axes())
 
     def _axes(self) -> FloatArray:
         """(3, 3) this camera's axes from the real one's."""
         exchange = np.eye(3)[[1, 0, 2]] if self.exchanged else np.eye(3)
         return np.diag([1.0, -1.0 if self.flipped else 1.0, 1.0]) @ exchange
+
+
+def _axial(samples: FloatArray, P: FloatArray) -> FloatArray:
+    """Samples (n, 4) tau, w after a change of axes (3, 3); in a mirror, a rotation's axis turns round."""
+    return np.column_stack([samples[:, 0], np.linalg.det(P) * samples[:, 1:] @ P.T])
 
 
 def turned(camera: PinholeCamera, shutter: RollingShutter) -> Turned:

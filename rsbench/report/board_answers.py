@@ -16,9 +16,11 @@ from rsbench.report.pictures import Image, colour_map
 
 DEPTH_PX, FRAME_LEVELS = 3.0, 64.0
 """Errors that have the last colour: of disparity, and of the mean over the colours in 8-bit levels."""
+_DIFFERENCE = f"difference, 0 (dark) to {FRAME_LEVELS:g} of 255 levels or more (bright); grey: not drawn"
 ERRORS = {
     "depth": f"error, 0 (dark) to {DEPTH_PX:g} px of disparity or more (bright); grey: unknown, or no surface",
-    "correction": f"difference, 0 (dark) to {FRAME_LEVELS:g} of 255 levels or more (bright); grey: not drawn",
+    "correction": _DIFFERENCE,
+    "correction-mono": _DIFFERENCE,
 }
 Named = tuple[str, str, Image]
 """Stem of the file, words, picture."""

@@ -85,6 +85,8 @@ class OwnMotion:
     side: Side
     motion: Motion | None
     """In its own unit of length; None: unknown, and everything goes its flow."""
+    far: bool = False
+    """Whether everything is infinitely far, whatever the flow says."""
 
 
 def find_flows(images: Sequence[NDArray[Any]]) -> Flows:
@@ -147,6 +149,8 @@ class MonoFusion:
         own, shape = self.own, self.images[0].shape[:2]
         if own.motion is None:
             return [_Layer(np.zeros(shape, np.float32), np.ones(shape, np.float32)) for _ in FRAMES]
+        if own.far:
+            return [_Layer(np.zeros(shape, np.float32), np.zeros(shape, np.float32)) for _ in FRAMES]
         poses = [row_poses(own.rig, own.shutter, own.motion, own.side, frame) for frame in FRAMES]
         maps = [reprojection_of(own.rig.camera, poses[frame], poses[1 - frame]) for frame in FRAMES]
         met = [_triangulated(self.flows.flow[frame], maps[frame]) for frame in FRAMES]

@@ -8,6 +8,8 @@ on 8-bit images without a mask, whether the estimate is rounded or not, for ours
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +26,21 @@ Image = NDArray[np.uint8] | Picture
 def ssim_deepunroll(estimate: Image, truth: Image) -> float:
     """SSIM of images (H, W[, C]) with DeepUnrollNet's window, centred at 5.5 of 0 ... 10; all windows count."""
     return float(np.mean(ssim_map(picture_of(estimate), picture_of(truth), _DEEPUNROLL)))
+
+
+def psnr_deepunroll(estimate: Image, truth: Image, weights: FloatArray | None = None) -> float:
+    """PSNR in dB of images (H, W[, C]) as DeepUnrollNet has it: each pixel with its weight (H, W), 100 if equal.
+
+    NaN where no pixel has weight. Its masks are images, whose values are the weights.
+    """
+    difference = picture_of(estimate).unit - picture_of(truth).unit
+    squares = (difference * difference).reshape(*difference.shape[:2], -1).mean(axis=-1)
+    weights = np.ones_like(squares) if weights is None else weights
+    total = float(np.sum(weights))
+    if total == 0.0:
+        return math.nan
+    error = float(np.sum(squares * weights)) / total
+    return 100.0 if error == 0.0 else -10.0 * math.log10(error)
 
 
 def ssim_uniform(estimate: Image, truth: Image) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from commands import assert_refused, run_here
+from commands import assert_refused, bytes_below, run_here
 
 import rsbench
 from rsbench.core.camera import PinholeCamera
@@ -85,10 +85,6 @@ def test_a_folder_gives_the_same_frames_in_order(folder: Path) -> None:
     ]
 
 
-def _bytes_below(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def test_an_interrupted_run_goes_on_where_it_was(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     name = "out"
     (folder / "in").mkdir()
@@ -123,7 +119,7 @@ def test_an_interrupted_run_goes_on_where_it_was(folder: Path, monkeypatch: pyte
             written.append(frame), write(to, frame, *rest, **more)))  # fmt: skip
         assert run_here(*given, folder / "halves" / name).returncode == 0
     assert written == [f"{frame:06d}" for frame in range(3)]
-    assert _bytes_below(folder / "halves") == _bytes_below(folder / "whole")
+    assert bytes_below(folder / "halves") == bytes_below(folder / "whole")
 
 
 def test_a_video_may_come_out(folder: Path) -> None:
@@ -143,8 +139,13 @@ def test_a_video_may_come_out(folder: Path) -> None:
 def test_bad_input_is_refused_in_one_line_and_nothing_is_left(folder: Path) -> None:
     write_png(folder / "small.png", _rolling(1)[:100])
     write_png(folder / "flat.png", np.full((*SIZE, 3), 90, np.uint8))
+    write_png(folder / "grey.png", _rolling(1)[..., 0])
+    (folder / "torn.png").write_bytes((folder / "1.png").read_bytes()[:2000])
     first = folder / "0.png"
     assert_refused(_correct(folder, first), "at least two")
+    assert_refused(_correct(folder, first, folder / "grey.png"), "alike")
+    assert_refused(_correct(folder, first, folder / "torn.png"), "torn.png")
+    assert_refused(_correct(folder, first, folder / "1.png", folder / "small.png"), "frame 2")
     assert_refused(_correct(folder, first, folder / "small.png"), "alike")
     assert_refused(_correct(folder, first, first), "nothing moves")
     assert_refused(_correct(folder, folder / "flat.png", folder / "flat.png"), "no texture")
@@ -163,6 +164,32 @@ def test_a_still_pair_among_others_is_a_mark_on_its_frame() -> None:
     assert [moment.number for moment in moments] == [0, 1, 2]
     assert [bool(moment.fused.reason) for moment in moments] == [False, False, True]
     np.testing.assert_array_equal(moments[2].fused.image, frames[2])
+
+
+def test_a_still_camera_is_known_by_its_clear_texture() -> None:
+    """Noise of a sensor, and of a coder, moves flow where there is little texture."""
+    rng, dim = np.random.default_rng(0), _rolling(0).astype(float)
+    dim[:, 60:] = 120.0 + 0.02 * (dim[:, 60:] - 120.0)
+    noisy = [np.clip(dim + rng.normal(0.0, 2.0, dim.shape), 0, 255).astype(np.uint8) for _ in range(3)]
+    coded = [cv2.imdecode(cv2.imencode(".jpg", each, [cv2.IMWRITE_JPEG_QUALITY, 70])[1], 1) for each in noisy]
+    for frames in (noisy, coded):
+        moments = _moments(frames)
+        assert ["still camera" in moment.fused.reason for moment in moments] == [True] * 3
+        with pytest.raises(RsbenchError, match="still camera"):
+            _moments(frames[:2])
+        np.testing.assert_array_equal(moments[1].fused.image, frames[1])
+
+
+def test_of_many_marked_frames_the_first_are_told(folder: Path) -> None:
+    (folder / "in").mkdir()
+    for frame in range(12):
+        write_png(folder / "in" / f"{frame:02d}.png", _rolling(min(frame, 1)))
+    result = _correct(folder, "--frames", folder / "in")
+    assert result.returncode == 1
+    (line,) = [line for line in result.stderr.splitlines() if "not corrected" in line]
+    assert line.count("nothing moves") == 8 and line.endswith("and 2 more, see motion.json")
+    record = json.loads((folder / "out" / "motion.json").read_text())
+    assert [each["number"] for each in record["frames"] if "reason" in each] == list(range(2, 12))
 
 
 def test_a_frame_after_a_cut_is_corrected_with_the_one_after_it() -> None:

@@ -206,7 +206,8 @@ def test_fastec_rs_has_the_frames_that_its_loader_asks_for(tmp_path: Path) -> No
     sequence = only(data)
     for side in SIDES:
         place = out / f"planes_{side}"
-        # As dataset_fastec_rs.py finds them: NNN_rolling.png from 000 on.
+        # As dataset_fastec_rs.py finds them: in folders with a meta.log, NNN_rolling.png from 000 on.
+        assert (place / "meta.log").is_file()
         assert sorted(path.name for path in place.glob("*_rolling.png")) == [
             f"{i:03d}_rolling.png" for i in range(3)
         ]

@@ -261,7 +261,7 @@ def test_colmap(tmp_path: Path) -> None:
 # What is wrong
 
 
-@pytest.mark.parametrize("layout", ["carla-rs", "colmap", "euroc", "kitti", "middlebury", "tum-rsvi"])
+@pytest.mark.parametrize("layout", ["carla-rs", "colmap", "euroc", "fastec-rs", "kitti", "middlebury", "tum-rsvi"])
 def test_an_empty_folder_has_no_layout(tmp_path: Path, layout: str) -> None:
     with pytest.raises(RsbenchError, match=r"holds no"):
         read_others(tmp_path, layout)

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from rsbench.benchmark.leaderboard.submissions import Submission
 from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Score
 from rsbench.benchmark.leaderboard.true_pictures import VIEW, Asked, TruePictures
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import VIEWS
+from rsbench.core.rig import VIEWS, View
 from rsbench.dataset import sequence as sequences
 from rsbench.dataset.layout import picture_file
 from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
@@ -35,7 +35,7 @@ from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.storage.files import write_bytes
 from rsbench.vision.corrector import demand_corrected, load_corrector
 from rsbench.vision.flow import dense_flow
-from rsbench.vision.fusion import Origin
+from rsbench.vision.fusion import Fused, Origin
 from rsbench.vision.published_quality import flip, ssim_deepunroll, ssim_uniform
 from rsbench.vision.quality import Picture, psnr_within, ssim_within
 
@@ -116,6 +116,8 @@ class CorrectionTrack(PictureTrack):
     name, id = "correction", "correction-1"
     title = "Corrected frames"
     asks_rows = True
+    rows: ClassVar[tuple[str, ...]] = ("first", "middle")
+    """At whose times frames are asked, where the dataset has the truth."""
     scores = _FRAMES
     error, error_title = "error", "1 - SSIM"
     exact = ("error", 1e-6)
@@ -134,10 +136,11 @@ class CorrectionTrack(PictureTrack):
     )
 
     def asked(self, sequence: sequences.Sequence) -> tuple[Asked, ...]:
-        """At the middle row too, where the dataset has that truth."""
+        """At the first row, and at others where the dataset has that truth."""
         side, frame = VIEW
-        middle = sequence.shutter.lines(side) // 2
-        rows = {"first": 0, **({"middle": middle} if middle in sequence.twins else {})}
+        lines = sequence.shutter.lines(side)
+        numbers = {"first": 0, "middle": lines // 2, "last": lines - 1}
+        rows = {name: numbers[name] for name in self.rows if numbers[name] in (0, *sequence.twins)}
         return tuple(
             Asked(f"{side}_{frame}_{name}", row, picture_file("gs", side, frame + sequence.first, row))
             for name, row in rows.items()
@@ -161,7 +164,7 @@ class CorrectionTrack(PictureTrack):
         def scores_of(submission: Submission, success: bool) -> Numbers:
             folder = submission.folder / FOLDER
             drawn = [read_answer_frame(folder, truth, each) for each in pictures.asked] if success else None
-            return frame_scores(true, drawn)
+            return frame_scores(true, drawn, self.rows)
 
         return scores_of
 
@@ -174,40 +177,48 @@ class CorrectionTrack(PictureTrack):
         return CardChain(chain, corrector, chain.key, ("readout", "images", *sorted(spec.sees)), spec.reference)
 
     def make(self, making: Making, chain: CorrectionOptions, place: Path) -> dict[str, Any]:
-        needs = chain.corrector.component.spec.needs
-        rig, shutter = making.problem.rig, making.problem.shutter
         drawn: dict[str, bytes] = {}
         try:
-            if needs & {"motion", "matches"} and making.given.matches is None:
-                start = time.perf_counter()
-                matches = find_matches_of_rig(making.images, rig, shutter.scanning, chain)
-                making.given = replace(making.given, matches=matches)
-                making.spent["matching"] = time.perf_counter() - start
-            first, *others = (float(each.row) for each in making.asked)
-            found = correct_four(
-                making.images,
-                rig,
-                shutter.readout_ratio,
-                replace(chain, target_row=first),
-                given=making.given,
-                views=(VIEW,),
-                scanning=shutter.scanning,
-                rows=others,
-            )
-            _share(making, found)
-            seconds = found.seconds["correction"]
-            for each, frames in zip(making.asked, (found.frames, *found.at_rows), strict=True):
-                demand_corrected(frames, chain.corrector.name)
-                fused = frames[VIEW]
+            frames, seconds = self.corrected(making, chain)
+            for each, found in zip(making.asked, frames, strict=True):
+                demand_corrected(found, chain.corrector.name)
+                fused = found[VIEW]
                 drawn[each.stem] = frame_png(fused.image, fused.origin != Origin.NOBODY)
         except RsbenchError as error:
             return {"success": False, "reason": str(error)[:300]}
         place.mkdir(parents=True)
         for stem, data in drawn.items():
             write_bytes(place / f"{stem}.png", data)
-        steps = {"matching": {"motion", "matches"}, "motion": {"motion"}, "depth": {"depth"}}
-        seconds += sum(making.spent.get(step, 0.0) for step, of in steps.items() if needs & of)
         return {"seconds": round(seconds, 4)}
+
+    def corrected(self, making: Making, chain: CorrectionOptions) -> tuple[list[dict[View, Fused]], float]:
+        """The frame at the time of each row that is asked, and the seconds that this takes alone.
+
+        Raises:
+            RsbenchError: it cannot be corrected.
+        """
+        needs = chain.corrector.component.spec.needs
+        rig, shutter = making.problem.rig, making.problem.shutter
+        if needs & {"motion", "matches"} and making.given.matches is None:
+            start = time.perf_counter()
+            matches = find_matches_of_rig(making.images, rig, shutter.scanning, chain)
+            making.given = replace(making.given, matches=matches)
+            making.spent["matching"] = time.perf_counter() - start
+        first, *others = (float(each.row) for each in making.asked)
+        found = correct_four(
+            making.images,
+            rig,
+            shutter.readout_ratio,
+            replace(chain, target_row=first),
+            given=making.given,
+            views=(VIEW,),
+            scanning=shutter.scanning,
+            rows=others,
+        )
+        _share(making, found)
+        steps = {"matching": {"motion", "matches"}, "motion": {"motion"}, "depth": {"depth"}}
+        spent = sum(making.spent.get(step, 0.0) for step, of in steps.items() if needs & of)
+        return [found.frames, *found.at_rows], found.seconds["correction"] + spent
 
 
 def _share(making: Making, found: CorrectedFrames) -> None:
@@ -228,7 +239,7 @@ class TrueFrame:
     """What a corrected frame is compared with."""
 
     name: str
-    """Of the row: ``first`` or ``middle``."""
+    """Of the row: ``first``, ``middle`` or ``last``."""
     picture: Picture
     """(H, W, 3) of a global shutter."""
     common: NDArray[np.bool_]
@@ -248,14 +259,19 @@ class TrueFrame:
         return found
 
 
-def frame_scores(truths: Sequence[TrueFrame], frames: Sequence[Frame] | None) -> Numbers:
-    """Of corrected frames, one for each that is asked; None: a failure. Means over these, of dB too."""
+def frame_scores(
+    truths: Sequence[TrueFrame], frames: Sequence[Frame] | None, rows: Sequence[str] = CorrectionTrack.rows
+) -> Numbers:
+    """Of corrected frames, one for each that is asked; None: a failure. Means over these, of dB too.
+
+    ``rows`` are those at whose times they may be asked.
+    """
     scores, squares = list[Numbers](), SquareErrors(CorrectionTrack.part_score)
     for number, true in enumerate(truths):
         squares.add(None if frames is None else frames[number][0], true.picture.image, true.parts)
         scores.append(_WORST_FRAME if frames is None else _frame(*frames[number], true))
     found = {key: float(np.mean([each[key] for each in scores])) for key in _WORST_FRAME}
-    by_row = {f"psnr_{name}": math.nan for name in ("first", "middle")}
+    by_row = {f"psnr_{name}": math.nan for name in rows}
     by_row |= {f"psnr_{true.name}": each["psnr"] for true, each in zip(truths, scores, strict=True)}
     return {**found, **by_row, **squares.scores(), "error": 1.0 - found["ssim"]}
 

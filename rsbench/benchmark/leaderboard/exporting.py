@@ -94,7 +94,8 @@ def _record(problem: Problem, track: Track) -> dict[str, Any]:
     record = problem_record(problem)
     if not track.gives_readout:
         del record["readout_ratio"]
-    return record
+    samples = problem.correspondences.gyro
+    return {**record, "gyro": samples.tolist()} if "gyro" in track.allowed and len(samples) > 0 else record
 
 
 def _rig(problem: Problem, columns: Sequence[str]) -> tuple[float, ...]:

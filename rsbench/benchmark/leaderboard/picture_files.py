@@ -30,7 +30,7 @@ FOLDER = "pictures"
 FARTHEST = 1e9
 """m: no surface is farther."""
 _FILE = re.compile(
-    rf"pictures/{NAME.pattern}/left_1(_first|_middle)?\.(exr|png)|matches/(left|right|stereo_[01]|tracks)\.csv"
+    rf"pictures/{NAME.pattern}/left_1(_first|_middle|_last)?\.(exr|png)|matches/(left|right|stereo_[01]|tracks)\.csv"
 )
 """Paths of what answers hold, below an entry: nothing else is taken from a board of somebody else."""
 _PNG = b"\x89PNG\r\n\x1a\n"

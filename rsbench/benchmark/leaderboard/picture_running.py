@@ -213,4 +213,6 @@ class Making:
     def __init__(self, problem: Problem, images: Images, asked: tuple[Asked, ...]) -> None:
         self.problem, self.images, self.asked = problem, images, asked
         self.given = Given()
+        self.alone: Given | None = None
+        """What the frames of the asked camera alone tell; None: not looked for yet."""
         self.spent: dict[str, float] = {}

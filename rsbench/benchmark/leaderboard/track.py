@@ -190,6 +190,10 @@ class Track(ABC):
         """The pictures of an answer."""
         return ()
 
+    def shown(self, sequence: Sequence) -> tuple[str, ...]:
+        """Files of a sequence that methods see beside its frames."""
+        return ()
+
     def scorer(self, truth: Truth, pictures: TruePictures) -> Callable[[Submission, bool], dict[str, float]]:
         """Scores of the pictures of submissions to one problem, by whether it is none that failed."""
         raise NotImplementedError(f"track {self.name!r} asks for no pictures")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rsbench.benchmark.leaderboard.correction_track import CorrectionTrack
 from rsbench.benchmark.leaderboard.depth_track import DepthTrack
+from rsbench.benchmark.leaderboard.mono_track import MonoCorrectionTrack
 from rsbench.benchmark.leaderboard.motion_tracks import OwnPoseTrack, PointsTrack, PoseTrack
 from rsbench.benchmark.leaderboard.readout_track import ReadoutTrack
 from rsbench.benchmark.leaderboard.track import Track
@@ -12,7 +13,15 @@ from rsbench.core.errors import RsbenchError
 
 TRACKS: dict[str, Track] = {
     track.name: track
-    for track in (PointsTrack(), PoseTrack(), OwnPoseTrack(), ReadoutTrack(), DepthTrack(), CorrectionTrack())
+    for track in (
+        PointsTrack(),
+        PoseTrack(),
+        OwnPoseTrack(),
+        ReadoutTrack(),
+        DepthTrack(),
+        CorrectionTrack(),
+        MonoCorrectionTrack(),
+    )
 }
 """By name, in the order of tables."""
 

@@ -107,7 +107,7 @@ def true_pictures(folder: Path, sequences: Iterable[Sequence], track: Track) -> 
             )
         pictures = track.asked(sequence)
         files = {}
-        for name in _files(sequence, pictures):
+        for name in (*_files(sequence, pictures), *track.shown(sequence)):
             if (manifest := listed.get(f"{sequence.whole}/{name}")) is None:
                 raise RsbenchError(f"{folder / 'dataset.json'}: lists no {sequence.whole}/{name}")
             files[name] = manifest.sha256

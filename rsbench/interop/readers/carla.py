@@ -1,8 +1,9 @@
 """Carla-RS (Liu et al., Deep Shutter Unrolling Network, CVPR 2020): velocities and radial depth of one camera.
 
 A sequence is a folder with ``gt_vel.log`` (wx, wy, wz in rad/s and x, y, z per second), ``%04d_rs.png``, and where
-depth was rendered ``%04d_rs.depth`` or ``.pdepth``. Its generator (UnrealCV of the same authors,
-Python/capture_rolling_shutter.py) says what the files do not:
+depth was rendered ``%04d_rs.depth`` or ``.pdepth``; ``%04d_gs_f.png`` and ``%04d_gs_m.png`` are what a global
+shutter takes at the first row and at row ``height // 2``, ``%04d_mask.png`` the pixels that the authors score. Its
+generator (UnrealCV of the same authors, Python/capture_rolling_shutter.py) says what the files do not:
 
 - exp([w t]x), v t is the pose of the camera at time t **in the camera at time 0**: ``cam_from_world`` is its
   inverse, rotation and translation grow apart (no screw), and the translation is turned by the rotation;
@@ -48,10 +49,7 @@ def read_carla(folder: Path) -> list[Recording]:
 
 
 def _read(folder: Path) -> Recording:
-    images: dict[View, Path] = {}
-    for path in sorted(folder.glob("[0-9][0-9][0-9][0-9]_rs.*")):
-        if path.suffix in (".png", ".jpg"):
-            images["left", int(path.name[:4])] = path
+    images: dict[View, Path] = {("left", frame): path for frame, path in _pictures(folder, "rs").items()}
     if not images:
         raise RsbenchError(f"{folder}: holds no 0000_rs.png")
     height, width = read_frame(next(iter(images.values()))).shape[:2]
@@ -74,8 +72,20 @@ def _read(folder: Path) -> Recording:
         frame_period_s=1.0 / fps,
         poses={"left": partial(_pose, w, v)},
         depths=depths,
+        truths={
+            ("left", frame, row): path
+            for kind, row in (("gs_f", 0), ("gs_m", height // 2))
+            for frame, path in _pictures(folder, kind).items()
+        },
+        masks={("left", frame): path for frame, path in _pictures(folder, "mask").items()},
         notes=() if known else (assumed,),
     )
+
+
+def _pictures(folder: Path, kind: str) -> dict[int, Path]:
+    """Files of images of one kind, by frame."""
+    found = sorted(folder.glob(f"[0-9][0-9][0-9][0-9]_{kind}.*"))
+    return {int(path.name[:4]): path for path in found if path.suffix in (".png", ".jpg")}
 
 
 def _pose(w: FloatArray, v: FloatArray, tau: FloatArray) -> Pose:

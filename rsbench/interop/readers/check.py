@@ -52,7 +52,10 @@ class Agreement:
 
 def file_faults(recording: Recording, progress: Callable[[str], object] = str) -> Iterator[str]:
     """Images that are missing, unreadable, or not of their camera's size; ``progress`` gets their names."""
-    for (side, _), path in recording.images.items():
+    for path, side in (
+        *((path, side) for (side, _), path in recording.images.items()),
+        *((path, side) for (side, *_), path in (*recording.truths.items(), *recording.masks.items())),
+    ):
         camera = recording.cameras[side]
         progress(path.name)
         try:

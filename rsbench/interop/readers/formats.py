@@ -11,6 +11,7 @@ from rsbench.dataset.recording import Recording
 from rsbench.interop.readers.carla import read_carla
 from rsbench.interop.readers.colmap import read_colmap
 from rsbench.interop.readers.euroc import read_euroc
+from rsbench.interop.readers.fastec import read_fastec
 from rsbench.interop.readers.stereo import read_kitti, read_middlebury
 
 _TUM_RSVI = {"left": 0.0, "right": 29.4737e-6}
@@ -25,6 +26,7 @@ FORMATS: Mapping[str, Callable[[Path], list[Recording]]] = {
     "carla-rs": read_carla,
     "colmap": read_colmap,
     "euroc": read_euroc,
+    "fastec-rs": read_fastec,
     "kitti": read_kitti,
     "middlebury": read_middlebury,
     "tum-rsvi": _read_tum_rsvi,

@@ -12,16 +12,19 @@ from typing import Any
 from rsbench.core.rig import SIDES
 from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence
-from rsbench.interop.writers.image_poses import Images, refuse
+from rsbench.interop.writers.image_poses import Images, refuse, write_lines
 from rsbench.storage.files import write_bytes
 from rsbench.storage.untrusted_files import inside, read_bytes
 
 ABOUT = (
     "SEQUENCE_left and SEQUENCE_right, each with NNN_rolling.png, NNN_global_first.png (the twin of the first "
-    "row) and NNN_global_middle.png (of row height // 2, where the dataset has that twin). There is no "
-    "calibration, depth or motion: a readout ratio of 1 is what those who use the layout assume."
+    "row), NNN_global_middle.png (of row height // 2, where the dataset has that twin) and meta.log, by which "
+    "the loader knows the folder of a sequence. There is no calibration, depth or motion: a readout ratio of 1 "
+    "is what those who use the layout assume."
 )
 _NAME = "fastec-rs"
+_META = "meta.log"
+"""By which the loader knows the folder of a sequence; it does not read it."""
 _MOST = 1000
 """Frames that three digits number."""
 
@@ -43,6 +46,7 @@ def write(sequence: Sequence, root: Path, images: Images) -> dict[str, Any]:
     for side in SIDES:
         place = root / f"{sequence.name}_{side}"
         place.mkdir(parents=True)
+        write_lines(place / _META, [f"# {sequence.name}, {side} camera: readout ratio {shutter.readout_ratio:g}"])
         for frame in range(sequence.frames):
             names = {"rolling": picture_file("rs", side, frame), "global_first": picture_file("gs", side, frame)}
             if middle in sequence.twins:

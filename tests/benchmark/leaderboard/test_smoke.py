@@ -74,7 +74,7 @@ def test_the_stored_scores_of_frames_are_those_of_this_code(corridor: Path) -> N
     where = ("--stored", STORED, "--data", corridor, "--workers", 1)
     ran = run_here("leaderboard", "smoke", *where, *tracks, *words)
     assert ran.returncode == 0, ran.stdout
-    assert ran.stdout.splitlines()[-1].startswith("13 answers of 13 entries of 5 tracks, 0 differ from ")
+    assert ran.stdout.splitlines()[-1].startswith("16 answers of 16 entries of 6 tracks, 0 differ from ")
 
 
 @pytest.mark.skipif(not STORED.is_dir(), reason="needs the committed results")

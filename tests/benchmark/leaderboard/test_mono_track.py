@@ -1,0 +1,135 @@
+"""The track of one camera: rows, what entries say that they use, a gyroscope, and no look to the right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from analytic_dataset import write_analytic_dataset
+from commands import run_here
+from leaderboards import PLANES, lines_of
+
+from rsbench.benchmark.leaderboard import running
+from rsbench.benchmark.leaderboard.board import entries_of
+from rsbench.benchmark.leaderboard.picture_running import Making
+from rsbench.benchmark.leaderboard.splits import dataset_split
+from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.core.rig import VIEWS
+from rsbench.dataset.card import load_dataset_card
+from rsbench.dataset.generation import generate_dataset
+
+TRACK = TRACKS["correction-mono"]
+CARD = """
+name = "seen-by-one"
+baseline = 0.3
+readout_ratio = 0.8
+frame_period_s = 0.05
+renderer = "preview"
+twins = ["middle", "last"]
+channels = ["imu"]
+
+[camera]
+width = 160
+height = 120
+focal = 170
+
+[motion]
+rotation_deg = 6
+rotation_axis = [0.4, 1.0, -0.6]
+translation = 0.06
+translation_axis = [-0.7, 0.3, -0.6]
+
+[[sequence]]
+name = "corridor"
+scene = "corridor"
+"""
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One sequence with a gyroscope, and the truth of three rows."""
+    folder = tmp_path_factory.mktemp("rendered")
+    (folder / "card.toml").write_text(CARD, encoding="utf-8")
+    generate_dataset(load_dataset_card(str(folder / "card.toml")), folder / "data")
+    return folder / "data"
+
+
+def _here(serve: Any, jobs: Any, workers: int, environment: object, *arguments: object) -> Any:
+    """``finished_jobs`` without a child."""
+    run = serve(*arguments)
+    yield from ((job, run(job)) for job in jobs)
+
+
+def test_methods_are_ranked_by_the_cameras_that_they_see(
+    rendered: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(running, "finished_jobs", _here)
+    where = ("--data", rendered, "--board", tmp_path / "board")
+    names = ("mono-fusion", "rotation-only", "gyro", "zhuang", "lao-lines", "fusion")
+    cards = [word for name in names for word in ("--entry", name)]
+    ran = run_here("leaderboard", "run", TRACK.name, *where, *cards)
+    assert ran.returncode == 0, ran.stderr
+    assert run_here("leaderboard", "oracles", TRACK.name, *where).returncode == 0
+    split = dataset_split(TRACK, rendered)
+    found = {e.header.method: e for e in entries_of(tmp_path / "board", TRACK.id, split.name)}
+    uses = {name: found[name].header.uses[2:] for name in names}
+    assert uses == {
+        "mono-fusion": ("time",),
+        "rotation-only": ("time",),
+        "gyro": ("gyro",),
+        "zhuang": ("time",),
+        "lao-lines": (),
+        "fusion": ("stereo", "time"),
+    }
+    psnr = {
+        name: entry.scores.iloc[0][["psnr_first", "psnr_middle", "psnr_last"]] for name, entry in found.items()
+    }
+    # What turns alone gains, and what knows depth or flow gains more, at every row.
+    for name in ("rotation-only", "gyro"):
+        assert np.all(psnr[name] > psnr["uncorrected"] + 1.0)
+    for name in ("mono-fusion", "fusion"):
+        assert np.all(psnr[name] > psnr["rotation-only"])
+    assert np.all(psnr["truth"] == np.inf)
+
+
+def test_a_gyroscope_is_given_where_there_is_one(rendered: Path, tmp_path: Path) -> None:
+    assert run_here("leaderboard", "export", TRACK.name, "--data", rendered, "--out", tmp_path).returncode == 0
+    (problem,) = lines_of(tmp_path / "problems.jsonl")
+    truth = dataset_split(TRACK, rendered).truths[0]
+    tau, w = np.split(np.array(problem["gyro"]), [1], axis=1)
+    assert tau.min() < 0.0 and tau.max() > 1.8
+    # The motion turns evenly; 0.02 rad/s of bias on each axis, at 20 frames a second.
+    np.testing.assert_allclose(np.mean(w, axis=0), truth.motion.w, atol=4.0 * 0.02 * 0.05)
+    assert truth.pictures is not None and "imu/measured.csv" in truth.pictures.files
+    # The tracks that do not give it are as they were.
+    other = dataset_split(TRACKS["correction"], rendered).truths[0].pictures
+    assert other is not None and "imu/measured.csv" not in other.files
+
+
+@pytest.mark.parametrize("name", ["mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu-layers"])
+def test_nobody_looks_to_the_right(name: str, rendered: Path) -> None:
+    """Black images of the right camera give the same frames."""
+    split = dataset_split(TRACK, rendered)
+    (problem,) = TRACK.problems(rendered, None, 1)
+    pictures, made = split.truths[0].pictures, list[np.ndarray]()
+    assert pictures is not None
+    images = {view: pictures.sequence.image("rs", *view) for view in VIEWS}
+    for seen in (images, {view: image * (view[0] == "left") for view, image in images.items()}):
+        frames, seconds = TRACK.corrected(  # pyrefly: ignore[missing-attribute]
+            Making(problem, seen, pictures.asked),
+            TRACK.chain(name).options,  # pyrefly: ignore[missing-attribute]
+        )
+        assert len(frames) == 3 and seconds > 0.0
+        made.append(np.stack([frame["left", 1].image for frame in frames]))
+    np.testing.assert_array_equal(made[0], made[1])
+
+
+def test_rows_are_asked_where_their_truth_is(tmp_path: Path) -> None:
+    for twins, rows in (((), [0]), ((40,), [0, 40]), ((40, 79), [0, 40, 79])):
+        folder = tmp_path / str(len(twins))
+        write_analytic_dataset(folder, *PLANES, twins=twins)
+        for track, most in (("correction-mono", 3), ("correction", 2)):
+            pictures = dataset_split(TRACKS[track], folder).truths[0].pictures
+            assert pictures is not None and [each.row for each in pictures.asked] == rows[:most]
