@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rsbench.capture.estimate import CERTAIN, Candidate, Capture, Window, conclude, examine
+from rsbench.capture.estimate import CERTAIN, Candidate, Capture, Window, conclude, examine, nearly_global
 from rsbench.capture.hypotheses import Known
 from rsbench.capture.scans import GLOBAL, Scans
 from rsbench.capture.settle import NoMotionError, reversed_scans, shutter_of
@@ -30,8 +30,6 @@ _MAX_SIGMA, _HARMLESS_PX = 0.1, 1.0
 _LOOK, _CLEARLY_LESS = 500, 0.97
 """Matches of a quick look at the order of frames, and the share of the noise that is less than by chance."""
 _OPPOSITE: dict[Scan, Scan] = {"top": "bottom", "bottom": "top", "left": "right", "right": "left"}
-_NEARLY, _SMALL = 0.06, 0.15
-"""Readout ratio of nearly a global shutter, within two deviations, and at most."""
 
 
 def rig_of(camera: PinholeCamera) -> StereoRig:
@@ -86,15 +84,8 @@ def fits_backwards(
 def conclude_alone(windows: Sequence[Window]) -> Capture:
     """What all windows of a camera say together; a global shutter where all that they allow is one or nearly."""
     capture = conclude(windows)
-    near = [
-        each for each in capture.candidates if each.ratio - 2.0 * each.sigma <= _NEARLY and each.ratio <= _SMALL
-    ]
-    probability = sum(each.probability for each in near)
-    if not near or probability < CERTAIN:
-        return capture
-    still = Candidate(scans=GLOBAL, probability=probability, ratio=0.0, sigma=0.0, delay=0.0, delay_sigma=0.0)
-    others = tuple(each for each in capture.candidates if each not in near)
-    return replace(capture, candidates=(still, *others), named=True)
+    candidates = nearly_global(capture)
+    return capture if candidates is None else replace(capture, candidates=candidates, named=True)
 
 
 def shutter_alone(capture: Capture, camera: PinholeCamera) -> RollingShutter:

@@ -19,7 +19,7 @@ import scipy
 from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET
 from rsbench.capture.evidence import Peak, WindowEvidence, window_evidence
 from rsbench.capture.hypotheses import CALIBRATION, DELAY, Hypothesis, Known
-from rsbench.capture.scans import Scans
+from rsbench.capture.scans import GLOBAL, Scans
 from rsbench.capture.start import find_lag, find_start
 from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.motion import Motion
@@ -36,6 +36,9 @@ FEWEST = 30
 """Matches between two times."""
 _LEAST_SHARE = 0.3
 """Of the matches, that must agree with what is told."""
+_NEARLY, _SMALL = 0.06, 0.15
+"""Readout ratio of nearly a global shutter, within two deviations; and the root mean square, at most, of
+the ratios that the matches then allow."""
 _STILL_PX = 1.0
 _UNLIKELY = 0.01
 _EXPECTED = {"top": 0.5, "global": 0.25, "bottom": 0.1, "left": 0.04, "right": 0.04}
@@ -192,6 +195,21 @@ def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA) -> Capture
         noise_px=float(np.median([window.noise_px for window in used])),
         moved_px=moved,
     )
+
+
+def nearly_global(capture: Capture) -> tuple[Candidate, ...] | None:
+    """The candidates with a global shutter first, where all that the matches allow is one or nearly one.
+
+    Whatever side it begins at: errors of a calibration are taken for small differences of times, and no camera has
+    a readout that short. None where the matches allow more, or a global shutter alone.
+    """
+    near = [each for each in capture.candidates if each.ratio - 2.0 * each.sigma <= _NEARLY]
+    probability = sum(each.probability for each in near)
+    if not near or probability < CERTAIN or all(each.scans == GLOBAL for each in near):
+        return None
+    sigma = float(np.sqrt(sum(each.probability * (each.ratio**2 + each.sigma**2) for each in near) / probability))
+    still = Candidate(scans=GLOBAL, probability=probability, ratio=0.0, sigma=sigma, delay=0.0, delay_sigma=0.0)
+    return None if sigma > _SMALL else (still, *(each for each in capture.candidates if each not in near))
 
 
 def _nothing(reason: str, matches: int, moved_px: float) -> Capture:

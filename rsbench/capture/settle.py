@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET, term_sizes
-from rsbench.capture.estimate import CERTAIN, Candidate, Capture, conclude, examine
+from rsbench.capture.estimate import CERTAIN, Candidate, Capture, conclude, examine, nearly_global
 from rsbench.capture.evidence import Peak
 from rsbench.capture.hypotheses import ACCELERATION, CALIBRATION, MODELS, Known
 from rsbench.capture.rectification import row_pattern
@@ -36,9 +36,6 @@ and the others come from the same calibration. From 0.1 px on there are any to f
 rendered pairs show 0.02 px at most, two excerpts of KITTI odometry 1.1 px."""
 _LEAST_SIZE = 1e-3
 """px that 1 of a term moves a pixel by, at least: of an image of a narrow field there is little of the others."""
-_NEARLY, _SMALL = 0.06, 0.15
-"""Readout ratio of nearly a global shutter, within two deviations; and the root mean square, at most, of
-the ratios that the matches then allow."""
 _SAME_DEG, _SAME_PERCENT = 1e-3, 1e-3
 """Differences of motions that say nothing, as between all models under a global shutter."""
 _CLEARLY, LEAST_BACKWARDS = 0.999, 0.25
@@ -102,25 +99,20 @@ def _stereo(matches: Correspondences) -> FloatArray:
 
 
 def as_global(capture: Capture, windows: Sequence[Correspondences], rig: StereoRig, known: Known) -> Capture:
-    """A global shutter, where all that the matches allow is one or nearly one, whatever side it begins at.
+    """A global shutter, where the matches allow nothing but one or nearly one (``nearly_global``).
 
-    Errors of a calibration are taken for small differences of times; no camera has a readout that short. What is
-    unknown beside is found again from the matches of the windows, under a global shutter.
+    What is unknown beside is found again from the matches of the windows, under a global shutter.
     """
-    near = [each for each in capture.candidates if each.ratio - 2.0 * each.sigma <= _NEARLY]
-    probability = sum(each.probability for each in near)
-    if not near or probability < CERTAIN or near == [each for each in near if each.scans == GLOBAL]:
-        return capture
-    sigma = float(np.sqrt(sum(each.probability * (each.ratio**2 + each.sigma**2) for each in near) / probability))
-    if sigma > _SMALL:
+    candidates = nearly_global(capture)
+    if candidates is None:
         return capture
     alone = replace(known, scans=(GLOBAL,), ratio=0.0, delay=0.0)
     again = conclude([examine(each, rig, alone) for each in windows])
     if again.likeliest is None:
         return capture
-    still = replace(again.likeliest, probability=probability, sigma=sigma)
-    others = tuple(each for each in capture.candidates if each not in near)
-    return replace(capture, candidates=(still, *others), models=again.models, peaks=again.peaks, named=True)
+    still = replace(again.likeliest, probability=candidates[0].probability, sigma=candidates[0].sigma)
+    found = (still, *candidates[1:])
+    return replace(capture, candidates=found, models=again.models, peaks=again.peaks, named=True)
 
 
 def shutter_found(capture: Capture, rig: StereoRig) -> RollingShutter:

@@ -7,8 +7,8 @@ from dataclasses import astuple, replace
 
 import numpy as np
 
-from rsbench.capture.estimate import CERTAIN, MAX_SIGMA, Candidate, Capture
-from rsbench.capture.scans import GLOBAL, Scans, scans_of
+from rsbench.capture.estimate import CERTAIN, MAX_SIGMA, Candidate, Capture, nearly_global
+from rsbench.capture.scans import scans_of
 from rsbench.capture.settle import shutter_found
 from rsbench.capture.trajectory_ratio import SequenceRatio, ratio_of_sequence
 from rsbench.core.correspondences import Correspondences
@@ -17,8 +17,6 @@ from rsbench.core.shutter import RollingShutter, Scanning
 
 LONGEST = 12
 """Successive windows that are looked at, at most: what is left open then is less than what noise leaves."""
-_NEARLY = 0.06
-"""Readout ratio of nearly a global shutter, within two deviations."""
 _TOGETHER = tuple(Scanning(scan=scan) for scan in ("top", "bottom", "left", "right"))
 
 
@@ -42,6 +40,9 @@ def capture_of_sequence(
     if found is None:
         return capture
     candidate = _candidate(found, rig)
+    # Nearly without a readout it is all the same where it begins.
+    near = nearly_global(replace(capture, candidates=(replace(candidate, probability=1.0),)))
+    candidate = candidate if near is None else near[0]
     doubt = ""
     if candidate.probability < CERTAIN or candidate.sigma > MAX_SIGMA:
         text = f"{candidate.ratio:.2f} +- {candidate.sigma:.2f}"
@@ -92,9 +93,11 @@ def _scannings(capture: Capture) -> tuple[Scanning, ...]:
 
 def _candidate(found: SequenceRatio, rig: StereoRig) -> Candidate:
     shutter = found.scanning.shutter_of(rig.camera.width, rig.camera.height, 1.0)
-    scans: Scans = scans_of(shutter)
-    ratio, sigma, probability = found.ratio, found.sigma, found.probability
-    if ratio - 2.0 * sigma <= _NEARLY and ratio + 2.0 * sigma < 3.0 * _NEARLY:
-        scans, ratio, sigma, probability = GLOBAL, 0.0, float(np.hypot(ratio, sigma)), 1.0
-    delay = found.scanning.right_delay
-    return Candidate(scans=scans, probability=probability, ratio=ratio, sigma=sigma, delay=delay, delay_sigma=0.0)
+    return Candidate(
+        scans=scans_of(shutter),
+        probability=found.probability,
+        ratio=found.ratio,
+        sigma=found.sigma,
+        delay=found.scanning.right_delay,
+        delay_sigma=0.0,
+    )

@@ -1,9 +1,12 @@
 """The readout ratio of a rig that shakes. Truth: points projected at their rows' times (``shaken_rig``)."""
 
 import numpy as np
+import pytest
+import shaken_rig
 from shaken_rig import RATIO, RIG, SHAKES, matches, sines
 
 from rsbench.capture.estimate import Capture
+from rsbench.capture.scans import GLOBAL
 from rsbench.capture.trajectory_ratio import ratio_of_sequence
 from rsbench.capture.trajectory_shutter import capture_of_sequence
 from rsbench.core.correspondences import Correspondences
@@ -44,3 +47,11 @@ def test_few_frames_say_that_they_are_few() -> None:
 
 def test_nothing_is_told_where_nothing_is_seen() -> None:
     assert capture_of_sequence(NOTHING, [Correspondences()] * 4, RIG) is NOTHING
+
+
+def test_a_shaken_rig_that_reads_all_lines_at_once_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shaken_rig, "RATIO", 0.0)
+    rng = np.random.default_rng(104)
+    windows, _ = matches(sines(rng, *SHAKES["strong"]), 6, rng, count=80)
+    best = capture_of_sequence(NOTHING, windows, RIG, Scanning()).likeliest
+    assert best is not None and best.scans == GLOBAL and best.ratio == 0.0 and best.probability == 1.0
