@@ -121,8 +121,10 @@ class Gate:
     dy: tuple[float, float]
 
 
-_DETECTED, _PAIRED = Recent[Features](28), Recent[Indices](56)
+_DETECTED, _PAIRED = Recent[Features](28), Recent[Indices](42)
 """A sequence asks for each image in two windows, and again after its shutter is known: of 12 windows at most."""
+_REMEMBERED = 10_000
+"""Features of an image, at most, that are kept: 6 MB."""
 
 
 def detect(
@@ -134,6 +136,8 @@ def detect(
         camera: whose lens the image has; None: it has none. Features of which the lens shows no ray are dropped.
     """
     options, grey = options or MatchOptions(), grey_u8(image)
+    if not 0 < options.max_features <= _REMEMBERED:
+        return _detected(grey, options, camera)
     key = content_key(grey), options.max_features, options.contrast_threshold, options.edge_threshold, camera
     return _DETECTED.get(key, lambda: _detected(grey, options, camera))
 
@@ -165,6 +169,8 @@ def match(a: Features, b: Features, gate: Gate, options: MatchOptions | None = N
     same match several times; it is kept once.
     """
     options = options or MatchOptions()
+    if max(len(a.points), len(b.points)) > _REMEMBERED:
+        return _paired(a, b, gate, options)
     key = a, b, gate, options.ratio, options.max_distance
     return _PAIRED.get(key, lambda: _paired(a, b, gate, options))
 

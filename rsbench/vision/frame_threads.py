@@ -28,29 +28,25 @@ def map_frames(work: Callable[[T], R], items: Iterable[T], pixels: int, bytes_pe
 
 def ahead(items: Iterator[T], most: int) -> Iterator[T]:
     """The items, in order, of which a thread makes up to ``most`` before they are asked for."""
-    last = object()
-    with ThreadPoolExecutor(1) as pool:
-        waiting = deque(pool.submit(next, items, last) for _ in range(most))
-        try:
-            while (item := waiting.popleft().result()) is not last:
-                waiting.append(pool.submit(next, items, last))
-                yield item  # pyrefly: ignore[invalid-yield]
-        finally:
-            for future in waiting:
-                future.cancel()
+    last, pool = object(), ThreadPoolExecutor(1)
+    waiting = deque(pool.submit(next, items, last) for _ in range(most))
+    try:
+        while (item := waiting.popleft().result()) is not last:
+            waiting.append(pool.submit(next, items, last))
+            yield item  # pyrefly: ignore[invalid-yield]
+    finally:  # an interrupt does not wait for what runs
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def map_ahead(work: Callable[[T], R], items: Iterable[T], most: int, threads: int) -> Generator[R]:
     """``work`` on each item, in order, by threads; up to ``most`` wait for those before them."""
-    waiting = deque[Future[R]]()
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            for item in items:
-                waiting.append(pool.submit(work, item))
-                if len(waiting) > most:
-                    yield waiting.popleft().result()
-            while waiting:
+    waiting, pool = deque[Future[R]](), ThreadPoolExecutor(threads)
+    try:
+        for item in items:
+            waiting.append(pool.submit(work, item))
+            if len(waiting) > most:
                 yield waiting.popleft().result()
-        finally:
-            for future in waiting:
-                future.cancel()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
