@@ -111,6 +111,7 @@ def again_over_first(folder: Path) -> tuple[Work, Work]:
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import generate_dataset
     from rsbench.report.evaluation_page import write_report
+    from rsbench.vision.features import forget_features
 
     generate_dataset(load_dataset_card("smoke"), folder / "smoke")
     options = EvaluationOptions(solvers=("rs-stereo-refined", "gs-8pt", "rs-stereo-linear"))
@@ -120,6 +121,7 @@ def again_over_first(folder: Path) -> tuple[Work, Work]:
         write_report(folder / "smoke", out)
 
     def first() -> None:
+        forget_features()
         evaluate(Path(tempfile.mkdtemp(dir=folder)))
 
     evaluate(folder / "kept")

@@ -29,6 +29,7 @@ from rsbench.pipeline.chain import correct_frames, find_depth
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import match_frames
 from rsbench.pipeline.frame_motion import solve_frames
+from rsbench.vision.features import forget_features
 
 BOUND = 10.0
 """Times what OpenCV alone needs for features and disparities, in processor seconds: it was 5.4 to 6.7 on a busy
@@ -47,6 +48,7 @@ def run(sequence: Sequence, options: CorrectionOptions) -> dict[str, tuple[float
         times[name] = (time.perf_counter() - wall, time.process_time() - cpu)
         return result
 
+    forget_features()
     matches = timed("match", lambda: match_frames(images, rig, options))
     ratio = sequence.shutter.readout_ratio
     solved = timed("solve", lambda: solve_frames(matches, rig, ratio, options))

@@ -33,6 +33,7 @@ from rsbench.pipeline.frame_depth import (
 from rsbench.pipeline.frame_matches import match_frames, match_unknown
 from rsbench.pipeline.frame_motion import FoundMotion, solve_frames
 from rsbench.vision.corrector import CorrectionProblem, find_corrected_rows
+from rsbench.vision.features import forget_features
 from rsbench.vision.fusion import Fused, Origin, inpaint
 from rsbench.vision.stereo_matcher import needs_motion, refuse_motion
 
@@ -207,6 +208,7 @@ def _solve(
         clock("motion")
         shutter = (scanning or Scanning()).shutter_of(camera.width, camera.height, readout_ratio)
         return matches, None, shutter, None
+    forget_features()
     if matches is None and readout_ratio is None and scanning is None:
         matches, doubt = match_unknown(images, rig, options)
     elif matches is None:

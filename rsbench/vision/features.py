@@ -127,6 +127,12 @@ _REMEMBERED = 10_000
 """Features of an image, at most, that are kept: 6 MB."""
 
 
+def forget_features() -> None:
+    """Find them again, also in images that were asked for before: so that their time is counted."""
+    _DETECTED.clear()
+    _PAIRED.clear()
+
+
 def detect(
     image: NDArray[Any], options: MatchOptions | None = None, camera: PinholeCamera | None = None
 ) -> Features:

@@ -37,6 +37,11 @@ class Recent(Generic[T]):
                 self._kept.popitem(last=False)
         return found
 
+    def clear(self) -> None:
+        """Keep nothing."""
+        with self._lock:
+            self._kept.clear()
+
 
 def content_key(image: NDArray[Any]) -> Hashable:
     """Equal for images of equal size, type and content."""

@@ -1,6 +1,6 @@
 import numpy as np
 
-from rsbench.vision.features import MatchOptions, detect
+from rsbench.vision.features import MatchOptions, detect, forget_features
 from rsbench.vision.recent import Recent, content_key
 
 
@@ -27,7 +27,10 @@ def test_images_are_told_apart_by_all_that_they_are() -> None:
 def test_features_are_those_of_the_image_and_the_options_that_are_asked_for() -> None:
     rng = np.random.default_rng(0)
     image = np.asarray(255 * rng.random((60, 80)), dtype=np.uint8)
-    assert detect(image) is detect(image.copy())
+    found = detect(image)
+    assert detect(image.copy()) is found
+    forget_features()
+    assert detect(image) is not found
     few = detect(image, MatchOptions(max_features=5))
     assert len(few.points) < len(detect(image).points)
     image[:] = 0
