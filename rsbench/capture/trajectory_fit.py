@@ -94,7 +94,7 @@ def normal_equations(
     n, past = len(curve.p), tracks.past
     width = width_of(tracks, curve)
     band, gradient, squares = np.zeros((6 * n, width)), np.zeros(6 * n), np.zeros(len(trust))
-    cost = _add_halves(curve, tracks, tails, trust, squares, band, gradient, want)
+    cost = _add_halves(curve, tracks, tails, trust, (squares, band, gradient), want)
     rough = roughness(curve, prior.memory, prior.smooth, width, past is None, until)
     for kind, strength in enumerate((prior.rotation, prior.position)):
         cost += 0.5 * rough.squares[kind] / strength
@@ -110,15 +110,14 @@ def _add_halves(
     tracks: TimedTracks,
     tails: Tails,
     trust: FloatArray,
-    squares: FloatArray,
-    band: FloatArray,
-    gradient: FloatArray,
+    out: tuple[FloatArray, FloatArray, FloatArray],
     want: bool,
 ) -> float:
     """``add_tracks``, many of them in two halves side by side: on any machine, so that sums are the same."""
     starts, middle, same = tracks.starts, len(trust) // 2, (tracks.focal, tails)
     if len(trust) < _MANY:
-        return add_tracks(curve, tracks.ends, starts, *same, trust, squares, band, gradient, want)
+        return add_tracks(curve, tracks.ends, starts, *same, trust, *out, want)
+    squares, band, gradient = out
     later = np.zeros_like(band), np.zeros_like(gradient)
     with ThreadPoolExecutor(1) as pool:
         half = (curve, tracks.ends, starts[middle:], *same, trust[middle:], squares[middle:], *later, want)
@@ -205,7 +204,7 @@ def squared_errors(curve: Curve, tracks: TimedTracks) -> FloatArray:
     return squares
 
 
-def near(found: Fit, tracks: TimedTracks) -> FloatArray:
+def right_tracks(found: Fit, tracks: TimedTracks) -> FloatArray:
     """(n,) which tracks are right by a fit to others, 1 or 0."""
     reach = tracks.freedom * (_REACH * found.tails.scale) ** 2
     return (squared_errors(found.curve, tracks) <= reach).astype(np.float64)

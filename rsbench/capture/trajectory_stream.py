@@ -18,7 +18,7 @@ from rsbench.capture.trajectory_choice import choose
 from rsbench.capture.trajectory_covariance import covariance_between
 from rsbench.capture.trajectory_data import Past, TimedTracks, pack_windows, thinned
 from rsbench.capture.trajectory_estimate import TrajectoryOptions, is_supported, noise_px
-from rsbench.capture.trajectory_fit import ANCHORED, Fit, fit, held, information, near, normal_equations
+from rsbench.capture.trajectory_fit import ANCHORED, Fit, fit, held, information, normal_equations, right_tracks
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, part, span_of
 from rsbench.capture.trajectory_start import continued, first_curve, window_motions
 from rsbench.core import so3
@@ -50,7 +50,7 @@ class StreamedWindow:
     covariance: FloatArray | None
     """(6, 6) of w and d of ``motion``; None where no track spans a period."""
     apart: int
-    """Windows to the nearest one that its own tracks carry, before or after; 0: it is one itself."""
+    """Windows to the nearest one that its own tracks carry, of those seen so far; 0: it is one itself."""
     noise_px: float
 
     @property
@@ -117,7 +117,7 @@ class _State:
             curve = continued(self.curve, ahead, start, last) if ahead else self.curve
             found = fit(curve, self._pack(few), self.fit.prior, options.learn, self.fit.tails)
         tracks = self._pack(self.windows)
-        trust = near(found, tracks)
+        trust = right_tracks(found, tracks)
         if options.link:
             tracks = self._pack(self.windows, [trust[each] for each in tracks.members])
         return fit(found.curve, tracks, found.prior, options.learn, found.tails), tracks

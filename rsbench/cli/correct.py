@@ -72,7 +72,7 @@ def correct(
         log = GyroGiven(file=gyro, fps=fps, offset_s=gyro_offset)
         correct_one_camera(frames, footage, camera, out, target, inpaint, seed, log)
         return
-    if gyro is not None:
+    if gyro is not None or fps is not None or gyro_offset != 0.0:
         raise typer.BadParameter("is used with --camera or --frames, of one camera", param_hint="--gyro")
     given = given_frames(frames, rig, out, left, right, row_poses)
     others = {"find_sky": sky, "inpaint": bool(inpaint), "seed": seed, "motion_model": motion_model}

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
+from rsbench.cli.correct_said import listed
 
+if TYPE_CHECKING:
     from rsbench.core.camera import PinholeCamera
     from rsbench.core.so3 import FloatArray
     from rsbench.pipeline.footage import FrameSource
@@ -31,7 +31,6 @@ GyroOffset = Annotated[
     float, typer.Option(metavar="SECONDS", help="What --gyro's clock shows at the first row of the first frame.")
 ]
 _MOST = 1e9
-_MOST_LISTED = 8
 _PAGE_FRAMES = 6
 _UNIT = "length of the translation over one frame period"
 
@@ -228,11 +227,11 @@ def _focal(record: dict[str, Any]) -> str:
 def _say(record: dict[str, Any], out: Path) -> None:
     """Exit 1 where some frames are not corrected."""
     told = {
-        key: _listed((each["number"], each[key]) for each in record["frames"] if key in each)
+        key: listed((each["number"], each[key]) for each in record["frames"] if key in each)
         for key in ("skipped", "reason")
     }
     motions = ((each["number"], each.get("motion", {})) for each in record["frames"])
-    told["gyro"] = _listed((number, motion["gyro"]) for number, motion in motions if "gyro" in motion)
+    told["gyro"] = listed((number, motion["gyro"]) for number, motion in motions if "gyro" in motion)
     corrected = sum("reason" not in each for each in record["frames"])
     typer.echo(f"readout ratio {_readout(record)}")
     typer.echo(f"{corrected} of {len(record['frames'])} frames corrected")
@@ -245,13 +244,6 @@ def _say(record: dict[str, Any], out: Path) -> None:
     if told["reason"]:
         typer.echo(f"rsbench: not corrected: {told['reason']}", err=True)
         raise typer.Exit(1)
-
-
-def _listed(frames: Iterable[tuple[int, str]]) -> str:
-    """Numbers of frames and why; of many the first ones."""
-    words = [f"frame {number} ({why})" for number, why in frames]
-    more = [f"and {len(words) - _MOST_LISTED} more, see motion.json"] if len(words) > _MOST_LISTED else []
-    return "; ".join(words[:_MOST_LISTED] + more)
 
 
 def _write(folder: Path, moments: Any, advance: Any, *, whole: bool) -> list[dict[str, Any]]:

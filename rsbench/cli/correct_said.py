@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,8 @@ import typer
 if TYPE_CHECKING:
     from rsbench.capture.estimate import Capture
     from rsbench.core.shutter import RollingShutter
+
+_MOST_LISTED = 8
 
 
 def write_page_of(
@@ -60,3 +63,10 @@ def readout_words(shutter: RollingShutter, capture: Capture | None) -> str:
 def say_calibration(record: dict[str, Any]) -> None:
     if record["calibration_note"]:
         typer.echo(f"errors of the calibration, taken from the matches: {record['calibration_note']}")
+
+
+def listed(frames: Iterable[tuple[int, str]]) -> str:
+    """Numbers of frames and why; of many the first ones."""
+    words = [f"frame {number} ({why})" for number, why in frames]
+    more = [f"and {len(words) - _MOST_LISTED} more, see motion.json"] if len(words) > _MOST_LISTED else []
+    return "; ".join(words[:_MOST_LISTED] + more)

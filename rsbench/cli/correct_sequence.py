@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from rsbench.cli.correct_input import sized, target_row
-from rsbench.cli.correct_said import readout_words, say_calibration, write_page_of
+from rsbench.cli.correct_said import listed, readout_words, say_calibration, write_page_of
 
 if TYPE_CHECKING:
     from rsbench.capture.estimate import Capture
@@ -142,11 +142,15 @@ def _write(folder: Path, moment: CorrectedMoment, close: bool, rows: RollingShut
 
 
 def _write_rest(folder: Path, out: Path, left: FrameSource, record: dict[str, Any], found: Found) -> None:
+    import numpy as np
+
     from rsbench.dataset.corrected_frames import join_poses, write_record
     from rsbench.report.trajectory_picture import draw_trajectory
 
-    poses = join_poses(folder, "trajectory")
     join_poses(folder, "row_poses")
+    join_poses(folder, "trajectory")
+    trajectory = folder / "trajectory.csv"
+    poses = np.loadtxt(trajectory, ndmin=2) if trajectory.is_file() else np.zeros((0, 8))
     write_record(folder, record)
     shutter, _, capture = found
     cards = _cards(folder, left, record["frames"])
@@ -187,7 +191,9 @@ def _say(out: Path, first: str, record: dict[str, Any]) -> None:
     from rsbench.dataset.corrected_video import is_video
 
     frames = record["frames"]
-    failed, skipped = _told(frames, "reason"), _told(frames, "skipped")
+    failed, skipped = (
+        listed((frame["number"], frame[key]) for frame in frames if key in frame) for key in ("reason", "skipped")
+    )
     typer.echo(first)
     say_calibration(record)
     typer.echo(f"{sum('reason' not in frame for frame in frames)} of {len(frames)} times corrected")
@@ -197,8 +203,3 @@ def _say(out: Path, first: str, record: dict[str, Any]) -> None:
     if failed:
         typer.echo(f"rsbench: not corrected: {failed}", err=True)
         raise typer.Exit(1)
-
-
-def _told(frames: list[dict[str, Any]], key: str) -> str:
-    """Which frames have a reason under ``key``, with it."""
-    return "; ".join(f"frame {frame['number']} ({frame[key]})" for frame in frames if key in frame)

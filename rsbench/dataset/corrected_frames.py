@@ -20,7 +20,6 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose, inverse
 from rsbench.core.shutter import RollingShutter
-from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import read_frame
 from rsbench.pipeline.frame_motion import FoundMotion
@@ -262,20 +261,18 @@ def write_poses(folder: Path, name: str, number: int, taus: ArrayLike, poses: Po
     write_bytes(place / f"{number:06d}.csv", "".join(lines).encode())
 
 
-def join_poses(folder: Path, name: str) -> FloatArray:
+def join_poses(folder: Path, name: str) -> None:
     """NAME.csv in TUM's format, lines ``tau tx ty tz qx qy qz qw``, of the parts of all frames; no file of none.
 
-    Returns:
-        Those lines, (n, 8), of a file that is small enough to draw.
+    Frame by frame, so that footage may be of any length.
     """
     parts = listed(folder / HIDDEN / name, ".csv")
     if not parts:
-        return np.zeros((0, 8))
+        return
     with (folder / f"{name}.csv").open("wb") as file:
         file.write(_TUM.encode())
         for part in parts:
             file.write(part.read_bytes())
-    return np.loadtxt(folder / f"{name}.csv", ndmin=2)
 
 
 def _line(tau: float, pose: Pose) -> str:
