@@ -197,12 +197,12 @@ def _start_from(
     timed: Mapping[str, TimedMatches], known: Known, fit: CaptureFit, hypothesis: Hypothesis
 ) -> tuple[FloatArray, FloatArray]:
     """Where the fit of a hypothesis starts: at another one's of the same scans."""
-    scans, model = hypothesis.scans, hypothesis.motion_model
+    model = hypothesis.motion_model
     unknowns = known.start(hypothesis, *fit.unknowns[[RATIO, DELAY]])
     unknowns[CALIBRATION] = fit.unknowns[CALIBRATION]
     unknowns[ACCELERATION] = fit.unknowns[ACCELERATION] if model == fit.hypothesis.motion_model else 0.0
-    motion = timed[fit.hypothesis.motion_model].packed(scans, fit.unknowns).motion(fit.theta)
-    return timed[model].packed(scans, unknowns).theta(*motion), unknowns
+    motion = timed[fit.hypothesis.motion_model].kernel(fit.unknowns).motion(fit.theta)
+    return timed[model].kernel(unknowns).theta(*motion), unknowns
 
 
 def _some(count: int, wanted: int) -> BoolArray:
@@ -273,15 +273,21 @@ def _fitted(
     fits: Sequence[CaptureFit],
     delays: Sequence[bool],
 ) -> list[CaptureFit]:
-    """The fits again, with and without a late right camera, from the nearest fit."""
-    out = []
+    """The fits again, with and without a late right camera, from the nearest fit; the best of them first.
+
+    Those that cannot come near the best one are given up on the way.
+    """
+    out, least = list[CaptureFit](), np.inf
+    fits = sorted(fits, key=lambda fit: fit.cost)
     pairs = dict.fromkeys((fit.hypothesis.scans, fit.hypothesis.motion_model) for fit in fits)
     for (scans, model), delayed in product(pairs, delays):
         hypothesis = Hypothesis(scans=scans, motion_model=model, delayed=delayed)
         of_pair = [f for f in fits if (f.hypothesis.scans, f.hypothesis.motion_model) == (scans, model)]
         start = _start_from(timed, known, min(of_pair, key=lambda fit: fit.cost), hypothesis)
         cost = _cost(timed, likelihood, known, hypothesis)
-        out.append(fit_capture(cost, *start, iterations=8, still=_ROUGHLY))
+        far = least + _CLOSE * likelihood.scale**2
+        out.append(fit_capture(cost, *start, iterations=8, still=_ROUGHLY, hopeless=far))
+        least = min(least, out[-1].cost)
     return out
 
 

@@ -26,6 +26,8 @@ _LONGEST_STEP = np.array([0.4, 0.4, 0.3, 2.0, *9 * [20.0], *3 * [0.2]])
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-8, 1e6
 """A motion makes up for most of a wrong ratio: more damping than this would hold the ratio where it is."""
 _MOTION = 6
+_OVER = 5.0
+"""Times Newton's prediction that a cost may fall, at most."""
 _MEDIAN, LEAST_SCALE_PX = 0.6, 0.005
 """Median of squared normal errors, one or five together; and what exact matches are taken for."""
 
@@ -74,7 +76,7 @@ class CaptureCost:
         self, matches: TimedMatches, hypothesis: Hypothesis, likelihood: Likelihood, prior: FloatArray
     ) -> None:
         self.hypothesis, self.likelihood, self.prior = hypothesis, likelihood, prior
-        self._matches = matches.subset(likelihood.chosen)
+        self._matches = matches.read(hypothesis.scans, likelihood.chosen)
         self.free = [k for k in range(UNKNOWNS) if prior[k] > 0.0]
         self._weight = np.zeros(UNKNOWNS)
         self._weight[self.free] = (likelihood.scale / prior[self.free]) ** 2
@@ -83,7 +85,7 @@ class CaptureCost:
 
     def tailed(self, unknowns: FloatArray) -> HeavyTailed:
         """The measurements at some unknowns (16,)."""
-        packed = self._matches.packed(self.hypothesis.scans, unknowns)
+        packed = self._matches.packed(unknowns)
         return HeavyTailed(**vars(packed), nu=self.likelihood.nu, scale=self.likelihood.scale, trust=self._trust)
 
     def each(self, theta: FloatArray, unknowns: FloatArray) -> FloatArray:
@@ -106,8 +108,8 @@ class CaptureCost:
         self, theta: FloatArray, unknowns: FloatArray, free: list[int]
     ) -> tuple[float, FloatArray, FloatArray]:
         """The cost, its gradient and its Hessian by theta and the free unknowns."""
-        packed, size = self._matches.packed(self.hypothesis.scans, unknowns), _MOTION + len(free)
-        by = self._matches.derivatives(self.hypothesis.scans, packed, float(unknowns[ACCELERATION]), free)
+        packed, size = self._matches.packed(unknowns), _MOTION + len(free)
+        by = self._matches.derivatives(packed, float(unknowns[ACCELERATION]), free)
         tails, trust = np.array([self.likelihood.nu, self.likelihood.scale]), self._trust
         gradient, H, n = np.zeros(size), np.zeros((size, size)), len(packed.pairs)
         at, focal, baseline = (theta, packed.kernel), packed.focal, packed.baseline
@@ -126,27 +128,31 @@ def fit_capture(
     iterations: int = 20,
     still: float = 1e-4,
     hold_ratio: bool = False,
+    hopeless: float = np.inf,
 ) -> CaptureFit:
     """Newton's method, damped, from a start (6,), (16,).
 
     Args:
         still: decrease of the cost, in squared scales of the errors, at which to stop.
         hold_ratio: whether the ratio stays as it is.
+        hopeless: cost that must come within reach, or it is given up: then the cost is above this.
     """
     free = [k for k in cost.free if k != RATIO or not hold_ratio]
     unknowns = _within(unknowns, free)
     damping = _LEAST_DAMPING
     now, gradient, H = cost.local(theta, unknowns, free)
     for _ in range(iterations):
-        before = now
+        before, newton = now, _Newton(gradient, H, unknowns, free)
+        if now - _OVER * newton.gain > hopeless:
+            break
         while damping < _LARGEST_DAMPING:
-            moved = _stepped(gradient, H, theta, unknowns, free, damping)
+            moved = newton.stepped(theta, damping)
             trial = cost.local(*moved, free)
             if trial[0] <= now:
                 (theta, unknowns), (now, gradient, H) = moved, trial
                 damping = max(0.1 * damping, _LEAST_DAMPING)
                 break
-            damping *= 10.0
+            damping = max(10.0 * damping, 1e-4)
         if before - now < still * cost.likelihood.scale**2:
             break
     sigma = np.zeros(UNKNOWNS)
@@ -167,27 +173,37 @@ def fit_capture(
     )
 
 
-def _stepped(
-    gradient: FloatArray, H: FloatArray, theta: FloatArray, unknowns: FloatArray, free: list[int], damping: float
-) -> tuple[FloatArray, FloatArray]:
-    """Where a damped Newton step leads; an unknown at its limit stays there."""
-    moves = np.ones(len(gradient), dtype=np.bool_)
-    for k, j in enumerate(free, start=_MOTION):
-        outwards = -gradient[k]
-        moves[k] = not (
-            (unknowns[j] <= _LEAST[j] and outwards < 0.0) or (unknowns[j] >= _MOST[j] and outwards > 0.0)
-        )
-    A, g = H[np.ix_(moves, moves)], gradient[moves]
-    size = np.sqrt(np.maximum(np.abs(np.diagonal(A)), 1e-12 * np.abs(A).max()) + 1e-300)
-    values, vectors = np.linalg.eigh(A / np.outer(size, size))
-    values = np.maximum(np.abs(values), 1e-9) + damping  # downhill, whatever the curvature
-    step = np.zeros(len(gradient))
-    step[moves] = -(vectors @ ((vectors.T @ (g / size)) / values)) / size
-    theta, unknowns = theta + step[:_MOTION], unknowns.copy()
-    unknowns[free] += np.clip(step[_MOTION:], -_LONGEST_STEP[free], _LONGEST_STEP[free])
-    length = float(np.linalg.norm(theta[3:]))
-    theta[3:] *= min(1.0, _MAX_TRANSLATION_M / max(length, _MAX_TRANSLATION_M))
-    return theta, _within(unknowns, free)
+class _Newton:
+    """Newton's step from one place; an unknown at its limit stays there."""
+
+    def __init__(self, gradient: FloatArray, H: FloatArray, unknowns: FloatArray, free: list[int]) -> None:
+        self._moves = np.ones(len(gradient), dtype=np.bool_)
+        for k, j in enumerate(free, start=_MOTION):
+            outwards = -gradient[k]
+            self._moves[k] = not (
+                (unknowns[j] <= _LEAST[j] and outwards < 0.0) or (unknowns[j] >= _MOST[j] and outwards > 0.0)
+            )
+        A, g = H[np.ix_(self._moves, self._moves)], gradient[self._moves]
+        self._size = np.sqrt(np.maximum(np.abs(np.diagonal(A)), 1e-12 * np.abs(A).max()) + 1e-300)
+        values, self._vectors = np.linalg.eigh(A / np.outer(self._size, self._size))
+        self._values = np.maximum(np.abs(values), 1e-9)  # downhill, whatever the curvature
+        self._slopes = self._vectors.T @ (g / self._size)
+        self._unknowns, self._free = unknowns, free
+
+    @property
+    def gain(self) -> float:
+        """By how much the cost would fall, if it were as here everywhere."""
+        return 0.5 * float(np.sum(self._slopes**2 / self._values))
+
+    def stepped(self, theta: FloatArray, damping: float) -> tuple[FloatArray, FloatArray]:
+        """Where a damped step leads."""
+        step = np.zeros(len(self._moves))
+        step[self._moves] = -(self._vectors @ (self._slopes / (self._values + damping))) / self._size
+        theta, unknowns, free = theta + step[:_MOTION], self._unknowns.copy(), self._free
+        unknowns[free] += np.clip(step[_MOTION:], -_LONGEST_STEP[free], _LONGEST_STEP[free])
+        length = float(np.linalg.norm(theta[3:]))
+        theta[3:] *= min(1.0, _MAX_TRANSLATION_M / max(length, _MAX_TRANSLATION_M))
+        return theta, _within(unknowns, free)
 
 
 def _within(unknowns: FloatArray, free: list[int]) -> FloatArray:

@@ -21,11 +21,11 @@ from rsbench.solvers.engine.packed import Packed, pack
 Start = Literal["global", "top", "bottom", "left", "right"]
 """The side of the image at which a camera begins to read, or ``global`` for all lines at once."""
 _FRAMES = np.array([0.0, 1.0])
-_FIRST_ERROR = 3
-"""Of the unknowns, the first error of the calibration; before it are ratio, delay and acceleration."""
+_RATIO, _DELAY, _ACCELERATION, _FIRST_ERROR = range(4)
+"""Places of the unknowns; after the first error of the calibration come the others."""
 STARTS: tuple[Start, ...] = get_args(Start)
-_ENDS: dict[Side, tuple[int, int]] = {"left": (0, 2), "right": (1, 3)}
-"""Ends of a track, of frame 0 and of frame 1, that a camera sees."""
+_FRAMES_OF_TRACKS, _LATE_OF_TRACKS = np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 1.0, 0.0, 1.0])
+"""Of the ends of a track: the frame, and 1 of those of the right camera."""
 
 
 @dataclass(frozen=True, order=True)
@@ -96,6 +96,15 @@ class _Lines:
     track_slopes: FloatArray
     """(m, 4, 2)."""
 
+    def only(self, pairs: BoolArray, tracks: BoolArray) -> _Lines:
+        """Those of masks (n,), (m,)."""
+        return _Lines(
+            pairs=self.pairs[pairs],
+            slopes=self.slopes[pairs],
+            tracks=self.tracks[tracks],
+            track_slopes=self.track_slopes[tracks],
+        )
+
 
 class TimedMatches:
     """Matches whose ends can be given the times of any scans.
@@ -134,12 +143,13 @@ class TimedMatches:
         )
 
     def _ray_shifts(self) -> tuple[FloatArray, FloatArray]:
-        """(n, 2, 13, 2) of the pairs' ends and (m, 4, 13, 2) of the tracks', see ``ray_shifts``."""
+        """(n, 2, 2, 13) of the pairs' ends and (m, 4, 2, 13) of the tracks': ``ray_shifts``, the errors last."""
         base, focal = self._base, float(self._base.focal[0])
         pairs = base.pairs[:, :4].reshape(-1, 2, 2)
         either = [ray_shifts(pairs, side, focal) for side in SIDES]
         tracks = [ray_shifts(base.tracks[:, k, :2], SIDES[k % 2], focal) for k in range(4)]
-        return np.where(self.left[:, None, None, None], *either), np.stack(tracks, axis=1)
+        found = np.where(self.left[:, None, None, None], *either), np.stack(tracks, axis=1)
+        return np.ascontiguousarray(found[0].swapaxes(2, 3)), np.ascontiguousarray(found[1].swapaxes(2, 3))
 
     def under(self, motion_model: str) -> TimedMatches:
         """The same matches under another motion model."""
@@ -158,70 +168,96 @@ class TimedMatches:
             int(np.count_nonzero(chosen)),
         )
         other._shifts = self._shifts[0][pairs], self._shifts[1][tracks]
-        other._lines = {
-            start: _Lines(
-                pairs=lines.pairs[pairs],
-                slopes=lines.slopes[pairs],
-                tracks=lines.tracks[tracks],
-                track_slopes=lines.track_slopes[tracks],
-            )
-            for start, lines in self._lines.items()
-        }
+        other._lines = {start: lines.only(pairs, tracks) for start, lines in self._lines.items()}
         return other
 
+    def read(self, scans: Scans, chosen: BoolArray | None = None) -> ReadMatches:
+        """Those of a mask (count,) as these scans time them; None: all."""
+        chosen = np.ones(self.count, dtype=np.bool_) if chosen is None else chosen
+        pairs, tracks = np.split(chosen, [len(self._base.pairs)])
+        left, right = (self._lines[scans.start(side)].only(pairs, tracks) for side in SIDES)
+        first, of_left = self.left[pairs][:, None], np.array([True, False, True, False])
+        lines = _Lines(
+            pairs=np.where(first, left.pairs, right.pairs),
+            slopes=np.where(first, left.slopes, right.slopes),
+            tracks=np.where(of_left, left.tracks, right.tracks),
+            track_slopes=np.where(of_left[:, None], left.track_slopes, right.track_slopes),
+        )
+        shifts = self._shifts[0][pairs], self._shifts[1][tracks]
+        return ReadMatches(self._base.only(chosen), self.left[pairs], lines, shifts)
+
     def packed(self, scans: Scans, unknowns: FloatArray) -> Packed:
-        """The measurements as these scans time them.
+        """The measurements as these scans time them, see ``ReadMatches.packed``."""
+        return self.read(scans).packed(unknowns)
+
+    def kernel(self, unknowns: FloatArray) -> MotionKernel:
+        """Of the motion model, with the acceleration among some unknowns (16,)."""
+        return _accelerated(self._base.kernel, float(unknowns[_ACCELERATION]))
+
+
+class ReadMatches:
+    """Matches as two cameras read them, one scan each, but for the unknowns of their capture."""
+
+    def __init__(
+        self, base: Packed, left: BoolArray, lines: _Lines, shifts: tuple[FloatArray, FloatArray]
+    ) -> None:
+        self._base, self._lines, self._shifts = base, lines, shifts
+        self.count = len(base.pairs) + len(base.tracks)
+        self._late = np.where(left, 0.0, 1.0)[:, None]
+        """(n, 1) of the pairs, 1 of those of the right camera."""
+        self._constant: tuple[list[int], FloatArray, FloatArray] | None = None
+
+    def packed(self, unknowns: FloatArray) -> Packed:
+        """The measurements at some unknowns.
 
         Args:
-            scans: where each camera begins to read.
             unknowns: (16,) readout ratio; frame periods by which the right camera is late; the motion's
                 acceleration, 0 of a model without one; what the calibration is wrong by.
         """
         ratio, delay, acceleration, *errors = map(float, unknowns)
-        pairs, tracks = self._base.pairs.copy(), self._base.tracks.copy()
-        for side in SIDES:
-            lines, late = self._lines[scans.start(side)], delay if side == "right" else 0.0
-            mine = self.left if side == "left" else ~self.left
-            pairs[mine, 4:6] = _FRAMES + late + ratio * lines.pairs[mine]
-            pairs[mine, 15:17] = ratio * lines.slopes[mine]
-            ends = list(_ENDS[side])
-            tracks[:, ends, 2] = _FRAMES + late + ratio * lines.tracks[:, ends]
-            tracks[:, ends, 7:9] = ratio * lines.track_slopes[:, ends]
+        pairs, tracks, lines = self._base.pairs.copy(), self._base.tracks.copy(), self._lines
+        pairs[:, 4:6] = _FRAMES + delay * self._late + ratio * lines.pairs
+        pairs[:, 15:17] = ratio * lines.slopes
+        tracks[:, :, 2] = _FRAMES_OF_TRACKS + delay * _LATE_OF_TRACKS + ratio * lines.tracks
+        tracks[:, :, 7:9] = ratio * lines.track_slopes
         if any(errors):
-            pairs[:, :4] -= np.einsum("nkcx,c->nkx", self._shifts[0], errors).reshape(-1, 4)
-            tracks[:, :, :2] -= np.einsum("mkcx,c->mkx", self._shifts[1], errors)
-        return replace(self._base, pairs=pairs, tracks=tracks, h=0.0, kernel=self._kernel(acceleration))
+            pairs[:, :4] -= (self._shifts[0] @ errors).reshape(-1, 4)
+            tracks[:, :, :2] -= self._shifts[1] @ errors
+        kernel = _accelerated(self._base.kernel, acceleration)
+        return replace(self._base, pairs=pairs, tracks=tracks, h=0.0, kernel=kernel)
 
-    def _kernel(self, acceleration: float) -> MotionKernel:
-        kernel = self._base.kernel
-        return AcceleratedKernel(acceleration=acceleration) if isinstance(kernel, AcceleratedKernel) else kernel
-
-    def derivatives(
-        self, scans: Scans, packed: Packed, acceleration: float, free: list[int]
-    ) -> tuple[FloatArray, FloatArray]:
+    def derivatives(self, packed: Packed, acceleration: float, free: list[int]) -> tuple[FloatArray, FloatArray]:
         """Of the ends' rays and times by k free unknowns: (n, 2, k, 3) of pairs, (m, 4, k, 3) of tracks.
 
-        An acceleration is one of all times: the motion is at beta(tau), see ``AcceleratedKernel``.
+        An acceleration is one of all times: the motion is at beta(tau), see ``AcceleratedKernel``. The next call
+        may write into what this one gave.
         """
-        pairs = np.zeros((len(packed.pairs), 2, len(free), 3))
-        tracks = np.zeros((len(packed.tracks), 4, len(free), 3))
+        if self._constant is None or self._constant[0] != free:
+            self._constant = (free, *self._constant_derivatives(free))
+        _, pairs, tracks = self._constant
+        if _ACCELERATION in free:
+            k = free.index(_ACCELERATION)
+            for by, tau in ((pairs, packed.pairs[:, 4:6]), (tracks, packed.tracks[:, :, 2])):
+                by[:, :, k, 2] = (tau**2 - tau) / ((2.0 + acceleration) * (1.0 + acceleration * tau))
+        return pairs, tracks
+
+    def _constant_derivatives(self, free: list[int]) -> tuple[FloatArray, FloatArray]:
+        """Those by all but an acceleration."""
+        pairs = np.zeros((len(self._base.pairs), 2, len(free), 3))
+        tracks = np.zeros((len(self._base.tracks), 4, len(free), 3))
         for k, unknown in enumerate(free):
             if unknown >= _FIRST_ERROR:
-                pairs[:, :, k, :2] = -self._shifts[0][:, :, unknown - _FIRST_ERROR]
-                tracks[:, :, k, :2] = -self._shifts[1][:, :, unknown - _FIRST_ERROR]
-                continue
-            if unknown == 2:
-                for by, tau in ((pairs, packed.pairs[:, 4:6]), (tracks, packed.tracks[:, :, 2])):
-                    by[:, :, k, 2] = (tau**2 - tau) / ((2.0 + acceleration) * (1.0 + acceleration * tau))
-                continue
-            for side in SIDES:
-                mine, ends = self.left if side == "left" else ~self.left, list(_ENDS[side])
-                if unknown == 0:
-                    lines = self._lines[scans.start(side)]
-                    pairs[mine, :, k, 2], tracks[:, ends, k, 2] = lines.pairs[mine], lines.tracks[:, ends]
-                else:
-                    pairs[mine, :, k, 2] = tracks[:, ends, k, 2] = float(side == "right")
+                pairs[:, :, k, :2] = -self._shifts[0][..., unknown - _FIRST_ERROR]
+                tracks[:, :, k, :2] = -self._shifts[1][..., unknown - _FIRST_ERROR]
+            elif unknown == _RATIO:
+                pairs[:, :, k, 2], tracks[:, :, k, 2] = self._lines.pairs, self._lines.tracks
+            elif unknown == _DELAY:
+                pairs[:, :, k, 2], tracks[:, :, k, 2] = self._late, _LATE_OF_TRACKS
         return pairs, tracks
+
+
+def _accelerated(kernel: MotionKernel, acceleration: float) -> MotionKernel:
+    return AcceleratedKernel(acceleration=acceleration) if isinstance(kernel, AcceleratedKernel) else kernel
 
 
 def _late(rig: StereoRig, scan: Scan) -> RollingShutter:

@@ -13,7 +13,7 @@ import numpy as np
 
 from rsbench.capture.hypotheses import Known
 from rsbench.capture.scans import Scans, line_of
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, without_lens
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
@@ -99,10 +99,13 @@ def with_lag_taken(matches: Correspondences, lag: Lag, rig: StereoRig) -> Corres
 def find_start(
     matches: Correspondences, rig: StereoRig, known: Known, options: RobustOptions, seed: int
 ) -> tuple[RobustEstimate | None, Lag]:
-    """The motion that explains most matches, of those under ``COARSE``; None when there is none."""
+    """The motion that explains most matches, of those under ``COARSE``; None when there is none.
+
+    A lens is taken from the matches beforehand: their times are then a little off, as they are under any of these.
+    """
     lag = find_lag(matches.tracks, rig)
-    taken = with_lag_taken(matches, lag, rig)
-    camera, found = rig.camera, list[RobustEstimate]()
+    taken = without_lens(with_lag_taken(matches, lag, rig), rig.camera)
+    rig, camera, found = rig.ideal, rig.camera, list[RobustEstimate]()
     for scan, ratio in _coarse(known):
         shutter = RollingShutter(height=camera.height, width=camera.width, readout_ratio=ratio, scan=scan)
         with np.errstate(invalid="ignore", over="ignore"):
