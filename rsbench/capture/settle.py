@@ -6,7 +6,7 @@ not matter; else the message names what the matches leave open, what that trades
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -98,16 +98,28 @@ def _stereo(matches: Correspondences) -> FloatArray:
     return pairs if len(pairs) else np.concatenate([tracks[:, :4], tracks[:, 4:]])
 
 
-def as_global(capture: Capture, windows: Sequence[Correspondences], rig: StereoRig, known: Known) -> Capture:
+def as_global(
+    capture: Capture,
+    windows: Sequence[Correspondences],
+    rig: StereoRig,
+    known: Known,
+    under_global: Callable[[], Capture | None] = lambda: None,
+) -> Capture:
     """A global shutter, where the matches allow nothing but one or nearly one (``nearly_global``).
 
-    What is unknown beside is found again from the matches of the windows, under a global shutter.
+    What is unknown beside is found again under a global shutter.
+
+    Args:
+        windows: the matches from which, of cameras of which ``known`` is known.
+        under_global: what others say, if anything; asked where the shutter is global.
     """
     candidates = nearly_global(capture)
     if candidates is None:
         return capture
-    alone = replace(known, scans=(GLOBAL,), ratio=0.0, delay=0.0)
-    again = conclude([examine(each, rig, alone) for each in windows])
+    again = under_global()
+    if again is None:
+        alone = replace(known, scans=(GLOBAL,), ratio=0.0, delay=0.0)
+        again = conclude([examine(each, rig, alone) for each in windows])
     if again.likeliest is None:
         return capture
     still = replace(again.likeliest, probability=candidates[0].probability, sigma=candidates[0].sigma)

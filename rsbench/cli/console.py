@@ -65,7 +65,8 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[str], None]]:
         task = progress.add_task(label, total=total, word="")
 
         def advance(word: str) -> None:
-            progress.update(task, advance=1, word=word)
+            done = progress.tasks[0].completed + 1  # may become more than was expected
+            progress.update(task, completed=done, total=max(total, done), word=word)
 
         yield advance
 

@@ -40,7 +40,8 @@ def estimate_sequence_capture(
 ) -> tuple[Capture | None, RollingShutter]:
     """How the cameras of a sequence read, from windows that lie evenly over it: their shutter does not change.
 
-    With a known ratio the calibration alone is looked for; no capture where the first window shows no errors.
+    With a known ratio the calibration alone is looked for; no capture where the first window shows no errors. Of a
+    shutter that is found to be global it is found as if that had been known.
 
     Args:
         readout_ratio, scanning, calibration: see ``solve_frames``.
@@ -50,8 +51,13 @@ def estimate_sequence_capture(
         RefusedFramesError: the first windows cannot be what they are said to be.
         NoMotionError: the windows do not determine the shutter.
     """
+
+    def under_global() -> Capture | None:
+        return estimate_sequence_capture(left, right, rig, options, 0.0, Scanning(), calibration, advance)[0]
+
     scanning = scanning if readout_ratio is None else scanning or Scanning()
-    look, refusals = _Look(rig, options, readout_ratio, scanning, calibration), Refusals(left)
+    asked = (rig, options, readout_ratio, scanning, calibration)
+    look, refusals = _Look(*asked, under_global), Refusals(left)
     doubts = list[RefusedFramesError | None]()
     every, number = max((left.count - 1) // WINDOWS, 1), -1
     for number, images in enumerate(window_images(left, right)):
@@ -94,7 +100,9 @@ class _Look:
         readout_ratio: float | None,
         scanning: Scanning | None,
         calibration: tuple[float, ...] | None,
+        under_global: Callable[[], Capture | None],
     ) -> None:
+        self._under_global = under_global
         self._rig, self._options, self._ratio = rig, options, readout_ratio
         self._scanning, self._calibration = scanning, calibration
         self._examined, self.used, self._first = list[Examined](), list[Correspondences](), list[Correspondences]()
@@ -149,7 +157,7 @@ class _Look:
             raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
         capture = conclude(self._examined)
         if self._ratio is None:
-            capture = as_global(capture, self.used, self._rig, self._known)
+            capture = as_global(capture, self.used, self._rig, self._known, self._under_global)
         if self._ratio is not None or len(self._first) + 1 < FEWEST_FRAMES:
             return capture
         if self.shaken or shakes(capture, self._first, self._rig, self._options.seed):
