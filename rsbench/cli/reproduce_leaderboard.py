@@ -18,10 +18,20 @@ def leaderboard(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.cli.leaderboard_smoke import own_solvers, smoke
 
     board = data / BOARD
-    run("points", own_solvers(), str(board), workers=workers or os.cpu_count() or 1)
-    oracles("points", board)
+    for track, entries in (("points", own_solvers()), ("points-2", entries_of_laws())):
+        run(track, entries, str(board), workers=workers or os.cpu_count() or 1)
+        oracles(track, board)
     smoke(out / "leaderboard" / "smoke", write=True)
     publish(board, out / "leaderboard")
+
+
+def entries_of_laws() -> list[str]:
+    """What comes with rsbench where motions follow several laws: one entry a method, and the one that chooses."""
+    from rsbench.benchmark.leaderboard.running import CHOOSES
+    from rsbench.benchmark.leaderboard.second_protocols import SAME_METHOD
+    from rsbench.cli.leaderboard_smoke import own_solvers
+
+    return [name for name in own_solvers() if name not in SAME_METHOD] + [CHOOSES]
 
 
 def boards(out: Path, data: Path, workers: int | None) -> None:

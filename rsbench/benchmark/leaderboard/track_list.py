@@ -7,6 +7,7 @@ from rsbench.benchmark.leaderboard.depth_track import DepthTrack
 from rsbench.benchmark.leaderboard.mono_track import MonoCorrectionTrack
 from rsbench.benchmark.leaderboard.motion_tracks import OwnPoseTrack, PointsTrack, PoseTrack
 from rsbench.benchmark.leaderboard.readout_track import ReadoutTrack
+from rsbench.benchmark.leaderboard.second_protocols import LawsOfPoints
 from rsbench.benchmark.leaderboard.track import Track
 from rsbench.components.cards import choices
 from rsbench.core.errors import RsbenchError
@@ -14,6 +15,7 @@ from rsbench.core.errors import RsbenchError
 TRACKS: dict[str, Track] = {
     track.name: track
     for track in (
+        LawsOfPoints(),
         PointsTrack(),
         PoseTrack(),
         OwnPoseTrack(),
@@ -27,7 +29,14 @@ TRACKS: dict[str, Track] = {
 
 
 def track_of_name(name: str) -> Track:
-    """Raises RsbenchError: there is no such track."""
+    """A track by its name, or by that of its protocol.
+
+    Raises:
+        RsbenchError: there is no such track.
+    """
+    by_id = {track.id: track for track in TRACKS.values()}
+    if name in by_id:
+        return by_id[name]
     if name not in TRACKS:
         raise RsbenchError(f"track {name!r} does not exist{choices(name, TRACKS)}")
     return TRACKS[name]
