@@ -7,7 +7,7 @@ from rsbench.benchmark.leaderboard.depth_track import DepthTrack
 from rsbench.benchmark.leaderboard.mono_track import MonoCorrectionTrack
 from rsbench.benchmark.leaderboard.motion_tracks import OwnPoseTrack, PointsTrack, PoseTrack
 from rsbench.benchmark.leaderboard.readout_track import ReadoutTrack
-from rsbench.benchmark.leaderboard.second_protocols import LawsOfPoints
+from rsbench.benchmark.leaderboard.second_protocols import DrawnReadout, LawsOfPoints, LawsOfPoses
 from rsbench.benchmark.leaderboard.track import Track
 from rsbench.components.cards import choices
 from rsbench.core.errors import RsbenchError
@@ -17,8 +17,10 @@ TRACKS: dict[str, Track] = {
     for track in (
         LawsOfPoints(),
         PointsTrack(),
+        LawsOfPoses(),
         PoseTrack(),
         OwnPoseTrack(),
+        DrawnReadout(),
         ReadoutTrack(),
         DepthTrack(),
         CorrectionTrack(),

@@ -105,6 +105,7 @@ def test_the_score_is_that_of_the_protocol(split: Split, tmp_path: Path) -> None
     for k, truth in enumerate(few.truths[:-1]):
         problem, noise = exact_problem(1, k, POINTS_2)
         bound = motion_bound(problem.correspondences, truth.rig, truth.shutter, smooth(truth.motion), noise)
+        assert bound.covariance is not None
         errors = np.linalg.cholesky(bound.covariance) @ rng.standard_normal((6, 4000))
         R = np.median(rotation_error(truth.motion.w + errors[:3].T, truth.motion.w))
         T = np.median(translation_error(truth.motion.d + errors[3:].T, truth.motion.d))
