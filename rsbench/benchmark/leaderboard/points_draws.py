@@ -36,7 +36,12 @@ class Draws:
 
     def motion(self, seed: int, number: int) -> Motion:
         """Of a problem."""
-        return self.setting(seed, number).motion(self.rng(seed, "motion", number))
+        return _motion(self, seed, number)
+
+
+@lru_cache(maxsize=512)  # a shaken one takes a tenth of a second
+def _motion(draws: Draws, seed: int, number: int) -> Motion:
+    return draws.setting(seed, number).motion(draws.rng(seed, "motion", number))
 
 
 def _between(rng: np.random.Generator, sizes: Range) -> float:
@@ -160,6 +165,7 @@ def _cell(seed: int, number: int) -> tuple[str, str]:
     return _CELLS[int(_order(seed)[number])]
 
 
+@lru_cache(maxsize=512)
 def setting_by_kind(seed: int, number: int) -> Setting:
     """Of a kind of rig under a law of motion: as many problems of each pair."""
     name, law = _cell(seed, number)
