@@ -6,6 +6,7 @@ from rsbench.benchmark.leaderboard.correction_track import CorrectionTrack
 from rsbench.benchmark.leaderboard.depth_track import DepthTrack
 from rsbench.benchmark.leaderboard.mono_track import MonoCorrectionTrack
 from rsbench.benchmark.leaderboard.motion_tracks import OwnPoseTrack, PointsTrack, PoseTrack
+from rsbench.benchmark.leaderboard.placed_track import PlacedCorrection
 from rsbench.benchmark.leaderboard.readout_track import ReadoutTrack
 from rsbench.benchmark.leaderboard.second_protocols import DrawnReadout, LawsOfPoints, LawsOfPoses
 from rsbench.benchmark.leaderboard.track import Track
@@ -23,6 +24,7 @@ TRACKS: dict[str, Track] = {
         DrawnReadout(),
         ReadoutTrack(),
         DepthTrack(),
+        PlacedCorrection(),
         CorrectionTrack(),
         MonoCorrectionTrack(),
     )
