@@ -143,7 +143,7 @@ def _row(each: Board, line: Standing) -> dict[str, Any]:
         "doubt": line.scored.doubt,
         "page": f"{each.id}/{header.method}.html",
         "cells": cells,
-        "words": [*([header.motion_model] if line.parts else []), ", ".join(line.ties), header.tuned_on],
+        "words": [*([line.assumes] if line.parts else []), ", ".join(line.ties), header.tuned_on],
     }
 
 

@@ -45,6 +45,6 @@ def _brief(lines: Sequence[Standing]) -> list[list[str]]:
         shares = [in_words(*line.means[key]) for key in (track.primary.key, "failure")]
         parts = [f"{triple[0]:.2f}" for triple in line.parts.values()]
         medians = [f"{line.medians[key]:.3g}" for key in track.of_kind("median")[:BRIEF]]
-        assumed = [line.scored.header.motion_model] if track.parting else []
+        assumed = [line.assumes] if track.parting else []
         rows.append([line.name, *assumed, line.uses, line.rank_words, shares[0], *parts, shares[1], *medians])
     return rows

@@ -52,6 +52,11 @@ class Standing:
         return f"{self.rank.place} [{self.rank.low}, {self.rank.high}] of {self.peers}"
 
     @property
+    def assumes(self) -> str:
+        """The motion model that the method names; nothing of an oracle."""
+        return "" if ORACLE in self.scored.header.uses else self.scored.header.motion_model
+
+    @property
     def name(self) -> str:
         """As tables show it: they tell entries that were handed in from those that the board ran itself."""
         return self.scored.header.method + (" (handed in)" if self.scored.handed_in else "")
@@ -143,7 +148,7 @@ def table(lines: Sequence[Standing]) -> pd.DataFrame:
         row: dict[str, object] = {"method": header.method, "uses": line.uses, "peers": line.peers or None}
         row |= {"handed_in": line.scored.handed_in, "doubt": line.scored.doubt or None}
         row |= dict(zip(("rank", "rank_low", "rank_high"), line.rank or (None, None, None), strict=True))
-        row |= {"assumes": header.motion_model} if line.parts else {}
+        row |= {"assumes": line.assumes or None} if line.parts else {}
         row |= _ends(line.means) | line.medians
         row |= _ends({f"{line.track.primary.key}_{name}": triple for name, triple in line.parts.items()})
         if "nees" in line.scored.scores:

@@ -36,6 +36,7 @@ from rsbench.solvers.engine.registry import load_solver_entry
 ROOT = Path(__file__).parents[3]
 LAWS_FOLDER = ROOT / "results" / "laws"
 TRACK = TRACKS["points-2"]
+RIVALS = ("rs-stereo-refined-twist", "gs-stereo-tracks-scaled")
 
 
 @pytest.fixture(scope="module")
@@ -173,6 +174,26 @@ def test_stored_predictions_give_the_committed_table(split: Split, tmp_path: Pat
             np.testing.assert_allclose(values, stored[name].to_numpy(dtype=np.float64), rtol=2e-5, atol=1e-9)
     made = json.loads((LAWS_FOLDER / "provenance.json").read_text("utf-8"))["entries"]
     assert {name.rpartition("/")[2] for name in made} == set(found["method"])
+
+
+@pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
+def test_results_tell_what_laws_cost() -> None:
+    """The sentences below the table of the page of results are those of its numbers."""
+    (path,) = (LAWS_FOLDER / "site").glob("points-2--*.csv")
+    ranked = pd.read_csv(path, index_col="method").dropna(subset="rank")
+    words = " ".join((ROOT / "docs" / "results-leaderboard.md").read_text("utf-8").split())
+    by_law = {law: ranked[f"near_bound_{law}"] for law in LAWS}
+    auto, others = by_law["accelerated"]["rs-stereo-auto"], by_law["accelerated"].drop("rs-stereo-auto")
+    assert f"is where motions accelerate: {auto:.2f} there, the next {others.max():.2f}." in words
+    rest = np.mean([each for law, each in by_law.items() if law != "accelerated"], axis=0)
+    mean = dict(zip(ranked.index, rest, strict=True))
+    auto, twist, scaled = (f"{mean[name]:.3f}" for name in (CHOOSES, *RIVALS))
+    assert f"it has {auto}, `{RIVALS[0]}` {twist} and `{RIVALS[1]}` {scaled}." in words
+    hand = by_law["spline"].max()
+    assert f"the best has {hand:.2f}, seven times the bound" in words and 6.5 < 10.0 ** (2.0 * (1.0 - hand)) < 7.5
+    places = ranked[["rank", "rank_low", "rank_high"]].astype(int)
+    assert places.loc[CHOOSES].tolist() == [1, 1, 1] and places.loc["rs-stereo-refined", "rank"] == 4
+    assert set(RIVALS) <= set(str(ranked.loc["rs-stereo-refined", "ties"]).split())
 
 
 def test_damaged_predictions_are_named(split: Split, tmp_path: Path) -> None:
