@@ -30,7 +30,8 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.leaderboard.splits import PUBLIC_SEED, points_motion, points_setting
+from rsbench.benchmark.leaderboard.points_draws import POINTS_1
+from rsbench.benchmark.leaderboard.splits import PUBLIC_SEED
 from rsbench.benchmark.provenance import provenance
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
@@ -93,9 +94,9 @@ def settings_of(solver: Solver, own_loop: bool) -> Iterator[Setting]:
 def problem(number: int) -> Simulation:
     """One of the seed, with gravity and a gyroscope."""
     setting = replace(
-        points_setting(SEED, number), gravity_noise_deg=GRAVITY_NOISE_DEG, gyro_noise_deg=GYRO_NOISE_DEG
+        POINTS_1.setting(SEED, number), gravity_noise_deg=GRAVITY_NOISE_DEG, gyro_noise_deg=GYRO_NOISE_DEG
     )
-    motion, rng = points_motion(setting, SEED, number), generator(SEED, "leaderboard", "scene", number)
+    motion, rng = POINTS_1.motion(SEED, number), generator(SEED, "leaderboard", "scene", number)
     return simulate(setting.rig(), setting.shutter(), motion, replace(setting.options(True), pairs=0), rng)
 
 

@@ -254,12 +254,25 @@ def merge(
 
 @board_app.command()
 def rescore(
-    track: Track, board: _Board, data: Data = None, seed_file: Secret = None, workers: Workers = 1
+    track: Track,
+    board: _Board,
+    data: Data = None,
+    seed_file: Secret = None,
+    workers: Workers = 1,
+    stored: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Make the board of these predictions, as results/laws/predictions."),
+    ] = None,
 ) -> None:
     """Score the stored predictions again and say which scores changed; runs no method."""
     from rsbench.benchmark.leaderboard.board import rescore
+    from rsbench.benchmark.leaderboard.stored_predictions import restore
 
     split = split_of(track, data, seed_file)
+    if stored is not None:
+        restore(stored, split, board)
+        _show(board, split.track.id, split.name, None)
+        return
     with _scoring(split) as step:
         changed = rescore(board, split, workers, step)
     for method, columns in changed.items():

@@ -37,8 +37,8 @@ def publish(
     from rsbench.dataset.secret_split import read_secret, secret_card
 
     of_frames, text = track_of_name(track), read_secret(seed_file)
-    if track == "points":
-        raise RsbenchError("track 'points': has no frames; export and submit take --seed-file themselves")
+    if not of_frames.rendered:
+        raise RsbenchError(f"track {track!r}: has no frames; export and submit take --seed-file themselves")
     for hidden in (keep, seed_file):
         if hidden.resolve().is_relative_to(out.resolve()):
             raise RsbenchError(f"{hidden}: lies in {out}, which everybody may see; take another place")

@@ -101,6 +101,8 @@ def _jobs(tracks: Sequence[str] | None, entries: Sequence[str] | None) -> list[J
         names = tuple(name for name in known if entries is None or name in entries)
         taken |= set(names)
         jobs += [Job(track, (name,)) for name in names] if track == "points" else [Job(track, names)][: len(names)]
+    if not jobs and entries is None:
+        raise RsbenchError(f"--track {', '.join(chosen)}: has no smoke run, its first protocol has")
     for name in entries or ():
         if name not in taken:
             raise RsbenchError(f"--entry {name}: is not run on {', '.join(chosen)}")

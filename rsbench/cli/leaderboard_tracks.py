@@ -13,11 +13,12 @@ if TYPE_CHECKING:
 Track = Annotated[
     str,
     typer.Argument(
-        help="points, pose (given matches), pose-own (own matches), readout, depth, correction or correction-mono."
+        help="A track or its protocol, such as points-2, pose (given matches) or pose-own (own matches)."
     ),
 ]
 Data = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="Dataset (a dataset.json) of all tracks but points.")
+    Path | None,
+    typer.Option(metavar="DIR", help="Dataset (a dataset.json) of all tracks but points and points-2."),
 ]
 Secret = Annotated[
     Path | None, typer.Option("--seed-file", metavar="FILE", help="Text from which a secret test split is drawn.")

@@ -25,6 +25,8 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench reproduce leaderboard --out results --data data  [dim](our solvers on points: 25 minutes of a core)[/dim]
 
+  rsbench reproduce laws --out results --data data         [dim](points under five laws: an hour of a core)[/dim]
+
   rsbench reproduce boards --out results --data data       [dim](tracks of frames, 216 sequences: 3 hours)[/dim]
 
   rsbench reproduce everything                             [dim](hours; goes on where it stopped)[/dim]"""
@@ -44,6 +46,7 @@ class Target(StrEnum):
     sgm = "sgm"
     real = "real"
     leaderboard = "leaderboard"
+    laws = "laws"
     boards = "boards"
     everything = "everything"
 
@@ -75,6 +78,7 @@ def reproduce(
             "mild, moderate, aggressive and poles. sgm: stereo matching when the cameras' rows are not in step. "
             "real: the default pipeline on rendered frames with lens, blur and noise, beside an ideal camera's. "
             "leaderboard: our solvers on the public split of points, its site, and the scores of the smoke run. "
+            "laws: the same of points under several laws of motion, with all predictions. "
             "boards: the same of the tracks of frames, on the dataset standard. "
             "everything: all of these, one after the other, with the time that each took."
         ),
@@ -122,10 +126,8 @@ def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds
             _correction(out, data, workers)
         elif target is Target.real:
             _real(out, data, seeds, width)
-        elif target is Target.leaderboard:
-            _leaderboard(out, data, workers)
-        elif target is Target.boards:
-            _boards(out, data, workers)
+        elif target in (Target.leaderboard, Target.laws, Target.boards):
+            _leaderboard(target, out, data, workers)
         elif target in (Target.fig4, Target.sgm):
             _depth(target, out, data)
         else:
@@ -138,16 +140,10 @@ def _correction(out: Path, data: Path, workers: int | None) -> None:
     correction(out, data, workers)
 
 
-def _leaderboard(out: Path, data: Path, workers: int | None) -> None:
-    from rsbench.cli.reproduce_leaderboard import leaderboard
+def _leaderboard(target: Target, out: Path, data: Path, workers: int | None) -> None:
+    from rsbench.cli import reproduce_leaderboard
 
-    leaderboard(out, data, workers)
-
-
-def _boards(out: Path, data: Path, workers: int | None) -> None:
-    from rsbench.cli.reproduce_leaderboard import boards
-
-    boards(out, data, workers)
+    getattr(reproduce_leaderboard, target.value)(out, data, workers)
 
 
 def _real(out: Path, data: Path, seeds: int, width: int | None) -> None:

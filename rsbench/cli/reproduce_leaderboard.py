@@ -1,4 +1,4 @@
-"""``rsbench reproduce leaderboard`` and ``boards``: what comes with rsbench, on every track of one board."""
+"""``rsbench reproduce leaderboard``, ``laws`` and ``boards``: what comes with rsbench, on every track."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 
 import typer
 
-BOARD = "leaderboard"
-"""Folder of the board below ``--data``."""
+BOARD, LAWS = "leaderboard", "laws"
+"""Folders of the boards below ``--data``."""
 
 
 def leaderboard(out: Path, data: Path, workers: int | None) -> None:
@@ -22,6 +22,29 @@ def leaderboard(out: Path, data: Path, workers: int | None) -> None:
     oracles("points", board)
     smoke(out / "leaderboard" / "smoke", write=True)
     publish(board, out / "leaderboard")
+
+
+def laws(out: Path, data: Path, workers: int | None) -> None:
+    """The same of points under several laws of motion, and what each entry answered."""
+    from rsbench.benchmark.leaderboard.board import splits_of
+    from rsbench.benchmark.leaderboard.stored_predictions import store
+    from rsbench.cli.leaderboard import oracles, run
+
+    board, folder = data / LAWS, out / LAWS
+    run("points-2", entries_of_laws(), str(board), workers=workers or os.cpu_count() or 1)
+    oracles("points-2", board)
+    publish(board, folder, "rsbench reproduce laws")
+    for protocol, split in splits_of(board):
+        store(board, protocol, split, folder / "predictions")
+
+
+def entries_of_laws() -> list[str]:
+    """What comes with rsbench where motions follow several laws: one entry a method, and the one that chooses."""
+    from rsbench.benchmark.leaderboard.running import CHOOSES
+    from rsbench.benchmark.leaderboard.second_protocols import SAME_METHOD
+    from rsbench.cli.leaderboard_smoke import own_solvers
+
+    return [name for name in own_solvers() if name not in SAME_METHOD] + [CHOOSES]
 
 
 def boards(out: Path, data: Path, workers: int | None) -> None:
@@ -59,7 +82,7 @@ def entries_of_frames() -> dict[str, list[str]]:
     }
 
 
-def publish(board: Path, out: Path) -> None:
+def publish(board: Path, out: Path, command: str = "rsbench reproduce leaderboard") -> None:
     """Write a board's site, and by what command and code each entry was made."""
     from rsbench.benchmark.leaderboard.board import entries_of, splits_of
     from rsbench.benchmark.provenance import provenance
@@ -78,5 +101,5 @@ def publish(board: Path, out: Path) -> None:
         for name, record in made.items()
         if isinstance(record, dict)
     }
-    write_json(out / "provenance.json", {**provenance("rsbench reproduce leaderboard"), "entries": brief})
+    write_json(out / "provenance.json", {**provenance(command), "entries": brief})
     typer.echo(f"page: {page}")

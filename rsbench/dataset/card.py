@@ -24,6 +24,7 @@ from rsbench.dataset.imu import Imu
 from rsbench.dataset.layout import MOST_FRAMES, MOST_TWINS
 from rsbench.dataset.matches import Matching
 from rsbench.dataset.motion_card import MotionCard as MotionCard
+from rsbench.dataset.motion_card import generator
 from rsbench.dataset.object_records import check_moving, drawn
 from rsbench.dataset.sequence import sequence_manifest
 from rsbench.dataset.sequence_card import CameraCard as CameraCard
@@ -61,6 +62,9 @@ class DatasetCard(Scanning):
     readout_ratio: float
     """Readout time over frame period, 0 (global shutter) to 1: row y of frame k is exposed at the time k +
     readout_ratio * y / height, in frame periods. Required, unless ``shutter`` is given."""
+    readout_range: tuple[float, float] | None = None
+    """Two readout ratios: each sequence's is drawn evenly between them, by its seed and name, in place of all that
+    is said otherwise."""
     frame_period_s: float = 0.1
     """Seconds from one frame to the next."""
     frames: int = len(FRAMES)
@@ -102,6 +106,9 @@ class DatasetCard(Scanning):
             self.rig_of(sequence)
             self._check_times(sequence)
             check_moving(sequence.moving, self.channels)
+        low, high = self.readout_range or (0.0, 1.0)
+        if not 0.0 <= low < high <= 1.0:
+            raise ValueError(f"readout_range = {[low, high]}: must be two ratios in [0, 1], the smaller first")
         if len(set(self.channels)) < len(self.channels):
             raise ValueError(f"channels = {list(self.channels)}: must differ from each other")
         check_channels(self.channels, self.camera.lens is not None, self.plain)
@@ -268,7 +275,7 @@ class DatasetCard(Scanning):
         if self.trajectory is not None:
             made = [each for sequence in made for each in self._followed(sequence, self.trajectory, folder)]
         made = [replace(each, moving=tuple(thing.found(folder) for thing in each.moving)) for each in made]
-        return replace(self, sequence=tuple(made), grid={}, trajectory=None, seeds=())
+        return replace(self, sequence=tuple(made), grid={}, trajectory=None, seeds=(), readout_range=None)
 
     def _variants(self, sequence: SequenceCard, seed: int | None) -> list[SequenceCard]:
         """One sequence for each combination of the grid. What is drawn is drawn once for each motion."""
@@ -281,10 +288,19 @@ class DatasetCard(Scanning):
                 varied = variation.of(varied)
             moved = (label for label, variation in values if variation.motion is not None)
             named = "-".join((sequence.name, *moved, *ending))
+            varied = self._with_ratio(varied)
             lasting = None if self.frames == len(FRAMES) else self._span(varied)[1]
             things = drawn(varied.moving, self.seed_of(varied), named, lasting)
             made.append(self._scaled(self._drawn(replace(varied, moving=things), named)))
         return made
+
+    def _with_ratio(self, sequence: SequenceCard) -> SequenceCard:
+        """With a readout ratio of its own, where they are drawn."""
+        if self.readout_range is None:
+            return sequence
+        share = generator(f"{self.seed_of(sequence)}/{sequence.name}/readout_ratio").random()
+        low, high = self.readout_range
+        return replace(sequence, readout_ratio=low + (high - low) * float(share))
 
     def _drawn(self, sequence: SequenceCard, name: str) -> SequenceCard:
         if self.trajectory is not None:

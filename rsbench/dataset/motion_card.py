@@ -78,16 +78,17 @@ class MotionCard:
             for field in ("rotation_axis", "translation_axis")
             if getattr(self, field) == "random"
         }
-        parameters = drawn_parameters(self.model, self.parameters, _generator(f"{seed}/{name}/parameters"))
+        parameters = drawn_parameters(self.model, self.parameters, generator(f"{seed}/{name}/parameters"))
         return replace(self, parameters=parameters, **axes)
 
 
-def _generator(text: str) -> np.random.Generator:
+def generator(text: str) -> np.random.Generator:
+    """What is drawn for a purpose that a text names."""
     return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little"))
 
 
 def _random_axis(text: str) -> Vector:
-    v = _generator(text).standard_normal(3)
+    v = generator(text).standard_normal(3)
     x, y, z = (v / np.linalg.norm(v)).tolist()
     return x, y, z
 

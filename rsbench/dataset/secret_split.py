@@ -104,7 +104,7 @@ def secret_card(
         made = [replace(each, scene=str(scenes / f"{_scene(each.scene).stem}.toml")) for each in made]
     digits = len(str(len(made) - 1))
     named = tuple(replace(each, name=f"s{number:0{digits}d}") for number, each in enumerate(made))
-    return replace(card, name=f"{card.name}-{split}", sequence=named, grid={}, seeds=())
+    return replace(card, name=f"{card.name}-{split}", sequence=named, grid={}, seeds=(), readout_range=None)
 
 
 def write_scenes(name_or_path: str, secret: Secret, folder: Path) -> list[Path]:
@@ -167,8 +167,12 @@ def _drawn(single: DatasetCard, secret: Secret) -> SequenceCard:
         return value * (_LEAST + (1.0 - _LEAST) * secret.share(name, sequence.name))
 
     rotation, translation = less("rotation", motion.rotation_deg), less("translation", motion.translation)
+    drawn = None
+    if single.readout_range is not None:
+        low, high = single.readout_range
+        drawn = low + (high - low) * secret.share("readout", sequence.name)
     return replace(
         sequence,
         motion=replace(motion, rotation_deg=rotation, translation=translation),
-        readout_ratio=less("readout", ratio),
+        readout_ratio=less("readout", ratio) if drawn is None else drawn,
     )

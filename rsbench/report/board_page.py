@@ -88,6 +88,7 @@ def _columns(each: Board) -> list[dict[str, Any]]:
     def column(key: str, title: str, first: str, hint: str, *, text: bool = False) -> dict[str, Any]:
         return {"key": key, "title": title, "first": first, "hint": hint, "text": text}
 
+    parts, part, primary = each.lines[0].parts, each.track.parting, each.track.primary.title
     stated = [
         column("nees_ratio", "NEES", "up", "squared error by the stated covariance: 1 where that is right"),
         *(
@@ -103,6 +104,8 @@ def _columns(each: Board) -> list[dict[str, Any]]:
         column("rank", "rank", "up", "among those that use no more, with its interval"),
         *(column(s.key, s.title, "down" if s.better == "higher" else "up", s.hint) for s in _scores(each)),
         *(stated if _stated(each) else []),
+        *(column(f"part_{name}", name, "down", f"{primary} where the {part} is {name}") for name in parts),
+        *([column("assumes", "assumes", "up", "motion model that it assumes", text=True)] if parts else []),
         column("ties", "ties", "up", "entries that the data do not tell from it", text=True),
         column("tuned_on", "tuned on", "up", "data by which its parameters were chosen", text=True),
     ]
@@ -130,6 +133,8 @@ def _row(each: Board, line: Standing) -> dict[str, Any]:
     for triple in named_numbers(line.calibration).values() if _stated(each) else ():
         text = "–" if np.isnan(triple[0]) else in_words(*triple)
         cells.append({"value": _value(triple[0]), "text": text, "bar": None})
+    for triple in line.parts.values():
+        cells.append({"value": _value(triple[0]), "text": in_words(*triple), "bar": None})
     return {
         "method": header.method,
         "uses": line.uses.replace(" + ", " "),
@@ -138,8 +143,7 @@ def _row(each: Board, line: Standing) -> dict[str, Any]:
         "doubt": line.scored.doubt,
         "page": f"{each.id}/{header.method}.html",
         "cells": cells,
-        "ties": ", ".join(line.ties),
-        "tuned_on": header.tuned_on,
+        "words": [*([line.assumes] if line.parts else []), ", ".join(line.ties), header.tuned_on],
     }
 
 

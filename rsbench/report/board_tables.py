@@ -38,9 +38,13 @@ def brief_medians(track: Track) -> list[str]:
 
 def _brief(lines: Sequence[Standing]) -> list[list[str]]:
     track = lines[0].track
-    rows = [["method", "uses", "rank", track.primary.title, "failed", *brief_medians(track)]]
+    assumes = ["assumes"] if track.parting else []
+    head = ["method", *assumes, "uses", "rank", track.primary.title, *lines[0].parts, "failed"]
+    rows = [[*head, *brief_medians(track)]]
     for line in lines:
         shares = [in_words(*line.means[key]) for key in (track.primary.key, "failure")]
+        parts = [f"{triple[0]:.2f}" for triple in line.parts.values()]
         medians = [f"{line.medians[key]:.3g}" for key in track.of_kind("median")[:BRIEF]]
-        rows.append([line.name, line.uses, line.rank_words, *shares, *medians])
+        assumed = [line.assumes] if track.parting else []
+        rows.append([line.name, *assumed, line.uses, line.rank_words, shares[0], *parts, shares[1], *medians])
     return rows

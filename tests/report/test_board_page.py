@@ -367,12 +367,16 @@ def test_the_divider_cuts_the_upper_picture(rendered_site: Path, browser: Browse
 def test_results_tell_the_bound_and_rows_of_the_committed_board() -> None:
     root = Path(__file__).parents[2]
     tables = {
-        path.name.partition("-")[0]: path.read_text("utf-8").splitlines()
-        for path in (root / "results" / "leaderboard" / "site").glob("*.md")
+        path.name.partition("--")[0]: path.read_text("utf-8").splitlines()
+        for folder in ("leaderboard", "laws")
+        for path in (root / "results" / folder / "site").glob("*.md")
     }
-    bound = next(line for line in tables["points"] if line.startswith("| cramer-rao"))
     page = (root / "docs" / "results-leaderboard.md").read_text("utf-8")
-    assert f"reach an AUC@5 of {bound.split(' | ')[3]}." in " ".join(page.split())
+    words = " ".join(page.split())
+    for protocol, score, column in (("points-1", "an AUC@5", 3), ("points-2", "a `near bound`", 4)):
+        bound = next(line for line in tables[protocol] if line.startswith("| cramer-rao"))
+        assert f"reach {score} of {bound.split(' | ')[column]}." in words
     shown = [each.splitlines() for each in page.split("\n\n") if each.startswith("| ")]
-    for rows, track in zip(shown, ("points", "pose", "depth", "correction"), strict=True):
-        assert set(rows) <= set(tables[track]) and len(rows) > 5
+    protocols = ("points-2", "points-1", "pose-1", "depth-1", "correction-1")
+    for rows, protocol in zip(shown, protocols, strict=True):
+        assert set(rows) <= set(tables[protocol]) and len(rows) > 5

@@ -48,8 +48,9 @@ class Header:
     """Machine on which the seconds were measured."""
     tuned_on: str = ""
     """Data by which its parameters were chosen."""
-    motion_model: Literal["linear", "twist"] = "linear"
-    """Motion model of the rows between the frames in which ``w`` and ``d`` are meant."""
+    motion_model: Literal["linear", "twist", "inertial", "accelerated", "spline", "none", "chosen"] = "linear"
+    """Motion model that the method assumes between the rows: ``none`` of a global shutter, ``chosen`` where the
+    matches of a problem decide."""
     png_unit_m: float | None = None
     """Metres of one step of depth maps that are PNG files, above 0 and at most 1."""
 

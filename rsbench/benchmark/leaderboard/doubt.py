@@ -27,7 +27,7 @@ COVERAGE = 0.999
 _DRAWS = 4000
 """Of errors at a bound: their median is known to 3 %."""
 _ORACLES = (ORACLE, "cramer-rao", "constant", "uncorrected", "fusion-true")
-_BUILT_IN = ("rs-stereo", "sgm", "sweep", "fusion")
+_BUILT_IN = ("rs-stereo", "rs-stereo-auto", "sgm", "sweep", "fusion")
 """Names that were used, beside those of cards."""
 
 

@@ -28,6 +28,8 @@ FEATURES = "sift"
 class FrameTrack(Track):
     """A track whose problems are the sequences of a dataset."""
 
+    rendered = True
+
     def split(self, data: Path | None, seed_file: Path | None = None, secret: bool = False) -> Split:
         if data is None:
             raise RsbenchError(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -18,13 +18,12 @@ from rsbench.benchmark.leaderboard.doubt import medians_of
 from rsbench.benchmark.leaderboard.frame_inputs import FrameTrack
 from rsbench.benchmark.leaderboard.marking import last, named
 from rsbench.benchmark.leaderboard.own_matches import FOLDER, match_files, match_scores, read_own_matches
+from rsbench.benchmark.leaderboard.points_draws import POINTS_1, Draws
 from rsbench.benchmark.leaderboard.running import SolverTrack, answer_problem
 from rsbench.benchmark.leaderboard.splits import (
     Split,
     Truth,
     exact_problem,
-    points_motion,
-    points_setting,
     points_split,
     seed_of,
     simulated_problem,
@@ -35,12 +34,13 @@ from rsbench.benchmark.scoring import answered, pose_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.bound import Bound, Views, motion_bound
 from rsbench.benchmark.simulated.convention_errors import misreading
-from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, track_pairs
 from rsbench.core.errors import RsbenchError
+from rsbench.core.motion import Motion, TwistMotion
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.so3 import FloatArray
+from rsbench.core.spline_motion import SplineMotion
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.registry import SolverEntry
@@ -129,8 +129,7 @@ class MotionTrack(SolverTrack):
         return answer_problem(problem, entry, runner)
 
     def rows(self, submission: Submission, split: Split) -> list[Row]:
-        model, found = submission.header.motion_model, submission.answers
-        return [_motion_row(truth, found.get(truth.name), model) for truth in split.truths]
+        return [motion_row(truth, submission.answers.get(truth.name)) for truth in split.truths]
 
 
 class PointsTrack(MotionTrack):
@@ -140,27 +139,31 @@ class PointsTrack(MotionTrack):
     title = "Motion from simulated matches"
     allowed = ("left", "right", "links", "readout")
     given = "tracks of random points, with noise and outliers"
+    draws: ClassVar[Draws] = POINTS_1
 
     def split(self, data: Path | None, seed_file: Path | None = None, secret: bool = False) -> Split:
         if data is not None:
             raise RsbenchError(f"--data {data}: the problems of points are simulated; leave it out")
         if secret and seed_file is None:
             raise RsbenchError("--secret: of the track 'points' a --seed-file makes a secret split; leave it out")
-        return points_split(self, seed_file)
+        return points_split(self, seed_file, self.draws)
 
     def problems(self, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
         seed = seed_of(seed_file)
-        return (simulated_problem(seed, number) for number in range(count))
+        return (simulated_problem(seed, number, self.draws) for number in range(count))
 
     def medians_at_bound(self, uses: Collection[str], split: Split) -> Mapping[str, FloatArray]:
         pairs = "both" if {"left", "right"} <= set(uses) else "left"
-        return _medians(split.seed, len(split.truths), "links" if "links" in uses else pairs)
+        seen = "links" if "links" in uses else pairs
+        held = bound_medians(self.draws, split.seed, min(len(split.truths), _HELD), seen)
+        rest = np.full(len(split.truths) - len(held["e_R_deg"]), np.inf)
+        return {name: np.concatenate([values, rest]) for name, values in held.items()}
 
     def oracles(self, split: Split, folder: Path) -> Iterator[Path]:
         yield from super().oracles(split, folder)
         path = folder / BOUND / "predictions.jsonl"
         path.parent.mkdir(parents=True)
-        write_bytes(path, bound_text(split, split.seed).encode())
+        write_bytes(path, bound_text(split, split.seed, self.draws).encode())
         yield path
 
 
@@ -222,7 +225,8 @@ def _mistaken(answers: Sequence[Answer], split: Split) -> tuple[str, int] | None
     return (words, count) if 2 * count > len(answers) else None
 
 
-def _motion_row(truth: Truth, answer: Answer | None, model: str) -> Row:
+def motion_row(truth: Truth, answer: Answer | None) -> Row:
+    """Scores of an answer to one problem."""
     w, d = _vectors(answer)
     success = answer is not None and bool(answered(w, d, answer.success))
     point = "body" if answer is None else answer.reference_point
@@ -243,7 +247,7 @@ def _motion_row(truth: Truth, answer: Answer | None, model: str) -> Row:
         **named(truth, success),
         **found,
         "metres": _metres(d, truth, point) if success and metric else math.nan if success else math.inf,
-        "e_row_deg": _row_angle(w, d, truth, model) if success else 180.0,
+        "e_row_deg": _row_angle(w, truth) if success else 180.0,
         "error_deg": worst,
         **{f"auc_{limit}": max(0.0, 1.0 - worst / limit) for limit in AUC_DEG},
         "within": float(found["e_R_deg"] < SUCCESS_DEG[0] and not found["e_T_deg"] >= SUCCESS_DEG[1]),
@@ -269,10 +273,10 @@ def _metres(d: FloatArray, truth: Truth, point: str) -> float:
     return float(np.linalg.norm(d - _true_d(truth, point)))
 
 
-def _row_angle(w: FloatArray, d: FloatArray, truth: Truth, model: str) -> float:
-    """The largest angle between estimated and true poses of a row, degrees."""
+def _row_angle(w: FloatArray, truth: Truth) -> float:
+    """The largest angle between true poses of a row and those of an even turn by ``w``, degrees."""
     times = np.linspace(0.0, 1.0 + truth.shutter.readout_ratio, _TIMES)
-    estimated = make_motion(model, w, d).body_from_world(times).R
+    estimated = so3.exp(times[:, None] * w)
     true = truth.motion.body_from_world(times).R
     return float(np.rad2deg(np.max(so3.angle(estimated @ np.swapaxes(true, -1, -2)))))
 
@@ -292,24 +296,30 @@ def _nees(answer: Answer, w: FloatArray, d: FloatArray, truth: Truth) -> float:
 
 
 @lru_cache(maxsize=8)
-def _medians(seed: int, count: int, seen: str) -> Mapping[str, FloatArray]:
+def bound_medians(draws: Draws, seed: int, count: int, seen: str) -> Mapping[str, FloatArray]:
     """As of ``Track.medians_at_bound``, of the first problems: a bound takes as long as a solver.
 
     A method that says less of its data is held to less; the readout counts as known.
     """
     bounds = list[Bound]()
     views: Views = "four-view" if seen == "links" else "pairs"
-    for number in range(min(count, _HELD)):
-        problem, noise_px = exact_problem(seed, number)
-        tracks, motion = problem.correspondences.tracks, points_motion(points_setting(seed, number), seed, number)
+    for number in range(count):
+        problem, noise_px = exact_problem(seed, number, draws)
+        tracks, motion = problem.correspondences.tracks, smooth(draws.motion(seed, number))
         given = Correspondences(left=track_pairs(tracks, "left")) if seen == "left" else problem.correspondences
         bounds.append(motion_bound(given, problem.rig, problem.shutter, motion, noise_px, views))
-    found = medians_of(bounds, with_direction=seen != "left")
-    rest = np.full(count - len(bounds), np.inf)
-    return {name: np.concatenate([values, rest]) for name, values in found.items()}
+    return medians_of(bounds, with_direction=seen != "left")
 
 
-def bound_text(split: Split, seed: int) -> str:
+def smooth(motion: Motion) -> Motion:
+    """For a bound: of a shaken motion the twist that it shakes about, whose bound is the same to 5 %.
+
+    A derivative of a spline by its end takes a hundred times as long.
+    """
+    return TwistMotion(motion.w, motion.d) if isinstance(motion, SplineMotion) else motion
+
+
+def bound_text(split: Split, seed: int, draws: Draws = POINTS_1) -> str:
     """Motions that err as little as the data allow, as a submission; ``seed`` is that of the split.
 
     Errors are drawn from the Cramer-Rao bound of the matches without the outliers: what an unbiased method that
@@ -322,13 +332,13 @@ def bound_text(split: Split, seed: int) -> str:
         "uses": [ORACLE],
         "description": "The true motion with errors drawn from the Cramer-Rao bound of all that is no outlier",
     }
-    return submission_text(header, _at_the_bound(split, seed))
+    return submission_text(header, _at_the_bound(split, seed, draws))
 
 
-def _at_the_bound(split: Split, seed: int) -> Iterator[dict[str, Any]]:
+def _at_the_bound(split: Split, seed: int, draws: Draws) -> Iterator[dict[str, Any]]:
     for number, truth in enumerate(split.truths):
-        exact, noise_px = exact_problem(seed, number)
-        bound = motion_bound(exact.correspondences, truth.rig, truth.shutter, truth.motion, noise_px)
+        exact, noise_px = exact_problem(seed, number, draws)
+        bound = motion_bound(exact.correspondences, truth.rig, truth.shutter, smooth(truth.motion), noise_px)
         covariance = bound.covariance
         if covariance is None or not math.isfinite(bound.rotation):
             yield {"name": truth.name, "success": False, "reason": "the matches do not determine the motion"}

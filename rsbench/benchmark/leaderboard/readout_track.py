@@ -87,6 +87,11 @@ class ReadoutTrack(FrameTrack, SolverTrack):
             )
         super().check_entry(entry)
 
+    def models_of(self, entry: SolverEntry) -> tuple[str, ...]:
+        """Motion models under which an entry looks for the ratio."""
+        assert isinstance(entry.solver, RefinedSolver)
+        return (entry.solver.motion_model,)
+
     def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
         """The readout ratio that explains the matches best; it needs no ``runner``: the solver is one of ours."""
         solver = entry.solver
@@ -96,7 +101,7 @@ class ReadoutTrack(FrameTrack, SolverTrack):
             left, right = (temporal_pairs(matches, side) for side in SIDES)
             matches = Correspondences(left=left, right=right)
         scanning = problem.shutter.scanning
-        known = known_of(matches, problem.rig, None, scanning, None, (solver.motion_model,))
+        known = known_of(matches, problem.rig, None, scanning, None, self.models_of(entry))
         known = replace(known, scans=(scans_of(replace(problem.shutter, readout_ratio=1.0)),))
         seed = seed_of_answer(problem, entry)
         capture = conclude([examine(matches, problem.rig, known, RobustOptions(), seed)])
@@ -107,10 +112,11 @@ class ReadoutTrack(FrameTrack, SolverTrack):
         return {"name": problem.name, "readout_ratio": best.ratio, "seconds": seconds}
 
     def rows(self, submission: Submission, split: Split) -> list[Row]:
-        return [_row(truth, submission.answers.get(truth.name)) for truth in split.truths]
+        return [readout_row(truth, submission.answers.get(truth.name)) for truth in split.truths]
 
 
-def _row(truth: Truth, answer: Answer | None) -> Row:
+def readout_row(truth: Truth, answer: Answer | None) -> Row:
+    """Scores of an answer to one problem."""
     ratio = None if answer is None or not answer.success else answer.readout_ratio
     error = _WORST if ratio is None else abs(ratio - truth.shutter.readout_ratio)
     return {

@@ -28,6 +28,7 @@ from rsbench.benchmark.leaderboard.submissions import Submission, submission_tex
 from rsbench.benchmark.leaderboard.track import ORACLE, Limits, Row, Step, Track
 from rsbench.benchmark.provenance import numeric_version, processor
 from rsbench.benchmark.simulated.trials import Information, enter
+from rsbench.capture.settle import AUTO
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.jobs.process_jobs import finished_jobs, run_jobs
@@ -42,6 +43,8 @@ from rsbench.storage.files import sha256, write_bytes, write_json
 from rsbench.storage.untrusted_files import check_name, parse_json, read_text
 
 _EXTRAS: tuple[Extra, ...] = ("covariance",)
+CHOOSES = "rs-stereo-auto"
+"""Entry of the recommended solver under the motion model that the matches prefer: what ``rsbench solve`` does."""
 Job = TypeVar("Job")
 _USES: dict[Information, tuple[str, ...]] = {
     "left pairs": ("left",),
@@ -95,6 +98,15 @@ class SolverTrack(Track):
     def load(self, cards: Sequence[str]) -> None:
         load_entries(cards, self)
 
+    def entry_of(self, card: str) -> SolverEntry:
+        """Raises RsbenchError: no such solver."""
+        return load_solver_entry(card)
+
+    def assumed(self, entry: SolverEntry) -> str:
+        """The motion model that a header names."""
+        model = entry.solver.spec.motion_model
+        return model if model in ("linear", "twist") else "linear"
+
     def steps(self, cards: Sequence[str], split: Split, limits: Limits) -> int:
         return len(cards) * -(-len(split.truths) // limits.chunk)
 
@@ -134,7 +146,7 @@ def load_entries(cards: Sequence[str], track: SolverTrack) -> dict[str, SolverEn
     Raises:
         RsbenchError: no such solver, or it uses what the track does not give.
     """
-    entries = {card: load_solver_entry(card) for card in cards}
+    entries = {card: track.entry_of(card) for card in cards}
     for entry in entries.values():
         track.check_entry(entry)
     return entries
@@ -262,17 +274,18 @@ def _identity(entry: SolverEntry, split: Split, data: str, limits: Limits) -> st
 
 def header_of(entry: SolverEntry, split: Split) -> dict[str, Any]:
     """The first line of a solver's submission."""
-    spec = entry.solver.spec
+    spec, track = entry.solver.spec, split.track
+    assert isinstance(track, SolverTrack)
     return {
         "protocol": split.track.id,
         "split": split.name,
         "method": entry.name,
-        "uses": uses_of(entry, split.track.gives_readout),
+        "uses": uses_of(entry, track.gives_readout),
         "description": entry.description[:300],
         "paper": spec.reference[:300],
         "code": "rsbench" if entry.built_in else "",
         "hardware": f"{processor()}, 1 thread"[:300],
-        "motion_model": spec.motion_model if spec.motion_model in ("linear", "twist") else "linear",
+        "motion_model": track.assumed(entry),
     }
 
 
@@ -298,7 +311,7 @@ def _serve(track: SolverTrack, inputs: Path, limits: Limits) -> Callable[[_Job],
 
     def run(job: _Job) -> None:
         try:
-            entry = load_solver_entry(job.card)
+            entry = track.entry_of(job.card)
             answers = [
                 track.answer(problem, entry, runner) for problem in problems[job.first : job.first + job.problems]
             ]
@@ -334,7 +347,8 @@ def seed_of_answer(problem: Problem, entry: SolverEntry) -> int:
 
 def answer_problem(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
     """What a solver says of a problem, as a line of a submission."""
-    found = solve_problem(problem, entry, RobustOptions(), runner, seed_of_answer(problem, entry), extras=_EXTRAS)
+    seed, model = seed_of_answer(problem, entry), AUTO if entry.name == CHOOSES else None
+    found = solve_problem(problem, entry, RobustOptions(), runner, seed, _EXTRAS, model)
     kept = {key: found[key] for key in _KEPT}
     if found["success"] and max(map(abs, (*found["w"], *found["d"]))) > LARGEST:
         return {"name": problem.name, "success": False, "reason": f"w or d goes beyond {LARGEST:g}"}

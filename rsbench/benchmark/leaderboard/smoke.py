@@ -43,7 +43,7 @@ CARD = "leaderboard-smoke"
 """The dataset's, for the tracks of frames."""
 ORACLES = ("truth", "constant", "uncorrected", "fusion-true")
 """Entries that are no cards."""
-ENTRIES = {track.name: track.smoke for track in TRACKS.values() if isinstance(track, FrameTrack)}
+ENTRIES = {track.name: track.smoke for track in TRACKS.values() if isinstance(track, FrameTrack) and track.smoke}
 """By track of frames."""
 PROBLEMS = 6
 """Of points; a minute for all solvers of ours."""

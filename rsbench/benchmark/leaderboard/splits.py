@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from rsbench.benchmark.leaderboard.points_draws import POINTS_1, Draws
 from rsbench.benchmark.leaderboard.track import Track
 from rsbench.benchmark.leaderboard.true_pictures import TruePictures, true_pictures
-from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.simulation import Simulation, simulate
 from rsbench.benchmark.simulated.sweep_card import Setting
 from rsbench.components.motion_models import motion_record
@@ -32,12 +32,11 @@ from rsbench.storage.untrusted_files import check_name, read_text
 
 PUBLIC_SEED = 1
 """Of the split ``dev``: its truth is known to everybody."""
-POINTS_PROBLEMS = 250
-_ANNOUNCED = (
-    "b7eafa489ffbd9d816c2edd44f5842bdf01306f286ab36dd2c0ef72aee05523b",
-    "f88c896f00000000",
-)
-"""Hash of the public points to nine digits, equal on all processors, and the fingerprint that was announced."""
+_ANNOUNCED = {
+    "b7eafa489ffbd9d816c2edd44f5842bdf01306f286ab36dd2c0ef72aee05523b": "f88c896f00000000",
+    "57af81babdeeb5d96992052241698c127f8a4e7fd716fc28f146bf858b8edb40": "7a998de400000000",
+}
+"""By the hash of public points to nine digits, equal on all processors, the fingerprint that was announced."""
 _SHORTEST_SECRET = 16
 """Characters of a seed file: shorter ones could be tried."""
 
@@ -77,9 +76,8 @@ class Split:
     def fingerprint(self) -> str:
         """SHA-256 of the protocol, the rigs, the true motions, and what is seen where pictures are asked."""
         content = [self.track.id, *(_identity(truth) for truth in self.truths)]
-        if self.label == "dev" and hash_of(_rounded(content)) == _ANNOUNCED[0]:
-            return _ANNOUNCED[1]
-        return hash_of(content)
+        announced = _ANNOUNCED.get(hash_of(_rounded(content))) if self.label == "dev" else None
+        return announced or hash_of(content)
 
     @property
     def name(self) -> str:
@@ -122,14 +120,14 @@ def _motion_identity(motion: Motion) -> dict[str, Any]:
 # Simulated points
 
 
-def points_split(track: Track, secret: Path | None = None) -> Split:
+def points_split(track: Track, secret: Path | None = None, draws: Draws = POINTS_1) -> Split:
     """The split ``dev``, or with a file that holds a secret seed the split ``test``.
 
     Raises:
         RsbenchError: the file cannot be read, or its text could be guessed.
     """
     seed = seed_of(secret)
-    truths = tuple(_drawn(seed, number) for number in range(POINTS_PROBLEMS))
+    truths = tuple(_drawn(draws, seed, number) for number in range(draws.problems))
     label = "dev" if secret is None else "test"
     return Split(track=track, label=label, public=secret is None, truths=truths, seed=seed)
 
@@ -150,33 +148,26 @@ def seed_of(path: Path | None) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest(), "big")
 
 
-def simulated_problem(seed: int, number: int) -> Problem:
+def simulated_problem(seed: int, number: int, draws: Draws = POINTS_1) -> Problem:
     """The matches of one problem: tracks alone, of which a method takes what it uses.
 
     Raises:
         RsbenchError: the motion leaves too few points in view; another seed is needed.
     """
-    setting = points_setting(seed, number)
-    try:
-        found = _simulated(setting, seed, number)
-    except ValueError as error:
-        raise RsbenchError(f"problem {_name(number)}: {error}; choose another seed") from error
+    found = _simulated(draws, draws.setting(seed, number), seed, number)
     return Problem(
         name=_name(number), correspondences=found.correspondences, rig=found.rig, known_shutter=found.shutter
     )
 
 
-def exact_problem(seed: int, number: int) -> tuple[Problem, float]:
+def exact_problem(seed: int, number: int, draws: Draws = POINTS_1) -> tuple[Problem, float]:
     """The matches of a problem without noise and without the outliers, and the noise that they get, px.
 
     Raises:
         RsbenchError: as ``simulated_problem``.
     """
-    setting = points_setting(seed, number)
-    try:
-        found = _simulated(setting.exact(), seed, number)
-    except ValueError as error:
-        raise RsbenchError(f"problem {_name(number)}: {error}; choose another seed") from error
+    setting = draws.setting(seed, number)
+    found = _simulated(draws, setting.exact(), seed, number)
     # Outliers are displaced after the noise, and the draws are common: without noise the same are.
     right = found.correspondences.tracks[~found.outliers["tracks"]]
     problem = Problem(
@@ -188,58 +179,34 @@ def exact_problem(seed: int, number: int) -> tuple[Problem, float]:
     return problem, setting.noise_px
 
 
-def _simulated(setting: Setting, seed: int, number: int) -> Simulation:
-    motion = points_motion(setting, seed, number)
-    rng = generator(seed, "leaderboard", "scene", number)
-    return simulate(setting.rig(), setting.shutter(), motion, replace(setting.options(True), pairs=0), rng)
+def _simulated(draws: Draws, setting: Setting, seed: int, number: int) -> Simulation:
+    options = replace(setting.options(True), pairs=0, outlier_images=draws.outlier_images)
+    scene = draws.rng(seed, "scene", number)
+    try:
+        return simulate(setting.rig(), setting.shutter(), draws.motion(seed, number), options, scene)
+    except ValueError as error:
+        raise RsbenchError(f"problem {_name(number)}: {error}; choose another seed") from error
 
 
 def _name(number: int) -> str:
     return f"p{number:03d}"
 
 
-def points_motion(setting: Setting, seed: int, number: int) -> Motion:
-    return setting.motion(generator(seed, "leaderboard", "motion", number))
-
-
-def points_setting(seed: int, number: int) -> Setting:
-    """Every size at random over what phones, drones and cars do; the camera is the paper's."""
-    rng = generator(seed, "leaderboard", "setting", number)
-
-    def between(low: float, high: float) -> float:
-        """As often in each factor."""
-        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-    return Setting(
-        width=900,
-        height=900,
-        focal=810.0,
-        depth=(2.0, 10.0),
-        rotation_deg=between(0.2, 8.0),
-        translation=between(0.05, 0.5),
-        baseline=between(0.1, 0.6),
-        noise_px=between(0.05, 1.0),
-        readout_ratio=float(rng.uniform(0.1, 1.0)),
-        points=int(rng.integers(40, 201)),
-        outlier_ratio=float(rng.choice([0.0, 0.1, 0.3, 0.5])),
-        shape="plane" if rng.random() < 0.2 else "box",
-    )
-
-
-def _drawn(seed: int, number: int) -> Truth:
-    setting = points_setting(seed, number)
+def _drawn(draws: Draws, seed: int, number: int) -> Truth:
+    setting, motion = draws.setting(seed, number), draws.motion(seed, number)
     facts = {
-        **_sizes(points_motion(setting, seed, number), setting.rig(), setting.shutter()),
+        **_sizes(motion, setting.rig(), setting.shutter()),
         "noise_px": setting.noise_px,
         "outliers": setting.outlier_ratio,
         "points": setting.points,
         "shape": setting.shape,
+        **draws.kinds(seed, number),
     }
     return Truth(
         name=_name(number),
         rig=setting.rig(),
         shutter=setting.shutter(),
-        motion=points_motion(setting, seed, number),
+        motion=motion,
         scene=_name(number),
         facts=facts,
     )

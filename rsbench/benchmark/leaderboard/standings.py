@@ -34,6 +34,8 @@ class Standing:
     """Of the other scores: over problems; NaN where the entry gives none."""
     calibration: Calibration | None
     """Of the covariances that it states."""
+    parts: dict[str, tuple[float, float, float]]
+    """Of the primary score in the parts of the problems that its track tells apart, by their names."""
 
     @property
     def track(self) -> Track:
@@ -48,6 +50,11 @@ class Standing:
         if self.peers == 1:
             return "alone"
         return f"{self.rank.place} [{self.rank.low}, {self.rank.high}] of {self.peers}"
+
+    @property
+    def assumes(self) -> str:
+        """The motion model that the method names; nothing of an oracle."""
+        return "" if ORACLE in self.scored.header.uses else self.scored.header.motion_model
 
     @property
     def name(self) -> str:
@@ -116,7 +123,15 @@ def _standing(
         means={name: score_interval(scores[name].to_numpy(), scenes) for name in track.of_kind("share")},
         medians={name: _median(scores[name].to_numpy()) for name in track.of_kind("median")},
         calibration=calibration(scores),
+        parts={} if not track.parting else _parts(scores, track),
     )
+
+
+def _parts(scores: pd.DataFrame, track: Track) -> dict[str, tuple[float, float, float]]:
+    return {
+        str(name): score_interval(part[track.primary.key].to_numpy(), list(part["scene"]))
+        for name, part in scores.groupby(track.parting)
+    }
 
 
 def _median(values: FloatArray) -> float:
@@ -133,7 +148,9 @@ def table(lines: Sequence[Standing]) -> pd.DataFrame:
         row: dict[str, object] = {"method": header.method, "uses": line.uses, "peers": line.peers or None}
         row |= {"handed_in": line.scored.handed_in, "doubt": line.scored.doubt or None}
         row |= dict(zip(("rank", "rank_low", "rank_high"), line.rank or (None, None, None), strict=True))
+        row |= {"assumes": line.assumes or None} if line.parts else {}
         row |= _ends(line.means) | line.medians
+        row |= _ends({f"{line.track.primary.key}_{name}": triple for name, triple in line.parts.items()})
         if "nees" in line.scored.scores:
             row |= _ends(named_numbers(line.calibration))
         rows.append(row | {"ties": " ".join(line.ties)})

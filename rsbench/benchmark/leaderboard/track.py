@@ -112,6 +112,10 @@ class Track(ABC):
     """Whether pictures are of the times of rows."""
     own_matches: ClassVar[bool] = False
     """Whether matches may be handed in with motions."""
+    rendered: ClassVar[bool] = False
+    """Whether problems are rendered frames."""
+    parting: ClassVar[str] = ""
+    """A column of scores.csv by whose values tables divide the primary score; empty: by none."""
     smoke: ClassVar[tuple[str, ...]] = ()
     """Entries of a smoke run: what rsbench has by default, the strongest that cost little, and oracles."""
     smoke_metrics: ClassVar[tuple[str, ...]]

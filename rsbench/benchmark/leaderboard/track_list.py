@@ -6,7 +6,9 @@ from rsbench.benchmark.leaderboard.correction_track import CorrectionTrack
 from rsbench.benchmark.leaderboard.depth_track import DepthTrack
 from rsbench.benchmark.leaderboard.mono_track import MonoCorrectionTrack
 from rsbench.benchmark.leaderboard.motion_tracks import OwnPoseTrack, PointsTrack, PoseTrack
+from rsbench.benchmark.leaderboard.placed_track import PlacedCorrection
 from rsbench.benchmark.leaderboard.readout_track import ReadoutTrack
+from rsbench.benchmark.leaderboard.second_protocols import DrawnReadout, LawsOfPoints, LawsOfPoses
 from rsbench.benchmark.leaderboard.track import Track
 from rsbench.components.cards import choices
 from rsbench.core.errors import RsbenchError
@@ -14,11 +16,15 @@ from rsbench.core.errors import RsbenchError
 TRACKS: dict[str, Track] = {
     track.name: track
     for track in (
+        LawsOfPoints(),
         PointsTrack(),
+        LawsOfPoses(),
         PoseTrack(),
         OwnPoseTrack(),
+        DrawnReadout(),
         ReadoutTrack(),
         DepthTrack(),
+        PlacedCorrection(),
         CorrectionTrack(),
         MonoCorrectionTrack(),
     )
@@ -27,7 +33,14 @@ TRACKS: dict[str, Track] = {
 
 
 def track_of_name(name: str) -> Track:
-    """Raises RsbenchError: there is no such track."""
+    """A track by its name, or by that of its protocol.
+
+    Raises:
+        RsbenchError: there is no such track.
+    """
+    by_id = {track.id: track for track in TRACKS.values()}
+    if name in by_id:
+        return by_id[name]
     if name not in TRACKS:
         raise RsbenchError(f"track {name!r} does not exist{choices(name, TRACKS)}")
     return TRACKS[name]

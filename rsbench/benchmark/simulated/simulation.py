@@ -15,14 +15,7 @@ from numpy.typing import NDArray
 from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.given import (
-    LARGEST_M,
-    LARGEST_PX,
-    check_number,
-    check_one_of,
-    check_whole,
-    shown,
-)
+from rsbench.core.given import LARGEST_M, LARGEST_PX, check_number, check_one_of, check_whole, shown
 from rsbench.core.lens import inverse_2x2
 from rsbench.core.motion import Motion
 from rsbench.core.projection import (
@@ -39,6 +32,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
 SceneShape = Literal["box", "plane"]
+OutlierImages = Literal["frame 1", "all"]
 MOST_POINTS = 1_000_000
 """Of each set: ten seconds of one core, and a gigabyte."""
 GYRO_RATE = 20
@@ -66,9 +60,11 @@ class SimulationOptions:
     noise_px: float = 0.0
     """Standard deviation of the noise on every pixel coordinate."""
     outlier_ratio: float = 0.0
-    """Share of matches whose frame-1 pixels are replaced by others."""
+    """Share of matches some of whose pixels are replaced by others."""
     outlier_px: float = 80.0
     """Outliers lie uniformly within this distance, per coordinate, of the truth."""
+    outlier_images: OutlierImages = "frame 1"
+    """Whose pixels: of frame 1, by one distance in both cameras; or of every image, each by its own."""
     depth: tuple[float, float] = (2.0, 10.0)
     """Range of depths in frame 0, metres, uniform."""
     gyro_rate: int = 0
@@ -103,6 +99,7 @@ class SimulationOptions:
         check_number("gravity_noise_deg", self.gravity_noise_deg, 0.0)
         check_number("affine_noise", self.affine_noise, 0.0)
         check_one_of("shape", self.shape, get_args(SceneShape))
+        check_one_of("outlier_images", self.outlier_images, get_args(OutlierImages))
         depth = self.depth
         if np.shape(depth) != (2,):
             raise ValueError(f"depth = {shown(depth)}: must be two distances in metres, the nearer first")
@@ -246,14 +243,16 @@ def _slanted(rays: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def _displace(matches: FloatArray, options: SimulationOptions, rng: np.random.Generator) -> np.ndarray:
-    """Move the frame-1 pixels of some matches, in place; returns which."""
+    """Move pixels of some matches, in place; returns which."""
     draws = rng.uniform(-1.0, 1.0, (len(matches), 3))
     chosen = np.argsort(draws[:, 2], kind="stable")[: round(options.outlier_ratio * len(matches))]
     mask = np.zeros(len(matches), dtype=np.bool_)
     mask[chosen] = True
     half = matches.shape[1] // 2
-    for k in range(half, 2 * half, 2):
-        matches[mask, k : k + 2] += options.outlier_px * draws[mask, :2]
+    moves = np.hstack([np.zeros((len(matches), half)), *half // 2 * [draws[:, :2]]])
+    if options.outlier_images == "all":
+        moves = rng.uniform(-1.0, 1.0, matches.shape)
+    matches[mask] += options.outlier_px * moves[mask]
     return mask
 
 

@@ -49,6 +49,7 @@ def test_each_difference_is_named(tmp_path: Path) -> None:
 
 
 def test_without_stored_scores_nothing_runs(tmp_path: Path) -> None:
+    assert_refused(run_here("leaderboard", "smoke", "--track", "points-2"), "--track points-2: has no smoke run")
     points = ("leaderboard", "smoke", "--track", "points", "--stored", tmp_path)
     assert_refused(run_here(*points), "scores.csv")
     assert_refused(

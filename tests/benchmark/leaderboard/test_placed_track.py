@@ -1,0 +1,107 @@
+"""Corrected frames ranked by geometry: a known distance scores what it should, and filters gain nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from leaderboards import lines_of
+
+from rsbench.benchmark.leaderboard.correction_track import TrueFrame
+from rsbench.benchmark.leaderboard.marking import mark
+from rsbench.benchmark.leaderboard.picture_parts import parts_within
+from rsbench.benchmark.leaderboard.placed_track import placed
+from rsbench.benchmark.leaderboard.splits import dataset_split
+from rsbench.benchmark.leaderboard.submissions import read_submission
+from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.vision.quality import Picture, ssim
+
+Image = np.ndarray[Any, np.dtype[np.uint8]]
+SHAPE = (192, 256)
+ALL = np.ones(SHAPE, dtype=np.bool_)
+
+
+def _scene() -> np.ndarray[Any, Any]:
+    """Coarse and fine texture (H + 64, W + 64, 3), to be cut out of."""
+    rng = np.random.default_rng(3)
+    shape = (SHAPE[0] + 64, SHAPE[1] + 64, 3)
+    parts = [cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), sigma) * sigma for sigma in (1.5, 4.0, 10.0)]
+    total = sum(parts, np.zeros(shape))
+    return 120.0 + 45.0 * total / total.std()
+
+
+def _seen(shift: np.ndarray[Any, Any] | float) -> np.ndarray[Any, Any]:
+    """The scene as each row sees it that stands ``shift`` px (H) to the right of its place."""
+    y, x = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]].astype(np.float32)
+    x = x + 32.0 + np.broadcast_to(np.asarray(shift, dtype=np.float32).reshape(-1, 1), SHAPE)
+    return cv2.remap(_scene().astype(np.float32), x.astype(np.float32), y + 32.0, cv2.INTER_CUBIC)
+
+
+def _u8(image: np.ndarray[Any, Any]) -> Image:
+    return np.clip(np.round(image), 0, 255).astype(np.uint8)
+
+
+def _true() -> TrueFrame:
+    image = _u8(_seen(0.0))
+    return TrueFrame(name="first", picture=Picture(image), common=ALL, parts=parts_within("rms", image, 0, ALL))
+
+
+def _sharpened(image: Image) -> Image:
+    return _u8(2.0 * image.astype(np.float64) - cv2.GaussianBlur(image, (0, 0), 1.5))
+
+
+FILTERS: dict[str, Callable[[Image], Any]] = {
+    "sharpen": _sharpened,
+    "median": lambda image: cv2.medianBlur(image, 3),
+    "gauss": lambda image: cv2.GaussianBlur(image, (0, 0), 1.0),
+    "bilateral": lambda image: cv2.bilateralFilter(image, 7, 40, 3),
+    "nlm": lambda image: cv2.fastNlMeansDenoisingColored(image, None, 8, 8, 7, 15),
+}
+
+
+@pytest.mark.parametrize("off", [0.0, 0.5, 1.0, 3.0])
+def test_a_known_distance_has_its_score(off: float) -> None:
+    # The tops of correlations of blurred windows are parabolas to some hundredths of a pixel.
+    expected = max(0.0, 1.0 - off / 2.0)
+    assert placed([_true()], [(_u8(_seen(off)), ALL)]) == pytest.approx(expected, abs=0.05)
+
+
+def test_what_is_not_drawn_counts_nothing() -> None:
+    drawn = ALL.copy()
+    drawn[:, ::2] = False
+    assert placed([_true()], [(_u8(_seen(0.0)), drawn)]) == pytest.approx(0.5, abs=0.02)
+    flat = np.full((*SHAPE, 3), 90, dtype=np.uint8)
+    plain = TrueFrame(name="first", picture=Picture(flat), common=ALL, parts={})
+    assert placed([plain], [(flat, ALL)]) == 1.0  # nothing there tells where it stands
+
+
+@pytest.mark.parametrize("shear", [0.0, 2.0])
+def test_filters_gain_nothing(shear: float) -> None:
+    """A noisy, blurred, vignetted frame: SSIM is better by 0.05 after filters, which move nothing."""
+    true, height = _true(), SHAPE[0]
+    rng = np.random.default_rng(0)
+    frame = cv2.GaussianBlur(_seen(shear * np.arange(height) / height), (0, 0), 0.8)
+    corner = np.hypot(*np.meshgrid(np.linspace(-1, 1, SHAPE[1]), np.linspace(-1, 1, height)))[..., None]
+    frame = _u8(frame * (1.0 - 0.1 * corner**2) + 10.0 * rng.standard_normal(frame.shape))
+    before, seen = placed([true], [(frame, ALL)]), ssim(frame, true.picture)
+    after = {name: placed([true], [(made(frame), ALL)]) for name, made in FILTERS.items()}
+    assert max(after.values()) < before + 0.01, (before, after)
+    assert max(ssim(made(frame), true.picture) for made in FILTERS.values()) > seen + 0.05
+    straight = placed([true], [(_u8(_seen(0.0)), ALL)])
+    assert straight > before + (0.3 if shear else -0.01)
+
+
+def test_oracles_have_their_places(planes: Path, tmp_path: Path) -> None:
+    split = dataset_split(TRACKS["correction-2"], planes)
+    found = {
+        path.parent.name: mark(read_submission(path, split), split)
+        for path in split.track.oracles(split, tmp_path)
+    }
+    # A picture on itself: the top of an uneven correlation is no more than 0.01 px from the middle.
+    assert np.all(found["truth"]["placed"] > 0.995) and np.all(found["truth"]["misplaced"] < 0.005)
+    assert np.all(found["fusion-true"]["placed"] > found["uncorrected"]["placed"])
+    assert lines_of(tmp_path / "truth" / "predictions.jsonl")[0]["protocol"] == "correction-2"
