@@ -76,11 +76,12 @@ def _own_docstrings(cls: type) -> tuple[tuple[str, str], ...]:
         tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
     except (OSError, TypeError, SyntaxError, IndexError):  # made in a shell, or without its source
         return ()
-    return tuple(
-        (field.target.id, " ".join(str(text.value.value).split()))  # pyrefly: ignore[missing-attribute]
-        for field, text in itertools.pairwise(tree.body if isinstance(tree, ast.ClassDef) else [])
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and _is_text(text)
-    )
+    found = []
+    for field, text in itertools.pairwise(tree.body) if isinstance(tree, ast.ClassDef) else ():
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and _is_text(text):
+            told = str(text.value.value)  # pyrefly: ignore[missing-attribute]
+            found.append((field.target.id, " ".join(told.split())))
+    return tuple(found)
 
 
 def _is_text(node: ast.stmt) -> bool:
