@@ -27,7 +27,8 @@ help:
 demo: $(STAMP)
 	@$(BIN)/rsbench demo
 
-# Types are checked while the kernels are compiled and the first tests run, two processes, the long ones first.
+# Types are checked while the kernels are compiled and the first tests run, two processes, the long ones first. Bytecode
+# is kept whatever the environment says: of the processes that tests start, each would compile it anew.
 test: $(STAMP)
 	@echo "== format"; $(BIN)/ruff format --check .
 	@echo "== lint";   $(BIN)/ruff check .
@@ -35,7 +36,7 @@ test: $(STAMP)
 	@echo "== types, beside compiling and the tests"; \
 	$(BIN)/pyrefly check --progress-bar no --python-interpreter-path $(BIN)/python & types=$$!; \
 	$(BIN)/python -c '$(COMPILE)' || { kill $$types; exit 1; }; \
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --no-loadscope-reorder; tests=$$?; \
+	PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --no-loadscope-reorder; tests=$$?; \
 	wait $$types || { echo "types: failed, see above" >&2; exit 1; }; exit $$tests
 
 # Not locked: of these the newest that pyproject.toml allows.

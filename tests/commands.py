@@ -7,15 +7,17 @@ children print. That every command starts in one: tests/test_installed_wheel.py 
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
 import pytest
+from typer.main import get_command
 
 from rsbench.cli import console, crash_log, main
 
@@ -29,6 +31,8 @@ def run_here(*arguments: object, text: str = "", **environment: str) -> subproce
     out, err, code = io.StringIO(), io.StringIO(), 0
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         patch.setattr(sys, "argv", words)
+        if not environment:  # the options are made of some of it
+            patch.setattr(main, "app", _command())
         patch.setattr(crash_log, "describe", _raise)
         patch.setattr(sys, "stdin", io.StringIO(text))
         for name, value in environment.items():
@@ -41,6 +45,12 @@ def run_here(*arguments: object, text: str = "", **environment: str) -> subproce
         finally:
             console.be_quiet(False)
     return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
+
+
+@functools.cache
+def _command() -> Callable[..., object]:
+    """Commands with their options, which Typer makes anew at each call of an app."""
+    return get_command(main.app)
 
 
 def _raise(error: Exception) -> NoReturn:

@@ -41,19 +41,31 @@ So each scene is built once, and those of child processes do not lie beside its 
 """
 
 LONG = (
-    "test_lens_sequences.py",
-    "test_run_sweep.py",
+    "test_trajectory.py",
+    "test_s3.py",
+    "test_workers.py",
+    "test_mirror.py",
     "test_evaluation_entries.py",
+    "test_correct_one_camera.py",
     "test_generation.py",
-    "test_correct_command.py",
-    "test_channels.py",
+    "test_run_sweep.py",
+    "test_contract.py",
+    "test_compiled.py",
     "test_interrupted.py",
+    "test_attack.py",
     "test_scoring_workers.py",
+    "test_lens_sequences.py",
+    "test_bound.py",
+    "test_isolation.py",
+    "test_correct_command.py",
+    "test_add_a_motion.py",
+    "test_solve_command.py",
+    "test_refined_solver.py",
     "test_sequence_jobs.py",
     "test_board.py",
-    "test_bound.py",
+    "test_settle.py",
     "test_reproduce_simulated.py",
-    "test_command_line.py",
+    "test_channels.py",
 )
 """Files that take 20 s of a processor and more, the longest first: a process that gets one at the end works on
 alone."""

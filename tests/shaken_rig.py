@@ -56,7 +56,9 @@ def seen(law: Law, points: FloatArray, frame: int, side: int) -> FloatArray:
     for _ in range(12):
         R, p = law(times(y, frame))
         x = np.einsum("nij,nj->ni", R, points - p) + np.array([(0.5 - side) * BASELINE, 0.0, 0.0])
-        y = FOCAL * x[:, 1] / x[:, 2] + 239.5
+        before, y = y, FOCAL * x[:, 1] / x[:, 2] + 239.5
+        if np.all((np.abs(y - before) < 1e-9) | (np.abs(y - 239.5) > HEIGHT)):  # or far beside the image
+            break
     pixels = np.stack([FOCAL * x[:, 0] / x[:, 2] + 319.5, y], axis=-1)
     return np.where(x[:, 2:] > 0.1, pixels, np.nan)
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from rsbench.capture.trajectory_kernels import END
 from rsbench.core.correspondences import BEYOND_PX, BoolArray, Correspondences, unlinked_pairs
@@ -160,6 +159,8 @@ def _met(begins: FloatArray, ends: FloatArray, known: BoolArray) -> IntArray:
     out = -np.ones(len(begins), dtype=np.int64)
     if len(begins) == 0 or len(ends) == 0:
         return out
+    from scipy.spatial import cKDTree  # takes as long to load as all else that a solver needs
+
     found = cKDTree(ends).query(begins, p=np.inf, distance_upper_bound=BEYOND_PX)
     distance, nearest = np.asarray(found[0]), np.asarray(found[1])
     order = np.argsort(distance, kind="stable")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import re
 import sys
@@ -199,6 +200,7 @@ _ABOUT = {
 }
 
 
+@functools.cache
 def component_classes() -> dict[str, dict[type, list[str]]]:
     """By kind of component: rsbench's own classes that have parameters, with the names that use them."""
     from rsbench.cli.component_kinds import COMPONENTS, component_kind

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import inspect
 import itertools
 import textwrap
@@ -65,17 +66,22 @@ def value_in_a_card(value: object) -> Any:
 
 def field_docstrings(cls: type) -> dict[str, str]:
     """Texts below the fields of a class and of those above it, in one line each."""
-    found: dict[str, str] = {}
-    for parent in reversed(cls.__mro__[:-1]):
-        try:
-            tree = ast.parse(textwrap.dedent(inspect.getsource(parent))).body[0]
-        except (OSError, TypeError, SyntaxError, IndexError):  # made in a shell, or without its source
-            continue
-        body = tree.body if isinstance(tree, ast.ClassDef) else []
-        for field, text in itertools.pairwise(body):
-            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and _is_text(text):
-                found[field.target.id] = " ".join(str(text.value.value).split())  # pyrefly: ignore[missing-attribute]
-    return found
+    return {name: text for parent in reversed(cls.__mro__[:-1]) for name, text in _own_docstrings(parent)}
+
+
+@functools.cache
+def _own_docstrings(cls: type) -> tuple[tuple[str, str], ...]:
+    """Names and texts of the fields of a class itself; finding its source takes up to a tenth of a second."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+    except (OSError, TypeError, SyntaxError, IndexError):  # made in a shell, or without its source
+        return ()
+    found = []
+    for field, text in itertools.pairwise(tree.body) if isinstance(tree, ast.ClassDef) else ():
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and _is_text(text):
+            told = str(text.value.value)  # pyrefly: ignore[missing-attribute]
+            found.append((field.target.id, " ".join(told.split())))
+    return tuple(found)
 
 
 def _is_text(node: ast.stmt) -> bool:

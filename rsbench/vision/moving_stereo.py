@@ -61,6 +61,16 @@ class _Eye(NamedTuple):
         )
 
 
+class _Looked(NamedTuple):
+    """Pixels (H, W, 2) of a camera and their rays (H, W, 3); NaN where its lens shows nothing.
+
+    Both from ideal places: from pixels with a lens Newton's method would have to find the rays.
+    """
+
+    pixels: FloatArray
+    rays: FloatArray
+
+
 def moving_disparities(
     entry: MatcherEntry,
     images: Mapping[Side, NDArray[np.uint8]],
@@ -104,14 +114,14 @@ def _of_side(
         here, there = both if side == "left" else both[::-1]
         partner = grid + _across(sign * there)
         before, gain = rho, camera.fx * rig.baseline
-        rho = _known(_inverse_depth(eyes[side], eyes[other], _pixels(camera, wide, partner), ends))
+        rho = _known(_inverse_depth(eyes[side], eyes[other], _looked(camera, wide, partner), ends))
         if np.mean(gain * np.abs(rho - before) > _STILL_PX) < _SETTLED:
             break
     known = np.isfinite(here)
     places: FloatArray = np.where(known[..., None], grid - _across(sign * here), 0.0)
     moved = (ends - grid).astype(np.float32)
     ends = places + np.stack([between_pixels(moved[..., k], places) for k in (0, 1)], axis=-1)
-    rho = _inverse_depth(eyes[side], eyes[other], _pixels(camera, wide, grid), _inside(camera, ends))
+    rho = _inverse_depth(eyes[side], eyes[other], _looked(camera, wide, grid), _inside(camera, ends))
     disparity = np.where(known, gain * rho, np.nan)
     return _on_sensor(camera, wide, disparity.astype(np.float32))
 
@@ -123,9 +133,9 @@ def _ends(rig: StereoRig, eye: _Eye, other: _Eye, sign: float, rho: FloatArray) 
     that of the partner in ``eye``, whose line's time is meant.
     """
     grid = rig.camera.pixel_grid()
-    partner = _pixels(eye.camera, rig.camera, grid + _across(sign * rig.camera.fx * rig.baseline * rho))
-    R, t = eye.pose_at(partner)
-    X = _turned(np.swapaxes(R, -1, -2), eye.camera.unproject(partner) - rho[..., None] * t)
+    partner = _looked(eye.camera, rig.camera, grid + _across(sign * rig.camera.fx * rig.baseline * rho))
+    R, t = eye.pose_at(partner.pixels)
+    X = _turned(np.swapaxes(R, -1, -2), partner.rays - rho[..., None] * t)
     ends = _pixels(eye.camera, rig.camera, grid)
     for _ in range(_STEPS):
         R, t = other.pose_at(ends)
@@ -133,14 +143,14 @@ def _ends(rig: StereoRig, eye: _Eye, other: _Eye, sign: float, rho: FloatArray) 
     return ends
 
 
-def _inverse_depth(eye: _Eye, other: _Eye, pixels: FloatArray, ends: FloatArray) -> FloatArray:
+def _inverse_depth(eye: _Eye, other: _Eye, own: _Looked, ends: FloatArray) -> FloatArray:
     """Inverse depth (H, W), 1 / m, of pixels (H, W, 2) whose points the other camera sees at ``ends``; NaN: none.
 
     By the columns of the ends, as disparities are; the rows hold the guess that the image was resampled by.
     """
-    (R, t), (S, s) = eye.pose_at(pixels), other.pose_at(ends)
+    (R, t), (S, s) = eye.pose_at(own.pixels), other.pose_at(ends)
     turn = S @ np.swapaxes(R, -1, -2)
-    way, step = _turned(turn, eye.camera.unproject(pixels)), s - _turned(turn, t)
+    way, step = _turned(turn, own.rays), s - _turned(turn, t)
     column = other.camera.unproject(ends)[..., 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         rho = (way[..., 0] - column * way[..., 2]) / (column * step[..., 2] - step[..., 0])
@@ -167,6 +177,11 @@ def _across(steps: NDArray[Any]) -> FloatArray:
 def _pixels(camera: PinholeCamera, wide: PinholeCamera, places: FloatArray) -> FloatArray:
     """Pixels (H, W, 2) of the camera with its lens at places of the wide one without."""
     return places if wide is camera else camera.project(wide.unproject(places))
+
+
+def _looked(camera: PinholeCamera, wide: PinholeCamera, places: FloatArray) -> _Looked:
+    rays, pixels = wide.unproject(places), _pixels(camera, wide, places)
+    return _Looked(pixels, np.where(np.isfinite(pixels[..., :1]), rays, np.nan))
 
 
 def _shown(camera: PinholeCamera, wide: PinholeCamera, places: FloatArray) -> F32:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from commands import run_here
+from small_scenes import write_box_scene, write_small_card
 
 MACHINE = {"seconds.json", "seconds.csv", "provenance.json", "hashes.jsonl", "report.html", "seconds"}
 """Files that hold times, the date and the machine."""
@@ -64,9 +65,13 @@ def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path) -> None:
 def test_a_cluster_generates_evaluates_and_simulates_the_same_bytes(
     smoke_dataset: Path, tmp_path: Path, address: str
 ) -> None:
-    run = run_here("-q", "generate", "smoke", "--out", tmp_path / "data", "--scheduler", address)
-    assert run.returncode == 0, run.stderr
-    assert contents(tmp_path / "data") == contents(smoke_dataset)
+    card = write_small_card(tmp_path, [write_box_scene(tmp_path, "a"), write_box_scene(tmp_path, "b", (50, 70))])
+    generated = []
+    for name, how in (("rendered", ()), ("sent", ("--scheduler", address))):
+        run = run_here("-q", "generate", card, "--out", tmp_path / name, *how)
+        assert run.returncode == 0, run.stderr
+        generated.append(contents(tmp_path / name))
+    assert len(generated[0]) > 20 and generated[0] == generated[1]
     one = evaluated(smoke_dataset, tmp_path / "one")
     assert one == evaluated(smoke_dataset, tmp_path / "there", "--scheduler", address)
     made = []
