@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,12 +14,10 @@ from rsbench.core.rig import Side
 from rsbench.core.so3 import FloatArray
 
 BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
 JOIN_TOLERANCE_PX = 0.01
 """Two ends are one point when neither coordinate differs by more: above the rounding of float32 and of printed
 numbers, below the noise of keypoints and the distance between two of them."""
 BEYOND_PX = float(np.nextafter(JOIN_TOLERANCE_PX, 1.0))
-_PRIMES = np.array([2.0, 3.0, 5.0, 7.0, 11.0, 13.0, 17.0, 19.0])
 
 _TRACK_HALF: dict[Side, list[int]] = {"left": [0, 1, 4, 5], "right": [2, 3, 6, 7]}
 SET_COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8, "lines": 16}
@@ -148,31 +145,9 @@ def temporal_pairs(correspondences: Correspondences, side: Side) -> FloatArray:
 
 def repeated(rows: FloatArray, others: FloatArray) -> BoolArray:
     """Mask (n,) of the matches (n, c) that are also among ``others`` (m, c), within ``JOIN_TOLERANCE_PX``."""
-    out = np.zeros(len(rows), dtype=np.bool_)
-    for found, _, _ in near(rows, others, out):
-        out[found] = True
-    return out
+    if len(rows) == 0 or len(others) == 0:
+        return np.zeros(len(rows), dtype=np.bool_)
+    from scipy.spatial import cKDTree  # takes as long to load as all else that a solver needs
 
-
-def near(rows: FloatArray, others: FloatArray, done: BoolArray) -> Iterator[tuple[IntArray, IntArray, FloatArray]]:
-    """Pairs of a row (n, c) and one of ``others`` (m, c) that differ by ``JOIN_TOLERANCE_PX`` at most.
-
-    In parts: indices of rows, each once in a part, of others, and the largest difference of a column. Rows that
-    the caller marks in ``done`` (n,) meanwhile are left out. Not a tree of SciPy's, which takes as long to load as
-    all else that a solver needs: sums with weights of no common measure nearly tell the others apart, in any
-    number of columns, and who is near has nearly the same sum.
-    """
-    weights = np.sqrt(_PRIMES[: rows.shape[1]])
-    sums, their_sums = rows @ weights, others @ weights
-    order = np.argsort(their_sums, kind="stable")
-    rounding = 1e-12 * np.max(np.abs(their_sums), initial=0.0)
-    reach, their_sums = BEYOND_PX * float(np.sum(weights)) + rounding, their_sums[order]
-    begin, end = np.searchsorted(their_sums, sums - reach), np.searchsorted(their_sums, sums + reach, "right")
-    for step in range(np.max(end - begin, initial=0)):
-        i = np.flatnonzero((begin + step < end) & ~done)
-        if len(i) == 0:
-            return
-        j = order[begin[i] + step]
-        apart = np.max(np.abs(rows[i] - others[j]), axis=1, initial=0.0)
-        within = apart < BEYOND_PX
-        yield i[within], j[within], apart[within]
+    distance, _ = cKDTree(others).query(rows, p=np.inf, distance_upper_bound=BEYOND_PX)
+    return np.isfinite(distance)

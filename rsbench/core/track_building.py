@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.correspondences import JOIN_TOLERANCE_PX, Correspondences, near, repeated, unlinked_pairs
+from rsbench.core.correspondences import BEYOND_PX, JOIN_TOLERANCE_PX, Correspondences, repeated, unlinked_pairs
 from rsbench.core.rig import SIDES, Side
 from rsbench.core.so3 import FloatArray
 
@@ -95,10 +95,8 @@ def _assign(pairs: FloatArray, stereo_0: FloatArray, stereo_1: FloatArray) -> ND
 
 def _nearest(points: FloatArray, ends: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
     """Distances and indices (n, k) of the ends (m, 2) within the tolerance of points (n, 2); infinite for none."""
-    shape = len(points), min(_RIVALS, len(ends)) + 1  # the last for who comes next
-    distance, index = np.full(shape, np.inf), np.zeros(shape, dtype=np.int64)
-    for i, j, apart in near(points, ends, np.zeros(len(points), dtype=np.bool_)):
-        distance[i, -1], index[i, -1] = apart, j
-        sorted_ = np.argsort(distance[i], axis=1, kind="stable")
-        distance[i], index[i] = (np.take_along_axis(each[i], sorted_, axis=1) for each in (distance, index))
-    return distance[:, :-1], index[:, :-1]
+    from scipy.spatial import cKDTree  # see ``repeated``
+
+    rivals = np.arange(1, min(_RIVALS, len(ends)) + 1)
+    distance, index = cKDTree(ends).query(points, k=rivals, p=np.inf, distance_upper_bound=BEYOND_PX)
+    return np.asarray(distance), np.asarray(index, dtype=np.int64)
