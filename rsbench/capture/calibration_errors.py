@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.lens import Lens, inverse_2x2
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.so3 import FloatArray
 
@@ -30,19 +31,22 @@ TERMS = (
     "radial",
     "tangential_x",
     "tangential_y",
+    "focal",
 )
 """px by which disparities are too large, as a function 1, x, y, xx, xy, yy of the ray; row differences, px, as one
-of 1, x, y, xy (to first order errors of the relative rotation and focal lengths); k1, p2, p1 of both lenses."""
+of 1, x, y, xy (to first order errors of the relative rotation and focal lengths); k1, p2, p1 of both lenses; the
+share by which both focal lengths are too short."""
 OFFSET = 0
-BENDS, ROWS, LENS = slice(1, 6), slice(6, 10), slice(10, 13)
+BENDS, ROWS, LENS, FOCAL = slice(1, 6), slice(6, 10), slice(10, 13), 13
 NO_ERRORS = (0.0,) * len(TERMS)
 _HALF: dict[Side, float] = {"left": 0.5, "right": -0.5}
 
 
-def ray_shifts(rays: FloatArray, side: Side, focal: float) -> FloatArray:
-    """(..., 13, 2) by which measured rays x, y (..., 2) of one camera are too large for 1 of each of ``TERMS``.
+def ray_shifts(rays: FloatArray, side: Side, focal: float, lens: Lens | None = None) -> FloatArray:
+    """(..., 14, 2) by which measured rays x, y (..., 2) of one camera are too large for 1 of each of ``TERMS``.
 
-    Half of an offset and of a row difference is the left camera's, half the right one's.
+    Half of an offset and of a row difference is the left camera's, half the right one's. Behind a lens, what the
+    radial coefficient and the focal length do to its distorted rays is taken back through it.
     """
     x, y, out = rays[..., 0], rays[..., 1], np.zeros((*rays.shape[:-1], len(TERMS), 2))
     half = _HALF[side] / focal
@@ -50,11 +54,17 @@ def ray_shifts(rays: FloatArray, side: Side, focal: float) -> FloatArray:
     out[..., BENDS, 0] = half * np.stack([x, y, x * x, x * y, y * y], axis=-1)
     out[..., ROWS, 1] = half * row_terms(x, y)
     out[..., LENS, :] = lens_terms(x, y)
+    out[..., FOCAL, :] = rays
+    if lens is not None:
+        distorted = lens.distort(rays)
+        back = inverse_2x2(distorted.jacobian)
+        for term, shift in ((FOCAL, distorted.xy), (LENS.start, out[..., LENS.start, :])):
+            out[..., term, :] = (back @ shift[..., None])[..., 0]
     return out
 
 
 def term_sizes(rays: FloatArray, focal: float) -> FloatArray:
-    """(13,) px, root mean square over rays (n, 2), that 1 of each of ``TERMS`` moves the ends of a match by."""
+    """(14,) px, root mean square over rays (n, 2), that 1 of each of ``TERMS`` moves the ends of a match by."""
     size = focal * np.sqrt(np.mean(np.sum(ray_shifts(rays, "left", focal) ** 2, axis=-1), axis=0))
     size[: ROWS.stop] *= 2.0  # either end by half of it
     return np.asarray(size)
@@ -80,7 +90,7 @@ def of_offset(offset: float) -> tuple[float, ...]:
 
 
 def in_words(errors: Sequence[float], rig: StereoRig) -> str:
-    """What errors (13,) do to the images of a rig; empty where there are none."""
+    """What errors (14,) do to the images of a rig; empty where there are none."""
     if not np.any(errors):
         return ""
     camera, values = rig.camera, np.asarray(errors)
@@ -92,7 +102,7 @@ def in_words(errors: Sequence[float], rig: StereoRig) -> str:
 
 
 def recalibrated(matches: Correspondences, rig: StereoRig, errors: Sequence[float]) -> Correspondences:
-    """The matches, px, with the errors (13,) of their calibration taken from them; of cameras without a lens."""
+    """The matches, px, with the errors (14,) of their calibration taken from them; of cameras without a lens."""
     if not np.any(errors):
         return matches
     camera = rig.camera

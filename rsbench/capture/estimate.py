@@ -235,7 +235,7 @@ class _Sum:
     at: float
     sigma: float
     mean: FloatArray
-    """(16,) of the unknowns; of delay and calibration, which the windows share."""
+    """(17,) of the unknowns; of delay and calibration, which the windows share."""
     sigmas: FloatArray
     last: Peak
 

@@ -58,7 +58,7 @@ class Peak:
     fit: CaptureFit
     """At the best ratio; its deviations are those at that ratio."""
     trade: FloatArray
-    """(22,) derivative of motion and unknowns by the ratio, all else fitted; zeros where the ratio is known."""
+    """(23,) derivative of motion and unknowns by the ratio, all else fitted; zeros where the ratio is known."""
 
     @property
     def sigma(self) -> float:

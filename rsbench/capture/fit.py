@@ -10,22 +10,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsbench.capture.hypotheses import ACCELERATION, LEAST_RATIO, RATIO, UNKNOWNS, Hypothesis
+from rsbench.capture.calibration_errors import FOCAL
+from rsbench.capture.hypotheses import ACCELERATION, CALIBRATION, LEAST_RATIO, RATIO, UNKNOWNS, Hypothesis
 from rsbench.capture.scans import TimedMatches
 from rsbench.core.correspondences import BoolArray
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.capture_terms import add_pairs, add_tracks
 from rsbench.solvers.engine.heavy_tails import HeavyTailed
+from rsbench.solvers.engine.kernels import BEHIND
 
 BEYOND_RATIO = 1.2
 """No ratio is beyond 1, but the top of what noise makes of one near 1 may be."""
 _MAX_TRANSLATION_M = 50.0
-_LEAST = np.array([LEAST_RATIO, -1.0, -0.45, *10 * [-50.0], *3 * [-2.0]])
-_MOST = np.array([BEYOND_RATIO, 1.0, 3.0, *10 * [50.0], *3 * [2.0]])
-_LONGEST_STEP = np.array([0.4, 0.4, 0.3, 2.0, *9 * [20.0], *3 * [0.2]])
+_LEAST = np.array([LEAST_RATIO, -1.0, -0.45, *10 * [-50.0], *3 * [-2.0], -0.4])
+_MOST = np.array([BEYOND_RATIO, 1.0, 3.0, *10 * [50.0], *3 * [2.0], 0.4])
+_LONGEST_STEP = np.array([0.4, 0.4, 0.3, 2.0, *9 * [20.0], *3 * [0.2], 0.1])
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-8, 1e6
 """A motion makes up for most of a wrong ratio: more damping than this would hold the ratio where it is."""
-_MOTION = 6
+_MOTION, _FOCAL = 6, CALIBRATION.start + FOCAL
 _OVER = 5.0
 """Times Newton's prediction that a cost may fall, at most."""
 _MEDIAN, LEAST_SCALE_PX = 0.6, 0.005
@@ -53,11 +55,11 @@ class CaptureFit:
     theta: FloatArray
     """(6,) of the motion."""
     unknowns: FloatArray
-    """(16,)."""
+    """(17,)."""
     cost: float
     """Negative logarithm of likelihood and prior, times the squared scale, px^2."""
     sigma: FloatArray
-    """(16,) standard deviations of the unknowns; the ratio's is 0 where it was held."""
+    """(17,) standard deviations of the unknowns; the ratio's is 0 where it was held."""
     spread: FloatArray
     """(6, 6) what not knowing them, but for a ratio that was held, adds to the covariance of theta."""
     occam: float
@@ -68,7 +70,7 @@ class CaptureCost:
     """The cost of one hypothesis as a function of the motion and the unknowns.
 
     Args:
-        prior: (16,) standard deviations of the unknowns about 0; 0 holds an unknown where it starts, and infinity
+        prior: (17,) standard deviations of the unknowns about 0; 0 holds an unknown where it starts, and infinity
             says nothing of it.
     """
 
@@ -84,21 +86,21 @@ class CaptureCost:
         self._trust = np.ones(count) if likelihood.trust is None else likelihood.trust
 
     def tailed(self, unknowns: FloatArray) -> HeavyTailed:
-        """The measurements at some unknowns (16,)."""
+        """The measurements at some unknowns (17,)."""
         packed = self._matches.packed(unknowns)
         return HeavyTailed(**vars(packed), nu=self.likelihood.nu, scale=self.likelihood.scale, trust=self._trust)
 
     def each(self, theta: FloatArray, unknowns: FloatArray) -> FloatArray:
         """(n,) what each measurement adds."""
         tailed = self.tailed(unknowns)
-        squares = np.concatenate([tailed.pair_residuals(theta) ** 2, tailed.track_squares(theta)])
+        squares = _squares(tailed, theta)
         factor = 0.5 * tailed.scale**2 * tailed.trust * (tailed.nu + tailed.freedom)
         return np.asarray(factor * np.log1p(squares / (tailed.nu * tailed.scale**2)))
 
     def typical_error(self, theta: FloatArray, unknowns: FloatArray) -> float:
         """Scale of the errors, px, that their median shows: up to half of them may be wrong."""
         tailed = self.tailed(unknowns)
-        squares = np.concatenate([tailed.pair_residuals(theta) ** 2, tailed.track_squares(theta)])
+        squares = _squares(tailed, theta)
         return max(float(np.sqrt(np.median(squares / tailed.freedom) / _MEDIAN)), LEAST_SCALE_PX)
 
     def __call__(self, theta: FloatArray, unknowns: FloatArray) -> float:
@@ -115,9 +117,18 @@ class CaptureCost:
         at, focal, baseline = (theta, packed.kernel), packed.focal, packed.baseline
         cost = add_pairs(*at, packed.pairs, by[0], focal, tails, trust[:n], gradient, H)
         cost += add_tracks(*at, packed.tracks, by[1], focal, baseline, tails, trust[n:], gradient, H)
+        if _FOCAL in free:  # by which the same errors of rays are more pixels
+            tailed = HeavyTailed(**vars(packed), nu=self.likelihood.nu, scale=self.likelihood.scale, trust=trust)
+            squares = _squares(tailed, theta)
+            stretch = tailed.weights(squares)[squares < BEHIND] @ squares[squares < BEHIND]
+            gradient[_MOTION + free.index(_FOCAL)] += stretch / (1.0 - unknowns[_FOCAL])
         gradient[_MOTION:] += self._weight[free] * unknowns[free]
         H[range(_MOTION, size), range(_MOTION, size)] += self._weight[free]
         return cost + 0.5 * float(self._weight @ unknowns**2), gradient, H
+
+
+def _squares(tailed: HeavyTailed, theta: FloatArray) -> FloatArray:
+    return np.concatenate([tailed.pair_residuals(theta) ** 2, tailed.track_squares(theta)])
 
 
 def fit_capture(
@@ -130,7 +141,7 @@ def fit_capture(
     hold_ratio: bool = False,
     hopeless: float = np.inf,
 ) -> CaptureFit:
-    """Newton's method, damped, from a start (6,), (16,).
+    """Newton's method, damped, from a start (6,), (17,).
 
     Args:
         still: decrease of the cost, in squared scales of the errors, at which to stop.

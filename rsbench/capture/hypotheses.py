@@ -51,14 +51,14 @@ class Known:
     models: tuple[str, ...] = MODELS
 
     def prior(self, hypothesis: Hypothesis) -> FloatArray:
-        """(16,) standard deviations of the unknowns, as ``CaptureCost`` takes them."""
+        """(17,) standard deviations of the unknowns, as ``CaptureCost`` takes them."""
         ratio = np.inf if self.ratio is None and hypothesis.scans.rolls else 0.0
         delay = DELAY_SIGMA if hypothesis.delayed else 0.0
         acceleration = ACCELERATION_SIGMA if hypothesis.motion_model == "accelerated" else 0.0
         return np.array([ratio, delay, acceleration, *self.calibration_sigma])
 
     def start(self, hypothesis: Hypothesis, ratio: float, delay: float) -> FloatArray:
-        """(16,) unknowns of a hypothesis, of which these are guesses."""
+        """(17,) unknowns of a hypothesis, of which these are guesses."""
         out = np.zeros(UNKNOWNS)
         out[RATIO], out[DELAY] = ratio, delay if hypothesis.delayed else self.delay or 0.0
         out[CALIBRATION] = self.calibration

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from rsbench.capture.calibration_errors import ray_shifts
+from rsbench.capture.calibration_errors import FOCAL, ray_shifts
 from rsbench.core.correspondences import BoolArray, Correspondences, unlinked_pairs
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
@@ -134,7 +134,7 @@ class TimedMatches:
         sets = [getattr(matches, side)[unlinked_pairs(matches, side)] for side in SIDES]
         self.pixels: FloatArray = np.concatenate([*(each[:, :2] for each in sets), matches.tracks[:, :2]])
         """(count, 2) where each is seen in frame 0."""
-        self._shifts = self._ray_shifts()
+        self._shifts = self._ray_shifts(rig)
         self._lines["global"] = _Lines(
             pairs=np.zeros((pairs, 2)),
             slopes=np.zeros((pairs, 2)),
@@ -142,12 +142,12 @@ class TimedMatches:
             track_slopes=np.zeros((tracks, 4, 2)),
         )
 
-    def _ray_shifts(self) -> tuple[FloatArray, FloatArray]:
-        """(n, 2, 2, 13) of the pairs' ends and (m, 4, 2, 13) of the tracks': ``ray_shifts``, the errors last."""
-        base, focal = self._base, float(self._base.focal[0])
+    def _ray_shifts(self, rig: StereoRig) -> tuple[FloatArray, FloatArray]:
+        """(n, 2, 2, 14) of the pairs' ends and (m, 4, 2, 14) of the tracks': ``ray_shifts``, the errors last."""
+        base, optics = self._base, (float(self._base.focal[0]), rig.camera.lens)
         pairs = base.pairs[:, :4].reshape(-1, 2, 2)
-        either = [ray_shifts(pairs, side, focal) for side in SIDES]
-        tracks = [ray_shifts(base.tracks[:, k, :2], SIDES[k % 2], focal) for k in range(4)]
+        either = [ray_shifts(pairs, side, *optics) for side in SIDES]
+        tracks = [ray_shifts(base.tracks[:, k, :2], SIDES[k % 2], *optics) for k in range(4)]
         found = np.where(self.left[:, None, None, None], *either), np.stack(tracks, axis=1)
         return np.ascontiguousarray(found[0].swapaxes(2, 3)), np.ascontiguousarray(found[1].swapaxes(2, 3))
 
@@ -191,7 +191,7 @@ class TimedMatches:
         return self.read(scans).packed(unknowns)
 
     def kernel(self, unknowns: FloatArray) -> MotionKernel:
-        """Of the motion model, with the acceleration among some unknowns (16,)."""
+        """Of the motion model, with the acceleration among some unknowns (17,)."""
         return _accelerated(self._base.kernel, float(unknowns[_ACCELERATION]))
 
 
@@ -211,7 +211,7 @@ class ReadMatches:
         """The measurements at some unknowns.
 
         Args:
-            unknowns: (16,) readout ratio; frame periods by which the right camera is late; the motion's
+            unknowns: (17,) readout ratio; frame periods by which the right camera is late; the motion's
                 acceleration, 0 of a model without one; what the calibration is wrong by.
         """
         ratio, delay, acceleration, *errors = map(float, unknowns)
@@ -223,8 +223,8 @@ class ReadMatches:
         if any(errors):
             pairs[:, :4] -= (self._shifts[0] @ errors).reshape(-1, 4)
             tracks[:, :, :2] -= self._shifts[1] @ errors
-        kernel = _accelerated(self._base.kernel, acceleration)
-        return replace(self._base, pairs=pairs, tracks=tracks, h=0.0, kernel=kernel)
+        kernel, focal = _accelerated(self._base.kernel, acceleration), self._base.focal / (1.0 - errors[FOCAL])
+        return replace(self._base, pairs=pairs, tracks=tracks, h=0.0, kernel=kernel, focal=focal)
 
     def derivatives(self, packed: Packed, acceleration: float, free: list[int]) -> tuple[FloatArray, FloatArray]:
         """Of the ends' rays and times by k free unknowns: (n, 2, k, 3) of pairs, (m, 4, k, 3) of tracks.

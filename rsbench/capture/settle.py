@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET, term_sizes
+from rsbench.capture.calibration_errors import FOCAL, NO_ERRORS, OFFSET, term_sizes
 from rsbench.capture.estimate import CERTAIN, Candidate, Capture, conclude, examine, nearly_global
 from rsbench.capture.evidence import Peak
 from rsbench.capture.hypotheses import ACCELERATION, CALIBRATION, MODELS, Known
@@ -88,7 +88,9 @@ def _errors_expected(matches: Correspondences, rig: StereoRig) -> tuple[float, .
         return NO_ERRORS
     camera = rig.camera
     rays = (0.5 * (stereo[:, :2] + stereo[:, 2:]) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    return tuple((sigma / np.maximum(term_sizes(rays, camera.fx), _LEAST_SIZE)).tolist())
+    out = sigma / np.maximum(term_sizes(rays, camera.fx), _LEAST_SIZE)
+    out[FOCAL] = 0.0  # what the rows show says nothing of it
+    return tuple(out.tolist())
 
 
 def _stereo(matches: Correspondences) -> FloatArray:

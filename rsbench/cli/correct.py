@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import typer
 
 from rsbench.cli.component_kinds import named
-from rsbench.cli.correct_input import EPILOG, given_frames, sized, target_row
+from rsbench.cli.correct_input import EPILOG, given_frames, sized, target_row, with_focal
 from rsbench.cli.correct_one_camera import (
     CameraFile,
     Footage,
@@ -157,9 +157,9 @@ def _correct_four(
     refuse_video(out)
     images = read_four(dict(zip(order, paths, strict=True)))  # pyrefly: ignore[bad-argument-type]
     rig = sized(card, images["left", 0])
-    height = rig.camera.height
-    options = replace(options, target_row=target_row(target, height))
+    options = replace(options, target_row=target_row(target, rig.camera.height))
     with fresh_folder(out) as folder:
+        rig, focal = with_focal(card, rig, [images], options)
         with progress_bar("correcting", 4) as advance:
             result = correct_four(
                 images,
@@ -176,6 +176,7 @@ def _correct_four(
             write_frame(folder, f"{side}_{frame}", fused)
         calibration = (card.calibration or NO_ERRORS) if result.found is None else result.found.calibration
         record = rig_record(rig, result.shutter, result.capture, options, calibration)
+        record["focal_note"] = focal
         record["motion"] = None if result.found is None else motion_record(result.found)
         record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in frames.items()}
         record["seconds"] = result.seconds

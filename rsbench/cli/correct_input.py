@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rsbench.core.rig import StereoRig
+    from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import FrameSource, RigCard
+    from rsbench.pipeline.frame_depth import Images
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -26,7 +29,7 @@ RIG.toml, for images of cameras side by side (pixels, metres; without readout_ra
   readout_ratio = 0.8        [dim]# readout time / frame period; or shutter = "gopro-hero6-4k30", of a real
                              # camera's mode (rsbench list shutters)[/dim]
   \\[camera]
-  fx = 812.3
+  fx = 812.3                 [dim]# focal_sigma = 8 beside it: not sure (812 +- 8), so it is found[/dim]
   fy = 812.3
   cx = 479.5
   cy = 269.5
@@ -144,3 +147,19 @@ def sized(card: RigCard, image: Any) -> StereoRig:
         return card.rig(width, height)
     except ValueError as error:
         raise RsbenchError(f"--rig: of images of {width} x {height} pixels: {error}") from error
+
+
+def with_focal(
+    card: RigCard, rig: StereoRig, windows: Iterable[Images], options: CorrectionOptions
+) -> tuple[StereoRig, str]:
+    """The rig with the focal length that frames show, where its card is not sure, and words for it; else empty."""
+    from rsbench.cli.console import progress_bar
+    from rsbench.pipeline.focal_of_frames import focal_of_frames
+
+    sigma = card.camera.focal_sigma
+    if not sigma:
+        return rig, ""
+    with progress_bar("looking at the focal length", 1) as advance:
+        found = focal_of_frames(windows, rig, sigma, options, card.readout_ratio, card.scanning)
+        advance("")
+    return found.rig, found.words(rig, sigma)

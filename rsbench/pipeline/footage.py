@@ -20,6 +20,7 @@ from rsbench.components.cards import parse_card, read_toml
 from rsbench.components.shutters import SHUTTER_KEY, with_shutter
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
+from rsbench.core.given import check_number
 from rsbench.core.lens import Lens
 from rsbench.core.rig import StereoRig, View
 from rsbench.core.shutter import RollingShutter, Scanning, StatedShutter
@@ -47,6 +48,12 @@ class CameraCard:
     """Row of the principal point, pixels."""
     lens: Lens | None = None
     """Distortion of the lens. Absent: images without distortion."""
+    focal_sigma: float = 0.0
+    """Standard deviation of fx, pixels (fx = 520 +- 20): the focal length is then found with the motion. Absent:
+    it is exact."""
+
+    def __post_init__(self) -> None:
+        check_number("focal_sigma", self.focal_sigma, least=0.0, most=0.3 * abs(self.fx))
 
 
 @dataclass(frozen=True, kw_only=True)
