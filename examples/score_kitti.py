@@ -31,6 +31,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.focal_of_frames import focal_of_frames, spread_windows
 from rsbench.pipeline.footage import FrameSource, read_frame
 from rsbench.pipeline.frame_matches import match_frames
 from rsbench.pipeline.frame_motion import solve_frames
@@ -132,6 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--right", default="image_1")
     parser.add_argument("--ratio", type=readout_ratio, default=0.0, help="readout ratio from 0 to 1, or none")
     parser.add_argument("--focal", type=factor, default=1.0, help="tried focal length over the card's, 0.5 to 2")
+    parser.add_argument("--focal-sigma", type=float, default=0.0, help="px: how sure it is; it is then found")
     parser.add_argument("--every", type=step, default=1, help="score every n-th window")
     parser.add_argument("--trajectory", action="store_true", help="one trajectory through all windows")
     given = parser.parse_args(arguments)
@@ -183,7 +185,11 @@ def score(given: argparse.Namespace) -> list[str]:
         raise RsbenchError(
             f"{given.folder}: {len(files[0])} left and {len(files[1])} right images, {len(poses)} poses"
         )
-    ratio, lines = given.ratio, []
+    ratio, lines = given.ratio, list[str]()
+    if given.focal_sigma:
+        found = focal_of_frames(spread_windows(*sources), rig, given.focal_sigma, options, ratio)
+        lines.append(found.words(rig, given.focal_sigma))
+        rig = found.rig
     capture, calibration = None, NO_ERRORS
     try:
         capture, shutter = estimate_sequence_capture(sources[0], sources[1], rig, options, ratio)

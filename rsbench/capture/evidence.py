@@ -277,17 +277,15 @@ def _fitted(
 
     Those that cannot come near the best one are given up on the way.
     """
-    out, least = list[CaptureFit](), np.inf
-    fits = sorted(fits, key=lambda fit: fit.cost)
+    out, fits = list[CaptureFit](), sorted(fits, key=lambda fit: fit.cost)
     pairs = dict.fromkeys((fit.hypothesis.scans, fit.hypothesis.motion_model) for fit in fits)
     for (scans, model), delayed in product(pairs, delays):
         hypothesis = Hypothesis(scans=scans, motion_model=model, delayed=delayed)
         of_pair = [f for f in fits if (f.hypothesis.scans, f.hypothesis.motion_model) == (scans, model)]
         start = _start_from(timed, known, min(of_pair, key=lambda fit: fit.cost), hypothesis)
         cost = _cost(timed, likelihood, known, hypothesis)
-        far = least + _CLOSE * likelihood.scale**2
+        far = min((fit.cost for fit in out), default=np.inf) + _CLOSE * likelihood.scale**2
         out.append(fit_capture(cost, *start, iterations=8, still=_ROUGHLY, hopeless=far))
-        least = min(least, out[-1].cost)
     return out
 
 

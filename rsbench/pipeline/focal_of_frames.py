@@ -16,7 +16,7 @@ from rsbench.pipeline.frame_depth import Images
 from rsbench.pipeline.frame_matches import match_frames, match_unknown
 from rsbench.pipeline.sequence_windows import window_images
 
-_WINDOWS = 4
+_WINDOWS = 8
 """At most, of a sequence."""
 
 
