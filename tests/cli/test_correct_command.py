@@ -108,6 +108,23 @@ def test_four_frames(tmp_path: Path, castle: Sequence, frames: list[Path], rig: 
     assert (out / "corrected" / "left_0.png").read_bytes() == before
 
 
+def test_a_focal_length_that_is_not_sure_is_looked_for_and_told(
+    tmp_path: Path, castle: Sequence, frames: list[Path], rig: Path
+) -> None:
+    """What is found of frames this small is anybody's guess: told with the card's, and used, or the card's is."""
+    fx, out = castle.rig.camera.fx, tmp_path / "out"
+    rig.write_text(rig.read_text().replace("[camera]", f"[camera]\nfocal_sigma = {0.1 * fx}"))
+    result = correct(*frames, "--rig", rig, "--out", out)
+    assert result.returncode == 0, result.stderr
+    record = json.loads((out / "motion.json").read_text("utf-8"))
+    assert record["focal_note"] in result.stdout and f"(card: {fx:.1f} +- {0.1 * fx:.1f})" in record["focal_note"]
+    assert ("cannot tell" in record["focal_note"]) == (record["camera"]["fx"] == fx)
+    looked = run_here("inspect", *frames, "--rig", rig)
+    assert looked.returncode in (0, 1) and record["focal_note"] in looked.stderr
+    rig.write_text(rig.read_text().replace(f"focal_sigma = {0.1 * fx}", "focal_sigma = -1"))
+    assert_refused(correct(*frames, "--rig", rig, "--out", tmp_path / "other"), "focal_sigma = -1")
+
+
 def test_a_sequence_of_folders(tmp_path: Path, frames: list[Path], rig: Path) -> None:
     for number, path in enumerate(frames):
         side = tmp_path / ("left", "right")[number % 2]
@@ -153,6 +170,7 @@ def footage(tmp_path: Path, castle: Sequence, rig: Path) -> tuple[object, ...]:
             if frame is not None:
                 image = castle.image("rs", side, frame)
             write_png(tmp_path / side / f"{number}.png", image)
+    rig.write_text(rig.read_text().replace("[camera]", "[camera]\nfocal_sigma = 3"))
     given = ("--left", tmp_path / "left", "--right", tmp_path / "right", "--rig", rig)
     return (*given, "--row-poses", "--out")
 

@@ -155,6 +155,9 @@ def test_bad_input_is_refused_in_one_line_and_nothing_is_left(folder: Path) -> N
     assert unknown.returncode == 1 and "cannot tell the readout ratio" in unknown.stderr
     (folder / "camera.toml").write_text("readout_ratio = 1.0\nfov_deg = 180.0\n")
     assert_refused(_correct(folder, first, folder / "1.png"), "fov_deg")
+    intrinsics = "fx = 300\nfy = 300\ncx = 99.5\ncy = 74.5\n"
+    (folder / "camera.toml").write_text(f"readout_ratio = 1.0\n[camera]\n{intrinsics}focal_sigma = 9\n")
+    assert_refused(_correct(folder, first, folder / "1.png"), "focal_sigma")
     assert not (folder / "out").exists()
 
 
