@@ -11,7 +11,7 @@ from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.capture.estimate import Capture, _product, conclude, examine
 from rsbench.capture.evidence import Peak
 from rsbench.capture.fit import CaptureFit
-from rsbench.capture.hypotheses import DELAY, LEAST_RATIO, Hypothesis, Known
+from rsbench.capture.hypotheses import DELAY, LEAST_RATIO, RATIO, UNKNOWNS, Hypothesis, Known
 from rsbench.capture.scans import ALL_SCANS, Scans, TimedMatches, line_of, scans_of
 from rsbench.capture.start import find_lag, first_shutter
 from rsbench.core.camera import PinholeCamera
@@ -20,6 +20,7 @@ from rsbench.core.lens import Lens
 from rsbench.core.motion import AcceleratedMotion, InertialMotion, LinearMotion, Motion, TwistMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
+from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.packed import pack
 
 CAMERA = PinholeCamera.centred(640, 480, 600.0)
@@ -94,6 +95,13 @@ def test_what_moves_along_its_rows_does_not_show_their_readout() -> None:
     }
 
 
+def unknowns(ratio: float, delay: float) -> FloatArray:
+    """Of cameras whose calibration is right."""
+    out = np.zeros(UNKNOWNS)
+    out[[RATIO, DELAY]] = ratio, delay
+    return out
+
+
 @pytest.mark.parametrize("lens", [None, Lens(model="brown-conrady", k1=-0.1)])
 @pytest.mark.parametrize(("scan", "right"), [("top", "bottom"), ("left", "top"), ("right", "right")])
 def test_times_are_those_of_the_shutter(lens: Lens | None, scan: Scan, right: Scan) -> None:
@@ -108,18 +116,18 @@ def test_times_are_those_of_the_shutter(lens: Lens | None, scan: Scan, right: Sc
     )
     expected = pack(given, rig, known)
     timed = TimedMatches(given, rig)
-    found = timed.packed(scans_of(known), np.array([0.6, 0.05, 0.0, 0.0]))
+    found = timed.packed(scans_of(known), unknowns(0.6, 0.05))
     np.testing.assert_allclose(found.pairs, expected.pairs, atol=1e-12)
     np.testing.assert_allclose(found.tracks, expected.tracks, atol=1e-12)
     some = np.arange(timed.count) % 2 == 0
-    halved = timed.subset(some).packed(scans_of(known), np.array([0.6, 0.05, 0.0, 0.0]))
+    halved = timed.subset(some).packed(scans_of(known), unknowns(0.6, 0.05))
     np.testing.assert_array_equal(halved.tracks, found.only(some).tracks)
     np.testing.assert_array_equal(halved.pairs, found.only(some).pairs)
 
 
 def test_a_global_camera_reads_everything_at_once() -> None:
     given = Correspondences(tracks=np.random.default_rng(1).uniform(100, 380, (6, 8)))
-    tracks = TimedMatches(given, RIG).packed(Scans("global", "top"), np.array([0.6, 0.0, 0.0, 0.0])).tracks
+    tracks = TimedMatches(given, RIG).packed(Scans("global", "top"), unknowns(0.6, 0.0)).tracks
     np.testing.assert_array_equal(tracks[:, [0, 2], 2], np.tile([0.0, 1.0], (6, 1)))
     np.testing.assert_allclose(tracks[:, 1, 2], 0.6 * given.tracks[:, 3] / 480)
     assert not np.any(tracks[:, [0, 2], 7:9])
