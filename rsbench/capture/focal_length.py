@@ -93,12 +93,12 @@ def _error_of(
     """The share by which the focal length is too short, and its deviation; None where the windows do not tell."""
     scanning = scanning if readout_ratio is None else scanning or Scanning()
     known = known_of(windows[0], rig, readout_ratio, scanning)
-    sigmas, least = list(known.calibration_sigma), _FEWEST_TURNS if any(known.calibration_sigma) else 1
+    sigmas, rows_differ = list(known.calibration_sigma), any(known.calibration_sigma)
     sigmas[FOCAL] = prior
     known = replace(known, calibration_sigma=tuple(sigmas))
     examined = [(each, examine(each, rig, known, robust, seed)) for each in windows]
     turning = [(each, window) for each, window in examined if _turn(window) >= _LEAST_TURN]
-    if len(turning) < least:
+    if not turning:
         return None
     capture = conclude([window for _, window in turning])
     if readout_ratio is None:
@@ -106,7 +106,10 @@ def _error_of(
     best = capture.likeliest
     if best is None or best.probability < CERTAIN:
         return None
-    left_over = _LEFT_OVER if least > 1 else 0.0
+    errs = rows_differ and best.scans.together  # of cameras that read apart the rows differ anyway
+    if errs and len(turning) < _FEWEST_TURNS:
+        return None
+    left_over = _LEFT_OVER if errs else 0.0
     return best.calibration[FOCAL], float(np.hypot(best.calibration_sigma[FOCAL], left_over))
 
 
