@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rsbench.capture.calibration_errors import NO_ERRORS, recalibrated
+from rsbench.capture.calibration_errors import NO_ERRORS, CardSigma, recalibrated
 from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.trajectory_stream import stream_trajectory
 from rsbench.core import so3
@@ -31,8 +31,8 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.focal_of_frames import focal_of_frames, spread_windows
 from rsbench.pipeline.footage import FrameSource, read_frame
+from rsbench.pipeline.found_camera import camera_of_frames, spread_windows
 from rsbench.pipeline.frame_matches import match_frames
 from rsbench.pipeline.frame_motion import solve_frames
 from rsbench.pipeline.sequence_capture import estimate_sequence_capture
@@ -134,6 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--ratio", type=readout_ratio, default=0.0, help="readout ratio from 0 to 1, or none")
     parser.add_argument("--focal", type=factor, default=1.0, help="tried focal length over the card's, 0.5 to 2")
     parser.add_argument("--focal-sigma", type=float, default=0.0, help="px: how sure it is; it is then found")
+    parser.add_argument("--k1-sigma", type=float, default=0.0, help="of the lens that undistortion left; likewise")
     parser.add_argument("--every", type=step, default=1, help="score every n-th window")
     parser.add_argument("--trajectory", action="store_true", help="one trajectory through all windows")
     given = parser.parse_args(arguments)
@@ -186,9 +187,9 @@ def score(given: argparse.Namespace) -> list[str]:
             f"{given.folder}: {len(files[0])} left and {len(files[1])} right images, {len(poses)} poses"
         )
     ratio, lines = given.ratio, list[str]()
-    if given.focal_sigma:
-        found = focal_of_frames(spread_windows(*sources), rig, given.focal_sigma, options, ratio)
-        lines.append(found.words(rig, given.focal_sigma))
+    if sigma := CardSigma(focal=given.focal_sigma, k1=given.k1_sigma):
+        found = camera_of_frames(spread_windows(*sources), rig, sigma, options, ratio)
+        lines.append(found.words(rig, sigma))
         rig = found.rig
     capture, calibration = None, NO_ERRORS
     try:

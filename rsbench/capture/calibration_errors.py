@@ -8,7 +8,7 @@ Here each is a shift of the rays of both cameras, linear in its number, so that 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,8 +38,27 @@ of 1, x, y, xy (to first order errors of the relative rotation and focal lengths
 share by which both focal lengths are too short."""
 OFFSET = 0
 BENDS, ROWS, LENS, FOCAL = slice(1, 6), slice(6, 10), slice(10, 13), 13
+RADIAL = LENS.start
+STRETCHING = (RADIAL, FOCAL)
+"""Those that change how many pixels an error of a ray is by more than a hundredth."""
+_STEP = 1e-5
+_STEPS = _STEP * np.eye(2)
 NO_ERRORS = (0.0,) * len(TERMS)
 _HALF: dict[Side, float] = {"left": 0.5, "right": -0.5}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CardSigma:
+    """How sure a card is of a camera: standard deviations; 0: it is exact."""
+
+    focal: float = 0.0
+    """px, of fx; fy goes with it."""
+    k1: float = 0.0
+    """Of the lens; where there is none, of what undistortion left."""
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to find."""
+        return self.focal > 0.0 or self.k1 > 0.0
 
 
 def ray_shifts(rays: FloatArray, side: Side, focal: float, lens: Lens | None = None) -> FloatArray:
@@ -54,13 +73,30 @@ def ray_shifts(rays: FloatArray, side: Side, focal: float, lens: Lens | None = N
     out[..., BENDS, 0] = half * np.stack([x, y, x * x, x * y, y * y], axis=-1)
     out[..., ROWS, 1] = half * row_terms(x, y)
     out[..., LENS, :] = lens_terms(x, y)
-    out[..., FOCAL, :] = rays
-    if lens is not None:
-        distorted = lens.distort(rays)
-        back = inverse_2x2(distorted.jacobian)
-        for term, shift in ((FOCAL, distorted.xy), (LENS.start, out[..., LENS.start, :])):
-            out[..., term, :] = (back @ shift[..., None])[..., 0]
+    out[..., STRETCHING, :] = _stretching_shifts(rays, lens)
     return out
+
+
+def _stretching_shifts(rays: FloatArray, lens: Lens | None) -> FloatArray:
+    """(..., 2, 2) those of ``STRETCHING``: of the distorted rays, taken back through the lens."""
+    square = np.sum(rays**2, axis=-1, keepdims=True)
+    if lens is None:
+        return np.stack([square * rays, rays], axis=-2)
+    distorted, radial = lens.distort(rays), square
+    if lens.model == "kannala-brandt":  # whose k1 is of the angle from the axis, not of its tangent
+        radius = np.sqrt(square)
+        radial = np.arctan(radius) ** 3 / np.where(radius > 0.0, radius, 1.0)
+    shifts = np.stack([radial * rays, distorted.xy], axis=-1)
+    return np.asarray((inverse_2x2(distorted.jacobian) @ shifts).swapaxes(-1, -2))
+
+
+def ray_stretches(rays: FloatArray, lens: Lens | None = None) -> FloatArray:
+    """(..., 2, 2, 2) derivative by the ray, the last axis, of what 1 of each of ``STRETCHING`` shifts it by.
+
+    By central differences, whose own error is of the square of the step.
+    """
+    ends = [_stretching_shifts(rays + step, lens) - _stretching_shifts(rays - step, lens) for step in _STEPS]
+    return np.stack(ends, axis=-1) / (2.0 * _STEP)
 
 
 def term_sizes(rays: FloatArray, focal: float) -> FloatArray:

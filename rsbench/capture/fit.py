@@ -10,14 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsbench.capture.calibration_errors import FOCAL
+from rsbench.capture.calibration_errors import STRETCHING
 from rsbench.capture.hypotheses import ACCELERATION, CALIBRATION, LEAST_RATIO, RATIO, UNKNOWNS, Hypothesis
 from rsbench.capture.scans import TimedMatches
 from rsbench.core.correspondences import BoolArray
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.capture_terms import add_pairs, add_tracks
 from rsbench.solvers.engine.heavy_tails import HeavyTailed
-from rsbench.solvers.engine.kernels import BEHIND
 
 BEYOND_RATIO = 1.2
 """No ratio is beyond 1, but the top of what noise makes of one near 1 may be."""
@@ -27,7 +26,9 @@ _MOST = np.array([BEYOND_RATIO, 1.0, 3.0, *10 * [50.0], *3 * [2.0], 0.4])
 _LONGEST_STEP = np.array([0.4, 0.4, 0.3, 2.0, *9 * [20.0], *3 * [0.2], 0.1])
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-8, 1e6
 """A motion makes up for most of a wrong ratio: more damping than this would hold the ratio where it is."""
-_MOTION, _FOCAL = 6, CALIBRATION.start + FOCAL
+_MOTION = 6
+_STRETCHING = tuple(CALIBRATION.start + term for term in STRETCHING)
+_STEP = 1e-7
 _OVER = 5.0
 """Times Newton's prediction that a cost may fall, at most."""
 _MEDIAN, LEAST_SCALE_PX = 0.6, 0.005
@@ -117,11 +118,9 @@ class CaptureCost:
         at, focal, baseline = (theta, packed.kernel), packed.focal, packed.baseline
         cost = add_pairs(*at, packed.pairs, by[0], focal, tails, trust[:n], gradient, H)
         cost += add_tracks(*at, packed.tracks, by[1], focal, baseline, tails, trust[n:], gradient, H)
-        if _FOCAL in free:  # by which the same errors of rays are more pixels
-            tailed = HeavyTailed(**vars(packed), nu=self.likelihood.nu, scale=self.likelihood.scale, trust=trust)
-            squares = _squares(tailed, theta)
-            stretch = tailed.weights(squares)[squares < BEHIND] @ squares[squares < BEHIND]
-            gradient[_MOTION + free.index(_FOCAL)] += stretch / (1.0 - unknowns[_FOCAL])
+        for unknown in set(_STRETCHING) & set(free):  # by which the same errors of rays are more pixels, too
+            ahead = float(np.sum(self.each(theta, unknowns + _STEP * np.eye(UNKNOWNS)[unknown])))
+            gradient[_MOTION + free.index(unknown)] = (ahead - cost) / _STEP  # finds it to half a step
         gradient[_MOTION:] += self._weight[free] * unknowns[free]
         H[range(_MOTION, size), range(_MOTION, size)] += self._weight[free]
         return cost + 0.5 * float(self._weight @ unknowns**2), gradient, H

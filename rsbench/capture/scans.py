@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from rsbench.capture.calibration_errors import FOCAL, ray_shifts
+from rsbench.capture.calibration_errors import STRETCHING, ray_shifts, ray_stretches
 from rsbench.core.correspondences import BoolArray, Correspondences, unlinked_pairs
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
@@ -134,7 +134,7 @@ class TimedMatches:
         sets = [getattr(matches, side)[unlinked_pairs(matches, side)] for side in SIDES]
         self.pixels: FloatArray = np.concatenate([*(each[:, :2] for each in sets), matches.tracks[:, :2]])
         """(count, 2) where each is seen in frame 0."""
-        self._shifts = self._ray_shifts(rig)
+        self._shifts, self._stretches = self._ray_shifts(rig), self._ray_stretches(rig)
         self._lines["global"] = _Lines(
             pairs=np.zeros((pairs, 2)),
             slopes=np.zeros((pairs, 2)),
@@ -150,6 +150,11 @@ class TimedMatches:
         tracks = [ray_shifts(base.tracks[:, k, :2], SIDES[k % 2], *optics) for k in range(4)]
         found = np.where(self.left[:, None, None, None], *either), np.stack(tracks, axis=1)
         return np.ascontiguousarray(found[0].swapaxes(2, 3)), np.ascontiguousarray(found[1].swapaxes(2, 3))
+
+    def _ray_stretches(self, rig: StereoRig) -> tuple[FloatArray, FloatArray]:
+        """(n, 2, 2, 2, 2) of the pairs' ends and (m, 4, 2, 2, 2) of the tracks', see ``ray_stretches``."""
+        pairs, tracks = self._base.pairs[:, :4].reshape(-1, 2, 2), self._base.tracks[:, :, :2]
+        return ray_stretches(pairs, rig.camera.lens), ray_stretches(tracks, rig.camera.lens)
 
     def under(self, motion_model: str) -> TimedMatches:
         """The same matches under another motion model."""
@@ -168,6 +173,7 @@ class TimedMatches:
             int(np.count_nonzero(chosen)),
         )
         other._shifts = self._shifts[0][pairs], self._shifts[1][tracks]
+        other._stretches = self._stretches[0][pairs], self._stretches[1][tracks]
         other._lines = {start: lines.only(pairs, tracks) for start, lines in self._lines.items()}
         return other
 
@@ -183,8 +189,8 @@ class TimedMatches:
             tracks=np.where(of_left, left.tracks, right.tracks),
             track_slopes=np.where(of_left[:, None], left.track_slopes, right.track_slopes),
         )
-        shifts = self._shifts[0][pairs], self._shifts[1][tracks]
-        return ReadMatches(self._base.only(chosen), self.left[pairs], lines, shifts)
+        shifts, stretches = ((each[0][pairs], each[1][tracks]) for each in (self._shifts, self._stretches))
+        return ReadMatches(self._base.only(chosen), self.left[pairs], lines, shifts, stretches)
 
     def packed(self, scans: Scans, unknowns: FloatArray) -> Packed:
         """The measurements as these scans time them, see ``ReadMatches.packed``."""
@@ -199,9 +205,14 @@ class ReadMatches:
     """Matches as two cameras read them, one scan each, but for the unknowns of their capture."""
 
     def __init__(
-        self, base: Packed, left: BoolArray, lines: _Lines, shifts: tuple[FloatArray, FloatArray]
+        self,
+        base: Packed,
+        left: BoolArray,
+        lines: _Lines,
+        shifts: tuple[FloatArray, FloatArray],
+        stretches: tuple[FloatArray, FloatArray],
     ) -> None:
-        self._base, self._lines, self._shifts = base, lines, shifts
+        self._base, self._lines, self._shifts, self._stretches = base, lines, shifts, stretches
         self.count = len(base.pairs) + len(base.tracks)
         self._late = np.where(left, 0.0, 1.0)[:, None]
         """(n, 1) of the pairs, 1 of those of the right camera."""
@@ -223,8 +234,19 @@ class ReadMatches:
         if any(errors):
             pairs[:, :4] -= (self._shifts[0] @ errors).reshape(-1, 4)
             tracks[:, :, :2] -= self._shifts[1] @ errors
-        kernel, focal = _accelerated(self._base.kernel, acceleration), self._base.focal / (1.0 - errors[FOCAL])
-        return replace(self._base, pairs=pairs, tracks=tracks, h=0.0, kernel=kernel, focal=focal)
+        if any(stretching := [errors[term] for term in STRETCHING]):
+            ends = self._stretched(pairs[:, 7:15].reshape(-1, 2, 4), self._stretches[0], stretching)
+            pairs[:, 7:15] = ends.reshape(-1, 8)
+            tracks[:, :, 3:7] = self._stretched(tracks[:, :, 3:7], self._stretches[1], stretching)
+        kernel = _accelerated(self._base.kernel, acceleration)
+        return replace(self._base, pairs=pairs, tracks=tracks, h=0.0, kernel=kernel)
+
+    def _stretched(self, by_pixel: FloatArray, stretches: FloatArray, errors: list[float]) -> FloatArray:
+        """Derivatives (n, k, 4) of the ideal pixels by the pixels, of rays that errors shift unevenly."""
+        fx, fy = self._base.focal
+        by_ray = np.eye(2) - np.einsum("k,...kij->...ij", errors, stretches)
+        by_ray = by_ray * [[1.0, fx / fy], [fy / fx, 1.0]]
+        return np.asarray((by_ray @ by_pixel.reshape(*by_pixel.shape[:-1], 2, 2)).reshape(by_pixel.shape))
 
     def derivatives(self, packed: Packed, acceleration: float, free: list[int]) -> tuple[FloatArray, FloatArray]:
         """Of the ends' rays and times by k free unknowns: (n, 2, k, 3) of pairs, (m, 4, k, 3) of tracks.

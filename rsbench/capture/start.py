@@ -85,15 +85,19 @@ def _columns(pixels: FloatArray, rig: StereoRig) -> FloatArray:
 
 
 def with_lag_taken(matches: Correspondences, lag: Lag, rig: StereoRig) -> Correspondences:
-    """The matches as the right camera would have had them at the left one's times, to first order."""
-    tracks, right = matches.tracks.copy(), matches.right.copy()
+    """The ideal matches as the right camera would have had them at the left one's times, to first order.
+
+    In ideal pixels, for a lens shows no ray at some of the pixels that a lag may lead to.
+    """
+    ideal = without_lens(matches, rig.camera)
+    tracks, right = ideal.tracks.copy(), ideal.right.copy()
     moved = tracks[:, 6:8] - tracks[:, 2:4]
-    tracks[:, 2:4] += lag.at(tracks[:, 0:2], rig)[:, None] * moved
-    tracks[:, 6:8] += lag.at(tracks[:, 4:6], rig)[:, None] * moved
+    tracks[:, 2:4] += lag.at(matches.tracks[:, 0:2], rig)[:, None] * moved
+    tracks[:, 6:8] += lag.at(matches.tracks[:, 4:6], rig)[:, None] * moved
     moved = right[:, 2:4] - right[:, 0:2]
-    right[:, 0:2] += lag.at(right[:, 0:2], rig)[:, None] * moved
-    right[:, 2:4] += lag.at(right[:, 2:4], rig)[:, None] * moved
-    return Correspondences(left=matches.left, right=right, tracks=tracks)
+    right[:, 0:2] += lag.at(matches.right[:, 0:2], rig)[:, None] * moved
+    right[:, 2:4] += lag.at(matches.right[:, 2:4], rig)[:, None] * moved
+    return Correspondences(left=ideal.left, right=right, tracks=tracks)
 
 
 def find_start(
@@ -104,7 +108,7 @@ def find_start(
     A lens is taken from the matches beforehand: their times are then a little off, as they are under any of these.
     """
     lag = find_lag(matches.tracks, rig)
-    taken = without_lens(with_lag_taken(matches, lag, rig), rig.camera)
+    taken = with_lag_taken(matches, lag, rig)
     rig, camera, found = rig.ideal, rig.camera, list[RobustEstimate]()
     for scan, ratio in _coarse(known):
         shutter = RollingShutter(height=camera.height, width=camera.width, readout_ratio=ratio, scan=scan)

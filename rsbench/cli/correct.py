@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import typer
 
 from rsbench.cli.component_kinds import named
-from rsbench.cli.correct_input import EPILOG, given_frames, sized, target_row, with_focal
+from rsbench.cli.correct_input import EPILOG, given_frames, sized, target_row, with_found_camera
 from rsbench.cli.correct_one_camera import (
     CameraFile,
     Footage,
@@ -159,7 +159,7 @@ def _correct_four(
     rig = sized(card, images["left", 0])
     options = replace(options, target_row=target_row(target, rig.camera.height))
     with fresh_folder(out) as folder:
-        rig, focal = with_focal(card, rig, [images], options)
+        rig, focal = with_found_camera(card, rig, [images], options)
         with progress_bar("correcting", 4) as advance:
             result = correct_four(
                 images,
@@ -176,7 +176,7 @@ def _correct_four(
             write_frame(folder, f"{side}_{frame}", fused)
         calibration = (card.calibration or NO_ERRORS) if result.found is None else result.found.calibration
         record = rig_record(rig, result.shutter, result.capture, options, calibration)
-        record["focal_note"] = focal
+        record["calibration_note"] = focal
         record["motion"] = None if result.found is None else motion_record(result.found)
         record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in frames.items()}
         record["seconds"] = result.seconds

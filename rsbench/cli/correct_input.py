@@ -34,6 +34,7 @@ RIG.toml, for images of cameras side by side (pixels, metres; without readout_ra
   cx = 479.5
   cy = 269.5
   lens = { model = "brown-conrady", k1 = -0.2 }   [dim]# or kannala-brandt; without it: no distortion[/dim]
+  k1_sigma = 0.02            [dim]# k1 = -0.2 +- 0.02, likewise[/dim]
 
 Names: rsbench list solvers, matchers, features or correctors; a card's path ends in .toml.
 
@@ -149,17 +150,17 @@ def sized(card: RigCard, image: Any) -> StereoRig:
         raise RsbenchError(f"--rig: of images of {width} x {height} pixels: {error}") from error
 
 
-def with_focal(
+def with_found_camera(
     card: RigCard, rig: StereoRig, windows: Iterable[Images], options: CorrectionOptions
 ) -> tuple[StereoRig, str]:
-    """The rig with the focal length that frames show, where its card is not sure, and words for it; else empty."""
+    """The rig with the focal length and k1 that frames show, where its card is not sure; and words, else empty."""
     from rsbench.cli.console import progress_bar
-    from rsbench.pipeline.focal_of_frames import focal_of_frames
+    from rsbench.pipeline.found_camera import camera_of_frames
 
-    sigma = card.camera.focal_sigma
+    sigma = card.camera.sigma
     if not sigma:
         return rig, ""
-    with progress_bar("looking at the focal length", 1) as advance:
-        found = focal_of_frames(windows, rig, sigma, options, card.readout_ratio, card.scanning)
+    with progress_bar("looking at the calibration", 1) as advance:
+        found = camera_of_frames(windows, rig, sigma, options, card.readout_ratio, card.scanning)
         advance("")
     return found.rig, found.words(rig, sigma)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from rsbench.cli.correct_input import sized, target_row, with_focal
+from rsbench.cli.correct_input import sized, target_row, with_found_camera
 from rsbench.cli.correct_said import listed, readout_words, say_calibration, write_page_of
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def correct_sequence_given(given: Given, target: str, options: CorrectionOptions
     from rsbench.dataset.corrected_frames import fresh_folder, rig_record
     from rsbench.dataset.corrected_video import is_video, video_place
     from rsbench.pipeline.chain import check_cameras
-    from rsbench.pipeline.focal_of_frames import spread_windows
+    from rsbench.pipeline.found_camera import spread_windows
 
     sources, card, out = given.footage(), given.card, given.out
     rig = sized(card, next(iter(sources[0])))
@@ -43,9 +43,9 @@ def correct_sequence_given(given: Given, target: str, options: CorrectionOptions
     check_cameras(rig, card.scanning or Scanning(), options, card.disparity_offset)
     run = _run_key(given, sources, options, close)
     with video_place(out, run) if is_video(out) else fresh_folder(out, run=run) as folder:
-        rig, focal = with_focal(card, rig, spread_windows(*sources), options)
+        rig, focal = with_found_camera(card, rig, spread_windows(*sources), options)
         shutter, calibration, capture = found = _look(sources, rig, card, options)
-        record = {**rig_record(rig, shutter, capture, options, calibration), "focal_note": focal}
+        record = {**rig_record(rig, shutter, capture, options, calibration), "calibration_note": focal}
         record["frames"] = _correct_into(folder, sources, rig, found, options, close, given.row_poses)
         if is_video(out):
             _write_both(out, folder, sources, record)

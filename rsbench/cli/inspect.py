@@ -159,22 +159,22 @@ def _framed(name: str, left: FrameSource, right: FrameSource, card: Path, option
         shutter = None if ratio is None or scanning is None else scanning.shutter_of(width, height, ratio)
     except ValueError as error:
         raise RsbenchError(f"--rig: of images of {width} x {height} pixels: {error}") from error
-    if said.camera.focal_sigma:
-        rig = _with_focal(left, right, rig, said, options)
+    if said.camera.sigma:
+        rig = _with_found_camera(left, right, rig, said, options)
     return _Case(name, _frame_windows(left, right, rig, options), shutter)
 
 
-def _with_focal(
+def _with_found_camera(
     left: FrameSource, right: FrameSource, rig: StereoRig, said: RigCard, options: _Options
 ) -> StereoRig:
-    """The rig of a card that is not sure of its focal length; what was found goes to stderr."""
-    from rsbench.cli.correct_input import with_focal
+    """The rig of a card that is not sure of its cameras; what was found goes to stderr."""
+    from rsbench.cli.correct_input import with_found_camera
     from rsbench.pipeline.correction_options import CorrectionOptions
-    from rsbench.pipeline.focal_of_frames import spread_windows
+    from rsbench.pipeline.found_camera import spread_windows
     from rsbench.vision.feature_matcher import load_features
 
     chain = CorrectionOptions(features=load_features(options.features), seed=options.seed)
-    rig, words = with_focal(said, rig, spread_windows(left, right), chain)
+    rig, words = with_found_camera(said, rig, spread_windows(left, right), chain)
     typer.echo(words, err=True)
     return rig
 

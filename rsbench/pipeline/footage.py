@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration_errors import of_offset
+from rsbench.capture.calibration_errors import CardSigma, of_offset
 from rsbench.components.cards import parse_card, read_toml
 from rsbench.components.shutters import SHUTTER_KEY, with_shutter
 from rsbench.core.camera import PinholeCamera
@@ -51,9 +51,18 @@ class CameraCard:
     focal_sigma: float = 0.0
     """Standard deviation of fx, pixels (fx = 520 +- 20): the focal length is then found with the motion. Absent:
     it is exact."""
+    k1_sigma: float = 0.0
+    """Standard deviation of the lens's k1 (-0.20 +- 0.02), of 0 without a lens: it is then found with the motion.
+    Absent: it is exact."""
 
     def __post_init__(self) -> None:
         check_number("focal_sigma", self.focal_sigma, least=0.0, most=0.3 * abs(self.fx))
+        check_number("k1_sigma", self.k1_sigma, least=0.0, most=0.3)
+
+    @property
+    def sigma(self) -> CardSigma:
+        """How sure the card is of them."""
+        return CardSigma(focal=self.focal_sigma, k1=self.k1_sigma)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,8 +44,8 @@ class OneCameraCard:
             raise ValueError("fov_deg: leave it out beside [camera], which says the focal length")
         if self.camera is not None and self.camera.lens is not None:
             raise ValueError("camera.lens: leave it out; undistort frames of one camera first")
-        if self.camera is not None and self.camera.focal_sigma:
-            raise ValueError("camera.focal_sigma: leave it out; of one camera the focal length is not found")
+        if self.camera is not None and self.camera.sigma:
+            raise ValueError("camera.focal_sigma, k1_sigma: leave them out; of one camera neither is found")
 
     def camera_of(self, width: int, height: int) -> PinholeCamera:
         """The camera of images of this size."""

@@ -108,19 +108,24 @@ def test_four_frames(tmp_path: Path, castle: Sequence, frames: list[Path], rig: 
     assert (out / "corrected" / "left_0.png").read_bytes() == before
 
 
-def test_a_focal_length_that_is_not_sure_is_looked_for_and_told(
+def test_a_camera_that_is_not_sure_is_looked_for_and_told(
     tmp_path: Path, castle: Sequence, frames: list[Path], rig: Path
 ) -> None:
     """What is found of frames this small is anybody's guess: told with the card's, and used, or the card's is."""
     fx, out = castle.rig.camera.fx, tmp_path / "out"
-    rig.write_text(rig.read_text().replace("[camera]", f"[camera]\nfocal_sigma = {0.1 * fx}"))
+    rig.write_text(rig.read_text().replace("[camera]", f"[camera]\nk1_sigma = 0.02\nfocal_sigma = {0.1 * fx}"))
     result = correct(*frames, "--rig", rig, "--out", out)
     assert result.returncode == 0, result.stderr
     record = json.loads((out / "motion.json").read_text("utf-8"))
-    assert record["focal_note"] in result.stdout and f"(card: {fx:.1f} +- {0.1 * fx:.1f})" in record["focal_note"]
-    assert ("cannot tell" in record["focal_note"]) == (record["camera"]["fx"] == fx)
+    assert (
+        record["calibration_note"] in result.stdout
+        and f"(card: {fx:.1f} +- {0.1 * fx:.1f})" in record["calibration_note"]
+    )
+    focal, k1 = record["calibration_note"].split("; k1 ")
+    assert ("cannot tell" in focal) == (record["camera"]["fx"] == fx)
+    assert ("cannot tell" in k1) == (record["camera"].get("lens") is None) and "(card: 0.000 +- 0.020)" in k1
     looked = run_here("inspect", *frames, "--rig", rig)
-    assert looked.returncode in (0, 1) and record["focal_note"] in looked.stderr
+    assert looked.returncode in (0, 1) and record["calibration_note"] in looked.stderr
     rig.write_text(rig.read_text().replace(f"focal_sigma = {0.1 * fx}", "focal_sigma = -1"))
     assert_refused(correct(*frames, "--rig", rig, "--out", tmp_path / "other"), "focal_sigma = -1")
 

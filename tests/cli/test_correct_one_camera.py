@@ -157,7 +157,7 @@ def test_bad_input_is_refused_in_one_line_and_nothing_is_left(folder: Path) -> N
     assert_refused(_correct(folder, first, folder / "1.png"), "fov_deg")
     intrinsics = "fx = 300\nfy = 300\ncx = 99.5\ncy = 74.5\n"
     (folder / "camera.toml").write_text(f"readout_ratio = 1.0\n[camera]\n{intrinsics}focal_sigma = 9\n")
-    assert_refused(_correct(folder, first, folder / "1.png"), "focal_sigma")
+    assert_refused(_correct(folder, first, folder / "1.png"), "focal_sigma, k1_sigma")
     assert not (folder / "out").exists()
 
 

@@ -1,12 +1,13 @@
-"""The focal length of a rig whose card says how sure it is of it, from some of its frames."""
+"""The focal length and k1 of a rig whose card says how sure it is of them, from some of its frames."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import islice
 
-from rsbench.capture.focal_length import FoundFocal, find_focal
+from rsbench.capture.calibration_errors import CardSigma
 from rsbench.capture.rectification import RefusedFramesError
+from rsbench.capture.self_calibration import FoundCamera, find_camera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import Scanning
@@ -26,15 +27,15 @@ def spread_windows(left: FrameSource, right: FrameSource) -> Iterable[Images]:
     return islice(window_images(left, right), every // 2, None, every)
 
 
-def focal_of_frames(
+def camera_of_frames(
     windows: Iterable[Images],
     rig: StereoRig,
-    sigma: float,
+    sigma: CardSigma,
     options: CorrectionOptions,
     readout_ratio: float | None = None,
     scanning: Scanning | None = None,
-) -> FoundFocal:
-    """``find_focal`` from the matches of a few windows; those without matches say nothing.
+) -> FoundCamera:
+    """``find_camera`` from the matches of a few windows; those without matches say nothing.
 
     Args:
         readout_ratio, scanning: see ``solve_frames``.
@@ -49,5 +50,5 @@ def focal_of_frames(
         except RefusedFramesError:
             continue  # the correction says so of each
     if not matches:
-        return FoundFocal(rig=rig, sigma=sigma, told=False)
-    return find_focal(matches, rig, sigma, readout_ratio, scanning, options.robust, options.seed)
+        return FoundCamera(rig=rig, sigma=sigma, told=(False, False))
+    return find_camera(matches, rig, sigma, readout_ratio, scanning, options.robust, options.seed)
