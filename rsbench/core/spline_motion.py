@@ -267,7 +267,7 @@ def _spectral_spline(parameters: Mapping[str, Any]) -> _Spline:
     _only(parameters, "spectrum", "seed", "periods")
     interval = _interval(parameters)
     spectrum = ShakeSpectrum.of(parameters["spectrum"], interval)
-    times = interval * (np.arange(least_poses(interval, _periods(parameters))) - 1.0)
+    times = np.asarray(interval * (np.arange(least_poses(interval, _periods(parameters))) - 1.0), dtype=np.float64)
     poses = spectrum.control(times, interval, _generator("spectrum", parameters))
     return _Spline(interval, Pose(so3.exp(poses[:, :3]), poses[:, 3:]))
 

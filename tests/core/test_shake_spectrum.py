@@ -17,7 +17,7 @@ STILL = [0.0] * 6
 
 
 def _motion(bands: list[list[float]], path: list[float] = STILL, **others: Any) -> SplineMotion:
-    given = {"interval": 0.5, "spectrum": {"path": path, "bands": bands}, **others}
+    given: dict[str, Any] = {"interval": 0.5, "spectrum": {"path": path, "bands": bands}, **others}
     w, d = SplineMotion.endpoint(given) or (None, None)
     assert w is not None and d is not None
     return SplineMotion(w, d, **given)
@@ -27,7 +27,9 @@ def _power(values: FloatArray, cycles: float) -> tuple[FloatArray, FloatArray]:
     """Power (n, 3) by frequency (n,) of values (m, 3), ``cycles`` of which are a frame period."""
     window = np.hanning(len(values))[:, None]
     spectrum = np.abs(np.fft.rfft((values - values.mean(axis=0)) * window, axis=0)) ** 2
-    return np.fft.rfftfreq(len(values), 1.0 / cycles), spectrum / np.sum(window**2) * 2.0 / len(values)
+    return np.asarray(np.fft.rfftfreq(len(values), 1.0 / cycles), dtype=np.float64), spectrum / np.sum(
+        window**2
+    ) * 2.0 / len(values)
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.05, 0.1), (0.2, 0.4)])
