@@ -16,10 +16,7 @@ A row of the table is one method; the last table is of all sequences.
     failed      windows without a motion, which score the worst value
     s           seconds of a window, without the matches
 
-``trajectory`` is ``rsbench.estimate_trajectory``, ``correct`` what ``rsbench correct`` takes for footage;
-``linear`` and ``auto`` are independent windows under the paper's model and under the one that each prefers;
-``gs-vo`` is what a global shutter would have seen, with a constant twist between frames; ``gyro`` integrates the
-channel imu and knows no position; ``rolling`` corrects nothing; ``truth`` is the oracle.
+The methods are those of the leaderboard's track ``trajectory``, and the truth.
 """
 
 from __future__ import annotations
@@ -35,8 +32,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rsbench.benchmark.trajectory_methods import METHODS, Estimate, Problem
-from rsbench.benchmark.trajectory_scores import Truth, trajectory_scores
+from rsbench.benchmark.trajectory_methods import METHODS, Estimate, Given
+from rsbench.benchmark.trajectory_scores import TrueTrajectory, trajectory_scores
 from rsbench.components.cards import card_path
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
@@ -45,7 +42,8 @@ from rsbench.dataset.card import read_dataset_card
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.imu import gyro_samples
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.pipeline.chain import Given, correct_four
+from rsbench.pipeline import chain
+from rsbench.pipeline.chain import correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import frame_pairs
 from rsbench.pipeline.frame_matches import find_matches_of_rig
@@ -96,7 +94,7 @@ def _pictures(sequence: Sequence) -> Iterator[tuple[Any, ...]]:
 
 def _fused(pair: Sequence, motion: Motion, images: Any, pairs: Any) -> list[Any]:
     options, shutter = CorrectionOptions(), pair.shutter
-    given, view = Given(motion=motion, pairs=pairs), ("left", 0)
+    given, view = chain.Given(motion=motion, pairs=pairs), ("left", 0)
     rows = (float(shutter.height // 2),)
     ratio = shutter.readout_ratio
     found = correct_four(images, pair.rig, ratio, options, given=given, views=(view,), rows=rows)
@@ -114,7 +112,7 @@ def _drawn(pair: Sequence, motion: Motion | None, images: Any, pairs: Any) -> li
 # The table
 
 
-def problem_of(sequence: Sequence) -> Problem:
+def problem_of(sequence: Sequence) -> Given:
     """A sequence with the matches of our matcher."""
     options = CorrectionOptions()
     matches = list[Correspondences]()
@@ -123,16 +121,16 @@ def problem_of(sequence: Sequence) -> Problem:
         matches.append(find_matches_of_rig(images, pair.rig, pair.shutter.scanning, options))
     inertial = sequence.inertial() if "imu" in sequence.channels else None
     gyro = None if inertial is None else gyro_samples(inertial, sequence.frame_period_s)
-    return Problem(rig=sequence.rig, shutter=sequence.shutter, matches=matches, gyro=gyro)
+    return Given(rig=sequence.rig, shutter=sequence.shutter, matches=matches, gyro=gyro)
 
 
 def table(sequence: Sequence, entries: list[str], psnr: bool) -> dict[str, Scores]:
     """Scores of entries by name."""
-    problem, truth, found = problem_of(sequence), Truth.of(sequence), dict[str, Scores]()
+    problem, truth, found = problem_of(sequence), TrueTrajectory.of(sequence), dict[str, Scores]()
     pictures = list(_pictures(sequence)) if psnr else []
     for name in entries:
         began = time.perf_counter()
-        estimate = truth.estimate if name == "truth" else METHODS[name](problem)
+        estimate = truth.estimate if name == "truth" else METHODS[name].solve(problem)
         if estimate is None:
             continue
         spent = (time.perf_counter() - began) / len(problem.matches)
@@ -163,10 +161,10 @@ def _say(line: str) -> None:
 
 def _print(title: str, found: dict[str, Scores]) -> None:
     shown = [key for key in COLUMNS if any(np.isfinite(each.get(key, np.nan)) for each in found.values())]
-    _say(f"\n{title}\n{'':11}" + "".join(f"{COLUMNS[key]:>11}" for key in shown))
+    _say(f"\n{title}\n{'':23}" + "".join(f"{COLUMNS[key]:>11}" for key in shown))
     for name, each in found.items():
         values = (each.get(key, np.nan) for key in shown)
-        _say(f"{name:11}" + "".join(f"{'-' if np.isnan(value) else f'{value:.4g}':>11}" for value in values))
+        _say(f"{name:23}" + "".join(f"{'-' if np.isnan(value) else f'{value:.4g}':>11}" for value in values))
 
 
 def main() -> int:

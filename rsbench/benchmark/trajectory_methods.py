@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -79,7 +80,7 @@ def chained(windows: list[Motion | None]) -> Estimate:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Problem:
+class Given:
     """What methods are given."""
 
     rig: StereoRig
@@ -91,15 +92,15 @@ class Problem:
     seed: int = 0
 
 
-def _trajectory(problem: Problem) -> Estimate:
-    found = estimate_trajectory(problem.matches, problem.rig, problem.shutter, seed=problem.seed)
-    return along(found.motion, len(problem.matches))
+def _trajectory(given: Given) -> Estimate:
+    found = estimate_trajectory(given.matches, given.rig, given.shutter, seed=given.seed)
+    return along(found.motion, len(given.matches))
 
 
-def _correct(problem: Problem) -> Estimate:
-    options = CorrectionOptions(motion_model=AUTO, seed=problem.seed)
-    windows = (Window(images={}, pairs=None, found=None, matches=each) for each in problem.matches)
-    found = list(on_one_trajectory(windows, problem.rig, problem.shutter, options, NO_ERRORS))
+def _correct(given: Given) -> Estimate:
+    options = CorrectionOptions(motion_model=AUTO, seed=given.seed)
+    windows = (Window(images={}, pairs=None, found=None, matches=each) for each in given.matches)
+    found = list(on_one_trajectory(windows, given.rig, given.shutter, options, NO_ERRORS))
     motions = [None if each.found is None else each.found.motion for each in found]
     unknown = Pose(np.full((3, 3), np.nan), np.full(3, np.nan))
     poses = [each.pose or unknown for each in found]
@@ -107,12 +108,12 @@ def _correct(problem: Problem) -> Estimate:
     return Estimate(windows=motions, starts=starts, failed=sum(motion is None for motion in motions))
 
 
-def _windows(model: str | None) -> Callable[[Problem], Estimate]:
-    def solve(problem: Problem) -> Estimate:
-        options, motions = CorrectionOptions(motion_model=model, seed=problem.seed), list[Motion | None]()
-        for matches in problem.matches:
+def _windows(model: str | None) -> Callable[[Given], Estimate]:
+    def solve(given: Given) -> Estimate:
+        options, motions = CorrectionOptions(motion_model=model, seed=given.seed), list[Motion | None]()
+        for matches in given.matches:
             try:
-                motions.append(find_motion(matches, problem.rig, problem.shutter, options).motion)
+                motions.append(find_motion(matches, given.rig, given.shutter, options).motion)
             except NoMotionError:
                 motions.append(None)
         return chained(motions)
@@ -120,8 +121,8 @@ def _windows(model: str | None) -> Callable[[Problem], Estimate]:
     return solve
 
 
-def _global_shutter(problem: Problem) -> Estimate:
-    return chained([pnp_motion(each.tracks, problem.rig) for each in problem.matches])
+def _global_shutter(given: Given) -> Estimate:
+    return chained([pnp_motion(each.tracks, given.rig) for each in given.matches])
 
 
 def pnp_motion(tracks: FloatArray, rig: StereoRig) -> Motion | None:
@@ -143,23 +144,57 @@ def pnp_motion(tracks: FloatArray, rig: StereoRig) -> Motion | None:
     return TwistMotion(w, shift[:, 0] + so3.exp(w) @ offset - offset)
 
 
-def _gyro(problem: Problem) -> Estimate | None:
-    if problem.gyro is None:
+def _gyro(given: Given) -> Estimate | None:
+    if given.gyro is None:
         return None
-    return along(GyroMotion(problem.gyro, np.zeros(3)), len(problem.matches), positions=False)
+    return along(GyroMotion(given.gyro, np.zeros(3)), len(given.matches), positions=False)
 
 
-def _rolling(problem: Problem) -> Estimate:
-    return along(LinearMotion(np.zeros(3), np.zeros(3)), len(problem.matches))
+def _rolling(given: Given) -> Estimate:
+    return along(LinearMotion(np.zeros(3), np.zeros(3)), len(given.matches))
 
 
-METHODS: dict[str, Callable[[Problem], Estimate | None]] = {
-    "trajectory": _trajectory,
-    "correct": _correct,
-    "auto": _windows(AUTO),
-    "linear": _windows(None),
-    "gs-vo": _global_shutter,
-    "gyro": _gyro,
-    "rolling": _rolling,
+class Method(NamedTuple):
+    """A way to a trajectory."""
+
+    solve: Callable[[Given], Estimate | None]
+    """None where it is not given what it needs."""
+    uses: tuple[str, ...]
+    """Of what the leaderboard gives."""
+    motion_model: str
+    """That it assumes, as the header of a submission says it."""
+    description: str
+
+
+_MATCHES = ("left", "right", "links")
+METHODS: dict[str, Method] = {
+    "rs-trajectory": Method(
+        _trajectory,
+        (*_MATCHES, "readout"),
+        "spline",
+        "One spline through all windows, as rsbench.estimate_trajectory",
+    ),
+    "rs-trajectory-streamed": Method(
+        _correct, (*_MATCHES, "readout"), "spline", "The same some windows at a time, as rsbench correct does"
+    ),
+    "windows-auto": Method(
+        _windows(AUTO),
+        (*_MATCHES, "readout"),
+        "chosen",
+        "Each window by itself, under the motion model that its matches prefer",
+    ),
+    "windows-linear": Method(
+        _windows(None), (*_MATCHES, "readout"), "linear", "Each window by itself, under the paper's motion model"
+    ),
+    "gs-vo": Method(
+        _global_shutter,
+        _MATCHES,
+        "none",
+        "Stereo odometry of a global shutter: P3P in RANSAC of each window, refined; OpenCV",
+    ),
+    "gyro-integrated": Method(
+        _gyro, ("gyro",), "spline", "The integral of the gyroscope, biases and all; no position"
+    ),
+    "no-motion": Method(_rolling, ("readout",), "none", "A rig that stands still"),
 }
-"""By name; None where a method is not given what it needs."""
+"""By the name on a board."""

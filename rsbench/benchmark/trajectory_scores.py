@@ -16,9 +16,14 @@ from rsbench.core import so3
 from rsbench.core.pose_errors import WORST_ANGLE
 from rsbench.core.projection import back_project, rs_project
 from rsbench.core.se3 import Pose, compose, inverse, transform
+from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence
 
+LINES = 9
+"""Of a frame that are scored."""
+AUC_DEG = {"auc_way": 0.1, "auc_rows": 0.02}
+"""Thresholds of the areas under the curves of errors of lines against the sequence's and the frame's first one."""
 _POINTS_PX = 16
 """Between points of the middle frame whose ways are followed."""
 
@@ -77,7 +82,7 @@ def jitter(estimate: FloatArray, truth: FloatArray) -> float:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Truth:
+class TrueTrajectory:
     """What trajectories of a sequence are compared with."""
 
     sequence: Sequence
@@ -86,7 +91,7 @@ class Truth:
     estimate: Estimate
 
     @classmethod
-    def of(cls, sequence: Sequence) -> Truth:
+    def of(cls, sequence: Sequence) -> TrueTrajectory:
         middle = sequence.frames // 2
         depth = sequence.depth("rs", "left", middle)[::_POINTS_PX, ::_POINTS_PX]
         grid = sequence.rig.camera.pixel_grid()[::_POINTS_PX, ::_POINTS_PX]
@@ -95,13 +100,19 @@ class Truth:
         return cls(sequence=sequence, points=points, estimate=along(sequence.motion, sequence.frames - 1))
 
 
-def trajectory_scores(truth: Truth, estimate: Estimate) -> dict[str, float]:
-    """All but PSNR; NaN where the entry says nothing of it."""
+def scored_times(shutter: RollingShutter, frame: int, count: int = LINES) -> FloatArray:
+    """Times (count,) of lines of the left camera, even from the first to the last one."""
+    tau = np.sort(shutter.line_times(frame, "left"))
+    return tau[np.round(np.linspace(0.0, len(tau) - 1.0, count)).astype(np.int64)]
+
+
+def trajectory_scores(truth: TrueTrajectory, estimate: Estimate) -> dict[str, float]:
+    """Scores of a trajectory; NaN where it says nothing of it."""
     sequence, frames = truth.sequence, range(truth.sequence.frames)
     rows, way = list[FloatArray](), [list[Pose](), list[Pose]()]
     for frame in frames:
-        tau = sequence.shutter.line_times(frame, "left")
-        poses = [each.within(frame, np.sort(tau)) for each in (estimate, truth.estimate)]
+        tau = scored_times(sequence.shutter, frame)
+        poses = [each.within(frame, tau) for each in (estimate, truth.estimate)]
         rows.append(turn_errors(poses[0].R, poses[1].R))
         for kept, pose, each in zip(way, poses, (estimate, truth.estimate), strict=True):
             kept.append(compose(pose, each.start(frame)))
@@ -113,6 +124,8 @@ def trajectory_scores(truth: Truth, estimate: Estimate) -> dict[str, float]:
         "rows_95_deg": float(np.quantile(own, 0.95)),
         "way_median_deg": float(np.median(gone)),
         "way_95_deg": float(np.quantile(gone, 0.95)),
+        "auc_rows": float(np.mean(np.clip(1.0 - own / AUC_DEG["auc_rows"], 0.0, None))),
+        "auc_way": float(np.mean(np.clip(1.0 - gone / AUC_DEG["auc_way"], 0.0, None))),
         "failed": float(estimate.failed),
     }
     starts = [_starts(each, len(frames)) for each in (estimate, truth.estimate)]
@@ -131,12 +144,12 @@ def _starts(estimate: Estimate, frames: int) -> Pose:
     return Pose(np.stack([each.R for each in poses]), np.stack([each.t for each in poses]))
 
 
-def _jitter(truth: Truth, estimate: Estimate) -> float:
+def _jitter(truth: TrueTrajectory, estimate: Estimate) -> float:
     both = [_corrected_places(truth, each) for each in (estimate, truth.estimate)]
     return jitter(*both)
 
 
-def _corrected_places(truth: Truth, estimate: Estimate) -> FloatArray:
+def _corrected_places(truth: TrueTrajectory, estimate: Estimate) -> FloatArray:
     """Where points (frames, n, 2) stand in left frames corrected with a trajectory and their true depth, px."""
     sequence, places = truth.sequence, list[FloatArray]()
     rig, offset = sequence.rig, sequence.rig.offset("left")
