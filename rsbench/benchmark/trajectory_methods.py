@@ -127,11 +127,12 @@ def _global_shutter(given: Given) -> Estimate:
 
 def pnp_motion(tracks: FloatArray, rig: StereoRig) -> Motion | None:
     """The motion that tracks (n, 8) show to a global shutter; None where there is none."""
-    tracks = with_depth(tracks)
+    tracks = with_depth(rig.camera.ideal_pixels(tracks.reshape(-1, 4, 2)).reshape(-1, 8))
+    rig = rig.ideal
     if len(tracks) < _FEWEST:
         return None
     points = stereo_points(tracks, rig) + rig.offset("left")
-    pixels, K = rig.camera.ideal_pixels(tracks[:, 4:6]), rig.camera.ideal.K
+    pixels, K = np.ascontiguousarray(tracks[:, 4:6]), rig.camera.K
     cv2.setRNGSeed(0)
     good, turn, shift, inliers = cv2.solvePnPRansac(
         points, pixels, K, None, iterationsCount=_DRAWS, reprojectionError=_INLIER_PX, flags=cv2.SOLVEPNP_P3P

@@ -35,7 +35,7 @@ _TOLERANCE = 1e-12
 _SAME = 1e-9
 """Largest difference of w and d that are still those of given poses."""
 _MAX_ITERATIONS = 100
-_LONGEST = 1e4
+_LONGEST, _MOST_DRAWN = 1e4, 20_000
 
 
 class Shake(NamedTuple):
@@ -108,7 +108,9 @@ class SplineMotion(Motion):
         parameters = {key: value for key, value in chosen.items() if value is not None}
         fixed = self.endpoint(parameters)
         if fixed is not None and np.max(np.abs(np.concatenate(fixed) - [*self.w, *self.d])) > _SAME:
-            raise ValueError("w and d of a spline with poses are those of its poses, and were given otherwise")
+            raise ValueError(
+                "w and d of a spline with poses or a spectrum are those of its poses, and were given otherwise"
+            )
         step, offsets = _shake(parameters)
         offsets.setflags(write=False)
         object.__setattr__(self, "interval", step)
@@ -267,7 +269,12 @@ def _spectral_spline(parameters: Mapping[str, Any]) -> _Spline:
     _only(parameters, "spectrum", "seed", "periods")
     interval = _interval(parameters)
     spectrum = ShakeSpectrum.of(parameters["spectrum"], interval)
-    times = np.asarray(interval * (np.arange(least_poses(interval, _periods(parameters))) - 1.0), dtype=np.float64)
+    count = least_poses(interval, _periods(parameters))
+    if count > _MOST_DRAWN:
+        raise ValueError(
+            f"interval = {interval:g}: too small: {count} control poses, at most {_MOST_DRAWN} are drawn"
+        )
+    times = np.asarray(interval * (np.arange(count) - 1.0), dtype=np.float64)
     poses = spectrum.control(times, interval, _generator("spectrum", parameters))
     return _Spline(interval, Pose(so3.exp(poses[:, :3]), poses[:, 3:]))
 

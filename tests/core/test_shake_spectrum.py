@@ -94,6 +94,8 @@ def test_a_spectrum_excludes_other_shakes() -> None:
     spectrum = {"path": STILL, "bands": [[0.1, 0.2, 0.1, 0.0]]}
     with pytest.raises(ValueError, match="spectrum and preset exclude each other"):
         SplineMotion.endpoint({"interval": 0.5, "spectrum": spectrum, "preset": "handheld"})
+    with pytest.raises(ValueError, match="at most 20000 are drawn"):
+        SplineMotion.endpoint({"interval": 1e-6, "spectrum": spectrum})
 
 
 def test_the_card_handheld_turns_as_fast_as_it_says() -> None:

@@ -26,7 +26,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.jobs.isolation import EntryFailure, use_one_thread
+from rsbench.jobs.isolation import use_one_thread
 from rsbench.jobs.workers import Workers
 from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.warm_up import warm_up
@@ -132,10 +132,8 @@ def _serve(track: Track, inputs: Path, limits: Limits) -> Callable[[_Job], None]
     def run(job: _Job) -> None:
         try:
             answer = _solve(job, sequences[job.name])
-        except RsbenchError as error:
-            answer = {"success": False, "reason": str(error)[:300]}
-        except (ValueError, ArithmeticError) as error:
-            raise EntryFailure(f"{job}: {error}") from error
+        except (RsbenchError, ValueError, ArithmeticError) as error:  # such as matches that determine nothing
+            answer = {"success": False, "reason": " ".join(str(error).split())[:300]}
         job.path.parent.mkdir(parents=True, exist_ok=True)
         write_json(job.path, {"name": job.name, **answer})
 
