@@ -134,7 +134,10 @@ class TrajectoryTrack(FrameTrack):
     name, id = "trajectory", "trajectory-1"
     title = "Trajectory of whole sequences from given matches"
     allowed = ("left", "right", "links", "readout", "gyro")
-    given = "matches of each two successive frames by rsbench's SIFT; a gyroscope's samples where there are some"
+    given = (
+        "matches of each two successive frames by rsbench's SIFT; samples of a gyroscope where the dataset has "
+        "the channel imu"
+    )
     scores = _SCORES
     error, error_title = "error", "1 - AUC way"
     exact = ("way_95_deg", 1e-6)
