@@ -34,8 +34,9 @@ from rsbench.storage.files import sha256, write_bytes, write_json
 
 _MOST_POSES = 500
 """Of an answer: a line of a file of answers has its length."""
-_APART = 1e-6
-"""Frame periods, at least, between two poses: a readout of a whole period meets the next frame."""
+APART = 1e-5
+"""Frame periods, at least, between two poses of an answer: rows are farther apart, and a spline through nearer
+ones may go anywhere."""
 
 
 class _Job(NamedTuple):
@@ -62,7 +63,7 @@ def answer_of(estimate: Estimate, shutter: RollingShutter, frames: int) -> dict[
             raise RsbenchError(f"no motion from frame {frame} on: {estimate.failed} windows have none")
         rows.append(np.concatenate([tau[:, None], t, so3.quaternion(R)[:, [1, 2, 3, 0]]], axis=1))
     found = np.concatenate(rows)
-    found = found[np.append(True, np.diff(found[:, 0]) > _APART)]
+    found = found[np.append(True, np.diff(found[:, 0]) > APART)]
     return {"poses": np.round(found, 10).tolist(), "metric": estimate.positions}
 
 

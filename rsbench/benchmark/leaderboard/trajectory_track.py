@@ -21,7 +21,7 @@ from rsbench.benchmark.leaderboard.marking import last, named
 from rsbench.benchmark.leaderboard.splits import Split, Truth, label_of, truth_of
 from rsbench.benchmark.leaderboard.submissions import Submission, template_text, truth_text
 from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Limits, Row, Score, Step
-from rsbench.benchmark.leaderboard.trajectory_running import answer_of, run_methods
+from rsbench.benchmark.leaderboard.trajectory_running import APART, answer_of, run_methods
 from rsbench.benchmark.trajectory_methods import METHODS, along
 from rsbench.benchmark.trajectory_scores import AUC_DEG, TrueTrajectory, trajectory_scores
 from rsbench.components.cards import choices
@@ -111,6 +111,9 @@ class TrajectoryAnswer(Answer):
             raise ValueError(f"poses: numbers must lie within {LARGEST:g} of 0")
         if np.any(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0) > _UNIT):
             raise ValueError("poses: a quaternion is not of length 1; a row is tau, tx, ty, tz, qx, qy, qz, qw")
+        apart = float(np.min(np.diff(rows[:, 0])))
+        if 0.0 < apart < APART:
+            raise ValueError(f"poses: two are {apart:g} frame periods apart: must be {APART:g} or more")
         _ = self.motion
 
     @property
@@ -251,7 +254,8 @@ class TrajectoryTrack(FrameTrack):
 
 def _is_inverted(answer: TrajectoryAnswer, truth: Truth) -> bool:
     """Whether a trajectory is much nearer to the truth when each pose is inverted."""
-    tau = np.arange(0.0, answer.motion.lasts + 1e-9)
+    assert truth.sequence is not None
+    tau = np.arange(float(truth.sequence.frames))
     found, true = (each.body_from_world(tau).R for each in (answer.motion, truth.motion))
     as_is, turned = (np.max(so3.angle(R @ np.swapaxes(true, 1, 2))) for R in (found, np.swapaxes(found, 1, 2)))
     return bool(_INVERTED * turned < as_is)

@@ -114,6 +114,7 @@ GOOD = _poses(np.arange(float(FRAMES)))
         ({"poses": [*GOOD[:2], *GOOD[:2]]}, "later than the one before"),
         ({"poses": [[row[0], 1e12, *row[2:]] for row in GOOD]}, "within 1e\\+09"),
         ({"poses": [[*row[:4], 0.0, 0.0, float(k % 2), 1.0 - k % 2] for k, row in enumerate(GOOD)]}, "90 degrees"),
+        ({"poses": [GOOD[0], [1e-30, *GOOD[1][1:]], *GOOD[1:]]}, "1e-30 frame periods apart"),
         ({"poses": GOOD[:-1]}, "must reach from 0 to 4"),
         ({"poses": [[row[0] + 0.1, *row[1:]] for row in GOOD]}, "0.1|time 0"),
         ({"poses": GOOD, "w": [0.0, 0.0, 0.0]}, "w: is not asked"),
@@ -128,6 +129,15 @@ def test_what_is_no_trajectory_is_a_fault(
     assert found.submission is None and len(found.faults) == 1
     with pytest.raises(RsbenchError, match=words):
         read_submission(path, split)
+
+
+def test_poses_of_another_age_cost_nothing(split: Split, tmp_path: Path) -> None:
+    """Times and places are limited by 1e9 alone: nothing may be made for each frame period of them."""
+    poses = [[-1e9, *GOOD[0][1:]], *GOOD, [1e9, *GOOD[0][1:]]]
+    row = _scored(split, tmp_path, poses=poses, metric=True)
+    assert row["ate_mm"] < 1e-3 and row["rows_95_deg"] > 0.02
+    far = _scored(split, tmp_path, poses=[[pose[0], 1e9, *pose[2:]] for pose in GOOD], metric=True)
+    assert far["auc_way"] > 0.0 and np.isfinite(far["ate_mm"])
 
 
 def test_inverted_poses_are_noted(split: Split, tmp_path: Path) -> None:
