@@ -17,7 +17,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.corrected_frames import join_poses, rig_record, write_frame, write_poses, write_record
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.storage.files import read_json, write_json
+from rsbench.storage.files import read_json, write_json, write_png
 from rsbench.storage.work_folder import HIDDEN, remove
 from rsbench.vision.fusion import Fused, Origin
 
@@ -96,7 +96,7 @@ def test_colmap_gets_corrected_frames_with_the_poses_of_their_time(tmp_path: Pat
     """Points come from the depth of the left frame: each must lie in the right frame where its colour is."""
     sequence = _corrected(data, tmp_path / "walk", row, rows=row > 0)
     note = _export(tmp_path / "walk", "colmap", tmp_path / "out")["walk"]
-    assert note["frames"] == FRAMES - 1 and "1 frames with a pose were not corrected" in note["told"][0]
+    assert note["frames"] == FRAMES - 1 and "1 frames of the trajectory were not corrected" in note["told"][0]
     folder = tmp_path / "out/walk"
     found = _images(folder / "sparse/images.txt")
     assert sorted(found) == sorted(path.name for path in (folder / "images").iterdir())
@@ -136,6 +136,39 @@ def test_options_that_cannot_be_are_one_line(
 ) -> None:
     _corrected(data, tmp_path / "walk")
     assert_refused(run_here("export", tmp_path / "walk", "--out", tmp_path / "out", *options), *words)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_lens_stays_a_lens(tmp_path: Path) -> None:
+    _corrected(dataset(tmp_path / "data", "brown", frames=FRAMES), tmp_path / "walk")
+    _export(tmp_path / "walk", "colmap", tmp_path / "out")
+    line = (tmp_path / "out/walk/sparse/cameras.txt").read_text("utf-8").splitlines()[0].split()
+    assert line[1] == "OPENCV" and [float(word) for word in line[4:]] == [
+        60,
+        61,
+        31,
+        25.5,
+        -0.1,
+        0.02,
+        0.001,
+        -0.002,
+    ]
+
+
+def test_a_frame_whose_row_has_no_pose_is_left_out(tmp_path: Path, data: Path) -> None:
+    _corrected(data, tmp_path / "walk", HEIGHT // 2, rows=True)
+    path = tmp_path / "walk/row_poses.csv"
+    lines = path.read_text("utf-8").splitlines(keepends=True)
+    path.write_text("".join(lines[: 1 + 2 * HEIGHT]), newline="\n")
+    note = _export(tmp_path / "walk", "colmap", tmp_path / "out")["walk"]
+    assert note["frames"] == 2 and "2 frames of the trajectory" in note["told"][0]
+
+
+def test_a_picture_of_another_size_is_one_line(tmp_path: Path, data: Path) -> None:
+    _corrected(data, tmp_path / "walk")
+    write_png(tmp_path / "walk/corrected/left_000001.png", np.zeros((8, 8, 3), dtype=np.uint8))
+    result = run_here("export", tmp_path / "walk", "--to", "colmap", "--out", tmp_path / "out")
+    assert_refused(result, "left_000001.png")
     assert not (tmp_path / "out").exists()
 
 

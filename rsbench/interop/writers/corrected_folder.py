@@ -184,7 +184,8 @@ def _write_colmap(corrected: Corrected, folder: Path) -> dict[str, Any]:
     for name, content in (("cameras", cameras), ("images", lines), ("points3D", points)):
         write_lines(sparse / f"{name}.txt", content)
     left_out = len(corrected.times) - len(frames)
-    told = [f"{left_out} frames with a pose were not corrected, and are left out"] if left_out else []
+    words = "frames of the trajectory were not corrected, or have no pose at their row, and are left out"
+    told = [f"{left_out} {words}"] if left_out else []
     return {"frames": len(frames), "points": len(points), "told": told}
 
 
@@ -214,7 +215,8 @@ def _at_row(corrected: Corrected) -> tuple[FloatArray, Pose]:
     wanted = corrected.shutter.time_after(corrected.row, corrected.times, "left")
     near = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
     near -= wanted - times[near - 1] < times[near] - wanted
-    return corrected.times, Pose(poses.R[near], poses.t[near])
+    known = np.abs(times[near] - wanted) <= corrected.shutter.readout_ratio / corrected.shutter.height
+    return corrected.times[known], Pose(poses.R[near[known]], poses.t[near[known]])
 
 
 def _points(corrected: Corrected, frame: int, left: Pose, step: int, before: int) -> list[str]:
@@ -223,12 +225,16 @@ def _points(corrected: Corrected, frame: int, left: Pose, step: int, before: int
     path = corrected.folder / "depth" / f"{stem}.exr"
     if not path.is_file():
         return []
-    depth = read_depth(path)[cut, cut]
-    image = read_corrected(corrected.folder, stem)[cut, cut]
+    camera = corrected.rig.camera
+    depth = read_depth(path, (camera.width, camera.height))[cut, cut]
+    image = read_corrected(corrected.folder, stem)
+    if image.shape[:2] != (camera.height, camera.width):
+        raise RsbenchError(f"{corrected.folder}: {stem}.png is not of the size that {MARKER} says; correct again")
+    image = image[cut, cut]
     grey = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image[..., :3]
     colours = (grey >> 8 if grey.dtype == np.uint16 else grey)[depth > 0.0]
-    pixels = corrected.rig.camera.pixel_grid()[cut, cut][depth > 0.0]
-    x = depth[depth > 0.0][:, None] * corrected.rig.camera.unproject(pixels)
+    pixels = camera.pixel_grid()[cut, cut][depth > 0.0]
+    x = depth[depth > 0.0][:, None] * camera.unproject(pixels)
     world = transform(inverse(left), x)
     return [
         f"{before + k} {numbers(place)} {' '.join(map(str, colour))} {number(0.0)}"
