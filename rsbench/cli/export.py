@@ -18,7 +18,9 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench export data/paper --to gsplat --out out/gsplat --sequence castle
 
-  rsbench export data/paper --to webdataset --out out/shards"""
+  rsbench export data/paper --to webdataset --out out/shards
+
+  rsbench export corrected --to colmap --out out/map    [dim](what rsbench correct made of footage)[/dim]"""
 
 
 class Target(StrEnum):
@@ -44,7 +46,10 @@ class Pictures(StrEnum):
 
 
 def export(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with a dataset.json.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="DIR", help="Folder with a dataset.json, or of corrected footage (motion.json)."),
+    ],
     to: Annotated[Target, typer.Option(help="Format; the document 'export' says what each holds.")],
     out: Annotated[Path, typer.Option(help="Folder that appears when all is written.")],
     images: Annotated[
@@ -55,7 +60,10 @@ def export(
         list[str] | None, typer.Option("--sequence", "--only", help="Only this sequence; repeatable.")
     ] = None,
 ) -> None:
-    """Write a dataset in the layout of COLMAP, evo and others; say or refuse what a format cannot hold."""
+    """Write a dataset, or corrected footage, in the layout of COLMAP, evo and others.
+
+    What a format cannot hold is said or refused.
+    """
     from rsbench.cli.console import late_progress, say
     from rsbench.interop.writers.exporter import export_dataset
 

@@ -45,6 +45,12 @@ EPILOG = """[bold]Examples[/bold]
 
 More: [bold]rsbench docs submit[/bold] and [bold]rsbench docs protocols[/bold]"""
 
+_SHOWN = (
+    *("e_R_deg", "e_T_deg", "e_readout", "abs_rel", "psnr", "epe_px"),
+    *("way_median_deg", "rows_median_deg", "ate_mm", "jitter_px"),
+)
+"""Keys of the scores whose medians tables on a terminal have."""
+
 board_app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", epilog=EPILOG)
 
 _Board = Annotated[Path, typer.Option(help="Folder of the board.")]
@@ -150,7 +156,7 @@ def run(
     entry: Annotated[
         list[str],
         typer.Option(
-            help="Solver, stereo matcher (depth) or corrector (correction, -mono), a name or a card; repeatable.",
+            help="Solver, stereo matcher (depth), corrector (correction, -mono), method (trajectory); repeatable.",
             autocompletion=complete("solvers"),
         ),
     ],
@@ -342,7 +348,7 @@ def _cells(line: Standing) -> dict[str, str]:
     for score in line.track.scores:
         if score.key in ("flip", "failure"):
             cells[score.title] = f"{100.0 * line.means[score.key][0]:.1f} %"
-        elif score.key in ("e_R_deg", "e_T_deg", "e_readout", "abs_rel", "psnr", "epe_px"):
+        elif score.key in _SHOWN:
             cells[score.title.removesuffix(" (deg)")] = _number(line.medians[score.key])
     return cells
 

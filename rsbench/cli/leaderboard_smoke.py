@@ -102,7 +102,9 @@ def _jobs(tracks: Sequence[str] | None, entries: Sequence[str] | None) -> list[J
         taken |= set(names)
         jobs += [Job(track, (name,)) for name in names] if track == "points" else [Job(track, names)][: len(names)]
     if not jobs and entries is None:
-        raise RsbenchError(f"--track {', '.join(chosen)}: has no smoke run, its first protocol has")
+        raise RsbenchError(
+            f"--track {', '.join(chosen)}: has no smoke run; there are: {', '.join(('points', *ENTRIES))}"
+        )
     for name in entries or ():
         if name not in taken:
             raise RsbenchError(f"--entry {name}: is not run on {', '.join(chosen)}")

@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from rsbench.core import given, se3, so3
 from rsbench.core.motion import Motion
 from rsbench.core.se3 import Pose, compose, inverse
+from rsbench.core.shake_spectrum import ShakeSpectrum
 from rsbench.core.so3 import FloatArray
 
 LAST = 2.0
@@ -34,7 +35,7 @@ _TOLERANCE = 1e-12
 _SAME = 1e-9
 """Largest difference of w and d that are still those of given poses."""
 _MAX_ITERATIONS = 100
-_LONGEST = 1e4
+_LONGEST, _MOST_DRAWN = 1e4, 20_000
 
 
 class Shake(NamedTuple):
@@ -85,13 +86,15 @@ class SplineMotion(Motion):
         shake: ArrayLike | None = None,
         poses: ArrayLike | None = None,
         periods: float | None = None,
+        spectrum: Mapping[str, Any] | None = None,
     ) -> None:
-        """From ``preset`` ("handheld") and ``seed`` (0), or ``interval`` and one of ``shake`` and ``poses``.
+        """From ``preset`` ("handheld") and ``seed`` (0), or ``interval`` and ``shake``, ``poses`` or ``spectrum``.
 
         Args:
-            periods: until when a preset's shake lasts, frame periods; a longer one begins as a shorter one does.
+            periods: until when a shake that is drawn lasts, frame periods; a longer one begins as a shorter one.
             poses: (n, 6) rotation vectors (radians) and translations (metres) of the body's control poses;
                 w and d must be their ``endpoint``.
+            spectrum: ``path`` and ``bands``, see ``ShakeSpectrum.of``; ``seed`` draws; w and d as of ``poses``.
 
         Raises:
             ValueError: another combination, too few control poses, a half turn or more, or a shake so strong
@@ -101,11 +104,13 @@ class SplineMotion(Motion):
         if float(np.linalg.norm(self.w)) >= np.pi:
             raise ValueError(f"w of a spline must be below a half turn, got {self.w.tolist()}")
         chosen = {"preset": preset, "seed": seed, "interval": interval, "shake": shake, "poses": poses}
-        chosen["periods"] = periods
+        chosen |= {"periods": periods, "spectrum": spectrum}
         parameters = {key: value for key, value in chosen.items() if value is not None}
         fixed = self.endpoint(parameters)
         if fixed is not None and np.max(np.abs(np.concatenate(fixed) - [*self.w, *self.d])) > _SAME:
-            raise ValueError("w and d of a spline with poses are those of its poses, and were given otherwise")
+            raise ValueError(
+                "w and d of a spline with poses or a spectrum are those of its poses, and were given otherwise"
+            )
         step, offsets = _shake(parameters)
         offsets.setflags(write=False)
         object.__setattr__(self, "interval", step)
@@ -148,7 +153,7 @@ class SplineMotion(Motion):
 
     @classmethod
     def endpoint(cls, parameters: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
-        if parameters.get("poses") is None:
+        if parameters.get("poses") is None and parameters.get("spectrum") is None:
             return None
         R, t = _given_spline(parameters).from_start(1.0)
         return so3.log(R), t
@@ -216,7 +221,7 @@ class _Spline:
 
 def _shake(parameters: Mapping[str, Any]) -> tuple[float, FloatArray]:
     """Interval and shake (n, 6) that the parameters of ``SplineMotion`` mean."""
-    if "poses" in parameters:
+    if "poses" in parameters or "spectrum" in parameters:
         spline = _given_spline(parameters)
         xi = se3.log(spline.from_start(1.0))
         anchored = compose(spline.control, inverse(spline.at(0.0)[0]))
@@ -224,32 +229,58 @@ def _shake(parameters: Mapping[str, Any]) -> tuple[float, FloatArray]:
     if "shake" in parameters:
         _only(parameters, "shake")
         return _interval(parameters), _twists(parameters["shake"], _interval(parameters), "shake")
-    preset, seed = parameters.get("preset", "handheld"), parameters.get("seed", 0)
+    preset = parameters.get("preset", "handheld")
     if preset not in PRESETS:
         raise ValueError(f"preset = {preset!r}: must be one of {', '.join(PRESETS)}")
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ValueError(f"seed = {seed!r}: must be a whole number, not negative")
     if "interval" in parameters:
-        raise ValueError("interval goes with shake or poses; a preset has its own")
-    periods = parameters.get("periods", LAST)
-    if isinstance(periods, bool) or not isinstance(periods, int | float) or not LAST <= periods <= _LONGEST:
-        raise ValueError(f"periods = {periods!r}: must be a number from {LAST:g} to {_LONGEST:g}")
+        raise ValueError("interval goes with shake or poses, or spectrum; a preset has its own")
     interval, rotation_deg, translation = PRESETS[preset]
-    digest = hashlib.sha256(f"{preset}/{seed}".encode()).digest()
-    rng = np.random.default_rng(int.from_bytes(digest[:16], "little"))
+    rng, periods = _generator(preset, parameters), _periods(parameters)
     sigma = np.concatenate([np.deg2rad(rotation_deg), translation])
     return interval, sigma * rng.standard_normal((least_poses(interval, periods), 6))
 
 
+def _generator(purpose: str, parameters: Mapping[str, Any]) -> np.random.Generator:
+    """What is drawn with the seed of the parameters."""
+    seed = parameters.get("seed", 0)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ValueError(f"seed = {seed!r}: must be a whole number, not negative")
+    digest = hashlib.sha256(f"{purpose}/{seed}".encode()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:16], "little"))
+
+
+def _periods(parameters: Mapping[str, Any]) -> float:
+    periods = parameters.get("periods", LAST)
+    if isinstance(periods, bool) or not isinstance(periods, int | float) or not LAST <= periods <= _LONGEST:
+        raise ValueError(f"periods = {periods!r}: must be a number from {LAST:g} to {_LONGEST:g}")
+    return float(periods)
+
+
 def _given_spline(parameters: Mapping[str, Any]) -> _Spline:
+    if "spectrum" in parameters:
+        return _spectral_spline(parameters)
     _only(parameters, "poses")
     interval = _interval(parameters)
     poses = _twists(parameters["poses"], interval, "poses")
     return _Spline(interval, Pose(so3.exp(poses[:, :3]), poses[:, 3:]))
 
 
-def _only(parameters: Mapping[str, Any], name: str) -> None:
-    others = set(parameters) - {"interval", name}
+def _spectral_spline(parameters: Mapping[str, Any]) -> _Spline:
+    _only(parameters, "spectrum", "seed", "periods")
+    interval = _interval(parameters)
+    spectrum = ShakeSpectrum.of(parameters["spectrum"], interval)
+    count = least_poses(interval, _periods(parameters))
+    if count > _MOST_DRAWN:
+        raise ValueError(
+            f"interval = {interval:g}: too small: {count} control poses, at most {_MOST_DRAWN} are drawn"
+        )
+    times = np.asarray(interval * (np.arange(count) - 1.0), dtype=np.float64)
+    poses = spectrum.control(times, interval, _generator("spectrum", parameters))
+    return _Spline(interval, Pose(so3.exp(poses[:, :3]), poses[:, 3:]))
+
+
+def _only(parameters: Mapping[str, Any], name: str, *more: str) -> None:
+    others = set(parameters) - {"interval", name, *more}
     if others:
         raise ValueError(f"{name} and {', '.join(sorted(others))} exclude each other")
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rsbench.benchmark.leaderboard.splits import Split, dataset_split
+from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import read_pairs
 from rsbench.report.board_answers import ERRORS, Named, answer_images, true_images
@@ -118,7 +118,7 @@ def _at_hand(each: Board, data: Sequence[Path]) -> tuple[Split | None, Path | No
     if each.pages and not each.facts.empty:
         for folder in data:
             try:
-                split = dataset_split(each.track, folder)
+                split = each.track.split(folder)
             except RsbenchError:
                 if not (folder / "dataset.json").is_file():
                     raise

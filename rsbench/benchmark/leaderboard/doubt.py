@@ -18,6 +18,7 @@ from rsbench.benchmark.leaderboard.track import ORACLE
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.bound import Bound
 from rsbench.benchmark.statistics import share_interval
+from rsbench.benchmark.trajectory_methods import METHODS
 from rsbench.components.cards import list_cards
 from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
@@ -37,7 +38,7 @@ def refuse_reserved(header: Header, where: str) -> None:
     if ORACLE in header.uses:
         return
     kinds = ("solvers", "matchers", "correctors")
-    if method.lower() in {*_ORACLES, *_BUILT_IN, *(name for kind in kinds for name in list_cards(kind))}:
+    if method.lower() in {*_ORACLES, *_BUILT_IN, *METHODS, *(name for kind in kinds for name in list_cards(kind))}:
         raise RsbenchError(
             f"{where}: method = {method!r}: is the name of a method of rsbench; choose another, such as "
             f"'{method}-mine'"

@@ -31,6 +31,10 @@ class FrameTrack(Track):
     rendered = True
 
     def split(self, data: Path | None, seed_file: Path | None = None, secret: bool = False) -> Split:
+        return dataset_split(self, self.source(data, seed_file), public=not secret)
+
+    def source(self, data: Path | None, seed_file: Path | None) -> Path:
+        """Folder of the dataset. Raises RsbenchError where the options name none, or another source."""
         if data is None:
             raise RsbenchError(
                 f"--data: the track {self.name!r} needs the folder of a dataset; make one with rsbench generate"
@@ -39,7 +43,7 @@ class FrameTrack(Track):
             raise RsbenchError(
                 f"--seed-file {seed_file}: a dataset has its own seed; leave it out, and say --secret"
             )
-        return dataset_split(self, data, public=not secret)
+        return data
 
     def problems(self, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
         assert data is not None
@@ -50,7 +54,12 @@ def matched_problems(data: Path) -> Iterator[Problem]:
     """Each sequence with its given matches; none where the frames show no texture."""
     options = CorrectionOptions(features=load_features(FEATURES))
     for sequence in read_pairs(data):
-        yield _problem(sequence, _matches(sequence, options))
+        yield matched(sequence, options)
+
+
+def matched(sequence: Sequence, options: CorrectionOptions) -> Problem:
+    """Two frames with their matches."""
+    return _problem(sequence, _matches(sequence, options))
 
 
 def bare_problems(data: Path) -> Iterator[Problem]:

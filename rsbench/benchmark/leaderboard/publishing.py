@@ -15,7 +15,7 @@ from pathlib import Path
 
 from rsbench.benchmark.leaderboard.exporting import check_place, write_inputs
 from rsbench.benchmark.leaderboard.frame_inputs import write_frames
-from rsbench.benchmark.leaderboard.splits import Split, dataset_split, truth_of
+from rsbench.benchmark.leaderboard.splits import Split, truth_of
 from rsbench.benchmark.leaderboard.track import Track
 from rsbench.components.cards import card_path, parse_card
 from rsbench.core.errors import RsbenchError
@@ -67,7 +67,7 @@ def drawn_split(track: Track, card: str, text: Secret) -> Split:
     Raises:
         RsbenchError: as ``secret_card``; or the track asks for what only rendering tells.
     """
-    if track.pictures:
+    if track.pictures or track.whole:
         raise RsbenchError(f"track {track.name!r}: its truth is rendered; name the keeper's folder with --keep")
     drawn = secret_card(card, secret_of(track, text))
     pairs = [pair for each in _sequences(drawn) for pair in each.pairs()]
@@ -113,7 +113,7 @@ def publish(
     drawn = secret_card(card, secret, keep / SCENES)
     write_scenes(card, secret, keep / SCENES)
     generate_dataset(drawn, data, workers=workers, progress=progress)
-    split = dataset_split(track, data, public=False)
+    split = track.split(data, secret=True)
     made = _announcement(split, card, text, data)
     announced = read_announcement(out) if (out / ANNOUNCEMENT).exists() else None
     if announced is not None:
@@ -179,7 +179,7 @@ def announced_split(announced: Announcement, track: Track, card: str, text: Secr
     """
     if text.commitment != announced.commitment:
         raise RsbenchError("--seed-file: its text is not the announced one; take the file that publish was given")
-    split = drawn_split(track, card, text) if keep is None else dataset_split(track, keep / DATA, public=False)
+    split = drawn_split(track, card, text) if keep is None else track.split(keep / DATA, secret=True)
     found = replace(announced, fingerprint=split.fingerprint)
     _check_same(
         announced, found if keep is None else replace(found, truth=truth_hash(keep / DATA)), "truth", "fingerprint"

@@ -231,19 +231,25 @@ def dataset_split(track: Track, folder: Path, *, public: bool = True) -> Split:
         RsbenchError: the dataset cannot be read, its name cannot be that of a split, or its cameras are none of
             which the track asks pictures.
     """
-    name = read_dataset_manifest(folder).name
-    try:
-        check_name(name)
-    except ValueError as error:
-        raise RsbenchError(f"{folder / 'dataset.json'}: {error}") from error
+    name = label_of(folder)
     pairs = read_pairs(folder)
     pictures = true_pictures(folder, pairs, track) if track.pictures else {}
     truths = tuple(truth_of(sequence, pictures.get(sequence.name)) for sequence in pairs)
     return Split(track=track, label=name, public=public, truths=truths)
 
 
+def label_of(folder: Path) -> str:
+    """Of the split of a dataset: its name. Raises RsbenchError where that can be none, or is not there."""
+    name = read_dataset_manifest(folder).name
+    try:
+        check_name(name)
+    except ValueError as error:
+        raise RsbenchError(f"{folder / 'dataset.json'}: {error}") from error
+    return name
+
+
 def truth_of(sequence: Sequence, pictures: TruePictures | None = None) -> Truth:
-    """Of two frames, with what is compared where pictures are asked."""
+    """Of a sequence, with what is compared where pictures are asked."""
     scene = sequence.manifest.get("scene")
     named = scene.get("name") if isinstance(scene, dict) else None
     facts = {

@@ -114,6 +114,8 @@ class Track(ABC):
     """Whether matches may be handed in with motions."""
     rendered: ClassVar[bool] = False
     """Whether problems are rendered frames."""
+    whole: ClassVar[bool] = False
+    """Whether a problem is a whole sequence, of whose true depth scores are made."""
     parting: ClassVar[str] = ""
     """A column of scores.csv by whose values tables divide the primary score; empty: by none."""
     smoke: ClassVar[tuple[str, ...]] = ()

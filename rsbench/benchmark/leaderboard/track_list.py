@@ -10,6 +10,7 @@ from rsbench.benchmark.leaderboard.placed_track import PlacedCorrection
 from rsbench.benchmark.leaderboard.readout_track import ReadoutTrack
 from rsbench.benchmark.leaderboard.second_protocols import DrawnReadout, LawsOfPoints, LawsOfPoses
 from rsbench.benchmark.leaderboard.track import Track
+from rsbench.benchmark.leaderboard.trajectory_track import TrajectoryTrack
 from rsbench.components.cards import choices
 from rsbench.core.errors import RsbenchError
 
@@ -27,6 +28,7 @@ TRACKS: dict[str, Track] = {
         PlacedCorrection(),
         CorrectionTrack(),
         MonoCorrectionTrack(),
+        TrajectoryTrack(),
     )
 }
 """By name, in the order of tables."""

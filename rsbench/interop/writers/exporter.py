@@ -11,6 +11,9 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
 from rsbench.dataset.corrected_frames import fresh_folder
 from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.interop.writers.corrected_folder import ABOUT as ABOUT_CORRECTED
+from rsbench.interop.writers.corrected_folder import check as check_corrected
+from rsbench.interop.writers.corrected_folder import export_corrected, is_corrected, read_corrected_folder
 from rsbench.interop.writers.image_poses import Images, write_lines
 from rsbench.storage.files import check_out, write_json
 
@@ -50,10 +53,10 @@ def export_dataset(
     only: tuple[str, ...] = (),
     progress: Progress = lambda word: None,
 ) -> list[str]:
-    """Write a dataset in another layout; ``out`` appears when all of it is written.
+    """Write a dataset, or corrected frames, in another layout; ``out`` appears when all of it is written.
 
     Args:
-        folder: of the dataset.
+        folder: of the dataset, or of what ``rsbench correct`` made of footage.
         name: of the format.
         out: a folder that is empty, missing, or of an earlier export, which is replaced.
         images: None is what the format holds best.
@@ -68,6 +71,8 @@ def export_dataset(
     """
     if name not in FORMATS:
         raise RsbenchError(f"--to {name}: must be one of {', '.join(FORMATS)}")
+    if is_corrected(folder):
+        return _export_corrected(folder, name, out, images, only, progress)
     kind = FORMATS[name]
     if images is not None and images not in kind.images:
         one = f"is made of {', '.join(kind.images)}" if kind.images else "takes no choice of images"
@@ -83,13 +88,32 @@ def export_dataset(
         for sequence, note in zip(sequences, _written(module, sequences, fresh, chosen), strict=True):
             notes[sequence.name] = note
             progress(sequence.name)
-        told = [f"{key}: {sentence}" for key, note in notes.items() for sentence in note["told"]]
-        record = {"format": 1, "rsbench": __version__, "to": name, "about": module.ABOUT}
-        if kind.images:
-            record["images"] = chosen
-        write_json(fresh / RECORD, {**record, "sequences": notes})
-        readme = [f"Written by rsbench {__version__}: rsbench export --to {name}", "", module.ABOUT, *told]
-        write_lines(fresh / README, readme)
+        return _tell(fresh, name, module.ABOUT, notes, {"images": chosen} if kind.images else {})
+
+
+def _export_corrected(
+    folder: Path, name: str, out: Path, images: Images | None, only: tuple[str, ...], progress: Progress
+) -> list[str]:
+    """``export_dataset`` of what ``rsbench correct`` made of footage."""
+    if images is not None or only:
+        option = f"--images {images}" if images is not None else f"--sequence {only[0]}"
+        raise RsbenchError(f"{option}: {folder} holds one sequence of corrected frames; leave the option out")
+    corrected = read_corrected_folder(folder)
+    check_corrected(corrected, name)
+    check_out(out)
+    with fresh_folder(out, "rsbench export") as fresh:
+        notes = {corrected.name: export_corrected(corrected, name, fresh)}
+        progress(corrected.name)
+        return _tell(fresh, name, ABOUT_CORRECTED[name], notes, {})
+
+
+def _tell(fresh: Path, name: str, about: str, notes: dict[str, dict[str, Any]], more: dict[str, Any]) -> list[str]:
+    """Write what is there, for people and programs; returns what had to be said."""
+    told = [f"{key}: {sentence}" for key, note in notes.items() for sentence in note["told"]]
+    record = {"format": 1, "rsbench": __version__, "to": name, "about": about, **more}
+    write_json(fresh / RECORD, {**record, "sequences": notes})
+    readme = [f"Written by rsbench {__version__}: rsbench export --to {name}", "", about, *told]
+    write_lines(fresh / README, readme)
     return told
 
 

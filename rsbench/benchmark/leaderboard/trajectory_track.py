@@ -1,0 +1,280 @@
+"""The track that asks for the trajectory of a whole sequence, from the matches of each two of its frames.
+
+An answer is poses at times of its own choice; a cubic spline goes through them. Rotations are scored at lines of
+all frames, drift at the starts of the frames, and what a viewer would see of it by true points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pandas as pd
+
+from rsbench.benchmark.leaderboard.answers import LARGEST, Answer
+from rsbench.benchmark.leaderboard.frame_inputs import FEATURES, FrameTrack, matched
+from rsbench.benchmark.leaderboard.marking import last, named
+from rsbench.benchmark.leaderboard.splits import Split, Truth, label_of, truth_of
+from rsbench.benchmark.leaderboard.submissions import Submission, template_text, truth_text
+from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Limits, Row, Score, Step
+from rsbench.benchmark.leaderboard.trajectory_running import APART, answer_of, run_methods
+from rsbench.benchmark.trajectory_methods import METHODS, along
+from rsbench.benchmark.trajectory_scores import AUC_DEG, TrueTrajectory, trajectory_scores
+from rsbench.components.cards import choices
+from rsbench.core import so3
+from rsbench.core.errors import RsbenchError
+from rsbench.core.so3 import FloatArray
+from rsbench.core.trajectory_motion import TrajectoryMotion
+from rsbench.dataset.imu import gyro_samples
+from rsbench.dataset.sequence import Sequence as Rendered
+from rsbench.dataset.sequence import read_dataset
+from rsbench.jobs.workers import Workers
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.problem import Problem
+from rsbench.storage.files import write_bytes
+from rsbench.vision.feature_matcher import load_features
+
+FEWEST_FRAMES, MOST_FRAMES = 4, 250
+_UNIT = 1e-3
+_REACH = 1e-6
+"""Frame periods by which the first and the last pose may miss the starts of the first and the last frame."""
+_INVERTED = 10.0
+"""Times as near to the truth as it stands, at least, is a trajectory whose poses are inverted by mistake."""
+_FAILURE = {
+    **{f"{name}_{part}_deg": 180.0 for name in ("rows", "way") for part in ("median", "95")},
+    **dict.fromkeys(AUC_DEG, 0.0),
+    "rpe_deg": 180.0,
+    **dict.fromkeys(("ate_mm", "rpe_mm", "jitter_px"), np.inf),
+}
+_SCORES = (
+    Score(
+        key="auc_way",
+        title="AUC way",
+        hint="area to 0.1 deg under the curve of the rotation of lines against the sequence's first one",
+        kind="share",
+        better="higher",
+    ),
+    Score(
+        key="auc_rows",
+        title="AUC rows",
+        hint="area to 0.02 deg, of lines against the first one of their frame",
+        kind="share",
+        better="higher",
+    ),
+    FAILED,
+    *(
+        Score(key=f"{name}_{part}_deg", title=f"{name} {part} (deg)", hint=hint, kind="median")
+        for name, words in (("way", "of the sequence"), ("rows", "of its frame"))
+        for part, hint in (
+            ("median", f"median angle of lines against the first one {words}"),
+            ("95", f"95 % quantile of the angle of lines against the first one {words}"),
+        )
+    ),
+    Score(key="ate_mm", title="ATE (mm)", hint="of the starts of frames, rigidly aligned, as evo", kind="median"),
+    Score(key="rpe_mm", title="RPE (mm)", hint="from frame to frame, as evo", kind="median"),
+    Score(key="rpe_deg", title="RPE (deg)", hint="from frame to frame, as evo", kind="median"),
+    Score(
+        key="jitter_px",
+        title="jitter (px)",
+        hint="mean acceleration of what true points are off in corrected frames, per squared frame period",
+        kind="median",
+    ),
+    SECONDS,
+)
+Poses = tuple[tuple[float, float, float, float, float, float, float, float], ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrajectoryAnswer(Answer):
+    """A trajectory, or a failure."""
+
+    poses: Poses | None = None
+    """Rows ``tau, tx, ty, tz, qx, qy, qz, qw``: frame periods, and the body in a world that stands still."""
+    metric: bool = False
+    """Whether positions are known, in metres."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("w", "d", "readout_ratio", "covariance"):
+            if getattr(self, name) is not None:
+                raise ValueError(f"{name}: is not asked; an answer is poses")
+        if not self.success:
+            return
+        if self.poses is None or len(self.poses) < 2:
+            raise ValueError("poses: a success needs two rows or more; a failure says success = false")
+        rows = self.rows
+        if np.any(np.abs(rows) > LARGEST):
+            raise ValueError(f"poses: numbers must lie within {LARGEST:g} of 0")
+        if np.any(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0) > _UNIT):
+            raise ValueError("poses: a quaternion is not of length 1; a row is tau, tx, ty, tz, qx, qy, qz, qw")
+        apart = float(np.min(np.diff(rows[:, 0])))
+        if 0.0 < apart < APART:
+            raise ValueError(f"poses: two are {apart:g} frame periods apart: must be {APART:g} or more")
+        _ = self.motion
+
+    @property
+    def rows(self) -> FloatArray:
+        """(n, 8) the poses of a success."""
+        return np.array(self.poses or (), dtype=np.float64)
+
+    @cached_property
+    def motion(self) -> TrajectoryMotion:
+        """Through the poses, of a success. Raises ValueError where they lead nowhere."""
+        rows = self.rows
+        rows[:, 4:] /= np.linalg.norm(rows[:, 4:], axis=1, keepdims=True)
+        given = {"poses": rows}
+        w, d = TrajectoryMotion.endpoint(given) or (np.zeros(3), np.zeros(3))
+        return TrajectoryMotion(w, d, **given)
+
+
+class TrajectoryTrack(FrameTrack):
+    """Whole sequences of rendered frames."""
+
+    name, id = "trajectory", "trajectory-1"
+    title = "Trajectory of whole sequences from given matches"
+    allowed = ("left", "right", "links", "readout", "gyro")
+    given = (
+        "matches of each two successive frames by rsbench's SIFT; samples of a gyroscope where the dataset has "
+        "the channel imu"
+    )
+    scores = _SCORES
+    error, error_title = "error", "1 - AUC way"
+    exact = ("way_95_deg", 1e-6)
+    answers = TrajectoryAnswer
+    whole = True
+    smoke: ClassVar[tuple[str, ...]] = ()
+    smoke_metrics = ("auc_way", "auc_rows", "way_median_deg", "rows_median_deg", "ate_mm", "rpe_mm", "rpe_deg")
+
+    # Inputs
+
+    def split(self, data: Path | None, seed_file: Path | None = None, secret: bool = False) -> Split:
+        data = self.source(data, seed_file)
+        truths = list[Truth]()
+        for sequence in read_dataset(data):
+            if not FEWEST_FRAMES <= sequence.frames <= MOST_FRAMES:
+                raise RsbenchError(
+                    f"{data}: {sequence.name} has {sequence.frames} frames: the track {self.name!r} takes "
+                    f"sequences of {FEWEST_FRAMES} to {MOST_FRAMES}, such as those of the card handheld"
+                )
+            truth = truth_of(sequence)
+            truths.append(replace(truth, facts={**truth.facts, **_facts(sequence)}))
+        return Split(track=self, label=label_of(data), public=not secret, truths=tuple(truths))
+
+    def problems(self, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
+        """The windows of the first so many sequences; the gyroscope's samples are those of the first window."""
+        assert data is not None
+        options = CorrectionOptions(features=load_features(FEATURES))
+        for sequence in read_dataset(data)[:count]:
+            for number, pair in enumerate(sequence.pairs()):
+                problem = matched(pair, options)
+                if number == 0 and "imu" in sequence.channels:
+                    gyro = gyro_samples(sequence.inertial(), sequence.frame_period_s)
+                    matches = replace(problem.correspondences, gyro=gyro)
+                    problem = replace(problem, correspondences=matches)
+                yield problem
+
+    # Predictions
+
+    def true_answer(self, truth: Truth) -> Mapping[str, Any]:
+        assert truth.sequence is not None
+        frames = truth.sequence.frames
+        return answer_of(along(truth.motion, frames - 1), truth.shutter, frames)
+
+    def write_truth(self, split: Split, folder: Path, file: str = "predictions.jsonl") -> Path:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_bytes(folder / file, truth_text(split).encode())
+        return folder / file
+
+    def write_template(self, split: Split, path: Path) -> None:
+        sequence = split.truths[0].sequence
+        assert sequence is not None
+        still = [[float(frame), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0] for frame in range(sequence.frames)]
+        write_bytes(path, template_text(split, {"poses": still, "metric": False}).encode())
+
+    def check_beside(
+        self, submission: Submission, split: Split, most: int, hints: bool
+    ) -> tuple[list[str], list[str]]:
+        """What poses must reach over is told by the split."""
+        faults, answered = list[str](), list[tuple[TrajectoryAnswer, Truth]]()
+        for answer in submission.answers.values():
+            truth = split.by_name[answer.name]
+            assert isinstance(answer, TrajectoryAnswer) and truth.sequence is not None
+            if not answer.success:
+                continue
+            answered.append((answer, truth))
+            first, end, last_start = answer.rows[0, 0], answer.rows[-1, 0], truth.sequence.frames - 1
+            if first > _REACH or end < last_start - _REACH:
+                faults.append(
+                    f"{submission.folder}: name = {answer.name!r}: poses reach from {first:g} to {end:g}: must "
+                    f"reach from 0 to {last_start}, the starts of the first and the last frame"
+                )
+        inverted = sum(_is_inverted(*each) for each in answered) if hints and split.public and not faults else 0
+        if 2 * inverted <= len(answered):
+            return faults[:most], []
+        words = (
+            f"{submission.folder}: {inverted} of {len(answered)} trajectories are near to the truth inverted; "
+            "poses are those of the body in the world"
+        )
+        return [], [words]
+
+    # Running
+
+    def load(self, cards: Sequence[str]) -> None:
+        for card in cards:
+            if card not in METHODS:
+                raise RsbenchError(f"--entry {card}: no method of the track {self.name!r}{choices(card, METHODS)}")
+
+    def steps(self, cards: Sequence[str], split: Split, limits: Limits) -> int:
+        return len(cards) * len(split.truths)
+
+    def run(self, cards: Sequence[str], split: Split, inputs: Path, work: Path, **options: Any) -> list[Path]:
+        return run_methods(self, cards, split, inputs, work, **options)
+
+    # Marking
+
+    def mark(
+        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Path | None
+    ) -> list[pd.DataFrame | RsbenchError]:
+        rows: list[list[Row]] = [[] for _ in submissions]
+        for truth in split.truths:
+            assert truth.sequence is not None
+            true = TrueTrajectory.of(truth.sequence)
+            for mine, submission in zip(rows, submissions, strict=True):
+                mine.append(_row(truth, true, submission.answers.get(truth.name)))
+            step(truth.name)
+        return [pd.DataFrame(each) for each in rows]
+
+    def oracles(self, split: Split, folder: Path) -> Iterator[Path]:
+        yield self.write_truth(split, folder / ORACLE)
+
+
+def _is_inverted(answer: TrajectoryAnswer, truth: Truth) -> bool:
+    """Whether a trajectory is much nearer to the truth when each pose is inverted."""
+    assert truth.sequence is not None
+    tau = np.arange(float(truth.sequence.frames))
+    found, true = (each.body_from_world(tau).R for each in (answer.motion, truth.motion))
+    as_is, turned = (np.max(so3.angle(R @ np.swapaxes(true, 1, 2))) for R in (found, np.swapaxes(found, 1, 2)))
+    return bool(_INVERTED * turned < as_is)
+
+
+def _facts(sequence: Rendered) -> dict[str, float | str]:
+    """Root mean square of how fast the rig turns, and how many frames there are."""
+    rates, _ = sequence.motion.velocity(np.linspace(0.0, sequence.frames - 1.0, 20 * sequence.frames))
+    turn = float(np.rad2deg(np.sqrt(np.mean(np.sum(rates**2, axis=1)))))
+    return {"turn_deg": turn, "frames": float(sequence.frames)}
+
+
+def _row(truth: Truth, true: TrueTrajectory, answer: Answer | None) -> Row:
+    """Scores of an answer to one problem."""
+    success = isinstance(answer, TrajectoryAnswer) and answer.success
+    found = dict(_FAILURE)
+    if isinstance(answer, TrajectoryAnswer) and success:
+        assert truth.sequence is not None
+        estimate = along(answer.motion, truth.sequence.frames - 1, positions=answer.metric)
+        found = trajectory_scores(true, estimate)
+        del found["failed"]
+    return {**named(truth, success), **found, "error": 1.0 - found["auc_way"], **last(success, answer)}
