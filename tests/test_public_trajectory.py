@@ -31,3 +31,15 @@ def test_what_is_no_sequence_is_refused() -> None:
         rsbench.estimate_trajectory(cast("Any", [1, 2]), RIG, SHUTTER)
     with pytest.raises(ValueError, match="needs tracks"):
         rsbench.estimate_trajectory([rsbench.Correspondences()], RIG, SHUTTER)
+
+
+def test_random_tracks_show_no_trajectory() -> None:
+    rng = np.random.default_rng(0)
+    windows = []
+    for _ in range(4):
+        tracks = rng.uniform(0.0, 1.0, (60, 8)) * np.tile([639.0, 479.0], 4)
+        tracks[:, [2, 6]] = tracks[:, [0, 4]] - rng.uniform(1.0, 40.0, (60, 2))
+        tracks[:, [3, 7]] = tracks[:, [1, 5]]
+        windows.append(rsbench.Correspondences(tracks=tracks))
+    with pytest.raises(rsbench.RsbenchError, match="no trajectory explains the matches"):
+        rsbench.estimate_trajectory(windows, RIG, SHUTTER)

@@ -47,7 +47,7 @@ def estimate_trajectory(
 
     Raises:
         ValueError: an argument of another type or out of its range; no tracks.
-        RsbenchError: no such feature matcher; a shutter that the matches do not tell.
+        RsbenchError: no such feature matcher; a shutter that the matches do not tell; matches of no motion.
     """
     from rsbench.pipeline.array_trajectory import matches_of, trajectory_of
 

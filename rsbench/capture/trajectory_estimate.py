@@ -35,6 +35,8 @@ _JUDGED = 8
 """First windows, from which knots and prior are chosen."""
 _FEWEST, _LEAST_SHARE = 15, 0.2
 """Right tracks, and their share, from which on a window is supported by its own matches."""
+MOST_NOISE_PX = 10.0
+"""Beyond which errors are no noise: random tracks leave some 20 px, and by that scale most of them are right."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +170,7 @@ def _told(
         nu=found.tails.nu,
         prior=found.prior,
         inliers=inliers,
-        supported=np.array([is_supported(mask) for mask in inliers]),
+        supported=np.array([is_supported(mask, found.tails) for mask in inliers]),
         fit=found,
         curve=found.curve,
         covariance_band=banded.inverse_band(
@@ -182,9 +184,10 @@ def noise_px(tails: Tails) -> float:
     return tails.scale * float(scipy.special.stdtrit(tails.nu, _ONE_SIGMA))
 
 
-def is_supported(inliers: BoolArray) -> bool:
+def is_supported(inliers: BoolArray, tails: Tails) -> bool:
     """Whether tracks (n,), some of them right, carry their window."""
-    return bool(np.count_nonzero(inliers) >= max(_FEWEST, _LEAST_SHARE * len(inliers)))
+    enough = np.count_nonzero(inliers) >= max(_FEWEST, _LEAST_SHARE * len(inliers))
+    return bool(enough and noise_px(tails) <= MOST_NOISE_PX)
 
 
 def trajectory_bound(

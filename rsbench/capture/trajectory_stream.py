@@ -135,7 +135,10 @@ class _State:
         inverse = banded.inverse_band(information(found.curve, tracks, found.tails, found.prior, found.trust))
         windows = enumerate(self.windows)
         right = [found.trust[tracks.members[k]][: len(each.tracks)] > 0.0 for k, each in windows]
-        carried = [self._carried, *(self.first + k for k, each in enumerate(right) if is_supported(each))]
+        carried = [
+            self._carried,
+            *(self.first + k for k, each in enumerate(right) if is_supported(each, found.tails)),
+        ]
         for k in range(count):
             number = self.first + k
             yield StreamedWindow(

@@ -6,7 +6,8 @@ import itertools
 from collections.abc import Collection, Sequence
 from typing import Any
 
-from rsbench.capture.trajectory_estimate import Trajectory, estimate_trajectory
+from rsbench.capture.settle import NoMotionError
+from rsbench.capture.trajectory_estimate import MOST_NOISE_PX, Trajectory, estimate_trajectory
 from rsbench.capture.trajectory_shutter import shutter_of_sequence
 from rsbench.components import arguments
 from rsbench.core.correspondences import Correspondences
@@ -45,8 +46,14 @@ def trajectory_of(
 
     Raises:
         ValueError: no tracks; or, without a shutter, too few frames.
-        NoMotionError: the matches do not tell the shutter.
+        NoMotionError: the matches do not tell the shutter, or no trajectory explains them.
     """
     if shutter is None and len(windows) + 1 < FEWEST_FRAMES:
         raise ValueError(f"shutter: is found of {FEWEST_FRAMES} frames and more; these are {len(windows) + 1}")
-    return estimate_trajectory(windows, rig, shutter or shutter_of_sequence(windows, rig, seed), seed=seed)
+    found = estimate_trajectory(windows, rig, shutter or shutter_of_sequence(windows, rig, seed), seed=seed)
+    if found.noise_px > MOST_NOISE_PX:
+        raise NoMotionError(
+            f"no trajectory explains the matches: they err by some {found.noise_px:.0f} px about the best "
+            "one; are they of one scene, and the frames in order?"
+        )
+    return found
