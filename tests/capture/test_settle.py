@@ -235,3 +235,12 @@ def test_what_is_given_is_known() -> None:
     nothing = known_of(Correspondences(), RIG, None, None)
     assert len(nothing.scans) == 25 and nothing.delay is None and not nothing.shutter_known
     assert isinstance(nothing, Known)
+
+
+def test_a_ratio_near_0_tells_no_scan() -> None:
+    capture = found_in(simulated(2, 0.7, 2.0, 1000).correspondences)
+    best = capture.candidates[0]
+    assert shutter_found(capture, RIG).readout_ratio == best.ratio
+    near = replace(best, ratio=0.25, sigma=0.09, probability=0.98)
+    with pytest.raises(NoMotionError, match="cannot tell the readout ratio"):
+        shutter_found(replace(capture, candidates=(near,)), RIG)
