@@ -40,6 +40,7 @@ deviations of 21 pairs of traced frames were too small by a half (``benchmarks/w
 _MOST_ROUNDS, _SETTLED = 4, 0.1
 """Behind a lens the error is linear only nearby: again from what was found, until it moves by few deviations."""
 _TERMS = [FOCAL, RADIAL]
+_LATER = "is found with the errors of the calibration that rows show"
 _OPEN = "as the card has it: the matches cannot tell; turn the rig, or give more frames"
 
 
@@ -52,6 +53,8 @@ class FoundCamera:
     """Of what was found; the card's where the matches do not tell."""
     told: tuple[bool, bool]
     """Whether they tell the focal length and k1; where not, the rig has the card's."""
+    k1_later: bool = False
+    """Whether rows show that the calibration errs: k1 is then found with its other errors, and is no lens here."""
 
     def words(self, given: StereoRig, sigma: CardSigma) -> str:
         """Such as "focal length 545.9 +- 0.4 px (card: 520.0 +- 20.0)"."""
@@ -63,7 +66,8 @@ class FoundCamera:
         if sigma.k1:
             card = f"(card: {_k1(given):.3f} +- {sigma.k1:.3f})"
             found = f"{_k1(self.rig):.4f} +- {self.sigma.k1:.4f}"
-            said.append(f"k1 {found if self.told[1] else _OPEN} {card}")
+            open_ = _LATER if self.k1_later else _OPEN
+            said.append(f"k1 {found if self.told[1] else open_} {card}")
         return "; ".join(said)
 
 
@@ -86,21 +90,22 @@ def find_camera(
     """
     scanning = scanning if readout_ratio is None else scanning or Scanning()
     known = known_of(windows[0], rig, readout_ratio, scanning)
+    later = sigma.k1 > 0.0 and known.calibration_sigma[OFFSET] > 0.0
     found, told, last = rig, np.zeros(2, dtype=np.bool_), np.zeros(2)
     for _ in range(_MOST_ROUNDS):
         prior = np.array([sigma.focal / found.camera.fx, sigma.k1])
         errors = _errors_of(windows, found, _expecting(known, prior), robust, seed)
         mended = None if errors is None else _mended(found, np.where(errors.told, errors.values, 0.0))
-        if errors is None or mended is None or not np.any(errors.told):
-            return FoundCamera(rig=rig, sigma=sigma, told=(False, False))
+        lost = errors is None or not np.any(errors.told) or np.any(told & ~errors.told)
+        if errors is None or mended is None or lost:
+            return FoundCamera(rig=rig, sigma=sigma, told=(False, False), k1_later=later)
         found, told, last = mended, errors.told, errors.sigma * (mended.camera.fx, 1.0)
         known = replace(known, scans=errors.scans)
         if found.camera.lens is None or np.all(np.abs(errors.values) < _SETTLED * errors.sigma):
             break
     focal, k1 = np.where(told, last, (sigma.focal, sigma.k1))
-    return FoundCamera(
-        rig=found, sigma=CardSigma(focal=float(focal), k1=float(k1)), told=(bool(told[0]), bool(told[1]))
-    )
+    stated = CardSigma(focal=float(focal), k1=float(k1))
+    return FoundCamera(rig=found, sigma=stated, told=(bool(told[0]), bool(told[1])), k1_later=later)
 
 
 def _expecting(known: Known, prior: FloatArray) -> Known:

@@ -176,7 +176,7 @@ def _correct_four(
             write_frame(folder, f"{side}_{frame}", fused)
         calibration = (card.calibration or NO_ERRORS) if result.found is None else result.found.calibration
         record = rig_record(rig, result.shutter, result.capture, options, calibration)
-        record["calibration_note"] = focal
+        record["camera_note"] = focal
         record["motion"] = None if result.found is None else motion_record(result.found)
         record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in frames.items()}
         record["seconds"] = result.seconds

@@ -61,8 +61,8 @@ def readout_words(shutter: RollingShutter, capture: Capture | None) -> str:
 
 
 def say_calibration(record: dict[str, Any]) -> None:
-    if record["calibration_note"]:
-        typer.echo(record["calibration_note"])
+    if record["camera_note"]:
+        typer.echo(record["camera_note"])
     if record["calibration_note"]:
         typer.echo(f"errors of the calibration, taken from the matches: {record['calibration_note']}")
 

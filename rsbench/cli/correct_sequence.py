@@ -45,7 +45,7 @@ def correct_sequence_given(given: Given, target: str, options: CorrectionOptions
     with video_place(out, run) if is_video(out) else fresh_folder(out, run=run) as folder:
         rig, focal = with_found_camera(card, rig, spread_windows(*sources), options)
         shutter, calibration, capture = found = _look(sources, rig, card, options)
-        record = {**rig_record(rig, shutter, capture, options, calibration), "calibration_note": focal}
+        record = {**rig_record(rig, shutter, capture, options, calibration), "camera_note": focal}
         record["frames"] = _correct_into(folder, sources, rig, found, options, close, given.row_poses)
         if is_video(out):
             _write_both(out, folder, sources, record)

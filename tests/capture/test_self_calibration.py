@@ -141,3 +141,12 @@ def test_a_lens_that_would_fold_is_not_taken() -> None:
     _, rig = matches_of(CAMERA)
     assert _mended(rig, np.array([0.0, -0.9])) is None
     assert _mended(rig, np.array([0.0, -0.1])) is not None
+
+
+def test_where_rows_differ_k1_is_one_of_the_errors() -> None:
+    """Row differences of half a pixel and more, of a scene at 2 to 10 m and a lens that nobody undistorted."""
+    matches, rig = matches_of(replace(CAMERA, lens=Lens(model="brown-conrady", k1=0.05)))
+    given, sigma = replace(rig, camera=CAMERA), CardSigma(k1=0.05)
+    found = find_camera([matches], given, sigma, 0.8, Scanning())
+    assert found.told == (False, False) and found.rig == given
+    assert "with the errors of the calibration" in found.words(given, sigma)

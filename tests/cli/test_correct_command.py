@@ -21,7 +21,7 @@ from rsbench.capture.calibration_errors import of_offset
 from rsbench.capture.estimate import conclude, examine
 from rsbench.capture.hypotheses import Known
 from rsbench.capture.scans import Scans
-from rsbench.cli.correct_said import readout_words
+from rsbench.cli.correct_said import readout_words, say_calibration
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
@@ -117,17 +117,25 @@ def test_a_camera_that_is_not_sure_is_looked_for_and_told(
     result = correct(*frames, "--rig", rig, "--out", out)
     assert result.returncode == 0, result.stderr
     record = json.loads((out / "motion.json").read_text("utf-8"))
-    assert (
-        record["calibration_note"] in result.stdout
-        and f"(card: {fx:.1f} +- {0.1 * fx:.1f})" in record["calibration_note"]
-    )
-    focal, k1 = record["calibration_note"].split("; k1 ")
+    note = record["camera_note"]
+    assert result.stdout.count(note) == 1 and record["calibration_note"] != note
+    assert f"(card: {fx:.1f} +- {0.1 * fx:.1f})" in note
+    focal, k1 = note.split("; k1 ")
     assert ("cannot tell" in focal) == (record["camera"]["fx"] == fx)
-    assert ("cannot tell" in k1) == (record["camera"].get("lens") is None) and "(card: 0.000 +- 0.020)" in k1
+    assert ("cannot tell" in k1) == (record["lens"] is None) and "(card: 0.000 +- 0.020)" in k1
     looked = run_here("inspect", *frames, "--rig", rig)
-    assert looked.returncode in (0, 1) and record["calibration_note"] in looked.stderr
+    assert looked.returncode in (0, 1) and note in looked.stderr
     rig.write_text(rig.read_text().replace(f"focal_sigma = {0.1 * fx}", "focal_sigma = -1"))
     assert_refused(correct(*frames, "--rig", rig, "--out", tmp_path / "other"), "focal_sigma = -1")
+
+
+def test_a_camera_that_was_found_and_errors_of_its_calibration_are_two_lines(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for camera in ("", "focal length 690.0 +- 22.0 px"):
+        say_calibration({"camera_note": camera, "calibration_note": "rows by up to 1.0 px"})
+        lines = capsys.readouterr().out.splitlines()
+        assert lines[-1].endswith("rows by up to 1.0 px") and lines[:-1] == [camera][: bool(camera)]
 
 
 def test_a_sequence_of_folders(tmp_path: Path, frames: list[Path], rig: Path) -> None:
