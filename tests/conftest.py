@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from hypothesis import settings
 from skips import SkipReport
 
 from rsbench.components.imports import import_untried
@@ -24,6 +25,12 @@ if TYPE_CHECKING:
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Started in the background of a shell without job control: the commands that tests interrupt would inherit it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# The same examples in every run, so that a change fails by what it broke alone: `--hypothesis-profile=drawn` draws
+# others. No deadlines: the first example of a test may compile or import what the others use.
+settings.register_profile("same", derandomize=True, deadline=None)
+settings.register_profile("drawn", deadline=None)
+settings.load_profile("same")
 
 # Modules that tests write are not tried in a process of their own first, which takes half a second for each. The
 # command line, which tests start as others do, does it.

@@ -92,6 +92,14 @@ _Estimate = Annotated[
     bool,
     typer.Option("--estimate", help="Only say how many files, bytes and minutes; tries one camera of each scene."),
 ]
+_Backend = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="What renders: llvm, cuda or scalar; default: the environment's RSBENCH_VARIANT, else the first that "
+        "works. Pixels of two backends differ by rounding.",
+    ),
+]
 
 
 def generate(
@@ -110,13 +118,14 @@ def generate(
     split: _Split = None,
     rehash: _Rehash = False,
     estimate: _Estimate = False,
+    backend: _Backend = None,
 ) -> None:
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import generate_dataset, steps_of
     from rsbench.dataset.store_destination import store_for
-    from rsbench.renderers.backend import start_backend
+    from rsbench.renderers.backend import ask_for, start_backend
     from rsbench.storage.files import check_out
     from rsbench.storage.object_store import path_or_url, shown
 
@@ -126,9 +135,10 @@ def generate(
     dataset = _chosen(whole, sequence, shard, channels)
     if not estimate:
         _ = check_out(place) if isinstance(place, Path) else store_for(place, processes)
-    backend = start_backend()
-    if backend.message:
-        typer.echo(backend.message, err=True)
+    if backend is not None:
+        ask_for(backend)
+    if (started := start_backend()).message:
+        typer.echo(started.message, err=True)
     if estimate:
         typer.echo(_estimated(dataset, full_frames))
         return

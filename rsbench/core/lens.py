@@ -164,6 +164,8 @@ def _solve(J: FloatArray, right: FloatArray) -> FloatArray:
 
 def _first_root(coefficients: list[float]) -> float:
     """Smallest positive root of a polynomial, lowest power first; infinite when it has none."""
-    roots = np.polynomial.polynomial.polyroots(coefficients)
+    # What is nothing beside the others puts a root beyond all images, and would overflow as a divisor.
+    small = 1e-100 * max(map(abs, coefficients))
+    roots = np.polynomial.polynomial.polyroots([c if abs(c) > small else 0.0 for c in coefficients])
     real = roots.real[(np.abs(roots.imag) <= 1e-6 * np.abs(roots)) & (roots.real > 0.0)]
     return float(np.min(real, initial=np.inf))

@@ -67,10 +67,10 @@ def log(R: ArrayLike) -> FloatArray:
     sine = np.linalg.norm(vee, axis=-1)
     angle = np.arctan2(sine, 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0))
     scale = np.where(sine > 1e-8, angle / np.where(sine > 1e-8, sine, 1.0), 1.0)
-    near_pi = angle > np.pi - 1e-3
+    near_pi = angle > np.pi - 0.1
     if not np.any(near_pi):
         return scale[..., None] * vee
-    # sin(angle) vanishes at pi: there the axis comes from the symmetric part (1 - cos) a a^T + cos I.
+    # sin(angle) vanishes at pi: near it the axis comes from the symmetric part (1 - cos) a a^T + cos I.
     cosine = np.where(near_pi, np.cos(angle), -1.0)[..., None, None]
     outer = (0.5 * (R + np.swapaxes(R, -1, -2)) - cosine * np.eye(3)) / (1.0 - cosine)
     column = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)

@@ -59,13 +59,14 @@ _lock = threading.RLock()
 def start_backend(preference: Preference = "auto") -> Backend:
     """Choose the Mitsuba variant of this process and start it; later calls return the same answer.
 
-    ``auto`` takes LLVM (the same bits on every machine of a kind), then CUDA, then the slow scalar variant. The
-    environment variable ``RSBENCH_VARIANT`` overrides ``preference``; ``DRJIT_LIBLLVM_PATH`` names the one libLLVM
+    ``auto`` takes LLVM (the same bits on every machine of a kind), then CUDA, then the slow scalar variant;
+    ``cuda`` takes what ``auto`` would where no GPU can trace, and says so in the message. The environment variable
+    ``RSBENCH_VARIANT`` overrides ``preference``; ``DRJIT_LIBLLVM_PATH`` names the one libLLVM
     to try. Every library is tried in a child process first, so an unsuitable one cannot end this process.
 
     Raises:
-        RsbenchError: unknown preference; a backend asked for by name does not work here; another backend has
-            already been started in this process; the working folder is gone.
+        RsbenchError: unknown preference; ``llvm`` does not work here; another backend has already been started in
+            this process; the working folder is gone.
     """
     global _started
     wanted = _wanted(preference)
@@ -73,15 +74,29 @@ def start_backend(preference: Preference = "auto") -> Backend:
         if _started is None:
             _check_working_folder()
             chosen, candidate = _adopted() or _choose(wanted)
+            if chosen.variant == VARIANTS["llvm"]:
+                _check_loaded()
             if candidate is not None:
                 llvm.load(candidate)
             _set_variant(chosen.variant)
             _started = chosen
-        if wanted != "auto" and _started.variant != VARIANTS[wanted]:
+        instead = wanted == "cuda" and _started.message is not None
+        if wanted != "auto" and _started.variant != VARIANTS[wanted] and not instead:
             raise RsbenchError(
                 f"renderer backend {wanted!r} cannot start: this process already renders with {_started.variant}"
             )
         return _started
+
+
+def ask_for(name: str) -> None:
+    """Have this process, and those that it starts, render with a backend.
+
+    Raises:
+        RsbenchError: no such backend.
+    """
+    if name not in VARIANTS:
+        raise RsbenchError(f"--backend {name}: allowed are {', '.join(VARIANTS)}")
+    os.environ["RSBENCH_VARIANT"] = name
 
 
 def _check_working_folder() -> None:
@@ -103,26 +118,32 @@ def _wanted(preference: str) -> Preference:
 
 
 def _choose(wanted: Preference) -> tuple[Backend, llvm.Candidate | None]:
-    refusals: list[str] = []
-    if wanted in ("auto", "llvm"):
-        for candidate in llvm.candidates():
-            verdict = llvm.probe(candidate)
-            if verdict.ok:
-                backend = Backend(variant=VARIANTS["llvm"], llvm_path=candidate.path, llvm_version=verdict.version)
-                return backend, candidate
-            refusals.append(f"{candidate.path}: {verdict.reason}")
-    tried = f" ({'; '.join(refusals)})" if refusals else ""
-    if wanted == "llvm":
-        raise RsbenchError(f"renderer backend 'llvm' found no usable libLLVM{tried}; {llvm.REMEDY}")
-    if wanted in ("auto", "cuda"):
+    without_gpu = ""
+    if wanted == "cuda":
         verdict = probe_cuda()
         if verdict.ok:
             return Backend(variant=VARIANTS["cuda"]), None
-        if wanted == "cuda":
-            raise RsbenchError(f"renderer backend 'cuda' does not work here: {verdict.reason}")
+        without_gpu = f"renderer backend 'cuda' does not work here ({verdict.reason})"
+    refusals: list[str] = []
+    for candidate in llvm.candidates() if wanted != "scalar" else ():
+        verdict = llvm.probe(candidate)
+        if verdict.ok:
+            variant = VARIANTS["llvm"]
+            message = f"{without_gpu}: rendering with {variant}" if without_gpu else None
+            found = Backend(
+                variant=variant, llvm_path=candidate.path, llvm_version=verdict.version, message=message
+            )
+            return found, candidate
+        refusals.append(f"{candidate.path}: {verdict.reason}")
+    tried = f" ({'; '.join(refusals)})" if refusals else ""
+    if wanted == "llvm":
+        raise RsbenchError(f"renderer backend 'llvm' found no usable libLLVM{tried}; {llvm.REMEDY}")
+    if wanted == "auto" and probe_cuda().ok:
+        return Backend(variant=VARIANTS["cuda"]), None
     if wanted == "scalar":
         return Backend(variant=VARIANTS["scalar"]), None
-    message = f"no usable libLLVM{tried}: rendering with scalar_rgb, tens of times slower; {llvm.REMEDY}"
+    why = "; ".join(filter(None, [without_gpu, f"no usable libLLVM{tried}"]))
+    message = f"{why}: rendering with scalar_rgb, tens of times slower; {llvm.REMEDY}"
     return Backend(variant=VARIANTS["scalar"], message=message), None
 
 
@@ -139,6 +160,18 @@ def _adopted() -> tuple[Backend, None] | None:
         )
     path = os.environ.get("DRJIT_LIBLLVM_PATH")
     return Backend(variant=variant, llvm_path=Path(path) if path else None), None
+
+
+def _check_loaded() -> None:
+    """Dr.Jit looks for LLVM once, as it is imported."""
+    drjit = sys.modules.get("drjit")
+    version = drjit.detail.llvm_version() if drjit is not None else (llvm.MINIMUM_VERSION,)
+    if version[0] < llvm.MINIMUM_VERSION:
+        found = f"has LLVM {'.'.join(map(str, version))}" if version[0] > 0 else "found none it can use"
+        raise RsbenchError(
+            f"drjit was imported before rsbench and {found}, of which {llvm.MINIMUM_VERSION} or later is needed: "
+            "call rsbench.renderers.backend.start_backend() before that import, or set DRJIT_LIBLLVM_PATH"
+        )
 
 
 def _set_variant(variant: str) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import typer
 from commands import run_here
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rsbench.cli.console import print_rows, progress_bar
@@ -55,7 +55,6 @@ def test_the_extra_that_the_viewer_needs_is_named() -> None:
 _bracketed = st.text("[]/ab=#", min_size=1, max_size=12).map(lambda text: f"[{text}]")
 
 
-@settings(deadline=None)  # the first call imports rich
 @given(_bracketed, _bracketed, _bracketed)
 def test_tables_print_brackets_as_they_are(title: str, column: str, cell: str) -> None:
     with pytest.MonkeyPatch.context() as patch:

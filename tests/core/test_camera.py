@@ -12,7 +12,7 @@ from rsbench.core.camera import PinholeCamera
 CAMERA = PinholeCamera(width=640, height=480, fx=500.0, fy=510.0, cx=310.0, cy=250.0)
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=40)
 @given(st.floats(-100, 800), st.floats(-100, 800), st.floats(0.01, 1000))
 def test_project_inverts_unproject(x: float, y: float, depth: float) -> None:
     ray = CAMERA.unproject([x, y])

@@ -16,7 +16,7 @@ from rsbench.core.se3 import Pose, compose, inverse, transform
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
-few = settings(max_examples=25, deadline=None, derandomize=True)
+few = settings(max_examples=25)
 vectors = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
 seeds = st.integers(0, 2**32 - 1)
 models = st.sampled_from([LinearMotion, TwistMotion])

@@ -38,7 +38,7 @@ no_numbers = st.sampled_from(NO_NUMBERS)
 no_sizes = st.one_of(
     no_numbers, st.floats(), st.integers(max_value=-1), st.integers(min_value=10**8), st.sampled_from([2.5, 3.0])
 )
-few = settings(max_examples=40, deadline=None, derandomize=True)
+few = settings(max_examples=40)
 
 
 def refused(make: Callable[[], object]) -> None:

@@ -53,7 +53,7 @@ class _Plain(LinearMotion):  # pyrefly: ignore[invalid-inheritance]  # final
 
 
 @pytest.mark.parametrize("name", MODELS)
-@settings(deadline=None, max_examples=5)
+@settings(max_examples=5)
 @given(place=st.integers(-1, 7), within=st.floats(0.05, 0.95), scale=st.floats(0.1, 1.5))
 def test_accelerations_are_the_derivatives_of_velocities(
     name: str, place: int, within: float, scale: float

@@ -41,7 +41,7 @@ def test_pixels_are_opencvs(lens: Lens) -> None:
     np.testing.assert_allclose(camera.project(X), pixels, rtol=0, atol=1e-10)
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=40)
 @given(
     st.sampled_from(["brown-conrady", "kannala-brandt"]),
     st.lists(st.floats(-0.25, 0.25), min_size=4, max_size=4),

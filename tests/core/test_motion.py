@@ -21,7 +21,7 @@ Model = (
 )
 MODELS: tuple[Model, ...] = (LinearMotion, TwistMotion, InertialMotion, AcceleratedMotion, SplineMotion)
 
-few = settings(max_examples=25, deadline=None, derandomize=True)
+few = settings(max_examples=25)
 vectors = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
 times = st.floats(-2, 3)
 

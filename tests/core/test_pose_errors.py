@@ -13,7 +13,7 @@ from rsbench.core.motion import LinearMotion
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 
-few = settings(max_examples=40, deadline=None, derandomize=True)
+few = settings(max_examples=40)
 vectors = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
 
 

@@ -26,7 +26,7 @@ from rsbench.core.se3 import transform
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
 
-few = settings(max_examples=25, deadline=None, derandomize=True)
+few = settings(max_examples=25)
 vectors = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
 seeds = st.integers(0, 2**32 - 1)
 models = st.sampled_from([LinearMotion, TwistMotion])

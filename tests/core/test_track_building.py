@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rsbench.core.correspondences import (
@@ -43,7 +43,6 @@ def in_order(tracks: np.ndarray) -> np.ndarray:
     return tracks[np.argsort(tracks[:, 0])]
 
 
-@settings(deadline=None)  # the first example loads the search tree
 @given(count=st.integers(0, 40), seed=st.integers(0, 1000), noise=st.sampled_from([0.0, 1e-9, 1e-6, 4e-3]))
 def test_neither_order_nor_rounding_matter(count: int, seed: int, noise: float) -> None:
     rng = np.random.default_rng(seed)
@@ -57,7 +56,6 @@ def test_neither_order_nor_rounding_matter(count: int, seed: int, noise: float) 
         assert len(temporal_pairs(joined.correspondences, side)) == count
 
 
-@settings(deadline=None)  # the first example loads the search tree
 @given(seed=st.integers(0, 1000))
 def test_shared_ends_join_the_same_matches_in_any_order(seed: int) -> None:
     """Points that several matches claim, up to rounding: each left-right match joins one of them."""
@@ -112,7 +110,6 @@ def test_tracks_that_are_given_stay_first_and_take_their_matches() -> None:
     np.testing.assert_array_equal(join_stereo(joined).correspondences.tracks, joined.tracks)
 
 
-@settings(deadline=None)  # the first example loads the search tree
 @given(seed=st.integers(0, 1000))
 def test_repeats_are_those_of_a_search_over_all(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -13,7 +13,7 @@ from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.core.trajectory_motion import TrajectoryMotion, world_from_body
 
-few = settings(max_examples=25, deadline=None, derandomize=True)
+few = settings(max_examples=25)
 
 
 def _smooth(tau: FloatArray) -> Pose:

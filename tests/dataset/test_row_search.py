@@ -46,7 +46,7 @@ def _points(geometry: GivenGeometry, source: ImageView, rng: np.random.Generator
     return back_project(*geometry[:3], source.side, source.frame, grid, depth), grid
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(
     lens=st.sampled_from(LENSES),
     model=st.sampled_from(MODELS),

@@ -27,7 +27,6 @@ from rsbench.renderers.llvm import Candidate, ProbeResult
 RENDER = """
 import ctypes, os, sys, time
 from pathlib import Path
-import drjit
 import numpy as np
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
@@ -39,6 +38,7 @@ from rsbench.scenes.model import Light, Material, Scene, SceneMesh
 
 started = start_backend()
 if "WIDTH" in os.environ:  # as on a processor with other registers; Dr.Jit has this function for C++ alone
+    import drjit
     core = ctypes.CDLL(str(next(Path(drjit.__path__[0]).glob("libdrjit-core.so*"))))
     features = os.environ["FEATURES"].encode()
     core._Z19jit_llvm_set_targetPKcS0_j(b"x86-64", features, ctypes.c_uint32(int(os.environ["WIDTH"])))
@@ -168,12 +168,17 @@ def test_preferences_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RsbenchError, match=r"/x/libLLVM.so: is LLVM 14.*install LLVM 17"):
         backend._choose("llvm")
     monkeypatch.setattr(backend, "probe_cuda", lambda: ProbeResult(ok=False, reason="no NVIDIA driver"))
-    with pytest.raises(RsbenchError, match="no NVIDIA driver"):
-        backend._choose("cuda")
+    slow = backend._choose("cuda")[0]
+    assert slow.variant == "scalar_rgb" and "no NVIDIA driver" in str(slow.message)
     assert backend._choose("auto")[0].variant == "scalar_rgb"
     monkeypatch.setattr(llvm, "probe", lambda candidate: ProbeResult(ok=True, version="21.1.8"))
     chosen = backend._choose("auto")[0]
     assert (chosen.variant, chosen.llvm_version, chosen.message) == ("llvm_ad_rgb", "21.1.8", None)
+    instead = backend._choose("cuda")[0]
+    message = "renderer backend 'cuda' does not work here (no NVIDIA driver): rendering with llvm_ad_rgb"
+    assert (instead.variant, instead.message) == ("llvm_ad_rgb", message)
+    monkeypatch.setattr(backend, "_started", instead)
+    assert backend.start_backend("cuda") is instead, "a second call is no conflict"
 
 
 def test_environment_variable_overrides_and_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -190,6 +195,25 @@ def test_a_file_that_is_no_library_is_refused(tmp_path: Path) -> None:
     verdict = llvm.probe(Candidate(path=junk, source="DRJIT_LIBLLVM_PATH"))
     assert not verdict.ok and verdict.reason
     assert not llvm.probe(Candidate(path=tmp_path / "absent.so", source="system")).ok
+
+
+@pytest.mark.parametrize("library", [*llvm.outdated_libraries(), None], ids=str)
+def test_dr_jit_imported_first_with_an_unsuitable_llvm_or_none_is_refused(library: Path | None) -> None:
+    code = """
+import os
+import drjit
+del os.environ["DRJIT_LIBLLVM_PATH"]
+from rsbench.renderers.backend import start_backend
+start_backend("llvm")
+"""
+    needs_llvm()
+    environ = {
+        **os.environ,
+        "DRJIT_LIBLLVM_PATH": str(library or "/nonexistent/libLLVM.so"),
+        "RSBENCH_VARIANT": "",
+    }
+    done = subprocess.run([sys.executable, "-c", code], env=environ, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "RsbenchError: drjit was imported before rsbench and " in done.stderr, done
 
 
 def test_unsuitable_system_llvm_ends_only_the_child() -> None:

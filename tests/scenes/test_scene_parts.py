@@ -110,7 +110,7 @@ triangle = st.lists(st.tuples(coordinate, coordinate, coordinate), min_size=3, m
 
 
 @given(triangle)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_flat_textures_keep_lengths(corners: list[tuple[float, float, float]]) -> None:
     piece = flat("a", [corners])
     area = np.linalg.norm(np.cross(np.subtract(corners[1], corners[0]), np.subtract(corners[2], corners[0])))
@@ -134,7 +134,7 @@ def test_textures_hang_upright_on_walls_and_roofs() -> None:
 
 
 @given(st.floats(-180, 180), st.floats(0.2, 3), st.tuples(coordinate, coordinate, coordinate))
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_placing_is_a_similarity(heading: float, scale: float, at: tuple[float, float, float]) -> None:
     (moved,) = placed([prism("a", U_SHAPE, 2.0)], at, heading, scale)
     assert_sound(moved)

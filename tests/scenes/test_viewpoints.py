@@ -16,7 +16,7 @@ point = st.tuples(coordinate, coordinate, coordinate)
 
 
 @given(point, point)
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 def test_the_view_is_centred_level_and_right_handed(
     eye: tuple[float, float, float], target: tuple[float, float, float]
 ) -> None:

@@ -72,7 +72,7 @@ def paper_constraint(
 
 @pytest.mark.parametrize(("side", "sign"), [("left", 1.0), ("right", -1.0)])
 @given(seed=st.integers(0, 10_000))
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 def test_rows_equal_the_papers_equations_in_the_papers_axes(side: Side, sign: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     match = rng.uniform(0, 899, 4)
@@ -138,7 +138,7 @@ def test_accuracy_is_the_known_one(
     assert e_T / 1.6 < measured[1] < 1.6 * e_T
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10**6), sign=st.sampled_from([-1.0, 1.0]))
 def test_tracks_hold_the_length_of_a_known_direction(seed: int, sign: float) -> None:
     """Exact for exact matches, with the sign, whatever the motion; rounding of the tracks is all that remains."""
@@ -197,7 +197,7 @@ def test_all_unknowns_need_more_matches_and_leave_less_error() -> None:
     assert "need 13" in LinearSolver(terms="third").estimate(few, RIG, SHUTTER).reason
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 40))
 def test_chosen_matches_stand_apart(seed: int, n: int) -> None:
     """Against brute force: what is left out stands no farther from the chosen than the chosen from each other."""
@@ -280,7 +280,7 @@ def test_scaling_columns_costs_the_rotation_at_a_tenth_of_a_pixel() -> None:
     assert scaled[0] > 3 * literal[0] and scaled[1] > 3 * literal[1]
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 10**6))
 def test_choices_left_open_agree_without_noise(seed: int) -> None:
     """The null space of exact data of the paper's own truncated model has one dimension, however A is scaled."""
@@ -337,7 +337,7 @@ def test_scaled_translation_is_exact_for_the_true_rotation() -> None:
     axis=st.tuples(*[st.floats(-1, 1)] * 3),
     t=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda t: np.linalg.norm(t) > 0.2),
 )
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 def test_eight_point_on_exact_global_shutter_data(
     axis: tuple[float, float, float], t: tuple[float, float, float]
 ) -> None:

@@ -26,7 +26,7 @@ def trial(model: str, noise_px: float) -> Simulation:
     return simulate(RIG, SHUTTER, motion, SimulationOptions(tracks=60, noise_px=noise_px), rng)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(seed=st.integers(0, 10**6), damping=st.sampled_from([0.0, 1e-4, 1.0]))
 def test_step_solves_the_damped_normal_equations(seed: int, damping: float) -> None:
     rng = np.random.default_rng(seed)

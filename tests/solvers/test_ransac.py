@@ -154,7 +154,7 @@ def test_stops_after_the_required_iterations() -> None:
 
 
 @given(st.lists(st.floats(-5, 5), min_size=1, max_size=20), st.floats(0.1, 3))
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_msac_score_is_bounded_by_the_number_of_data(residuals: list[float], threshold: float) -> None:
     score = msac_score(np.array(residuals), threshold)
     assert 0.0 <= score <= len(residuals)

@@ -55,7 +55,7 @@ def assert_motion(estimate: MotionEstimate, motion: Motion, tolerance: float) ->
 @pytest.mark.parametrize("sets", ["pairs", "tracks", "both"])
 @given(seed=st.integers(0, 10_000), angle=st.floats(0.5, 6.0), distance=st.floats(0.1, 0.5))
 @example(seed=1838, angle=4.5, distance=0.1875)  # of a plane's motions, one is 5 px wrong, most of it in few pairs
-@settings(deadline=None, max_examples=12)
+@settings(max_examples=12)
 def test_exact_on_exact_data(model: str, sets: str, seed: int, angle: float, distance: float) -> None:
     rng = np.random.default_rng(seed)
     motion = random_motion(rng, np.radians(angle), distance, model)

@@ -15,7 +15,7 @@ from rsbench.vision.baseline_depths import monocular_depth, plane_depth
 Build = Callable[..., Any]
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(0.5, 20.0), st.integers(0, 100))
 def test_the_plane_is_found_among_other_surfaces(a: float, b: float, z: float, seed: int) -> None:
     """A fifth of the pixels lies on something else: absolute differences leave the plane where it is."""

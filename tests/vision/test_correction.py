@@ -39,7 +39,7 @@ def _flat(depth: np.ndarray, step: float = 0.01, reach: int = 2) -> np.ndarray:
     return cv2.dilate(near, kernel) <= cv2.erode(near, kernel) * (1 + step * reach)
 
 
-@settings(deadline=None, max_examples=8)
+@settings(max_examples=8)
 @given(
     tilt=st.tuples(st.floats(-0.7, 0.7), st.floats(-0.7, 0.7)),
     turn=st.tuples(*[st.floats(-3, 3)] * 3),

@@ -66,7 +66,7 @@ def _smooth(depth: np.ndarray) -> np.ndarray:
     return cv2.dilate(depth, kernel) <= cv2.erode(depth, kernel) * 1.04
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.sampled_from([BARREL, CUSHION, FISHEYE]), st.floats(-200, 400), st.floats(-200, 400))
 def test_the_compiled_lens_is_the_one_of_the_camera(lens: Lens, x: float, y: float) -> None:
     camera = PinholeCamera(width=200, height=160, fx=260.0, fy=250.0, cx=97.0, cy=81.0, lens=lens)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rsbench.benchmark.studies.claim_rules import (
@@ -139,7 +139,6 @@ EQUIVALENCE = {
 }
 
 
-@settings(deadline=None)
 @given(
     claim=st.sampled_from(sorted(EQUIVALENCE)),
     error=st.floats(0.01, 100.0),
@@ -159,7 +158,6 @@ def test_a_solver_that_gets_worse_by_a_factor_of_two_never_passes(
     assert any(check.holds is False for check in narrow)
 
 
-@settings(deadline=None)
 @given(error=st.floats(0.01, 100.0), change=st.floats(-0.05, 0.05))
 def test_a_solver_that_stays_as_it_is_passes(error: float, change: float) -> None:
     same = wide([error, error * (1.0 + change), error], 0.01)

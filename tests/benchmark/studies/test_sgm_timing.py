@@ -36,7 +36,7 @@ def _exact(depth: np.ndarray, motion: LinearMotion, timing: Timing) -> np.ndarra
     return np.stack([disparity - CAMERA.fx * RIG.baseline / depth, seen[..., 1] - grid[..., 1]], axis=-1)
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(_VECTOR, _VECTOR, st.floats(2.0, 20.0), st.sampled_from(TIMINGS))
 def test_the_prediction_is_first_order(
     w: tuple[float, ...], d: tuple[float, ...], z: float, timing: Timing
