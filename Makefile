@@ -2,6 +2,7 @@
 # make demo       render, solve, correct and score one sequence; ends with the path of its report
 # make test       format, lint, types, layers and every test
 # make test-extras  install rerun-sdk, torch and datasets (1 GB and more), and run the tests that need them
+# make test-gpu   the renderer's tests on an NVIDIA GPU
 # make attack     kills, failing files, mutated inputs, hostile surroundings, faults for verify: hours
 # make docs       the documentation site, in build/docs; warnings are errors
 # make reference  docs/reference/commands.md and cards.md from the code
@@ -17,7 +18,7 @@ CANDIDATES = $(or $(PYTHON),python3 python3.14 python3.13 python3.12 python3.11)
 COMPILE := from rsbench.solvers.engine.warm_up import warm_up; warm_up(["linear", "twist"])
 SUITABLE := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: help demo test test-extras attack docs reference lock clean
+.PHONY: help demo test test-extras test-gpu attack docs reference lock clean
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := demo
 
@@ -45,6 +46,11 @@ test-extras: $(STAMP)
 	@NO_SKIPS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest tests/interop/test_view.py \
 	  tests/interop/test_export_training.py tests/interop/test_export_colmap.py tests/jobs/test_dask_jobs.py \
 	  tests/storage/test_s3.py
+
+test-gpu: $(STAMP)
+	@$(BIN)/python -c 'import sys; from rsbench.renderers.backend import probe_cuda; found = probe_cuda(); \
+	  sys.exit(None if found.ok else f"make: no GPU to test: {found.reason}")'
+	@RSBENCH_VARIANT=cuda OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest tests/renderers
 
 attack: $(STAMP)
 	@PYTHONPATH=tests $(BIN)/python -m attack --write docs/explanation/reliability.md

@@ -18,75 +18,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rendering_child import assert_alike, child, needs_llvm
 
 from rsbench.core.errors import RsbenchError
 from rsbench.renderers import backend, diagnosis, llvm, probe_cache
 from rsbench.renderers.backend import Backend, start_backend
 from rsbench.renderers.llvm import Candidate, ProbeResult
-
-RENDER = """
-import ctypes, os, sys, time
-from pathlib import Path
-import numpy as np
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.se3 import Pose
-from rsbench.renderers.backend import start_backend
-from rsbench.renderers.options import RendererOptions
-from rsbench.renderers.render import LinePoses, render
-from rsbench.renderers.scene import MitsubaScene
-from rsbench.scenes.model import Light, Material, Scene, SceneMesh
-
-started = start_backend()
-if "WIDTH" in os.environ:  # as on a processor with other registers; Dr.Jit has this function for C++ alone
-    import drjit
-    core = ctypes.CDLL(str(next(Path(drjit.__path__[0]).glob("libdrjit-core.so*"))))
-    features = os.environ["FEATURES"].encode()
-    core._Z19jit_llvm_set_targetPKcS0_j(b"x86-64", features, ctypes.c_uint32(int(os.environ["WIDTH"])))
-    assert core._Z21jit_llvm_vector_widthv() == int(os.environ["WIDTH"])
-texture = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
-meshes = []
-for x, y, z, size in ((-3, -3, 9, 6), (-1, -1, 4, 1.5), (0.2, 0.1, 3, 0.8)):
-    meshes.append(SceneMesh(
-        name="quad",
-        vertices=np.array([[x, y, z], [x + size, y, z], [x + size, y + size, z + 1], [x, y + size, z + 1.0]]),
-        faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32),
-        material=Material(name="t", texture=texture),
-        uv=np.array([[0, 1], [1, 1], [1, 0], [0, 0.0]]),
-    ))
-light = Light(sun_direction=(0.3, -0.5, -0.8), up=(0.0, -1.0, 0.0))
-scene = MitsubaScene(Scene(name="quads", meshes=tuple(meshes), light=light))
-width, height = int(sys.argv[2]), int(sys.argv[3])
-camera = PinholeCamera.centred(width, height, 0.8 * width)
-tau = np.arange(height) / height
-R = np.tile(np.eye(3), (height, 1, 1))
-t = np.stack([0.2 * tau, 0 * tau, -0.3 * tau], axis=-1)
-begin = time.perf_counter()
-sunsky = render(scene, camera, LinePoses(R, t), RendererOptions(samples=4))
-seconds = time.perf_counter() - begin
-path = render(scene, camera, LinePoses(R, t), RendererOptions(samples=4, integrator="path", seed=3))
-stitched = render(scene, camera, LinePoses(R, t), RendererOptions(samples=4, method="stitched"))
-assert (stitched.image == sunsky.image).all() and (stitched.depth == sunsky.depth).all()
-parts = 0.3 * ((np.arange(64) + 0.5) / 64 - 0.5)[:, None, None]
-blur = LinePoses(np.tile(R, (64, 1, 1, 1)), t + parts * np.array([0.2, 0, -0.3]))
-exposed = render(scene, camera, LinePoses(R, t), RendererOptions(samples=4, seed=3), exposed=blur)
-np.savez(sys.argv[1], sunsky=sunsky.image, exposed=exposed.image, depth=sunsky.depth, path=path.image,
-         seconds=seconds, variant=started.variant, message=started.message or "")
-"""
-
-
-def child(tmp_path: Path, name: str, size: tuple[int, int], **environ: str) -> Any:
-    out = tmp_path / f"{name}.npz"
-    command = [sys.executable, "-c", RENDER, str(out), str(size[0]), str(size[1])]
-    done = subprocess.run(
-        command, env={**os.environ, **environ}, capture_output=True, text=True, timeout=300, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return np.load(out)
-
-
-def needs_llvm() -> None:
-    if not any(llvm.probe(candidate).ok for candidate in llvm.candidates()):
-        pytest.skip("no usable LLVM on this machine")
 
 
 def test_scalar_fallback_renders_the_same_frame_and_says_how_to_be_faster(tmp_path: Path) -> None:
@@ -112,13 +49,16 @@ def test_another_vector_width_renders_the_same_within_the_documented_tolerance(t
         pytest.skip("no x86-64 with AVX2 under Linux, on which Dr.Jit's width can be set")
     other = child(tmp_path, "other", (96, 72), WIDTH=str(width), FEATURES="+avx2,+fma,+bmi,+bmi2,+f16c")
     own = child(tmp_path, "own", (96, 72))
-    # docs/get-started/install.md: depth to 1e-5, and images but for one pixel in a hundred, where one of the few
-    # samples at an edge sees the other side.
-    np.testing.assert_allclose(other["depth"], own["depth"], rtol=1e-5)
-    for channel in ("sunsky", "path", "exposed"):
-        levels = [np.rint(255 * np.clip(each[channel], 0, 1) ** (1 / 2.2)) for each in (other, own)]
-        assert np.mean(np.any(levels[0] != levels[1], axis=-1)) < 0.01, channel
-        assert abs(np.mean(levels[0]) - np.mean(levels[1])) < 0.1, channel
+    assert_alike(other, own)
+
+
+def test_a_gpu_renders_the_same_within_the_documented_tolerance(tmp_path: Path) -> None:
+    needs_llvm()
+    if not (verdict := backend.probe_cuda()).ok:
+        pytest.skip(verdict.reason)
+    gpu = child(tmp_path, "gpu", (96, 72), RSBENCH_VARIANT="cuda")
+    assert str(gpu["variant"]) == "cuda_ad_rgb"
+    assert_alike(gpu, child(tmp_path, "own", (96, 72), RSBENCH_VARIANT="llvm"))
 
 
 def test_same_bits_in_another_process(tmp_path: Path) -> None:
