@@ -1,9 +1,9 @@
 """Frames a second on a GPU and on this machine's processor, rolling over global shutter, and what bounds them.
 
 A process renders with one backend, so each has its own. For each size and integrator: the median time of a
-rolling-shutter frame, image and depth in host memory; its ratio to a global-shutter frame, run in turn; how much of
-it Dr.Jit's kernels take by their own clock (the rest is Python, launches and copies to the host); how long a copy of
-the frame's arrays to the host takes alone; and how long writing its files takes, PNG and EXR.
+rolling-shutter frame, image and depth in host memory; its ratio to a global-shutter frame, run in turn; how much
+of it Dr.Jit's kernels take by their own clock (the rest is Python, launches and copies to the host); how long a
+copy of the frame's arrays to the host takes alone; and how long writing its files takes, PNG and EXR.
 
     python benchmarks/gpu_rendering.py --backends cuda llvm --out results/speed/gpu
 """
@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from rsbench.benchmark.provenance import provenance
 from rsbench.storage.files import write_depth, write_json, write_png, write_table
@@ -61,6 +62,14 @@ def copy_milliseconds(pixels: int, runs: int) -> float:
     return statistics.median(found)
 
 
+def writing_milliseconds(image: NDArray[np.uint8], depth: NDArray[np.float32]) -> Row:
+    """Of the files of a frame."""
+    with tempfile.TemporaryDirectory() as folder:
+        png = [milliseconds(lambda: write_png(Path(folder, "a.png"), image)) for _ in range(3)]
+        exr = [milliseconds(lambda: write_depth(Path(folder, "a.exr"), depth)) for _ in range(3)]
+    return {"png_ms": statistics.median(png), "exr_ms": statistics.median(exr)}
+
+
 def rows_of(name: str, runs: int) -> Iterator[Row]:
     """What this process's backend does."""
     import render_rs_vs_gs as scenes
@@ -84,10 +93,6 @@ def rows_of(name: str, runs: int) -> Iterator[Row]:
             still(), rolling()
             pairs = [(milliseconds(rolling), milliseconds(still)) for _ in range(runs)]
             kernels = statistics.median(kernel_milliseconds(rolling) for _ in range(runs))
-            with tempfile.TemporaryDirectory() as folder:
-                image = to_srgb8(frame.image, 1.0)
-                png = [milliseconds(lambda: write_png(Path(folder, "a.png"), image)) for _ in range(3)]
-                exr = [milliseconds(lambda: write_depth(Path(folder, "a.exr"), frame.depth)) for _ in range(3)]
             yield {
                 "backend": started.variant,
                 "width": width,
@@ -98,8 +103,7 @@ def rows_of(name: str, runs: int) -> Iterator[Row]:
                 "rolling_over_global": statistics.median(pair[0] / pair[1] for pair in pairs),
                 "kernels_ms": kernels,
                 "copy_ms": copy_milliseconds(width * height, runs),
-                "png_ms": statistics.median(png),
-                "exr_ms": statistics.median(exr),
+                **writing_milliseconds(to_srgb8(frame.image, 1.0), frame.depth),
                 "runs": runs,
             }
 

@@ -219,7 +219,7 @@ def test_no_speed_exceeds_the_bound(model: Model, w: FloatArray, d: FloatArray, 
     bound = motion.fastest(frame, frame + 1.0)
     assert bound is not None
     for rate, most in zip(motion.velocity(np.linspace(frame, frame + 1.0, 200)), bound, strict=True):
-        assert np.max(np.linalg.norm(rate, axis=-1)) <= most * (1.0 + 1e-12)
+        assert np.max(np.linalg.norm(rate, axis=-1)) <= most * (1.0 + 1e-12) + 1e-150  # squares below lose digits
 
 
 @pytest.mark.parametrize(
