@@ -38,7 +38,9 @@ class LensRays:
         self._most = dr.opaque(mi.Float, camera.width - 1.0), dr.opaque(mi.Float, camera.height - 1.0)
         centres = camera.unproject(camera.pixel_grid())[..., :2].reshape(-1, 2)
         if lens.model == "kannala-brandt":
-            centres = np.arctan(np.hypot(centres[:, :1], centres[:, 1:]))
+            # With its tangent: a GPU's is good to single precision alone.
+            tangent = np.hypot(centres[:, :1], centres[:, 1:])
+            centres = np.concatenate([np.arctan(tangent), tangent], axis=1)
         self._start = [mi.Float64(np.ascontiguousarray(column)) for column in centres.T]
 
     def pixel(self, x: Any, y: Any, active: Any) -> tuple[Any, ...]:
@@ -52,7 +54,7 @@ class LensRays:
         start = [dr.gather(mi.Float64, table, row * self.width + column, active) for table in self._start]
         xd, yd = self._distorted(column, row)
         if self.lens.model == "kannala-brandt":
-            return start[0], 1.0 / self._slope(start[0]), dr.sqrt(xd * xd + yd * yd), dr.tan(start[0])
+            return start[0], 1.0 / self._slope(start[0]), dr.sqrt(xd * xd + yd * yd), start[1]
         by_x, across, by_y = self._derivative(*start)
         determinant = by_x * by_y - across * across
         return *start, xd, yd, by_y / determinant, -across / determinant, by_x / determinant

@@ -266,7 +266,8 @@ def _picture_check(
 
     noisy = options.integrator == "path" and not _made_here(content)
     rendered = to_srgb8(frame.image, options.exposure)
-    return image_check(clean_picture(content.sequence, view), content.pictures[view], rendered, rows, noisy)
+    file, stored = clean_picture(content.sequence, view), content.pictures[view]
+    return image_check(file, stored, rendered, rows, noisy, _by_gpu(content))
 
 
 def _frame_checks(
@@ -292,7 +293,7 @@ def _frame_checks(
             some = rows[::_COMPRESSED] if sensor.jpeg_quality and len(rows) < sequence.shutter.height else rows
             period = sequence.frame_period_s
             sensed = sensed_rows(scene, sequence, (view.side, view.frame), sensor, period, chosen, some)
-            yield image_check(view.image, seen, sensed, some, elsewhere)
+            yield image_check(view.image, seen, sensed, some, elsewhere, _by_gpu(content))
     with contextlib.suppress(RsbenchError):
         if whole_frames(sequence.manifest):
             yield _stack_check(content, scene, chosen, view, rows)
@@ -316,7 +317,15 @@ def _stack_check(
     frame = render(scene, sequence.rig.camera, poses, chosen, rows=rows)
     rendered = to_srgb8(frame.image, chosen.exposure)
     noisy = chosen.integrator == "path" and not _made_here(content)
-    return image_check(f"gs_stack/{view.side}_{view.frame}", seen, rendered, rows, noisy)
+    return image_check(f"gs_stack/{view.side}_{view.frame}", seen, rendered, rows, noisy, _by_gpu(content))
+
+
+def _by_gpu(content: Content) -> bool:
+    """Whether a GPU rendered the one, what is stored or what is rendered again, and not the other."""
+    from rsbench.renderers.backend import VARIANTS, start_backend
+
+    variants = {start_backend().variant, _table(content.sequence.manifest, "made_by").get("variant")}
+    return len(variants) > 1 and VARIANTS["cuda"] in variants
 
 
 def _made_here(content: Content) -> bool:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.renderers.backend import start_backend
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import LinePoses, render, render_global
 from rsbench.renderers.scene import MitsubaScene
@@ -65,10 +66,12 @@ def test_rolling_shutter_depth_of_a_plane_follows_every_row(quad: Any, row_poses
     near = (truth > 0) & (truth < 100)  # beyond, the plane is seen at a grazing angle and then ends
     assert near.mean() > 0.3 and (truth == 0).mean() > 0.2
     _, direction = rays(CAMERA, R, t)
-    # n.d is a difference of terms of size |d|, so its rounding grows as 1 / |n.d|.
+    # n.d is a difference of terms of size |d|, so its rounding grows as 1 / |n.d|;
+    # that of a GPU with the triangle too.
+    size = 1800.0 / 16 if start_backend().variant == "cuda_ad_rgb" else 0.0
     grazing = np.linalg.norm(direction, axis=-1) / np.abs(direction[..., 1])
     assert (np.abs(depth - truth) / np.where(near, truth, 1))[near].max() < 0.05
-    assert (np.abs(depth - truth)[near] <= (FLOAT32 * truth * grazing)[near]).all()
+    assert (np.abs(depth - truth)[near] <= (FLOAT32 * (truth + size) * grazing)[near]).all()
     np.testing.assert_array_equal(depth[truth == 0], 0.0)
     # The test can tell rows apart: the pose of a neighbouring row is far outside the tolerance.
     wrong = plane_depth(CAMERA, np.roll(R, 1, 0), np.roll(t, 1, 0), np.array([0.0, 1.0, 0.0]), 1.6)
