@@ -26,8 +26,9 @@ from rsbench.renderers.scene import MitsubaScene
 
 PACKET = 16
 """Lanes that are traced together at most (AVX-512)."""
-LANES_PER_LAUNCH = 1 << 22
-"""Bounds the memory of a launch; larger work is split, which changes no bit of the result."""
+LANES_PER_LAUNCH, _ON_GPU = 1 << 22, 8
+"""Bounds the memory of a launch, and how many times as many a GPU takes, which waits for each launch to be recorded;
+larger work is split, which changes no bit of the result."""
 
 Float32Array = NDArray[np.float32]
 
@@ -77,8 +78,14 @@ def _padded(width: int) -> int:
     return -(-width // PACKET) * PACKET
 
 
+def _most_lanes() -> int:
+    import mitsuba as mi
+
+    return LANES_PER_LAUNCH * (_ON_GPU if str(mi.variant()).startswith("cuda") else 1)
+
+
 def _bands(rows: Sequence[int], width: int) -> Iterator[Sequence[int]]:
-    step = max(1, LANES_PER_LAUNCH // _padded(width))
+    step = max(1, _most_lanes() // _padded(width))
     for start in range(0, len(rows), step):
         yield rows[start : start + step]
 
@@ -189,8 +196,10 @@ def _path_band(
 
     offsets = mi.Float(subpixel_grid(options.samples).ravel())
     integrator, sampler = path_integrator(options.max_depth), lane_sampler()
-    per_pass = max(1, LANES_PER_LAUNCH // (len(rows) * _padded(camera.width)))
-    total = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
+    pixels = _Lanes.of(rows, camera.width)
+    count = dr.width(pixels.row)
+    per_pass = max(1, _most_lanes() // count)
+    place, total = dr.arange(mi.UInt32, count), [dr.zeros(mi.Float, count)] * 3
     for first in range(0, options.samples, per_pass):
         copies = min(per_pass, options.samples - first)
         lanes = _Lanes.of(rows, camera.width, copies)
@@ -202,6 +211,9 @@ def _path_band(
         sampler.seed_lanes(dr.opaque(mi.UInt32, options.seed), pixel, sample)
         ray = mi.RayDifferential3f(origin, dr.normalize(direction))
         radiance, _, _ = integrator.sample(scene.scene, sampler, ray, active=lanes.active)
-        for one in lanes.image([*radiance], camera.width):
-            total += one
-    return total / np.float32(options.samples)
+        dr.eval(radiance)
+        for copy in range(copies):
+            entry = place + dr.opaque(mi.UInt32, copy * count)
+            total = [one + dr.gather(mi.Float, each, entry) for one, each in zip(total, radiance, strict=True)]
+        dr.eval(total)
+    return pixels.image(total, camera.width)[0] / np.float32(options.samples)
