@@ -27,7 +27,7 @@ from rsbench.renderers.scene import MitsubaScene
 PACKET = 16
 """Lanes that are traced together at most (AVX-512)."""
 LANES_PER_LAUNCH, _ON_GPU = 1 << 22, 8
-"""Bounds the memory of a launch, and how many times as many a GPU takes, which waits for each launch to be recorded;
+"""Bounds the memory of a launch, and how many times as many a GPU takes, which waits while launches are recorded;
 larger work is split, which changes no bit of the result."""
 
 Float32Array = NDArray[np.float32]
@@ -199,7 +199,7 @@ def _path_band(
     pixels = _Lanes.of(rows, camera.width)
     count = dr.width(pixels.row)
     per_pass = max(1, _most_lanes() // count)
-    place, total = dr.arange(mi.UInt32, count), [dr.zeros(mi.Float, count)] * 3
+    total = dr.zeros(mi.Color3f, count)
     for first in range(0, options.samples, per_pass):
         copies = min(per_pass, options.samples - first)
         lanes = _Lanes.of(rows, camera.width, copies)
@@ -211,9 +211,26 @@ def _path_band(
         sampler.seed_lanes(dr.opaque(mi.UInt32, options.seed), pixel, sample)
         ray = mi.RayDifferential3f(origin, dr.normalize(direction))
         radiance, _, _ = integrator.sample(scene.scene, sampler, ray, active=lanes.active)
-        dr.eval(radiance)
-        for copy in range(copies):
-            entry = place + dr.opaque(mi.UInt32, copy * count)
-            total = [one + dr.gather(mi.Float, each, entry) for one, each in zip(total, radiance, strict=True)]
-        dr.eval(total)
-    return pixels.image(total, camera.width)[0] / np.float32(options.samples)
+        total = _added(total, radiance, copies)
+    return pixels.image([*total], camera.width)[0] / np.float32(options.samples)
+
+
+def _added(total: Any, radiance: Any, copies: int) -> Any:
+    """The total of each pixel, and one copy of its radiance after another."""
+    import drjit as dr
+    import mitsuba as mi
+
+    dr.eval(total, radiance)
+    place, step = dr.arange(mi.UInt32, dr.width(total)), dr.opaque(mi.UInt32, dr.width(total))
+    last = dr.opaque(mi.UInt32, copies)
+
+    def add_copy(k: Any, total: Any) -> tuple[Any, Any]:
+        return k + 1, total + mi.Color3f(*(dr.gather(mi.Float, each, place + k * step) for each in radiance))
+
+    _, total = dr.while_loop(
+        state=(dr.zeros(mi.UInt32, dr.width(total)), total),
+        cond=lambda k, total: k < last,
+        body=add_copy,
+        labels=("copy", "total"),
+    )
+    return total
