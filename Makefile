@@ -2,7 +2,7 @@
 # make demo       render, solve, correct and score one sequence; ends with the path of its report
 # make test       format, lint, types, layers and every test
 # make test-extras  install rerun-sdk, torch and datasets (1 GB and more), and run the tests that need them
-# make test-gpu   the renderer's tests on an NVIDIA GPU
+# make test-gpu   tests of what renders, on an NVIDIA GPU
 # make attack     kills, failing files, mutated inputs, hostile surroundings, faults for verify: hours
 # make docs       the documentation site, in build/docs; warnings are errors
 # make reference  docs/reference/commands.md and cards.md from the code
@@ -50,7 +50,7 @@ test-extras: $(STAMP)
 test-gpu: $(STAMP)
 	@$(BIN)/python -c 'import sys; from rsbench.renderers.backend import probe_cuda; found = probe_cuda(); \
 	  sys.exit(None if found.ok else f"make: no GPU to test: {found.reason}")'
-	@RSBENCH_VARIANT=cuda OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest tests/renderers
+	@RSBENCH_VARIANT=cuda OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -k "not moving" tests/renderers tests/dataset
 
 attack: $(STAMP)
 	@PYTHONPATH=tests $(BIN)/python -m attack --write docs/explanation/reliability.md

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.errors import RsbenchError
-from rsbench.renderers.backend import start_backend
+from rsbench.renderers.backend import VARIANTS, start_backend
 from rsbench.scenes.environment import irradiance_map
 from rsbench.scenes.model import Environment, Light, Material, Scene, SceneMesh
 
@@ -29,16 +29,22 @@ class MitsubaScene:
 
     Raises:
         RsbenchError: a mesh or texture has the wrong shape, is not finite or points at vertices that it does not
-            have; a textured mesh has no uv; the sun or the zenith has no direction; no backend.
+            have; a textured mesh has no uv; the sun or the zenith has no direction; objects that move on a GPU; no
+            backend.
     """
 
     def __init__(self, scene: Scene) -> None:
-        start_backend()
+        variant = start_backend().variant
         import mitsuba as mi
 
         self.name = scene.name
         self.light = scene.light
         drawn = [mesh for mesh in scene.meshes if mesh.faces.size]
+        if variant == VARIANTS["cuda"] and any(mesh.mover for mesh in drawn):
+            # Each is a scene of its own; on a GPU the rays of a kernel meet one of them alone, without a word.
+            raise RsbenchError(
+                f"scene {scene.name}: objects that move are not rendered on a GPU: choose backend llvm"
+            )
         content: dict[str, Any] = {"type": "scene"}
         moved: list[dict[str, Any]] = [{"type": "scene"} for _ in range(max((m.mover for m in drawn), default=0))]
         # `path` picks one emitter at random for each shadow ray: black ones would only add noise.

@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +101,16 @@ def test_start_is_idempotent_and_refuses_a_second_variant(monkeypatch: pytest.Mo
     other: backend.Preference = "llvm" if first.variant == "scalar_rgb" else "scalar"
     with pytest.raises(RsbenchError, match=f"already renders with {first.variant}"):
         start_backend(other)
+
+
+def test_objects_that_move_are_refused_on_a_gpu(town: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    import rsbench.renderers.scene as module
+
+    start_backend()
+    monkeypatch.setattr(module, "start_backend", lambda: Backend(variant="cuda_ad_rgb"))
+    moved = replace(town, meshes=(*town.meshes[:-1], replace(town.meshes[-1], mover=1)))
+    with pytest.raises(RsbenchError, match="objects that move are not rendered on a GPU"):
+        module.MitsubaScene(moved)
 
 
 def test_preferences_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
