@@ -135,8 +135,7 @@ def generate(
     dataset = _chosen(whole, sequence, shard, channels)
     if not estimate:
         _ = check_out(place) if isinstance(place, Path) else store_for(place, processes)
-    if backend is not None:
-        ask_for(backend)
+    ask_for(backend)
     if (started := start_backend()).message:
         typer.echo(started.message, err=True)
     if estimate:

@@ -88,15 +88,15 @@ def start_backend(preference: Preference = "auto") -> Backend:
         return _started
 
 
-def ask_for(name: str) -> None:
-    """Have this process, and those that it starts, render with a backend.
+def ask_for(name: str | None) -> None:
+    """Have this process, and those that it starts, render with a backend; with None, as the environment says.
 
     Raises:
         RsbenchError: no such backend.
     """
-    if name not in VARIANTS:
+    if name is not None and name not in VARIANTS:
         raise RsbenchError(f"--backend {name}: allowed are {', '.join(VARIANTS)}")
-    os.environ["RSBENCH_VARIANT"] = name
+    os.environ.update({"RSBENCH_VARIANT": name} if name else {})
 
 
 def _check_working_folder() -> None:
