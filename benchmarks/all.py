@@ -24,7 +24,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy loads
 import numpy as np
 import pandas as pd
 
+from rsbench.benchmark.images.plan import EvaluationOptions
 from rsbench.benchmark.provenance import provenance
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import VIEWS
 from rsbench.storage.files import write_bytes, write_json, write_table
 
 ROOT = Path(__file__).parents[1]
@@ -32,6 +35,7 @@ RESULTS, PAGE = ROOT / "results/speed", ROOT / "docs/results-speed.md"
 START, END = "<!-- The table of benchmarks/all.py -->\n", "<!-- End of the table -->\n"
 COLUMNS = ["row", "anchor", "median", "lowest", "highest", "runs", "limit"]
 Work = Callable[[], object]
+OPTIONS = EvaluationOptions(solvers=("rs-stereo-refined", "gs-8pt", "rs-stereo-linear"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,17 +111,15 @@ def motion_over_poselib(solver: str) -> Callable[[], tuple[Work, Work]]:
 def again_over_first(folder: Path) -> tuple[Work, Work]:
     """``evaluate`` of the card smoke with three solvers."""
     from rsbench.benchmark.images.evaluation import open_evaluation
-    from rsbench.benchmark.images.plan import EvaluationOptions
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import generate_dataset
     from rsbench.report.evaluation_page import write_report
     from rsbench.vision.features import forget_features
 
     generate_dataset(load_dataset_card("smoke"), folder / "smoke")
-    options = EvaluationOptions(solvers=("rs-stereo-refined", "gs-8pt", "rs-stereo-linear"))
 
     def evaluate(out: Path) -> None:
-        open_evaluation(folder / "smoke", out, options).run("benchmark", lambda word: None)
+        open_evaluation(folder / "smoke", out, OPTIONS).run("benchmark", lambda word: None)
         write_report(folder / "smoke", out)
 
     def first() -> None:
@@ -126,6 +128,70 @@ def again_over_first(folder: Path) -> tuple[Work, Work]:
 
     evaluate(folder / "kept")
     return lambda: evaluate(folder / "kept"), first
+
+
+def checked_over_made(folder: Path) -> tuple[Work, Work]:
+    """``verify`` of the sequence castle of the card paper, and ``generate`` of it."""
+    from rsbench.verification import verify_dataset
+
+    made = made_again(folder)
+    return lambda: verify_dataset(made(), rerender="auto"), made
+
+
+def scored_over_made(folder: Path) -> tuple[Work, Work]:
+    """``evaluate`` of the sequence castle of the card paper with three solvers, and ``generate`` of it."""
+    from rsbench.benchmark.images.evaluation import open_evaluation
+    from rsbench.vision.features import forget_features
+
+    made = made_again(folder)
+    place = made()
+
+    def evaluate() -> None:
+        forget_features()
+        open_evaluation(place, Path(tempfile.mkdtemp(dir=folder)), OPTIONS).run("benchmark", lambda word: None)
+
+    evaluate()
+    return evaluate, made
+
+
+def made_again(folder: Path) -> Callable[[], Path]:
+    """Renders the sequence castle of the card paper anew; where it lies."""
+    from rsbench.dataset.card import load_dataset_card
+    from rsbench.dataset.generation import generate_dataset
+
+    card = load_dataset_card("paper").only(["castle"])
+
+    def make() -> Path:
+        place = Path(tempfile.mkdtemp(dir=folder)) / "castle"
+        generate_dataset(card, place)
+        return place
+
+    make()
+    return make
+
+
+def asked_over_matched(data: Path) -> tuple[Work, Work]:
+    """``inspect`` of four frames 900 x 900 of which nothing is known, and the matches that it reads."""
+    from rsbench.capture.estimate import conclude, examine
+    from rsbench.capture.settle import known_of
+    from rsbench.dataset.sequence import read_dataset
+    from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.pipeline.frame_matches import match_unknown
+    from rsbench.vision.features import forget_features
+
+    sequence, options = next(iter(read_dataset(data))), CorrectionOptions()
+    images = {view: sequence.image("rs", *view) for view in VIEWS}
+
+    def match() -> Correspondences:
+        forget_features()
+        return match_unknown(images, sequence.rig, options)[0]
+
+    def inspect() -> None:
+        matches = match()
+        conclude([examine(matches, sequence.rig, known_of(matches, sequence.rig, None, None), options.robust, 0)])
+
+    inspect()
+    return inspect, match
 
 
 def rows(data: Path, folder: Path) -> Iterator[Row]:
@@ -159,6 +225,27 @@ def rows(data: Path, folder: Path) -> Iterator[Row]:
             runs=5,
             prepare=motion_over_poselib(solver),
         )
+    yield Row(
+        name="`inspect`, four frames 900 x 900, nothing known",
+        anchor="their matches",
+        limit=8.0,
+        runs=3,
+        prepare=lambda: asked_over_matched(data),
+    )
+    yield Row(
+        name="`verify` of a sequence of `paper`",
+        anchor="`generate` of it",
+        limit=1.0,
+        runs=3,
+        prepare=lambda: checked_over_made(folder),
+    )
+    yield Row(
+        name="`evaluate` of a sequence of `paper`, three solvers",
+        anchor="`generate` of it",
+        limit=2.0,
+        runs=3,
+        prepare=lambda: scored_over_made(folder),
+    )
     yield Row(
         name="`evaluate` of `smoke` again, nothing changed",
         anchor="the first time",
