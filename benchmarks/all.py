@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import argparse
 import os
+import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy loads
@@ -35,7 +36,8 @@ RESULTS, PAGE = ROOT / "results/speed", ROOT / "docs/results-speed.md"
 START, END = "<!-- The table of benchmarks/all.py -->\n", "<!-- End of the table -->\n"
 COLUMNS = ["row", "anchor", "median", "lowest", "highest", "runs", "limit"]
 Work = Callable[[], object]
-OPTIONS = EvaluationOptions(solvers=("rs-stereo-refined", "gs-8pt", "rs-stereo-linear"))
+SOLVERS = ("--solver", "rs-stereo-refined", "--solver", "gs-8pt", "--solver", "rs-stereo-linear")
+OPTIONS = EvaluationOptions(solvers=SOLVERS[1::2])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,10 +53,10 @@ class Row:
 
 
 def cpu(work: Work) -> float:
-    """Processor seconds, of all threads."""
-    begin = time.process_time()
+    """Processor seconds, of all threads and of the processes that end meanwhile."""
+    begin = os.times()
     work()
-    return time.process_time() - begin
+    return sum(os.times()[:4]) - sum(begin[:4])
 
 
 def rolling_over_global() -> tuple[Work, Work]:
@@ -130,44 +132,23 @@ def again_over_first(folder: Path) -> tuple[Work, Work]:
     return lambda: evaluate(folder / "kept"), first
 
 
-def checked_over_made(folder: Path) -> tuple[Work, Work]:
-    """``verify`` of the sequence castle of the card paper, and ``generate`` of it."""
-    from rsbench.verification import verify_dataset
+def command_over_generate(folder: Path, *words: str) -> tuple[Work, Work]:
+    """A command on the sequence castle of the card paper, and ``generate`` of it."""
+    number = count()
 
-    made = made_again(folder)
-    return lambda: verify_dataset(made(), rerender="auto"), made
-
-
-def scored_over_made(folder: Path) -> tuple[Work, Work]:
-    """``evaluate`` of the sequence castle of the card paper with three solvers, and ``generate`` of it."""
-    from rsbench.benchmark.images.evaluation import open_evaluation
-    from rsbench.vision.features import forget_features
-
-    made = made_again(folder)
-    place = made()
-
-    def evaluate() -> None:
-        forget_features()
-        open_evaluation(place, Path(tempfile.mkdtemp(dir=folder)), OPTIONS).run("benchmark", lambda word: None)
-
-    evaluate()
-    return evaluate, made
-
-
-def made_again(folder: Path) -> Callable[[], Path]:
-    """Renders the sequence castle of the card paper anew; where it lies."""
-    from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.generation import generate_dataset
-
-    card = load_dataset_card("paper").only(["castle"])
+    def run(*command: str) -> None:
+        quiet = subprocess.DEVNULL
+        subprocess.run([sys.executable, "-m", "rsbench", *command], stdout=quiet, stderr=quiet, check=True)
 
     def make() -> Path:
-        place = Path(tempfile.mkdtemp(dir=folder)) / "castle"
-        generate_dataset(card, place)
+        place = folder / f"castle{next(number)}"
+        run("generate", "paper", "--sequence", "castle", "--out", str(place))
         return place
 
-    make()
-    return make
+    made = make()
+    return lambda: run(
+        words[0], str(made), *(each.format(folder / f"out{next(number)}") for each in words[1:])
+    ), make
 
 
 def asked_over_matched(data: Path) -> tuple[Work, Work]:
@@ -237,14 +218,14 @@ def rows(data: Path, folder: Path) -> Iterator[Row]:
         anchor="`generate` of it",
         limit=1.0,
         runs=3,
-        prepare=lambda: checked_over_made(folder),
+        prepare=lambda: command_over_generate(folder, "verify"),
     )
     yield Row(
         name="`evaluate` of a sequence of `paper`, three solvers",
         anchor="`generate` of it",
         limit=2.0,
         runs=3,
-        prepare=lambda: scored_over_made(folder),
+        prepare=lambda: command_over_generate(folder, "evaluate", *SOLVERS, "--out", "{}"),
     )
     yield Row(
         name="`evaluate` of `smoke` again, nothing changed",
