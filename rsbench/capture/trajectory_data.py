@@ -47,6 +47,8 @@ class TimedTracks:
     """(2,) fx, fy, px."""
     past: Past | None = None
     """Of the tracks of earlier windows; None: the spline begins here, and the pose at time 0 is the world's."""
+    share: float = 1.0
+    """What a track counts beside the prior: less than 1 where errors of neighbouring tracks are alike."""
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -76,6 +78,7 @@ def pack_windows(
     right: Sequence[FloatArray] | None = None,
     first: int = 0,
     past: Past | None = None,
+    share: float = 1.0,
 ) -> TimedTracks:
     """The tracks of windows, and their pairs that no track repeats; window k is of the frames k and k + 1.
 
@@ -84,6 +87,7 @@ def pack_windows(
             are one track; None: none is linked to another.
         first: number of the first window.
         past: of those before.
+        share: what a track counts beside the prior.
     """
     members = [np.zeros(0, dtype=np.int64) for _ in windows]
     ends, owners = list[FloatArray](), list[IntArray]()
@@ -111,6 +115,7 @@ def pack_windows(
         members=tuple(members),
         focal=np.array([rig.camera.fx, rig.camera.fy]),
         past=past,
+        share=share,
     )
 
 

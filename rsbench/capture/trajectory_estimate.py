@@ -51,6 +51,9 @@ class TrajectoryOptions:
     """Whether the matches say the prior and the knots."""
     link: bool = True
     """Whether tracks that meet in a frame are one; without it their common ends count as two."""
+    share: float = 0.5
+    """What a track counts beside the prior. Patches of tracks that lie within 10 px of each other overlap and err
+    alike: counted for one each, the tracks of a still hand take their common errors for accelerations."""
     seed: int = 0
     """Of the search for motions of single windows."""
 
@@ -138,7 +141,8 @@ def estimate_trajectory(
     if len(windows) > _JUDGED:
         found, tracks = _fitted(windows, rig, shutter, motions, found.curve.interval, found.prior, options)
     if options.link:
-        tracks = pack_windows(windows, rig, shutter, [found.trust[each] for each in tracks.members])
+        right = [found.trust[each] for each in tracks.members]
+        tracks = pack_windows(windows, rig, shutter, right, share=options.share)
         found = fit(found.curve, tracks, found.prior, options.learn, found.tails)
     return _told(found, tracks, windows, shutter)
 
@@ -153,7 +157,7 @@ def _fitted(
     options: TrajectoryOptions,
 ) -> tuple[Fit, TimedTracks]:
     """The spline of windows, and their tracks."""
-    tracks = pack_windows(windows, rig, shutter)
+    tracks = pack_windows(windows, rig, shutter, share=options.share)
     curve = first_curve(motions, tracks, span_of(len(windows), shutter), interval)
     return fit(curve, tracks, prior, options.learn), tracks
 

@@ -102,7 +102,8 @@ class _State:
         self.fresh += 1
 
     def _pack(self, windows: Sequence[Correspondences], right: Sequence[FloatArray] | None = None) -> TimedTracks:
-        return pack_windows(windows, self.rig, self.shutter, right, self.first, self.past)
+        share = self.options.share
+        return pack_windows(windows, self.rig, self.shutter, right, self.first, self.past, share)
 
     def solve(self) -> tuple[Fit, TimedTracks]:
         """The spline of all that is remembered; some of the tracks say first which are right."""
@@ -124,7 +125,7 @@ class _State:
 
     def _begun(self, few: Sequence[Correspondences]) -> Fit:
         """The first spline: some of the tracks say which knots and which prior."""
-        options, tracks = self.options, pack_windows(few, self.rig, self.shutter)
+        options, tracks = self.options, self._pack(few)
         curve = first_curve(self.motions, tracks, span_of(len(few), self.shutter), options.intervals[0])
         found = fit(curve, tracks, options.prior, options.learn)
         return choose(found, tracks, options.intervals) if options.learn else found
