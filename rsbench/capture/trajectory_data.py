@@ -15,6 +15,8 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
 IntArray = NDArray[np.int64]
+_ENOUGH = 400
+"""Tracks of a window from which on its pairs say little more, and take longer than all else."""
 LONGEST = 5
 """Frames of a track: more would couple more control poses for little."""
 
@@ -69,6 +71,11 @@ def thinned(windows: Sequence[Correspondences], count: int) -> list[Corresponden
     """About so many tracks of each window, and no pairs where there are as many as that."""
     few = [Correspondences(tracks=each.tracks[:: max(len(each.tracks) // count, 1)]) for each in windows]
     return [some if len(some.tracks) >= count else each for some, each in zip(few, windows, strict=True)]
+
+
+def telling(window: Correspondences) -> Correspondences:
+    """What is looked at of a window: its tracks alone, where there are enough."""
+    return Correspondences(tracks=window.tracks) if len(window.tracks) >= _ENOUGH else window
 
 
 def pack_windows(

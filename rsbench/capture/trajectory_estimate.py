@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from rsbench.capture import trajectory_banded as banded
 from rsbench.capture.trajectory_choice import approximated, choose
 from rsbench.capture.trajectory_covariance import covariance_between, pose_covariance
-from rsbench.capture.trajectory_data import TimedTracks, pack_windows
+from rsbench.capture.trajectory_data import TimedTracks, pack_windows, telling
 from rsbench.capture.trajectory_fit import NORMAL, Fit, fit, information
 from rsbench.capture.trajectory_kernels import Tails
 from rsbench.capture.trajectory_prior import Prior
@@ -129,7 +129,7 @@ def estimate_trajectory(
     Raises:
         ValueError: no windows, or no tracks in any.
     """
-    options = options or TrajectoryOptions(seed=seed)
+    options, windows = options or TrajectoryOptions(seed=seed), [telling(each) for each in windows]
     if not any(len(window.tracks) for window in windows):
         raise ValueError("a trajectory needs tracks: matches of both cameras over time")
     if motions is None:

@@ -16,7 +16,7 @@ import scipy
 from rsbench.capture import trajectory_banded as banded
 from rsbench.capture.trajectory_choice import choose
 from rsbench.capture.trajectory_covariance import covariance_between
-from rsbench.capture.trajectory_data import Past, TimedTracks, pack_windows, thinned
+from rsbench.capture.trajectory_data import Past, TimedTracks, pack_windows, telling, thinned
 from rsbench.capture.trajectory_estimate import TrajectoryOptions, is_supported, noise_px
 from rsbench.capture.trajectory_fit import ANCHORED, Fit, fit, held, information, normal_equations, right_tracks
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, part, span_of
@@ -97,7 +97,7 @@ class _State:
         """Number of the last window that its own tracks carry, of those that have left."""
 
     def add(self, window: Correspondences, motion: Motion | None) -> None:
-        self.windows.append(window)
+        self.windows.append(telling(window))
         self.motions.append(motion)
         self.fresh += 1
 
