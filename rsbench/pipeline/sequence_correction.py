@@ -181,7 +181,7 @@ def _moment(
     motion = None if window.found is None else window.found.motion
     pairs = window.pairs
     if "depth" in needs:
-        pairs = find_depth(window.images, rig, shutter, motion, options, pairs)
+        pairs = find_depth(window.images, rig, shutter, motion, options, pairs, frames=(place,))
     views = tuple((side, place) for side in SIDES)
     offset = 0.0 if window.found is None else window.found.disparity_offset
     known = Given(matches=window.matches, motion=motion, pairs=pairs)
