@@ -15,7 +15,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
 IntArray = NDArray[np.int64]
-_ENOUGH = 400
+ENOUGH = 400
 """Tracks of a window from which on its pairs say little more, and take longer than all else."""
 LONGEST = 5
 """Frames of a track: more would couple more control poses for little."""
@@ -75,7 +75,7 @@ def thinned(windows: Sequence[Correspondences], count: int) -> list[Corresponden
 
 def telling(window: Correspondences) -> Correspondences:
     """What is looked at of a window: its tracks alone, where there are enough."""
-    return Correspondences(tracks=window.tracks) if len(window.tracks) >= _ENOUGH else window
+    return Correspondences(tracks=window.tracks) if len(window.tracks) >= ENOUGH else window
 
 
 def pack_windows(
