@@ -12,13 +12,14 @@ from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.scans import GLOBAL
 from rsbench.capture.settle import NoMotionError, as_global, known_of, shutter_found
 from rsbench.capture.trajectory_check import SUCCESSIVE, shakes
+from rsbench.capture.trajectory_data import ENOUGH
 from rsbench.capture.trajectory_shutter import LONGEST, capture_of_sequence
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource
-from rsbench.pipeline.frame_matches import match_frames, match_unknown
+from rsbench.pipeline.frame_matches import match_frames, match_unknown, with_enough
 from rsbench.pipeline.frame_motion import models_asked
 from rsbench.pipeline.sequence_windows import JUDGED, Refusals, window_images
 
@@ -65,12 +66,13 @@ def estimate_sequence_capture(
         chosen = not look.shaken and number % every == 0 and len(look.used) < WINDOWS
         if not (chosen or number < look.successive):
             continue
+        matching = with_enough(options, ENOUGH) if look.shaken else options
         try:
             if scanning is None:
-                matches, doubt = match_unknown(images, rig, options, judge_rig=number < JUDGED)
+                matches, doubt = match_unknown(images, rig, matching, judge_rig=number < JUDGED)
                 doubts.append(doubt)
             else:
-                matches = match_frames(images, rig, options, scanning, judge_rig=number < JUDGED)
+                matches = match_frames(images, rig, matching, scanning, judge_rig=number < JUDGED)
         except RefusedFramesError as error:
             refusals.add(number, error)
             matches, chosen = Correspondences(), False
