@@ -19,6 +19,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource
+from rsbench.pipeline.frame_depth import Images
 from rsbench.pipeline.frame_matches import match_frames, match_unknown, with_enough
 from rsbench.pipeline.frame_motion import models_asked
 from rsbench.pipeline.sequence_windows import JUDGED, Refusals, window_images
@@ -68,11 +69,8 @@ def estimate_sequence_capture(
             continue
         matching = with_enough(options, ENOUGH) if look.shaken else options
         try:
-            if scanning is None:
-                matches, doubt = match_unknown(images, rig, matching, judge_rig=number < JUDGED)
-                doubts.append(doubt)
-            else:
-                matches = match_frames(images, rig, matching, scanning, judge_rig=number < JUDGED)
+            matches, doubt = _matched(images, rig, matching, scanning, number < JUDGED)
+            doubts.append(doubt)
         except RefusedFramesError as error:
             refusals.add(number, error)
             matches, chosen = Correspondences(), False
@@ -90,6 +88,15 @@ def estimate_sequence_capture(
     if doubt is not None and shutter.rows_together:
         raise doubt
     return capture, shutter
+
+
+def _matched(
+    images: Images, rig: StereoRig, options: CorrectionOptions, scanning: Scanning | None, judge_rig: bool
+) -> tuple[Correspondences, RefusedFramesError | None]:
+    """Of a window; and what speaks against a pair that reads as one, where the scanning is not known."""
+    if scanning is None:
+        return match_unknown(images, rig, options, judge_rig=judge_rig)
+    return match_frames(images, rig, options, scanning, judge_rig=judge_rig), None
 
 
 class _Look:
