@@ -98,9 +98,12 @@ class SiftMatcher(MatchOptions, FeatureMatcher):
     def _matched(self, images: Mapping[View, NDArray[np.uint8]], camera: PinholeCamera | None) -> Correspondences:
         four = (images["left", 0], images["right", 0], images["left", 1], images["right", 1])
         matches = match_stereo_frames(*four, self, camera)
-        if 0 < self.enough_tracks <= len(matches.tracks):
+        alone = 0 < self.enough_tracks <= len(matches.tracks)
+        if alone:
             matches = Correspondences(tracks=matches.tracks)
-        return refine_matches(images, matches) if self.refine and not _still(matches) else matches
+        if self.refine and not _still(matches):
+            matches = refine_matches(images, matches)
+        return Correspondences(tracks=matches.tracks) if alone else matches
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
