@@ -52,8 +52,8 @@ class TrajectoryOptions:
     link: bool = True
     """Whether tracks that meet in a frame are one; without it their common ends count as two."""
     share: float = 0.5
-    """What a track counts beside the prior. Patches of tracks that lie within 10 px of each other overlap and err
-    alike: counted for one each, the tracks of a still hand take their common errors for accelerations."""
+    """What a track counts beside the prior. Patches of neighbouring tracks overlap and err alike: counted for one
+    each, they take a still hand's common errors for accelerations."""
     seed: int = 0
     """Of the search for motions of single windows."""
 

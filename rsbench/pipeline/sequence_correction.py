@@ -14,7 +14,7 @@ from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET
 from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.settle import AUTO, NoMotionError
 from rsbench.capture.trajectory_data import ENOUGH
-from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, compose
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.pipeline.chain import Given, check_cameras, correct_known, find_depth
@@ -183,7 +183,9 @@ def _moment(
     motion = None if window.found is None else window.found.motion
     pairs = window.pairs
     if "depth" in needs:
-        pairs = find_depth(window.images, rig, shutter, motion, options, pairs, frames=(place,))
+        # Of a trajectory every frame is corrected by itself: the other one's own depth hardly shows in it.
+        frames = FRAMES if window.pose is None else (place,)
+        pairs = find_depth(window.images, rig, shutter, motion, options, pairs, frames=frames)
     views = tuple((side, place) for side in SIDES)
     offset = 0.0 if window.found is None else window.found.disparity_offset
     known = Given(matches=window.matches, motion=motion, pairs=pairs)
