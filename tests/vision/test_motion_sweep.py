@@ -31,7 +31,7 @@ def test_a_thin_post_before_a_wall_gets_its_depth(world: Build, shapes: Any, u8:
     asked: Any = tuple(images), tuple(known), scene.rig, scene.shutter, scene.motion, side
     both = depth_from_motion(*asked)
     for frame in (0, 1):  # as where both are asked for: the other one is searched where it must agree
-        alone = depth_from_motion(*asked, (frame,))
+        alone = depth_from_motion(*asked, wanted=(frame,))
         np.testing.assert_array_equal(alone[frame], both[frame])
         assert not np.any(alone[1 - frame])
     for frame, found in enumerate(both):
