@@ -15,6 +15,8 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
 IntArray = NDArray[np.int64]
+ENOUGH = 400
+"""Tracks of a window from which on its pairs say little more, and take longer than all else."""
 LONGEST = 5
 """Frames of a track: more would couple more control poses for little."""
 
@@ -47,6 +49,8 @@ class TimedTracks:
     """(2,) fx, fy, px."""
     past: Past | None = None
     """Of the tracks of earlier windows; None: the spline begins here, and the pose at time 0 is the world's."""
+    share: float = 1.0
+    """What a track counts beside the prior: less than 1 where errors of neighbouring tracks are alike."""
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -69,6 +73,11 @@ def thinned(windows: Sequence[Correspondences], count: int) -> list[Corresponden
     return [some if len(some.tracks) >= count else each for some, each in zip(few, windows, strict=True)]
 
 
+def telling(window: Correspondences) -> Correspondences:
+    """What is looked at of a window: its tracks alone, where there are enough."""
+    return Correspondences(tracks=window.tracks) if len(window.tracks) >= ENOUGH else window
+
+
 def pack_windows(
     windows: Sequence[Correspondences],
     rig: StereoRig,
@@ -76,6 +85,7 @@ def pack_windows(
     right: Sequence[FloatArray] | None = None,
     first: int = 0,
     past: Past | None = None,
+    share: float = 1.0,
 ) -> TimedTracks:
     """The tracks of windows, and their pairs that no track repeats; window k is of the frames k and k + 1.
 
@@ -84,6 +94,7 @@ def pack_windows(
             are one track; None: none is linked to another.
         first: number of the first window.
         past: of those before.
+        share: what a track counts beside the prior.
     """
     members = [np.zeros(0, dtype=np.int64) for _ in windows]
     ends, owners = list[FloatArray](), list[IntArray]()
@@ -111,6 +122,7 @@ def pack_windows(
         members=tuple(members),
         focal=np.array([rig.camera.fx, rig.camera.fy]),
         past=past,
+        share=share,
     )
 
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from rsbench.capture import trajectory_banded as banded
 from rsbench.capture.trajectory_choice import approximated, choose
 from rsbench.capture.trajectory_covariance import covariance_between, pose_covariance
-from rsbench.capture.trajectory_data import TimedTracks, pack_windows
+from rsbench.capture.trajectory_data import TimedTracks, pack_windows, telling
 from rsbench.capture.trajectory_fit import NORMAL, Fit, fit, information
 from rsbench.capture.trajectory_kernels import Tails
 from rsbench.capture.trajectory_prior import Prior
@@ -51,6 +51,9 @@ class TrajectoryOptions:
     """Whether the matches say the prior and the knots."""
     link: bool = True
     """Whether tracks that meet in a frame are one; without it their common ends count as two."""
+    share: float = 0.5
+    """What a track counts beside the prior. Patches of neighbouring tracks overlap and err alike: counted for one
+    each, they take a still hand's common errors for accelerations."""
     seed: int = 0
     """Of the search for motions of single windows."""
 
@@ -126,7 +129,7 @@ def estimate_trajectory(
     Raises:
         ValueError: no windows, or no tracks in any.
     """
-    options = options or TrajectoryOptions(seed=seed)
+    options, windows = options or TrajectoryOptions(seed=seed), [telling(each) for each in windows]
     if not any(len(window.tracks) for window in windows):
         raise ValueError("a trajectory needs tracks: matches of both cameras over time")
     if motions is None:
@@ -138,7 +141,8 @@ def estimate_trajectory(
     if len(windows) > _JUDGED:
         found, tracks = _fitted(windows, rig, shutter, motions, found.curve.interval, found.prior, options)
     if options.link:
-        tracks = pack_windows(windows, rig, shutter, [found.trust[each] for each in tracks.members])
+        right = [found.trust[each] for each in tracks.members]
+        tracks = pack_windows(windows, rig, shutter, right, share=options.share)
         found = fit(found.curve, tracks, found.prior, options.learn, found.tails)
     return _told(found, tracks, windows, shutter)
 
@@ -153,7 +157,7 @@ def _fitted(
     options: TrajectoryOptions,
 ) -> tuple[Fit, TimedTracks]:
     """The spline of windows, and their tracks."""
-    tracks = pack_windows(windows, rig, shutter)
+    tracks = pack_windows(windows, rig, shutter, share=options.share)
     curve = first_curve(motions, tracks, span_of(len(windows), shutter), interval)
     return fit(curve, tracks, prior, options.learn), tracks
 

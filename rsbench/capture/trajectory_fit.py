@@ -7,7 +7,7 @@ by maximum evidence (D. MacKay, Bayesian interpolation, Neural Computation 1992)
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -94,7 +94,7 @@ def normal_equations(
     n, past = len(curve.p), tracks.past
     width = width_of(tracks, curve)
     band, gradient, squares = np.zeros((6 * n, width)), np.zeros(6 * n), np.zeros(len(trust))
-    cost = _add_halves(curve, tracks, tails, trust, (squares, band, gradient), want)
+    cost = _add_halves(curve, tracks, tails, tracks.share * trust, (squares, band, gradient), want)
     rough = roughness(curve, prior.memory, prior.smooth, width, past is None, until)
     for kind, strength in enumerate((prior.rotation, prior.position)):
         cost += 0.5 * rough.squares[kind] / strength
@@ -158,6 +158,8 @@ def information(
 ) -> FloatArray:
     """Factor of the expected information of the control poses, whose pose at time 0 is held; a band.
 
+    Every track counts for one.
+
     Args:
         prior: None: what the tracks alone say.
 
@@ -167,7 +169,8 @@ def information(
     # Of a t distribution: K. Lange, R. Little, J. Taylor, see ``heavy_tails``.
     expected = trust * (tails.nu + tracks.freedom) / (tails.nu + tracks.freedom + 2.0)
     silent = prior or Prior(1.0, 1, np.inf, np.inf)
-    found = normal_equations(curve, tracks, Tails(NORMAL, tails.scale), silent, expected)
+    each = replace(tracks, share=1.0)
+    found = normal_equations(curve, each, Tails(NORMAL, tails.scale), silent, expected)
     return banded.factor(held(found, curve, tracks, ANCHORED))
 
 

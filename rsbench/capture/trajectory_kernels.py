@@ -78,7 +78,7 @@ class Scratch(NamedTuple):
     """(m,) gradient."""
 
 
-@compiled
+@compiled(error_model="numpy")
 def _scratch(ends: int, size: int) -> Scratch:
     return Scratch(
         blank_views(ends),
@@ -100,7 +100,7 @@ def _scratch(ends: int, size: int) -> Scratch:
     )
 
 
-@compiled
+@compiled(error_model="numpy")
 def add_tracks(
     curve: Curve,
     ends: FloatArray,
@@ -143,7 +143,7 @@ def add_tracks(
     return total
 
 
-@compiled
+@compiled(error_model="numpy")
 def _explain(curve: Curve, track: FloatArray, focal: FloatArray, s: Scratch) -> float:
     """The best point of a track; its squared error, px^2."""
     count = len(track)
@@ -162,12 +162,12 @@ def _explain(curve: Curve, track: FloatArray, focal: FloatArray, s: Scratch) -> 
     return total
 
 
-@compiled
+@compiled(error_model="numpy")
 def _ridge() -> float:
     return (_UNCERTAIN / _ROUGH_RHO) ** 2
 
 
-@compiled
+@compiled(error_model="numpy")
 def _first_point(track: FloatArray, s: Scratch) -> Vector:
     """The point of the first end's ray and of the inverse depth that all others show; fills G and b."""
     v, x = s.views, (track[0, 0], track[0, 1], 1.0)
@@ -190,7 +190,7 @@ def _first_point(track: FloatArray, s: Scratch) -> Vector:
     return x[0], x[1], above / below
 
 
-@compiled
+@compiled(error_model="numpy")
 def _linearise(track: FloatArray, focal: FloatArray, point: Vector, s: Scratch, weigh: bool) -> bool:
     """Fill errors, their derivatives by the point and the factor of its normal matrix; False behind a camera.
 
@@ -225,7 +225,7 @@ def _linearise(track: FloatArray, focal: FloatArray, point: Vector, s: Scratch, 
     return _factor(s.N, s.L)
 
 
-@compiled
+@compiled(error_model="numpy")
 def _flow(P: Vector, rate: Vector, focal: FloatArray) -> tuple[float, float]:
     """How the ideal pixel of P moves when P moves by ``rate``."""
     return (
@@ -234,7 +234,7 @@ def _flow(P: Vector, rate: Vector, focal: FloatArray) -> tuple[float, float]:
     )
 
 
-@compiled
+@compiled(error_model="numpy")
 def _fill_weight(end: FloatArray, flow: tuple[float, float], W: FloatArray) -> None:
     """W = (L - v s^T)^-1: the ideal pixel moves by L, the prediction by its velocity times the time's slope s."""
     a, b = end[3] - flow[0] * end[7], end[4] - flow[0] * end[8]
@@ -245,7 +245,7 @@ def _fill_weight(end: FloatArray, flow: tuple[float, float], W: FloatArray) -> N
     W[0, 0], W[0, 1], W[1, 0], W[1, 1] = d / det, -b / det, -c / det, a / det
 
 
-@compiled
+@compiled(error_model="numpy")
 def _factor(N: FloatArray, L: FloatArray) -> bool:
     """Lower Cholesky factor (3, 3) of N; False when the ends do not determine the point."""
     for i in range(3):
@@ -262,7 +262,7 @@ def _factor(N: FloatArray, L: FloatArray) -> bool:
     return True
 
 
-@compiled
+@compiled(error_model="numpy")
 def _solve(L: FloatArray, g: Vector) -> Vector:
     """N^-1 g."""
     a = _forward(L, g)
@@ -271,7 +271,7 @@ def _solve(L: FloatArray, g: Vector) -> Vector:
     return (a[0] - L[1, 0] * y - L[2, 0] * z) / L[0, 0], y, z
 
 
-@compiled
+@compiled(error_model="numpy")
 def _forward(L: FloatArray, g: Vector) -> Vector:
     """L^-1 g."""
     x = g[0] / L[0, 0]
@@ -279,7 +279,7 @@ def _forward(L: FloatArray, g: Vector) -> Vector:
     return x, y, (g[2] - L[2, 0] * x - L[2, 1] * y) / L[2, 2]
 
 
-@compiled
+@compiled(error_model="numpy")
 def _add_track(
     track: FloatArray, focal: FloatArray, s: Scratch, weight: float, band: FloatArray, gradient: FloatArray
 ) -> None:
@@ -306,7 +306,7 @@ def _add_track(
     _reduce(s, size, weight, 6 * low, band, gradient)
 
 
-@compiled
+@compiled(error_model="numpy")
 def _fill_block(end: FloatArray, n: int, focal: FloatArray, s: Scratch) -> None:
     """Derivatives of the errors of an end by its four control poses."""
     v, W, P, rho = s.views, s.W[n], (s.P[n, 0], s.P[n, 1], s.P[n, 2]), s.point[2]
@@ -328,7 +328,7 @@ def _fill_block(end: FloatArray, n: int, focal: FloatArray, s: Scratch) -> None:
                 s.block[i, 6 * j + 3 + k] = by_pose[1][i, k] * v.share[n, j]
 
 
-@compiled
+@compiled(error_model="numpy")
 def _reduce(s: Scratch, size: int, weight: float, first: int, band: FloatArray, gradient: FloatArray) -> None:
     """Add the weighted equations (size) to the band from unknown ``first`` on, without the point."""
     Q = s.Q

@@ -33,7 +33,7 @@ class Views(NamedTuple):
     """(n, 4) how p moves when a control pose does."""
 
 
-@compiled
+@compiled(error_model="numpy")
 def blank_views(count: int) -> Views:
     """Room for so many poses."""
     return Views(
@@ -47,7 +47,7 @@ def blank_views(count: int) -> Views:
     )
 
 
-@compiled
+@compiled(error_model="numpy")
 def fill_views(curve: Curve, taus: FloatArray, views: Views) -> None:
     """The poses at times (n,)."""
     work = np.zeros((6, 3, 3))
@@ -55,7 +55,7 @@ def fill_views(curve: Curve, taus: FloatArray, views: Views) -> None:
         fill_view(curve, taus[k], views, k, work)
 
 
-@compiled
+@compiled(error_model="numpy")
 def fill_view(curve: Curve, tau: float, views: Views, k: int, work: FloatArray) -> None:
     """The pose at one time, as number ``k``; work (6, 3, 3)."""
     count = len(curve.p)
@@ -76,7 +76,7 @@ def fill_view(curve: Curve, tau: float, views: Views, k: int, work: FloatArray) 
     _fill_turn(curve, i, b, rates, views, k, work)
 
 
-@compiled
+@compiled(error_model="numpy")
 def _fill_turn(curve: Curve, i: int, b: Vector, rates: Vector, views: Views, k: int, work: FloatArray) -> None:
     """Rotation, its rate and its derivatives: from the last factor to the first."""
     before, factor, jacobian, product, by_step, inverse = work[0], work[1], work[2], work[3], work[4], work[5]
@@ -111,24 +111,24 @@ def _fill_turn(curve: Curve, i: int, b: Vector, rates: Vector, views: Views, k: 
     _set(views.spin, k, spin)
 
 
-@compiled
+@compiled(error_model="numpy")
 def _row(rows: FloatArray, i: int) -> Vector:
     return (rows[i, 0], rows[i, 1], rows[i, 2])
 
 
-@compiled
+@compiled(error_model="numpy")
 def _set(rows: FloatArray, i: int, value: Vector) -> None:
     rows[i, 0], rows[i, 1], rows[i, 2] = value
 
 
-@compiled
+@compiled(error_model="numpy")
 def _multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     for m in range(3):
         for n in range(3):
             out[m, n] = a[m, 0] * b[0, n] + a[m, 1] * b[1, n] + a[m, 2] * b[2, n]
 
 
-@compiled
+@compiled(error_model="numpy")
 def _multiply_transposed(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """a b^T."""
     for m in range(3):

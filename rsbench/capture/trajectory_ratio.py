@@ -37,7 +37,7 @@ is a fit of something else."""
 _FEWEST, _SOME, _TRACKS = 15, 60, 150
 """Tracks of a window, about: below which nothing is told, to tell the scanning, and the ratio."""
 _PRECISION = 1e12
-_STEP, _STEPS = 0.05, 6
+_STEP, _STEPS, _ROUGH_STEPS = 0.05, 6, 2
 _NODES = np.array([-2.5, -1.2, 0.0, 1.2, 2.5])
 """Deviations from the peak at which the evidence is summed."""
 _NOTHING = -1e12
@@ -91,7 +91,7 @@ def ratio_of_sequence(
     profile, ratio = _Profile(thinned(windows, _TRACKS), rig, scannings[best]), found[best][1]
     try:
         profile.begin(ratio, seed)
-        profile.settle(_peak(profile, ratio)[0])
+        profile.settle(_peak(profile, ratio, _ROUGH_STEPS)[0])
         return _told(profile, *_peak(profile, profile.settled), 1.0 / float(others))
     except banded.NotDefiniteError:
         return None
@@ -174,11 +174,11 @@ class _Profile:
         return self._fits[min(self._fits, key=lambda other: abs(other - ratio))]
 
 
-def _peak(profile: _Profile, start: float) -> tuple[float, float]:
+def _peak(profile: _Profile, start: float, steps: int = _STEPS) -> tuple[float, float]:
     """Where the evidence is largest, and its deviation: parabolas through three ratios, ever closer."""
     best, step = start, _STEP
     sigma = step
-    for number in range(_STEPS):
+    for number in range(steps):
         low, high = max(best - step, _LEAST), min(best + step, 1.0)
         middle = 0.5 * (low + high)
         values = [profile.at(each) for each in (low, middle, high)]

@@ -16,7 +16,7 @@ import scipy
 from rsbench.capture import trajectory_banded as banded
 from rsbench.capture.trajectory_choice import choose
 from rsbench.capture.trajectory_covariance import covariance_between
-from rsbench.capture.trajectory_data import Past, TimedTracks, pack_windows, thinned
+from rsbench.capture.trajectory_data import Past, TimedTracks, pack_windows, telling, thinned
 from rsbench.capture.trajectory_estimate import TrajectoryOptions, is_supported, noise_px
 from rsbench.capture.trajectory_fit import ANCHORED, Fit, fit, held, information, normal_equations, right_tracks
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, part, span_of
@@ -97,12 +97,13 @@ class _State:
         """Number of the last window that its own tracks carry, of those that have left."""
 
     def add(self, window: Correspondences, motion: Motion | None) -> None:
-        self.windows.append(window)
+        self.windows.append(telling(window))
         self.motions.append(motion)
         self.fresh += 1
 
     def _pack(self, windows: Sequence[Correspondences], right: Sequence[FloatArray] | None = None) -> TimedTracks:
-        return pack_windows(windows, self.rig, self.shutter, right, self.first, self.past)
+        share = self.options.share
+        return pack_windows(windows, self.rig, self.shutter, right, self.first, self.past, share)
 
     def solve(self) -> tuple[Fit, TimedTracks]:
         """The spline of all that is remembered; some of the tracks say first which are right."""
@@ -124,7 +125,7 @@ class _State:
 
     def _begun(self, few: Sequence[Correspondences]) -> Fit:
         """The first spline: some of the tracks say which knots and which prior."""
-        options, tracks = self.options, pack_windows(few, self.rig, self.shutter)
+        options, tracks = self.options, self._pack(few)
         curve = first_curve(self.motions, tracks, span_of(len(few), self.shutter), options.intervals[0])
         found = fit(curve, tracks, options.prior, options.learn)
         return choose(found, tracks, options.intervals) if options.learn else found

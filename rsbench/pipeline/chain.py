@@ -230,8 +230,9 @@ def find_depth(
     options: CorrectionOptions,
     pairs: Pairs | None = None,
     disparity_offset: float = 0.0,
+    frames: tuple[int, ...] = FRAMES,
 ) -> Pairs:
-    """The frames with their depth: by the matcher unless ``pairs`` has it, then from the motion."""
+    """The frames with their depth: by the matcher unless ``pairs`` has it, then from the motion, of ``frames``."""
     if pairs is None and needs_motion(options.matcher):
         if motion is None:
             raise ValueError(f"the motion must be known where matcher {options.matcher.name!r} finds depth")
@@ -247,7 +248,7 @@ def find_depth(
             raise ValueError("the motion must be known where depth is found through a lens")
         pairs = timed_pairs(pairs, rig, shutter, motion)
     if options.depth_from_motion and motion is not None and not all(pair.with_motion for pair in pairs):
-        pairs = complete_depth(pairs, rig, shutter, motion)
+        pairs = complete_depth(pairs, rig, shutter, motion, frames)
     return pairs
 
 

@@ -193,13 +193,15 @@ def timed_pairs(pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion: M
     return first, second
 
 
-def complete_depth(pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion: Motion) -> Pairs:
-    """The same frames with depth from the motion where the other camera gave none."""
+def complete_depth(
+    pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion: Motion, frames: tuple[int, ...] = FRAMES
+) -> Pairs:
+    """The same frames with depth from the motion where the other camera gave none, in those asked for."""
 
     def side_depths(side: Side) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         first, second = eight_bit([pair.images[side] for pair in pairs])
         known = pairs[0].depth[side], pairs[1].depth[side]
-        return depth_from_motion((first, second), known, rig, shutter, motion, side)
+        return depth_from_motion((first, second), known, rig, shutter, motion, side, frames)
 
     with ThreadPoolExecutor(len(SIDES)) as pool:
         found = dict(zip(SIDES, pool.map(side_depths, SIDES), strict=True))

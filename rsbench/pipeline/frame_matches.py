@@ -83,6 +83,14 @@ def match_frames(
     return _enough(find_matches_of_rig(images, rig, scanning, options))
 
 
+def with_enough(options: CorrectionOptions, tracks: int) -> CorrectionOptions:
+    """The same options, but for rsbench's own matcher giving tracks alone where there are as many as that."""
+    component = options.features.component
+    if not isinstance(component, SiftMatcher):
+        return options
+    return replace(options, features=replace(options.features, component=replace(component, enough_tracks=tracks)))
+
+
 def match_unknown(
     images: Images, rig: StereoRig, options: CorrectionOptions, *, judge_rig: bool = True
 ) -> tuple[Correspondences, RefusedFramesError | None]:

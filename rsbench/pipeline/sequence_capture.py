@@ -12,13 +12,15 @@ from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.scans import GLOBAL
 from rsbench.capture.settle import NoMotionError, as_global, known_of, shutter_found
 from rsbench.capture.trajectory_check import SUCCESSIVE, shakes
+from rsbench.capture.trajectory_data import ENOUGH
 from rsbench.capture.trajectory_shutter import LONGEST, capture_of_sequence
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource
-from rsbench.pipeline.frame_matches import match_frames, match_unknown
+from rsbench.pipeline.frame_depth import Images
+from rsbench.pipeline.frame_matches import match_frames, match_unknown, with_enough
 from rsbench.pipeline.frame_motion import models_asked
 from rsbench.pipeline.sequence_windows import JUDGED, Refusals, window_images
 
@@ -65,12 +67,10 @@ def estimate_sequence_capture(
         chosen = not look.shaken and number % every == 0 and len(look.used) < WINDOWS
         if not (chosen or number < look.successive):
             continue
+        matching = with_enough(options, ENOUGH) if look.shaken else options
         try:
-            if scanning is None:
-                matches, doubt = match_unknown(images, rig, options, judge_rig=number < JUDGED)
-                doubts.append(doubt)
-            else:
-                matches = match_frames(images, rig, options, scanning, judge_rig=number < JUDGED)
+            matches, doubt = _matched(images, rig, matching, scanning, number < JUDGED)
+            doubts.append(doubt)
         except RefusedFramesError as error:
             refusals.add(number, error)
             matches, chosen = Correspondences(), False
@@ -88,6 +88,15 @@ def estimate_sequence_capture(
     if doubt is not None and shutter.rows_together:
         raise doubt
     return capture, shutter
+
+
+def _matched(
+    images: Images, rig: StereoRig, options: CorrectionOptions, scanning: Scanning | None, judge_rig: bool
+) -> tuple[Correspondences, RefusedFramesError | None]:
+    """Of a window; and what speaks against a pair that reads as one, where the scanning is not known."""
+    if scanning is None:
+        return match_unknown(images, rig, options, judge_rig=judge_rig)
+    return match_frames(images, rig, options, scanning, judge_rig=judge_rig), None
 
 
 class _Look:

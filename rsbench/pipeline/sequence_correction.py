@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET
 from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.settle import AUTO, NoMotionError
-from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.capture.trajectory_data import ENOUGH
+from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, compose
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.pipeline.chain import Given, check_cameras, correct_known, find_depth
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource
 from rsbench.pipeline.frame_depth import frame_pair
-from rsbench.pipeline.frame_matches import match_frames
+from rsbench.pipeline.frame_matches import match_frames, with_enough
 from rsbench.pipeline.frame_motion import FoundMotion, solve_frames
 from rsbench.pipeline.sequence_capture import FEWEST_FRAMES
 from rsbench.pipeline.sequence_trajectory import Window, on_one_trajectory
@@ -118,13 +119,14 @@ def _windows(
 ) -> Iterator[Window]:
     """The windows of a sequence, each for itself; ``with_motion``: with a motion where the corrector needs one."""
     needs, refusals = options.corrector.component.spec.needs, Refusals(left)
+    matching = options if with_motion or "matches" in needs else with_enough(options, ENOUGH)
     number = -1
     for number, images in enumerate(window_images(left, right)):
         found, reason, matches = None, "", None
         if needs & {"motion", "matches"}:
             try:
                 judged, scanning = number < JUDGED, shutter.scanning
-                matches = match_frames(images, rig, options, scanning, judge_rig=judged)
+                matches = match_frames(images, rig, matching, scanning, judge_rig=judged)
                 if "motion" in needs and with_motion:
                     ratio = shutter.readout_ratio
                     found = solve_frames(matches, rig, ratio, options, calibration, scanning, in_order=True).found
@@ -181,7 +183,9 @@ def _moment(
     motion = None if window.found is None else window.found.motion
     pairs = window.pairs
     if "depth" in needs:
-        pairs = find_depth(window.images, rig, shutter, motion, options, pairs)
+        # Of a trajectory every frame is corrected by itself: the other one's own depth hardly shows in it.
+        frames = FRAMES if window.pose is None else (place,)
+        pairs = find_depth(window.images, rig, shutter, motion, options, pairs, frames=frames)
     views = tuple((side, place) for side in SIDES)
     offset = 0.0 if window.found is None else window.found.disparity_offset
     known = Given(matches=window.matches, motion=motion, pairs=pairs)

@@ -45,6 +45,7 @@ _RANGES = {
     "search_radius": (1e-6, 1e6),
     "row_tolerance": (1e-6, 1e6),
     "max_disparity": (1e-6, 1e6),
+    "enough_tracks": (0, _MOST_FEATURES),
 }
 
 
@@ -73,6 +74,8 @@ class MatchOptions:
     """Drop a temporal match when its loop through the other camera ends elsewhere."""
     refine: bool = False
     """Align the ends of matches by the grey levels around them, see ``patch_alignment``."""
+    enough_tracks: int = 0
+    """Give tracks alone where there are as many as that, which is sooner done; 0 gives all matches."""
     affine: bool = False
     """Give left matches affine frames: the similarity of the keypoints' sizes and orientations."""
 
@@ -95,7 +98,12 @@ class SiftMatcher(MatchOptions, FeatureMatcher):
     def _matched(self, images: Mapping[View, NDArray[np.uint8]], camera: PinholeCamera | None) -> Correspondences:
         four = (images["left", 0], images["right", 0], images["left", 1], images["right", 1])
         matches = match_stereo_frames(*four, self, camera)
-        return refine_matches(images, matches) if self.refine and not _still(matches) else matches
+        alone = 0 < self.enough_tracks <= len(matches.tracks)
+        if alone:
+            matches = Correspondences(tracks=matches.tracks)
+        if self.refine and not _still(matches):
+            matches = refine_matches(images, matches)
+        return Correspondences(tracks=matches.tracks) if alone else matches
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -242,7 +250,8 @@ def match_stereo_frames(
 
 def _still(matches: Correspondences) -> bool:
     """Whether nothing moves over time: errors that are all alike would leave solvers no noise to judge by."""
-    moved = np.concatenate([each[:, 2:] - each[:, :2] for each in (matches.left, matches.right)])
+    pairs = matches.left, matches.right, matches.tracks[:, [0, 1, 4, 5]]
+    moved = np.concatenate([each[:, 2:] - each[:, :2] for each in pairs])
     return len(moved) == 0 or float(np.median(np.abs(moved))) < _STILL_PX
 
 

@@ -212,18 +212,22 @@ def _look_up(
     places = np.full((*wanted.shape, 2), np.nan, dtype=np.float32)
     expected = np.zeros(wanted.shape, dtype=np.float32)
     _find_in_lines(rho, wanted, maps, places, expected)
+    inside, known = np.isfinite(places[..., 0]), np.full(wanted.shape, np.nan, dtype=np.float32)
     # Half a pixel past the last centre still belongs to the frame, and rounds beyond it in float32.
-    nearest = np.rint(np.where(np.isfinite(places), places, 0.0)).astype(np.intp)
-    x, y = np.moveaxis(np.clip(nearest, 0, (camera.width - 1, camera.height - 1)), -1, 0)
-    return places, expected, inverse_depth(view.depth)[y, x]
+    nearest = np.rint(places[inside]).astype(np.intp)
+    x, y = np.clip(nearest, 0, (camera.width - 1, camera.height - 1)).T
+    known[inside] = inverse_depth(view.depth[y, x])
+    return places, expected, known
 
 
 def _differ(a: NDArray[Any], b: NDArray[Any], where: Mask) -> Mask:
     """(H, W) whether images differ in the mean of 3 x 3 pixels, of those that are ``where``."""
     levels = np.iinfo(a.dtype).max if np.issubdtype(a.dtype, np.integer) else 1.0
-    apart = np.abs(np.atleast_3d(a).astype(np.float32) - np.atleast_3d(b)).max(axis=-1) / np.float32(levels)
+    apart = np.zeros(where.shape, dtype=np.float32)
+    each = np.abs(np.atleast_3d(a)[where].astype(np.float32) - np.atleast_3d(b)[where])
+    apart[where] = each.max(axis=-1) / np.float32(levels)
     count = cv2.blur(where.astype(np.float32), (3, 3))
-    mean = cv2.blur(np.where(where, apart, np.float32(0.0)), (3, 3)) / np.maximum(count, np.float32(1e-6))
+    mean = cv2.blur(apart, (3, 3)) / np.maximum(count, np.float32(1e-6))
     return np.asarray(mean > _DIFFERENT)
 
 

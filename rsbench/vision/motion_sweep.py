@@ -49,12 +49,16 @@ def depth_from_motion(
     shutter: RollingShutter,
     motion: Motion,
     side: Side,
+    wanted: tuple[int, ...] = (0, 1),
 ) -> tuple[F32, F32]:
     """Depth (H, W), metres, of the pixels of both frames of one camera whose depth is 0; 0 where it stays unknown.
 
     ``images`` (H, W[, 3]) are uint8 or uint16, ``depths`` (H, W) what is known of both; inf is infinitely far. The
     warp moves a pixel by less than its parallax between the frames, so the depth is as good as the correction
     needs it, however small the parallax.
+
+    Args:
+        wanted: frames whose depth is asked for; that of the others stays unknown.
     """
     found = np.zeros_like(depths[0]), np.zeros_like(depths[1])
     poses = [row_poses(rig, shutter, motion, side, frame) for frame in (0, 1)]
@@ -68,13 +72,23 @@ def depth_from_motion(
     greys = [grey_u8(image) for image in images]
     censuses = [census(grey) for grey in greys]
     rhos = [inverse_depth(depth) for depth in depths]
-    for frame in (0, 1):
-        y, x = np.nonzero(unknown[frame])
+    for frame in (*wanted, *({0, 1} - set(wanted))):
+        searched = unknown[frame]
+        if frame not in wanted:  # only to confirm the other one
+            searched = searched & _landed(rhos[1 - frame], unknown[1 - frame], maps[1 - frame])
+        y, x = np.nonzero(searched)
         both = (greys[frame], greys[1 - frame], censuses[frame], censuses[1 - frame])
         rhos[frame][y, x] = _search(y, x, both, maps[frame], count, 1.0 / gain)
-    for frame in (0, 1):
+    for frame in wanted:
         _keep_agreeing(rhos[frame], rhos[1 - frame], unknown[frame], maps[frame], _AGREE_PX / gain, found[frame])
     return found
+
+
+def _landed(rho: F32, wanted: Mask, maps: Reprojection) -> Mask:
+    """Places (H, W) of the other frame where ``wanted`` pixels are seen, and those in their windows."""
+    marks = np.zeros(rho.shape, dtype=np.uint8)
+    _mark(rho, wanted, maps, marks)
+    return np.asarray(cv2.dilate(marks, np.ones((_WINDOW, _WINDOW), np.uint8)) > 0)
 
 
 def _search(
@@ -228,18 +242,37 @@ def _keep_agreeing(
 ) -> None:
     """Write the depth of ``wanted`` pixels whose inverse depth the other frame confirms where it sees them."""
     height, width = rho.shape
-    lines = len(maps.A)
     for y in range(height):
         for x in range(width):
             if not wanted[y, x] or not rho[y, x] >= 0.0:
                 continue
-            line, u, v, s = line_of(maps.columns, x, y), np.nan, np.nan, np.nan
-            for _ in range(6):
-                u, v, s = reproject(x, y, rho[y, x], line, maps)
-                along = across_lines(maps.there, u, v)
-                if not -lines < along < 2 * lines:
-                    break
-                line = min(max(int(along + 0.5), 0), lines - 1)
+            u, v, s = _seen_at(x, y, rho[y, x], maps)
             inside = -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5
             if inside and abs(other[int(v + 0.5), int(u + 0.5)] - rho[y, x] * s) <= tolerance:
                 depth[y, x] = 1.0 / rho[y, x] if rho[y, x] > 0.0 else np.inf
+
+
+@compiled(error_model="numpy")
+def _mark(rho: F32, wanted: Mask, maps: Reprojection, marks: NDArray[np.uint8]) -> None:
+    """Mark where the other frame sees ``wanted`` pixels."""
+    height, width = rho.shape
+    for y in range(height):
+        for x in range(width):
+            if wanted[y, x] and rho[y, x] >= 0.0:
+                u, v, _ = _seen_at(x, y, rho[y, x], maps)
+                if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
+                    marks[int(v + 0.5), int(u + 0.5)] = 1
+
+
+@compiled(error_model="numpy")
+def _seen_at(x: int, y: int, rho: float, maps: Reprojection) -> tuple[float, float, float]:
+    """Where the other frame sees a pixel, and its inverse depth there by that here."""
+    lines = len(maps.A)
+    line, u, v, s = line_of(maps.columns, x, y), np.nan, np.nan, np.nan
+    for _ in range(6):
+        u, v, s = reproject(x, y, rho, line, maps)
+        along = across_lines(maps.there, u, v)
+        if not -lines < along < 2 * lines:
+            break
+        line = min(max(int(along + 0.5), 0), lines - 1)
+    return u, v, s

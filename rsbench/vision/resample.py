@@ -18,6 +18,8 @@ from rsbench.components.compiled import compiled
 
 F32 = NDArray[np.float32]
 Interpolation = Literal["cubic", "linear"]
+_FEW, _PACKED = 4, 512
+"""Positions for one that is not NaN, below which these are sampled in rows of so many."""
 Weights = tuple[np.float32, np.float32, np.float32, np.float32]
 
 
@@ -27,13 +29,15 @@ def resample(image: NDArray[Any], positions: F32, interpolation: Interpolation =
     Computed in float32 and rounded once where the image holds integers; the border pixels are repeated outward.
     ``image`` is uint8, uint16 or float32.
     """
+    known = ~np.isnan(positions[..., 0])
+    if _FEW * np.count_nonzero(known) < known.size:
+        return _resample_few(image, positions, known, interpolation)
     source = np.ascontiguousarray(image, dtype=np.float32)
     if interpolation == "linear":
-        unknown = np.isnan(positions[..., 0])
-        known = np.where(unknown[..., None], np.float32(0.0), positions)
-        values = cv2.remap(source, known, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        places = np.where(known[..., None], positions, np.float32(0.0))
+        values = cv2.remap(source, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         values = values.reshape(*positions.shape[:2], *image.shape[2:])
-        values[unknown] = 0.0
+        values[~known] = 0.0
     else:
         values = np.zeros((*positions.shape[:2], *image.shape[2:]), dtype=np.float32)
         _cubic(np.atleast_3d(source), positions, np.atleast_3d(values))
@@ -42,6 +46,19 @@ def resample(image: NDArray[Any], positions: F32, interpolation: Interpolation =
     largest = np.float32(np.iinfo(image.dtype).max)
     # Half is added and the fraction cut off: rounding, several times faster than np.rint.
     return (np.clip(values, 0.0, largest) + np.float32(0.5)).astype(image.dtype)
+
+
+def _resample_few(
+    image: NDArray[Any], positions: F32, known: NDArray[np.bool_], interpolation: Interpolation
+) -> NDArray[Any]:
+    """``resample`` of few ``known`` (h, w) positions."""
+    out = np.zeros((*known.shape, *image.shape[2:]), dtype=image.dtype)
+    some = positions[known]
+    if len(some):
+        places = np.zeros((-(-len(some) // _PACKED), _PACKED, 2), dtype=np.float32)
+        places.reshape(-1, 2)[: len(some)] = some
+        out[known] = resample(image, places, interpolation).reshape(-1, *image.shape[2:])[: len(some)]
+    return out
 
 
 @compiled(error_model="numpy", fastmath={"contract"})

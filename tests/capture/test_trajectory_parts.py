@@ -11,13 +11,14 @@ from shaken_rig import RIG, SHUTTER, matches, sines
 
 from rsbench.capture import trajectory_banded as banded
 from rsbench.capture.trajectory_choice import approximated
-from rsbench.capture.trajectory_data import pack_windows
-from rsbench.capture.trajectory_fit import normal_equations
+from rsbench.capture.trajectory_data import ENOUGH, pack_windows, telling
+from rsbench.capture.trajectory_fit import NORMAL, information, normal_equations
 from rsbench.capture.trajectory_kernels import Tails
 from rsbench.capture.trajectory_poses import blank_views, fill_views
 from rsbench.capture.trajectory_prior import Prior, roughness, whitening
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, moved
 from rsbench.components.motion_models import motion_record, read_motion
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import LinearMotion
 from rsbench.core.so3 import FloatArray
 
@@ -125,6 +126,33 @@ def test_roughness_is_that_of_second_differences() -> None:
     rows = whitening(0.5, 0.7, 2)
     errors = [rows[0][0] * d[0], rows[1] @ d[:2], *(rows[2] @ d[k : k + 3] for k in range(5))]
     assert roughness(curve, 0.7, 2, 30).squares[1] == pytest.approx(float(np.sum(np.square(errors))), rel=1e-12)
+
+
+def test_half_a_share_is_half_the_information() -> None:
+    """Of normal errors it is that of twice the variance; covariances count every track for one."""
+    rng = np.random.default_rng(6)
+    windows, _ = matches(sines(rng, 1.0, 0.15, 0.45), 3, rng, outliers=0.0)
+    curve, prior = (
+        make_curve(-0.5, 0.5, np.tile(np.eye(3), (10, 1, 1)), np.zeros((10, 3))),
+        Prior(0.5, 2, 1e-4, 1e-4),
+    )
+    half, whole = (pack_windows(windows, RIG, SHUTTER, share=share) for share in (0.5, 1.0))
+    trust = np.ones(len(whole))
+    shared = normal_equations(curve, half, Tails(NORMAL, 0.3), prior, trust)
+    wide = normal_equations(curve, whole, Tails(NORMAL, 0.3 * np.sqrt(2.0)), prior, trust)
+    for a, b in ((shared.cost, wide.cost), (shared.gradient, wide.gradient), (shared.band, wide.band)):
+        np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-4 * np.max(np.abs(b)))  # nearly normal: nu is 1e9
+    one, other = (information(curve, each, Tails(5.0, 0.3), prior, trust) for each in (half, whole))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_pairs_of_windows_with_tracks_enough_are_left_out() -> None:
+    rng = np.random.default_rng(7)
+    pairs, tracks = rng.uniform(0.0, 470.0, (5, 4)), rng.uniform(0.0, 470.0, (ENOUGH, 8))
+    few = Correspondences(left=pairs, tracks=tracks[1:])
+    assert telling(few) is few
+    many = telling(Correspondences(left=pairs, tracks=tracks))
+    assert len(many.tracks) == ENOUGH and len(many.left) == 0
 
 
 def test_the_inverse_of_a_band() -> None:

@@ -12,7 +12,7 @@ from rsbench.core.projection import back_project, rs_project
 from rsbench.core.rig import View
 from rsbench.vision.descriptor_search import best_two
 from rsbench.vision.feature_matcher import find_correspondences, load_features
-from rsbench.vision.features import Gate, MatchOptions, close_loops, detect, match_stereo_frames
+from rsbench.vision.features import Gate, MatchOptions, SiftMatcher, close_loops, detect, match_stereo_frames
 
 Build = Callable[..., Any]
 Four = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -113,6 +113,17 @@ def test_tracks_are_made_of_the_pairwise_matches(images: Four) -> None:
     assert rows(tracks[:, :4]) <= rows(found.stereo_0)
     assert rows(tracks[:, 4:]) <= rows(found.stereo_1)
     assert len(rows(tracks)) == len(tracks)
+
+
+def test_where_tracks_are_enough_there_are_no_pairs(images: Four) -> None:
+    views: tuple[View, ...] = (("left", 0), ("right", 0), ("left", 1), ("right", 1))
+    seen = dict(zip(views, images, strict=True))
+    everything = SiftMatcher(refine=True).match(seen)
+    count = len(everything.tracks)
+    alone = SiftMatcher(refine=True, enough_tracks=count).match(seen)
+    np.testing.assert_array_equal(alone.tracks, everything.tracks)
+    assert not any(len(each) for each in (alone.left, alone.right, alone.stereo_0, alone.stereo_1))
+    assert len(SiftMatcher(refine=True, enough_tracks=count + 1).match(seen).left) == len(everything.left)
 
 
 def test_loops_close_or_open_or_contradict() -> None:

@@ -28,8 +28,13 @@ def test_a_thin_post_before_a_wall_gets_its_depth(world: Build, shapes: Any, u8:
     images, truth = [u8(image) for image, _ in seen], [depth for _, depth in seen]
     posts = [depth < 4.0 for depth in truth]
     known = [np.where(post, 0.0, depth).astype(np.float32) for post, depth in zip(posts, truth, strict=True)]
-    geometry = scene.rig, scene.shutter, scene.motion
-    for frame, found in enumerate(depth_from_motion(tuple(images), tuple(known), *geometry, side)):  # pyrefly: ignore[bad-argument-type]
+    asked: Any = tuple(images), tuple(known), scene.rig, scene.shutter, scene.motion, side
+    both = depth_from_motion(*asked)
+    for frame in (0, 1):  # as where both are asked for: the other one is searched where it must agree
+        alone = depth_from_motion(*asked, wanted=(frame,))
+        np.testing.assert_array_equal(alone[frame], both[frame])
+        assert not np.any(alone[1 - frame])
+    for frame, found in enumerate(both):
         assert not np.any(found[~posts[frame]])
         got = found[posts[frame]]
         assert np.mean(got > 0.0) > 0.7

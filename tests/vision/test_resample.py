@@ -77,3 +77,19 @@ def test_positions_beyond_the_border_repeat_it() -> None:
     image = np.random.default_rng(3).random((6, 6)).astype(np.float32)
     at = np.array([[[-30.0, 2.0], [2.0, 400.0]]], dtype=np.float32)
     np.testing.assert_allclose(resample(image, at), [[image[2, 0], image[5, 2]]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("interpolation", ["cubic", "linear"])
+@pytest.mark.parametrize("share", [0.0, 0.002, 0.1, 0.24])
+@pytest.mark.parametrize("channels", [0, 3])
+def test_few_positions_among_many_are_sampled_alike(interpolation: str, share: float, channels: int) -> None:
+    """Those that are wanted have the values of a request for all of them; the others are 0."""
+    rng = np.random.default_rng(3)
+    image = rng.integers(0, 255, (40, 50, channels) if channels else (40, 50), dtype=np.uint8)
+    at = _positions(rng, 60, -2.0, 48.0)
+    wanted = rng.random((60, 60)) < share
+    few = np.where(wanted[..., None], at, np.float32(np.nan))
+    whole, got = (resample(image, each, interpolation) for each in (at, few))  # pyrefly: ignore[bad-argument-type]
+    # Vector instructions may round a sum otherwise than what is left at the end of a row does.
+    assert np.max(np.abs(got[wanted].astype(int) - whole[wanted]), initial=0) <= 1
+    assert not np.any(got[~wanted])
