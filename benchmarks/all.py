@@ -15,6 +15,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import count
@@ -54,9 +55,9 @@ class Row:
 
 def cpu(work: Work) -> float:
     """Processor seconds, of all threads and of the processes that end meanwhile."""
-    begin = os.times()
+    begin = time.process_time(), sum(os.times()[2:4])
     work()
-    return sum(os.times()[:4]) - sum(begin[:4])
+    return time.process_time() - begin[0] + sum(os.times()[2:4]) - begin[1]
 
 
 def rolling_over_global() -> tuple[Work, Work]:
