@@ -131,6 +131,8 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="folder for frames.csv and provenance.json")
     parser.add_argument("--child", choices=("cuda", "llvm"), help=argparse.SUPPRESS)
     given = parser.parse_args()
+    if given.runs < 1:
+        parser.error(f"--runs {given.runs}: at least 1")
     if given.child:
         for row in rows_of(given.child, given.runs):
             sys.stdout.write(json.dumps(row) + "\n")
@@ -150,7 +152,9 @@ def main() -> int:
     if given.out is not None:
         given.out.mkdir(parents=True, exist_ok=True)
         write_table(given.out / "frames.csv", pd.DataFrame(found))
-        command_line = f"python benchmarks/gpu_rendering.py --backends {' '.join(given.backends)}"
+        command_line = (
+            f"python benchmarks/gpu_rendering.py --backends {' '.join(given.backends)} --runs {given.runs}"
+        )
         write_json(given.out / "provenance.json", {**provenance(command_line), "gpu": device()})
     return 0
 

@@ -20,6 +20,7 @@ from score_kitti import read_rig, step
 
 from rsbench.capture.estimate import CERTAIN, conclude, examine
 from rsbench.capture.settle import NoMotionError, as_global, known_of, shutter_found
+from rsbench.core.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource
 from rsbench.pipeline.frame_matches import match_unknown
@@ -29,7 +30,10 @@ from rsbench.pipeline.sequence_windows import window_images
 def stated(folder: Path, names: tuple[str, str], every: int) -> Iterator[tuple[int, str, float, float]]:
     """Number of a pair, "told", "cannot tell" or "states none", ratio and standard deviation."""
     sources, options = [FrameSource(folder / name) for name in names], CorrectionOptions()
-    rig = read_rig(folder, min(sources[0].path.iterdir()))
+    files = [*sources[0].path.iterdir()] if sources[0].path.is_dir() else []
+    if not files:
+        raise RsbenchError(f"{sources[0].path}: no folder of images; --left and --right name them")
+    rig = read_rig(folder, min(files))
     for number, images in enumerate(window_images(*sources)):
         if number % every:
             continue
@@ -47,13 +51,8 @@ def stated(folder: Path, names: tuple[str, str], every: int) -> Iterator[tuple[i
             yield number, "cannot tell" if alone else "states none", ratio, sigma
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", type=Path, nargs="+")
-    parser.add_argument("--left", default="image_0")
-    parser.add_argument("--right", default="image_1")
-    parser.add_argument("--every", type=step, default=1, help="ask every n-th pair")
-    given = parser.parse_args()
+def _tell(given: argparse.Namespace) -> None:
+    """A line a pair, and the counts."""
     counts = {"told": 0, "told wrong": 0, "cannot tell": 0, "0 beyond two deviations": 0, "states none": 0}
     for folder in given.folders:
         for number, word, ratio, sigma in stated(folder, (given.left, given.right), given.every):
@@ -64,6 +63,20 @@ def main() -> int:
             sys.stdout.write(f"{folder.name} {number}: {word}{number_words}\n")
             sys.stdout.flush()
     sys.stdout.write(", ".join(f"{name} {count}" for name, count in counts.items()) + "\n")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", type=Path, nargs="+")
+    parser.add_argument("--left", default="image_0")
+    parser.add_argument("--right", default="image_1")
+    parser.add_argument("--every", type=step, default=1, help="ask every n-th pair")
+    given = parser.parse_args()
+    try:
+        _tell(given)
+    except RsbenchError as error:
+        sys.stderr.write(f"kitti_pairs: error: {error}\n")
+        return 2
     return 0
 
 

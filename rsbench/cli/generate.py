@@ -125,7 +125,7 @@ def generate(
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import generate_dataset, steps_of
     from rsbench.dataset.store_destination import store_for
-    from rsbench.renderers.backend import ask_for, start_backend
+    from rsbench.renderers.backend import start_backend
     from rsbench.storage.files import check_out
     from rsbench.storage.object_store import path_or_url, shown
 
@@ -135,7 +135,7 @@ def generate(
     dataset = _chosen(whole, sequence, shard, channels)
     if not estimate:
         _ = check_out(place) if isinstance(place, Path) else store_for(place, processes)
-    ask_for(backend)
+    _ask_for(backend, scheduler)
     if (started := start_backend()).message:
         typer.echo(started.message, err=True)
     if estimate:
@@ -148,6 +148,16 @@ def generate(
         )
     words = f"{len(dataset.sequence)} sequences, {len(rendered)} rendered now"
     typer.echo(f"{shown(str(place))}: {words}")
+
+
+def _ask_for(backend: str | None, scheduler: str | None) -> None:
+    """The backend of this process and of those that it starts, which the workers of a cluster are not."""
+    from rsbench.core.errors import RsbenchError
+    from rsbench.renderers.backend import ask_for
+
+    if backend is not None and scheduler is not None:
+        raise RsbenchError("--backend: not with --scheduler: set RSBENCH_VARIANT where its workers start")
+    ask_for(backend)
 
 
 def _split(card: str, name: str, place: Path | str, changed: bool) -> DatasetCard:

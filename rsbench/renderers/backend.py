@@ -96,7 +96,8 @@ def ask_for(name: str | None) -> None:
     """
     if name is not None and name not in VARIANTS:
         raise RsbenchError(f"--backend {name}: allowed are {', '.join(VARIANTS)}")
-    os.environ.update({"RSBENCH_VARIANT": name} if name else {})
+    if name is not None:
+        os.environ["RSBENCH_VARIANT"] = name
 
 
 def _check_working_folder() -> None:

@@ -16,8 +16,14 @@ from small_scenes import write_box_scene, write_small_card
 
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
+from rsbench.dataset.sequence import read_dataset
+from rsbench.dataset.views import ImageView
+from rsbench.renderers import backend
 from rsbench.storage.files import read_depth, read_png, write_depth, write_png
-from rsbench.verification import SequenceReport, verify_dataset
+from rsbench.verification import SequenceReport, rerender, verify_dataset
+from rsbench.verification.content import read_content
+from rsbench.verification.image_checks import Picture
+from rsbench.verification.rendered_checks import image_check
 
 
 @pytest.fixture(scope="module")
@@ -87,3 +93,30 @@ def test_a_picture_of_other_light_is_one_finding(sound: Path, tmp_path: Path) ->
     faults = verified(sound, spoilt(sound, tmp_path, change)).faults
     images = [fault for fault in faults if "the image differs from what is rendered again" in fault]
     assert len(images) == 8
+
+
+@pytest.mark.parametrize(
+    ("share", "by_gpu", "passes"), [(0.01, False, False), (0.01, True, True), (0.03, True, False)]
+)
+def test_a_gpu_may_move_more_samples_across_edges(share: float, by_gpu: bool, passes: bool) -> None:
+    rng = np.random.default_rng(0)
+    rendered = rng.integers(0, 200, (50, 60, 3), dtype=np.uint8)
+    stored = rendered.copy()
+    stored.reshape(-1, 3)[rng.choice(3000, round(share * 3000), replace=False)] += 20
+    picture = Picture.of(ImageView("rs", "left", 0), stored, noisy=False)
+    check = image_check("left_0.png", picture, rendered, list(range(50)), noisy=False, by_gpu=by_gpu)
+    assert (check.fault is None) == passes and not check.same_bits
+
+
+@pytest.mark.parametrize(
+    ("here", "made", "differs"),
+    [("llvm", "llvm", False), ("cuda", "cuda", False), ("llvm", "cuda", True), ("cuda", "llvm", True)],
+)
+def test_who_rendered_is_read_from_the_sequence(
+    sound: Path, here: str, made: str, differs: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = read_content(next(iter(read_dataset(sound / "dataset"))))
+    content.sequence.manifest["made_by"]["variant"] = f"{made}_ad_rgb"
+    monkeypatch.setattr(backend, "_started", backend.Backend(variant=f"{here}_ad_rgb"))
+    monkeypatch.delenv("RSBENCH_VARIANT", raising=False)
+    assert rerender._by_gpu(content) == differs
