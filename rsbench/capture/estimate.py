@@ -20,7 +20,7 @@ from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET
 from rsbench.capture.evidence import Peak, WindowEvidence, window_evidence
 from rsbench.capture.hypotheses import CALIBRATION, DELAY, Hypothesis, Known
 from rsbench.capture.scans import GLOBAL, Scans
-from rsbench.capture.start import find_lag, find_start
+from rsbench.capture.start import find_lag, find_start, without_leaps
 from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, StereoRig
@@ -158,7 +158,7 @@ def examine(
     else:
         motion, lag = (start.w, start.d), find_lag(matches.tracks, rig)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        evidence = window_evidence(matches, rig, known, motion, lag)
+        evidence = window_evidence(without_leaps(matches, rig), rig, known, motion, lag)
     reason = "too few matches agree with any motion" if evidence is None else ""
     return Window(evidence=evidence, reason=reason, matches=count, moved_px=moved)
 
