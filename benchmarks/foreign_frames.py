@@ -248,6 +248,13 @@ def _forward(rng: np.random.Generator) -> Case:
     return Case(law=motion.Linear(w, d), rig=Rig(ratio=0.9), model="linear")
 
 
+def _drive(rng: np.random.Generator) -> Case:
+    """Eight frames from a vehicle that brakes or speeds up on a wide bend."""
+    w = np.radians(0.5) * motion.direction(rng, (0.1, 1.0, 0.1))
+    d = np.array([*rng.normal(0.0, 0.01, 2), -rng.uniform(0.15, 0.25)])  # as in _forward
+    return Case(law=motion.Accelerated(w, d, k=rng.uniform(-0.08, 0.1)), rig=Rig(ratio=0.8), frames=8)
+
+
 def _shaken(strength: float, slowest: float, fastest: float, frames: int = 8) -> Callable[..., Case]:
     """Sequences from a hand."""
 
@@ -265,6 +272,7 @@ ROWS: dict[str, Callable[[np.random.Generator], Case]] = {
     "inertial": _inertial,
     "forward": _forward,
     "accelerated": _accelerated,
+    "drive": _drive,
     "strong": _shaken(1.0, 0.15, 0.45),
     "tremor": _shaken(0.25, 0.15, 0.45),
     "walk": _shaken(1.0, 0.06, 0.18),
