@@ -15,6 +15,7 @@ from rsbench.capture.hypotheses import ACCELERATION, CALIBRATION, LEAST_RATIO, R
 from rsbench.capture.scans import TimedMatches
 from rsbench.core.correspondences import BoolArray
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.any_law import any_law
 from rsbench.solvers.engine.capture_terms import add_pairs, add_tracks
 from rsbench.solvers.engine.heavy_tails import HeavyTailed
 
@@ -115,7 +116,7 @@ class CaptureCost:
         by = self._matches.derivatives(packed, float(unknowns[ACCELERATION]), free)
         tails, trust = np.array([self.likelihood.nu, self.likelihood.scale]), self._trust
         gradient, H, n = np.zeros(size), np.zeros((size, size)), len(packed.pairs)
-        at, focal, baseline = (theta, packed.kernel), packed.focal, packed.baseline
+        at, focal, baseline = (theta, any_law(packed.kernel)), packed.focal, packed.baseline
         cost = add_pairs(*at, packed.pairs, by[0], focal, tails, trust[:n], gradient, H)
         cost += add_tracks(*at, packed.tracks, by[1], focal, baseline, tails, trust[n:], gradient, H)
         for unknown in set(_STRETCHING) & set(free):  # by which the same errors of rays are more pixels, too

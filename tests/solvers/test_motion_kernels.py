@@ -24,6 +24,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.solvers.engine import kernel_type
+from rsbench.solvers.engine.any_law import AnyLaw, any_law, quick_law
 from rsbench.solvers.engine.kernel_type import MotionKernel, Moved, kernel_for, load_kernel
 from rsbench.solvers.engine.motion_kernels import linear_move, linear_translation_jacobian
 from rsbench.solvers.engine.packed import pack
@@ -243,3 +244,24 @@ def test_a_solver_may_assume_another_model_than_the_data_follow() -> None:
         for name in ("linear", "twist", "inertial")
     ]
     assert all(1e-5 < error < 1e-2 for error in errors)
+
+
+@pytest.mark.parametrize("name", ["linear", "twist", "inertial", "accelerated"])
+def test_any_law_is_each_law_to_the_last_digit(name: str) -> None:
+    own = load_kernel(name, {"acceleration": 0.3} if name == "accelerated" else None)
+    both = any_law(own)
+    assert isinstance(both, AnyLaw)
+    assert (quick_law(own) is own) == (name == "linear")
+    theta, found = np.concatenate([W, D]), []
+    for kernel in (own, both):
+        R, A, T_w, T_v = np.zeros((4, 3, 3))
+        moved = kernel.move(theta, 0.3, 1.6, R, A)
+        kernel.translation_jacobian(theta, 0.3, 1.6, R, A, T_w, T_v)
+        found.append(np.concatenate([np.ravel(moved), *(np.ravel(each) for each in (R, A, T_w, T_v))]))
+    np.testing.assert_array_equal(found[0], found[1])
+
+
+def test_a_foreign_law_keeps_its_kernel() -> None:
+    kernel = CubicKernel(0.4)
+    assert any_law(kernel) is kernel
+    assert quick_law(kernel) is kernel

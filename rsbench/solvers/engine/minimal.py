@@ -23,7 +23,7 @@ def solve_triples(packed: Packed, samples: NDArray[np.int64], iterations: int = 
     A step that does not lower the cost is not taken and the damping grows.
     """
     out = np.zeros((len(samples), 6))
-    _descend(packed.tracks, samples, packed.kernel, packed.focal, packed.h, packed.baseline, iterations, out)
+    _descend(packed.tracks, samples, packed.law, packed.focal, packed.h, packed.baseline, iterations, out)
     return out
 
 

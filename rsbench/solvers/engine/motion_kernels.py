@@ -92,6 +92,35 @@ def turned(phi: Vector, v: Vector) -> Vector:
     return plus(plus(v, c0, once), c1, cross(phi, once))
 
 
+@compiled
+def inertial_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+    """T = a exp(tau1 w) v, a = tau1 - tau0."""
+    w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
+    a = tau1 - tau0
+    rotate(w, a, R, A)
+    ahead = turned(times(tau1, w), v)
+    back = times(-1.0, ahead)
+    return times(a, ahead), back, plus(ahead, a, cross(w, ahead)), times(-1.0, w), w
+
+
+@compiled
+def inertial_translation_jacobian(
+    theta: FloatArray, tau0: float, tau1: float, T_w: FloatArray, T_v: FloatArray
+) -> None:
+    """Of ``inertial_move``."""
+    a, phi = tau1 - tau0, times(tau1, (theta[0], theta[1], theta[2]))
+    ahead = turned(phi, (theta[3], theta[4], theta[5]))
+    _, c1, c2, _, _ = coefficients(dot(phi, phi))
+    for j in range(3):
+        e = (1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0)
+        once = cross(phi, e)
+        spin = plus(plus(e, c1, once), c2, cross(phi, once))  # column j of J(phi)
+        by_w, by_v = cross(spin, ahead), turned(phi, e)
+        for i in range(3):
+            T_w[i, j] = a * tau1 * by_w[i]
+            T_v[i, j] = a * by_v[i]
+
+
 @final
 @kernel_for(InertialMotion)
 @dataclass(frozen=True)
@@ -99,12 +128,7 @@ class InertialKernel(MotionKernel):
     """Constant velocity in the world; v is that of the world in the body at time 0: T = a exp(tau1 w) v."""
 
     def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
-        w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
-        a = tau1 - tau0
-        rotate(w, a, R, A)
-        ahead = turned(times(tau1, w), v)
-        back = times(-1.0, ahead)
-        return times(a, ahead), back, plus(ahead, a, cross(w, ahead)), times(-1.0, w), w
+        return inertial_move(theta, tau0, tau1, R, A)
 
     def translation_jacobian(
         self,
@@ -116,17 +140,7 @@ class InertialKernel(MotionKernel):
         T_w: FloatArray,
         T_v: FloatArray,
     ) -> None:
-        a, phi = tau1 - tau0, times(tau1, (theta[0], theta[1], theta[2]))
-        ahead = turned(phi, (theta[3], theta[4], theta[5]))
-        _, c1, c2, _, _ = coefficients(dot(phi, phi))
-        for j in range(3):
-            e = (1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0)
-            once = cross(phi, e)
-            spin = plus(plus(e, c1, once), c2, cross(phi, once))  # column j of J(phi)
-            by_w, by_v = cross(spin, ahead), turned(phi, e)
-            for i in range(3):
-                T_w[i, j] = a * tau1 * by_w[i]
-                T_v[i, j] = a * by_v[i]
+        inertial_translation_jacobian(theta, tau0, tau1, T_w, T_v)
 
     def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
         return np.concatenate([w, so3.exp(-w) @ d], dtype=np.float64)
@@ -148,6 +162,30 @@ def beta(k: float, tau: float) -> tuple[float, float]:
     return scale * (tau + 0.5 * k * tau * tau), scale * (1.0 + k * tau)
 
 
+@compiled
+def accelerated_move(k: float, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+    """``linear_move`` at the times beta(tau)."""
+    (beta0, speed0), (beta1, speed1) = beta(k, tau0), beta(k, tau1)
+    T, rate0, rate1, spin0, spin1 = linear_move(theta, beta0, beta1, R, A)
+    return T, times(speed0, rate0), times(speed1, rate1), times(speed0, spin0), times(speed1, spin1)
+
+
+@compiled
+def accelerated_translation_jacobian(
+    k: float,
+    theta: FloatArray,
+    tau0: float,
+    R: FloatArray,
+    A: FloatArray,
+    tau1: float,
+    T_w: FloatArray,
+    T_v: FloatArray,
+) -> None:
+    """Of ``accelerated_move``."""
+    beta0, beta1 = beta(k, tau0)[0], beta(k, tau1)[0]
+    linear_translation_jacobian(theta, beta0, R, A, beta1, T_w, T_v)
+
+
 @final
 @kernel_for(AcceleratedMotion)
 @dataclass(frozen=True)
@@ -157,9 +195,7 @@ class AcceleratedKernel(MotionKernel):
     acceleration: float
 
     def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
-        (beta0, speed0), (beta1, speed1) = beta(self.acceleration, tau0), beta(self.acceleration, tau1)
-        T, rate0, rate1, spin0, spin1 = linear_move(theta, beta0, beta1, R, A)
-        return T, times(speed0, rate0), times(speed1, rate1), times(speed0, spin0), times(speed1, spin1)
+        return accelerated_move(self.acceleration, theta, tau0, tau1, R, A)
 
     def translation_jacobian(
         self,
@@ -171,8 +207,28 @@ class AcceleratedKernel(MotionKernel):
         T_w: FloatArray,
         T_v: FloatArray,
     ) -> None:
-        beta0, beta1 = beta(self.acceleration, tau0)[0], beta(self.acceleration, tau1)[0]
-        linear_translation_jacobian(theta, beta0, R, A, beta1, T_w, T_v)
+        accelerated_translation_jacobian(self.acceleration, theta, tau0, R, A, tau1, T_w, T_v)
+
+
+@compiled
+def twist_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+    """T = a J(a w) v, a = tau1 - tau0."""
+    w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
+    rotate(w, tau1 - tau0, R, A)
+    Rv = apply(R, v)
+    return apply(A, v), times(-1.0, Rv), Rv, times(-1.0, w), w
+
+
+@compiled
+def twist_translation_jacobian(
+    theta: FloatArray, tau0: float, tau1: float, A: FloatArray, T_w: FloatArray, T_v: FloatArray
+) -> None:
+    """Of ``twist_move``."""
+    a = tau1 - tau0
+    twist_by_w(a, times(a, (theta[0], theta[1], theta[2])), (theta[3], theta[4], theta[5]), T_w)
+    for i in range(3):
+        for j in range(3):
+            T_v[i, j] = A[i, j]
 
 
 @final
@@ -182,10 +238,7 @@ class TwistKernel(MotionKernel):
     """Constant twist; v is its linear part: T = a J(a w) v, a = tau1 - tau0."""
 
     def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
-        w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
-        rotate(w, tau1 - tau0, R, A)
-        Rv = apply(R, v)
-        return apply(A, v), times(-1.0, Rv), Rv, times(-1.0, w), w
+        return twist_move(theta, tau0, tau1, R, A)
 
     def translation_jacobian(
         self,
@@ -197,11 +250,7 @@ class TwistKernel(MotionKernel):
         T_w: FloatArray,
         T_v: FloatArray,
     ) -> None:
-        a = tau1 - tau0
-        twist_by_w(a, times(a, (theta[0], theta[1], theta[2])), (theta[3], theta[4], theta[5]), T_w)
-        for i in range(3):
-            for j in range(3):
-                T_v[i, j] = A[i, j]
+        twist_translation_jacobian(theta, tau0, tau1, A, T_w, T_v)
 
     def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
         return np.concatenate([w, np.linalg.solve(so3.left_jacobian(w), d)], dtype=np.float64)

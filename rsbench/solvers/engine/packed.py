@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-import rsbench.solvers.engine.motion_kernels  # noqa: F401  (gives the models their kernels)
 from rsbench.core.correspondences import BoolArray, Correspondences, temporal_pairs, unlinked_pairs
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.any_law import quick_law
 from rsbench.solvers.engine.kernel_type import MotionKernel, load_kernel
 from rsbench.solvers.engine.kernels import BEHIND, count_in_front, pair_terms
 from rsbench.solvers.engine.track_kernels import track_terms
@@ -35,6 +35,11 @@ class Packed:
     baseline: float
     kernel: MotionKernel
     """Of the motion model."""
+
+    @property
+    def law(self) -> MotionKernel:
+        """The kernel as the compiled residuals take it."""
+        return quick_law(self.kernel)
 
     @property
     def constraints(self) -> int:
@@ -103,15 +108,15 @@ class Packed:
         """Half the sum of squares in px^2, its gradient (6,) and Gauss-Newton Hessian (6, 6)."""
         residuals, squares = np.zeros(len(self.pairs)), np.zeros(len(self.tracks))
         H, gradient = np.zeros((6, 6)), np.zeros(6)
-        pair_terms(theta, self.kernel, self.pairs, self.focal, self.h, residuals, H, gradient, True)
-        track_terms(theta, self.kernel, self.tracks, self.focal, self.h, self.baseline, squares, H, gradient, True)
+        pair_terms(theta, self.law, self.pairs, self.focal, self.h, residuals, H, gradient, True)
+        track_terms(theta, self.law, self.tracks, self.focal, self.h, self.baseline, squares, H, gradient, True)
         return 0.5 * float(residuals @ residuals + np.sum(squares)), gradient, self.held(theta, H)
 
     def pair_residuals(self, theta: FloatArray) -> FloatArray:
         """Sampson errors (n,) of the pairs, px."""
         residuals = np.zeros(len(self.pairs))
         pair_terms(
-            theta, self.kernel, self.pairs, self.focal, self.h, residuals, np.zeros((6, 6)), np.zeros(6), False
+            theta, self.law, self.pairs, self.focal, self.h, residuals, np.zeros((6, 6)), np.zeros(6), False
         )
         return residuals
 
@@ -120,7 +125,7 @@ class Packed:
         squares = np.zeros(len(self.tracks))
         track_terms(
             theta,
-            self.kernel,
+            self.law,
             self.tracks,
             self.focal,
             self.h,
@@ -150,7 +155,7 @@ class Packed:
 
     def in_front(self, theta: FloatArray) -> int:
         """Number of pairs whose point lies in front of both cameras."""
-        return count_in_front(theta, self.kernel, self.pairs)
+        return count_in_front(theta, self.law, self.pairs)
 
     def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
         """Parameters (6,) of the motion (w, d)."""

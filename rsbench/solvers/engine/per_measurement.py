@@ -29,11 +29,11 @@ def each_term(packed: Packed, theta: FloatArray) -> Each:
     """What ``Packed.normal_equations`` sums up, and with the row checks of the tracks in their squares."""
     pairs, count = len(packed.pairs), len(packed.pairs) + len(packed.tracks)
     squares, g, H = np.zeros(count), np.zeros((count, 6)), np.zeros((count, 6, 6))
-    _each_pair(theta, packed.kernel, packed.pairs, packed.focal, packed.h, squares[:pairs], H[:pairs], g[:pairs])
+    _each_pair(theta, packed.law, packed.pairs, packed.focal, packed.h, squares[:pairs], H[:pairs], g[:pairs])
     squares[:pairs] **= 2
     _each_track(
         theta,
-        packed.kernel,
+        packed.law,
         packed.tracks,
         packed.focal,
         packed.h,
