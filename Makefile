@@ -4,6 +4,7 @@
 # make test-extras  install rerun-sdk, torch and datasets (1 GB and more), and run the tests that need them
 # make test-gpu   tests of what renders, on an NVIDIA GPU
 # make attack     kills, failing files, mutated inputs, hostile surroundings, faults for verify: hours
+# make sample     the release's sample of data, build/rsbench-sample.zip
 # make docs       the documentation site, in build/docs; warnings are errors
 # make reference  docs/reference/commands.md and cards.md from the code
 # make lock       renew constraints.txt from pyproject.toml (needs uv)
@@ -18,7 +19,7 @@ CANDIDATES = $(or $(PYTHON),python3 python3.14 python3.13 python3.12 python3.11)
 COMPILE := from rsbench.solvers.engine.warm_up import warm_up; warm_up(["linear", "twist"])
 SUITABLE := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: help demo test test-extras test-gpu attack docs reference lock clean
+.PHONY: help demo test test-extras test-gpu attack sample docs reference lock clean
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := demo
 
@@ -54,6 +55,9 @@ test-gpu: $(STAMP)
 
 attack: $(STAMP)
 	@PYTHONPATH=tests $(BIN)/python -m attack --write docs/explanation/reliability.md
+
+sample: $(STAMP)
+	@$(BIN)/python benchmarks/release_sample.py build/rsbench-sample.zip
 
 docs: $(STAMP)
 	@$(BIN)/sphinx-build -W --keep-going -q -b html docs build/docs
