@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.capture.trajectory_gyro import GyroSteps
 from rsbench.capture.trajectory_kernels import END
 from rsbench.core.correspondences import BEYOND_PX, BoolArray, Correspondences, unlinked_pairs
 from rsbench.core.rig import SIDES, Side, StereoRig
@@ -30,9 +31,11 @@ class Past:
     p: FloatArray
     """(k, 3)."""
     gradient: FloatArray
-    """(6 k,)."""
+    """(6 k,), and of the bias of a gyroscope, where there is one, three more."""
     H: FloatArray
-    """(6 k, 6 k)."""
+    """(6 k, 6 k), likewise."""
+    bias: FloatArray | None = None
+    """(3,) about which it is known."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,6 +54,8 @@ class TimedTracks:
     """Of the tracks of earlier windows; None: the spline begins here, and the pose at time 0 is the world's."""
     share: float = 1.0
     """What a track counts beside the prior: less than 1 where errors of neighbouring tracks are alike."""
+    gyro: GyroSteps | None = None
+    """What a gyroscope says of the times that the spline lasts; None: there is none."""
 
     def __len__(self) -> int:
         return len(self.starts) - 1

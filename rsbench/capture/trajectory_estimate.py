@@ -9,17 +9,17 @@ Two frames do not show what both shake alike; a sequence does, for its windows o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from rsbench.capture import trajectory_banded as banded
 from rsbench.capture.trajectory_choice import approximated, choose
 from rsbench.capture.trajectory_covariance import covariance_between, pose_covariance
 from rsbench.capture.trajectory_data import TimedTracks, pack_windows, telling
-from rsbench.capture.trajectory_fit import NORMAL, Fit, fit, information
+from rsbench.capture.trajectory_fit import NORMAL, Fit, covariance_band, fit, information
+from rsbench.capture.trajectory_gyro import bordered_inverse, contradicts, gyro_steps
 from rsbench.capture.trajectory_kernels import Tails
 from rsbench.capture.trajectory_prior import Prior
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, span_of
@@ -83,6 +83,19 @@ class TrajectoryBound:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class GyroFound:
+    """What a sequence says of a gyroscope."""
+
+    bias: FloatArray
+    """(3,) of its samples, rad per frame period."""
+    noise: float
+    """Standard deviation of its turn over a frame period about each axis, rad, what the spline does not follow
+    included."""
+    contradicts: bool
+    """Whether its samples are not of these frames: of another clock, sign or other axes."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory(TrajectoryBound):
     """What the rig did, seen from the body at time 0."""
 
@@ -100,6 +113,8 @@ class Trajectory(TrajectoryBound):
     supported: BoolArray
     """(windows,) whether a window's own tracks carry it; elsewhere the spline bridges it."""
     fit: Fit
+    gyro: GyroFound | None = None
+    """What was found of a gyroscope; None: none was given."""
 
     @property
     def interval(self) -> float:
@@ -118,6 +133,7 @@ def estimate_trajectory(
     motions: Sequence[Motion | None] | None = None,
     options: TrajectoryOptions | None = None,
     seed: int = 0,
+    gyro: FloatArray | None = None,
 ) -> Trajectory:
     """The trajectory of a rig, from matches with outliers.
 
@@ -125,6 +141,7 @@ def estimate_trajectory(
         windows: of the frames 0 and 1, 1 and 2, ...
         motions: of each window, to begin with; None: they are searched.
         seed: of that search, where there are no options.
+        gyro: (n, 4) samples as of ``Correspondences.gyro``, tau of the sequence; bias and noise are found.
 
     Raises:
         ValueError: no windows, or no tracks in any.
@@ -134,32 +151,27 @@ def estimate_trajectory(
         raise ValueError("a trajectory needs tracks: matches of both cameras over time")
     if motions is None:
         motions = window_motions(windows, rig, shutter, options.seed)
-    few = slice(0, _JUDGED)
-    found, tracks = _fitted(windows[few], rig, shutter, motions[few], options.intervals[0], options.prior, options)
+    steps = None if gyro is None else gyro_steps(gyro)
+
+    def fitted(windows: Sequence[Correspondences], interval: float, prior: Prior) -> tuple[Fit, TimedTracks]:
+        """The spline of the first windows, and their tracks."""
+        span = span_of(len(windows), shutter)
+        tracks = pack_windows(windows, rig, shutter, share=options.share)
+        tracks = replace(tracks, gyro=None if steps is None else steps.between(*span))
+        curve = first_curve(motions[: len(windows)], tracks, span, interval)
+        return fit(curve, tracks, prior, options.learn), tracks
+
+    found, tracks = fitted(windows[:_JUDGED], options.intervals[0], options.prior)
     if options.learn:
         found = choose(found, tracks, options.intervals)
     if len(windows) > _JUDGED:
-        found, tracks = _fitted(windows, rig, shutter, motions, found.curve.interval, found.prior, options)
+        found, tracks = fitted(windows, found.curve.interval, found.prior)
     if options.link:
         right = [found.trust[each] for each in tracks.members]
-        tracks = pack_windows(windows, rig, shutter, right, share=options.share)
-        found = fit(found.curve, tracks, found.prior, options.learn, found.tails)
+        linked = pack_windows(windows, rig, shutter, right, share=options.share)
+        tracks = replace(linked, gyro=tracks.gyro)
+        found = fit(found.curve, tracks, found.prior, options.learn, found.tails, drift=found.drift)
     return _told(found, tracks, windows, shutter)
-
-
-def _fitted(
-    windows: Sequence[Correspondences],
-    rig: StereoRig,
-    shutter: RollingShutter,
-    motions: Sequence[Motion | None],
-    interval: float,
-    prior: Prior,
-    options: TrajectoryOptions,
-) -> tuple[Fit, TimedTracks]:
-    """The spline of windows, and their tracks."""
-    tracks = pack_windows(windows, rig, shutter, share=options.share)
-    curve = first_curve(motions, tracks, span_of(len(windows), shutter), interval)
-    return fit(curve, tracks, prior, options.learn), tracks
 
 
 def _told(
@@ -177,10 +189,16 @@ def _told(
         supported=np.array([is_supported(mask, found.tails) for mask in inliers]),
         fit=found,
         curve=found.curve,
-        covariance_band=banded.inverse_band(
-            information(found.curve, tracks, found.tails, found.prior, found.trust)
-        ),
+        covariance_band=covariance_band(found, tracks),
+        gyro=_gyro_found(found, tracks),
     )
+
+
+def _gyro_found(found: Fit, tracks: TimedTracks) -> GyroFound | None:
+    if tracks.gyro is None or found.drift is None:
+        return None
+    bias, variance = found.drift
+    return GyroFound(bias=bias, noise=float(np.sqrt(variance)), contradicts=contradicts(tracks.gyro, found.drift))
 
 
 def noise_px(tails: Tails) -> float:
@@ -217,5 +235,5 @@ def trajectory_bound(
     everything = [np.ones(len(each)) for each in pack_windows(windows, rig, shutter).members]
     tracks = pack_windows(windows, rig, shutter, everything)
     curve = approximated(motion.body_from_world, span_of(len(windows), shutter), interval)
-    lower = information(curve, tracks, Tails(NORMAL, noise_px), prior, np.ones(len(tracks)))
-    return TrajectoryBound(curve=curve, covariance_band=banded.inverse_band(lower))
+    told = information(curve, tracks, Tails(NORMAL, noise_px), prior, np.ones(len(tracks)))
+    return TrajectoryBound(curve=curve, covariance_band=bordered_inverse(*told))
