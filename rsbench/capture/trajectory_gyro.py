@@ -1,8 +1,8 @@
-"""A gyroscope beside the matches of a sequence: how far it turns from moment to moment, and what it errs by.
+"""A gyroscope beside the matches of a sequence: how fast it turns at its moments, and what it errs by.
 
-Its samples are integrated over short steps, each of which is one measurement of the spline's turn, of white noise.
-A bias that stays and the noise's variance are found with the spline: the bias is an unknown beside the control
-poses, a border of three columns beside the band.
+A sample is a measurement of the spline's rate at its time, of white noise, so that nothing is integrated: neither
+gaps nor slow sampling matter. A bias that stays and the noise's variance are found with the spline: the bias is an
+unknown beside the control poses, a border of three columns beside the band.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from rsbench.core import so3
 from rsbench.core.correspondences import BoolArray
 from rsbench.core.so3 import FloatArray
 
-_STEP = 0.125
-"""Frame periods of a step, where samples are closer: half of the finest knots."""
-_LONGEST, _GAP = 0.5, 3.0
-"""Frame periods of a step, and medians between two samples, beyond which samples are missing."""
+_APART = 1 / 16
+"""Frame periods: samples that are closer are taken together. A filter in the sensor makes their noise alike, and
+the mean over an eighth of a period blunts what a hand shakes."""
+_MOMENT = 1e-3
+"""Half of the time over which the spline's turn is taken for its rate: far above rounding, far below a knot."""
 _BIAS = 1e-2
 """Standard deviation of the bias, rad per frame period, before anything is seen: 0.3 rad/s at 30 Hz."""
 _LEAST_VARIANCE = 1e-12
@@ -42,6 +43,8 @@ class GyroSteps(NamedTuple):
     end: FloatArray
     turn: FloatArray
     """(n, 3) rotation vectors of the body at the end, seen from the body at the start; bias and all."""
+    worth: FloatArray
+    """(n,) frame periods that one speaks for: its rates have the noise of a turn over so long."""
 
     def between(self, first: float, last: float) -> GyroSteps:
         """Those that start at a time or later, and end at another or earlier."""
@@ -89,30 +92,15 @@ class Sensed(NamedTuple):
 
 
 def gyro_steps(samples: FloatArray) -> GyroSteps:
-    """Steps of samples (n, 4) tau, w, of which each speaks for the time that is nearest to it.
-
-    So no sample is in two steps, and their noises are apart. Steps with missing samples are left out.
-    """
-    tau, places = np.unique(samples[:, 0], return_index=True)
-    if len(tau) < 2:
-        return GyroSteps(np.zeros(0), np.zeros(0), np.zeros((0, 3)))
-    from scipy.interpolate import CubicSpline  # takes as long to load as all else that a solver needs
-
-    spacing = np.diff(tau)
-    edges = np.concatenate([tau[:1], tau[:-1] + 0.5 * spacing, tau[-1:]])
-    angles = np.diff(CubicSpline(tau, samples[places, 1:]).antiderivative()(edges), axis=0)
-    number = np.floor(tau / _STEP)
-    first = np.flatnonzero(np.diff(number, prepend=-np.inf))
-    count = np.diff(first, append=len(tau))
-    R = np.broadcast_to(np.eye(3), (len(first), 3, 3)).copy()
-    for k in range(int(np.max(count))):
-        there = count > k
-        R[there] = so3.exp(angles[first[there] + k]) @ R[there]
-    start, end = edges[first], edges[first + count]
-    missing = np.append(spacing > _GAP * np.median(spacing), False)
-    missing[1:] |= missing[:-1]
-    whole = ~np.logical_or.reduceat(missing, first) & (end - start <= _LONGEST)
-    return GyroSteps(start[whole], end[whole], so3.log(R[whole]))
+    """Turns within a moment around samples (n, 4) tau, w, in any order; close ones are taken together."""
+    samples = samples[np.argsort(samples[:, 0], kind="stable")]
+    first = np.flatnonzero(np.diff(np.floor(samples[:, 0] / _APART), prepend=-np.inf))
+    if len(first) < 2:
+        return GyroSteps(np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros(0))
+    count = np.diff(first, append=len(samples))
+    means = np.add.reduceat(samples, first) / count[:, None]
+    worth = count * (samples[-1, 0] - samples[0, 0]) / (len(samples) - 1)
+    return GyroSteps(means[:, 0] - _MOMENT, means[:, 0] + _MOMENT, 2.0 * _MOMENT * means[:, 1:], worth)
 
 
 def sensed(curve: Curve, steps: GyroSteps, bias: FloatArray, width: int) -> Sensed:
@@ -123,8 +111,8 @@ def sensed(curve: Curve, steps: GyroSteps, bias: FloatArray, width: int) -> Sens
     R, turn, index = views.R.reshape(2, count, 3, 3), views.turn.reshape(2, count, 4, 3, 3), views.index
     turned, wanted = R[1] @ np.swapaxes(R[0], 1, 2), steps.turn - length[:, None] * bias
     off = turned @ np.swapaxes(so3.exp(wanted), 1, 2)
-    errors, root = so3.log(off), length[:, None] ** -0.5
-    # By a turn of the body at the end, over the root of the length.
+    errors, root = so3.log(off), (steps.worth**0.5 / length)[:, None]
+    # By a turn of the body at the end, and whitened.
     by_end = np.linalg.inv(so3.left_jacobian(errors)) * root[..., None]
     by_bias = by_end @ off @ so3.left_jacobian(wanted) * length[:, None, None]
     errors = root * errors
@@ -223,9 +211,8 @@ def contradicts(steps: GyroSteps, drift: Drift) -> bool:
     """Whether a gyroscope errs by much of what it measures, and by more than its noise: of another clock."""
     if len(steps.start) < 3:
         return False
-    length = (steps.end - steps.start)[:, None]
-    rates = steps.turn / length
-    errors = drift.variance * float(np.mean(1.0 / length))
+    rates = steps.turn / (steps.end - steps.start)[:, None]
+    errors = drift.variance * float(np.mean(1.0 / steps.worth))
     varied = float(np.mean(np.var(rates, axis=0)))
     noise = float(np.mean(np.diff(rates, n=2, axis=0) ** 2)) / 6.0  # slow turns hardly show in second differences
     return errors > max(_UNLIKE**2 * varied, _NOISY**2 * noise)
