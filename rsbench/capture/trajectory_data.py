@@ -31,11 +31,21 @@ class Past:
     p: FloatArray
     """(k, 3)."""
     gradient: FloatArray
-    """(6 k,), and of the bias of a gyroscope, where there is one, three more."""
+    """(6 k,), and where there is a gyroscope four more, of its errors."""
     H: FloatArray
     """(6 k, 6 k), likewise."""
-    bias: FloatArray | None = None
-    """(3,) about which it is known."""
+    errors: FloatArray | None = None
+    """(4,) of the gyroscope, about which it is known."""
+
+    def without_gyro(self) -> Past:
+        """The same of the control poses alone, whatever the errors of a gyroscope are."""
+        if self.errors is None:
+            return self
+        k = 6 * len(self.p)
+        solved = np.linalg.solve(self.H[k:, k:], np.column_stack([self.H[k:, :k], self.gradient[k:]]))
+        H = self.H[:k, :k] - self.H[:k, k:] @ solved[:, :-1]
+        gradient = self.gradient[:k] - self.H[:k, k:] @ solved[:, -1]
+        return Past(R=self.R, p=self.p, gradient=gradient, H=0.5 * (H + H.T))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -19,7 +19,7 @@ from rsbench.capture.trajectory_choice import approximated, choose
 from rsbench.capture.trajectory_covariance import covariance_between, pose_covariance
 from rsbench.capture.trajectory_data import TimedTracks, pack_windows, telling
 from rsbench.capture.trajectory_fit import NORMAL, Fit, covariance_band, fit, information
-from rsbench.capture.trajectory_gyro import bordered_inverse, contradicts, gyro_steps
+from rsbench.capture.trajectory_gyro import Drift, GyroSteps, bordered_inverse, contradicts, gyro_steps
 from rsbench.capture.trajectory_kernels import Tails
 from rsbench.capture.trajectory_prior import Prior
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, span_of
@@ -88,11 +88,13 @@ class GyroFound:
 
     bias: FloatArray
     """(3,) of its samples, rad per frame period."""
+    shift: float
+    """Frame periods that its times are early by."""
     noise: float
     """Standard deviation of its turn over a frame period about each axis, rad, what the spline does not follow
     included."""
-    contradicts: bool
-    """Whether its samples are not of these frames: of another clock, sign or other axes."""
+    used: bool
+    """False: its samples contradict the matches, being of another time, sign or other axes, and were left out."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -151,27 +153,56 @@ def estimate_trajectory(
         raise ValueError("a trajectory needs tracks: matches of both cameras over time")
     if motions is None:
         motions = window_motions(windows, rig, shutter, options.seed)
-    steps = None if gyro is None else gyro_steps(gyro)
-
-    def fitted(windows: Sequence[Correspondences], interval: float, prior: Prior) -> tuple[Fit, TimedTracks]:
-        """The spline of the first windows, and their tracks."""
-        span = span_of(len(windows), shutter)
-        tracks = pack_windows(windows, rig, shutter, share=options.share)
-        tracks = replace(tracks, gyro=None if steps is None else steps.between(*span))
-        curve = first_curve(motions[: len(windows)], tracks, span, interval)
-        return fit(curve, tracks, prior, options.learn), tracks
-
-    found, tracks = fitted(windows[:_JUDGED], options.intervals[0], options.prior)
-    if options.learn:
-        found = choose(found, tracks, options.intervals)
-    if len(windows) > _JUDGED:
-        found, tracks = fitted(windows, found.curve.interval, found.prior)
-    if options.link:
-        right = [found.trust[each] for each in tracks.members]
-        linked = pack_windows(windows, rig, shutter, right, share=options.share)
-        tracks = replace(linked, gyro=tracks.gyro)
-        found = fit(found.curve, tracks, found.prior, options.learn, found.tails, drift=found.drift)
+    given = _Given(windows, rig, shutter, motions, options, None if gyro is None else gyro_steps(gyro))
+    found, tracks = given.fitted()
+    if tracks.gyro is not None and found.drift is not None and contradicts(tracks.gyro, found.drift):
+        drift = found.drift
+        found, tracks = replace(given, gyro=None).fitted()
+        return replace(_told(found, tracks, windows, shutter), gyro=_gyro_found(drift, used=False))
     return _told(found, tracks, windows, shutter)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What a trajectory is found of."""
+
+    windows: Sequence[Correspondences]
+    rig: StereoRig
+    shutter: RollingShutter
+    motions: Sequence[Motion | None]
+    options: TrajectoryOptions
+    gyro: GyroSteps | None
+
+    def fitted(self) -> tuple[Fit, TimedTracks]:
+        """The spline, and what it was fitted to."""
+        options = self.options
+        found, tracks = self._first(_JUDGED, options.intervals[0], options.prior)
+        if options.learn:
+            found = choose(found, tracks, options.intervals)
+        if len(self.windows) > _JUDGED:
+            found, tracks = self._first(len(self.windows), found.curve.interval, found.prior, found.drift)
+        if options.link:
+            right = [found.trust[each] for each in tracks.members]
+            tracks = self._packed(len(self.windows), found.drift, right)
+            found = fit(found.curve, tracks, found.prior, options.learn, found.tails, drift=found.drift)
+        return found, tracks
+
+    def _first(
+        self, count: int, interval: float, prior: Prior, drift: Drift | None = None
+    ) -> tuple[Fit, TimedTracks]:
+        """The spline of so many windows, and their tracks."""
+        tracks, motions = self._packed(count, drift), self.motions[:count]
+        curve = first_curve(motions, tracks, span_of(len(motions), self.shutter), interval)
+        return fit(curve, tracks, prior, self.options.learn, drift=drift), tracks
+
+    def _packed(self, count: int, drift: Drift | None, right: Sequence[FloatArray] | None = None) -> TimedTracks:
+        windows = self.windows[:count]
+        tracks = pack_windows(windows, self.rig, self.shutter, right, share=self.options.share)
+        if self.gyro is None:
+            return tracks
+        shift = 0.0 if drift is None else drift.shift
+        first, last = span_of(len(windows), self.shutter)
+        return replace(tracks, gyro=self.gyro.between(first - shift, last - shift))
 
 
 def _told(
@@ -190,15 +221,12 @@ def _told(
         fit=found,
         curve=found.curve,
         covariance_band=covariance_band(found, tracks),
-        gyro=_gyro_found(found, tracks),
+        gyro=None if found.drift is None else _gyro_found(found.drift, used=True),
     )
 
 
-def _gyro_found(found: Fit, tracks: TimedTracks) -> GyroFound | None:
-    if tracks.gyro is None or found.drift is None:
-        return None
-    bias, variance = found.drift
-    return GyroFound(bias=bias, noise=float(np.sqrt(variance)), contradicts=contradicts(tracks.gyro, found.drift))
+def _gyro_found(drift: Drift, *, used: bool) -> GyroFound:
+    return GyroFound(bias=drift.bias, shift=drift.shift, noise=float(np.sqrt(drift.variance)), used=used)
 
 
 def noise_px(tails: Tails) -> float:

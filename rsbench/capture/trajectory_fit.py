@@ -41,7 +41,7 @@ _FLAT_COST, _NEAR = 1e-3, 1.0
 _MANY = 300
 """Tracks from which on it pays to share them."""
 _LEAST_WIDTH = 5
-"""Control poses that the prior ties."""
+"""Control poses that the prior ties, and a moment of a gyroscope."""
 ANCHORED = 1e4
 """Precision of the pose at time 0, in those of the most certain control pose."""
 _TELLING = 2.0
@@ -65,7 +65,7 @@ class Equations(NamedTuple):
     sensed: Sensed | None = None
     """Of a gyroscope."""
     border: Border | None = None
-    """Of its bias."""
+    """Of its errors."""
 
     @property
     def slope(self) -> FloatArray:
@@ -90,12 +90,9 @@ class Fit:
 def width_of(tracks: TimedTracks, curve: Curve) -> int:
     """Width of the band: unknowns that are felt together."""
     last = len(curve.p) - 4
-    spans = [tracks.span] if tracks.gyro is None else [tracks.span, tracks.gyro[:2]]
+    places = [np.clip(np.floor((tau - curve.first) / curve.interval), 0, last) for tau in tracks.span]
     known = 0 if tracks.past is None else len(tracks.past.p)
-    for span in spans:
-        low, high = (np.clip(np.floor((tau - curve.first) / curve.interval), 0, last) for tau in span)
-        known = max(int(np.max(high - low, initial=0)) + 4, known)
-    return 6 * max(_LEAST_WIDTH, known)
+    return 6 * max(int(np.max(places[1] - places[0], initial=0)) + 4, _LEAST_WIDTH, known)
 
 
 def normal_equations(
@@ -125,7 +122,7 @@ def normal_equations(
         band += rough.bands[kind] / strength
     found = border = None
     if tracks.gyro is not None and drift is not None:
-        found = sensed(curve, tracks.gyro, drift.bias, width)
+        found = sensed(curve, tracks.gyro, drift, width)
         gradient += found.gradient / drift.variance
         band += found.band / drift.variance
         more, border = border_of(found, drift, past is None)
@@ -162,12 +159,12 @@ def _add_halves(
 def _add_past(
     past: Past, curve: Curve, gradient: FloatArray, band: FloatArray, border: Border | None, drift: Drift | None
 ) -> float:
-    """Cost of control poses and a bias that are not where earlier matches had them, and its equations."""
+    """Cost of control poses, and errors of a gyroscope, that are not as they were earlier, and its equations."""
     k = len(past.p)
     turned = so3.log(curve.R[:k] @ np.swapaxes(past.R, 1, 2))
     away = np.concatenate([turned, curve.p[:k] - past.p], axis=1).ravel()
-    if border is not None and drift is not None and past.bias is not None:
-        away = np.concatenate([away, drift.bias - past.bias])
+    if border is not None and drift is not None and past.errors is not None:
+        away = np.concatenate([away, drift.errors - past.errors])
         border.mixed[: 6 * k] += past.H[: 6 * k, 6 * k :]
         border.corner[...] += past.H[6 * k :, 6 * k :]
         border.slope[...] += past.H[6 * k :] @ away + past.gradient[6 * k :]
@@ -306,11 +303,11 @@ def descend(
 
 
 def _moved(drift: Drift | None, step: FloatArray) -> Drift | None:
-    return None if drift is None else drift._replace(bias=drift.bias + step)
+    return None if drift is None else drift.moved(step)
 
 
 def _step(matrix: FloatArray, here: Equations, damping: float) -> FloatArray | None:
-    """Of the control poses and of a bias, where there is one."""
+    """Of the control poses and, where there is a gyroscope, of its errors."""
     damped = matrix.copy()
     damped[:, 0] += damping * here.band[:, 0]
     try:

@@ -1,8 +1,8 @@
 """A gyroscope beside the matches of a sequence: how fast it turns at its moments, and what it errs by.
 
 A sample is a measurement of the spline's rate at its time, of white noise, so that nothing is integrated: neither
-gaps nor slow sampling matter. A bias that stays and the noise's variance are found with the spline: the bias is an
-unknown beside the control poses, a border of three columns beside the band.
+gaps nor slow sampling matter. What it errs by is found with the spline: a bias that stays and how far its clock is
+off are unknowns beside the control poses, a border of four columns beside the band; then the noise's variance.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from rsbench.capture.trajectory_poses import blank_views, fill_views
 from rsbench.capture.trajectory_prior import add_blocks
 from rsbench.capture.trajectory_spline import Curve
 from rsbench.core import so3
-from rsbench.core.correspondences import BoolArray
 from rsbench.core.so3 import FloatArray
 
 _APART = 1 / 16
@@ -26,6 +25,9 @@ _MOMENT = 1e-3
 """Half of the time over which the spline's turn is taken for its rate: far above rounding, far below a knot."""
 _BIAS = 1e-2
 """Standard deviation of the bias, rad per frame period, before anything is seen: 0.3 rad/s at 30 Hz."""
+_SHIFT, FARTHEST = 0.2, 0.5
+"""Standard deviation of the shift of its clock, frame periods, before anything is seen, and the largest that is
+looked for: a quarter of the period of the fastest shakes of a hand."""
 _LEAST_VARIANCE = 1e-12
 """rad^2 per frame period: far below that of any gyroscope, and above rounding."""
 _TELLING = 2.0
@@ -48,34 +50,54 @@ class GyroSteps(NamedTuple):
 
     def between(self, first: float, last: float) -> GyroSteps:
         """Those that start at a time or later, and end at another or earlier."""
-        return self._of((self.start >= first) & (self.end <= last))
+        return self._part(self._begun(first), int(np.searchsorted(self.end, last, side="right")))
 
     def begun_before(self, time: float) -> GyroSteps:
-        """Those that start before a time: all others of them do so then or later."""
-        return self._of(self.start < time)
+        """Those that start before a time: all others do so then or later."""
+        return self._part(0, self._begun(time))
 
-    def _of(self, chosen: BoolArray) -> GyroSteps:
-        return GyroSteps(*(each[chosen] for each in self))
+    def _begun(self, time: float) -> int:
+        return int(np.searchsorted(self.start, time))
+
+    def _part(self, first: int, after: int) -> GyroSteps:
+        return GyroSteps(*(each[first:after] for each in self))
 
 
 class Drift(NamedTuple):
     """What a gyroscope errs by."""
 
-    bias: FloatArray
-    """(3,) of its rates in the convention of ``Correspondences.gyro``, rad per frame period."""
+    errors: FloatArray
+    """(4,) bias of its rates in the convention of ``Correspondences.gyro``, rad per frame period, and the shift:
+    frame periods that its times are early by."""
     variance: float
     """Of the white noise of its turn over a frame period, about each axis, rad^2."""
 
+    @property
+    def bias(self) -> FloatArray:
+        """(3,) rad per frame period."""
+        return self.errors[:3]
+
+    @property
+    def shift(self) -> float:
+        """Frame periods."""
+        return float(self.errors[3])
+
+    def moved(self, step: FloatArray) -> Drift:
+        """Other errors, the shift no farther than what is looked for."""
+        errors = self.errors + step
+        errors[3] = np.clip(errors[3], -FARTHEST, FARTHEST)
+        return self._replace(errors=errors)
+
 
 class Border(NamedTuple):
-    """Normal equations of the bias beside those of the control poses."""
+    """Normal equations of a gyroscope's errors beside those of the control poses."""
 
     mixed: FloatArray
-    """(6 controls, 3)."""
+    """(6 controls, 4)."""
     corner: FloatArray
-    """(3, 3)."""
+    """(4, 4)."""
     slope: FloatArray
-    """(3,) gradient."""
+    """(4,) gradient."""
 
 
 class Sensed(NamedTuple):
@@ -103,56 +125,60 @@ def gyro_steps(samples: FloatArray) -> GyroSteps:
     return GyroSteps(means[:, 0] - _MOMENT, means[:, 0] + _MOMENT, 2.0 * _MOMENT * means[:, 1:], worth)
 
 
-def sensed(curve: Curve, steps: GyroSteps, bias: FloatArray, width: int) -> Sensed:
-    """Errors of steps within a spline, and their derivatives in a band of a width."""
+def sensed(curve: Curve, steps: GyroSteps, drift: Drift, width: int) -> Sensed:
+    """Errors of steps within a spline, and their derivatives in a band of a width, five control poses at least."""
     count, controls, length = len(steps.start), len(curve.p), steps.end - steps.start
     views = blank_views(2 * count)
-    fill_views(curve, np.concatenate([steps.start, steps.end]), views)
+    fill_views(curve, np.concatenate([steps.start, steps.end]) + drift.shift, views)
     R, turn, index = views.R.reshape(2, count, 3, 3), views.turn.reshape(2, count, 4, 3, 3), views.index
-    turned, wanted = R[1] @ np.swapaxes(R[0], 1, 2), steps.turn - length[:, None] * bias
+    turned, wanted = R[1] @ np.swapaxes(R[0], 1, 2), steps.turn - length[:, None] * drift.bias
     off = turned @ np.swapaxes(so3.exp(wanted), 1, 2)
     errors, root = so3.log(off), (steps.worth**0.5 / length)[:, None]
     # By a turn of the body at the end, and whitened.
     by_end = np.linalg.inv(so3.left_jacobian(errors)) * root[..., None]
-    by_bias = by_end @ off @ so3.left_jacobian(wanted) * length[:, None, None]
+    faster = views.spin[count:] - (turned @ views.spin[:count, :, None])[..., 0]
+    by_drift = np.concatenate(
+        [by_end @ off @ so3.left_jacobian(wanted) * length[:, None, None], by_end @ faster[..., None]], axis=2
+    )
     errors = root * errors
     size = 4 + int(np.max(index[count:] - index[:count], initial=0))
     first = np.minimum(index[:count], controls - size)
     by, rows = np.zeros((count, size, 3, 3)), np.arange(count)[:, None]
     by[rows, (index[:count] - first)[:, None] + np.arange(4)] -= (by_end @ turned)[:, None] @ turn[0]
     by[rows, (index[count:] - first)[:, None] + np.arange(4)] += by_end[:, None] @ turn[1]
-    gradient, band, mixed = np.zeros(6 * controls), np.zeros((6 * controls, width)), np.zeros((controls, 6, 3))
+    gradient, band, mixed = np.zeros(6 * controls), np.zeros((6 * controls, width)), np.zeros((controls, 6, 4))
     add_blocks(gradient, band, by, errors, first, 0)
-    np.add.at(mixed[:, :3], first[:, None] + np.arange(size), np.swapaxes(by, 2, 3) @ by_bias[:, None])
-    corner, slope = np.einsum("kmi,kmj->ij", by_bias, by_bias), np.einsum("kmi,km->i", by_bias, errors)
-    border = Border(mixed.reshape(-1, 3), corner, slope)
+    np.add.at(mixed[:, :3], first[:, None] + np.arange(size), np.swapaxes(by, 2, 3) @ by_drift[:, None])
+    corner, slope = np.einsum("kmi,kmj->ij", by_drift, by_drift), np.einsum("kmi,km->i", by_drift, errors)
+    border = Border(mixed.reshape(-1, 4), corner, slope)
     return Sensed(float(np.sum(errors**2)), gradient, band, border, errors.size)
 
 
 def first_drift(curve: Curve, steps: GyroSteps) -> Drift:
-    """No bias, and the noise that steps have about a spline."""
-    found = sensed(curve, steps, np.zeros(3), 6 * len(curve.p))
-    return Drift(np.zeros(3), max(found.squares / max(found.count, 1), _LEAST_VARIANCE))
+    """None but the noise that steps have about a spline."""
+    found = sensed(curve, steps, Drift(np.zeros(4), 1.0), 6 * max(len(curve.p), 5))
+    return Drift(np.zeros(4), max(found.squares / max(found.count, 1), _LEAST_VARIANCE))
 
 
 def border_of(found: Sensed, drift: Drift, begins: bool) -> tuple[float, Border]:
-    """Cost of errors, and what they say of the bias; at the beginning of a sequence, that it is small too."""
+    """Cost of steps and of a gyroscope's errors, and the border; ``begins``: with what is expected of the errors."""
     border = Border(*(each / drift.variance for each in found.border))
     cost = 0.5 * found.squares / drift.variance
     if begins:
-        cost += 0.5 * float(drift.bias @ drift.bias) / _BIAS**2
-        known = border.corner + np.eye(3) / _BIAS**2, border.slope + drift.bias / _BIAS**2
+        expected = np.array([_BIAS, _BIAS, _BIAS, _SHIFT]) ** -2
+        cost += 0.5 * float(expected @ drift.errors**2)
+        known = border.corner + np.diag(expected), border.slope + expected * drift.errors
         border = Border(border.mixed, *known)
     return cost, border
 
 
 class Eliminated(NamedTuple):
-    """The bias, left out of normal equations whose factor is known."""
+    """A gyroscope's errors, left out of normal equations whose factor is known."""
 
     follows: FloatArray
-    """(6 controls, 3) how the control poses move against the bias."""
+    """(6 controls, 4) how the control poses move against them."""
     covariance: FloatArray
-    """(3, 3) of the bias."""
+    """(4, 4) of them."""
     log_determinant: float
     """What it adds to that of the control poses alone."""
 
@@ -170,21 +196,21 @@ def eliminated(lower: FloatArray, border: Border) -> Eliminated:
 
 
 def bordered_step(lower: FloatArray, gradient: FloatArray, border: Border) -> tuple[FloatArray, FloatArray]:
-    """Newton's step of control poses (6 controls,) and bias (3,). Raises NotDefiniteError."""
-    alone, bias = banded.solve(lower, gradient), eliminated(lower, border)
-    step = -bias.covariance @ (border.slope - border.mixed.T @ alone)
-    return -alone - bias.follows @ step, step
+    """Newton's step of control poses (6 controls,) and a gyroscope's errors (4,). Raises NotDefiniteError."""
+    alone, rest = banded.solve(lower, gradient), eliminated(lower, border)
+    step = -rest.covariance @ (border.slope - border.mixed.T @ alone)
+    return -alone - rest.follows @ step, step
 
 
 def bordered_inverse(lower: FloatArray, border: Border | None) -> FloatArray:
-    """Covariance of control poses, in its band, with a bias that is not known beside them."""
+    """Covariance of control poses, in its band, with a gyroscope's errors that are not known beside them."""
     inverse = banded.inverse_band(lower)
     if border is None:
         return inverse
-    bias = eliminated(lower, border)
-    spread = bias.follows @ bias.covariance
+    rest = eliminated(lower, border)
+    spread = rest.follows @ rest.covariance
     for i in range(inverse.shape[1]):
-        inverse[: len(lower) - i, i] += np.sum(spread[: len(lower) - i] * bias.follows[i:], axis=1)
+        inverse[: len(lower) - i, i] += np.sum(spread[: len(lower) - i] * rest.follows[i:], axis=1)
     return inverse
 
 
@@ -197,9 +223,9 @@ def learned(
         lower: factor of the normal matrix of control poses alone.
         inverse: see ``bordered_inverse``.
     """
-    bias = eliminated(lower, border)
-    tied = banded.inner(inverse, found.band) + np.sum(bias.covariance * found.border.corner)
-    tied -= 2.0 * np.sum((bias.follows @ bias.covariance) * found.border.mixed)
+    rest = eliminated(lower, border)
+    tied = banded.inner(inverse, found.band) + np.sum(rest.covariance * found.border.corner)
+    tied -= 2.0 * np.sum((rest.follows @ rest.covariance) * found.border.mixed)
     used = float(tied) / drift.variance
     left = found.count - used
     if left <= _TELLING:
@@ -208,11 +234,14 @@ def learned(
 
 
 def contradicts(steps: GyroSteps, drift: Drift) -> bool:
-    """Whether a gyroscope errs by much of what it measures, and by more than its noise: of another clock."""
+    """Whether a gyroscope is of another clock or axes.
+
+    It errs by much of what it measures and by more than its noise, or its clock is off by more than is looked for.
+    """
     if len(steps.start) < 3:
         return False
     rates = steps.turn / (steps.end - steps.start)[:, None]
     errors = drift.variance * float(np.mean(1.0 / steps.worth))
     varied = float(np.mean(np.var(rates, axis=0)))
     noise = float(np.mean(np.diff(rates, n=2, axis=0) ** 2)) / 6.0  # slow turns hardly show in second differences
-    return errors > max(_UNLIKE**2 * varied, _NOISY**2 * noise)
+    return errors > max(_UNLIKE**2 * varied, _NOISY**2 * noise) or abs(drift.shift) >= FARTHEST

@@ -26,7 +26,7 @@ from rsbench.capture.trajectory_fit import (
     normal_equations,
     right_tracks,
 )
-from rsbench.capture.trajectory_gyro import GyroSteps, contradicts, gyro_steps
+from rsbench.capture.trajectory_gyro import Drift, GyroSteps, contradicts, gyro_steps
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, part, span_of
 from rsbench.capture.trajectory_start import continued, first_curve, window_motions
 from rsbench.core import so3
@@ -61,7 +61,7 @@ class StreamedWindow:
     """Windows to the nearest one that its own tracks carry, of those seen so far; 0: it is one itself."""
     noise_px: float
     gyro: bool | None
-    """Whether a gyroscope agrees with the matches around; None: there is none."""
+    """Whether a gyroscope's samples are used; False: they contradict the matches; None: there are none."""
 
     @property
     def supported(self) -> bool:
@@ -101,7 +101,9 @@ class _State:
     def __init__(
         self, rig: StereoRig, shutter: RollingShutter, options: TrajectoryOptions, gyro: GyroSteps | None
     ) -> None:
-        self.rig, self.shutter, self.options, self.gyro = rig, shutter, options, gyro
+        self.rig, self.shutter, self.options = rig, shutter, options
+        self.gyro, self.unlike = gyro, False
+        """Of the windows that are remembered and of later ones; and whether it contradicted the matches."""
         self.windows, self.motions = list[Correspondences](), list[Motion | None]()
         self.first = self.fresh = 0
         self.curve: Curve | None = None
@@ -115,20 +117,34 @@ class _State:
         self.motions.append(motion)
         self.fresh += 1
 
-    def _pack(self, windows: Sequence[Correspondences], right: Sequence[FloatArray] | None = None) -> TimedTracks:
+    def _pack(
+        self,
+        windows: Sequence[Correspondences],
+        right: Sequence[FloatArray] | None = None,
+        drift: Drift | None = None,
+    ) -> TimedTracks:
         share = self.options.share
         tracks = pack_windows(windows, self.rig, self.shutter, right, self.first, self.past, share)
-        return replace(tracks, gyro=self._steps())
-
-    def _steps(self) -> GyroSteps | None:
-        """Of the times that are remembered. What began before the spline does is in the past."""
         if self.gyro is None:
-            return None
-        first = span_of(0, self.shutter)[0] if self.curve is None else self.curve.first
-        return self.gyro.between(first, span_of(self.first + len(self.windows), self.shutter)[1])
+            return tracks
+        # What has left with earlier windows is no more looked at, wherever a clock puts it by now.
+        shift = 0.0 if drift is None else drift.shift
+        first = span_of(0, self.shutter)[0] - shift if self.curve is None else -np.inf
+        last = span_of(self.first + len(windows), self.shutter)[1] - shift
+        return replace(tracks, gyro=self.gyro.between(first, last))
 
     def solve(self) -> tuple[Fit, TimedTracks]:
-        """The spline of all that is remembered; some of the tracks say first which are right."""
+        """The spline of all that is remembered; a gyroscope that contradicts the matches is forgotten."""
+        found, tracks = self._solved()
+        if tracks.gyro is None or found.drift is None or not contradicts(tracks.gyro, found.drift):
+            return found, tracks
+        self.gyro, self.unlike = None, True
+        self.past = None if self.past is None else self.past.without_gyro()
+        self.fit = None if self.fit is None else replace(self.fit, drift=None)
+        return self._solved()
+
+    def _solved(self) -> tuple[Fit, TimedTracks]:
+        """Some of the tracks say first which are right."""
         count, options = len(self.windows), self.options
         few = thinned(self.windows, _JUDGED_BY)
         if self.curve is None or self.fit is None:
@@ -138,12 +154,12 @@ class _State:
             ahead = self.motions[count - self.fresh :]
             last = span_of(self.first + count, self.shutter)[1]
             curve = continued(self.curve, ahead, start, last) if ahead else self.curve
-            before = self.fit
-            found = fit(curve, self._pack(few), before.prior, options.learn, before.tails, drift=before.drift)
-        tracks = self._pack(self.windows)
+            before, tracks = self.fit, self._pack(few, drift=self.fit.drift)
+            found = fit(curve, tracks, before.prior, options.learn, before.tails, drift=before.drift)
+        tracks = self._pack(self.windows, drift=found.drift)
         trust = right_tracks(found, tracks)
         if options.link:
-            tracks = self._pack(self.windows, [trust[each] for each in tracks.members])
+            tracks = self._pack(self.windows, [trust[each] for each in tracks.members], found.drift)
         return fit(found.curve, tracks, found.prior, options.learn, found.tails, drift=found.drift), tracks
 
     def _begun(self, few: Sequence[Correspondences]) -> Fit:
@@ -157,7 +173,6 @@ class _State:
         """The first so many windows."""
         start, end = span_of(1, self.shutter)
         inverse = covariance_band(found, tracks)
-        wrong = tracks.gyro is not None and found.drift is not None and contradicts(tracks.gyro, found.drift)
         windows = enumerate(self.windows)
         right = [found.trust[tracks.members[k]][: len(each.tracks)] > 0.0 for k, each in windows]
         carried = [
@@ -174,7 +189,7 @@ class _State:
                 inliers=right[k],
                 apart=min(abs(number - each) for each in carried),
                 noise_px=noise_px(found.tails),
-                gyro=None if tracks.gyro is None else not wrong,
+                gyro=False if self.unlike else None if self.gyro is None else True,
             )
         self._carried = max(each for each in carried if each < self.first + count)
 
@@ -189,8 +204,10 @@ class _State:
         stays = self.first + count + span_of(0, self.shutter)[0]
         drop = max(int(np.floor((stays - curve.first) / curve.interval + 1e-9)), 0)
         first = curve.first + drop * curve.interval
-        if tracks.gyro is not None:
-            gone = replace(gone, gyro=tracks.gyro.begun_before(first))
+        if self.gyro is not None and tracks.gyro is not None and found.drift is not None:
+            begun = first - found.drift.shift
+            gone = replace(gone, gyro=tracks.gyro.begun_before(begun))
+            self.gyro = self.gyro.between(begun, np.inf)
         self.past = _marginal(found, gone, trust, drop)
         self.curve = make_curve(first, curve.interval, curve.R[drop:], curve.p[drop:])
         self.fit = found
@@ -219,7 +236,9 @@ def _marginal(found: Fit, gone: TimedTracks, trust: FloatArray, drop: int) -> Pa
     curve, smooth, drift = found.curve, found.prior.smooth, found.drift
     equations = normal_equations(curve, gone, found.tails, found.prior, trust, until=drop, drift=drift)
     band, border = held(equations, curve, gone, ANCHORED), equations.border
-    ends = gone.span[1] if gone.gyro is None else np.concatenate([gone.span[1], gone.gyro.end])
+    ends = gone.span[1]
+    if gone.gyro is not None and drift is not None:
+        ends = np.concatenate([ends, gone.gyro.end + drift.shift])
     latest = np.floor((ends - curve.first) / curve.interval)
     known = 0 if gone.past is None else len(gone.past.p)
     count = min(max(int(np.max(latest, initial=0)) + 4, drop + smooth + 2, known), len(curve.p))
@@ -235,7 +254,7 @@ def _marginal(found: Fit, gone: TimedTracks, trust: FloatArray, drop: int) -> Pa
         p=curve.p[drop:count],
         gradient=gradient[m:] - H[m:, :m] @ solved[:, -1],
         H=0.5 * (reduced + reduced.T),
-        bias=None if drift is None else drift.bias,
+        errors=None if drift is None else drift.errors,
     )
 
 
