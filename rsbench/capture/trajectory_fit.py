@@ -171,7 +171,7 @@ def _add_past(
     slope = past.H @ away
     gradient[: 6 * k] += (slope + past.gradient)[: 6 * k]
     for i in range(6 * k):
-        band[: 6 * k - i, i] += np.diagonal(past.H, -i)
+        band[: 6 * k - i, i] += np.diagonal(past.H[: 6 * k, : 6 * k], -i)
     return float(away @ (0.5 * slope + past.gradient))
 
 

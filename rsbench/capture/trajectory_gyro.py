@@ -161,7 +161,7 @@ def first_drift(curve: Curve, steps: GyroSteps) -> Drift:
 
 
 def border_of(found: Sensed, drift: Drift, begins: bool) -> tuple[float, Border]:
-    """Cost of steps and of a gyroscope's errors, and the border; ``begins``: with what is expected of the errors."""
+    """Cost of steps, and the border; ``begins``: with what is expected of the gyroscope's errors."""
     border = Border(*(each / drift.variance for each in found.border))
     cost = 0.5 * found.squares / drift.variance
     if begins:
