@@ -19,7 +19,7 @@ from rsbench.capture.trajectory_choice import approximated, choose
 from rsbench.capture.trajectory_covariance import covariance_between, pose_covariance
 from rsbench.capture.trajectory_data import TimedTracks, pack_windows, telling
 from rsbench.capture.trajectory_fit import NORMAL, Fit, covariance_band, fit, information
-from rsbench.capture.trajectory_gyro import Drift, GyroSteps, bordered_inverse, contradicts, gyro_steps
+from rsbench.capture.trajectory_gyro import Drift, GyroFound, GyroSteps, bordered_inverse, contradicts, gyro_steps
 from rsbench.capture.trajectory_kernels import Tails
 from rsbench.capture.trajectory_prior import Prior
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, span_of
@@ -83,21 +83,6 @@ class TrajectoryBound:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class GyroFound:
-    """What a sequence says of a gyroscope."""
-
-    bias: FloatArray
-    """(3,) of its samples, rad per frame period."""
-    shift: float
-    """Frame periods that its times are early by."""
-    noise: float
-    """Standard deviation of its turn over a frame period about each axis, rad, what the spline does not follow
-    included."""
-    used: bool
-    """False: its samples contradict the matches, being of another time, sign or other axes, and were left out."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory(TrajectoryBound):
     """What the rig did, seen from the body at time 0."""
 
@@ -158,7 +143,7 @@ def estimate_trajectory(
     if tracks.gyro is not None and found.drift is not None and contradicts(tracks.gyro, found.drift):
         drift = found.drift
         found, tracks = replace(given, gyro=None).fitted()
-        return replace(_told(found, tracks, windows, shutter), gyro=_gyro_found(drift, used=False))
+        return replace(_told(found, tracks, windows, shutter), gyro=GyroFound.of(drift, used=False))
     return _told(found, tracks, windows, shutter)
 
 
@@ -221,12 +206,8 @@ def _told(
         fit=found,
         curve=found.curve,
         covariance_band=covariance_band(found, tracks),
-        gyro=None if found.drift is None else _gyro_found(found.drift, used=True),
+        gyro=None if found.drift is None else GyroFound.of(found.drift),
     )
-
-
-def _gyro_found(drift: Drift, *, used: bool) -> GyroFound:
-    return GyroFound(bias=drift.bias, shift=drift.shift, noise=float(np.sqrt(drift.variance)), used=used)
 
 
 def noise_px(tails: Tails) -> float:

@@ -7,6 +7,7 @@ off are unknowns beside the control poses, a border of four columns beside the b
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -87,6 +88,25 @@ class Drift(NamedTuple):
         errors = self.errors + step
         errors[3] = np.clip(errors[3], -FARTHEST, FARTHEST)
         return self._replace(errors=errors)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GyroFound:
+    """What a sequence says of a gyroscope."""
+
+    bias: FloatArray
+    """(3,) of its samples, rad per frame period."""
+    shift: float
+    """Frame periods that its times are early by."""
+    noise: float
+    """Standard deviation of its turn over a frame period about each axis, rad; what no spline follows is in it."""
+    used: bool
+    """False: its samples contradict the matches, being of another time, sign or other axes, and were left out."""
+
+    @classmethod
+    def of(cls, drift: Drift, *, used: bool = True) -> GyroFound:
+        """In words of users."""
+        return cls(bias=drift.bias, shift=drift.shift, noise=float(np.sqrt(drift.variance)), used=used)
 
 
 class Border(NamedTuple):

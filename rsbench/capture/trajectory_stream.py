@@ -26,7 +26,7 @@ from rsbench.capture.trajectory_fit import (
     normal_equations,
     right_tracks,
 )
-from rsbench.capture.trajectory_gyro import Drift, GyroSteps, contradicts, gyro_steps
+from rsbench.capture.trajectory_gyro import Drift, GyroFound, GyroSteps, contradicts, gyro_steps
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, part, span_of
 from rsbench.capture.trajectory_start import continued, first_curve, window_motions
 from rsbench.core import so3
@@ -60,8 +60,8 @@ class StreamedWindow:
     apart: int
     """Windows to the nearest one that its own tracks carry, of those seen so far; 0: it is one itself."""
     noise_px: float
-    gyro: bool | None
-    """Whether a gyroscope's samples are used; False: they contradict the matches; None: there are none."""
+    gyro: GyroFound | None
+    """What is known of a gyroscope by then; None: there is none."""
 
     @property
     def supported(self) -> bool:
@@ -102,8 +102,10 @@ class _State:
         self, rig: StereoRig, shutter: RollingShutter, options: TrajectoryOptions, gyro: GyroSteps | None
     ) -> None:
         self.rig, self.shutter, self.options = rig, shutter, options
-        self.gyro, self.unlike = gyro, False
-        """Of the windows that are remembered and of later ones; and whether it contradicted the matches."""
+        self.gyro = gyro
+        """Of the windows that are remembered and of later ones."""
+        self.unlike: GyroFound | None = None
+        """One that contradicted the matches."""
         self.windows, self.motions = list[Correspondences](), list[Motion | None]()
         self.first = self.fresh = 0
         self.curve: Curve | None = None
@@ -138,7 +140,7 @@ class _State:
         found, tracks = self._solved()
         if tracks.gyro is None or found.drift is None or not contradicts(tracks.gyro, found.drift):
             return found, tracks
-        self.gyro, self.unlike = None, True
+        self.gyro, self.unlike = None, GyroFound.of(found.drift, used=False)
         self.past = None if self.past is None else self.past.without_gyro()
         self.fit = None if self.fit is None else replace(self.fit, drift=None)
         return self._solved()
@@ -189,7 +191,7 @@ class _State:
                 inliers=right[k],
                 apart=min(abs(number - each) for each in carried),
                 noise_px=noise_px(found.tails),
-                gyro=False if self.unlike else None if self.gyro is None else True,
+                gyro=self.unlike if found.drift is None else GyroFound.of(found.drift),
             )
         self._carried = max(each for each in carried if each < self.first + count)
 
