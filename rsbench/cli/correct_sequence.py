@@ -219,7 +219,7 @@ def _say(out: Path, first: str, record: dict[str, Any]) -> None:
     gyros = [(each["number"], each["motion"]["gyro"]) for each in frames if "gyro" in each.get("motion", {})]
     used = [found for _, found in gyros if not isinstance(found, str)]
     if used:
-        typer.echo(f"gyroscope: its clock is {_late(used[-1]['shift'])}, which is taken from its times")
+        typer.echo(f"gyroscope: its clock is {_late(used[-1]['shift'])}, which is allowed for")
     typer.echo(f"{sum('reason' not in frame for frame in frames)} of {len(frames)} times corrected")
     typer.echo(f"video: {out.resolve()}" if is_video(out) else f"report: {(out / 'report.html').resolve()}")
     if len(used) < len(gyros):

@@ -28,6 +28,7 @@ from rsbench.solvers.engine.robust_motion import RobustEstimate
 from rsbench.solvers.engine.robust_problem import MatchCount
 
 BRIDGED = "few of the matches agree with the motion"
+TURNED = "; they turn as the gyroscope says, and stay where they are"
 _LONGEST_BRIDGE = 2
 """Windows from the nearest one with matches up to which a spline is believed: the middle one of eight without any
 is wrong by 1 deg where a hand turns by 1.5 deg a frame, that of four by 0.16 deg."""
@@ -79,6 +80,7 @@ def on_one_trajectory(
         if streamed.apart > _LONGEST_BRIDGE:
             by_gyro = streamed.gyro is not None and streamed.gyro.used
             found, pose = _turning(found) if by_gyro else None, None
+            reason += TURNED if by_gyro else ""
         yield replace(window, found=found, reason=reason, pose=pose)
 
 
