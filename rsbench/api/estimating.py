@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rsbench.components import arguments
 from rsbench.core import given
@@ -28,6 +28,7 @@ def estimate_trajectory(
     *,
     features: str = "sift-refined",
     seed: int = 0,
+    gyro: ArrayLike | None = None,
 ) -> Trajectory:
     """The way of the rig through a sequence, one continuous-time spline, from matches that may hold outliers.
 
@@ -38,12 +39,15 @@ def estimate_trajectory(
         shutter: how they read; None has it found, of four frames and more.
         features: name or card of the feature matcher, where frames are given.
         seed: of the search for motions of single windows.
+        gyro: (n, 4) samples of a gyroscope, as of ``Correspondences``, tau in frame periods of the sequence. Bias,
+            noise and a clock that is off by up to half a frame period are found; the shutter is found without it.
 
     Returns:
         ``motion``: ``body_from_world(tau)`` at any times in frame periods, seen from the body at time 0;
         ``covariance(tau)`` and ``covariance_between(start, tau)`` (n, 6, 6) of turns about the body's axes,
         radians, and of its position, metres; ``shutter``; ``noise_px``; for each window ``inliers`` and
-        ``supported``, False where its own matches do not carry it and the spline bridges it.
+        ``supported``, False where its own matches do not carry it and the spline bridges it; ``gyro``: ``bias``,
+        ``shift``, ``noise`` and whether it is ``used``, which one is not that contradicts the matches.
 
     Raises:
         ValueError: an argument of another type or out of its range; no tracks.
@@ -55,10 +59,11 @@ def estimate_trajectory(
     given.check_type("rig", rig, StereoRig)
     if shutter is not None:
         arguments.check_rows(rig, shutter)
+    samples = arguments.gyro_samples(gyro)
     windows = [each for each in sequence if isinstance(each, Correspondences)]
-    if len(windows) == len(sequence):
-        return trajectory_of(windows, rig, shutter, seed)
-    return trajectory_of(matches_of(sequence, rig, features), rig, shutter, seed)
+    if len(windows) != len(sequence):
+        windows = matches_of(sequence, rig, features)
+    return trajectory_of(windows, rig, shutter, seed, samples)
 
 
 def under_model(

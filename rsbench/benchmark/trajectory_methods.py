@@ -97,6 +97,13 @@ def _trajectory(given: Given) -> Estimate:
     return along(found.motion, len(given.matches))
 
 
+def _trajectory_gyro(given: Given) -> Estimate | None:
+    if given.gyro is None:
+        return None
+    found = estimate_trajectory(given.matches, given.rig, given.shutter, seed=given.seed, gyro=given.gyro)
+    return along(found.motion, len(given.matches))
+
+
 def _correct(given: Given) -> Estimate:
     options = CorrectionOptions(motion_model=AUTO, seed=given.seed)
     windows = (Window(images={}, pairs=None, found=None, matches=each) for each in given.matches)
@@ -177,6 +184,12 @@ METHODS: dict[str, Method] = {
     ),
     "rs-trajectory-streamed": Method(
         _correct, (*_MATCHES, "readout"), "spline", "The same some windows at a time, as rsbench correct does"
+    ),
+    "rs-trajectory-gyro": Method(
+        _trajectory_gyro,
+        (*_MATCHES, "readout", "gyro"),
+        "spline",
+        "The same spline through the samples of a gyroscope too, whose bias and clock are found",
     ),
     "windows-auto": Method(
         _windows(AUTO),

@@ -61,7 +61,7 @@ def choose(found: Fit, tracks: TimedTracks, intervals: Sequence[float]) -> Fit:
 def again(found: Fit, curve: Curve, tracks: TimedTracks, memory: float, smooth: int) -> Fit:
     """A fit under another prior or with other knots, with the same tails and the same tracks."""
     prior = found.prior._replace(memory=memory, smooth=smooth)
-    return fit(curve, tracks, prior, tails=found.tails, trust=found.trust)
+    return fit(curve, tracks, prior, tails=found.tails, trust=found.trust, drift=found.drift)
 
 
 def resampled(curve: Curve, interval: float) -> Curve:

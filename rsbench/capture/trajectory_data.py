@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.capture.trajectory_gyro import GyroSteps
 from rsbench.capture.trajectory_kernels import END
 from rsbench.core.correspondences import BEYOND_PX, BoolArray, Correspondences, unlinked_pairs
 from rsbench.core.rig import SIDES, Side, StereoRig
@@ -30,9 +31,21 @@ class Past:
     p: FloatArray
     """(k, 3)."""
     gradient: FloatArray
-    """(6 k,)."""
+    """(6 k,), and where there is a gyroscope four more, of its errors."""
     H: FloatArray
-    """(6 k, 6 k)."""
+    """(6 k, 6 k), likewise."""
+    errors: FloatArray | None = None
+    """(4,) of the gyroscope, about which it is known."""
+
+    def without_gyro(self) -> Past:
+        """The same of the control poses alone, whatever the errors of a gyroscope are."""
+        if self.errors is None:
+            return self
+        k = 6 * len(self.p)
+        solved = np.linalg.solve(self.H[k:, k:], np.column_stack([self.H[k:, :k], self.gradient[k:]]))
+        H = self.H[:k, :k] - self.H[:k, k:] @ solved[:, :-1]
+        gradient = self.gradient[:k] - self.H[:k, k:] @ solved[:, -1]
+        return Past(R=self.R, p=self.p, gradient=gradient, H=0.5 * (H + H.T))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,6 +64,8 @@ class TimedTracks:
     """Of the tracks of earlier windows; None: the spline begins here, and the pose at time 0 is the world's."""
     share: float = 1.0
     """What a track counts beside the prior: less than 1 where errors of neighbouring tracks are alike."""
+    gyro: GyroSteps | None = None
+    """What a gyroscope says of the times that the spline lasts; None: there is none."""
 
     def __len__(self) -> int:
         return len(self.starts) - 1

@@ -9,17 +9,17 @@ Two frames do not show what both shake alike; a sequence does, for its windows o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from rsbench.capture import trajectory_banded as banded
 from rsbench.capture.trajectory_choice import approximated, choose
 from rsbench.capture.trajectory_covariance import covariance_between, pose_covariance
 from rsbench.capture.trajectory_data import TimedTracks, pack_windows, telling
-from rsbench.capture.trajectory_fit import NORMAL, Fit, fit, information
+from rsbench.capture.trajectory_fit import NORMAL, Fit, covariance_band, fit, information
+from rsbench.capture.trajectory_gyro import Drift, GyroFound, GyroSteps, bordered_inverse, contradicts, gyro_steps
 from rsbench.capture.trajectory_kernels import Tails
 from rsbench.capture.trajectory_prior import Prior
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, span_of
@@ -100,6 +100,8 @@ class Trajectory(TrajectoryBound):
     supported: BoolArray
     """(windows,) whether a window's own tracks carry it; elsewhere the spline bridges it."""
     fit: Fit
+    gyro: GyroFound | None = None
+    """What was found of a gyroscope; None: none was given."""
 
     @property
     def interval(self) -> float:
@@ -118,6 +120,7 @@ def estimate_trajectory(
     motions: Sequence[Motion | None] | None = None,
     options: TrajectoryOptions | None = None,
     seed: int = 0,
+    gyro: FloatArray | None = None,
 ) -> Trajectory:
     """The trajectory of a rig, from matches with outliers.
 
@@ -125,6 +128,7 @@ def estimate_trajectory(
         windows: of the frames 0 and 1, 1 and 2, ...
         motions: of each window, to begin with; None: they are searched.
         seed: of that search, where there are no options.
+        gyro: (n, 4) samples as of ``Correspondences.gyro``, tau of the sequence; bias and noise are found.
 
     Raises:
         ValueError: no windows, or no tracks in any.
@@ -134,32 +138,56 @@ def estimate_trajectory(
         raise ValueError("a trajectory needs tracks: matches of both cameras over time")
     if motions is None:
         motions = window_motions(windows, rig, shutter, options.seed)
-    few = slice(0, _JUDGED)
-    found, tracks = _fitted(windows[few], rig, shutter, motions[few], options.intervals[0], options.prior, options)
-    if options.learn:
-        found = choose(found, tracks, options.intervals)
-    if len(windows) > _JUDGED:
-        found, tracks = _fitted(windows, rig, shutter, motions, found.curve.interval, found.prior, options)
-    if options.link:
-        right = [found.trust[each] for each in tracks.members]
-        tracks = pack_windows(windows, rig, shutter, right, share=options.share)
-        found = fit(found.curve, tracks, found.prior, options.learn, found.tails)
+    given = _Given(windows, rig, shutter, motions, options, None if gyro is None else gyro_steps(gyro))
+    found, tracks = given.fitted()
+    if tracks.gyro is not None and found.drift is not None and contradicts(tracks.gyro, found.drift):
+        drift = found.drift
+        found, tracks = replace(given, gyro=None).fitted()
+        return replace(_told(found, tracks, windows, shutter), gyro=GyroFound.of(drift, used=False))
     return _told(found, tracks, windows, shutter)
 
 
-def _fitted(
-    windows: Sequence[Correspondences],
-    rig: StereoRig,
-    shutter: RollingShutter,
-    motions: Sequence[Motion | None],
-    interval: float,
-    prior: Prior,
-    options: TrajectoryOptions,
-) -> tuple[Fit, TimedTracks]:
-    """The spline of windows, and their tracks."""
-    tracks = pack_windows(windows, rig, shutter, share=options.share)
-    curve = first_curve(motions, tracks, span_of(len(windows), shutter), interval)
-    return fit(curve, tracks, prior, options.learn), tracks
+@dataclass(frozen=True)
+class _Given:
+    """What a trajectory is found of."""
+
+    windows: Sequence[Correspondences]
+    rig: StereoRig
+    shutter: RollingShutter
+    motions: Sequence[Motion | None]
+    options: TrajectoryOptions
+    gyro: GyroSteps | None
+
+    def fitted(self) -> tuple[Fit, TimedTracks]:
+        """The spline, and what it was fitted to."""
+        options = self.options
+        found, tracks = self._first(_JUDGED, options.intervals[0], options.prior)
+        if options.learn:
+            found = choose(found, tracks, options.intervals)
+        if len(self.windows) > _JUDGED:
+            found, tracks = self._first(len(self.windows), found.curve.interval, found.prior, found.drift)
+        if options.link:
+            right = [found.trust[each] for each in tracks.members]
+            tracks = self._packed(len(self.windows), found.drift, right)
+            found = fit(found.curve, tracks, found.prior, options.learn, found.tails, drift=found.drift)
+        return found, tracks
+
+    def _first(
+        self, count: int, interval: float, prior: Prior, drift: Drift | None = None
+    ) -> tuple[Fit, TimedTracks]:
+        """The spline of so many windows, and their tracks."""
+        tracks, motions = self._packed(count, drift), self.motions[:count]
+        curve = first_curve(motions, tracks, span_of(len(motions), self.shutter), interval)
+        return fit(curve, tracks, prior, self.options.learn, drift=drift), tracks
+
+    def _packed(self, count: int, drift: Drift | None, right: Sequence[FloatArray] | None = None) -> TimedTracks:
+        windows = self.windows[:count]
+        tracks = pack_windows(windows, self.rig, self.shutter, right, share=self.options.share)
+        if self.gyro is None:
+            return tracks
+        shift = 0.0 if drift is None else drift.shift
+        first, last = span_of(len(windows), self.shutter)
+        return replace(tracks, gyro=self.gyro.between(first - shift, last - shift))
 
 
 def _told(
@@ -177,9 +205,8 @@ def _told(
         supported=np.array([is_supported(mask, found.tails) for mask in inliers]),
         fit=found,
         curve=found.curve,
-        covariance_band=banded.inverse_band(
-            information(found.curve, tracks, found.tails, found.prior, found.trust)
-        ),
+        covariance_band=covariance_band(found, tracks),
+        gyro=None if found.drift is None else GyroFound.of(found.drift),
     )
 
 
@@ -217,5 +244,5 @@ def trajectory_bound(
     everything = [np.ones(len(each)) for each in pack_windows(windows, rig, shutter).members]
     tracks = pack_windows(windows, rig, shutter, everything)
     curve = approximated(motion.body_from_world, span_of(len(windows), shutter), interval)
-    lower = information(curve, tracks, Tails(NORMAL, noise_px), prior, np.ones(len(tracks)))
-    return TrajectoryBound(curve=curve, covariance_band=banded.inverse_band(lower))
+    told = information(curve, tracks, Tails(NORMAL, noise_px), prior, np.ones(len(tracks)))
+    return TrajectoryBound(curve=curve, covariance_band=bordered_inverse(*told))

@@ -11,30 +11,37 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from rsbench.capture import trajectory_banded as banded
 from rsbench.capture.trajectory_data import Past, TimedTracks
+from rsbench.capture.trajectory_gyro import (
+    Border,
+    Drift,
+    Sensed,
+    border_of,
+    bordered_inverse,
+    bordered_step,
+    eliminated,
+    first_drift,
+    learned,
+    sensed,
+)
 from rsbench.capture.trajectory_kernels import Tails, add_tracks
+from rsbench.capture.trajectory_noise import LEAST_SCALE_PX, REACH, observed
 from rsbench.capture.trajectory_prior import Prior, Roughness, anchors, log_prior, roughness
 from rsbench.capture.trajectory_spline import Curve, from_pose_at, moved
 from rsbench.core import so3
 from rsbench.core.so3 import FloatArray
 
-_TAILS = (3.0, 5.0, 10.0, 30.0)
-"""Degrees of freedom to choose from, as in ``heavy_tails``."""
 NORMAL = 1e9
 """Degrees of freedom of tails that are none."""
-_REACH = 10.0
-"""Errors, in scales, beyond which a track is wrong."""
-_LEAST_SCALE_PX = 1e-3
 _ROUNDS, _STEPS_A_ROUND, _LAST_STEPS = 15, 2, 10
 _FLAT, _FLAT_STRENGTH, _FLAT_EVIDENCE = 0.01, 0.05, 0.1
 _FLAT_COST, _NEAR = 1e-3, 1.0
 _MANY = 300
 """Tracks from which on it pays to share them."""
 _LEAST_WIDTH = 5
-"""Control poses that the prior ties."""
+"""Control poses that the prior ties, and a moment of a gyroscope."""
 ANCHORED = 1e4
 """Precision of the pose at time 0, in those of the most certain control pose."""
 _TELLING = 2.0
@@ -55,6 +62,15 @@ class Equations(NamedTuple):
     squares: FloatArray
     """(n,) of the tracks, px^2."""
     rough: Roughness
+    sensed: Sensed | None = None
+    """Of a gyroscope."""
+    border: Border | None = None
+    """Of its errors."""
+
+    @property
+    def slope(self) -> FloatArray:
+        """Gradient by all unknowns."""
+        return self.gradient if self.border is None else np.concatenate([self.gradient, self.border.slope])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,6 +83,8 @@ class Fit:
     trust: FloatArray
     """(n,) 1 of tracks that count, else 0."""
     equations: Equations
+    drift: Drift | None = None
+    """Of a gyroscope."""
 
 
 def width_of(tracks: TimedTracks, curve: Curve) -> int:
@@ -85,11 +103,13 @@ def normal_equations(
     trust: FloatArray,
     want: bool = True,
     until: int | None = None,
+    drift: Drift | None = None,
 ) -> Equations:
     """At a spline, under given distributions.
 
     Args:
         until: number of a control pose; only that part of the prior which begins before it.
+        drift: of the gyroscope, where the tracks have one.
     """
     n, past = len(curve.p), tracks.past
     width = width_of(tracks, curve)
@@ -100,9 +120,16 @@ def normal_equations(
         cost += 0.5 * rough.squares[kind] / strength
         gradient += rough.gradients[kind] / strength
         band += rough.bands[kind] / strength
+    found = border = None
+    if tracks.gyro is not None and drift is not None:
+        found = sensed(curve, tracks.gyro, drift, width)
+        gradient += found.gradient / drift.variance
+        band += found.band / drift.variance
+        more, border = border_of(found, drift, past is None)
+        cost += more
     if past is not None:
-        cost += _add_past(past, curve, gradient, band)
-    return Equations(cost, gradient, band, squares, rough)
+        cost += _add_past(past, curve, gradient, band, border, drift)
+    return Equations(cost, gradient, band, squares, rough, found, border)
 
 
 def _add_halves(
@@ -129,15 +156,22 @@ def _add_halves(
     return cost + other.result()
 
 
-def _add_past(past: Past, curve: Curve, gradient: FloatArray, band: FloatArray) -> float:
-    """Cost of control poses that are not where earlier matches had them, and its equations."""
+def _add_past(
+    past: Past, curve: Curve, gradient: FloatArray, band: FloatArray, border: Border | None, drift: Drift | None
+) -> float:
+    """Cost of control poses, and errors of a gyroscope, that are not as they were earlier, and its equations."""
     k = len(past.p)
     turned = so3.log(curve.R[:k] @ np.swapaxes(past.R, 1, 2))
     away = np.concatenate([turned, curve.p[:k] - past.p], axis=1).ravel()
+    if border is not None and drift is not None and past.errors is not None:
+        away = np.concatenate([away, drift.errors - past.errors])
+        border.mixed[: 6 * k] += past.H[: 6 * k, 6 * k :]
+        border.corner[...] += past.H[6 * k :, 6 * k :]
+        border.slope[...] += past.H[6 * k :] @ away + past.gradient[6 * k :]
     slope = past.H @ away
-    gradient[: 6 * k] += slope + past.gradient
+    gradient[: 6 * k] += (slope + past.gradient)[: 6 * k]
     for i in range(6 * k):
-        band[: 6 * k - i, i] += np.diagonal(past.H, -i)
+        band[: 6 * k - i, i] += np.diagonal(past.H[: 6 * k, : 6 * k], -i)
     return float(away @ (0.5 * slope + past.gradient))
 
 
@@ -154,14 +188,20 @@ def held(equations: Equations, curve: Curve, tracks: TimedTracks, certain: float
 
 
 def information(
-    curve: Curve, tracks: TimedTracks, tails: Tails, prior: Prior | None, trust: FloatArray
-) -> FloatArray:
-    """Factor of the expected information of the control poses, whose pose at time 0 is held; a band.
+    curve: Curve,
+    tracks: TimedTracks,
+    tails: Tails,
+    prior: Prior | None,
+    trust: FloatArray,
+    drift: Drift | None = None,
+) -> tuple[FloatArray, Border | None]:
+    """Factor of the expected information of the control poses, a band, and its border; the pose at time 0 is held.
 
     Every track counts for one.
 
     Args:
         prior: None: what the tracks alone say.
+        drift: of the gyroscope, where the tracks have one.
 
     Raises:
         NotDefiniteError: they do not determine the spline.
@@ -170,8 +210,14 @@ def information(
     expected = trust * (tails.nu + tracks.freedom) / (tails.nu + tracks.freedom + 2.0)
     silent = prior or Prior(1.0, 1, np.inf, np.inf)
     each = replace(tracks, share=1.0)
-    found = normal_equations(curve, each, Tails(NORMAL, tails.scale), silent, expected)
-    return banded.factor(held(found, curve, tracks, ANCHORED))
+    found = normal_equations(curve, each, Tails(NORMAL, tails.scale), silent, expected, drift=drift)
+    return banded.factor(held(found, curve, tracks, ANCHORED)), found.border
+
+
+def covariance_band(found: Fit, tracks: TimedTracks) -> FloatArray:
+    """Covariance of the control poses of a fit, in its band. Raises NotDefiniteError."""
+    told = information(found.curve, tracks, found.tails, found.prior, found.trust, found.drift)
+    return bordered_inverse(*told)
 
 
 def log_evidence(found: Fit, precision: float) -> float:
@@ -184,7 +230,11 @@ def log_evidence(found: Fit, precision: float) -> float:
     """
     curve, equations = found.curve, found.equations
     anchor = anchors(curve, equations.band.shape[1], precision)
-    after = banded.log_determinant(banded.factor(equations.band + anchor))
+    lower = banded.factor(equations.band + anchor)
+    after = banded.log_determinant(lower)
+    if equations.sensed is not None and equations.border is not None and found.drift is not None:
+        after += eliminated(lower, equations.border).log_determinant
+        after += equations.sensed.count * float(np.log(found.drift.variance))
     return log_prior(curve, found.prior, equations.rough) - 0.5 * after - equations.cost
 
 
@@ -209,47 +259,62 @@ def squared_errors(curve: Curve, tracks: TimedTracks) -> FloatArray:
 
 def right_tracks(found: Fit, tracks: TimedTracks) -> FloatArray:
     """(n,) which tracks are right by a fit to others, 1 or 0."""
-    reach = tracks.freedom * (_REACH * found.tails.scale) ** 2
+    reach = tracks.freedom * (REACH * found.tails.scale) ** 2
     return (squared_errors(found.curve, tracks) <= reach).astype(np.float64)
 
 
 def descend(
-    curve: Curve, tracks: TimedTracks, tails: Tails, prior: Prior, trust: FloatArray, steps: int
-) -> tuple[Curve, Equations]:
+    curve: Curve,
+    tracks: TimedTracks,
+    tails: Tails,
+    prior: Prior,
+    trust: FloatArray,
+    steps: int,
+    drift: Drift | None = None,
+) -> tuple[Curve, Equations, Drift | None]:
     """Levenberg-Marquardt steps, until one promises to lower the cost by less than a thousandth of a unit.
 
     Steps that promise little are taken as they are: the equations take the weights of pixels as given, and their
     root is not quite the least cost.
     """
-    here, damping = normal_equations(curve, tracks, tails, prior, trust), 0.0
+    here, damping = normal_equations(curve, tracks, tails, prior, trust, drift=drift), 0.0
     for _ in range(steps):
         matrix = held(here, curve, tracks, 1.0)
-        promise, trial, there = 0.0, curve, here
+        promise, trial, there, other = 0.0, curve, here, drift
         while damping <= _LARGEST_DAMPING:
             step = _step(matrix, here, damping)
             if step is not None:
-                promise = -0.5 * float(step @ here.gradient)
-                trial = moved(curve, step)
+                promise = -0.5 * float(step @ here.slope)
+                trial, other = moved(curve, step[: len(matrix)]), _moved(drift, step[len(matrix) :])
                 if tracks.past is None:
                     trial = from_pose_at(trial, 0.0)
-                there = normal_equations(trial, tracks, tails, prior, trust)
+                there = normal_equations(trial, tracks, tails, prior, trust, drift=other)
                 near = damping == 0.0 and abs(promise) < _NEAR
                 if there.cost <= here.cost + (_NEAR if near else 0.0):
                     break
             damping = max(10.0 * damping, _LEAST_DAMPING)
         if damping > _LARGEST_DAMPING:
             break
-        curve, here, damping = trial, there, 0.1 * damping if damping > _LEAST_DAMPING else 0.0
+        curve, here, drift = trial, there, other
+        damping = 0.1 * damping if damping > _LEAST_DAMPING else 0.0
         if promise < _FLAT_COST:
             break
-    return curve, here
+    return curve, here, drift
+
+
+def _moved(drift: Drift | None, step: FloatArray) -> Drift | None:
+    return None if drift is None else drift.moved(step)
 
 
 def _step(matrix: FloatArray, here: Equations, damping: float) -> FloatArray | None:
+    """Of the control poses and, where there is a gyroscope, of its errors."""
     damped = matrix.copy()
     damped[:, 0] += damping * here.band[:, 0]
     try:
-        return -banded.solve(banded.factor(damped), here.gradient)
+        lower = banded.factor(damped)
+        if here.border is None:
+            return -banded.solve(lower, here.gradient)
+        return np.concatenate(bordered_step(lower, here.gradient, here.border))
     except banded.NotDefiniteError:
         return None
 
@@ -261,74 +326,53 @@ def fit(
     learn: bool = True,
     tails: Tails | None = None,
     trust: FloatArray | None = None,
+    drift: Drift | None = None,
 ) -> Fit:
-    """The spline, from one that is near, with noise, tails and, if ``learn``, the prior's strength.
+    """The spline, from one that is near, with the noises, tails and, if ``learn``, the prior's strength.
 
     Args:
         trust: with it, ``tails`` and ``trust`` stay as they are.
+        drift: of the gyroscope that the tracks have, to begin with.
     """
     settled = trust is not None
     trust = np.ones(len(tracks)) if trust is None else trust
     if tails is None:
         median = float(np.median(squared_errors(curve, tracks) / tracks.freedom))
-        tails = Tails(3.0, max(float(np.sqrt(median)), _LEAST_SCALE_PX))
+        tails = Tails(3.0, max(float(np.sqrt(median)), LEAST_SCALE_PX))
+    if tracks.gyro is not None and drift is None:
+        drift = first_drift(curve, tracks.gyro)
     for _ in range(_ROUNDS):
-        curve, here = descend(curve, tracks, tails, prior, trust, _STEPS_A_ROUND)
-        last = np.array([tails.scale, prior.rotation, prior.position])
-        lower = banded.factor(held(here, curve, tracks, ANCHORED))
-        used, determined, learned = _strengths(here, lower, prior)
+        curve, here, drift = descend(curve, tracks, tails, prior, trust, _STEPS_A_ROUND, drift)
+        last = _strengths_of(prior, drift)
+        old, lower = tails.scale, banded.factor(held(here, curve, tracks, ANCHORED))
+        used, determined, better, drift = _strengths(here, lower, prior, drift)
         if not settled:
             tails, trust = observed(here.squares, tracks.freedom, tails, used)
-        prior = learned if learn else prior
-        change = np.abs(np.log([tails.scale, prior.rotation, prior.position] / last))
-        settling = (change[1:] > _FLAT_STRENGTH) & (change[1:] * determined > _FLAT_EVIDENCE)
-        if change[0] < _FLAT and not np.any(settling):
+        prior = better if learn else prior
+        change = np.abs(np.log(_strengths_of(prior, drift) / last))
+        settling = (change > _FLAT_STRENGTH) & (change * determined > _FLAT_EVIDENCE)
+        if abs(np.log(tails.scale / old)) < _FLAT and not np.any(settling):
             break
-    curve, here = descend(curve, tracks, tails, prior, trust, _LAST_STEPS)
-    return Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=here)
+    curve, here, drift = descend(curve, tracks, tails, prior, trust, _LAST_STEPS, drift)
+    return Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=here, drift=drift)
 
 
-def _strengths(here: Equations, lower: FloatArray, prior: Prior) -> tuple[float, FloatArray, Prior]:
-    """Numbers of parameters, and of accelerations (2,), that the data determine; the prior of more evidence."""
-    inverse, old = banded.inverse_band(lower), np.array([prior.rotation, prior.position])
+def _strengths_of(prior: Prior, drift: Drift | None) -> FloatArray:
+    """Variances that are found with the spline."""
+    return np.array([prior.rotation, prior.position, *([] if drift is None else [drift.variance])])
+
+
+def _strengths(
+    here: Equations, lower: FloatArray, prior: Prior, drift: Drift | None
+) -> tuple[float, FloatArray, Prior, Drift | None]:
+    """Numbers of parameters that tracks determine, and of accelerations and errors of a gyroscope that are left
+    beside them (2 or 3,); the prior and the gyroscope's noise of more evidence."""
+    inverse, old = bordered_inverse(lower, here.border), np.array([prior.rotation, prior.position])
     tied = np.array([banded.inner(inverse, band) for band in here.rough.bands]) / old
     determined = np.maximum(here.rough.count - tied, 1e-3)
     new = np.where(determined > _TELLING, np.clip(here.rough.squares / determined, *_STRENGTHS), old)
     used = len(lower) - 6.0 - float(np.sum(tied))
-    return used, determined, prior._replace(rotation=float(new[0]), position=float(new[1]))
-
-
-def observed(squares: FloatArray, freedom: FloatArray, tails: Tails, used: float) -> tuple[Tails, FloatArray]:
-    """Distribution of errors, and which tracks (n,) are right, 1 or 0.
-
-    Args:
-        used: degrees of freedom that the trajectory has taken.
-    """
-    scale = tails.scale
-    near = squares <= freedom * (_REACH * scale) ** 2
-    if not np.any(near):
-        return tails, np.ones(len(squares))
-    q, p = squares[near], freedom[near]
-    left = max(float(np.sum(p)) - used, 0.1 * float(np.sum(p)))
-    found = [Tails(nu, _scale(q, p, nu, scale, left)) for nu in _TAILS]
-    best = max(found, key=lambda each: _likelihood(q, p, each))
-    return best, (squares <= freedom * (_REACH * best.scale) ** 2).astype(np.float64)
-
-
-def _scale(q: FloatArray, p: FloatArray, nu: float, scale: float, left: float) -> float:
-    """Of the largest likelihood (parameter-expanded EM, see ``heavy_tails``)."""
-    count = len(p) + (float(np.sum(p)) - left) / nu
-    for _ in range(50):
-        weights = (nu + p) / (nu + q / scale**2)
-        last, scale = scale, max(float(np.sqrt(weights @ q / left * count / np.sum(weights))), _LEAST_SCALE_PX)
-        if abs(scale - last) <= 1e-4 * scale:
-            break
-    return scale
-
-
-def _likelihood(q: FloatArray, p: FloatArray, tails: Tails) -> float:
-    """Logarithm, without terms that are the same for all."""
-    nu, scale = tails
-    gammaln = scipy.special.gammaln
-    norm = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * p * np.log(nu * scale**2)
-    return float(np.sum(norm - 0.5 * (nu + p) * np.log1p(q / (nu * scale**2))))
+    if here.sensed is not None and here.border is not None and drift is not None:
+        own, left, drift = learned(here.sensed, drift, lower, inverse, here.border)
+        used, determined = used + 3.0 - own, np.append(determined, left)
+    return used, determined, prior._replace(rotation=float(new[0]), position=float(new[1])), drift

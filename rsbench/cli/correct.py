@@ -68,13 +68,11 @@ def correct(
     gyro_offset: GyroOffset = 0.0,
 ) -> None:
     """Correct your own rolling-shutter frames: of a stereo rig or of one camera, two times or a whole sequence."""
+    log = GyroGiven(file=gyro, fps=fps, offset_s=gyro_offset)
     if camera is not None or footage is not None:
-        log = GyroGiven(file=gyro, fps=fps, offset_s=gyro_offset)
         correct_one_camera(frames, footage, camera, out, target, inpaint, seed, log)
         return
-    if gyro is not None or fps is not None or gyro_offset != 0.0:
-        raise typer.BadParameter("is used with --camera or --frames, of one camera", param_hint="--gyro")
-    given = given_frames(frames, rig, out, left, right, row_poses)
+    given = given_frames(frames, rig, out, left, right, log, row_poses)
     others = {"find_sky": sky, "inpaint": bool(inpaint), "seed": seed, "motion_model": motion_model}
     options = _options(features, solver, matcher, corrector, fill, **others)
     _correct_given(given, target, options, inpaint is None)

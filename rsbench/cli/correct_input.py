@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rsbench.cli.correct_one_camera import GyroGiven
     from rsbench.core.rig import StereoRig
     from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import FrameSource, RigCard
@@ -55,6 +56,7 @@ class Given:
     left: list[Path] | Path
     """Its images, or a folder or video."""
     right: list[Path] | Path
+    gyro: GyroGiven
     row_poses: bool = False
     """Whether the pose at every row of a sequence is wanted."""
 
@@ -75,6 +77,7 @@ def given_frames(
     out: Path | None,
     left: Path | None,
     right: Path | None,
+    gyro: GyroGiven,
     row_poses: bool = False,
 ) -> Given:
     """Raises RsbenchError for another combination of arguments."""
@@ -87,22 +90,23 @@ def given_frames(
     if frames and rendered:
         if rig or left or right:
             raise RsbenchError(f"{frames[0]}: is a sequence, which knows its frames and rig; leave the others out")
-        return _of_sequence(frames[0], out, row_poses)
+        return _of_sequence(frames[0], out, gyro, row_poses)
     assert rig is not None
-    if row_poses and frames:
-        raise RsbenchError("--row-poses: two times have no trajectory; give --left and --right of four and more")
+    for option, wanted in (("--row-poses", row_poses), ("--gyro", gyro.file is not None)):
+        if wanted and frames:
+            raise RsbenchError(f"{option}: two times have no trajectory; give --left and --right of four and more")
     card = read_rig_card(rig)
     if frames is not None and len(frames) == 4 and not (left or right):
-        return Given(card=card, out=out, four=frames, left=[], right=[])
+        return Given(card=card, out=out, four=frames, left=[], right=[], gyro=gyro)
     if frames or not (left and right):
         count = f"{len(frames)} images; " if frames else ""
         raise RsbenchError(
             f"frames: {count}give LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right, or a sequence's folder"
         )
-    return Given(card=card, out=out, four=[], left=left, right=right, row_poses=row_poses)
+    return Given(card=card, out=out, four=[], left=left, right=right, gyro=gyro, row_poses=row_poses)
 
 
-def _of_sequence(folder: Path, out: Path, row_poses: bool) -> Given:
+def _of_sequence(folder: Path, out: Path, gyro: GyroGiven, row_poses: bool) -> Given:
     """The rolling-shutter frames of a sequence of a dataset."""
     from rsbench.core.errors import RsbenchError
     from rsbench.core.rig import SIDES
@@ -120,7 +124,9 @@ def _of_sequence(folder: Path, out: Path, row_poses: bool) -> Given:
         [folder / picture_file("rs", side, frame) for frame in range(sequence.frames)] for side in SIDES
     )
     card = rig_card_of(sequence.rig, sequence.shutter)
-    return Given(card=card, out=out, four=[], left=left, right=right, row_poses=row_poses)
+    if gyro.file is not None and gyro.fps is None:
+        gyro = replace(gyro, fps=1.0 / sequence.frame_period_s)
+    return Given(card=card, out=out, four=[], left=left, right=right, gyro=gyro, row_poses=row_poses)
 
 
 def target_row(target: str, height: int) -> float:

@@ -23,7 +23,8 @@ Footage = Annotated[Path | None, typer.Option("--frames", metavar="DIR|VIDEO", h
 GyroFile = Annotated[
     Path | None,
     typer.Option(
-        metavar="LOG.gcsv|LOG.csv", help="Of one camera: what a gyroscope measured; needs --fps or a video."
+        metavar="LOG.gcsv|LOG.csv",
+        help="What a gyroscope measured; of a rig, over four frames and more. Needs --fps or a video.",
     ),
 ]
 Fps = Annotated[float | None, typer.Option(help="Frames a second, for --gyro. Default: what the video says.")]
@@ -72,6 +73,12 @@ class GyroGiven:
     fps: float | None
     offset_s: float
 
+    def __post_init__(self) -> None:
+        from rsbench.core.errors import RsbenchError
+
+        if self.file is None and (self.fps is not None or self.offset_s != 0.0):
+            raise RsbenchError("--fps, --gyro-offset: are of a gyroscope's log; give --gyro too")
+
     def samples(self, source: FrameSource) -> FloatArray | None:
         """(n, 4) tau, w; None without a log.
 
@@ -83,8 +90,6 @@ class GyroGiven:
         from rsbench.interop.readers.gyro_log import read_gyro_log
 
         if self.file is None:
-            if self.fps is not None or self.offset_s != 0.0:
-                raise RsbenchError("--fps, --gyro-offset: are of a gyroscope's log; give --gyro too")
             return None
         fps = said_fps(source.path) if self.fps is None else self.fps
         if fps is None:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rsbench.cli.correct_input import Given
     from rsbench.core.rig import StereoRig
     from rsbench.core.shutter import RollingShutter
+    from rsbench.core.so3 import FloatArray
     from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import FrameSource, RigCard
     from rsbench.pipeline.sequence_correction import CorrectedMoment
@@ -38,15 +39,16 @@ def correct_sequence_given(given: Given, target: str, options: CorrectionOptions
     from rsbench.pipeline.found_camera import spread_windows
 
     sources, card, out = given.footage(), given.card, given.out
+    gyro = _gyro(given, sources[0], options)
     rig = sized(card, next(iter(sources[0])))
     options = replace(options, target_row=target_row(target, rig.camera.height))
     check_cameras(rig, card.scanning or Scanning(), options, card.disparity_offset)
-    run = _run_key(given, sources, options, close)
+    run = _run_key(given, sources, options, close, gyro)
     with video_place(out, run) if is_video(out) else fresh_folder(out, run=run) as folder:
         rig, focal = with_found_camera(card, rig, spread_windows(*sources), options)
         shutter, calibration, capture = found = _look(sources, rig, card, options)
         record = {**rig_record(rig, shutter, capture, options, calibration), "camera_note": focal}
-        record["frames"] = _correct_into(folder, sources, rig, found, options, close, given.row_poses)
+        record["frames"] = _correct_into(folder, sources, rig, found, options, close, given.row_poses, gyro)
         if is_video(out):
             _write_both(out, folder, sources, record)
         else:
@@ -54,7 +56,21 @@ def correct_sequence_given(given: Given, target: str, options: CorrectionOptions
     _say(out, f"readout ratio {readout_words(shutter, capture)}", record)
 
 
-def _run_key(given: Given, sources: Sources, options: CorrectionOptions, close: bool) -> str:
+def _gyro(given: Given, left: FrameSource, options: CorrectionOptions) -> FloatArray | None:
+    """Samples of a gyroscope, where there is one; RsbenchError where nothing takes them."""
+    from rsbench.core.errors import RsbenchError
+    from rsbench.pipeline.sequence_correction import takes_gyro
+
+    if given.gyro.file is not None and not takes_gyro(left, options):
+        raise RsbenchError(
+            "--gyro: is taken for the trajectory of four frames and more, with the motion model auto; leave it out"
+        )
+    return given.gyro.samples(left)
+
+
+def _run_key(
+    given: Given, sources: Sources, options: CorrectionOptions, close: bool, gyro: FloatArray | None
+) -> str:
     """Of all that decides what is written: a run with another key does not go on with what this one wrote."""
     import hashlib
 
@@ -64,6 +80,7 @@ def _run_key(given: Given, sources: Sources, options: CorrectionOptions, close: 
     flags = close, given.row_poses, is_video(given.out)
     said = [__version__, repr(given.card), repr(options), repr(flags)]
     said += [each for source in sources for each in source.identity()]
+    said += [] if gyro is None else [hashlib.sha256(gyro.tobytes()).hexdigest()]
     return hashlib.sha256("\n".join(said).encode()).hexdigest()
 
 
@@ -91,6 +108,7 @@ def _correct_into(
     options: CorrectionOptions,
     close: bool,
     row_poses: bool,
+    gyro: FloatArray | None,
 ) -> list[dict[str, Any]]:
     """Write every frame that is not there yet; returns what motion.json says of each.
 
@@ -105,7 +123,7 @@ def _correct_into(
     with progress_bar("correcting", max(sources[0].count, 1)) as advance:
         for entry in entries:
             advance(f"frame {entry['number']}")
-        for moment in correct_sequence(*sources, rig, *taken, first=len(entries)):
+        for moment in correct_sequence(*sources, rig, *taken, first=len(entries), gyro=gyro):
             entries.append(_write(folder, moment, close, shutter if row_poses else None))
             advance(f"frame {moment.number}")
     return entries
@@ -198,10 +216,22 @@ def _say(out: Path, first: str, record: dict[str, Any]) -> None:
     )
     typer.echo(first)
     say_calibration(record)
+    gyros = [(each["number"], each["motion"]["gyro"]) for each in frames if "gyro" in each.get("motion", {})]
+    used = [found for _, found in gyros if not isinstance(found, str)]
+    if used:
+        typer.echo(f"gyroscope: its clock is {_late(used[-1]['shift'])}, which is allowed for")
     typer.echo(f"{sum('reason' not in frame for frame in frames)} of {len(frames)} times corrected")
     typer.echo(f"video: {out.resolve()}" if is_video(out) else f"report: {(out / 'report.html').resolve()}")
+    if len(used) < len(gyros):
+        unlike = listed((number, found) for number, found in gyros if isinstance(found, str))
+        typer.echo(f"rsbench: corrected without the gyroscope: {unlike}", err=True)
     if skipped:
         typer.echo(f"rsbench: corrected with the motion of the frames around: {skipped}", err=True)
     if failed:
         typer.echo(f"rsbench: not corrected: {failed}", err=True)
         raise typer.Exit(1)
+
+
+def _late(shift: float) -> str:
+    """Of a clock whose times are early by so many frame periods."""
+    return f"{abs(shift):.3f} frame periods {'behind' if shift > 0.0 else 'ahead'}"

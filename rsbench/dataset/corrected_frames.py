@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET, TERMS, in_words
 from rsbench.capture.estimate import Capture
 from rsbench.capture.settle import record_of
+from rsbench.capture.trajectory_gyro import GyroFound
 from rsbench.core import so3
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
@@ -23,6 +24,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import read_frame
 from rsbench.pipeline.frame_motion import FoundMotion
+from rsbench.pipeline.mono_gyro import CONTRADICTED
 from rsbench.storage.files import read_depth, read_json, read_png, write_bytes, write_depth, write_json, write_png
 from rsbench.storage.work_folder import (
     HIDDEN,
@@ -187,6 +189,7 @@ def motion_record(found: FoundMotion) -> dict[str, Any]:
     estimate, motion = found.robust.estimate, found.motion
     # A covariance holds about the point that the solver solved for.
     known = estimate.covariance is not None and found.reference_point == "body"
+    gyro = {} if found.gyro is None else {"gyro": _gyro_record(found.gyro)}
     return {
         "solver": found.solver,
         "model": motion.name,
@@ -203,7 +206,15 @@ def motion_record(found: FoundMotion) -> dict[str, Any]:
         "covariance_w_d": np.asarray(estimate.covariance).tolist() if known else None,
         "inliers": {str(name): count.inliers for name, count in found.robust.counts.items()},
         "matches": {str(name): count.matches for name, count in found.robust.counts.items()},
+        **gyro,
     }
+
+
+def _gyro_record(gyro: GyroFound) -> Any:
+    """What was found of it, or why it is not used."""
+    if not gyro.used:
+        return CONTRADICTED
+    return {"bias": gyro.bias.tolist(), "shift": gyro.shift, "noise": gyro.noise}
 
 
 def rig_record(

@@ -6,6 +6,8 @@ import itertools
 from collections.abc import Collection, Sequence
 from typing import Any
 
+import numpy as np
+
 from rsbench.capture.settle import NoMotionError
 from rsbench.capture.trajectory_estimate import MOST_NOISE_PX, Trajectory, estimate_trajectory
 from rsbench.capture.trajectory_shutter import shutter_of_sequence
@@ -13,6 +15,7 @@ from rsbench.components import arguments
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import find_matches
 from rsbench.vision.feature_matcher import load_features
@@ -40,17 +43,24 @@ def matches_of(frames: Sequence[Any], rig: StereoRig, features: str) -> list[Cor
 
 
 def trajectory_of(
-    windows: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter | None, seed: int
+    windows: Sequence[Correspondences],
+    rig: StereoRig,
+    shutter: RollingShutter | None,
+    seed: int,
+    gyro: FloatArray | None = None,
 ) -> Trajectory:
     """The trajectory, and the shutter where that is not known.
 
     Raises:
-        ValueError: no tracks; or, without a shutter, too few frames.
+        ValueError: no tracks; without a shutter, too few frames; samples of a gyroscope of another time.
         NoMotionError: the matches do not tell the shutter, or no trajectory explains them.
     """
     if shutter is None and len(windows) + 1 < FEWEST_FRAMES:
         raise ValueError(f"shutter: is found of {FEWEST_FRAMES} frames and more; these are {len(windows) + 1}")
-    found = estimate_trajectory(windows, rig, shutter or shutter_of_sequence(windows, rig, seed), seed=seed)
+    if gyro is not None and not np.any((gyro[:, 0] >= 0.0) & (gyro[:, 0] <= len(windows))):
+        raise ValueError(f"gyro: no sample is of the times from 0 to {len(windows)} frame periods")
+    shutter = shutter or shutter_of_sequence(windows, rig, seed)
+    found = estimate_trajectory(windows, rig, shutter, seed=seed, gyro=gyro)
     if found.noise_px > MOST_NOISE_PX:
         raise NoMotionError(
             f"no trajectory explains the matches: they err by some {found.noise_px:.0f} px about the best "

@@ -24,6 +24,7 @@ from rsbench.capture.settle import (
     shutter_found,
     spread_by_unknowns,
 )
+from rsbench.capture.trajectory_gyro import GyroFound
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
@@ -62,6 +63,8 @@ class FoundMotion:
     """What was taken from the matches before, see ``calibration_errors.TERMS``."""
     choice: ModelChoice | None = None
     """How the motion model was chosen; None when it is the solver's."""
+    gyro: GyroFound | None = None
+    """What was found of a gyroscope; None: there is none."""
 
     @property
     def disparity_offset(self) -> float:

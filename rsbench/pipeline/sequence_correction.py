@@ -17,6 +17,7 @@ from rsbench.capture.trajectory_data import ENOUGH
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, compose
 from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.chain import Given, check_cameras, correct_known, find_depth
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource
@@ -63,6 +64,7 @@ def correct_sequence(
     scanning: Scanning | None = None,
     *,
     first: int = 0,
+    gyro: FloatArray | None = None,
 ) -> Iterator[CorrectedMoment]:
     """Every frame of a sequence corrected, in order; the last one with the motion from the one before.
 
@@ -73,6 +75,7 @@ def correct_sequence(
         calibration: what the calibration is wrong by, see ``calibration_errors.TERMS``.
         scanning: how the cameras read their lines; None: rows from the top, both at once.
         first: number of the first frame that is wanted.
+        gyro: (n, 4) samples as of ``Correspondences.gyro``, tau of the sequence; of one that ``takes_gyro``.
 
     Raises:
         RefusedFramesError: the first three windows, or all, cannot be what they are said to be.
@@ -84,7 +87,7 @@ def correct_sequence(
     along = _has_trajectory(left, shutter, options)
     windows = ahead(_windows(left, right, rig, shutter, options, calibration, not along), _AHEAD)
     if along:
-        windows = on_one_trajectory(windows, rig, shutter, options, calibration)
+        windows = on_one_trajectory(windows, rig, shutter, options, calibration, gyro)
     deep = _with_depth(windows, rig, shutter, options, calibration[OFFSET], first)
     places = (each for each in _places(deep) if each[0] >= first)
     # Nothing is known of whether another package's may run twice at a time.
@@ -103,9 +106,14 @@ def _places(windows: Iterable[Window]) -> Iterator[tuple[int, int, list[Window]]
 
 
 def _has_trajectory(left: FrameSource, shutter: RollingShutter, options: CorrectionOptions) -> bool:
-    """Whether one trajectory is fitted to all windows: of four frames and more whose motion model is open."""
+    """Whether one trajectory is fitted to all windows."""
+    return takes_gyro(left, options) and shutter.readout_ratio > 0.0
+
+
+def takes_gyro(left: FrameSource, options: CorrectionOptions) -> bool:
+    """Whether a trajectory is fitted if the shutter rolls: of four frames and more whose motion model is open."""
     asked = options.motion_model == AUTO and "motion" in options.corrector.component.spec.needs
-    return asked and shutter.readout_ratio > 0.0 and not 0 < left.count < FEWEST_FRAMES
+    return asked and not 0 < left.count < FEWEST_FRAMES
 
 
 def _windows(

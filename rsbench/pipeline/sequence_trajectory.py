@@ -13,11 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rsbench.capture.calibration_errors import recalibrated
+from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.capture.trajectory_stream import StreamedWindow, stream_trajectory
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Images, Pairs
 from rsbench.pipeline.frame_motion import FoundMotion
@@ -26,6 +28,7 @@ from rsbench.solvers.engine.robust_motion import RobustEstimate
 from rsbench.solvers.engine.robust_problem import MatchCount
 
 BRIDGED = "few of the matches agree with the motion"
+TURNED = "; they turn as the gyroscope says, and stay where they are"
 _LONGEST_BRIDGE = 2
 """Windows from the nearest one with matches up to which a spline is believed: the middle one of eight without any
 is wrong by 1 deg where a hand turns by 1.5 deg a frame, that of four by 0.16 deg."""
@@ -52,12 +55,15 @@ def on_one_trajectory(
     shutter: RollingShutter,
     options: CorrectionOptions,
     calibration: tuple[float, ...],
+    gyro: FloatArray | None = None,
 ) -> Iterator[Window]:
     """Windows with the motion of one trajectory in place of that of each; those without matches are bridged.
 
     Args:
         windows: in order.
         calibration: what the calibration is wrong by, see ``calibration_errors.TERMS``.
+        gyro: (n, 4) samples as of ``Correspondences.gyro``, tau of the sequence. It bridges any number of windows:
+            far from those with matches it alone tells how the rig turns, and nobody where it is.
     """
     waiting = deque[Window]()
 
@@ -66,13 +72,15 @@ def on_one_trajectory(
             waiting.append(window)
             yield recalibrated(window.matches or Correspondences(), rig, calibration)
 
-    for streamed in stream_trajectory(matches(), rig, shutter, options.seed):
+    for streamed in stream_trajectory(matches(), rig, shutter, options.seed, gyro=gyro):
         window = waiting.popleft()
         found = _found(streamed, options, calibration)
         reason = "" if streamed.supported else window.reason or BRIDGED
         pose = streamed.body_from_world
         if streamed.apart > _LONGEST_BRIDGE:
-            found = pose = None
+            by_gyro = streamed.gyro is not None and streamed.gyro.used
+            found, pose = _turning(found) if by_gyro else None, None
+            reason += TURNED if by_gyro else ""
         yield replace(window, found=found, reason=reason, pose=pose)
 
 
@@ -96,5 +104,19 @@ def _found(streamed: StreamedWindow, options: CorrectionOptions, calibration: tu
         threshold_px=0.0,
     )
     return FoundMotion(
-        motion=motion, robust=robust, solver=options.solver.name, reference_point="body", calibration=calibration
+        motion=motion,
+        robust=robust,
+        solver=options.solver.name,
+        reference_point="body",
+        calibration=calibration,
+        gyro=streamed.gyro,
     )
+
+
+def _turning(found: FoundMotion) -> FoundMotion:
+    """Of a rig that turns as it does and stays where it is."""
+    assert isinstance(found.motion, ContinuousMotion)
+    curve = found.motion.curve
+    motion = ContinuousMotion.of(curve._replace(p=np.zeros_like(curve.p)))
+    estimate = replace(found.robust.estimate, d=motion.d, covariance=None)
+    return replace(found, motion=motion, robust=replace(found.robust, estimate=estimate))

@@ -234,6 +234,31 @@ def test_a_bad_window_is_bridged_and_told(tmp_path: Path, footage: tuple[object,
     np.testing.assert_allclose(rows[::96], np.array(lines, dtype=float), atol=1e-7)  # nine digits
 
 
+def _log(path: Path, rate: float) -> Path:
+    """Of a rig that swings by so many rad/s, 200 samples a second."""
+    rows = [f"{5_000_000 * k},{rate * np.sin(0.2 * k)},0,0" for k in range(-20, 120)]
+    path.write_text("stamp_ns,wx,wy,wz\n" + "\n".join(rows), encoding="utf-8")
+    return path
+
+
+def test_a_gyroscope_that_contradicts_the_frames_is_told_and_left_out(
+    tmp_path: Path, footage: tuple[object, ...]
+) -> None:
+    log = _log(tmp_path / "log.csv", 3.0)
+    for name, more in (("alone", ()), ("both", ("--gyro", log, "--fps", 20))):
+        result = correct(*footage, tmp_path / name, *more)
+        assert result.returncode == 0, result.stderr
+        told = "corrected without the gyroscope: frame 0 (the gyroscope contradicts the frames)"
+        assert (told in result.stderr) == (name == "both")
+    alone, both = (bytes_below(tmp_path / name / "corrected") for name in ("alone", "both"))
+    assert alone == both
+    assert_refused(correct(*footage, tmp_path / "no", "--gyro", log), "--fps")
+    assert_refused(correct(*footage, tmp_path / "no", "--fps", 20), "give --gyro too")
+    given = ("--gyro", log, "--fps", 20, "--motion-model", "linear")
+    assert_refused(correct(*footage, tmp_path / "no", *given), "--gyro", "four frames and more")
+    assert_refused(correct(*footage, tmp_path / "no", *given[:4], "--gyro-offset", 90), "--gyro-offset")
+
+
 def test_bad_calls_are_refused_and_leave_nothing(tmp_path: Path, frames: list[Path], rig: Path) -> None:
     out = tmp_path / "out"
     common = ("--rig", rig, "--out", out)
@@ -248,6 +273,7 @@ def test_bad_calls_are_refused_and_leave_nothing(tmp_path: Path, frames: list[Pa
     assert_refused(correct(*[flat] * 4, *common), "no texture")
     assert_refused(correct(*frames, *common, "--target", "500"), "--target 500", "95")
     assert_refused(correct(*frames, *common, "--row-poses"), "two times have no trajectory")
+    assert_refused(correct(*frames, *common, "--gyro", "log.csv", "--fps", 9), "--gyro", "no trajectory")
     assert_refused(correct(*frames, "--out", out), "--rig")
     assert_refused(correct(*frames, *common, "--solver", "nobody"), "nobody", "does not exist")
     assert_refused(correct(*frames, "--rig", tmp_path / "no.toml", "--out", out), "no.toml")

@@ -1,0 +1,267 @@
+"""A gyroscope beside the matches of a sequence: how fast it turns at its moments, and what it errs by.
+
+A sample is a measurement of the spline's rate at its time, of white noise, so that nothing is integrated: neither
+gaps nor slow sampling matter. What it errs by is found with the spline: a bias that stays and how far its clock is
+off are unknowns beside the control poses, a border of four columns beside the band; then the noise's variance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rsbench.capture import trajectory_banded as banded
+from rsbench.capture.trajectory_poses import blank_views, fill_views
+from rsbench.capture.trajectory_prior import add_blocks
+from rsbench.capture.trajectory_spline import Curve
+from rsbench.core import so3
+from rsbench.core.so3 import FloatArray
+
+_APART = 1 / 16
+"""Frame periods: samples that are closer are taken together. A filter in the sensor makes their noise alike, and
+the mean over an eighth of a period blunts what a hand shakes."""
+_MOMENT = 1e-3
+"""Half of the time over which the spline's turn is taken for its rate: far above rounding, far below a knot."""
+_BIAS = 1e-2
+"""Standard deviation of the bias, rad per frame period, before anything is seen: 0.3 rad/s at 30 Hz."""
+_SHIFT, FARTHEST = 0.2, 0.5
+"""Standard deviation of the shift of its clock, frame periods, before anything is seen, and the largest that is
+looked for: a quarter of the period of the fastest shakes of a hand."""
+_LEAST_VARIANCE = 1e-12
+"""rad^2 per frame period: far below that of any gyroscope, and above rounding."""
+_TELLING = 2.0
+"""Errors beside those that the spline follows, at least, to say how large they are."""
+_UNLIKE, _NOISY = 0.3, 3.0
+"""Root mean square of a gyroscope's errors, over that of how its rates vary and over that of its own noise, from
+which on both it contradicts the matches."""
+
+
+class GyroSteps(NamedTuple):
+    """Turns that a gyroscope measured, n of them in the order of time."""
+
+    start: FloatArray
+    """(n,) frame periods."""
+    end: FloatArray
+    turn: FloatArray
+    """(n, 3) rotation vectors of the body at the end, seen from the body at the start; bias and all."""
+    worth: FloatArray
+    """(n,) frame periods that one speaks for: its rates have the noise of a turn over so long."""
+
+    def between(self, first: float, last: float) -> GyroSteps:
+        """Those that start at a time or later, and end at another or earlier."""
+        return self._part(self._begun(first), int(np.searchsorted(self.end, last, side="right")))
+
+    def begun_before(self, time: float) -> GyroSteps:
+        """Those that start before a time: all others do so then or later."""
+        return self._part(0, self._begun(time))
+
+    def _begun(self, time: float) -> int:
+        return int(np.searchsorted(self.start, time))
+
+    def _part(self, first: int, after: int) -> GyroSteps:
+        return GyroSteps(*(each[first:after] for each in self))
+
+
+class Drift(NamedTuple):
+    """What a gyroscope errs by."""
+
+    errors: FloatArray
+    """(4,) bias of its rates in the convention of ``Correspondences.gyro``, rad per frame period, and the shift:
+    frame periods that its times are early by."""
+    variance: float
+    """Of the white noise of its turn over a frame period, about each axis, rad^2."""
+
+    @property
+    def bias(self) -> FloatArray:
+        """(3,) rad per frame period."""
+        return self.errors[:3]
+
+    @property
+    def shift(self) -> float:
+        """Frame periods."""
+        return float(self.errors[3])
+
+    def moved(self, step: FloatArray) -> Drift:
+        """Other errors, the shift no farther than what is looked for."""
+        errors = self.errors + step
+        errors[3] = np.clip(errors[3], -FARTHEST, FARTHEST)
+        return self._replace(errors=errors)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GyroFound:
+    """What a sequence says of a gyroscope."""
+
+    bias: FloatArray
+    """(3,) of its samples, rad per frame period."""
+    shift: float
+    """Frame periods that its times are early by."""
+    noise: float
+    """Standard deviation of its turn over a frame period about each axis, rad; what no spline follows is in it."""
+    used: bool
+    """False: its samples contradict the matches, being of another time, sign or other axes, and were left out."""
+
+    @classmethod
+    def of(cls, drift: Drift, *, used: bool = True) -> GyroFound:
+        """In words of users."""
+        return cls(bias=drift.bias, shift=drift.shift, noise=float(np.sqrt(drift.variance)), used=used)
+
+
+class Border(NamedTuple):
+    """Normal equations of a gyroscope's errors beside those of the control poses."""
+
+    mixed: FloatArray
+    """(6 controls, 4)."""
+    corner: FloatArray
+    """(4, 4)."""
+    slope: FloatArray
+    """(4,) gradient."""
+
+
+class Sensed(NamedTuple):
+    """Sum of squared errors of steps, whitened but for the variance, and half its derivatives."""
+
+    squares: float
+    gradient: FloatArray
+    """(6 controls,)."""
+    band: FloatArray
+    """(6 controls, width)."""
+    border: Border
+    count: int
+    """Scalar errors."""
+
+
+def gyro_steps(samples: FloatArray) -> GyroSteps:
+    """Turns within a moment around samples (n, 4) tau, w, in any order; close ones are taken together."""
+    samples = samples[np.argsort(samples[:, 0], kind="stable")]
+    first = np.flatnonzero(np.diff(np.floor(samples[:, 0] / _APART), prepend=-np.inf))
+    if len(first) < 2:
+        return GyroSteps(np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros(0))
+    count = np.diff(first, append=len(samples))
+    means = np.add.reduceat(samples, first) / count[:, None]
+    worth = count * (samples[-1, 0] - samples[0, 0]) / (len(samples) - 1)
+    return GyroSteps(means[:, 0] - _MOMENT, means[:, 0] + _MOMENT, 2.0 * _MOMENT * means[:, 1:], worth)
+
+
+def sensed(curve: Curve, steps: GyroSteps, drift: Drift, width: int) -> Sensed:
+    """Errors of steps within a spline, and their derivatives in a band of a width, five control poses at least."""
+    count, controls, length = len(steps.start), len(curve.p), steps.end - steps.start
+    views = blank_views(2 * count)
+    fill_views(curve, np.concatenate([steps.start, steps.end]) + drift.shift, views)
+    R, turn, index = views.R.reshape(2, count, 3, 3), views.turn.reshape(2, count, 4, 3, 3), views.index
+    turned, wanted = R[1] @ np.swapaxes(R[0], 1, 2), steps.turn - length[:, None] * drift.bias
+    off = turned @ np.swapaxes(so3.exp(wanted), 1, 2)
+    errors, root = so3.log(off), (steps.worth**0.5 / length)[:, None]
+    # By a turn of the body at the end, and whitened.
+    by_end = np.linalg.inv(so3.left_jacobian(errors)) * root[..., None]
+    faster = views.spin[count:] - (turned @ views.spin[:count, :, None])[..., 0]
+    by_drift = np.concatenate(
+        [by_end @ off @ so3.left_jacobian(wanted) * length[:, None, None], by_end @ faster[..., None]], axis=2
+    )
+    errors = root * errors
+    size = 4 + int(np.max(index[count:] - index[:count], initial=0))
+    first = np.minimum(index[:count], controls - size)
+    by, rows = np.zeros((count, size, 3, 3)), np.arange(count)[:, None]
+    by[rows, (index[:count] - first)[:, None] + np.arange(4)] -= (by_end @ turned)[:, None] @ turn[0]
+    by[rows, (index[count:] - first)[:, None] + np.arange(4)] += by_end[:, None] @ turn[1]
+    gradient, band, mixed = np.zeros(6 * controls), np.zeros((6 * controls, width)), np.zeros((controls, 6, 4))
+    add_blocks(gradient, band, by, errors, first, 0)
+    np.add.at(mixed[:, :3], first[:, None] + np.arange(size), np.swapaxes(by, 2, 3) @ by_drift[:, None])
+    corner, slope = np.einsum("kmi,kmj->ij", by_drift, by_drift), np.einsum("kmi,km->i", by_drift, errors)
+    border = Border(mixed.reshape(-1, 4), corner, slope)
+    return Sensed(float(np.sum(errors**2)), gradient, band, border, errors.size)
+
+
+def first_drift(curve: Curve, steps: GyroSteps) -> Drift:
+    """None but the noise that steps have about a spline."""
+    found = sensed(curve, steps, Drift(np.zeros(4), 1.0), 6 * max(len(curve.p), 5))
+    return Drift(np.zeros(4), max(found.squares / max(found.count, 1), _LEAST_VARIANCE))
+
+
+def border_of(found: Sensed, drift: Drift, begins: bool) -> tuple[float, Border]:
+    """Cost of steps, and the border; ``begins``: with what is expected of the gyroscope's errors."""
+    border = Border(*(each / drift.variance for each in found.border))
+    cost = 0.5 * found.squares / drift.variance
+    if begins:
+        expected = np.array([_BIAS, _BIAS, _BIAS, _SHIFT]) ** -2
+        cost += 0.5 * float(expected @ drift.errors**2)
+        known = border.corner + np.diag(expected), border.slope + expected * drift.errors
+        border = Border(border.mixed, *known)
+    return cost, border
+
+
+class Eliminated(NamedTuple):
+    """A gyroscope's errors, left out of normal equations whose factor is known."""
+
+    follows: FloatArray
+    """(6 controls, 4) how the control poses move against them."""
+    covariance: FloatArray
+    """(4, 4) of them."""
+    log_determinant: float
+    """What it adds to that of the control poses alone."""
+
+
+def eliminated(lower: FloatArray, border: Border) -> Eliminated:
+    """Raises NotDefiniteError."""
+    follows = banded.solve(lower, border.mixed)
+    left = border.corner - border.mixed.T @ follows
+    try:
+        root = np.linalg.cholesky(0.5 * (left + left.T))
+    except np.linalg.LinAlgError as error:
+        raise banded.NotDefiniteError(str(error)) from None
+    inverse = np.linalg.inv(root)
+    return Eliminated(follows, inverse.T @ inverse, 2.0 * float(np.sum(np.log(np.diagonal(root)))))
+
+
+def bordered_step(lower: FloatArray, gradient: FloatArray, border: Border) -> tuple[FloatArray, FloatArray]:
+    """Newton's step of control poses (6 controls,) and a gyroscope's errors (4,). Raises NotDefiniteError."""
+    alone, rest = banded.solve(lower, gradient), eliminated(lower, border)
+    step = -rest.covariance @ (border.slope - border.mixed.T @ alone)
+    return -alone - rest.follows @ step, step
+
+
+def bordered_inverse(lower: FloatArray, border: Border | None) -> FloatArray:
+    """Covariance of control poses, in its band, with a gyroscope's errors that are not known beside them."""
+    inverse = banded.inverse_band(lower)
+    if border is None:
+        return inverse
+    rest = eliminated(lower, border)
+    spread = rest.follows @ rest.covariance
+    for i in range(inverse.shape[1]):
+        inverse[: len(lower) - i, i] += np.sum(spread[: len(lower) - i] * rest.follows[i:], axis=1)
+    return inverse
+
+
+def learned(
+    found: Sensed, drift: Drift, lower: FloatArray, inverse: FloatArray, border: Border
+) -> tuple[float, float, Drift]:
+    """Parameters that steps determine, errors that are left beside them, and the variance of more evidence.
+
+    Args:
+        lower: factor of the normal matrix of control poses alone.
+        inverse: see ``bordered_inverse``.
+    """
+    rest = eliminated(lower, border)
+    tied = banded.inner(inverse, found.band) + np.sum(rest.covariance * found.border.corner)
+    tied -= 2.0 * np.sum((rest.follows @ rest.covariance) * found.border.mixed)
+    used = float(tied) / drift.variance
+    left = found.count - used
+    if left <= _TELLING:
+        return used, 1e-3, drift
+    return used, left, drift._replace(variance=max(found.squares / left, _LEAST_VARIANCE))
+
+
+def contradicts(steps: GyroSteps, drift: Drift) -> bool:
+    """Whether a gyroscope is of another clock or axes.
+
+    It errs by much of what it measures and by more than its noise, or its clock is off by more than is looked for.
+    """
+    if len(steps.start) < 3:
+        return False
+    rates = steps.turn / (steps.end - steps.start)[:, None]
+    errors = drift.variance * float(np.mean(1.0 / steps.worth))
+    varied = float(np.mean(np.var(rates, axis=0)))
+    noise = float(np.mean(np.diff(rates, n=2, axis=0) ** 2)) / 6.0  # slow turns hardly show in second differences
+    return errors > max(_UNLIKE**2 * varied, _NOISY**2 * noise) or abs(drift.shift) >= FARTHEST
