@@ -252,7 +252,7 @@ def test_any_law_is_each_law_to_the_last_digit(name: str) -> None:
     both = any_law(own)
     assert isinstance(both, AnyLaw)
     assert (quick_law(own) is own) == (name == "linear")
-    theta, found = np.concatenate([W, D]), []
+    theta, found = np.concatenate([W, D]), list[FloatArray]()
     for kernel in (own, both):
         R, A, T_w, T_v = np.zeros((4, 3, 3))
         moved = kernel.move(theta, 0.3, 1.6, R, A)
