@@ -258,7 +258,7 @@ def contradicts(steps: GyroSteps, drift: Drift) -> bool:
 
     It errs by much of what it measures and by more than its noise, or its clock is off by more than is looked for.
     """
-    if len(steps.start) < 3:
+    if len(steps.start) < 3 or drift.variance <= _LEAST_VARIANCE:
         return False
     rates = steps.turn / (steps.end - steps.start)[:, None]
     errors = drift.variance * float(np.mean(1.0 / steps.worth))
