@@ -190,6 +190,7 @@ def motion_record(found: FoundMotion) -> dict[str, Any]:
     # A covariance holds about the point that the solver solved for.
     known = estimate.covariance is not None and found.reference_point == "body"
     gyro = {} if found.gyro is None else {"gyro": _gyro_record(found.gyro)}
+    turned, shifted = found.unevenness
     return {
         "solver": found.solver,
         "model": motion.name,
@@ -203,6 +204,7 @@ def motion_record(found: FoundMotion) -> dict[str, Any]:
         "metric": estimate.metric,
         "note": estimate.reason,
         "noise_px": estimate.noise_px,
+        "uneven": {"rotation_deg": float(np.rad2deg(turned)), "translation": shifted},
         "covariance_w_d": np.asarray(estimate.covariance).tolist() if known else None,
         "inliers": {str(name): count.inliers for name, count in found.robust.counts.items()},
         "matches": {str(name): count.matches for name, count in found.robust.counts.items()},

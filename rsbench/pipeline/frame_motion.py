@@ -25,6 +25,7 @@ from rsbench.capture.settle import (
     spread_by_unknowns,
 )
 from rsbench.capture.trajectory_gyro import GyroFound
+from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
@@ -46,6 +47,9 @@ BACKWARDS = (
     "is said (scan in the rig's card)"
 )
 
+_MOMENTS = 33
+"""Of a frame period, at which poses are compared."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FoundMotion:
@@ -65,6 +69,20 @@ class FoundMotion:
     """How the motion model was chosen; None when it is the solver's."""
     gyro: GyroFound | None = None
     """What was found of a gyroscope; None: there is none."""
+
+    @property
+    def unevenness(self) -> tuple[float, float]:
+        """How far the body is off an even motion through its poses at 0 and 1: root mean square over them.
+
+        Radians, and metres of the middle of the rig: none of a rig that coasts, much of one that shakes.
+        """
+        tau = np.linspace(0.0, 1.0, _MOMENTS)
+        (R, t), w = self.motion.body_from_world(tau), self.motion.w
+        places = -(np.swapaxes(R, 1, 2) @ t[..., None])[..., 0]
+        turns = so3.log(R @ np.swapaxes(so3.exp(tau[:, None] * w), 1, 2))
+        shifts = places - tau[:, None] * places[-1]
+        turned, shifted = (float(np.sqrt(np.mean(np.sum(each**2, axis=1)))) for each in (turns, shifts))
+        return turned, shifted
 
     @property
     def disparity_offset(self) -> float:

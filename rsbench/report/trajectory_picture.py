@@ -12,6 +12,8 @@ from rsbench.core import so3
 from rsbench.core.so3 import FloatArray
 
 _WIDE, _HIGH, _LEFT, _TOP = 520.0, 200.0, 64.0, 10.0
+_TOLD = 3.0
+"""Deviations from which on something is told from none."""
 _COLOURS = {"x": "#c0392b", "y": "#27855a", "z": "#0b6bcb"}
 
 
@@ -37,17 +39,35 @@ def draw_trajectory(poses: FloatArray, frames: Sequence[Mapping[str, Any]]) -> d
 
 
 def _caption(frames: Sequence[Mapping[str, Any]], bridged: Sequence[int]) -> str:
-    covariances = [(frame.get("motion") or {}).get("covariance_w_d") for frame in frames]
-    known = [np.sqrt(np.diagonal(np.array(each))) for each in covariances if each is not None]
+    motions = [
+        motion for frame in frames if (motion := frame.get("motion") or {}).get("covariance_w_d") is not None
+    ]
     text = "Red x, green y, blue z."
-    if known:
-        w, d = np.max(np.stack(known)[:, :3], axis=1), np.max(np.stack(known)[:, 3:], axis=1)
+    if motions:
+        # Of each frame: deviations about or along the worst axis, motion, and what an even one is off by.
+        deviations = [np.sqrt(np.diagonal(np.array(each["covariance_w_d"]))).reshape(2, 3) for each in motions]
+        w, d = np.max(np.stack(deviations), axis=2).T
         text += (
             f" Standard deviation of the motion over a frame period, about or along the worst axis: "
             f"{np.rad2deg(np.median(w)):.2g} deg, {1000.0 * np.median(d):.2g} mm in the median; "
-            f"{np.rad2deg(np.max(w)):.2g} deg, {1000.0 * np.max(d):.2g} mm at most."
+            f"{np.rad2deg(np.max(w)):.2g} deg, {1000.0 * np.max(d):.2g} mm at most. {_kind(motions, w, d)}"
         )
     return text + (" Grey: windows that it bridges." if bridged else "")
+
+
+def _kind(motions: Sequence[Mapping[str, Any]], w: FloatArray, d: FloatArray) -> str:
+    """Whether a rig stands, coasts or shakes, by the deviations (n,) of its motions, radians and metres."""
+    moved = np.array([[np.deg2rad(each["rotation_deg"]), each["translation"]] for each in motions]).T
+    uneven = [each["uneven"] for each in motions]
+    off = np.array([[np.deg2rad(each["rotation_deg"]), each["translation"]] for each in uneven]).T
+    if np.all(np.median(moved / [w, d], axis=1) < _TOLD):
+        return "The rig stands still."
+    verb = "coasts" if np.all(np.median(off / [w, d], axis=1) < _TOLD) else "shakes or changes its speed"
+    turn, shift = np.median(off, axis=1)
+    return (
+        f"The rig {verb}: within a period it leaves an even motion by {np.rad2deg(turn):.2g} deg and "
+        f"{1000.0 * shift:.2g} mm, root mean square, in the median."
+    )
 
 
 def _drawing(numbers: FloatArray, values: FloatArray, bridged: Sequence[int], title: str) -> Markup:
