@@ -29,6 +29,8 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench reproduce boards --out results --data data       [dim](tracks of frames, 216 sequences: 3 hours)[/dim]
 
+  rsbench reproduce handheld --out results --data data     [dim](trajectories of 9 sequences)[/dim]
+
   rsbench reproduce everything                             [dim](hours; goes on where it stopped)[/dim]"""
 
 
@@ -48,6 +50,7 @@ class Target(StrEnum):
     leaderboard = "leaderboard"
     laws = "laws"
     boards = "boards"
+    handheld = "handheld"
     everything = "everything"
 
 
@@ -80,6 +83,7 @@ def reproduce(
             "leaderboard: our solvers on the public split of points, its site, and the scores of the smoke run. "
             "laws: the same of points under several laws of motion, with all predictions. "
             "boards: the same of the tracks of frames, on the dataset standard. "
+            "handheld: trajectories of whole sequences from hands. "
             "everything: all of these, one after the other, with the time that each took."
         ),
     ],
@@ -126,7 +130,7 @@ def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds
             _correction(out, data, workers)
         elif target is Target.real:
             _real(out, data, seeds, width)
-        elif target in (Target.leaderboard, Target.laws, Target.boards):
+        elif target in (Target.leaderboard, Target.laws, Target.boards, Target.handheld):
             _leaderboard(target, out, data, workers)
         elif target in (Target.fig4, Target.sgm):
             _depth(target, out, data)

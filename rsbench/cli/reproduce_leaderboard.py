@@ -1,4 +1,4 @@
-"""``rsbench reproduce leaderboard``, ``laws`` and ``boards``: what comes with rsbench, on every track."""
+"""``rsbench reproduce leaderboard``, ``laws``, ``boards`` and ``handheld``: what comes with rsbench, on every track."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-BOARD, LAWS = "leaderboard", "laws"
+BOARD, LAWS, HANDHELD = "leaderboard", "laws", "handheld"
 """Folders of the boards below ``--data``."""
 
 
@@ -80,6 +80,18 @@ def entries_of_frames() -> dict[str, list[str]]:
         "depth": own(STEREO_MATCHERS),
         "correction": images_alone,
     }
+
+
+def handheld(out: Path, data: Path, workers: int | None) -> None:
+    """The track of trajectories on footage from hands, rendered where it is missing."""
+    from rsbench.benchmark.trajectory_methods import METHODS
+    from rsbench.cli.generate import generate
+    from rsbench.cli.leaderboard import run
+
+    board, frames, count = data / f"{HANDHELD}-board", data / HANDHELD, workers or os.cpu_count() or 1
+    generate("handheld", str(frames), None, workers=count)
+    run("trajectory", list(METHODS), str(board), frames, workers=count)
+    publish(board, out / HANDHELD, "rsbench reproduce handheld")
 
 
 def publish(board: Path, out: Path, command: str = "rsbench reproduce leaderboard") -> None:
