@@ -31,11 +31,11 @@ class Past:
     p: FloatArray
     """(k, 3)."""
     gradient: FloatArray
-    """(6 k,), and where there is a gyroscope four more, of its errors."""
+    """(6 k,), and where there is a gyroscope more, of its errors."""
     H: FloatArray
     """(6 k, 6 k), likewise."""
     errors: FloatArray | None = None
-    """(4,) of the gyroscope, about which it is known."""
+    """(m,) of the gyroscope, about which it is known."""
 
     def without_gyro(self) -> Past:
         """The same of the control poses alone, whatever the errors of a gyroscope are."""

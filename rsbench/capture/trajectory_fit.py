@@ -374,5 +374,5 @@ def _strengths(
     used = len(lower) - 6.0 - float(np.sum(tied))
     if here.sensed is not None and here.border is not None and drift is not None:
         own, left, drift = learned(here.sensed, drift, lower, inverse, here.border)
-        used, determined = used + 4.0 - own, np.append(determined, left)
+        used, determined = used + len(drift.errors) - own, np.append(determined, left)
     return used, determined, prior._replace(rotation=float(new[0]), position=float(new[1])), drift

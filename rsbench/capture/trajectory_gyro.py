@@ -1,8 +1,9 @@
 """A gyroscope beside the matches of a sequence: how fast it turns at its moments, and what it errs by.
 
 A sample is a measurement of the spline's rate at its time, of white noise, so that nothing is integrated: neither
-gaps nor slow sampling matter. What it errs by is found with the spline: a bias that stays and how far its clock is
-off are unknowns beside the control poses, a border of four columns beside the band; then the noise's variance.
+gaps nor slow sampling matter. What it errs by is found with the spline: a bias that stays, how far its clock is
+off, and what its axes and scales are off by are unknowns beside the control poses, a border of 13 columns beside
+the band; then the noise's variance.
 """
 
 from __future__ import annotations
@@ -29,6 +30,11 @@ _BIAS = 1e-2
 _SHIFT, FARTHEST = 0.2, 0.5
 """Standard deviation of the shift of its clock, frame periods, before anything is seen, and the largest that is
 looked for: a quarter of the period of the fastest shakes of a hand."""
+_CROOKED, _MOST_CROOKED = 0.02, 0.3
+"""Standard deviation of axes and scales before anything is seen, rad and relative, and the largest errors of them
+that are believed."""
+ERRORS = 13
+_EXPECTED = np.array([_BIAS] * 3 + [_SHIFT] + [_CROOKED] * 9)
 _LEAST_VARIANCE = 1e-12
 """rad^2 per frame period: far below that of any gyroscope, and above rounding."""
 _TELLING = 2.0
@@ -68,8 +74,8 @@ class Drift(NamedTuple):
     """What a gyroscope errs by."""
 
     errors: FloatArray
-    """(4,) bias of its rates in the convention of ``Correspondences.gyro``, rad per frame period, and the shift:
-    frame periods that its times are early by."""
+    """(13,) bias of its rates in the convention of ``Correspondences.gyro``, rad per frame period; the shift:
+    frame periods that its times are early by; what the matrix (3, 3) that multiplies its rates has beside 1."""
     variance: float
     """Of the white noise of its turn over a frame period, about each axis, rad^2."""
 
@@ -82,6 +88,11 @@ class Drift(NamedTuple):
     def shift(self) -> float:
         """Frame periods."""
         return float(self.errors[3])
+
+    @property
+    def crooked(self) -> FloatArray:
+        """(3, 3)."""
+        return self.errors[4:].reshape(3, 3)
 
     def moved(self, step: FloatArray) -> Drift:
         """Other errors, the shift no farther than what is looked for."""
@@ -98,6 +109,8 @@ class GyroFound:
     """(3,) of its samples, rad per frame period."""
     shift: float
     """Frame periods that its times are early by."""
+    matrix: FloatArray
+    """(3, 3) what its rates are multiplied by, bias and all: near the identity, where axes and scales are off."""
     noise: float
     """Standard deviation of its turn over a frame period about each axis, rad; what no spline follows is in it."""
     used: bool
@@ -106,18 +119,19 @@ class GyroFound:
     @classmethod
     def of(cls, drift: Drift, *, used: bool = True) -> GyroFound:
         """In words of users."""
-        return cls(bias=drift.bias, shift=drift.shift, noise=float(np.sqrt(drift.variance)), used=used)
+        noise = float(np.sqrt(drift.variance))
+        return cls(bias=drift.bias, shift=drift.shift, matrix=np.eye(3) + drift.crooked, noise=noise, used=used)
 
 
 class Border(NamedTuple):
     """Normal equations of a gyroscope's errors beside those of the control poses."""
 
     mixed: FloatArray
-    """(6 controls, 4)."""
+    """(6 controls, 13)."""
     corner: FloatArray
-    """(4, 4)."""
+    """(13, 13)."""
     slope: FloatArray
-    """(4,) gradient."""
+    """(13,) gradient."""
 
 
 class Sensed(NamedTuple):
@@ -151,33 +165,38 @@ def sensed(curve: Curve, steps: GyroSteps, drift: Drift, width: int) -> Sensed:
     views = blank_views(2 * count)
     fill_views(curve, np.concatenate([steps.start, steps.end]) + drift.shift, views)
     R, turn, index = views.R.reshape(2, count, 3, 3), views.turn.reshape(2, count, 4, 3, 3), views.index
-    turned, wanted = R[1] @ np.swapaxes(R[0], 1, 2), steps.turn - length[:, None] * drift.bias
+    turned = R[1] @ np.swapaxes(R[0], 1, 2)
+    wanted = steps.turn + steps.turn @ drift.crooked.T - length[:, None] * drift.bias
     off = turned @ np.swapaxes(so3.exp(wanted), 1, 2)
     errors, root = so3.log(off), (steps.worth**0.5 / length)[:, None]
     # By a turn of the body at the end, and whitened.
     by_end = np.linalg.inv(so3.left_jacobian(errors)) * root[..., None]
     faster = views.spin[count:] - (turned @ views.spin[:count, :, None])[..., 0]
-    by_drift = np.concatenate(
-        [by_end @ off @ so3.left_jacobian(wanted) * length[:, None, None], by_end @ faster[..., None]], axis=2
-    )
+    against = by_end @ off @ so3.left_jacobian(wanted)
+    by_crooked = -(against[..., None] * steps.turn[:, None, None, :]).reshape(count, 3, 9)
+    by_drift = np.concatenate([against * length[:, None, None], by_end @ faster[..., None], by_crooked], axis=2)
     errors = root * errors
     size = 4 + int(np.max(index[count:] - index[:count], initial=0))
     first = np.minimum(index[:count], controls - size)
     by, rows = np.zeros((count, size, 3, 3)), np.arange(count)[:, None]
     by[rows, (index[:count] - first)[:, None] + np.arange(4)] -= (by_end @ turned)[:, None] @ turn[0]
     by[rows, (index[count:] - first)[:, None] + np.arange(4)] += by_end[:, None] @ turn[1]
-    gradient, band, mixed = np.zeros(6 * controls), np.zeros((6 * controls, width)), np.zeros((controls, 6, 4))
+    gradient, band, mixed = (
+        np.zeros(6 * controls),
+        np.zeros((6 * controls, width)),
+        np.zeros((controls, 6, ERRORS)),
+    )
     add_blocks(gradient, band, by, errors, first, 0)
     np.add.at(mixed[:, :3], first[:, None] + np.arange(size), np.swapaxes(by, 2, 3) @ by_drift[:, None])
     corner, slope = np.einsum("kmi,kmj->ij", by_drift, by_drift), np.einsum("kmi,km->i", by_drift, errors)
-    border = Border(mixed.reshape(-1, 4), corner, slope)
+    border = Border(mixed.reshape(-1, ERRORS), corner, slope)
     return Sensed(float(np.sum(errors**2)), gradient, band, border, errors.size)
 
 
 def first_drift(curve: Curve, steps: GyroSteps) -> Drift:
     """None but the noise that steps have about a spline."""
-    found = sensed(curve, steps, Drift(np.zeros(4), 1.0), 6 * max(len(curve.p), 5))
-    return Drift(np.zeros(4), max(found.squares / max(found.count, 1), _LEAST_VARIANCE))
+    found = sensed(curve, steps, Drift(np.zeros(ERRORS), 1.0), 6 * max(len(curve.p), 5))
+    return Drift(np.zeros(ERRORS), max(found.squares / max(found.count, 1), _LEAST_VARIANCE))
 
 
 def border_of(found: Sensed, drift: Drift, begins: bool) -> tuple[float, Border]:
@@ -185,7 +204,7 @@ def border_of(found: Sensed, drift: Drift, begins: bool) -> tuple[float, Border]
     border = Border(*(each / drift.variance for each in found.border))
     cost = 0.5 * found.squares / drift.variance
     if begins:
-        expected = np.array([_BIAS, _BIAS, _BIAS, _SHIFT]) ** -2
+        expected = _EXPECTED**-2
         cost += 0.5 * float(expected @ drift.errors**2)
         known = border.corner + np.diag(expected), border.slope + expected * drift.errors
         border = Border(border.mixed, *known)
@@ -196,9 +215,9 @@ class Eliminated(NamedTuple):
     """A gyroscope's errors, left out of normal equations whose factor is known."""
 
     follows: FloatArray
-    """(6 controls, 4) how the control poses move against them."""
+    """(6 controls, 13) how the control poses move against them."""
     covariance: FloatArray
-    """(4, 4) of them."""
+    """(13, 13) of them."""
     log_determinant: float
     """What it adds to that of the control poses alone."""
 
@@ -216,7 +235,7 @@ def eliminated(lower: FloatArray, border: Border) -> Eliminated:
 
 
 def bordered_step(lower: FloatArray, gradient: FloatArray, border: Border) -> tuple[FloatArray, FloatArray]:
-    """Newton's step of control poses (6 controls,) and a gyroscope's errors (4,). Raises NotDefiniteError."""
+    """Newton's step of control poses (6 controls,) and a gyroscope's errors (13,). Raises NotDefiniteError."""
     alone, rest = banded.solve(lower, gradient), eliminated(lower, border)
     step = -rest.covariance @ (border.slope - border.mixed.T @ alone)
     return -alone - rest.follows @ step, step
@@ -256,7 +275,8 @@ def learned(
 def contradicts(steps: GyroSteps, drift: Drift) -> bool:
     """Whether a gyroscope is of another clock or axes.
 
-    It errs by much of what it measures and by more than its noise, or its clock is off by more than is looked for.
+    It errs by much of what it measures and by more than its noise, or its clock, axes or scales are off by more
+    than is believed.
     """
     if len(steps.start) < 3 or drift.variance <= _LEAST_VARIANCE:
         return False
@@ -264,4 +284,5 @@ def contradicts(steps: GyroSteps, drift: Drift) -> bool:
     errors = drift.variance * float(np.mean(1.0 / steps.worth))
     varied = float(np.mean(np.var(rates, axis=0)))
     noise = float(np.mean(np.diff(rates, n=2, axis=0) ** 2)) / 6.0  # slow turns hardly show in second differences
-    return errors > max(_UNLIKE**2 * varied, _NOISY**2 * noise) or abs(drift.shift) >= FARTHEST
+    far = abs(drift.shift) >= FARTHEST or float(np.max(np.abs(drift.crooked))) > _MOST_CROOKED
+    return far or errors > max(_UNLIKE**2 * varied, _NOISY**2 * noise)

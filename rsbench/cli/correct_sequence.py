@@ -53,7 +53,7 @@ def correct_sequence_given(given: Given, target: str, options: CorrectionOptions
             _write_both(out, folder, sources, record)
         else:
             _write_rest(folder, out, sources[0], record, found)
-    _say(out, f"readout ratio {readout_words(shutter, capture)}", record)
+    _say(out, f"readout ratio {readout_words(shutter, capture)}", record, gyro is not None)
 
 
 def _gyro(given: Given, left: FrameSource, options: CorrectionOptions) -> FloatArray | None:
@@ -206,7 +206,7 @@ def _write_both(out: Path, folder: Path, sources: Sources, record: dict[str, Any
     write_video(out, folder, both, fps_of(sources[0].path), record)
 
 
-def _say(out: Path, first: str, record: dict[str, Any]) -> None:
+def _say(out: Path, first: str, record: dict[str, Any], given_gyro: bool) -> None:
     """Exit 1 where a time is not corrected."""
     from rsbench.dataset.corrected_video import is_video
 
@@ -219,7 +219,10 @@ def _say(out: Path, first: str, record: dict[str, Any]) -> None:
     gyros = [(each["number"], each["motion"]["gyro"]) for each in frames if "gyro" in each.get("motion", {})]
     used = [found for _, found in gyros if not isinstance(found, str)]
     if used:
-        typer.echo(f"gyroscope: its clock is {_late(used[-1]['shift'])}, which is allowed for")
+        off = max(abs(value - (i == j)) for i, row in enumerate(used[-1]["matrix"]) for j, value in enumerate(row))
+        typer.echo(f"gyroscope: clock {_late(used[-1]['shift'])}, axes and scales off by {off:.1%}: allowed for")
+    elif given_gyro and record["readout_ratio"] == 0.0:
+        typer.echo("rsbench: corrected without the gyroscope: the shutter is global", err=True)
     typer.echo(f"{sum('reason' not in frame for frame in frames)} of {len(frames)} times corrected")
     typer.echo(f"video: {out.resolve()}" if is_video(out) else f"report: {(out / 'report.html').resolve()}")
     if len(used) < len(gyros):

@@ -1,4 +1,4 @@
-"""``rsbench reproduce leaderboard``, ``laws``, ``boards`` and ``handheld``: what comes with rsbench, on every track."""
+"""``rsbench reproduce leaderboard``, ``laws``, ``boards``, ``handheld``: what comes with rsbench, on all tracks."""
 
 from __future__ import annotations
 

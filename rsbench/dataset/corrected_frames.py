@@ -216,7 +216,8 @@ def _gyro_record(gyro: GyroFound) -> Any:
     """What was found of it, or why it is not used."""
     if not gyro.used:
         return CONTRADICTED
-    return {"bias": gyro.bias.tolist(), "shift": gyro.shift, "noise": gyro.noise}
+    found = {"bias": gyro.bias, "shift": gyro.shift, "matrix": gyro.matrix, "noise": gyro.noise}
+    return {name: np.asarray(value).tolist() for name, value in found.items()}
 
 
 def rig_record(

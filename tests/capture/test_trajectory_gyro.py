@@ -11,6 +11,7 @@ from rsbench.capture.trajectory_data import TimedTracks
 from rsbench.capture.trajectory_estimate import TrajectoryOptions, estimate_trajectory
 from rsbench.capture.trajectory_fit import ANCHORED, held, normal_equations
 from rsbench.capture.trajectory_gyro import (
+    ERRORS,
     Border,
     Drift,
     bordered_inverse,
@@ -60,11 +61,11 @@ def test_derivatives_of_the_errors_of_a_gyroscope() -> None:
     curve = wild(rng)
     tau = np.linspace(0.1, 2.3, 13)
     samples = np.column_stack([tau, 0.2 * rng.normal(size=(13, 3))])
-    steps, drift = gyro_steps(samples), Drift(np.array([0.02, -0.01, 0.03, 0.07]), 1.0)
+    steps, drift = gyro_steps(samples), Drift(np.append([0.02, -0.01, 0.03, 0.07], 0.1 * rng.normal(size=9)), 1.0)
 
     def at(x: FloatArray) -> float:
-        other = drift._replace(errors=drift.errors + x[-4:])
-        return 0.5 * sensed(moved(curve, x[:-4]), steps, other, 30).squares
+        other = drift._replace(errors=drift.errors + x[-ERRORS:])
+        return 0.5 * sensed(moved(curve, x[:-ERRORS]), steps, other, 30).squares
 
     found = sensed(curve, steps, drift, 30)
     ours = np.concatenate([found.gradient, found.border.slope])
@@ -77,10 +78,10 @@ def test_the_normal_matrix_is_the_second_derivative_where_nothing_errs() -> None
     rng = np.random.default_rng(1)
     curve, tau = wild(rng), np.linspace(0.2, 2.2, 11)
     steps = gyro_steps(np.column_stack([tau, evaluate(curve, tau)[1]]))
-    drift = Drift(np.zeros(4), 1.0)
+    drift = Drift(np.zeros(ERRORS), 1.0)
 
     def slope(x: FloatArray) -> FloatArray:
-        there = sensed(moved(curve, x[:-4]), steps, drift._replace(errors=x[-4:]), 30)
+        there = sensed(moved(curve, x[:-ERRORS]), steps, drift._replace(errors=x[-ERRORS:]), 30)
         return np.concatenate([there.gradient, there.border.slope])
 
     found = sensed(curve, steps, drift, 30)
@@ -108,9 +109,9 @@ def test_a_border_is_solved_as_a_dense_matrix() -> None:
     added = np.linalg.slogdet(whole)[1] - np.linalg.slogdet(H)[1]
     assert eliminated(lower, border).log_determinant == pytest.approx(added, rel=1e-10)
     # What steps determine is the trace of the inverse times their own part of the matrix, here two thirds of it.
-    own = sensed(wild(rng, 4), gyro_steps(np.zeros((0, 4))), Drift(np.zeros(4), 1.0), 30)
+    own = sensed(wild(rng, 4), gyro_steps(np.zeros((0, 4))), Drift(np.zeros(ERRORS), 1.0), 30)
     own = own._replace(band=band / 3.0, border=Border(*(each / 3.0 for each in border)), count=100, squares=7.0)
-    used, left, drift = learned(own, Drift(np.zeros(4), 0.5), lower, ours, border)
+    used, left, drift = learned(own, Drift(np.zeros(ERRORS), 0.5), lower, ours, border)
     assert used == pytest.approx((n + 4) * 2.0 / 3.0, rel=1e-9) and left == pytest.approx(100.0 - used)
     assert drift.variance == pytest.approx(7.0 / left)
 
@@ -175,6 +176,21 @@ def test_rows_are_better_with_a_gyroscope_whose_clock_is_off(shake: str, late: f
     assert abs(found.gyro.shift - late) < 0.03
     # 160 samples of three axes tell the noise to 4 %, knots that do not follow the shakes add to it.
     assert 0.85 * DENSITY < found.gyro.noise < 1.5 * DENSITY
+
+
+def test_axes_and_scales_that_are_off_are_found() -> None:
+    """Taken as right they make rows three times as wrong as without a gyroscope."""
+    rng = np.random.default_rng(202)
+    law = sines(rng, *SHAKES["strong"])
+    windows, _ = matches(law, 8, rng, count=150)
+    samples = measured(law, 8, rng)
+    wrong = 1.05 * Rotation.from_rotvec([0.05, -0.03, 0.04]).as_matrix()
+    samples[:, 1:] = samples[:, 1:] @ wrong.T
+    options = TrajectoryOptions(intervals=(0.5,))
+    alone, found = (estimate_trajectory(windows, RIG, SHUTTER, options=options, gyro=g) for g in (None, samples))
+    assert found.gyro is not None and found.gyro.used
+    assert np.median(row_errors_deg(found, law, 8)) < 0.8 * np.median(row_errors_deg(alone, law, 8))
+    assert np.linalg.norm(found.gyro.matrix @ wrong - np.eye(3)) < 0.5 * np.linalg.norm(wrong - np.eye(3))
 
 
 @pytest.mark.parametrize("fault", ["sign", "unit", "another time"])

@@ -39,7 +39,7 @@ def test_a_gyroscope_turns_frames_far_from_any_that_match() -> None:
         assert np.rad2deg(Rotation.from_matrix(b @ a.T @ c @ d.T).magnitude()) < 0.03
         assert (each.pose is None) == (k in far)
         record = motion_record(each.found)
-        assert set(record["gyro"]) == {"bias", "shift", "noise"}
+        assert set(record["gyro"]) == {"bias", "shift", "matrix", "noise"}
         if k in far:
             assert each.reason == BRIDGED + TURNED and record["covariance_w_d"] is None
             np.testing.assert_allclose(motion.body_from_world(rows).t, 0.0, atol=1e-12)
