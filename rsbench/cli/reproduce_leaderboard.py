@@ -1,4 +1,4 @@
-"""``rsbench reproduce leaderboard``, ``laws``, ``boards``, ``handheld``: what comes with rsbench, on all tracks."""
+"""``rsbench reproduce leaderboard``, ``laws``, ``boards``, ``handheld``: what comes with rsbench, on tracks."""
 
 from __future__ import annotations
 
