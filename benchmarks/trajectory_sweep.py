@@ -196,15 +196,18 @@ def table(sweep: str, trials: int) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def _words(of: pd.Series) -> str:
+    value, low, high = (float(each) for each in of)
+    return in_words(value, low, high) if low < high else f"{value:.3g}"
+
+
 def shown(found: pd.DataFrame) -> list[str]:
     """Markdown: a row of each value, rotation of the rows in degrees."""
     names = [STATED, OURS, *WINDOWS, STILL]
     lines = []
     for (sweep, value), rows in found.groupby(["sweep", "value"], sort=False):
         by = rows.set_index("entry")
-        cells = [
-            in_words(*by.loc[name, ["rotation_deg", "rotation_deg_low", "rotation_deg_high"]]) for name in names
-        ]
+        cells = [_words(by.loc[name, ["rotation_deg", "rotation_deg_low", "rotation_deg_high"]]) for name in names]
         lines.append(f"| {sweep} | {value:g} | {' | '.join(cells)} |")
     return ["| varied | value | " + " | ".join(names) + " |", "|---" * (len(names) + 2) + "|", *lines]
 
