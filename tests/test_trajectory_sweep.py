@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import importlib
 from types import ModuleType
 
 import numpy as np
 import pandas as pd
-import programs
 import pytest
+from programs import ROOT
 
-FOLDER = Path(__file__).parents[1] / "results/trajectory"
+FOLDER = ROOT / "results/trajectory"
 
 
-@pytest.fixture(scope="module")
-def program() -> ModuleType:
-    return programs.program("benchmarks/trajectory_sweep.py")
+@pytest.fixture
+def program(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))  # whose programs find each other in their folder
+    return importlib.import_module("trajectory_sweep")
 
 
 def test_points_are_seen_where_their_rows_are_read(program: ModuleType) -> None:
