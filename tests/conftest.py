@@ -18,6 +18,7 @@ from hypothesis import settings
 from skips import SkipReport
 
 from rsbench.components.imports import import_untried
+from rsbench.storage.caches import temporary, user_cache
 
 if TYPE_CHECKING:
     from rsbench.scenes.model import Light, Scene
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Started in the background of a shell without job control: the commands that tests interrupt would inherit it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Before Numba reads it: tests, and what they start, share compiled code also where they move the user's cache.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(user_cache() or temporary()))
 
 # The same examples in every run, so that a change fails by what it broke alone: `--hypothesis-profile=drawn` draws
 # others. No deadlines: the first example of a test may compile or import what the others use.

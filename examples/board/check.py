@@ -47,6 +47,10 @@ def main() -> None:
     if len(methods) != 1:
         refuse(f"changes {len(methods)} entries ({', '.join(sorted(methods))}); one at a time")
     (method,) = methods
+    for other in git("ls-tree", "--name-only", "-z", base, "submissions/").decode().split("\0"):
+        name = other.removeprefix("submissions/")
+        if name != method and name.lower() == method.lower():
+            refuse(f"submissions/{method}: differs from submissions/{name} in case alone")
     with tempfile.TemporaryDirectory() as folder:
         for path, blob in files.items():
             place = Path(folder, path)

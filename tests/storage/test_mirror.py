@@ -24,7 +24,6 @@ from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
 from rsbench.storage import mirror
-from rsbench.storage.caches import user_cache
 from rsbench.storage.files import write_bytes
 from rsbench.storage.mirror import mirrored, name_of
 from rsbench.storage.work_folder import WORK, work_folder
@@ -38,7 +37,6 @@ TIMES = ("provenance.json", "seconds.json", "seconds.csv")
 @pytest.fixture
 def memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """An empty store, and no memory of any other."""
-    monkeypatch.setenv("NUMBA_CACHE_DIR", os.environ.get("NUMBA_CACHE_DIR", str(user_cache())))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     store = fsspec.filesystem("memory")
     for _ in range(2):
@@ -110,7 +108,7 @@ def _here(serve: Any, jobs: Any, workers: int, environment: object, *arguments: 
 
 def test_a_board_goes_to_a_store(memory: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(running, "finished_jobs", _here)
-    monkeypatch.setattr("rsbench.cli.leaderboard.split_of", lambda *options: small_split())
+    monkeypatch.setattr("rsbench.cli.leaderboard.split_of", lambda *options: small_split(3))
     command = ("leaderboard", "run", "points", "--entry", "gs-8pt", "--board")
     assert run_here(*command, tmp_path / "board").returncode == 0
     run = run_here(*command, URL)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 import subprocess
 import sys
@@ -20,7 +19,6 @@ from small_scenes import write_box_scene, write_small_card
 
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
-from rsbench.storage.caches import user_cache
 from rsbench.storage.work_folder import HIDDEN
 
 pytestmark = [
@@ -49,7 +47,6 @@ def bucket(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     for name, value in variables.items():
         monkeypatch.setenv(f"AWS_{name}", value)
     monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-    monkeypatch.setenv("NUMBA_CACHE_DIR", os.environ.get("NUMBA_CACHE_DIR", str(user_cache())))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     from s3fs import S3FileSystem

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -160,6 +160,7 @@ def simulated_problem(seed: int, number: int, draws: Draws = POINTS_1) -> Proble
     )
 
 
+@lru_cache(maxsize=512)  # bounds of what methods use are of the same problems
 def exact_problem(seed: int, number: int, draws: Draws = POINTS_1) -> tuple[Problem, float]:
     """The matches of a problem without noise and without the outliers, and the noise that they get, px.
 

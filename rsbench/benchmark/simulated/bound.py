@@ -205,7 +205,14 @@ def root_information(
     Args:
         seen: for each image that sees all the points, its side, frame and their rows (n,).
     """
-    parts = [_projection_jacobian(rig, shutter, motion, points, *view) for view in seen]
+    taus = [shutter.row_time(rows, frame) for _, frame, rows in seen]
+    # Of all images at once: on a few points the calls take longer than the arithmetic.
+    everywhere = np.concatenate(taus), np.tile(points, (len(seen), 1))
+    moved = np.split(np.stack([_derivative(motion, *everywhere, axis) for axis in np.eye(6)], axis=-1), len(seen))
+    parts = [
+        _projection_jacobian(rig, shutter, motion, points, side, tau, each)
+        for (side, _, _), tau, each in zip(seen, taus, moved, strict=True)
+    ]
     by_motion = np.concatenate([part[0] for part in parts], axis=1)
     by_point = np.concatenate([part[1] for part in parts], axis=1)
     axes, values, _ = np.linalg.svd(by_point, full_matrices=False)
@@ -223,17 +230,20 @@ def _projection_jacobian(
     motion: Motion,
     points: FloatArray,
     side: Side,
-    frame: int,
-    rows: FloatArray,
+    tau: FloatArray,
+    moved: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Derivatives (n, 2, 6) and (n, 2, 3) of the implicit projection by (w, d) and by the point."""
-    tau = shutter.row_time(rows, frame)
+    """Derivatives (n, 2, 6) and (n, 2, 3) of the implicit projection by (w, d) and by the point.
+
+    Args:
+        tau: when each point is seen, (n,).
+        moved: derivatives (n, 3, 6) of the points in the body then, by (w, d).
+    """
     R, t = rig.cam_from_world(motion, tau, side)
     rotated = (R @ points[:, :, None])[:, :, 0]
     x = rotated + t
     w_rate, t_rate = motion.velocity(tau)
     velocity = so3.cross(w_rate, rotated) + t_rate
-    columns = [_derivative(motion, tau, points, axis) for axis in np.eye(6)]
     camera, z = rig.camera, x[:, 2]
     P = np.zeros((len(points), 2, 3))
     P[:, 0, 0], P[:, 0, 2] = camera.fx / z, -camera.fx * x[:, 0] / z**2
@@ -241,7 +251,7 @@ def _projection_jacobian(
     # Pixels move by P dx + (P velocity) h dy with their own row's dy: solve for dy, then insert it.
     drift = shutter.h * (P @ velocity[:, :, None])
     follow = np.eye(2) + drift * np.array([0.0, 1.0]) / (1.0 - drift[:, 1:])
-    return follow @ P @ np.stack(columns, axis=-1), follow @ P @ R
+    return follow @ P @ moved, follow @ P @ R
 
 
 def _derivative(motion: Motion, tau: FloatArray, points: FloatArray, axis: FloatArray) -> FloatArray:

@@ -155,8 +155,16 @@ class Setting:
 
     def exact(self) -> Setting:
         """The setting of the same matches without noise and with the truth for the solver."""
-        told = replace(self, noise_px=0.0, readout_ratio_error=0.0, affine_noise=0.0)
-        return replace(told, gyro_noise_deg=0.0, gyro_bias_deg=0.0, gyro_delay=0.0, gravity_noise_deg=0.0)
+        return replace(
+            self,
+            noise_px=0.0,
+            readout_ratio_error=0.0,
+            affine_noise=0.0,
+            gyro_noise_deg=0.0,
+            gyro_bias_deg=0.0,
+            gyro_delay=0.0,
+            gravity_noise_deg=0.0,
+        )
 
     def changed(self, changes: Mapping[str, Any], where: str) -> Setting:
         """The setting with some fields replaced.
