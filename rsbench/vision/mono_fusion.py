@@ -26,7 +26,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision import forward_warp
 from rsbench.vision.correction import WarpOptions, line_maps
-from rsbench.vision.curve_sweep import SweepOptions, Swept, sweep_frames
+from rsbench.vision.curve_sweep import SweepOptions, Swept, search_size, sweep_frames
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.fusion import Fused, Origin, inpaint
@@ -153,40 +153,13 @@ class MonoFusion:
             return [_Layer(np.zeros(shape, np.float32), np.zeros(shape, np.float32)) for _ in FRAMES]
         poses = [row_poses(own.rig, own.shutter, own.motion, own.side, frame) for frame in FRAMES]
         maps = [reprojection_of(own.rig.camera, poses[frame], poses[1 - frame]) for frame in FRAMES]
-        met = [_triangulated(self.flows.flow[frame], maps[frame]) for frame in FRAMES]
+        pick = _picked(*shape, *search_size(*shape, self.options.sweep))
+        met = [_triangulated(self.flows.flow[frame], maps[frame], pick) for frame in FRAMES]
+        offs = [off[np.ix_(*pick)] for off in self.flows.returns]
         greys = [grey_u8(image) for image in self.images]
-        most = self._range(met, parallax_gain(own.rig.camera, *maps))
+        most = _range(offs, met, parallax_gain(own.rig.camera, *maps))
         swept = sweep_frames(greys, own.rig, own.shutter, own.motion, own.side, most, self.options.sweep)
-        return [self._layer(frame, swept[frame], *met[frame]) for frame in FRAMES]
-
-    def _range(self, met: Sequence[tuple[F32, F32]], gain: float) -> float:
-        """Largest inverse depth that is looked for."""
-        believed = [
-            rho[(off < _RETURNS_PX) & (miss < _ON_CURVE_PX)]
-            for off, (rho, miss) in zip(self.flows.returns, met, strict=True)
-        ]
-        known = np.concatenate(believed)
-        largest = float(np.quantile(known, _RANGE_QUANTILE)) if known.size else 0.0
-        return largest * _RANGE_MARGIN + _RANGE_PX / max(gain, 1e-9)
-
-    def _layer(self, frame: int, swept: Swept, rho: F32, miss: F32) -> _Layer:
-        """Depth and weights (H, W) of a frame; ``rho`` and ``miss`` (H, W) as of ``_triangulated``."""
-        off = self.flows.returns[frame]
-        size, full = swept.rho.shape[::-1], rho.shape[::-1]
-        small_rho, small_off, small_miss = (
-            np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_NEAREST)) for each in (rho, off, miss)
-        )
-        still = (small_off < _RETURNS_PX) & (small_miss < _ON_CURVE_PX)
-        found = np.where(swept.agrees, swept.rho, np.where(still, small_rho, np.float32(np.nan)))
-        filled = cv2.resize(cv2.medianBlur(_filled(found), 5), full, interpolation=cv2.INTER_LINEAR)
-        # How far consistent flow ends off the curve says how far geometry is from explaining it, found or not.
-        wrong = np.maximum(small_miss - _ON_CURVE_PX, np.float32(0.0))
-        geometry = np.minimum(wrong, np.float32(1e3)) ** 2
-        flow = (np.minimum(small_off, np.float32(1e3)) / _RETURNS_PX) ** 4 + _SIGMA_PX**2
-        flow = np.where(swept.agrees, flow * _CONFIRMED, flow)
-        share = (geometry / (geometry + flow)).astype(np.float32)
-        share = cv2.blur(cv2.medianBlur(share, 5), (_SMOOTH_PX, _SMOOTH_PX))
-        return _Layer(np.asarray(filled), np.asarray(cv2.resize(share, full, interpolation=cv2.INTER_LINEAR)))
+        return [_layer(swept[frame], offs[frame], *met[frame], shape) for frame in FRAMES]
 
     def _drawn(self, frame: int, target_tau: float) -> tuple[NDArray[Any], F32]:
         """Image (H, W[, C]) and inverse depth (H, W) of one frame at the target; -1 where it shows nothing."""
@@ -243,29 +216,69 @@ def _weigh(
             places[y, x, 2] = of_flow * rho[y, x] + (1.0 - of_flow) * moved[2, y, x]
 
 
+def _picked(height: int, width: int, rows: int, columns: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """So many rows and columns, evenly apart, of an image."""
+    return np.arange(rows) * height // rows, np.arange(columns) * width // columns
+
+
+def _range(offs: Sequence[F32], met: Sequence[tuple[F32, F32]], gain: float) -> float:
+    """Largest inverse depth that is looked for."""
+    believed = [
+        rho[(off < _RETURNS_PX) & (miss < _ON_CURVE_PX)] for off, (rho, miss) in zip(offs, met, strict=True)
+    ]
+    known = np.concatenate(believed)
+    largest = float(np.quantile(known, _RANGE_QUANTILE)) if known.size else 0.0
+    return largest * _RANGE_MARGIN + _RANGE_PX / max(gain, 1e-9)
+
+
+def _layer(swept: Swept, off: F32, rho: F32, miss: F32, shape: tuple[int, ...]) -> _Layer:
+    """Depth and weights (H, W) of a frame.
+
+    ``off`` (h, w) says where its flow returns, ``rho`` and ``miss`` (h, w) are those of ``_triangulated``.
+    """
+    full = shape[1::-1]
+    still = (off < _RETURNS_PX) & (miss < _ON_CURVE_PX)
+    found = np.where(swept.agrees, swept.rho, np.where(still, rho, np.float32(np.nan)))
+    filled = cv2.resize(cv2.medianBlur(_filled(found), 5), full, interpolation=cv2.INTER_LINEAR)
+    # How far consistent flow ends off the curve says how far geometry is from explaining it, found or not.
+    wrong = np.maximum(miss - _ON_CURVE_PX, np.float32(0.0))
+    geometry = np.minimum(wrong, np.float32(1e3)) ** 2
+    flow = (np.minimum(off, np.float32(1e3)) / _RETURNS_PX) ** 4 + _SIGMA_PX**2
+    flow = np.where(swept.agrees, flow * _CONFIRMED, flow)
+    share = (geometry / (geometry + flow)).astype(np.float32)
+    share = cv2.blur(cv2.medianBlur(share, 5), (_SMOOTH_PX, _SMOOTH_PX))
+    return _Layer(np.asarray(filled), np.asarray(cv2.resize(share, full, interpolation=cv2.INTER_LINEAR)))
+
+
 def _filled(rho: NDArray[Any]) -> F32:
     """Inverse depth (h, w) with that of the farther neighbour in the row where it is NaN; then in the column."""
     rows = fill_holes(rho.astype(np.float32))
     return np.nan_to_num(fill_holes(rows.T).T, nan=0.0).astype(np.float32)
 
 
-def _triangulated(flow: F32, maps: Reprojection) -> tuple[F32, F32]:
-    """Inverse depth (H, W), at least 0, that fits a flow (H, W, 2) best, and px that the flow ends off it."""
-    rho, miss = np.zeros(flow.shape[:2], np.float32), np.zeros(flow.shape[:2], np.float32)
-    _triangulate(flow, maps.G, maps.c, maps.A, maps.B, rho, miss)
+def _triangulated(
+    flow: F32, maps: Reprojection, pick: tuple[NDArray[np.intp], NDArray[np.intp]]
+) -> tuple[F32, F32]:
+    """Inverse depth (h, w), at least 0, that fits a flow (H, W, 2) best, and px that the flow ends off it.
+
+    ``pick``: rows (h,) and columns (w,) of the pixels.
+    """
+    size = len(pick[0]), len(pick[1])
+    rho, miss = np.zeros(size, np.float32), np.zeros(size, np.float32)
+    _triangulate(flow, *pick, maps, rho, miss)
     return rho, miss
 
 
 @compiled(error_model="numpy")
 def _triangulate(
-    flow: F32, G: FloatArray, c: FloatArray, A: FloatArray, B: FloatArray, rho: F32, miss: F32
+    flow: F32, rows: NDArray[np.intp], columns: NDArray[np.intp], maps: Reprojection, rho: F32, miss: F32
 ) -> None:
-    """Fill ``rho`` and ``miss`` (H, W): least squares of ``(a + rho T)_xy - end (a + rho T)_z``, in pixels."""
-    height, width = rho.shape
+    """Fill ``rho`` and ``miss`` (h, w): least squares of ``(a + rho T)_xy - end (a + rho T)_z``, in pixels."""
+    G, c, A, B = maps.G, maps.c, maps.A, maps.B
     last = len(A) - 1
     a, T = np.zeros(3), np.zeros(3)
-    for y in range(height):
-        for x in range(width):
+    for row, y in enumerate(rows):
+        for column, x in enumerate(columns):
             u, v = x + flow[y, x, 0], y + flow[y, x, 1]
             line = min(max(int(np.floor(v)), 0), max(last - 1, 0))
             beside, part = min(line + 1, last), v - line
@@ -279,5 +292,5 @@ def _triangulate(
             qx, qy = T[0] - u * T[2], T[1] - v * T[2]
             found = max(-(px * qx + py * qy) / max(qx * qx + qy * qy, 1e-12), 0.0)
             z = a[2] + found * T[2]
-            rho[y, x] = found
-            miss[y, x] = np.hypot(px + found * qx, py + found * qy) / z if z > 1e-3 else np.inf
+            rho[row, column] = found
+            miss[row, column] = np.hypot(px + found * qx, py + found * qy) / z if z > 1e-3 else np.inf
