@@ -26,7 +26,14 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.vision.compiled_camera import across_lines
 from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.motion_sweep import census, ones
-from rsbench.vision.reprojection import Reprojection, homography, land, parallax_gain, reproject_pixels, reprojection_of
+from rsbench.vision.reprojection import (
+    Reprojection,
+    homography,
+    land,
+    parallax_gain,
+    reproject_pixels,
+    reprojection_of,
+)
 from rsbench.vision.semiglobal import aggregated, winners
 
 F32 = NDArray[np.float32]
