@@ -113,6 +113,16 @@ class _Layer(NamedTuple):
     """(H, W) weight of the scaled flow beside that of the geometry, 0 to 1."""
 
 
+class Beyond(NamedTuple):
+    """A pair of frames by which a hole of one of them may be filled."""
+
+    pair: MonoFusion
+    frame: int
+    """Which of both has the hole; the other one fills it."""
+    target_tau: float
+    """In frame periods of this pair."""
+
+
 class MonoFusion:
     """Two frames of one camera, ready to be corrected to any time."""
 
@@ -127,15 +137,21 @@ class MonoFusion:
         self.images, self.own, self.flows, self.options = images, own, flows, options or MonoFusionOptions()
         self._layers = self._find_layers()
 
-    def corrected(self, frame: int, target_tau: float) -> Fused:
-        """The frame at a time, in frame periods; its depth is in the motion's unit."""
-        first = self._drawn(frame, target_tau)
-        image, buffer = first
+    def corrected(self, frame: int, target_tau: float, beyond: Beyond | None = None) -> Fused:
+        """The frame at a time, in frame periods; its depth is in the motion's unit.
+
+        ``beyond``: another pair that the frame is one of, whose other frame may show what neither here does.
+        """
+        image, buffer = self._drawn(frame, target_tau)
         origin = np.where(buffer >= 0.0, np.uint8(Origin.HERE), np.uint8(Origin.NOBODY))
-        if self.options.fill and np.any(origin == Origin.NOBODY):
-            other, behind = self._drawn(1 - frame, target_tau)
+        others = [Beyond(self, frame, target_tau)] + ([] if beyond is None else [beyond])
+        for pair, same, tau in others if self.options.fill else []:
+            if not np.any(origin == Origin.NOBODY):
+                break
+            other, behind = pair._drawn(1 - same, tau)
             take = (origin == Origin.NOBODY) & (behind >= 0.0)
-            image[take], buffer[take], origin[take] = other[take], behind[take], Origin.OTHER_FRAME
+            unit = _unit(self._layers[frame].rho, pair._layers[same].rho)
+            image[take], buffer[take], origin[take] = other[take], unit * behind[take], Origin.OTHER_FRAME
         empty = origin == Origin.NOBODY
         if self.options.inpaint:
             image = inpaint(image, empty)
@@ -214,6 +230,12 @@ def _weigh(
             places[y, x, 0] = of_flow * (x + share * flow[y, x, 0]) + (1.0 - of_flow) * moved[0, y, x]
             places[y, x, 1] = of_flow * (y + share * flow[y, x, 1]) + (1.0 - of_flow) * moved[1, y, x]
             places[y, x, 2] = of_flow * rho[y, x] + (1.0 - of_flow) * moved[2, y, x]
+
+
+def _unit(rho: F32, other: F32) -> np.float32:
+    """The inverse depth here that 1 of another pair is, from both of a frame (H, W); 1 for frames at infinity."""
+    both = (rho > 0.0) & (other > 0.0)
+    return np.median(rho[both] / other[both]) if np.any(both) else np.float32(1.0)
 
 
 def _picked(height: int, width: int, rows: int, columns: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
