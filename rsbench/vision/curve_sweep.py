@@ -104,7 +104,7 @@ def sweep_frames(
         most: largest inverse depth.
         options: see there.
     """
-    height, width = search_size(*greys[0].shape, options)
+    height, width = search_size(greys[0].shape, options)
     camera = _resized(rig.camera, width, height)
     small = [np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)) for grey in greys]
     poses = [_poses(rig, shutter, motion, side, frame, height) for frame in FRAMES]
@@ -128,9 +128,9 @@ def sweep_frames(
     return first, second
 
 
-def search_size(height: int, width: int, options: SweepOptions) -> tuple[int, int]:
-    """Rows and columns at which frames of a size are compared."""
-    return max(height // options.shrink, 8), max(width // options.shrink, 8)
+def search_size(shape: tuple[int, ...], options: SweepOptions) -> tuple[int, int]:
+    """Rows and columns at which frames (H, W) are compared."""
+    return max(shape[0] // options.shrink, 8), max(shape[1] // options.shrink, 8)
 
 
 def _resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:

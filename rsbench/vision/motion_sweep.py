@@ -126,7 +126,7 @@ def census(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
 
 
 @compiled(error_model="numpy", inline="always")
-def ones(bits: np.uint32) -> int:
+def ones(bits: np.uint32) -> np.int64:
     """Number of bits that are 1 (Warren, "Hacker's delight", 2002)."""
     n = np.uint64(bits)
     n -= (n >> np.uint64(1)) & np.uint64(0x5555555555555555)
