@@ -68,7 +68,7 @@ def score_pair(folder: Path, focal: float) -> tuple[Scores, float]:
     bare = MonoFusionOptions(fill=False, inpaint=False)
     still = OwnMotion(rig=found.own.rig, shutter=shutter, side="left", motion=None)
     flowed = MonoFusion([first, second], still, flows, bare).corrected(1, target)
-    covered = flowed.origin == Origin.HERE
+    covered = flowed.origin != Origin.NOBODY
     estimates = (second, flowed.image, inpaint(flowed.image, ~covered), ours.image)
     scores = {
         method: (psnr(estimate, truth), psnr(estimate, truth, covered))

@@ -82,13 +82,15 @@ def flow_matches(flows: Flows, rng: np.random.Generator) -> FloatArray:
     """Matches (n, 4) x0, y0, x1, y1 at random pixels of frame 1 whose flow returns to where it began."""
     flow = flows.flow[1]
     height, width = flow.shape[:2]
-    x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    here = np.stack([x, y], axis=-1)
-    there = here + flow.astype(np.float64)
-    inside = np.all((there >= 0.0) & (there <= (width - 1, height - 1)), axis=-1)
+    x, y = (
+        flow[..., 0] + np.arange(width, dtype=np.float32),
+        flow[..., 1] + np.arange(height, dtype=np.float32)[:, None],
+    )
+    inside = (x >= 0.0) & (x <= width - 1) & (y >= 0.0) & (y <= height - 1)
     good = np.flatnonzero(inside & (flows.returns[1] < _RETURNS_PX))
     chosen = rng.choice(good, min(_MATCHES, good.size), replace=False)
-    return np.concatenate([there.reshape(-1, 2)[chosen], here.reshape(-1, 2)[chosen]], axis=-1)
+    here = np.stack([chosen % width, chosen // width], axis=-1).astype(np.float64)
+    return np.concatenate([here + flow.reshape(-1, 2)[chosen], here], axis=-1)
 
 
 def find_own_motion(

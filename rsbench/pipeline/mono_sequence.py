@@ -1,6 +1,7 @@
-"""Frames of one camera, any number of them, corrected in order, each with the frame before it.
+"""Frames of one camera, any number of them, corrected in order, each with the frame before or after it.
 
-A frame that does not go on from the one before it, as after a cut, is corrected with the one after it.
+That is the one nearer to the target's time, for a camera's speed changes; the other one fills what neither of
+these shows. A frame that does not go on from the one before it, as after a cut, is corrected with the next one.
 """
 
 from __future__ import annotations
@@ -10,14 +11,14 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import StereoRig
+from rsbench.core.rig import FRAMES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import CameraCard, check_alike
@@ -35,7 +36,7 @@ from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.pipeline.turned_frames import Turned, turned
 from rsbench.vision.closing import close_narrow
 from rsbench.vision.fusion import Fused
-from rsbench.vision.mono_fusion import MonoFusion, MonoFusionOptions, find_flows
+from rsbench.vision.mono_fusion import Beyond, MonoFusion, MonoFusionOptions, find_flows
 
 _AT_ONCE = 2
 """Pairs that are worked on at once: the rest of a pair's work fills the second of two cores."""
@@ -108,34 +109,46 @@ def correct_frames(
     """
     options = options or MonoOptions()
     turn = turned(camera, shutter)
-    waits: MonoMoment | None = None
-    held = list[MonoMoment]()  # of a first pair that is refused where no other frame follows
-    number = 0
-    for number, before, image, pair in _pairs(frames, turn, options, done, gyro):
-        yield from held
-        held.clear()
-        if pair is None:
+    held: MonoMoment | None = None
+    each: _Frame | None = None
+    for each in _with_neighbours(_pairs(frames, turn, options, done, gyro)):
+        if each.number < done:
             continue
-        if number == 1 and done == 0:
-            waits = _unmoved(0, before, pair.reason)
-        if waits is not None:
-            held.append(_corrected(0, waits, pair, turn, options) if pair.fusion else waits)
-        now, waits = _unmoved(number, image, pair.reason), None
-        # A camera that stood still is in place; the same frame twice stands for one that was not taken.
-        stays = pair.reason == STILL and not np.array_equal(before, image)
-        if pair.fusion or stays:
-            held.append(_corrected(1, now, pair, turn, options) if pair.fusion else now)
-        else:
-            waits = now
-        if number > 1 or pair.fusion:
-            yield from held
-            held.clear()
-    if number == 0:
+        if each.number == 1 and each.after is None and each.before and not each.before.fusion:
+            raise RsbenchError(f"frames: {each.before.reason}")
+        if held is not None:
+            yield held
+        held = _moment(each, turn, options)
+        if each.number > 0:  # a first one waits for whether others follow the second
+            yield held
+            held = None
+    if each is None:
         raise RsbenchError("frames: fewer than two; one camera shows its motion in at least two")
-    if held:
-        raise RsbenchError(f"frames: {held[0].fused.reason}")
-    if waits is not None:
-        yield waits
+
+
+class _Frame(NamedTuple):
+    """A frame and what is known of it and its neighbours; None where there is none, or it is done."""
+
+    number: int
+    image: NDArray[Any]
+    previous: NDArray[Any] | None
+    before: _Pair | None
+    """The frame before it and the frame."""
+    after: _Pair | None
+
+
+def _with_neighbours(
+    pairs: Iterator[tuple[int, NDArray[Any], NDArray[Any], _Pair | None]],
+) -> Iterator[_Frame]:
+    """Each frame of those of ``_pairs``."""
+    previous: NDArray[Any] | None = None
+    before: _Pair | None = None
+    last: tuple[int, NDArray[Any]] | None = None
+    for number, first, second, after in pairs:
+        yield _Frame(number - 1, first, previous, before, after)
+        previous, before, last = first, after, (number, second)
+    if last is not None:
+        yield _Frame(*last, previous, before, None)
 
 
 def _pairs(
@@ -226,15 +239,26 @@ def _unmoved(number: int, image: NDArray[Any], reason: str) -> MonoMoment:
     return MonoMoment(number=number, image=image, fused=fused, found=None)
 
 
-def _corrected(place: int, unmoved: MonoMoment, pair: _Pair, turn: Turned, options: MonoOptions) -> MonoMoment:
-    """The first or second frame of a pair; the first of all has nothing before it to be skipped."""
-    assert pair.fusion is not None
-    row = options.target_row
-    line = (turn.camera.height - 1) / 2 if row is None else turn.line(row)
-    fused = pair.fusion.corrected(place, float(turn.shutter.time_after(line, place, "left")))
-    fused = close_narrow(fused) if options.close else fused
-    skipped = unmoved.fused.reason if place == 0 and unmoved.number > 0 else ""
-    return replace(unmoved, fused=turn.back(fused), found=turn.found(pair.found), skipped=skipped)
+def _moment(each: _Frame, turn: Turned, options: MonoOptions) -> MonoMoment:
+    """A frame corrected with one neighbour, filled from both; or as it was read, with the reason."""
+    line = (turn.camera.height - 1) / 2 if options.target_row is None else turn.line(options.target_row)
+    times = [float(turn.shutter.time_after(line, place, "left")) for place in FRAMES]
+    ways = [(each.before, 1), (each.after, 0)]
+    if line > (turn.camera.height - 1) / 2:
+        ways.reverse()
+    good = [
+        (pair.fusion, place, pair.found) for pair, place in ways if pair is not None and pair.fusion is not None
+    ]
+    why = "" if each.before is None else each.before.reason
+    # A camera that stood still is in place; the same frame twice stands for one that was not taken.
+    stays = why == STILL and each.previous is not None and not np.array_equal(each.previous, each.image)
+    if stays or not good:
+        return _unmoved(each.number, each.image, why or (each.after.reason if each.after else ""))
+    fusion, place, found = good[0]
+    beyond = Beyond(good[1][0], good[1][1], times[good[1][1]]) if len(good) > 1 else None
+    fused = fusion.corrected(place, times[place], beyond)
+    fused = turn.back(close_narrow(fused) if options.close else fused)
+    return MonoMoment(number=each.number, image=each.image, fused=fused, found=turn.found(found), skipped=why)
 
 
 def translation_record(found: FoundOwnMotion) -> dict[str, Any]:

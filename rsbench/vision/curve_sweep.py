@@ -26,13 +26,20 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.vision.compiled_camera import across_lines
 from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.motion_sweep import census, ones
-from rsbench.vision.reprojection import Reprojection, parallax_gain, reproject, reproject_pixels, reprojection_of
+from rsbench.vision.reprojection import (
+    Reprojection,
+    homography,
+    land,
+    parallax_gain,
+    reproject_pixels,
+    reprojection_of,
+)
 from rsbench.vision.semiglobal import aggregated, winners
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-_BIT, _LEVEL, _LEVELS = 6.0, 4.0, 16.0
+_BIT, _LEVEL, _LEVELS = 6, 4, 16
 """Costs of a differing bit of 24 and of a grey level, of which at most so many count: 208 together."""
 _NOWHERE = 90
 """Cost of a place outside the other frame, between those of like and of unlike places."""
@@ -97,7 +104,7 @@ def sweep_frames(
         most: largest inverse depth.
         options: see there.
     """
-    height, width = (max(size // options.shrink, 8) for size in greys[0].shape)
+    height, width = search_size(greys[0].shape, options)
     camera = _resized(rig.camera, width, height)
     small = [np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)) for grey in greys]
     poses = [_poses(rig, shutter, motion, side, frame, height) for frame in FRAMES]
@@ -119,6 +126,11 @@ def sweep_frames(
     least = options.agree_px / max(gain, 1e-12)
     first, second = (Swept(rhos[i], _agrees(rhos[i], rhos[1 - i], maps[i], least)) for i in FRAMES)
     return first, second
+
+
+def search_size(shape: tuple[int, ...], options: SweepOptions) -> tuple[int, int]:
+    """Rows and columns at which frames (H, W) are compared."""
+    return max(shape[0] // options.shrink, 8), max(shape[1] // options.shrink, 8)
 
 
 def _resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
@@ -164,18 +176,22 @@ def _fill_volume(
 ) -> None:
     """Costs (h, w, n) of the inverse depths 0, step, 2 step, ... of every pixel."""
     height, width, count = volume.shape
-    lines = len(maps.A)
+    last = len(maps.A) - 1
     for y in range(height):
         for x in range(width):
-            line = y
+            costs, own, own_code, line = volume[y, x], np.int64(grey[y, x]), code[y, x], min(y, last)
+            M, b = homography(x, y, line, maps)
             for k in range(count):
+                u, v, _ = land(M, b, k * step, maps.lens)
                 # One plane further changes the row by one at most: its pose is that of the last landing.
-                u, v, _ = reproject(x, y, k * step, line, maps)
                 along = across_lines(maps.there, u, v)
-                if -lines < along < 2 * lines:
-                    line = min(max(int(along + 0.5), 0), lines - 1)
-                volume[y, x, k] = _NOWHERE
+                seen_by = min(max(int(along + 0.5), 0), last) if -last < along < 2 * last else line
+                if seen_by != line:
+                    line = seen_by
+                    M, b = homography(x, y, line, maps)
                 if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
                     ty, tx = int(v + 0.5), int(u + 0.5)
-                    apart = min(abs(float(grey[y, x]) - float(other[ty, tx])), _LEVELS)
-                    volume[y, x, k] = np.uint8(_BIT * ones(code[y, x] ^ other_code[ty, tx]) + _LEVEL * apart)
+                    apart = min(abs(own - np.int64(other[ty, tx])), _LEVELS)
+                    costs[k] = _BIT * ones(own_code ^ other_code[ty, tx]) + _LEVEL * apart
+                else:
+                    costs[k] = _NOWHERE

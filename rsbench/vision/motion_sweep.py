@@ -126,13 +126,13 @@ def census(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
 
 
 @compiled(error_model="numpy", inline="always")
-def ones(bits: np.uint32) -> int:
+def ones(bits: np.uint32) -> np.int64:
     """Number of bits that are 1 (Warren, "Hacker's delight", 2002)."""
-    n = np.int64(bits)
-    n -= (n >> 1) & 0x55555555
-    n = (n & 0x33333333) + ((n >> 2) & 0x33333333)
-    n = (n + (n >> 4)) & 0x0F0F0F0F
-    return int((n * 0x01010101) & 0xFFFFFFFF) >> 24
+    n = np.uint64(bits)
+    n -= (n >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    n = (n & np.uint64(0x3333333333333333)) + ((n >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    n = (n + (n >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((n * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
 @compiled(error_model="numpy")

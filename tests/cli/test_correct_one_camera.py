@@ -16,8 +16,11 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.dataset import corrected_frames
-from rsbench.pipeline.mono_sequence import MonoMoment, correct_frames
+from rsbench.pipeline.mono_correction import MonoFusionCorrector
+from rsbench.pipeline.mono_sequence import MonoMoment, MonoOptions, correct_frames
 from rsbench.storage.files import read_png, write_png
+from rsbench.vision.fusion import Fused, Origin
+from rsbench.vision.mono_fusion import MonoFusionOptions
 
 SPEED, SIZE = 12.0, (120, 160)
 """px to the right per frame period, of a texture that reaches far beyond the frames; rows, columns."""
@@ -222,6 +225,55 @@ def test_lines_may_be_read_from_any_side(scan: Scan) -> None:
         truth, inner = turn(_seen(np.full(SIZE[0], frame + 0.5))).astype(float), np.s_[20:-20, 20:-20]
         before = np.sqrt(np.mean((moment.image - truth)[inner] ** 2))
         assert np.sqrt(np.mean((moment.fused.image - truth)[inner] ** 2)) < 0.25 * before
+
+
+def _place(tau: np.ndarray) -> np.ndarray:
+    """Of a camera whose speed grows by a sixth in a frame, which the farther of both neighbours does not show."""
+    return 0.5 * tau + 0.06 * tau**2
+
+
+def _second(frames: list[np.ndarray], place: int, row: float) -> Fused:
+    """One of the frames at the time of a row, bare."""
+    corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=False))
+    options = MonoOptions(corrector=corrector, target_row=row, close=False)
+    shutter = RollingShutter(height=SIZE[0], width=SIZE[1], readout_ratio=1.0)
+    camera = PinholeCamera.centred(SIZE[1], SIZE[0], 160.0)
+    return list(correct_frames(frames, camera, shutter, options))[place].fused
+
+
+def _accelerated(row: float) -> tuple[list[np.ndarray], np.ndarray]:
+    """Three frames, and the truth of the second at the time of a row."""
+    frames = [_seen(_place(frame + np.arange(SIZE[0]) / SIZE[0])) for frame in range(3)]
+    return frames, _seen(_place(np.full(SIZE[0], 1.0 + row / SIZE[0]))).astype(float)
+
+
+@pytest.mark.parametrize("last", [False, True])
+def test_a_frame_is_corrected_with_the_neighbour_nearer_in_time(last: bool) -> None:
+    row = SIZE[0] - 1.0 if last else 0.0
+    frames, truth = _accelerated(row)
+    found = _second(frames, 1, row)
+    alone = _second(frames[:2], 1, row), _second(frames[1:], 0, row)
+    errors = [np.sqrt(np.mean((each.image - truth)[20:-20, 30:-30] ** 2)) for each in (found, *alone)]
+    seen = alone[last].origin == Origin.HERE
+    np.testing.assert_array_equal(found.image[seen], alone[last].image[seen])
+    assert errors[0] < 0.7 * errors[2 - last]
+
+
+def test_what_a_frame_and_its_neighbour_do_not_show_is_taken_from_the_other_one() -> None:
+    """The texture comes in from the left: what the second frame lacks there, only the third one shows."""
+    row = (SIZE[0] - 1) / 2
+    frames, truth = _accelerated(row)
+    two, three = _second(frames[:2], 1, row), _second(frames, 1, row)
+    holes, left = two.origin == Origin.NOBODY, three.origin == Origin.NOBODY
+    assert np.mean(holes) > 0.005 and np.sum(left) < 0.2 * np.sum(holes)
+    filled = holes & ~left
+    assert np.all(three.origin[filled] == Origin.OTHER_FRAME)
+    np.testing.assert_array_equal(three.image[~holes], two.image[~holes])
+    # A texture that is 20 px off has 1.4 times its own deviation, about 35 levels.
+    assert np.sqrt(np.mean((three.image - truth)[filled] ** 2)) < 12.0
+    # Its depth is in the unit of the frame's own, though the pairs have each their own.
+    ratio = np.median(three.depth[filled]) / np.median(three.depth[~holes])
+    assert 0.7 < ratio < 1.4
 
 
 def test_a_camera_may_be_intrinsics_a_field_of_view_or_nothing() -> None:
