@@ -8,6 +8,7 @@ does not know is NaN in it; it scores the worst value of everything.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -99,6 +100,17 @@ class TrueTrajectory:
         points = back_project(*geometry, "left", middle, grid[depth > 0.0], depth[depth > 0.0])
         return cls(sequence=sequence, points=points, estimate=along(sequence.motion, sequence.frames - 1))
 
+    @cached_property
+    def seen(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Of each left frame: the points (n, 3) in the body when they are seen, NaN where not, and when (n,)."""
+        sequence, found = self.sequence, list[tuple[FloatArray, FloatArray]]()
+        for frame in range(sequence.frames):
+            seen = rs_project(sequence.rig, sequence.shutter, sequence.motion, "left", frame, self.points)
+            rays = sequence.rig.camera.unproject(seen.pixels)
+            tau = np.where(np.isfinite(seen.tau), seen.tau, float(frame))
+            found.append((seen.depth[:, None] * rays - sequence.rig.offset("left"), tau))
+        return found
+
 
 def scored_times(shutter: RollingShutter, frame: int, count: int = LINES) -> FloatArray:
     """Times (count,) of lines of the left camera, even from the first to the last one."""
@@ -151,13 +163,9 @@ def _jitter(truth: TrueTrajectory, estimate: Estimate) -> float:
 
 def _corrected_places(truth: TrueTrajectory, estimate: Estimate) -> FloatArray:
     """Where points (frames, n, 2) stand in left frames corrected with a trajectory and their true depth, px."""
-    sequence, places = truth.sequence, list[FloatArray]()
-    rig, offset = sequence.rig, sequence.rig.offset("left")
-    for frame in range(sequence.frames):
-        seen = rs_project(rig, sequence.shutter, sequence.motion, "left", frame, truth.points)
-        x = seen.depth[:, None] * rig.camera.unproject(seen.pixels) - offset
-        tau = np.where(np.isfinite(seen.tau), seen.tau, float(frame))
-        at_start = transform(inverse(estimate.within(frame, tau)), x) + offset
+    rig, places = truth.sequence.rig, list[FloatArray]()
+    for frame, (x, tau) in enumerate(truth.seen):
+        at_start = transform(inverse(estimate.within(frame, tau)), x) + rig.offset("left")
         at_start[~np.isfinite(at_start[:, 2]) | (at_start[:, 2] <= 0.0)] = np.nan
         places.append(rig.camera.project(at_start))
     return np.stack(places)
