@@ -219,10 +219,16 @@ def main() -> int:
     parser.add_argument("--sweep", nargs="*", default=list(SWEEPS), choices=list(SWEEPS))
     parser.add_argument("--trials", type=int, default=10)
     options = parser.parse_args()
+    if options.trials < 1:
+        parser.error(f"--trials {options.trials}: must be 1 or more")
+    if options.out:  # before an hour has passed
+        try:
+            options.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            parser.error(f"--out {options.out}: {error.strerror}; choose another folder")
     found = pd.concat([table(each, options.trials) for each in options.sweep])
     sys.stdout.write("\n".join(shown(found)) + "\n")
     if options.out:
-        options.out.mkdir(parents=True, exist_ok=True)
         write_table(options.out / "rows.csv", found)
         command = f"python benchmarks/trajectory_sweep.py --out {options.out.as_posix()}"
         write_json(options.out / "provenance.json", provenance(command, trials=options.trials, seeds="0 and on"))

@@ -40,14 +40,15 @@ def estimate_trajectory(
         features: name or card of the feature matcher, where frames are given.
         seed: of the search for motions of single windows.
         gyro: (n, 4) samples of a gyroscope, as of ``Correspondences``, tau in frame periods of the sequence. Bias,
-            noise and a clock that is off by up to half a frame period are found; the shutter is found without it.
+            noise, a clock that is off by up to half a frame period, and axes and scales that are off by some
+            degrees and hundredths are found; the shutter is found without it.
 
     Returns:
         ``motion``: ``body_from_world(tau)`` at any times in frame periods, seen from the body at time 0;
         ``covariance(tau)`` and ``covariance_between(start, tau)`` (n, 6, 6) of turns about the body's axes,
         radians, and of its position, metres; ``shutter``; ``noise_px``; for each window ``inliers`` and
         ``supported``, False where its own matches do not carry it and the spline bridges it; ``gyro``: ``bias``,
-        ``shift``, ``noise`` and whether it is ``used``, which one is not that contradicts the matches.
+        ``shift``, ``matrix``, ``noise`` and whether it is ``used``, which one is not that contradicts the matches.
 
     Raises:
         ValueError: an argument of another type or out of its range; no tracks.

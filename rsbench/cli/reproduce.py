@@ -29,7 +29,7 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench reproduce boards --out results --data data       [dim](tracks of frames, 216 sequences: 3 hours)[/dim]
 
-  rsbench reproduce handheld --out results --data data     [dim](trajectories of 9 sequences)[/dim]
+  rsbench reproduce handheld --out results --data data     [dim](footage from hands: an hour of a core)[/dim]
 
   rsbench reproduce everything                             [dim](hours; goes on where it stopped)[/dim]"""
 
