@@ -81,13 +81,14 @@ def correct(
 def _correct_given(given: Given, target: str, options: CorrectionOptions, close: bool) -> None:
     """Exit 1 where no motion or no correction is found; ``close``: narrow holes of corrected frames."""
     from rsbench.capture.settle import NoMotionError
+    from rsbench.cli.compile_ahead import compiling_ahead
     from rsbench.pipeline.isolated_parts import Isolation
     from rsbench.vision.closing import close_narrow
     from rsbench.vision.corrector import NotCorrectedError
 
     finish: Finish = close_narrow if close else lambda fused: fused
     try:
-        with Isolation() as isolation:
+        with compiling_ahead(), Isolation() as isolation:
             options = isolation.chain(options)
             if given.four:
                 _correct_four(given.four, given.card, given.out, target, options, finish)

@@ -14,12 +14,14 @@ def demo(
 ) -> None:
     """Render one sequence at the paper's setting, solve, correct and score it, and write a report."""
     from rsbench.benchmark.images.plan import EvaluationOptions
+    from rsbench.cli.compile_ahead import compiling_ahead
     from rsbench.cli.evaluate import evaluate_dataset
     from rsbench.cli.generate import generate
 
-    generate("paper", str(out / scene), [scene], workers=1)
-    options = EvaluationOptions(solvers=("rs-stereo-refined", "rs-stereo-linear", "gs-8pt"))
-    evaluate_dataset(out / scene, out / f"{scene}-evaluation", options, "rsbench demo")
+    with compiling_ahead():
+        generate("paper", str(out / scene), [scene], workers=1)
+        options = EvaluationOptions(solvers=("rs-stereo-refined", "rs-stereo-linear", "gs-8pt"))
+        evaluate_dataset(out / scene, out / f"{scene}-evaluation", options, "rsbench demo")
 
 
 def register(app: typer.Typer) -> None:

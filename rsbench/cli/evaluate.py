@@ -207,12 +207,13 @@ def evaluate_dataset(
     """
     from rsbench.benchmark.images.evaluation import open_evaluation
     from rsbench.benchmark.images.plan import EvaluationOptions
+    from rsbench.cli.compile_ahead import compiling_ahead
     from rsbench.cli.console import print_table, progress_bar
     from rsbench.report.evaluation_page import summary_tables, write_report
     from rsbench.storage.mirror import name_of
 
     evaluation = open_evaluation(folder, out, options or EvaluationOptions(solvers=tuple(every_solver())))
-    with progress_bar(f"evaluating {folder.name}", evaluation.steps) as advance:
+    with compiling_ahead(), progress_bar(f"evaluating {folder.name}", evaluation.steps) as advance:
         stale = evaluation.run(command, advance, workers)
     for table in summary_tables(out):
         print_table(table.title, table.brief)
