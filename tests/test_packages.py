@@ -90,6 +90,10 @@ def test_the_metadata_say_what_an_index_shows(built: Built) -> None:
     assert found["Description-Content-Type"] == "text/markdown" and found["Summary"]
     shown = MarkdownIt("commonmark").enable("table").render(str(found.get_payload()))
     assert shown.startswith("<h1>rsbench</h1>") and shown.count("<table>") == 3
+    links, repository = re.findall(r'(?:href|src)="(.*?)"', shown), "https://github.com/rsbench/rsbench"
+    assert f"{repository}/raw/main/docs/before-after.gif" in links and all("://" in link for link in links)
+    for kind, path in re.findall(rf"{repository}/(blob|raw)/main/([^#\s]+)", "\n".join(links)):
+        assert (ROOT / path).is_file(), (kind, path)
 
 
 def test_version_and_day_are_those_of_citation_and_changelog() -> None:

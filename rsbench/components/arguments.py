@@ -91,10 +91,13 @@ def check_rows(rig: StereoRig, shutter: RollingShutter) -> None:
 
 
 def world_points(points: ArrayLike) -> FloatArray:
-    """Points (..., 3) as float64; raises ValueError on another shape."""
+    """Points (..., 3) as float64; raises ValueError on another shape, and on numbers that no scene has."""
     array = given.real_array("points", points)
     if array.ndim == 0 or array.shape[-1] != 3:
         raise ValueError(f"points: must have shape (..., 3), got {array.shape}")
+    far = np.abs(array) > given.LARGEST_M  # NaN is no point, and seen by nobody
+    if np.any(far):
+        raise ValueError(f"points: must lie within {given.LARGEST_M:g} m, got {array[far][0]:g}")
     return array
 
 

@@ -61,7 +61,9 @@ class PinholeCamera:
 
     @classmethod
     def centred(cls, width: int, height: int, focal: float) -> PinholeCamera:
-        """Square pixels and the principal point in the middle of the image."""
+        """Square pixels and the principal point in the middle of the image; ValueError as of the class."""
+        for name, size in (("width", width), ("height", height)):
+            given.check_whole(f"camera {name}", size, 1, given.LARGEST_SIZE)
         return cls(width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2)
 
     @property

@@ -78,7 +78,9 @@ def _plain(value: float) -> float:
 
 
 def real_array(name: str, value: ArrayLike) -> FloatArray:
-    """A copy as float64; raises ValueError unless it is an array of real numbers, finite or not."""
+    """A copy as float64; raises ValueError unless it is an array of real numbers, finite or not, none masked."""
+    if isinstance(value, np.ma.MaskedArray):
+        raise ValueError(f"{name} must not be a masked array: give what counts, or NaN where that is allowed")
     if isinstance(value, np.ndarray) and value.dtype == np.float64:
         return np.array(value)
     try:

@@ -123,7 +123,15 @@ def test_functions_refuse_what_is_no_rig_shutter_or_motion() -> None:
         refused(lambda wrong=wrong: ANY.simulate(wrong, shutter, motion))
     refused(lambda: ANY.simulate(rig, rig, motion))
     refused(lambda: ANY.simulate(rig, shutter, [0.1, 0.2, 0.3]))
-    refused(lambda: ANY.project(["a", "b", "c"], rig, shutter, motion))
+    for points in (
+        ["a", "b", "c"],
+        [0.0, 1e300, 1.0],
+        [np.inf, 0.0, 1.0],
+        np.ma.masked_array(np.ones(3), [False, True, False]),
+    ):
+        refused(lambda points=points: ANY.project(points, rig, shutter, motion))
+    for size in (("32", 24), (None, 24), (32.5, 24), (32, True)):
+        refused(lambda size=size: ANY.PinholeCamera.centred(*size, 30.0))
     refused(lambda: ANY.estimate_motion(ANY.Correspondences(), rig, shutter, threshold_px=True))
 
 
