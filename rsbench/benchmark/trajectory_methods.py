@@ -120,7 +120,8 @@ def _windows(model: str | None) -> Callable[[Given], Estimate]:
         options, motions = CorrectionOptions(motion_model=model, seed=given.seed), list[Motion | None]()
         for matches in given.matches:
             try:
-                motions.append(find_motion(matches, given.rig, given.shutter, options).motion)
+                found = find_motion(matches, given.rig, given.shutter, options, splines=False)
+                motions.append(found.motion)
             except NoMotionError:
                 motions.append(None)
         return chained(motions)

@@ -273,17 +273,40 @@ def choose_model(capture: Capture, asked: str = AUTO) -> ModelChoice | None:
     rival = next((name for name in probability if name != used), "")
     d = motion_at(capture.peaks[used]).d
     other = motion_at(capture.peaks[rival]).d if rival else d
-    length = max(float(np.linalg.norm(d)), 1e-12)
+    angle, percent = _apart(d, other)
     return ModelChoice(
         used=used,
         parameters=_parameters(capture.peaks[used]),
         probability=probability,
         decided=used == best and probability[best] >= CERTAIN,
         rival=rival,
-        d_angle_deg=float(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(d, other)), d @ other))),
-        d_length_percent=100.0 * (float(np.linalg.norm(other)) / length - 1.0),
+        d_angle_deg=angle,
+        d_length_percent=percent,
         spread=spread_by_unknowns(capture.peaks[used]),
     )
+
+
+def spline_choice(choice: ModelChoice | None, spline: Motion, law: Motion, probability: float) -> ModelChoice:
+    """The choice of a spline of that probability, in place of the law that was used, chosen or not."""
+    laws = {law.name: 1.0} if choice is None else choice.probability
+    angle, percent = _apart(spline.d, law.d)
+    return ModelChoice(
+        used=spline.name,
+        parameters={},
+        probability={spline.name: probability, **{name: (1.0 - probability) * p for name, p in laws.items()}},
+        decided=True,
+        rival=law.name,
+        d_angle_deg=angle,
+        d_length_percent=percent,
+        spread=np.zeros((6, 6)),
+    )
+
+
+def _apart(d: FloatArray, other: FloatArray) -> tuple[float, float]:
+    """Angle between two translations, degrees, and by how many per cent the other one is longer."""
+    angle = np.rad2deg(np.arctan2(np.linalg.norm(np.cross(d, other)), d @ other))
+    length = max(float(np.linalg.norm(d)), 1e-12)
+    return float(angle), 100.0 * (float(np.linalg.norm(other)) / length - 1.0)
 
 
 def _parameters(peak: Peak) -> dict[str, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rsbench.capture.trajectory_poses import Views, blank_views, fill_views
-from rsbench.capture.trajectory_spline import Curve
+from rsbench.capture.trajectory_spline import Curve, evaluate
 from rsbench.core import so3
 from rsbench.core.so3 import FloatArray
 
@@ -61,3 +61,19 @@ def _block(inverse: FloatArray, a: Views, b: Views) -> FloatArray:
     low = np.minimum(rows[:, :, None], columns[:, None])
     high = np.maximum(rows[:, :, None], columns[:, None])
     return inverse[low, high - low]
+
+
+def motion_covariance(curve: Curve, inverse: FloatArray, start: float) -> FloatArray | None:
+    """Covariance (6, 6) of w and d, of the motion over a period, seen from the body at its start."""
+    (here, there), _, _ = evaluate(curve, np.array([start, start + 1.0]))
+    R = here[1] @ here[0].T
+    t = there[1] - R @ there[0]
+    # w moves by J^-1 of a turn of the body about its own axes, and t = -R p by that turn and by p.
+    by = np.zeros((6, 6))
+    by[:3, :3] = np.linalg.inv(so3.left_jacobian(so3.log(R)))
+    by[3:, :3], by[3:, 3:] = -so3.hat(t), -R
+    try:
+        between = covariance_between(curve, inverse, start, np.array([start + 1.0]))[0]
+    except ValueError:  # the band is too narrow
+        return None
+    return np.asarray(by @ between @ by.T)

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from rsbench.capture.trajectory_choice import choose
-from rsbench.capture.trajectory_covariance import covariance_between
+from rsbench.capture.trajectory_covariance import motion_covariance
 from rsbench.capture.trajectory_data import Past, TimedTracks, pack_windows, telling, thinned
 from rsbench.capture.trajectory_estimate import TrajectoryOptions, is_supported, noise_px
 from rsbench.capture.trajectory_fit import (
@@ -29,7 +29,6 @@ from rsbench.capture.trajectory_fit import (
 from rsbench.capture.trajectory_gyro import Drift, GyroFound, GyroSteps, contradicts, gyro_steps
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, part, span_of
 from rsbench.capture.trajectory_start import continued, first_curve, window_motions
-from rsbench.core import so3
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
@@ -187,7 +186,7 @@ class _State:
                 number=number,
                 motion=ContinuousMotion.of(part(found.curve, number + start, number + end, float(number))),
                 body_from_world=evaluate(found.curve, float(number))[0],
-                covariance=_covariance(found.curve, inverse, float(number)),
+                covariance=motion_covariance(found.curve, inverse, float(number)),
                 inliers=right[k],
                 apart=min(abs(number - each) for each in carried),
                 noise_px=noise_px(found.tails),
@@ -215,22 +214,6 @@ class _State:
         self.fit = found
         self.windows, self.motions = self.windows[count:], self.motions[count:]
         self.first, self.fresh = self.first + count, 0
-
-
-def _covariance(curve: Curve, inverse: FloatArray, start: float) -> FloatArray | None:
-    """Covariance (6, 6) of w and d, of the motion over a period, seen from the body at its start."""
-    (here, there), _, _ = evaluate(curve, np.array([start, start + 1.0]))
-    R = here[1] @ here[0].T
-    t = there[1] - R @ there[0]
-    # w moves by J^-1 of a turn of the body about its own axes, and t = -R p by that turn and by p.
-    by = np.zeros((6, 6))
-    by[:3, :3] = np.linalg.inv(so3.left_jacobian(so3.log(R)))
-    by[3:, :3], by[3:, 3:] = -so3.hat(t), -R
-    try:
-        between = covariance_between(curve, inverse, start, np.array([start + 1.0]))[0]
-    except ValueError:  # the band is too narrow
-        return None
-    return np.asarray(by @ between @ by.T)
 
 
 def _marginal(found: Fit, gone: TimedTracks, trust: FloatArray, drop: int) -> Past:

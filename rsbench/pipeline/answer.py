@@ -10,6 +10,7 @@ import numpy as np
 from rsbench.capture.calibration_errors import recalibrated
 from rsbench.capture.estimate import Capture, conclude, examine
 from rsbench.capture.settle import (
+    AUTO,
     ModelChoice,
     NoMotionError,
     as_global,
@@ -24,7 +25,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.track_building import join_stereo
 from rsbench.pipeline.body_motion import body_motion
-from rsbench.pipeline.frame_motion import chosen_model, entry_of, takes_models, widened
+from rsbench.pipeline.frame_motion import chosen_model, entry_of, or_spline, takes_models, widened
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.base import MotionEstimate
@@ -148,7 +149,11 @@ def _under_model(
         choice = chosen_model(asked, start, matches, rig, shutter, options, seed)
     other = entry if choice is None else entry_of(entry, choice)
     result = result if other is entry else runner.robust(other, *given)
-    return other, result if choice is None else widened(result, choice.spread), choice
+    result = result if choice is None else widened(result, choice.spread)
+    law = body_motion(result.estimate, other.solver.spec, rig)
+    if asked == AUTO and isinstance(law, Motion):
+        result, choice, _ = or_spline(result, choice, law, matches, rig, shutter, seed)
+    return other, result, choice
 
 
 def _extras(problem: Problem, result: RobustEstimate, extras: Collection[Extra]) -> Answer:

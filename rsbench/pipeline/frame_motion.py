@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET, recalibrated
-from rsbench.capture.estimate import Capture, conclude, examine
+from rsbench.capture.estimate import CERTAIN, Capture, conclude, examine
 from rsbench.capture.hypotheses import MODELS
 from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.scans import scans_of
@@ -22,8 +22,10 @@ from rsbench.capture.settle import (
     known_of,
     runs_backwards,
     shutter_found,
+    spline_choice,
     spread_by_unknowns,
 )
+from rsbench.capture.shaken import shaken_motion
 from rsbench.capture.trajectory_gyro import GyroFound
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
@@ -40,6 +42,7 @@ from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.kernel_type import load_kernel
 from rsbench.solvers.engine.registry import SolverEntry
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
+from rsbench.solvers.engine.robust_problem import MatchCount
 from rsbench.solvers.refined import RefinedSolver
 
 BACKWARDS = (
@@ -97,11 +100,12 @@ def find_motion(
     options: CorrectionOptions,
     rng: np.random.Generator | None = None,
     capture: Capture | None = None,
+    splines: bool = True,
 ) -> FoundMotion:
     """The body's motion by the solver of the options; ``rng`` draws RANSAC's samples, by default from the seed.
 
     With a motion model in the options the matches decide which is used: by ``capture``, where the shutter was
-    found too, or by a look at the models alone.
+    found too, or by a look at the models alone. With ``auto`` they may ask for a spline, if ``splines`` may be.
 
     Another package's solver answers from a process of its own, within the time limit of its card.
 
@@ -125,7 +129,36 @@ def find_motion(
         robust = widened(robust, spread_by_unknowns(capture.peaks[capture.motion_model]))
     entry = entry if choice is None else entry_of(entry, choice)
     motion, point = motion_of(robust.estimate, entry, rig), entry.solver.spec.reference_point
+    if splines and options.motion_model == AUTO:
+        robust, choice, motion = or_spline(robust, choice, motion, matches, rig, shutter, options.seed)
     return FoundMotion(motion=motion, robust=robust, solver=entry.name, reference_point=point, choice=choice)
+
+
+def or_spline(
+    robust: RobustEstimate,
+    choice: ModelChoice | None,
+    law: Motion,
+    matches: Correspondences,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    seed: int,
+) -> tuple[RobustEstimate, ModelChoice | None, Motion]:
+    """An answer of a solver that ``takes_models``, or in its place a spline, where the matches ask for it."""
+    found = shaken_motion(matches, rig, shutter, law, seed)
+    if found is None or found.probability < CERTAIN:
+        return robust, choice, law
+    motion = found.motion
+    estimate = replace(
+        robust.estimate, w=motion.w, d=motion.d, noise_px=found.noise_px, covariance=found.covariance
+    )
+    count = MatchCount(inliers=int(np.count_nonzero(found.inliers)), matches=len(found.inliers))
+    robust = replace(
+        robust,
+        estimate=estimate,
+        inliers={**robust.inliers, "tracks": found.inliers},
+        counts={**robust.counts, "tracks": count},
+    )
+    return robust, spline_choice(choice, motion, law, found.probability), motion
 
 
 def widened(robust: RobustEstimate, spread: FloatArray) -> RobustEstimate:

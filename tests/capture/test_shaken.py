@@ -1,0 +1,86 @@
+"""A spline in place of a law, of two frames. Truth: points projected at their rows' times (``shaken_rig``)."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from shaken_rig import HEIGHT, RIG, SHAKES, SHUTTER, Law, matches, sines, times
+
+from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
+from rsbench.capture.hypotheses import MODELS
+from rsbench.capture.shaken import shaken_motion
+from rsbench.components.motion_models import make_motion
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.motion import Motion
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_motion import FoundMotion, find_motion
+
+OPTIONS = CorrectionOptions(motion_model="auto")
+
+
+def row_errors(motion: Motion, law: Law) -> FloatArray:
+    """Of the rotations of rows against the first one of their frame, degrees, of both frames."""
+    out = []
+    for frame in (0, 1):
+        tau = times(np.arange(0.0, HEIGHT, 12.0), frame)
+        ours, truth = motion.body_from_world(tau).R, law(tau)[0]
+        ours, truth = ours @ ours[0].T, truth @ truth[0].T
+        out.append(Rotation.from_matrix(ours @ np.swapaxes(truth, 1, 2)).magnitude()[1:])
+    return np.rad2deg(np.concatenate(out))
+
+
+def both(law: Law, rng: np.random.Generator) -> tuple[FoundMotion, FoundMotion]:
+    """What is found of two frames with 20 % outliers and 0.3 px of noise, without splines and with them."""
+    (window,), _ = matches(law, 2, rng)
+    laws, any_ = (find_motion(window, RIG, SHUTTER, OPTIONS, splines=splines) for splines in (False, True))
+    return laws, any_
+
+
+def test_a_rig_that_shakes_is_told_from_one_that_follows_a_law() -> None:
+    """Strongly shaken by sines, which are no spline of ours: rows err by less than half of what the law does."""
+    found = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        law = sines(rng, *SHAKES["strong"])
+        by_law, spline = both(law, rng)
+        assert spline.choice is not None and spline.choice.used == spline.motion.name == "continuous"
+        assert spline.choice.rival == by_law.motion.name and spline.choice.decided
+        assert sum(spline.choice.probability.values()) == pytest.approx(1.0)
+        found.append([np.sqrt(np.mean(row_errors(each.motion, law) ** 2)) for each in (by_law, spline)])
+    by_law, spline = np.median(found, axis=0)
+    assert spline < 0.5 * by_law
+
+
+def test_its_covariance_holds_and_the_answer_is_its_pose_at_one() -> None:
+    """Squared errors over the covariance are chi-squared of 6: 20 draws, whose mean has a deviation of 0.77."""
+    squares = []
+    for seed in range(20):
+        rng = np.random.default_rng(100 + seed)
+        law = sines(rng, 2.0, 0.06, 0.18)
+        estimate = both(law, rng)[1].robust.estimate
+        (R_0, R_1), p = law(np.array([0.0, 1.0]))
+        w = Rotation.from_matrix(R_1 @ R_0.T).as_rotvec()
+        wrong = np.concatenate([estimate.w - w, estimate.d + R_1 @ (p[1] - p[0])])
+        squares.append(wrong @ np.linalg.solve(estimate.covariance, wrong))
+    assert np.median(squares) < 12.0
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_laws_stay_laws(model: str) -> None:
+    more = {"acceleration": 0.3} if model == "accelerated" else {}
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        motion = make_motion(model, 0.05 * rng.normal(size=3), 0.2 * rng.normal(size=3), more)
+        data = simulate(RIG, SHUTTER, motion, SimulationOptions(tracks=300, noise_px=0.3, outlier_ratio=0.2), rng)
+        found = find_motion(data.correspondences, RIG, SHUTTER, OPTIONS)
+        assert found.motion.name in MODELS
+
+
+def test_few_tracks_and_a_global_shutter_ask_for_none() -> None:
+    rng = np.random.default_rng(0)
+    (window,), _ = matches(sines(rng, *SHAKES["strong"]), 2, rng)
+    law = make_motion("linear", [0.0, 0.02, 0.0], [0.1, 0.0, 0.1])
+    still = RollingShutter(height=HEIGHT, readout_ratio=0.0)
+    few = Correspondences(tracks=window.tracks[:20])
+    assert shaken_motion(window, RIG, still, law) is None and shaken_motion(few, RIG, SHUTTER, law) is None
