@@ -82,7 +82,8 @@ def under_model(
     Raises:
         RsbenchError: no such model, or the solver can take no other than its own.
     """
-    from rsbench.pipeline.frame_motion import check_model, chosen_model, entry_of, motion_of, widened
+    from rsbench.capture.settle import AUTO
+    from rsbench.pipeline.frame_motion import check_model, chosen_model, entry_of, motion_of, or_spline, widened
     from rsbench.solvers.engine.robust_motion import estimate_motion
 
     check_model(asked, entry)
@@ -90,8 +91,11 @@ def under_model(
         return found
     start = motion_of(found.estimate, entry, rig)
     choice = chosen_model(asked, start, matches, rig, shutter, options, seed)
-    if choice is None:
-        return found
-    solver, rng = entry_of(entry, choice).solver, np.random.default_rng(seed)
-    again = estimate_motion(matches, rig, shutter, solver, options, rng, entry.options.robust)
-    return replace(widened(again, choice.spread), motion_model=choice.used)
+    if choice is not None:
+        entry, rng = entry_of(entry, choice), np.random.default_rng(seed)
+        found = estimate_motion(matches, rig, shutter, entry.solver, options, rng, entry.options.robust)
+        found = widened(found, choice.spread)
+    if asked == AUTO and found.estimate.success:
+        law = motion_of(found.estimate, entry, rig)
+        found, choice, _ = or_spline(found, choice, law, matches, rig, shutter, seed)
+    return found if choice is None else replace(found, motion_model=choice.used)

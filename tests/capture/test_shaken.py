@@ -62,6 +62,7 @@ def test_its_covariance_holds_and_the_answer_is_its_pose_at_one() -> None:
         (R_0, R_1), p = law(np.array([0.0, 1.0]))
         w = Rotation.from_matrix(R_1 @ R_0.T).as_rotvec()
         wrong = np.concatenate([estimate.w - w, estimate.d + R_1 @ (p[1] - p[0])])
+        assert estimate.covariance is not None
         squares.append(wrong @ np.linalg.solve(estimate.covariance, wrong))
     assert np.median(squares) < 12.0
 
