@@ -17,7 +17,8 @@ from rsbench.capture.trajectory_choice import approximated
 from rsbench.capture.trajectory_covariance import motion_covariance
 from rsbench.capture.trajectory_data import TimedTracks, pack_windows, telling
 from rsbench.capture.trajectory_estimate import Trajectory, TrajectoryOptions, estimate_trajectory
-from rsbench.capture.trajectory_fit import Fit, normal_equations
+from rsbench.capture.trajectory_fit import normal_equations
+from rsbench.capture.trajectory_kernels import Tails
 from rsbench.capture.trajectory_prior import Prior
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, span_of
 from rsbench.core.correspondences import BoolArray, Correspondences
@@ -50,6 +51,42 @@ class Shaken:
     """That the rig moved so, and not by the law."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Spline:
+    """A spline, and the tracks that it was fitted to."""
+
+    found: Trajectory
+    tracks: TimedTracks
+
+    @classmethod
+    def through(
+        cls, window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion, seed: int
+    ) -> _Spline | None:
+        options = TrajectoryOptions(link=False, seed=seed)
+        try:
+            found = estimate_trajectory([window], rig, shutter, [law], options)
+        except (banded.NotDefiniteError, ValueError):
+            return None
+        return cls(found=found, tracks=pack_windows([window], rig, shutter, share=options.share))
+
+    def worth(self, curve: Curve, parameters: float, tails: Tails, trust: FloatArray) -> float:
+        """Logarithm of the likelihood of a spline, less half of log n for each parameter; but for a constant."""
+        found = normal_equations(curve, self.tracks, tails, _NO_PRIOR, trust, want=False)
+        return -found.cost - 0.5 * parameters * float(np.log(len(self.tracks)))
+
+    @property
+    def determined(self) -> float:
+        """Number of its parameters that the matches determine, not the prior (D. MacKay, see ``fit``)."""
+        found = self.found
+        tied = [
+            banded.inner(found.covariance_band, band) / strength
+            for band, strength in zip(
+                found.fit.equations.rough.bands, (found.prior.rotation, found.prior.position), strict=True
+            )
+        ]
+        return 6.0 * (len(found.curve.p) - 1) - float(np.sum(tied))
+
+
 def shaken_motion(
     matches: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion, seed: int = 0
 ) -> Shaken | None:
@@ -58,17 +95,15 @@ def shaken_motion(
     Args:
         law: of largest likelihood, from which the search begins.
     """
-    window, options = telling(matches), TrajectoryOptions(link=False, seed=seed)
+    window = telling(matches)
     if shutter.readout_ratio == 0.0 or len(window.tracks) < _FEWEST:
         return None
-    try:
-        found = estimate_trajectory([window], rig, shutter, [law], options)
-    except (banded.NotDefiniteError, ValueError):
+    spline = _Spline.through(window, rig, shutter, law, seed)
+    if spline is None:
         return None
-    tracks = pack_windows([window], rig, shutter, share=options.share)
+    found, errors = spline.found, (spline.found.fit.tails, spline.found.fit.trust)
     theirs = approximated(law.body_from_world, span_of(1, shutter), _NEAR)
-    gain = _log_likelihood(found.curve, found.fit, tracks) - _log_likelihood(theirs, found.fit, tracks)
-    odds = gain - 0.5 * (_determined(found) - _OF_A_LAW) * float(np.log(len(tracks)))
+    odds = spline.worth(found.curve, spline.determined, *errors) - spline.worth(theirs, _OF_A_LAW, *errors)
     return Shaken(
         motion=found.motion,
         covariance=motion_covariance(found.curve, found.covariance_band, 0.0),
@@ -78,16 +113,25 @@ def shaken_motion(
     )
 
 
-def _log_likelihood(curve: Curve, found: Fit, tracks: TimedTracks) -> float:
-    """Of the tracks that a fit takes for right, under the errors that it found; but for a constant."""
-    return -normal_equations(curve, tracks, found.tails, _NO_PRIOR, found.trust, want=False).cost
+def log_odds_of_opposite(
+    matches: Correspondences,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    opposite: RollingShutter,
+    motion: Motion,
+    seed: int = 0,
+) -> float:
+    """Of the lines being read from the opposite side, or of frames in the wrong order, of a rig that may shake.
 
-
-def _determined(found: Trajectory) -> float:
-    """Number of the spline's parameters that the matches determine, not the prior (D. MacKay, see ``fit``)."""
-    fit, strengths = found.fit, (found.prior.rotation, found.prior.position)
-    tied = [
-        banded.inner(found.covariance_band, band) / strength
-        for band, strength in zip(fit.equations.rough.bands, strengths, strict=True)
-    ]
-    return 6.0 * (len(found.curve.p) - 1) - float(np.sum(tied))
+    Args:
+        opposite: the shutter that is read so.
+        motion: from which the search begins.
+    """
+    window = telling(matches)
+    said, other = (_Spline.through(window, rig, each, motion, seed) for each in (shutter, opposite))
+    if said is None or other is None:
+        return -np.inf if other is None else np.inf
+    tails = min((each.found.fit.tails for each in (said, other)), key=lambda each: each.scale)
+    everything = np.ones(len(said.tracks))
+    here, there = (each.worth(each.found.curve, each.determined, tails, everything) for each in (said, other))
+    return there - here

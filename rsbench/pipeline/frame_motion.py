@@ -20,13 +20,15 @@ from rsbench.capture.settle import (
     backwards_known,
     choose_model,
     known_of,
+    reversed_scans,
     runs_backwards,
     shutter_found,
     spline_choice,
     spread_by_unknowns,
 )
-from rsbench.capture.shaken import shaken_motion
+from rsbench.capture.shaken import log_odds_of_opposite, shaken_motion
 from rsbench.capture.trajectory_gyro import GyroFound
+from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
@@ -50,6 +52,8 @@ BACKWARDS = (
     "is said (scan in the rig's card)"
 )
 
+_BEYOND_DOUBT = 7.0
+"""Logarithm of odds, as of a probability of 0.999."""
 _MOMENTS = 33
 """Of a frame period, at which poses are compared."""
 
@@ -323,7 +327,7 @@ def solve_frames(
         return SolvedFrames(found=None, shutter=shutter, matches=matches, capture=capture)
     at_rest = recalibrated(matches, rig, errors)
     found = replace(find_motion(at_rest, rig, shutter, options, capture=used), calibration=errors)
-    if capture is None and not in_order and _runs_backwards(at_rest, rig, found.motion, shutter, options):
+    if capture is None and not in_order and _runs_backwards(at_rest, rig, found, shutter, options):
         raise RefusedFramesError(BACKWARDS)
     return SolvedFrames(found=found, shutter=shutter, matches=matches, capture=capture)
 
@@ -364,15 +368,26 @@ def find_capture(
 
 
 def _runs_backwards(
-    matches: Correspondences, rig: StereoRig, motion: Motion, shutter: RollingShutter, options: CorrectionOptions
+    matches: Correspondences,
+    rig: StereoRig,
+    found: FoundMotion,
+    shutter: RollingShutter,
+    options: CorrectionOptions,
 ) -> bool:
     """Whether time runs backwards in the frames: their lines then seem to be read from the opposite side.
 
     At a ratio near 0 there is no order to see, and a wrong ratio or focal length is no wrong order: what counts is
-    whether the opposite scan, with the ratio that fits it best, is beyond doubt.
+    whether the opposite scan, with the ratio that fits it best, is beyond doubt. Of a rig that shakes no law
+    tells, but splines under both scans do.
     """
     if shutter.readout_ratio < LEAST_BACKWARDS or not shutter.plain:
         return False
+    if isinstance(found.motion, ContinuousMotion):
+        scans = reversed_scans(scans_of(shutter))
+        opposite = Scanning(scan=scans.left, right_scan=scans.right)  # pyrefly: ignore[bad-argument-type]
+        other = opposite.shutter_of(rig.camera.width, rig.camera.height, shutter.readout_ratio)
+        odds = log_odds_of_opposite(matches, rig, shutter, other, found.motion, options.seed)
+        return odds > _BEYOND_DOUBT
     known = backwards_known(matches, rig, shutter, models_asked(options.motion_model))
-    capture = conclude([examine(matches, rig, known, options.robust, options.seed, motion)])
+    capture = conclude([examine(matches, rig, known, options.robust, options.seed, found.motion)])
     return runs_backwards(capture, scans_of(shutter))

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from shaken_rig import HEIGHT, RIG, SHAKES, SHUTTER, Law, matches, sines, times
+from shaken_rig import HEIGHT, RATIO, RIG, SHAKES, SHUTTER, Law, matches, sines, times
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.capture.hypotheses import MODELS
+from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.shaken import shaken_motion
 from rsbench.components.motion_models import make_motion
 from rsbench.core.correspondences import Correspondences
@@ -14,7 +15,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_motion import FoundMotion, find_motion
+from rsbench.pipeline.frame_motion import FoundMotion, find_motion, solve_frames
 
 OPTIONS = CorrectionOptions(motion_model="auto")
 
@@ -26,7 +27,7 @@ def row_errors(motion: Motion, law: Law) -> FloatArray:
         tau = times(np.arange(0.0, HEIGHT, 12.0), frame)
         ours, truth = motion.body_from_world(tau).R, law(tau)[0]
         ours, truth = ours @ ours[0].T, truth @ truth[0].T
-        out.append(Rotation.from_matrix(ours @ np.swapaxes(truth, 1, 2)).magnitude()[1:])
+        out.append(np.asarray(Rotation.from_matrix(ours @ np.swapaxes(truth, 1, 2)).magnitude())[1:])
     return np.rad2deg(np.concatenate(out))
 
 
@@ -53,9 +54,9 @@ def test_a_rig_that_shakes_is_told_from_one_that_follows_a_law() -> None:
 
 
 def test_its_covariance_holds_and_the_answer_is_its_pose_at_one() -> None:
-    """Squared errors over the covariance are chi-squared of 6: 20 draws, whose mean has a deviation of 0.77."""
+    """Squared errors over the covariance are chi-squared of 6: their median is 5.3 where it is exact."""
     squares = []
-    for seed in range(20):
+    for seed in range(10):
         rng = np.random.default_rng(100 + seed)
         law = sines(rng, 2.0, 0.06, 0.18)
         estimate = both(law, rng)[1].robust.estimate
@@ -76,6 +77,19 @@ def test_laws_stay_laws(model: str) -> None:
         data = simulate(RIG, SHUTTER, motion, SimulationOptions(tracks=300, noise_px=0.3, outlier_ratio=0.2), rng)
         found = find_motion(data.correspondences, RIG, SHUTTER, OPTIONS)
         assert found.motion.name in MODELS
+
+
+@pytest.mark.parametrize("shake", list(SHAKES))
+def test_exchanged_times_of_a_rig_that_shakes_are_refused_and_right_ones_are_not(shake: str) -> None:
+    """A spline bends to most of a wrong order, too, but needs twice the parameters."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        (window,), _ = matches(sines(rng, *SHAKES[shake]), 2, rng, noise=0.1, count=600)
+        found = solve_frames(window, RIG, RATIO, OPTIONS).found
+        assert found is not None and found.motion.name == "continuous"  # and it was not refused
+        exchanged = Correspondences(tracks=np.roll(window.tracks, 4, axis=1))
+        with pytest.raises(RefusedFramesError, match="backwards"):
+            solve_frames(exchanged, RIG, RATIO, OPTIONS)
 
 
 def test_few_tracks_and_a_global_shutter_ask_for_none() -> None:
