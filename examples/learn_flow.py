@@ -221,7 +221,7 @@ def train(net: FlowNet, samples: Samples, steps: int, kept: Path) -> None:
             state = {"net": net.state_dict(), "optimiser": optimiser.state_dict(), "steps": (step + 1, steps)}
             torch.save(state, kept.with_suffix(".part"))
             kept.with_suffix(".part").replace(kept)
-            progress(f"training, {np.mean(losses[-KEEP_EVERY:]):.3f} px off,", step + 1, steps)
+        progress(f"training, {np.mean(losses[-KEEP_EVERY:]):.3f} px off,", step + 1, steps)
 
 
 def restored(net: FlowNet, optimiser: Any, steps: int, kept: Path) -> int:
