@@ -55,7 +55,7 @@ except ImportError:
 SEED, BATCH, RATE, KEEP_EVERY, REACH = 1, 6, 1.5e-3, 50, 2
 WIDTH, WIDEST = 128, 384
 """Columns that are learned from at a time (of rows all, for their times differ), and that are seen at most."""
-HEAD = "| frames | before | after | DIS | gain | better | px off: before | after | DIS |\n" + "|---" * 9 + "|"
+HEAD = "| frames | untrained | trained | DIS | gain of training | better | px off: untrained | trained | DIS |"
 F32 = NDArray[np.float32]
 MIRROR = np.array([1, -1], dtype=np.float32)
 
@@ -267,7 +267,7 @@ def fusion(pair: Pair, flows: Flows, ratio: float) -> MonoFusion:
 
 
 def score_pair(net: FlowNet, pair: Pair, ratio: float, truth: NDArray[Any], shift: F32 | float) -> FloatArray:
-    """(6,) at the middle row's time: PSNR of all pixels, before, after and of DIS, and px off the true shift."""
+    """(6,) at the middle row's time: PSNR of all pixels untrained, trained and of DIS; px off the true shift."""
     height = len(truth)
     grid = PinholeCamera.centred(truth.shape[1], height, 1.0).pixel_grid()
     tau = 1.0 + ratio * (height // 2) / height
@@ -350,7 +350,7 @@ def rendered(name: str, out: Path, workers: int) -> list[Sequence]:
 
 def print_table(net: FlowNet, chosen: argparse.Namespace) -> None:
     held = [score_sequence(net, each) for each in rendered("learn-test", chosen.out / "test", chosen.workers)]
-    lines = [HEAD, line_of(f"`learn-test`, {len(held)} sequences", held)]
+    lines = [HEAD, "|---" * 9 + "|", line_of(f"`learn-test`, {len(held)} sequences", held)]
     for name in ("Carla", "Fastec") if chosen.public else ():
         scores = score_public(net, chosen.public / name)
         lines.append(line_of(f"{name}-RS, {len(scores)} pairs", scores))

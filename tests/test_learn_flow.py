@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import rsbench
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.rig import StereoRig
+from rsbench.core.rig import StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.mono_correction import MonoFusionCorrector
 from rsbench.vision.corrector import CorrectionProblem
@@ -39,7 +39,7 @@ def plane(frame: int) -> NDArray[np.uint8]:
     time = frame + RATIO * y / HEIGHT
     u, v = x - SPEED[0] * time, y - SPEED[1] * time
     waves = (np.sin(0.31 * u + 0.13 * v), np.sin(0.11 * u - 0.37 * v), np.sin(0.05 * u * np.cos(0.3) + 0.21 * v))
-    return np.repeat((127 + 40 * sum(waves))[..., None], 3, axis=-1).round().astype(np.uint8)
+    return np.repeat((127 + 40 * np.sum(waves, axis=0))[..., None], 3, axis=-1).round().astype(np.uint8)
 
 
 def test_the_true_shift_leads_to_what_the_twin_shows(script: ModuleType, smoke_dataset: Path) -> None:
@@ -85,7 +85,7 @@ def test_untrained_it_leaves_the_frame_as_it_was(script: ModuleType) -> None:
 
 
 def test_with_dis_it_is_the_corrector_flow_scaled(script: ModuleType) -> None:
-    images = {("left", frame): plane(frame) for frame in (0, 1)}
+    images: dict[View, NDArray[np.uint8]] = {("left", frame): plane(frame) for frame in (0, 1)}
     rig = StereoRig(camera=PinholeCamera.centred(*SIZE, 200.0), baseline=0.1)
     problem = CorrectionProblem(
         images=images,
