@@ -45,8 +45,8 @@ test: $(STAMP)
 test-extras: $(STAMP)
 	@$(PIP) install --quiet -e '.[view,torch]' datasets --no-build-isolation
 	@NO_SKIPS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest tests/interop/test_view.py \
-	  tests/interop/test_export_training.py tests/interop/test_export_colmap.py tests/jobs/test_dask_jobs.py \
-	  tests/storage/test_s3.py
+	  tests/interop/test_export_training.py tests/interop/test_export_colmap.py tests/test_learn_flow.py \
+	  tests/jobs/test_dask_jobs.py tests/storage/test_s3.py
 
 test-gpu: $(STAMP)
 	@$(BIN)/python -c 'import sys; from rsbench.renderers.backend import probe_cuda; found = probe_cuda(); \
