@@ -11,6 +11,7 @@ import typer
 from rsbench.cli.correct_said import listed
 
 if TYPE_CHECKING:
+    from rsbench.capture.focal_alone import FoundFocal
     from rsbench.core.camera import PinholeCamera
     from rsbench.core.so3 import FloatArray
     from rsbench.pipeline.footage import FrameSource
@@ -160,22 +161,16 @@ def _correct_into(
     Args:
         whole: whether masks and depth are wanted, not the images alone.
     """
-    from rsbench.capture.settle import NoMotionError
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.corrected_frames import written_entries
+    from rsbench.pipeline.mono_focal import PAIRS, find_camera
     from rsbench.pipeline.mono_sequence import correct_frames
-    from rsbench.pipeline.mono_shutter import IN_ORDER, WINDOWS, find_shutter
 
-    height, width = next(iter(source)).shape[:2]
-    camera, corrector = card.camera_of(width, height), options.corrector
-    pairs = WINDOWS if card.readout_ratio is None else IN_ORDER
-    try:
-        with progress_bar("looking at the shutter", min(max(source.count - 1, 1), pairs)) as advance:
-            found = find_shutter(source, source.count, card, corrector.robust, corrector.seed, advance)
-    except NoMotionError as error:
-        typer.echo(f"rsbench: not corrected: {error}", err=True)
-        raise typer.Exit(1) from None
-    record = {**_known(card, camera, found, options), "gyro": gyro is not None}
+    robust, seed, count = options.corrector.robust, options.corrector.seed, max(source.count - 1, 1)
+    found = _shutter(source, card, options)
+    with progress_bar("looking at the camera", min(count, PAIRS if card.focal_unknown else 1)) as advance:
+        camera, focal = find_camera(source, source.count, card, found.shutter, robust, seed, advance)
+    record = {**_known(camera, focal, found, options), "gyro": gyro is not None}
     entries = written_entries(folder)
     with progress_bar("correcting", max(source.count, 1)) as advance:
         for entry in entries:
@@ -183,6 +178,21 @@ def _correct_into(
         moments = correct_frames(source, camera, found.shutter, options, len(entries), gyro)
         record["frames"] = entries + _write(folder, moments, advance, whole=whole)
     return record
+
+
+def _shutter(source: FrameSource, card: OneCameraCard, options: MonoOptions) -> FoundShutter:
+    """Exit 1 where the frames do not show it."""
+    from rsbench.capture.settle import NoMotionError
+    from rsbench.cli.console import progress_bar
+    from rsbench.pipeline.mono_shutter import IN_ORDER, WINDOWS, find_shutter
+
+    corrector, pairs = options.corrector, WINDOWS if card.readout_ratio is None else IN_ORDER
+    try:
+        with progress_bar("looking at the shutter", min(max(source.count - 1, 1), pairs)) as advance:
+            return find_shutter(source, source.count, card, corrector.robust, corrector.seed, advance)
+    except NoMotionError as error:
+        typer.echo(f"rsbench: not corrected: {error}", err=True)
+        raise typer.Exit(1) from None
 
 
 def _options(source: FrameSource, target: str, inpaint: bool | None, seed: int) -> MonoOptions:
@@ -194,7 +204,7 @@ def _options(source: FrameSource, target: str, inpaint: bool | None, seed: int) 
 
 
 def _known(
-    card: OneCameraCard, camera: PinholeCamera, found: FoundShutter, options: MonoOptions
+    camera: PinholeCamera, focal: FoundFocal | None, found: FoundShutter, options: MonoOptions
 ) -> dict[str, Any]:
     """What the correction assumed or found."""
     from rsbench.capture.settle import record_of
@@ -204,7 +214,9 @@ def _known(
     return {
         "units": {"length": _UNIT, "angle": "rad", "time": "frame period", "depth": f"{_UNIT}, 0 = unknown"},
         "camera": {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
-        "focal_length_assumed": card.camera is None and card.fov_deg is None,
+        "focal_length_assumed": focal is not None and not focal.told,
+        "focal_length_estimated": focal is not None and focal.told,
+        "focal_length_sigma": None if focal is None else focal.sigma,
         "scan": found.scan,
         "readout_ratio": found.shutter.readout_ratio,
         "readout_ratio_sigma": None if best is None else best.sigma,
@@ -225,8 +237,13 @@ def _readout(record: dict[str, Any]) -> str:
 
 
 def _focal(record: dict[str, Any]) -> str:
-    how = "assumed: the width of the image" if record["focal_length_assumed"] else "given"
-    return f"{record['camera']['fx']:.1f} px ({how})"
+    text, sigma = f"{record['camera']['fx']:.1f}", record["focal_length_sigma"]
+    if sigma is None:
+        return f"{text} px (given)"
+    how = (
+        "assumed: the width of the image; the frames do not tell it" if record["focal_length_assumed"] else "found"
+    )
+    return f"{text} +- {sigma:.1f} px ({how})"
 
 
 def _say(record: dict[str, Any], out: Path) -> None:
@@ -239,6 +256,7 @@ def _say(record: dict[str, Any], out: Path) -> None:
     told["gyro"] = listed((number, motion["gyro"]) for number, motion in motions if "gyro" in motion)
     corrected = sum("reason" not in each for each in record["frames"])
     typer.echo(f"readout ratio {_readout(record)}")
+    typer.echo(f"focal length {_focal(record)}")
     typer.echo(f"{corrected} of {len(record['frames'])} frames corrected")
     place = out if out.is_file() else out / "report.html"
     typer.echo(f"{'video' if out.is_file() else 'report'}: {place.resolve()}")
