@@ -32,8 +32,9 @@ _MATCHES, _SAMPLES = 400, 100
 _MODELS = ("inertial", "accelerated")
 _NEARBY, _ROUNDS = 0.3, 4
 """Share of a focal length that is found at once; one that is off by more is looked for again from there."""
-_LEAST_TURN = np.deg2rad(1.0)
-"""Per frame period: what turns less shows more of the flow's errors than of a focal length."""
+_LEAST_TURN, _LEAST_MOVED = np.deg2rad(1.0), 0.01
+"""Per frame period, and the widths by which that moves the image: what turns less shows more of the errors of the
+flow than of a focal length, and a focal length that is far too short makes turns look large."""
 _EXPECTED, _EXPECTED_WEIGHT = 0.25, 4.0
 """Scatter of the logarithm from pair to pair, before any is seen, and the number of pairs that this counts for."""
 _SHARED = 0.05
@@ -53,6 +54,11 @@ class PairFocal(NamedTuple):
     """By the noise of the matches alone."""
     turn: float
     """Radians per frame period."""
+
+    @property
+    def turns(self) -> bool:
+        """Whether the camera turned enough to show it."""
+        return self.turn >= _LEAST_TURN and self.turn * np.exp(self.log) >= _LEAST_MOVED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +110,7 @@ def focal_of_pair(
 
 def conclude_focal(pairs: Sequence[PairFocal | None], width: int) -> FoundFocal:
     """What all pairs of a video of this width say together."""
-    turning = [each for each in pairs if each is not None and each.turn >= _LEAST_TURN]
+    turning = [each for each in pairs if each is not None and each.turns]
     good = [each for each in turning if abs(each.log) <= _BROKEN * PRIOR]
     untold = FoundFocal(focal=float(width), sigma=PRIOR * width, told=False, pairs=len(good))
     if not good or len(good) < _LEAST_GOOD * len(turning):
