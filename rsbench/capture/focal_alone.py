@@ -39,6 +39,8 @@ _EXPECTED, _EXPECTED_WEIGHT = 0.25, 4.0
 """Scatter of the logarithm from pair to pair, before any is seen, and the number of pairs that this counts for."""
 _SHARED = 0.05
 """By which the pairs of a video err alike."""
+_LEAST_TURNING = 0.5
+"""Share of the pairs: where few seem to turn, they seem so by what they err."""
 _BROKEN, _LEAST_GOOD = 3.0, 0.75
 """Prior deviations beyond which a pair shows its shaking alone, and the share that must not be so."""
 _TELLING = 0.65
@@ -110,10 +112,11 @@ def focal_of_pair(
 
 def conclude_focal(pairs: Sequence[PairFocal | None], width: int) -> FoundFocal:
     """What all pairs of a video of this width say together."""
-    turning = [each for each in pairs if each is not None and each.turns]
+    solved = [each for each in pairs if each is not None]
+    turning = [each for each in solved if each.turns]
     good = [each for each in turning if abs(each.log) <= _BROKEN * PRIOR]
     untold = FoundFocal(focal=float(width), sigma=PRIOR * width, told=False, pairs=len(good))
-    if not good or len(good) < _LEAST_GOOD * len(turning):
+    if not good or len(good) < _LEAST_GOOD * len(turning) or len(turning) < _LEAST_TURNING * len(solved):
         return untold
     logs, own = np.array([each.log for each in good]), np.array([each.sigma for each in good])
     scatter = _EXPECTED

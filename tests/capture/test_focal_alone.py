@@ -53,4 +53,6 @@ def test_pairs_that_show_no_lens_that_is_made_are_not_averaged() -> None:
     broken, good = PairFocal(1.5, 0.01, 0.1), PairFocal(-0.2, 0.01, 0.1)
     assert not conclude_focal([broken, broken, good, good], WIDTH).told
     assert conclude_focal([broken, good, good, good], WIDTH).pairs == 3
-    assert not conclude_focal([None, PairFocal(-0.2, 0.01, np.deg2rad(0.3))], WIDTH).told
+    still = PairFocal(-0.2, 0.01, np.deg2rad(0.3))
+    assert not conclude_focal([None, still], WIDTH).told
+    assert not conclude_focal([good, still, still], WIDTH).told
