@@ -34,6 +34,8 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.footage import read_frame
 from rsbench.pipeline.mono_correction import find_own_motion
+from rsbench.pipeline.mono_focal import find_camera
+from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.fusion import Origin, inpaint
 from rsbench.vision.mono_fusion import MonoFusion, MonoFusionOptions, OwnMotion, find_flows
@@ -53,14 +55,22 @@ def psnr(estimate: Image, truth: Image, mask: NDArray[np.bool_] | None = None) -
     return float(10.0 * np.log10(255.0**2 / np.mean(error if mask is None else error[mask])))
 
 
-def score_pair(folder: Path, focal: float) -> tuple[Scores, float]:
-    """PSNR of all pixels and of covered ones by method, and seconds of ours."""
+def score_pair(folder: Path, focal: float | None) -> tuple[Scores, float]:
+    """PSNR of all pixels and of covered ones by method, and seconds of ours.
+
+    ``focal``: px; None: as the command finds it, or assumes it.
+    """
     images = [read_frame(folder / f"{name}.png") for name in ("rs_0", "rs_1", "gs_1")]
     first, second, truth = (image[..., :3] for image in images)
     height, width = truth.shape[:2]
-    rig = StereoRig(camera=PinholeCamera.centred(width, height, focal), baseline=1.0)
     shutter, target = RollingShutter(height=height, readout_ratio=1.0), 1.5
     started = time.perf_counter()
+    card = OneCameraCard(readout_ratio=1.0)
+    if focal is None:
+        camera = find_camera([first, second], 2, card, shutter, RobustOptions())[0]
+    else:
+        camera = PinholeCamera.centred(width, height, focal)
+    rig = StereoRig(camera=camera, baseline=1.0)
     flows = find_flows([first, second])
     found = find_own_motion(flows, rig, shutter, "left", RobustOptions())
     ours = MonoFusion([first, second], found.own, flows).corrected(1, target)
@@ -86,12 +96,13 @@ def main() -> int:
     """Print the table; 1 where a pair is worse than what the corrector promises."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("demo", type=Path, help="folder that holds Carla/seq_01 and so on")
+    parser.add_argument("--untold", action="store_true", help="do not tell the focal length")
     arguments = parser.parse_args()
     good = True
     for name, focal in SETS.items():
         pairs = {}
         for folder in sorted((arguments.demo / name).iterdir()):
-            pairs[folder.name], seconds = score_pair(folder, focal)
+            pairs[folder.name], seconds = score_pair(folder, None if arguments.untold else focal)
             values = "  ".join("{:5.2f} / {:5.2f}".format(*pairs[folder.name][each]) for each in METHODS)
             _say(f"{name:7}{folder.name:8}{values}  {seconds:.2f} s")
             scores = pairs[folder.name]

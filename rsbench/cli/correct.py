@@ -65,7 +65,7 @@ def correct(
     footage: Footage = None,
     gyro: GyroFile = None,
     fps: Fps = None,
-    gyro_offset: GyroOffset = 0.0,
+    gyro_offset: GyroOffset = None,
 ) -> None:
     """Correct your own rolling-shutter frames: of a stereo rig or of one camera, two times or a whole sequence."""
     log = GyroGiven(file=gyro, fps=fps, offset_s=gyro_offset)

@@ -11,6 +11,7 @@ import typer
 from rsbench.cli.correct_said import listed
 
 if TYPE_CHECKING:
+    from rsbench.capture.focal_alone import FoundFocal
     from rsbench.core.camera import PinholeCamera
     from rsbench.core.so3 import FloatArray
     from rsbench.pipeline.footage import FrameSource
@@ -29,7 +30,12 @@ GyroFile = Annotated[
 ]
 Fps = Annotated[float | None, typer.Option(help="Frames a second, for --gyro. Default: what the video says.")]
 GyroOffset = Annotated[
-    float, typer.Option(metavar="SECONDS", help="What --gyro's clock shows at the first row of the first frame.")
+    float | None,
+    typer.Option(
+        metavar="SECONDS",
+        help="What --gyro's clock shows at the first row of the first frame. Default: 0; of one camera what the "
+        "frames show, within half a second.",
+    ),
 ]
 _MOST = 1e9
 _PAGE_FRAMES = 6
@@ -61,7 +67,9 @@ def correct_one_camera(
         raise RsbenchError("frames: with --camera give FRAME_0 FRAME_1 and so on, or --frames DIR|VIDEO")
     card = OneCameraCard() if camera is None else read_one_camera(camera)
     source = FrameSource.of_files(frames) if frames is not None else FrameSource(footage or Path())
-    record = _correct(source, card, out, _options(source, target, inpaint, seed), gyro.samples(source))
+    samples = gyro.samples(source)
+    log = None if samples is None else Gyroscope(samples=samples, farthest=gyro.farthest(source))
+    record = _correct(source, card, out, _options(source, target, inpaint, seed), log)
     _say(record, out)
 
 
@@ -71,12 +79,12 @@ class GyroGiven:
 
     file: Path | None
     fps: float | None
-    offset_s: float
+    offset_s: float | None
 
     def __post_init__(self) -> None:
         from rsbench.core.errors import RsbenchError
 
-        if self.file is None and (self.fps is not None or self.offset_s != 0.0):
+        if self.file is None and (self.fps is not None or self.offset_s is not None):
             raise RsbenchError("--fps, --gyro-offset: are of a gyroscope's log; give --gyro too")
 
     def samples(self, source: FrameSource) -> FloatArray | None:
@@ -86,19 +94,14 @@ class GyroGiven:
             RsbenchError: a log that cannot be read, is of another time, or frames whose rate nobody says.
         """
         from rsbench.core.errors import RsbenchError
-        from rsbench.dataset.corrected_video import said_fps
         from rsbench.interop.readers.gyro_log import read_gyro_log
 
         if self.file is None:
             return None
-        fps = said_fps(source.path) if self.fps is None else self.fps
-        if fps is None:
-            raise RsbenchError("--fps: is required with --gyro and images, which do not say it")
-        if not 0.0 < fps < _MOST:
-            raise RsbenchError(f"--fps {fps:g}: must lie in (0, {_MOST:g})")
-        if not abs(self.offset_s) < _MOST:
-            raise RsbenchError(f"--gyro-offset {self.offset_s:g}: must lie within {_MOST:g} seconds")
-        samples = read_gyro_log(self.file).samples(fps, self.offset_s)
+        fps, offset_s = self._fps(source), self.offset_s or 0.0
+        if not abs(offset_s) < _MOST:
+            raise RsbenchError(f"--gyro-offset {offset_s:g}: must lie within {_MOST:g} seconds")
+        samples = read_gyro_log(self.file).samples(fps, offset_s)
         last = max(source.count, 2)
         if samples[-1, 0] <= 0.0 or samples[0, 0] >= last:
             raise RsbenchError(
@@ -107,9 +110,37 @@ class GyroGiven:
             )
         return samples
 
+    def farthest(self, source: FrameSource) -> float:
+        """Frame periods within which its clock may be off; 0 where the offset is given."""
+        from rsbench.pipeline.gyro_clock import FARTHEST_S
+
+        return FARTHEST_S * self._fps(source) if self.offset_s is None else 0.0
+
+    def _fps(self, source: FrameSource) -> float:
+        """Raises RsbenchError where nobody says it."""
+        from rsbench.core.errors import RsbenchError
+        from rsbench.dataset.corrected_video import said_fps
+
+        fps = said_fps(source.path) if self.fps is None else self.fps
+        if fps is None:
+            raise RsbenchError("--fps: is required with --gyro and images, which do not say it")
+        if not 0.0 < fps < _MOST:
+            raise RsbenchError(f"--fps {fps:g}: must lie in (0, {_MOST:g})")
+        return fps
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Gyroscope:
+    """A log beside the frames of one camera."""
+
+    samples: FloatArray
+    """(n, 4) tau, w."""
+    farthest: float
+    """Frame periods within which its clock may be off."""
+
 
 def _correct(
-    source: FrameSource, card: OneCameraCard, out: Path, options: MonoOptions, gyro: FloatArray | None
+    source: FrameSource, card: OneCameraCard, out: Path, options: MonoOptions, gyro: Gyroscope | None
 ) -> dict[str, Any]:
     """What motion.json holds, once all is written, as a folder or a video."""
     from rsbench.dataset.corrected_frames import fresh_folder, read_corrected, write_record
@@ -127,6 +158,7 @@ def _correct(
         record = _correct_into(folder, source, card, options, gyro, whole=True)
         write_record(folder, record)
         facts = [("readout ratio", _readout(record)), ("focal length", _focal(record))]
+        facts += [("gyroscope's clock", _clock(record))] if "gyro_clock" in record else []
         facts += [("unit of depth", _UNIT)]
         cards = _cards(folder, source, len(record["frames"]))
         write_page(folder, f"rsbench correct: {out.name}", "Rolling shutter to global shutter", facts, cards)
@@ -134,7 +166,7 @@ def _correct(
 
 
 def _run_key(
-    source: FrameSource, card: OneCameraCard, options: MonoOptions, video: bool, gyro: FloatArray | None
+    source: FrameSource, card: OneCameraCard, options: MonoOptions, video: bool, gyro: Gyroscope | None
 ) -> str:
     """Of all that decides what is written: a run with another key does not go on with what this one wrote."""
     import hashlib
@@ -142,7 +174,7 @@ def _run_key(
     from rsbench.core.version import __version__
 
     said = [__version__, repr(card), repr(options), repr(video), *source.identity()]
-    said += [] if gyro is None else [hashlib.sha256(gyro.tobytes()).hexdigest()]
+    said += [] if gyro is None else [hashlib.sha256(gyro.samples.tobytes()).hexdigest(), repr(gyro.farthest)]
     return hashlib.sha256("\n".join(said).encode()).hexdigest()
 
 
@@ -151,7 +183,7 @@ def _correct_into(
     source: FrameSource,
     card: OneCameraCard,
     options: MonoOptions,
-    gyro: FloatArray | None,
+    gyro: Gyroscope | None,
     *,
     whole: bool,
 ) -> dict[str, Any]:
@@ -160,29 +192,66 @@ def _correct_into(
     Args:
         whole: whether masks and depth are wanted, not the images alone.
     """
-    from rsbench.capture.settle import NoMotionError
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.corrected_frames import written_entries
     from rsbench.pipeline.mono_sequence import correct_frames
-    from rsbench.pipeline.mono_shutter import IN_ORDER, WINDOWS, find_shutter
 
-    height, width = next(iter(source)).shape[:2]
-    camera, corrector = card.camera_of(width, height), options.corrector
-    pairs = WINDOWS if card.readout_ratio is None else IN_ORDER
-    try:
-        with progress_bar("looking at the shutter", min(max(source.count - 1, 1), pairs)) as advance:
-            found = find_shutter(source, source.count, card, corrector.robust, corrector.seed, advance)
-    except NoMotionError as error:
-        typer.echo(f"rsbench: not corrected: {error}", err=True)
-        raise typer.Exit(1) from None
-    record = {**_known(card, camera, found, options), "gyro": gyro is not None}
+    found = _shutter(source, card, options)
+    camera, focal = _camera(source, card, found, options)
+    record: dict[str, Any] = {**_known(camera, focal, found, options), "gyro": gyro is not None}
+    samples = None if gyro is None else gyro.samples
+    if gyro is not None and gyro.farthest > 0.0:
+        samples, record["gyro_clock"] = _in_time(source, camera, found, options, gyro)
     entries = written_entries(folder)
     with progress_bar("correcting", max(source.count, 1)) as advance:
         for entry in entries:
             advance(f"frame {entry['number']}")
-        moments = correct_frames(source, camera, found.shutter, options, len(entries), gyro)
+        moments = correct_frames(source, camera, found.shutter, options, len(entries), samples)
         record["frames"] = entries + _write(folder, moments, advance, whole=whole)
     return record
+
+
+def _shutter(source: FrameSource, card: OneCameraCard, options: MonoOptions) -> FoundShutter:
+    """Exit 1 where the frames do not show it."""
+    from rsbench.capture.settle import NoMotionError
+    from rsbench.cli.console import progress_bar
+    from rsbench.pipeline.mono_shutter import IN_ORDER, WINDOWS, find_shutter
+
+    corrector, pairs = options.corrector, WINDOWS if card.readout_ratio is None else IN_ORDER
+    try:
+        with progress_bar("looking at the shutter", min(max(source.count - 1, 1), pairs)) as advance:
+            return find_shutter(source, source.count, card, corrector.robust, corrector.seed, advance)
+    except NoMotionError as error:
+        typer.echo(f"rsbench: not corrected: {error}", err=True)
+        raise typer.Exit(1) from None
+
+
+def _camera(
+    source: FrameSource, card: OneCameraCard, found: FoundShutter, options: MonoOptions
+) -> tuple[PinholeCamera, FoundFocal | None]:
+    """As of ``find_camera``."""
+    from rsbench.cli.console import progress_bar
+    from rsbench.pipeline.mono_focal import PAIRS, find_camera
+
+    given = source, source.count, card, found.shutter, options.corrector.robust, options.corrector.seed
+    if not card.focal_unknown:
+        return find_camera(*given)
+    with progress_bar("looking at the focal length", min(max(source.count - 1, 1), PAIRS)) as advance:
+        return find_camera(*given, advance)
+
+
+def _in_time(
+    source: FrameSource, camera: PinholeCamera, found: FoundShutter, options: MonoOptions, gyro: Gyroscope
+) -> tuple[FloatArray, dict[str, Any]]:
+    """Its samples at the times of the frames, and what these show of its clock."""
+    from rsbench.cli.console import progress_bar
+    from rsbench.pipeline.gyro_clock import PAIRS, in_time, pair_rates
+
+    known, corrector = (camera, found.shutter), options.corrector
+    with progress_bar("looking at the gyroscope's clock", min(max(source.count - 1, 1), PAIRS)) as advance:
+        pairs = pair_rates(source, source.count, *known, corrector.robust, corrector.seed, advance)
+    samples, clock = in_time(pairs, gyro.samples, *known, gyro.farthest)
+    return samples, clock._asdict()
 
 
 def _options(source: FrameSource, target: str, inpaint: bool | None, seed: int) -> MonoOptions:
@@ -194,7 +263,7 @@ def _options(source: FrameSource, target: str, inpaint: bool | None, seed: int) 
 
 
 def _known(
-    card: OneCameraCard, camera: PinholeCamera, found: FoundShutter, options: MonoOptions
+    camera: PinholeCamera, focal: FoundFocal | None, found: FoundShutter, options: MonoOptions
 ) -> dict[str, Any]:
     """What the correction assumed or found."""
     from rsbench.capture.settle import record_of
@@ -204,7 +273,9 @@ def _known(
     return {
         "units": {"length": _UNIT, "angle": "rad", "time": "frame period", "depth": f"{_UNIT}, 0 = unknown"},
         "camera": {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
-        "focal_length_assumed": card.camera is None and card.fov_deg is None,
+        "focal_length_assumed": focal is not None and not focal.told,
+        "focal_length_estimated": focal is not None and focal.told,
+        "focal_length_sigma": None if focal is None else focal.sigma,
         "scan": found.scan,
         "readout_ratio": found.shutter.readout_ratio,
         "readout_ratio_sigma": None if best is None else best.sigma,
@@ -225,8 +296,21 @@ def _readout(record: dict[str, Any]) -> str:
 
 
 def _focal(record: dict[str, Any]) -> str:
-    how = "assumed: the width of the image" if record["focal_length_assumed"] else "given"
-    return f"{record['camera']['fx']:.1f} px ({how})"
+    text, sigma = f"{record['camera']['fx']:.1f}", record["focal_length_sigma"]
+    if sigma is None:
+        return f"{text} px (given)"
+    how = (
+        "assumed: the width of the image; the frames do not tell it" if record["focal_length_assumed"] else "found"
+    )
+    return f"{text} +- {sigma:.1f} px ({how})"
+
+
+def _clock(record: dict[str, Any]) -> str:
+    clock = record["gyro_clock"]
+    if not clock["told"]:
+        return "the frames do not tell how far it is off; --gyro-offset gives it"
+    seen = f"{clock['shift']:+.3f} +- {clock['sigma']:.3f} frame periods off"
+    return f"{seen}, and set right" if clock["used"] else f"{seen}, and left as it is"
 
 
 def _say(record: dict[str, Any], out: Path) -> None:
@@ -239,6 +323,9 @@ def _say(record: dict[str, Any], out: Path) -> None:
     told["gyro"] = listed((number, motion["gyro"]) for number, motion in motions if "gyro" in motion)
     corrected = sum("reason" not in each for each in record["frames"])
     typer.echo(f"readout ratio {_readout(record)}")
+    typer.echo(f"focal length {_focal(record)}")
+    if "gyro_clock" in record:
+        typer.echo(f"gyroscope's clock: {_clock(record)}")
     typer.echo(f"{corrected} of {len(record['frames'])} frames corrected")
     place = out if out.is_file() else out / "report.html"
     typer.echo(f"{'video' if out.is_file() else 'report'}: {place.resolve()}")

@@ -30,6 +30,7 @@ from rsbench.pipeline.mono_correction import (
     find_own_motion,
     refusal,
 )
+from rsbench.pipeline.mono_focal import find_camera
 from rsbench.pipeline.mono_gyro import NOT_COVERED, around, rotation_alone, with_gyro
 from rsbench.pipeline.mono_shutter import find_shutter
 from rsbench.pipeline.one_camera_card import OneCameraCard
@@ -213,8 +214,8 @@ def correct_all(
         raise RsbenchError(str(error)) from error
     options = MonoOptions.of(inpaint, seed, target_row)
     shutter = find_shutter(frames, len(frames), card, options.corrector.robust, seed).shutter
-    height, width = frames[0].shape[:2]
-    moments = correct_frames(frames, card.camera_of(width, height), shutter, options, gyro=gyro)
+    found, _ = find_camera(frames, len(frames), card, shutter, options.corrector.robust, seed)
+    moments = correct_frames(frames, found, shutter, options, gyro=gyro)
     return [moment.fused for moment in moments]
 
 

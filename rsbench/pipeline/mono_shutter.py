@@ -76,7 +76,7 @@ def find_shutter(
         return _found(frames, count, card, options, seed, advance)
     scan, ratio = card.scan or "top", card.readout_ratio
     found, shutter = list[FloatArray](), None
-    for matches, _, camera in _matched(frames, card, 1, IN_ORDER if ratio >= LEAST_BACKWARDS else 0, seed):
+    for matches, _, camera in matched_pairs(frames, card, 1, IN_ORDER if ratio >= LEAST_BACKWARDS else 0, seed):
         shutter = shutter or Scanning(scan=scan).shutter_of(camera.width, camera.height, ratio)
         if matches is None:
             continue
@@ -106,7 +106,7 @@ def _found(
 ) -> FoundShutter:
     """The shutter that the frames show."""
     known, windows, camera, why = known_alone(card.scan), list[Window](), None, ""
-    for matches, reason, camera in _matched(frames, card, max((count - 1) // WINDOWS, 1), WINDOWS, seed):
+    for matches, reason, camera in matched_pairs(frames, card, max((count - 1) // WINDOWS, 1), WINDOWS, seed):
         why = why or reason
         if matches is not None:
             windows.append(examine_alone(matches, camera, known, options, seed))
@@ -120,7 +120,7 @@ def _found(
     return FoundShutter(shutter=shutter_alone(capture, camera), capture=capture)
 
 
-def _matched(
+def matched_pairs(
     frames: Iterable[NDArray[Any]], card: OneCameraCard, every: int, most: int, seed: int
 ) -> Iterator[tuple[FloatArray | None, str, PinholeCamera]]:
     """Matches of at most so many pairs, each ``every``-th, or why a pair has none; and the camera.

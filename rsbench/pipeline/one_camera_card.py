@@ -14,8 +14,7 @@ from rsbench.core.shutter import Scan
 from rsbench.pipeline.footage import CameraCard
 
 DEFAULT_FOCAL = 1.0
-"""Focal length in widths of the image where nothing is said: a horizontal field of view of 53 degrees. On frames
-of a high-speed camera, from 0.8 to 2.5 widths moved the corrected pixels by less than 0.05 px."""
+"""Focal length in widths of the image where nothing is said: a horizontal field of view of 53 degrees."""
 _WIDEST_DEG = 170.0
 
 
@@ -31,7 +30,8 @@ class OneCameraCard:
     """Side of the image at which the readout begins. Absent: found with the readout ratio, or ``top`` where that
     is given."""
     fov_deg: float | None = None
-    """Horizontal field of view, degrees, in place of ``camera``. Absent both: a focal length of the width."""
+    """Horizontal field of view, degrees, in place of ``camera``. Absent both: the focal length is found from the
+    frames, or is that of the width of the image where they cannot tell."""
     camera: CameraCard | None = None
     """Intrinsics."""
 
@@ -47,8 +47,13 @@ class OneCameraCard:
         if self.camera is not None and self.camera.sigma:
             raise ValueError("camera.focal_sigma, k1_sigma: leave them out; of one camera neither is found")
 
+    @property
+    def focal_unknown(self) -> bool:
+        """Whether nothing is said of the focal length."""
+        return self.camera is None and self.fov_deg is None
+
     def camera_of(self, width: int, height: int) -> PinholeCamera:
-        """The camera of images of this size."""
+        """The camera of images of this size; of ``DEFAULT_FOCAL`` where nothing is said."""
         if self.camera is not None:
             c = self.camera
             return PinholeCamera(width=width, height=height, fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy)

@@ -112,7 +112,7 @@ def ssim_within(
     chosen = [window_mask(b.image.shape[:2], mask) for mask in masks]
     if not any(np.any(windows) for windows in chosen):
         return [math.nan for _ in chosen]
-    scores = ssim_map(a, b, _GAUSSIAN)
+    scores = ssim_map(a, b, GAUSSIAN)
     return [float(np.mean(scores[windows])) if np.any(windows) else math.nan for windows in chosen]
 
 
@@ -130,7 +130,7 @@ class LastSsim:
             return math.nan
         last = self._last
         if last is None or last[0] is not estimate or last[1] is not truth:
-            last = self._last = estimate, truth, ssim_map(a, b, _GAUSSIAN)
+            last = self._last = estimate, truth, ssim_map(a, b, GAUSSIAN)
         return float(np.mean(last[2][windows]))
 
 
@@ -155,7 +155,7 @@ def _blur(image: FloatArray) -> FloatArray:
     return cv2.GaussianBlur(image, (size, size), _SIGMA, borderType=cv2.BORDER_REFLECT).reshape(image.shape)
 
 
-_GAUSSIAN = Window(_blur)
+GAUSSIAN = Window(_blur)
 
 
 def _pair(

@@ -74,8 +74,18 @@ def test_two_frames_become_upright(folder: Path) -> None:
         assert np.sqrt(np.mean((image - truth)[inner] ** 2)) < 0.25 * before
     record = json.loads((folder / "out" / "motion.json").read_text())
     assert record["camera"]["fx"] == pytest.approx(80.0 / np.tan(np.deg2rad(30.0)))
+    assert (record["focal_length_assumed"], record["focal_length_sigma"]) == (False, None)
     assert [frame["number"] for frame in record["frames"]] == [0, 1]
     assert (folder / "out" / "report.html").is_file()
+
+
+def test_a_focal_length_that_nothing_shows_is_assumed_and_said_so(folder: Path) -> None:
+    (folder / "camera.toml").write_text("readout_ratio = 1.0\n")
+    result = _correct(folder, folder / "0.png", folder / "1.png")
+    assert "focal length 160.0 +- 56.0 px (assumed: the width of the image" in result.stdout
+    record = json.loads((folder / "out" / "motion.json").read_text())
+    assert record["focal_length_assumed"] and not record["focal_length_estimated"]
+    assert (record["camera"]["fx"], record["focal_length_sigma"]) == (160.0, pytest.approx(56.0))
 
 
 def test_a_folder_gives_the_same_frames_in_order(folder: Path) -> None:

@@ -29,7 +29,7 @@ def test_frames_are_reversed_where_each_pair_looks_so(
     options = SimulationOptions(pairs=200, noise_px=0.1)
     given = simulate(rig, shutter, motion, options, np.random.default_rng(0)).correspondences.left
     pairs = [(given if way == "f" else given[:, [2, 3, 0, 1]], "", CAMERA) for way in ways]
-    monkeypatch.setattr(mono_shutter, "_matched", lambda *_: iter(pairs))
+    monkeypatch.setattr(mono_shutter, "matched_pairs", lambda *_: iter(pairs))
     card = OneCameraCard(readout_ratio=0.7)
     if refused:
         with pytest.raises(RefusedFramesError, match="backwards"):

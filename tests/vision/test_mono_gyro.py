@@ -215,8 +215,13 @@ def test_the_command_takes_a_log(tmp_path: Path, world: Any, shapes: Any, u8: An
     assert_refused(run("--gyro", tmp_path / "log.txt", "--fps", 20), ".gcsv")
     assert_refused(run("--fps", 20), "--gyro")
     done = run("--gyro", tmp_path / "log.csv", "--fps", 20, "--gyro-offset", 1.5)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0 and "clock" not in done.stdout, done.stderr
     record = read_json(tmp_path / "out" / "motion.json")
     assert [each["motion"]["model"] for each in record["frames"]] == ["gyro", "gyro"]
     image = read_png(tmp_path / "out" / "corrected" / "000001.png").astype(int)
     assert np.max(np.abs(image - corrected(scene, u8, samples).fused.image)) <= 1  # times in whole nanoseconds
+    early = [f"{int(row.split(',')[0]) - 1_500_000_000},{row.partition(',')[2]}" for row in rows]
+    (tmp_path / "early.csv").write_text("stamp_ns,wx,wy,wz\n" + "\n".join(early), encoding="utf-8")
+    shown = run("--gyro", tmp_path / "early.csv", "--fps", 20)
+    assert "gyroscope's clock: the frames do not tell" in shown.stdout  # two of them
+    assert read_json(tmp_path / "out" / "motion.json")["gyro_clock"]["used"] is False
