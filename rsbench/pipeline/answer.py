@@ -25,7 +25,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.track_building import join_stereo
 from rsbench.pipeline.body_motion import body_motion
-from rsbench.pipeline.frame_motion import chosen_model, entry_of, or_spline, takes_models, widened
+from rsbench.pipeline.frame_motion import SHAKES, chosen_model, entry_of, or_spline, takes_models, widened
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.base import MotionEstimate
@@ -152,7 +152,9 @@ def _under_model(
     result = result if choice is None else widened(result, choice.spread)
     law = body_motion(result.estimate, other.solver.spec, rig)
     if asked == AUTO and isinstance(law, Motion):
-        result, choice, _ = or_spline(result, choice, law, matches, rig, shutter, seed)
+        result, choice, motion = or_spline(result, choice, law, matches, rig, shutter, seed)
+        if capture is not None and motion is not law:
+            return other, _unsolved(SHAKES, options), None
     return other, result, choice
 
 

@@ -52,6 +52,10 @@ BACKWARDS = (
     "is said (scan in the rig's card)"
 )
 
+SHAKES = (
+    "cannot tell the readout ratio: the rig shakes as no motion model does, which two frames do not tell from a "
+    "readout. Give readout_ratio in the rig's card, or four frames and more"
+)
 _BEYOND_DOUBT = 7.0
 """Logarithm of odds, as of a probability of 0.999."""
 _MOMENTS = 33
@@ -329,6 +333,8 @@ def solve_frames(
     found = replace(find_motion(at_rest, rig, shutter, options, capture=used), calibration=errors)
     if capture is None and not in_order and _runs_backwards(at_rest, rig, found, shutter, options):
         raise RefusedFramesError(BACKWARDS)
+    if capture is not None and isinstance(found.motion, ContinuousMotion):
+        raise NoMotionError(SHAKES)
     return SolvedFrames(found=found, shutter=shutter, matches=matches, capture=capture)
 
 

@@ -8,14 +8,18 @@ from shaken_rig import HEIGHT, RATIO, RIG, SHAKES, SHUTTER, Law, matches, sines,
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.capture.hypotheses import MODELS
 from rsbench.capture.rectification import RefusedFramesError
+from rsbench.capture.settle import NoMotionError
 from rsbench.capture.shaken import shaken_motion
 from rsbench.components.motion_models import make_motion
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.answer import solve_problem
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import FoundMotion, find_motion, solve_frames
+from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.problem import Problem
 
 OPTIONS = CorrectionOptions(motion_model="auto")
 
@@ -90,6 +94,19 @@ def test_exchanged_times_of_a_rig_that_shakes_are_refused_and_right_ones_are_not
         exchanged = Correspondences(tracks=np.roll(window.tracks, 4, axis=1))
         with pytest.raises(RefusedFramesError, match="backwards"):
             solve_frames(exchanged, RIG, RATIO, OPTIONS)
+
+
+def test_a_readout_ratio_of_two_shaken_frames_is_not_told() -> None:
+    """It would be one under a law that does not hold: whichever of the two refusals comes first."""
+    for seed in (0, 1, 3):
+        rng = np.random.default_rng(seed)
+        (window,), _ = matches(sines(rng, *SHAKES["strong"]), 2, rng, noise=0.1, count=400)
+        with pytest.raises(NoMotionError, match="cannot tell"):
+            solve_frames(window, RIG, None, OPTIONS)
+        problem = Problem(name="", correspondences=window, rig=RIG, known_shutter=None)
+        with SolverRunner() as runner:
+            answer = solve_problem(problem, OPTIONS.solver, OPTIONS.robust, runner, motion_model="auto")
+        assert not answer["success"] and "cannot tell" in answer["reason"] and answer["w"] is None
 
 
 def test_few_tracks_and_a_global_shutter_ask_for_none() -> None:
