@@ -12,6 +12,7 @@ three quarters of each scene. A leak of one float image a sequence would be 0.07
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import subprocess
 import sys
@@ -53,8 +54,9 @@ def children(pid: int) -> list[int]:
     """Of a process, and theirs."""
     found = list[int]()
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
-        for child in map(int, task.read_text().split()):
-            found += [child, *children(child)]
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a thread that ended meanwhile
+            for child in map(int, task.read_text().split()):
+                found += [child, *children(child)]
     return found
 
 
