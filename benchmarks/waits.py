@@ -158,9 +158,16 @@ def main() -> None:
     )
     parser.add_argument("--write", action="store_true", help="into results/speed and docs/results-speed.md")
     given = parser.parse_args()
+    if given.runs < 1:
+        parser.error(f"--runs {given.runs}: must be 1 or more")
+    if given.only and given.write:
+        parser.error("--write: writes the whole table; leave --only out")
     found = list[dict[str, object]]()
     with tempfile.TemporaryDirectory() as folder:
-        for wait in waits(Path(folder)):
+        every = list(waits(Path(folder)))
+        if not any(given.only in wait.name for wait in every):
+            parser.error(f"--only {given.only!r}: is in no command's name")
+        for wait in every:
             needed = given.only in wait.name
             row = measured(wait, given.runs if needed else 1)
             if needed:
@@ -172,7 +179,8 @@ def main() -> None:
     if given.write:
         RESULTS.mkdir(parents=True, exist_ok=True)
         write_table(RESULTS / "waits.csv", pd.DataFrame(found, columns=COLUMNS))
-        write_json(RESULTS / "waits-provenance.json", provenance("python benchmarks/waits.py --write"))
+        command = f"python benchmarks/waits.py --write --runs {given.runs}"
+        write_json(RESULTS / "waits-provenance.json", provenance(command))
         before, _, rest = PAGE.read_text("utf-8").partition(START)
         shown = f"{before}{START}\n{table(pd.read_csv(RESULTS / 'waits.csv'))}\n{END}{rest.partition(END)[2]}"
         write_bytes(PAGE, shown.encode())

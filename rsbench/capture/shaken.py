@@ -123,6 +123,8 @@ def log_odds_of_opposite(
 ) -> float:
     """Of the lines being read from the opposite side, or of frames in the wrong order, of a rig that may shake.
 
+    Minus infinity where a spline is not found: that says nothing.
+
     Args:
         opposite: the shutter that is read so.
         motion: from which the search begins.
@@ -130,7 +132,7 @@ def log_odds_of_opposite(
     window = telling(matches)
     said, other = (_Spline.through(window, rig, each, motion, seed) for each in (shutter, opposite))
     if said is None or other is None:
-        return -np.inf if other is None else np.inf
+        return -np.inf
     tails = min((each.found.fit.tails for each in (said, other)), key=lambda each: each.scale)
     everything = np.ones(len(said.tracks))
     here, there = (each.worth(each.found.curve, each.determined, tails, everything) for each in (said, other))
