@@ -17,7 +17,7 @@ from rsbench.capture.trajectory_choice import approximated
 from rsbench.capture.trajectory_covariance import motion_covariance
 from rsbench.capture.trajectory_data import TimedTracks, pack_windows, telling
 from rsbench.capture.trajectory_estimate import Trajectory, TrajectoryOptions, estimate_trajectory
-from rsbench.capture.trajectory_fit import normal_equations
+from rsbench.capture.trajectory_fit import covariance_band, normal_equations
 from rsbench.capture.trajectory_kernels import Tails
 from rsbench.capture.trajectory_prior import Prior
 from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, span_of
@@ -32,8 +32,11 @@ _OF_A_LAW = 6.0
 """Parameters of a law, at least."""
 _FEWEST = 30
 """Tracks, from which on a spline is tried."""
-_NEAR = 0.25
-"""Frame periods between the control poses by which a law is told."""
+_KNOTS = 0.25
+"""Frame periods between control poses."""
+_SHARE = 0.15
+"""What a track counts beside the prior, and in the covariance. What rows of both frames shake alike hardly shows:
+tracks that err together by a tenth of a pixel, counted for more, turned it by degrees."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,12 +65,12 @@ class _Spline:
     def through(
         cls, window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion, seed: int
     ) -> _Spline | None:
-        options = TrajectoryOptions(link=False, seed=seed)
+        options = TrajectoryOptions(intervals=(_KNOTS,), link=False, share=_SHARE, seed=seed)
         try:
             found = estimate_trajectory([window], rig, shutter, [law], options)
         except (banded.NotDefiniteError, ValueError):
             return None
-        return cls(found=found, tracks=pack_windows([window], rig, shutter, share=options.share))
+        return cls(found=found, tracks=pack_windows([window], rig, shutter, share=TrajectoryOptions.share))
 
     def worth(self, curve: Curve, parameters: float, tails: Tails, trust: FloatArray) -> float:
         """Logarithm of the likelihood of a spline, less half of log n for each parameter; but for a constant."""
@@ -102,11 +105,11 @@ def shaken_motion(
     if spline is None:
         return None
     found, errors = spline.found, (spline.found.fit.tails, spline.found.fit.trust)
-    theirs = approximated(law.body_from_world, span_of(1, shutter), _NEAR)
+    theirs = approximated(law.body_from_world, span_of(1, shutter), _KNOTS)
     odds = spline.worth(found.curve, spline.determined, *errors) - spline.worth(theirs, _OF_A_LAW, *errors)
     return Shaken(
         motion=found.motion,
-        covariance=motion_covariance(found.curve, found.covariance_band, 0.0),
+        covariance=motion_covariance(found.curve, covariance_band(found.fit, spline.tracks, _SHARE), 0.0),
         noise_px=found.noise_px,
         inliers=found.inliers[0],
         probability=float(scipy.special.expit(odds)),

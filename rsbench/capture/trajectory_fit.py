@@ -194,14 +194,14 @@ def information(
     prior: Prior | None,
     trust: FloatArray,
     drift: Drift | None = None,
+    share: float = 1.0,
 ) -> tuple[FloatArray, Border | None]:
     """Factor of the expected information of the control poses, a band, and its border; the pose at time 0 is held.
-
-    Every track counts for one.
 
     Args:
         prior: None: what the tracks alone say.
         drift: of the gyroscope, where the tracks have one.
+        share: what a track counts beside the prior, in place of what it counted in a fit.
 
     Raises:
         NotDefiniteError: they do not determine the spline.
@@ -209,14 +209,14 @@ def information(
     # Of a t distribution: K. Lange, R. Little, J. Taylor, see ``heavy_tails``.
     expected = trust * (tails.nu + tracks.freedom) / (tails.nu + tracks.freedom + 2.0)
     silent = prior or Prior(1.0, 1, np.inf, np.inf)
-    each = replace(tracks, share=1.0)
+    each = replace(tracks, share=share)
     found = normal_equations(curve, each, Tails(NORMAL, tails.scale), silent, expected, drift=drift)
     return banded.factor(held(found, curve, tracks, ANCHORED)), found.border
 
 
-def covariance_band(found: Fit, tracks: TimedTracks) -> FloatArray:
-    """Covariance of the control poses of a fit, in its band. Raises NotDefiniteError."""
-    told = information(found.curve, tracks, found.tails, found.prior, found.trust, found.drift)
+def covariance_band(found: Fit, tracks: TimedTracks, share: float = 1.0) -> FloatArray:
+    """Covariance of the control poses of a fit, in its band, see ``information``. Raises NotDefiniteError."""
+    told = information(found.curve, tracks, found.tails, found.prior, found.trust, found.drift, share)
     return bordered_inverse(*told)
 
 

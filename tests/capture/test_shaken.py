@@ -57,8 +57,37 @@ def test_a_rig_that_shakes_is_told_from_one_that_follows_a_law() -> None:
     assert spline < 0.5 * by_law
 
 
+def test_what_two_frames_hardly_show_stays_small() -> None:
+    """A spline of 0.15 deg of shake, whose rows shake alike in both frames; tracks err together by 0.2 px.
+
+    Counted for more, such errors turned that mode by 0.9 to 1.7 deg, where the law errs by 0.3.
+    """
+    errors = []
+    for seed in (1, 4, 5, 7):
+        rng = np.random.default_rng(seed)
+        w, d = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
+        motion = make_motion("spline", 0.035 * w, 0.2 * d, {"preset": "handheld", "seed": seed})
+        data = simulate(RIG, SHUTTER, motion, SimulationOptions(tracks=900, noise_px=0.02), rng)
+        tracks = data.correspondences.tracks.copy()
+        for j, phase in enumerate(rng.uniform(0.0, 2.0 * np.pi, 8)):
+            waves = (tracks[:, 0] * (1 + j % 3) + tracks[:, 1] * (1 + j % 2)) / RIG.camera.width
+            tracks[:, j] += 0.2 * np.sin(2.0 * np.pi * waves + phase)
+        window = Correspondences(tracks=tracks)
+        found = [find_motion(window, RIG, SHUTTER, OPTIONS, splines=splines).motion for splines in (False, True)]
+
+        def law(tau: FloatArray, motion: Motion = motion) -> tuple[FloatArray, FloatArray]:
+            return motion.body_from_world(tau)
+
+        errors.append([np.sqrt(np.mean(row_errors(each, law) ** 2)) for each in found])
+    by_law, spline = np.transpose(errors)
+    assert np.max(spline) < 0.3 and np.median(spline) < np.median(by_law)
+
+
 def test_its_covariance_holds_and_the_answer_is_its_pose_at_one() -> None:
-    """Squared errors over the covariance are chi-squared of 6: their median is 5.3 where it is exact."""
+    """Squared errors over the covariance are chi-squared of 6: their median is 5.3 where it is exact.
+
+    These tracks err each by itself, which the covariance does not rely on: it may be too large, by a half.
+    """
     squares = []
     for seed in range(10):
         rng = np.random.default_rng(100 + seed)
@@ -69,7 +98,7 @@ def test_its_covariance_holds_and_the_answer_is_its_pose_at_one() -> None:
         wrong = np.concatenate([estimate.w - w, estimate.d + R_1 @ (p[1] - p[0])])
         assert estimate.covariance is not None
         squares.append(wrong @ np.linalg.solve(estimate.covariance, wrong))
-    assert np.median(squares) < 12.0
+    assert 1.5 < np.median(squares) < 8.0
 
 
 @pytest.mark.parametrize("model", MODELS)
