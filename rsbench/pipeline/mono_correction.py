@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.components.motion_models import make_motion
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import InertialMotion
 from rsbench.core.rig import Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.mono_law import asked_for
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
@@ -96,10 +96,9 @@ def flow_matches(flows: Flows, rng: np.random.Generator) -> FloatArray:
 def find_own_motion(
     flows: Flows, rig: StereoRig, shutter: RollingShutter, side: Side, robust: RobustOptions, seed: int = 0
 ) -> FoundOwnMotion:
-    """Constant velocity in the world and constant rate of turn of one camera; its translation has length 1.
+    """The motion of one camera, by the law that its flow asks for; its translation has length 1.
 
-    The more general models fit rendered and real pairs closer and predict them worse: two frames do not tell a
-    vibration.
+    Of laws of constant speed, and one that accelerates: two frames do not tell a vibration.
     """
     own = rig.about(side)
     nothing = OwnMotion(rig=own, shutter=shutter, side=side, motion=None)
@@ -113,7 +112,8 @@ def find_own_motion(
     estimate, length = found.estimate, float(np.linalg.norm(found.estimate.d))
     if not (estimate.success and length > 0.0):
         return FoundOwnMotion(own=nothing, robust=found, reason=estimate.reason or "no translation is found")
-    motion = make_motion(InertialMotion.name, estimate.w, estimate.d / length)
+    found, motion = asked_for(found, matches, own.about("left"), shutter, robust, seed)
+    motion = motion.with_endpoint(motion.w, motion.d / np.linalg.norm(motion.d))
     return FoundOwnMotion(own=OwnMotion(rig=own, shutter=shutter, side=side, motion=motion), robust=found)
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
+from rsbench.core.motion import AcceleratedMotion
 from rsbench.core.rig import FRAMES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -270,6 +271,7 @@ def translation_record(found: FoundOwnMotion) -> dict[str, Any]:
         return {"reason": found.reason, **unused}
     record = {
         "model": motion.name,
+        **({"acceleration": motion.acceleration} if isinstance(motion, AcceleratedMotion) else {}),
         "w": motion.w.tolist(),
         "d": motion.d.tolist(),
         "rotation_deg": float(np.rad2deg(np.linalg.norm(motion.w))),

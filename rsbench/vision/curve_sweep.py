@@ -45,6 +45,11 @@ _NOWHERE = 90
 """Cost of a place outside the other frame, between those of like and of unlike places."""
 _MEDIAN = 5
 _FEWEST = 4
+_COARSE, _REACH = 4, 0.2
+"""Shrinking of the first search, at options of half the size, and its parallax, of the image's longer side."""
+_TEXTURED, _TEXTURE_LEVELS = 5, 5.0
+"""Side of a window, px, and the deviation of its grey levels; in a smooth sky anything looks alike."""
+_NEAREST, _MARGIN, _MARGIN_PX = 0.998, 1.2, 2.0
 _BYTES = 500.0
 """Per pixel of the swept frame: the volume and its sums."""
 
@@ -126,6 +131,34 @@ def sweep_frames(
     least = options.agree_px / max(gain, 1e-12)
     first, second = (Swept(rhos[i], _agrees(rhos[i], rhos[1 - i], maps[i], least)) for i in FRAMES)
     return first, second
+
+
+def largest_seen(
+    greys: Sequence[U8],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    side: Side,
+    options: SweepOptions,
+) -> float:
+    """Largest inverse depth of textured places that both frames show, with a margin; arguments: ``sweep_frames``.
+
+    By a search at a quarter of the size, as far as things are expected to move: where flow lost a near thing, its
+    depth would not be looked for. 0 where there is none.
+    """
+    poses = [_poses(rig, shutter, motion, side, frame, greys[0].shape[0]) for frame in FRAMES]
+    maps = [reprojection_of(rig.camera, poses[frame], poses[1 - frame]) for frame in FRAMES]
+    gain = max(parallax_gain(rig.camera, *maps), 1e-9)
+    coarse = replace(options, shrink=_COARSE * options.shrink // 2)
+    swept = sweep_frames(greys, rig, shutter, motion, side, _REACH * max(greys[0].shape) / gain, coarse)
+    height, width = swept[0].rho.shape
+    known = []
+    for grey, each in zip(greys, swept, strict=True):
+        small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+        mean, square = (cv2.blur(part, (_TEXTURED, _TEXTURED)) for part in (small, small * small))
+        known.append(each.rho[each.agrees & (square - mean * mean > _TEXTURE_LEVELS**2)])
+    rho = np.concatenate(known)
+    return _MARGIN * float(np.quantile(rho, _NEAREST)) + _MARGIN_PX / gain if len(rho) else 0.0
 
 
 def search_size(shape: tuple[int, ...], options: SweepOptions) -> tuple[int, int]:

@@ -2,10 +2,11 @@
 
 A pixel of the standing scene has one unknown, its inverse depth: found along its own epipolar curve
 (``curve_sweep``), where the other frame confirms it; else by the dense flow, where that returns to its start and
-ends on the curve; else it is that of the farther neighbour in its row. What consistent flow carries beside the
-curve moves by itself: it goes its flow, scaled by the times of the rows. Both displacements are weighted by their
-variances. Each frame is drawn at the target, the nearer surface first, and what the first frame leaves empty is
-taken from the other one, moved to the same time.
+ends on the curve; along the border, as the surface beside it goes on (``border_depth``); else it is that of the
+farther neighbour in its row. What consistent flow carries beside the curve moves by itself: it goes its flow,
+scaled by the times of the rows. Both displacements are weighted by their variances. Each frame is drawn at the
+target, the nearer surface first, and what the first frame leaves empty is taken from the other one, moved to the
+same time.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ from rsbench.core.rig import FRAMES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision import forward_warp
+from rsbench.vision.border_depth import continued
 from rsbench.vision.correction import WarpOptions, line_maps
-from rsbench.vision.curve_sweep import SweepOptions, Swept, search_size, sweep_frames
+from rsbench.vision.curve_sweep import SweepOptions, Swept, largest_seen, search_size, sweep_frames
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.fusion import Fused, Origin, inpaint
@@ -178,8 +180,9 @@ class MonoFusion:
         met = [_triangulated(self.flows.flow[frame], maps[frame], pick) for frame in FRAMES]
         offs = [off[np.ix_(*pick)] for off in self.flows.returns]
         greys = [grey_u8(image) for image in self.images]
-        most = _range(offs, met, parallax_gain(own.rig.camera, *maps))
-        swept = sweep_frames(greys, own.rig, own.shutter, own.motion, own.side, most, self.options.sweep)
+        known, options = (greys, own.rig, own.shutter, own.motion, own.side), self.options.sweep
+        most = max(_range(offs, met, parallax_gain(own.rig.camera, *maps)), largest_seen(*known, options))
+        swept = sweep_frames(*known, most, options)
         return [_layer(swept[frame], offs[frame], *met[frame], shape) for frame in FRAMES]
 
     def _drawn(self, frame: int, target_tau: float) -> tuple[NDArray[Any], F32, NDArray[np.uint8]]:
@@ -300,7 +303,7 @@ def _layer(swept: Swept, off: F32, rho: F32, miss: F32, shape: tuple[int, ...]) 
     """
     full = shape[1::-1]
     still = (off < _RETURNS_PX) & (miss < _ON_CURVE_PX)
-    found = np.where(swept.agrees, swept.rho, np.where(still, rho, np.float32(np.nan)))
+    found = continued(np.where(swept.agrees, swept.rho, np.where(still, rho, np.float32(np.nan))))
     filled = cv2.resize(cv2.medianBlur(_filled(found), 5), full, interpolation=cv2.INTER_LINEAR)
     # How far consistent flow ends off the curve says how far geometry is from explaining it, found or not.
     wrong = np.maximum(miss - _ON_CURVE_PX, np.float32(0.0))
