@@ -38,6 +38,6 @@ def predict(
             split,
             lambda: track.problems(data, seed_file, len(split.truths)),
             place / "inputs",
-            lambda folder: write_frames_of(split, data, folder) if data and track.pictures else None,
+            lambda folder: write_frames_of(split, data, folder) if data and track.gives_images else None,
         )
         return track.run(entry, split, place / "inputs", place, workers=workers, limits=limits, step=advance)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,7 +17,6 @@ from rsbench.benchmark.leaderboard.answers import Answer
 from rsbench.benchmark.leaderboard.doubt import medians_of
 from rsbench.benchmark.leaderboard.frame_inputs import FrameTrack
 from rsbench.benchmark.leaderboard.marking import last, named
-from rsbench.benchmark.leaderboard.own_matches import FOLDER, match_files, match_scores, read_own_matches
 from rsbench.benchmark.leaderboard.points_draws import POINTS_1, Draws
 from rsbench.benchmark.leaderboard.running import SolverTrack, answer_problem
 from rsbench.benchmark.leaderboard.splits import (
@@ -58,7 +57,7 @@ _HELD = 100
 """Problems in which a method is held against the bound of its data."""
 _TIMES = 33
 """Row times, from the first row of frame 0 to the last of frame 1, at which poses are compared."""
-_MOTION = (
+MOTION = (
     *(
         Score(
             key=f"auc_{limit}",
@@ -81,7 +80,7 @@ _MOTION = (
     Score(key="metres", title="metres", hint="median distance of d from the truth, where claimed", kind="median"),
     SECONDS,
 )
-_MATCHES = (
+MATCHES = (
     Score(key="matches", title="matches", hint="median number of own matches", kind="median", better="higher"),
     Score(
         key="matches_1px",
@@ -107,7 +106,7 @@ class _Motion(Answer):
 class MotionTrack(SolverTrack):
     """The motion of a rig over one frame period."""
 
-    scores = _MOTION
+    scores = MOTION
     error, error_title = "error_deg", "max(e_R, e_T) in degrees"
     exact = ("error_deg", 1e-5)
     answers = _Motion
@@ -174,42 +173,6 @@ class PoseTrack(FrameTrack, MotionTrack):
     title = "Motion from given matches of rendered frames"
     allowed = ("left", "right", "links", "readout")
     given = "matches of the frames by rsbench's SIFT"
-
-
-class OwnPoseTrack(FrameTrack, MotionTrack):
-    """Of rendered frames; matches of the method's own may be handed in."""
-
-    name, id = "pose-own", "pose-own-1"
-    title = "Motion from rendered frames"
-    allowed = ("left", "right", "links", "readout", "images")
-    given = "the four rolling-shutter frames"
-    own_matches = True
-    scores = _MOTION + _MATCHES
-    smoke_metrics = (*MotionTrack.smoke_metrics, "matches", "matches_1px")
-
-    def load(self, cards: Sequence[str]) -> None:
-        raise RsbenchError(
-            f"track {self.name!r}: solvers of cards take given matches; run them on the track 'pose'"
-        )
-
-    def files_of(self, submission: Submission, split: Split) -> Iterable[str]:
-        return [f"{FOLDER}/{name}" for name in match_files(submission.folder)]
-
-    def check_beside(
-        self, submission: Submission, split: Split, most: int, hints: bool
-    ) -> tuple[list[str], list[str]]:
-        try:
-            read_own_matches(submission.folder, split.by_name)
-        except RsbenchError as error:
-            return [str(error)], []
-        return [], []
-
-    def rows(self, submission: Submission, split: Split) -> list[Row]:
-        rows, own = super().rows(submission, split), read_own_matches(submission.folder, split.by_name)
-        for row, truth in zip(rows, split.truths, strict=True):
-            assert truth.sequence is not None
-            row |= match_scores(truth.sequence, None if own is None else own[truth.name])
-        return rows
 
 
 def _mistaken(answers: Sequence[Answer], split: Split) -> tuple[str, int] | None:

@@ -82,6 +82,8 @@ class SolverTrack(Track):
 
     example: ClassVar[Mapping[str, Any]]
     """An answer for a template."""
+    also_uses: ClassVar[tuple[str, ...]] = ()
+    """What is used of every entry beside its solver."""
 
     @abstractmethod
     def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
@@ -280,7 +282,7 @@ def header_of(entry: SolverEntry, split: Split) -> dict[str, Any]:
         "protocol": split.track.id,
         "split": split.name,
         "method": entry.name,
-        "uses": uses_of(entry, track.gives_readout),
+        "uses": (*uses_of(entry, track.gives_readout), *track.also_uses),
         "description": entry.description[:300],
         "paper": spec.reference[:300],
         "code": "rsbench" if entry.built_in else "",

@@ -52,10 +52,8 @@ def nearness(over: FloatArray) -> FloatArray:
         return np.clip(1.0 - np.log10(over) / _DECADES, 0.0, 1.0)
 
 
-class SeveralLaws(SolverTrack):
-    """A track whose rigs move by several laws, which entries assume or choose from."""
-
-    parting = "motion"
+class Choosing(SolverTrack):
+    """A track whose entries assume a law of motion, or choose one."""
 
     def entry_of(self, card: str) -> SolverEntry:
         if card != CHOOSES:
@@ -69,6 +67,12 @@ class SeveralLaws(SolverTrack):
             return "chosen"
         spec = entry.solver.spec
         return "none" if spec.shutter == "global" else spec.motion_model
+
+
+class SeveralLaws(Choosing):
+    """A track whose rigs move by several laws."""
+
+    parting = "motion"
 
 
 def rounded(answer: dict[str, Any]) -> dict[str, Any]:

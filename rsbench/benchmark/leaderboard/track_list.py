@@ -5,7 +5,8 @@ from __future__ import annotations
 from rsbench.benchmark.leaderboard.correction_track import CorrectionTrack
 from rsbench.benchmark.leaderboard.depth_track import DepthTrack
 from rsbench.benchmark.leaderboard.mono_track import MonoCorrectionTrack
-from rsbench.benchmark.leaderboard.motion_tracks import OwnPoseTrack, PointsTrack, PoseTrack
+from rsbench.benchmark.leaderboard.motion_tracks import PointsTrack, PoseTrack
+from rsbench.benchmark.leaderboard.own_pose_track import OwnPoseTrack
 from rsbench.benchmark.leaderboard.placed_track import PlacedCorrection
 from rsbench.benchmark.leaderboard.readout_track import ReadoutTrack
 from rsbench.benchmark.leaderboard.second_protocols import DrawnReadout, LawsOfPoints, LawsOfPoses

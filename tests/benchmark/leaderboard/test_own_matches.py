@@ -109,6 +109,20 @@ def test_matches_are_kept_with_the_entry(split: Split, tmp_path: Path) -> None:
     assert list(entry.files) == ["matches/left.csv"] and entry.scores["matches_1px"][0] > 0.98
 
 
+def test_what_comes_with_rsbench_finds_its_own_matches(smoke_dataset: Path, tmp_path: Path) -> None:
+    """The matches of ``rsbench correct``, which are handed in, and the law that they ask for."""
+    board = ["--board", tmp_path / "board", "--data", smoke_dataset]
+    entries = ["--entry", "rs-stereo-auto", "--entry", "gs-8pt"]
+    ran = run_here("leaderboard", "run", "pose-own", *entries, *board)
+    assert ran.returncode == 0, ran.stderr
+    split = dataset_split(TRACKS["pose-own"], smoke_dataset)
+    baseline, ours = entries_of(tmp_path / "board", "pose-own-1", split.name)
+    assert (ours.header.method, baseline.header.method) == ("rs-stereo-auto", "gs-8pt")
+    assert "images" in ours.header.uses and "matches/tracks.csv" in ours.files
+    assert ours.scores["matches"].min() > 50 and ours.scores["matches_1px"].min() > 0.7
+    assert ours.scores["e_R_deg"].median() < 0.5 * baseline.scores["e_R_deg"].median()
+
+
 FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "another file": (lambda p: (p / "evil.csv").write_text("x"), "evil.csv: is not asked; there are: left.csv"),
     "a link": (lambda p: (p / "right.csv").symlink_to(p / "left.csv"), "right.csv: must be a file of its own"),
