@@ -14,13 +14,14 @@ import pytest
 from commands import assert_refused, run_here
 from leaderboards import named, truth_lines, write
 
+from rsbench.benchmark.leaderboard import publishing
 from rsbench.benchmark.leaderboard.board import entries_of
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.motion_tracks import smooth
 from rsbench.benchmark.leaderboard.points_draws import KINDS, LAWS, POINTS_2
 from rsbench.benchmark.leaderboard.running import CHOOSES
 from rsbench.benchmark.leaderboard.second_protocols import SAME_METHOD, rounded
-from rsbench.benchmark.leaderboard.splits import Split, exact_problem, points_split, simulated_problem
+from rsbench.benchmark.leaderboard.splits import Split, exact_problem, points_split, simulated_problem, truth_of
 from rsbench.benchmark.leaderboard.standings import standings, table
 from rsbench.benchmark.leaderboard.stored_predictions import SUFFIX, restore
 from rsbench.benchmark.leaderboard.submissions import read_submission
@@ -30,6 +31,7 @@ from rsbench.cli.reproduce_leaderboard import entries_of_laws
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import TwistMotion
 from rsbench.core.pose_errors import rotation_error, translation_error
+from rsbench.dataset.card import load_dataset_card
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.solvers.engine.registry import load_solver_entry
 
@@ -150,7 +152,8 @@ def test_numbers_are_stored_with_few_digits() -> None:
 
 def test_protocols_are_found_by_their_numbers() -> None:
     assert track_of_name("points-1") is TRACKS["points"] and track_of_name("points-2") is TRACK
-    assert not SAME_METHOD.keys() & set(entries_of_laws()) and set(SAME_METHOD.values()) <= set(entries_of_laws())
+    entries = entries_of_laws()["points-2"]
+    assert not SAME_METHOD.keys() & set(entries) and set(SAME_METHOD.values()) <= set(entries)
     with pytest.raises(RsbenchError, match="points-3"):
         track_of_name("points-3")
     assert points_split(TRACKS["points"]).truths[0].facts.keys().isdisjoint({"motion", "rig"})
@@ -159,13 +162,22 @@ def test_protocols_are_found_by_their_numbers() -> None:
 # What is committed
 
 
+def _without_frames(protocol: str) -> Split:
+    """Of the card ``laws``, as it would be read, had it been rendered."""
+    card = load_dataset_card("laws")
+    pairs = [pair for sequence in publishing._sequences(card) for pair in sequence.pairs()]
+    return Split(track=TRACKS[protocol], label=card.name, public=True, truths=tuple(map(truth_of, pairs)))
+
+
 @pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
-def test_stored_predictions_give_the_committed_table(split: Split, tmp_path: Path) -> None:
-    restore(LAWS_FOLDER / "predictions", split, tmp_path / "board")
-    found = table(standings(entries_of(tmp_path / "board", TRACK.id, split.name)))
-    (path,) = (LAWS_FOLDER / "site").glob("points-2--*.csv")
+@pytest.mark.parametrize("protocol", ["points-2", "pose-2", "readout-2"])
+def test_stored_predictions_give_the_committed_table(protocol: str, split: Split, tmp_path: Path) -> None:
+    split = split if protocol == TRACK.id else _without_frames(protocol)
+    restore(LAWS_FOLDER / "predictions" / protocol, split, tmp_path / "board")
+    found = table(standings(entries_of(tmp_path / "board", protocol, split.name)))
+    (path,) = (LAWS_FOLDER / "site").glob(f"{protocol}--*.csv")
     stored = pd.read_csv(path)
-    assert path.stem == f"points-2--{split.name}"
+    assert path.stem == f"{protocol}--{split.name}"
     assert list(found["method"]) == list(stored["method"]) and list(found.columns) == list(stored.columns)
     for name in found:
         if pd.api.types.is_numeric_dtype(stored[name]) and not pd.api.types.is_bool_dtype(stored[name]):
@@ -173,7 +185,8 @@ def test_stored_predictions_give_the_committed_table(split: Split, tmp_path: Pat
             values = found[name].to_numpy(dtype=np.float64, na_value=np.nan)
             np.testing.assert_allclose(values, stored[name].to_numpy(dtype=np.float64), rtol=2e-5, atol=1e-9)
     made = json.loads((LAWS_FOLDER / "provenance.json").read_text("utf-8"))["entries"]
-    assert {name.rpartition("/")[2] for name in made} == set(found["method"])
+    names = {name.rpartition("/")[2] for name in made if name.startswith(f"{protocol}/")}
+    assert names == set(found["method"])
 
 
 @pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
