@@ -54,8 +54,9 @@ class PlacedCorrection(CorrectionTrack):
             kind="share",
             better="higher",
         ),
-        *CorrectionTrack.scores,
+        *(score for score in CorrectionTrack.scores if not score.key.startswith("flip_")),
     )
+    flips = False
     error, error_title = "misplaced", "1 - placed"
     smoke: ClassVar[tuple[str, ...]] = ()
 

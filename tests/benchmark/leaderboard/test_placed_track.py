@@ -105,6 +105,7 @@ def test_oracles_have_their_places(planes: Path, tmp_path: Path) -> None:
     # A picture on itself: the top of an uneven correlation is no more than 0.01 px from the middle.
     assert np.all(found["truth"]["placed"] > 0.995) and np.all(found["truth"]["misplaced"] < 0.005)
     assert np.all(found["fusion-true"]["placed"] > found["uncorrected"]["placed"])
+    assert {score.key for score in split.track.scores} <= set(found["truth"]) and "flip_all" not in found["truth"]
     assert lines_of(tmp_path / "truth" / "predictions.jsonl")[0]["protocol"] == "correction-2"
 
 
