@@ -170,7 +170,7 @@ def _without_frames(protocol: str) -> Split:
 
 
 @pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
-@pytest.mark.parametrize("protocol", ["points-2", "pose-2"])
+@pytest.mark.parametrize("protocol", ["points-2", "pose-2", "readout-2"])
 def test_stored_predictions_give_the_committed_table(protocol: str, split: Split, tmp_path: Path) -> None:
     split = split if protocol == TRACK.id else _without_frames(protocol)
     restore(LAWS_FOLDER / "predictions" / protocol, split, tmp_path / "board")
