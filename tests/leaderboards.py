@@ -49,6 +49,12 @@ PLANES = _RIG, _SHUTTER, _MOTION
 ASK_PICTURES = ("depth", "correction")
 
 
+def jobs_here(serve: Any, jobs: Any, workers: int, environment: object, *arguments: object) -> Any:
+    """``finished_jobs`` without a child."""
+    run = serve(*arguments)
+    yield from ((job, run(job)) for job in jobs)
+
+
 def lines_of(path: Path) -> list[Line]:
     return [json.loads(line) for line in path.read_text("utf-8").splitlines()]
 

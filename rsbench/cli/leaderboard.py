@@ -267,7 +267,9 @@ def rescore(
     workers: Workers = 1,
     stored: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Make the board of these predictions, as results/laws/predictions."),
+        typer.Option(
+            metavar="DIR", help="Make the board of these predictions, as results/laws/predictions/pose-2."
+        ),
     ] = None,
 ) -> None:
     """Score the stored predictions again and say which scores changed; runs no method."""

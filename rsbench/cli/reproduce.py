@@ -25,7 +25,7 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench reproduce leaderboard --out results --data data  [dim](our solvers on points: 25 minutes of a core)[/dim]
 
-  rsbench reproduce laws --out results --data data         [dim](points under five laws: an hour of a core)[/dim]
+  rsbench reproduce laws --out results --data data         [dim](five laws: renders 180 sequences first)[/dim]
 
   rsbench reproduce boards --out results --data data       [dim](tracks of frames, 216 sequences: 3 hours)[/dim]
 
@@ -81,7 +81,7 @@ def reproduce(
             "mild, moderate, aggressive and poles. sgm: stereo matching when the cameras' rows are not in step. "
             "real: the default pipeline on rendered frames with lens, blur and noise, beside an ideal camera's. "
             "leaderboard: our solvers on the public split of points, its site, and the scores of the smoke run. "
-            "laws: the same of points under several laws of motion, with all predictions. "
+            "laws: points and frames under several laws of motion, with the predictions of solvers. "
             "boards: the same of the tracks of frames, on the dataset standard. "
             "handheld: trajectories of whole sequences from hands. "
             "everything: all of these, one after the other, with the time that each took."

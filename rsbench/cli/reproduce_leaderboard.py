@@ -25,26 +25,38 @@ def leaderboard(out: Path, data: Path, workers: int | None) -> None:
 
 
 def laws(out: Path, data: Path, workers: int | None) -> None:
-    """The same of points under several laws of motion, and what each entry answered."""
+    """Points and frames under several laws of motion, rendered where they are missing, and what entries answered.
+
+    Of pictures the site alone is published: the answers are gigabytes.
+    """
     from rsbench.benchmark.leaderboard.board import splits_of
     from rsbench.benchmark.leaderboard.stored_predictions import store
+    from rsbench.benchmark.leaderboard.track_list import track_of_id
+    from rsbench.cli.generate import generate
     from rsbench.cli.leaderboard import oracles, run
 
-    board, folder = data / LAWS, out / LAWS
-    run("points-2", entries_of_laws(), str(board), workers=workers or os.cpu_count() or 1)
-    oracles("points-2", board)
+    board, frames, folder, count = data / LAWS, data / "laws-frames", out / LAWS, workers or os.cpu_count() or 1
+    generate("laws", str(frames), None, workers=count)
+    for track, entries in entries_of_laws().items():
+        given = frames if track_of_id(track).rendered else None
+        run(track, entries, str(board), given, workers=count)
+        oracles(track, board, given)
     publish(board, folder, "rsbench reproduce laws")
     for protocol, split in splits_of(board):
-        store(board, protocol, split, folder / "predictions")
+        if not track_of_id(protocol).pictures:
+            store(board, protocol, split, folder / "predictions" / protocol)
 
 
-def entries_of_laws() -> list[str]:
-    """What comes with rsbench where motions follow several laws: one entry a method, and the one that chooses."""
+def entries_of_laws() -> dict[str, list[str]]:
+    """By protocol, what comes with rsbench: one entry a method, and of solvers the one that chooses its law."""
     from rsbench.benchmark.leaderboard.running import CHOOSES
     from rsbench.benchmark.leaderboard.second_protocols import SAME_METHOD
-    from rsbench.cli.leaderboard_smoke import own_solvers
 
-    return [name for name in own_solvers() if name not in SAME_METHOD] + [CHOOSES]
+    first = entries_of_frames()
+    solvers, readers = (
+        [name for name in first[track] if name not in SAME_METHOD] + [CHOOSES] for track in ("pose", "readout")
+    )
+    return {"points-2": solvers, "pose-2": solvers, "readout-2": readers, "correction-2": first["correction"]}
 
 
 def boards(out: Path, data: Path, workers: int | None) -> None:

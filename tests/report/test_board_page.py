@@ -378,6 +378,15 @@ def test_results_tell_the_bound_and_rows_of_the_committed_board() -> None:
         assert f"reach {score} of {bound.split(' | ')[column]}." in words
     ranked = [each for each in page.split("\n\n") if " rank |" in each.partition("\n")[0]]
     shown = [each.splitlines() for each in ranked]
-    protocols = ("points-2", "points-1", "pose-1", "depth-1", "correction-1")
+    protocols = (
+        "points-2",
+        "pose-2",
+        "readout-2",
+        "correction-2",
+        "points-1",
+        "pose-1",
+        "depth-1",
+        "correction-1",
+    )
     for rows, protocol in zip(shown, protocols, strict=True):
         assert set(rows) <= set(tables[protocol]) and len(rows) > 5

@@ -118,6 +118,8 @@ class CorrectionTrack(PictureTrack):
     asks_rows = True
     rows: ClassVar[tuple[str, ...]] = ("first", "middle")
     """At whose times frames are asked, where the dataset has the truth."""
+    flips: ClassVar[bool] = True
+    """Whether FLIP is among the scores."""
     scores = _FRAMES
     error, error_title = "error", "1 - SSIM"
     exact = ("error", 1e-6)
@@ -164,7 +166,7 @@ class CorrectionTrack(PictureTrack):
         def scores_of(submission: Submission, success: bool) -> Numbers:
             folder = submission.folder / FOLDER
             drawn = [read_answer_frame(folder, truth, each) for each in pictures.asked] if success else None
-            return frame_scores(true, drawn, self.rows)
+            return frame_scores(true, drawn, self.rows, flips=self.flips)
 
         return scores_of
 
@@ -260,23 +262,28 @@ class TrueFrame:
 
 
 def frame_scores(
-    truths: Sequence[TrueFrame], frames: Sequence[Frame] | None, rows: Sequence[str] = CorrectionTrack.rows
+    truths: Sequence[TrueFrame],
+    frames: Sequence[Frame] | None,
+    rows: Sequence[str] = CorrectionTrack.rows,
+    *,
+    flips: bool = True,
 ) -> Numbers:
     """Of corrected frames, one for each that is asked; None: a failure. Means over these, of dB too.
 
-    ``rows`` are those at whose times they may be asked.
+    ``rows`` are those at whose times they may be asked; ``flips``: FLIP too, which takes most of the time.
     """
     scores, squares = list[Numbers](), SquareErrors(CorrectionTrack.part_score)
     for number, true in enumerate(truths):
         squares.add(None if frames is None else frames[number][0], true.picture.image, true.parts)
-        scores.append(_WORST_FRAME if frames is None else _frame(*frames[number], true))
-    found = {key: float(np.mean([each[key] for each in scores])) for key in _WORST_FRAME}
+        scores.append(_WORST_FRAME if frames is None else _frame(*frames[number], true, flips))
+    keys = [key for key in _WORST_FRAME if flips or not key.startswith("flip_")]
+    found = {key: float(np.mean([each[key] for each in scores])) for key in keys}
     by_row = {f"psnr_{name}": math.nan for name in rows}
     by_row |= {f"psnr_{true.name}": each["psnr"] for true, each in zip(truths, scores, strict=True)}
     return {**found, **by_row, **squares.scores(), "error": 1.0 - found["ssim"]}
 
 
-def _frame(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame) -> Numbers:
+def _frame(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame, flips: bool) -> Numbers:
     common, truth, drawing = true.common, true.picture, Picture(image)
     masks = dict(zip(_PIXELS, (common, drawn, np.ones_like(common)), strict=True))
     both, values = common & drawn, list(masks.values())
@@ -290,7 +297,7 @@ def _frame(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame) 
     # Where no pixel counts there is no value; where SSIM is below 0, nothing of the picture is left.
     found = {key: _WORST_FRAME[key] if math.isnan(value) else value for key, value in found.items()}
     found |= {key: max(value, 0.0) for key, value in found.items() if key.startswith("ssim")}
-    return {**found, **_flips(image, truth.image, masks)}
+    return {**found, **(_flips(image, truth.image, masks) if flips else {})}
 
 
 def _flips(image: NDArray[np.uint8], truth: NDArray[np.uint8], masks: dict[str, Any]) -> Numbers:

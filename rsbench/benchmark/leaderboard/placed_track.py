@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import product
 from typing import ClassVar
 
@@ -21,10 +22,12 @@ from rsbench.benchmark.leaderboard.correction_track import CorrectionTrack, Fram
 from rsbench.benchmark.leaderboard.marking import Numbers
 from rsbench.benchmark.leaderboard.picture_files import FOLDER, read_answer_frame
 from rsbench.benchmark.leaderboard.picture_parts import texture
+from rsbench.benchmark.leaderboard.picture_running import CardChain
 from rsbench.benchmark.leaderboard.splits import Truth
 from rsbench.benchmark.leaderboard.submissions import Submission
 from rsbench.benchmark.leaderboard.track import Score
 from rsbench.benchmark.leaderboard.true_pictures import TruePictures
+from rsbench.capture.settle import AUTO
 
 LIMIT_PX = 2.0
 """A window that stands farther off has no part in the score."""
@@ -51,10 +54,17 @@ class PlacedCorrection(CorrectionTrack):
             kind="share",
             better="higher",
         ),
-        *CorrectionTrack.scores,
+        *(score for score in CorrectionTrack.scores if not score.key.startswith("flip_")),
     )
+    flips = False
     error, error_title = "misplaced", "1 - placed"
     smoke: ClassVar[tuple[str, ...]] = ()
+
+    def chain(self, card: str) -> CardChain:
+        """With the motion model that the matches prefer: what ``rsbench correct`` does."""
+        found = super().chain(card)
+        options = replace(found.options, motion_model=AUTO)
+        return found._replace(options=options, key=options.key)
 
     def scorer(self, truth: Truth, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
         others, true = super().scorer(truth, pictures), TrueFrame.all_of(pictures)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from commands import assert_refused, run_here
-from leaderboards import ASK_PICTURES, PLANES, files_below, lines_of, pictures_of
+from leaderboards import ASK_PICTURES, PLANES, files_below, jobs_here, lines_of, pictures_of
 
 from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.board import entries_of
@@ -20,12 +19,6 @@ from rsbench.storage.files import read_depth
 RIG, _, _ = PLANES
 
 
-def _here(serve: Any, jobs: Any, workers: int, environment: object, *arguments: object) -> Any:
-    """``finished_jobs`` without a child."""
-    run = serve(*arguments)
-    yield from ((job, run(job)) for job in jobs)
-
-
 @pytest.mark.parametrize(
     ("track", "entries"),
     [("depth", ("sgm", "sgm-plain")), ("correction", ("rotation-only", "fusion", "lao-lines"))],
@@ -34,7 +27,7 @@ def test_cards_run_and_go_on(
     track: str, entries: tuple[str, ...], smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Through the command line; what is lost is made again, to the last digit, and a solver is no matcher."""
-    monkeypatch.setattr(running, "finished_jobs", _here)
+    monkeypatch.setattr(running, "finished_jobs", jobs_here)
     where = ("--data", smoke_dataset, "--board", tmp_path / "board")
     cards = [word for entry in entries for word in ("--entry", entry)]
     assert_refused(run_here("leaderboard", "run", track, *where, "--entry", "gs-8pt"), "gs-8pt")
@@ -80,7 +73,7 @@ def test_a_method_of_somebody_else_runs_and_fails_alone(
     planes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two cards beside their own module: one level everywhere, and one that raises."""
-    monkeypatch.setattr(running, "finished_jobs", _here)
+    monkeypatch.setattr(running, "finished_jobs", jobs_here)
     (tmp_path / "level_matcher.py").write_text(MATCHER, "utf-8")
     for name, px in (("level", 5.0), ("odd", -1.0)):
         (tmp_path / f"{name}.toml").write_text(

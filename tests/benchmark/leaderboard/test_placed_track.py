@@ -18,6 +18,7 @@ from rsbench.benchmark.leaderboard.placed_track import placed
 from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.submissions import read_submission
 from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.vision.quality import Picture, ssim
 
 Image = np.ndarray[Any, np.dtype[np.uint8]]
@@ -104,4 +105,14 @@ def test_oracles_have_their_places(planes: Path, tmp_path: Path) -> None:
     # A picture on itself: the top of an uneven correlation is no more than 0.01 px from the middle.
     assert np.all(found["truth"]["placed"] > 0.995) and np.all(found["truth"]["misplaced"] < 0.005)
     assert np.all(found["fusion-true"]["placed"] > found["uncorrected"]["placed"])
+    assert {score.key for score in split.track.scores} <= set(found["truth"]) and "flip_all" not in found["truth"]
     assert lines_of(tmp_path / "truth" / "predictions.jsonl")[0]["protocol"] == "correction-2"
+
+
+def test_correctors_have_the_motion_whose_model_the_matches_prefer() -> None:
+    """As ``rsbench correct`` has; of the first protocol it stays that of the solver's own model."""
+    first, second = (TRACKS[name].chain("fusion") for name in ("correction", "correction-2"))  # pyrefly: ignore[missing-attribute]
+    assert first.options.motion_model is None and second.options.motion_model == "auto"
+    assert first.key == CorrectionOptions().key
+    assert second.key == CorrectionOptions(motion_model="auto").key != first.key
+    assert (second.entry.key, second.uses) == (first.entry.key, first.uses)

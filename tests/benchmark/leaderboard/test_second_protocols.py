@@ -14,13 +14,14 @@ import pytest
 from commands import assert_refused, run_here
 from leaderboards import named, truth_lines, write
 
+from rsbench.benchmark.leaderboard import publishing
 from rsbench.benchmark.leaderboard.board import entries_of
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.motion_tracks import smooth
 from rsbench.benchmark.leaderboard.points_draws import KINDS, LAWS, POINTS_2
 from rsbench.benchmark.leaderboard.running import CHOOSES
 from rsbench.benchmark.leaderboard.second_protocols import SAME_METHOD, rounded
-from rsbench.benchmark.leaderboard.splits import Split, exact_problem, points_split, simulated_problem
+from rsbench.benchmark.leaderboard.splits import Split, exact_problem, points_split, simulated_problem, truth_of
 from rsbench.benchmark.leaderboard.standings import standings, table
 from rsbench.benchmark.leaderboard.stored_predictions import SUFFIX, restore
 from rsbench.benchmark.leaderboard.submissions import read_submission
@@ -30,6 +31,7 @@ from rsbench.cli.reproduce_leaderboard import entries_of_laws
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import TwistMotion
 from rsbench.core.pose_errors import rotation_error, translation_error
+from rsbench.dataset.card import load_dataset_card
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.solvers.engine.registry import load_solver_entry
 
@@ -150,7 +152,8 @@ def test_numbers_are_stored_with_few_digits() -> None:
 
 def test_protocols_are_found_by_their_numbers() -> None:
     assert track_of_name("points-1") is TRACKS["points"] and track_of_name("points-2") is TRACK
-    assert not SAME_METHOD.keys() & set(entries_of_laws()) and set(SAME_METHOD.values()) <= set(entries_of_laws())
+    entries = entries_of_laws()["points-2"]
+    assert not SAME_METHOD.keys() & set(entries) and set(SAME_METHOD.values()) <= set(entries)
     with pytest.raises(RsbenchError, match="points-3"):
         track_of_name("points-3")
     assert points_split(TRACKS["points"]).truths[0].facts.keys().isdisjoint({"motion", "rig"})
@@ -159,13 +162,22 @@ def test_protocols_are_found_by_their_numbers() -> None:
 # What is committed
 
 
+def _without_frames(protocol: str) -> Split:
+    """Of the card ``laws``, as it would be read, had it been rendered."""
+    card = load_dataset_card("laws")
+    pairs = [pair for sequence in publishing._sequences(card) for pair in sequence.pairs()]
+    return Split(track=TRACKS[protocol], label=card.name, public=True, truths=tuple(map(truth_of, pairs)))
+
+
 @pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
-def test_stored_predictions_give_the_committed_table(split: Split, tmp_path: Path) -> None:
-    restore(LAWS_FOLDER / "predictions", split, tmp_path / "board")
-    found = table(standings(entries_of(tmp_path / "board", TRACK.id, split.name)))
-    (path,) = (LAWS_FOLDER / "site").glob("points-2--*.csv")
+@pytest.mark.parametrize("protocol", ["points-2", "pose-2", "readout-2"])
+def test_stored_predictions_give_the_committed_table(protocol: str, split: Split, tmp_path: Path) -> None:
+    split = split if protocol == TRACK.id else _without_frames(protocol)
+    restore(LAWS_FOLDER / "predictions" / protocol, split, tmp_path / "board")
+    found = table(standings(entries_of(tmp_path / "board", protocol, split.name)))
+    (path,) = (LAWS_FOLDER / "site").glob(f"{protocol}--*.csv")
     stored = pd.read_csv(path)
-    assert path.stem == f"points-2--{split.name}"
+    assert path.stem == f"{protocol}--{split.name}"
     assert list(found["method"]) == list(stored["method"]) and list(found.columns) == list(stored.columns)
     for name in found:
         if pd.api.types.is_numeric_dtype(stored[name]) and not pd.api.types.is_bool_dtype(stored[name]):
@@ -173,7 +185,8 @@ def test_stored_predictions_give_the_committed_table(split: Split, tmp_path: Pat
             values = found[name].to_numpy(dtype=np.float64, na_value=np.nan)
             np.testing.assert_allclose(values, stored[name].to_numpy(dtype=np.float64), rtol=2e-5, atol=1e-9)
     made = json.loads((LAWS_FOLDER / "provenance.json").read_text("utf-8"))["entries"]
-    assert {name.rpartition("/")[2] for name in made} == set(found["method"])
+    names = {name.rpartition("/")[2] for name in made if name.startswith(f"{protocol}/")}
+    assert names == set(found["method"])
 
 
 @pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
@@ -191,10 +204,26 @@ def test_results_tell_what_laws_cost() -> None:
     auto, twist, scaled = (f"{mean[name]:.3f}" for name in (CHOOSES, *RIVALS))
     assert f"it has {auto}, `{RIVALS[0]}` {twist} and `{RIVALS[1]}` {scaled}." in words
     best, others = by_law["spline"][CHOOSES], by_law["spline"].drop(CHOOSES).max()
-    assert 6.5 < 10.0 ** (2.0 * (1.0 - others)) < 7.5 and 2.5 < 10.0 ** (2.0 * (1.0 - best)) < 3.5
+    assert 6.5 < 10.0 ** (2.0 * (1.0 - others)) < 7.5 and 3.5 < 10.0 ** (2.0 * (1.0 - best)) < 4.5
     places = ranked[["rank", "rank_low", "rank_high"]].astype(int)
     assert np.all(places.loc[CHOOSES] == 1) and places.loc["rs-stereo-refined", "rank"] == 4
     assert set(RIVALS) <= set(str(ranked.loc["rs-stereo-refined", "ties"]).split())
+
+
+@pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
+def test_results_tell_what_laws_cost_on_frames() -> None:
+    """The sentences below the table of frames are those of its numbers; each bold claim holds."""
+    (path,) = (LAWS_FOLDER / "site").glob("pose-2--*.csv")
+    ranked = pd.read_csv(path, index_col="method").dropna(subset="rank")
+    words = " ".join((ROOT / "docs" / "results-leaderboard.md").read_text("utf-8").split())
+    auto, others = ranked.loc[CHOOSES], ranked.drop(CHOOSES)
+    first = f"**, with {auto['auc_apart']:.2f}, the next {others['auc_apart'].max():.2f}. It gains most"
+    assert first in words and np.all(ranked.loc[CHOOSES, ["rank", "rank_low", "rank_high"]].astype(int) == 1)
+    own, best = ({law: row[f"auc_apart_{law}"] for law in LAWS} for row in (auto, others.max(numeric_only=True)))
+    assert f"assumes: {own['accelerated']:.2f} there, the next {best['accelerated']:.2f}." in words
+    assert f"{best['linear']:.2f} to {own['linear']:.2f} (`linear`) and" in words
+    assert f"{best['twist']:.2f} to {own['twist']:.2f} (`twist`)" in words
+    assert f"the hardest here too**, {own['spline']:.2f}, the next {best['spline']:.2f}." in words
 
 
 def test_damaged_predictions_are_named(split: Split, tmp_path: Path) -> None:
