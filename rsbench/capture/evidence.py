@@ -75,9 +75,8 @@ class Peak:
             ends = -ends[::-1]
         low, high = scipy.special.log_ndtr(ends)
         mass = high + np.log1p(-np.exp(min(low - high, -1e-12)))
-        return self.value + float(
-            0.5 * np.log(2.0 * np.pi) + np.log(self.sigma) + mass - np.log(1.0 - LEAST_RATIO)
-        )
+        width = 0.5 * np.log(2.0 * np.pi) + np.log(self.sigma)
+        return self.value + float(width + mass - np.log(1.0 - LEAST_RATIO))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -183,8 +182,9 @@ def _of_each_model(
     found = list[tuple[CaptureFit, float]]()
     for fit, model in product(fits, known.models):
         hypothesis = replace(fit.hypothesis, motion_model=model)
-        start = _start_from(timed, known, fit, hypothesis)
-        found.append(_settled(timed[model], some, hypothesis, known, start))
+        starts = (_start_from(timed, known, fit, hypothesis, k) for k in hypothesis.accelerations)
+        settled = (_settled(timed[model], some, hypothesis, known, start) for start in starts)
+        found.append(min(settled, key=lambda each: (each[1], each[0].cost)))
     best, scale = min(found, key=lambda each: (each[1], each[0].cost))
     likelihood = _distribution(timed[best.hypothesis.motion_model], some, best, scale)
     if likelihood is None:
@@ -194,13 +194,13 @@ def _of_each_model(
 
 
 def _start_from(
-    timed: Mapping[str, TimedMatches], known: Known, fit: CaptureFit, hypothesis: Hypothesis
+    timed: Mapping[str, TimedMatches], known: Known, fit: CaptureFit, hypothesis: Hypothesis, k: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Where the fit of a hypothesis starts: at another one's of the same scans."""
+    """Where the fit of a hypothesis starts: at another one's of the same scans; ``k``: of another model's."""
     model = hypothesis.motion_model
     unknowns = known.start(hypothesis, *fit.unknowns[[RATIO, DELAY]])
     unknowns[CALIBRATION] = fit.unknowns[CALIBRATION]
-    unknowns[ACCELERATION] = fit.unknowns[ACCELERATION] if model == fit.hypothesis.motion_model else 0.0
+    unknowns[ACCELERATION] = fit.unknowns[ACCELERATION] if model == fit.hypothesis.motion_model else k
     motion = timed[fit.hypothesis.motion_model].kernel(fit.unknowns).motion(fit.theta)
     return timed[model].kernel(unknowns).theta(*motion), unknowns
 

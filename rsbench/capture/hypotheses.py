@@ -34,6 +34,12 @@ class Hypothesis:
     delayed: bool = False
     """Whether the right camera may be late."""
 
+    @property
+    def accelerations(self) -> tuple[float, ...]:
+        """k that its fits start from: from 0 alone, two of eighteen rigs that turned by 6 deg and slowed down were
+        taken for ones in reverse."""
+        return (0.0, -0.3, 0.3) if self.motion_model == "accelerated" else (0.0,)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Known:

@@ -17,9 +17,10 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.answer import solve_problem
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_motion import FoundMotion, find_motion, solve_frames
+from rsbench.pipeline.frame_motion import FoundMotion, chosen_model, find_motion, solve_frames
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import Problem
+from rsbench.solvers.engine.robust_motion import RobustOptions
 
 OPTIONS = CorrectionOptions(motion_model="auto")
 
@@ -145,3 +146,17 @@ def test_few_tracks_and_a_global_shutter_ask_for_none() -> None:
     still = RollingShutter(height=HEIGHT, readout_ratio=0.0)
     few = Correspondences(tracks=window.tracks[:20])
     assert shaken_motion(window, RIG, still, law) is None and shaken_motion(few, RIG, SHUTTER, law) is None
+
+
+def test_a_rig_that_slows_down_is_told_from_any_start() -> None:
+    """A turn of 6 deg at k = -0.3 with a third of outliers, looked for from a rig at rest."""
+    told = []
+    for seed in range(14, 22):
+        rng = np.random.default_rng(seed)
+        w, d = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
+        motion = make_motion("accelerated", 0.105 * w, 0.2 * d, {"acceleration": -0.3})
+        data = simulate(RIG, SHUTTER, motion, SimulationOptions(tracks=110, noise_px=0.1, outlier_ratio=0.3), rng)
+        rest = make_motion("linear", np.zeros(3), np.zeros(3))
+        choice = chosen_model("auto", rest, data.correspondences, RIG, SHUTTER, RobustOptions(), 0)
+        told.append(choice is not None and abs(choice.parameters.get("acceleration", 0.0) + 0.3) < 0.02)
+    assert sum(told) >= 7  # 6 where fits start from k = 0 alone
