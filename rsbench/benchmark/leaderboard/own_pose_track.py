@@ -36,7 +36,7 @@ class OwnPoseTrack(Choosing, FrameTrack, MotionTrack):
 
     def run(self, cards: Sequence[str], split: Split, inputs: Path, work: Path, **options: Any) -> list[Path]:
         """Solvers get the matches that ``rsbench correct`` finds by default, and hand them in."""
-        found, matched = with_matches(read_inputs(inputs, self), inputs), work / "matched"
+        found, matched = with_matches(read_inputs(inputs, self), inputs, CorrectionOptions()), work / "matched"
         write_inputs(replace(split, public=False), found, matched)
         files = run_cards(self, cards, split, matched, work, **options)
         for file in files:
@@ -63,9 +63,9 @@ class OwnPoseTrack(Choosing, FrameTrack, MotionTrack):
         return rows
 
 
-def with_matches(problems: Iterable[Problem], inputs: Path) -> list[Problem]:
-    """Problems with what the default features find in their frames; nothing where these show no texture."""
-    options, found = CorrectionOptions(), list[Problem]()
+def with_matches(problems: Iterable[Problem], inputs: Path, options: CorrectionOptions) -> list[Problem]:
+    """Problems with what the features of the options find in their frames; nothing where these show no texture."""
+    found = list[Problem]()
     for problem in problems:
         images, scanning = read_frames(inputs, problem), problem.shutter.scanning
         try:

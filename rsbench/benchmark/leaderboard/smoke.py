@@ -15,10 +15,11 @@ import pandas as pd
 
 from rsbench.benchmark.images.store import read_record
 from rsbench.benchmark.leaderboard.exporting import write_matches
-from rsbench.benchmark.leaderboard.frame_inputs import FEATURES, FrameTrack, read_frames, write_frames
+from rsbench.benchmark.leaderboard.frame_inputs import FEATURES, FrameTrack, write_frames
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.motion_tracks import PoseTrack
 from rsbench.benchmark.leaderboard.own_matches import FOLDER as MATCHES
+from rsbench.benchmark.leaderboard.own_pose_track import with_matches
 from rsbench.benchmark.leaderboard.running import (
     answer_problem,
     header_of,
@@ -34,7 +35,6 @@ from rsbench.dataset.sequence import read_dataset_manifest
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.jobs.process_jobs import finished_jobs
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.storage.files import read_table, write_bytes
 from rsbench.vision.feature_matcher import load_features
@@ -183,22 +183,12 @@ def _answers(split: Split, entries: Sequence[str], inputs: Path, work: Path) -> 
 def _with_own_matches(cards: Sequence[str], split: Split, inputs: Path, work: Path) -> Iterator[Path]:
     """Solvers on matches of the frames, which are handed in too."""
     options, runner = CorrectionOptions(features=load_features(FEATURES)), SolverRunner(single_thread=True)
-    given = [
-        replace(
-            each,
-            correspondences=find_matches_of_rig(
-                read_frames(inputs, each), each.rig, each.shutter.scanning, options
-            ),
-        )
-        for each in read_inputs(inputs, split.track)
-    ]
+    given = with_matches(read_inputs(inputs, split.track), inputs, options)
     for entry in load_entries(cards, PoseTrack()).values():
-        header = header_of(entry, split)
-        header["uses"] = [*header["uses"], "images"]
         path = work / entry.name / "predictions.jsonl"
         write_matches(given, path.parent / MATCHES)
         answers = (answer_problem(each, entry, runner) for each in given)
-        write_bytes(path, submission_text(header, answers).encode())
+        write_bytes(path, submission_text(header_of(entry, split), answers).encode())
         yield path
 
 
