@@ -59,9 +59,9 @@ def scores(sequence: Sequence) -> tuple[float, float, float]:
     own = [images["left", frame] for frame in FRAMES]
     flows, alone = find_flows(own), float("nan")
     if not refusal(own, flows):
-        found = find_own_motion(flows, sequence.rig, sequence.shutter, "left", RobustOptions()).own
+        own_motion = find_own_motion(flows, sequence.rig, sequence.shutter, "left", RobustOptions()).own
         tau = float(sequence.shutter.time_after(float(row), 1, "left"))
-        alone = psnr(MonoFusion(own, found, flows).corrected(1, tau).image)
+        alone = psnr(MonoFusion(own, own_motion, flows).corrected(1, tau).image)
     options = options_of("rs-stereo-refined", "auto", "sgm", "sift-refined", "fusion", target_row=float(row))
     four = [images[view] for view in (("left", 0), ("right", 0), ("left", 1), ("right", 1))]
     try:
@@ -78,11 +78,16 @@ def main() -> int:
     parser.add_argument("--only", default="", help="sequences in whose name this is")
     given = parser.parse_args()
     rows = []
-    for sequence in read_pairs(given.data):
-        if given.only in sequence.name:
-            rows.append((sequence.motion.name, *scores(sequence)))
-            sys.stdout.write(f"{sequence.name:44} " + "  ".join(f"{each:5.2f}" for each in rows[-1][1:]) + "\n")
-            sys.stdout.flush()
+    try:
+        chosen = [sequence for sequence in read_pairs(given.data) if given.only in sequence.name]
+    except RsbenchError as error:
+        parser.error(str(error))
+    if not chosen:
+        parser.error(f"--only {given.only!r}: is in no sequence's name")
+    for sequence in chosen:
+        rows.append((sequence.motion.name, *scores(sequence)))
+        sys.stdout.write(f"{sequence.name:44} " + "  ".join(f"{each:5.2f}" for each in rows[-1][1:]) + "\n")
+        sys.stdout.flush()
     sys.stdout.write(
         "law, sequences, refused by one or the other; uncorrected, one camera, rig; median and mean gap\n"
     )

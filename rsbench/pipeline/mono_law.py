@@ -79,7 +79,13 @@ def _settled(
     count = MatchCount(inliers=int(np.count_nonzero(right)), matches=len(matches))
     if not (estimate.success and np.any(estimate.d)):
         return found, InertialMotion(found.estimate.w, found.estimate.d)
-    told = replace(found, estimate=estimate, inliers={**found.inliers, "left": right}, counts={"left": count})
+    told = replace(
+        found,
+        estimate=estimate,
+        inliers={**found.inliers, "left": right},
+        counts={"left": count},
+        motion_model=law.name,
+    )
     return told, law.with_endpoint(estimate.w, estimate.d)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from rsbench.benchmark.leaderboard.running import read_inputs, run_cards
 from rsbench.benchmark.leaderboard.second_protocols import Choosing
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import Submission
-from rsbench.benchmark.leaderboard.track import Row
+from rsbench.benchmark.leaderboard.track import Limits, Row, Step
 from rsbench.core.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import find_matches_of_rig
@@ -34,11 +34,26 @@ class OwnPoseTrack(Choosing, FrameTrack, MotionTrack):
     smoke_metrics = (*MotionTrack.smoke_metrics, "matches", "matches_1px")
     also_uses = ("images",)
 
-    def run(self, cards: Sequence[str], split: Split, inputs: Path, work: Path, **options: Any) -> list[Path]:
+    def steps(self, cards: Sequence[str], split: Split, limits: Limits) -> int:
+        return super().steps(cards, split, limits) + len(split.truths)
+
+    def run(
+        self,
+        cards: Sequence[str],
+        split: Split,
+        inputs: Path,
+        work: Path,
+        *,
+        step: Step = lambda word: None,
+        **options: Any,
+    ) -> list[Path]:
         """Solvers get the matches that ``rsbench correct`` finds by default, and hand them in."""
-        found, matched = with_matches(read_inputs(inputs, self), inputs, CorrectionOptions()), work / "matched"
+        found, matched = list[Problem](), work / "matched"
+        for problem in with_matches(read_inputs(inputs, self), inputs, CorrectionOptions()):
+            found.append(problem)
+            step(problem.name)
         write_inputs(replace(split, public=False), found, matched)
-        files = run_cards(self, cards, split, matched, work, **options)
+        files = run_cards(self, cards, split, matched, work, step=step, **options)
         for file in files:
             write_matches(found, file.parent / FOLDER)
         return files
@@ -63,14 +78,12 @@ class OwnPoseTrack(Choosing, FrameTrack, MotionTrack):
         return rows
 
 
-def with_matches(problems: Iterable[Problem], inputs: Path, options: CorrectionOptions) -> list[Problem]:
+def with_matches(problems: Iterable[Problem], inputs: Path, options: CorrectionOptions) -> Iterator[Problem]:
     """Problems with what the features of the options find in their frames; nothing where these show no texture."""
-    found = list[Problem]()
     for problem in problems:
         images, scanning = read_frames(inputs, problem), problem.shutter.scanning
         try:
             matches = find_matches_of_rig(images, problem.rig, scanning, options)
         except RsbenchError:  # every solver fails such a problem, and says why
             matches = problem.correspondences
-        found.append(replace(problem, correspondences=matches))
-    return found
+        yield replace(problem, correspondences=matches)

@@ -183,7 +183,7 @@ def _answers(split: Split, entries: Sequence[str], inputs: Path, work: Path) -> 
 def _with_own_matches(cards: Sequence[str], split: Split, inputs: Path, work: Path) -> Iterator[Path]:
     """Solvers on matches of the frames, which are handed in too."""
     options, runner = CorrectionOptions(features=load_features(FEATURES)), SolverRunner(single_thread=True)
-    given = with_matches(read_inputs(inputs, split.track), inputs, options)
+    given = list(with_matches(read_inputs(inputs, split.track), inputs, options))
     for entry in load_entries(cards, PoseTrack()).values():
         path = work / entry.name / "predictions.jsonl"
         write_matches(given, path.parent / MATCHES)
