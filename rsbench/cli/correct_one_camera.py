@@ -367,4 +367,4 @@ def _cards(folder: Path, source: FrameSource, count: int) -> list[dict[str, Any]
 
     chosen = range(0, count, max(count // _PAGE_FRAMES, 1))[:_PAGE_FRAMES]
     before = {number: image for number, image in enumerate(source) if number in chosen}
-    return [card_of(f"frame {n}", before[n], read_fused(folder, f"{n:06d}")) for n in chosen]
+    return [card_of(f"frame {n}", before[n], read_fused(folder, f"{n:06d}"), unit="") for n in chosen]

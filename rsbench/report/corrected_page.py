@@ -37,8 +37,8 @@ _LEGEND = {
 _LONGEST = 900
 
 
-def card_of(title: str, before: NDArray[Any], fused: Fused) -> dict[str, Any]:
-    """One frame of the page: its pictures as URIs, small enough to carry many."""
+def card_of(title: str, before: NDArray[Any], fused: Fused, unit: str = " m") -> dict[str, Any]:
+    """One frame of the page: its pictures as URIs, small enough to carry many; ``unit`` of depth."""
     finite = np.isfinite(fused.depth) & (fused.depth > 0)
     inverse = np.where(finite, 1.0 / np.where(finite, fused.depth, 1.0), np.nan)
     low, high = np.nanpercentile(inverse, [1, 99]) if np.any(finite) else (0.0, 1.0)
@@ -52,8 +52,8 @@ def card_of(title: str, before: NDArray[Any], fused: Fused) -> dict[str, Any]:
         "after": _uri(_eight_bit(fused.image)),
         "origin": _uri(origin_picture),
         "depth": _uri(pictures.colour_map(inverse, low, high)),
-        "near": f"{1.0 / high:.3g}",
-        "far": f"{1.0 / low:.3g}" if low > 0 else "infinity",
+        "near": f"{1.0 / high:.3g}{unit}",
+        "far": f"{1.0 / low:.3g}{unit}" if low > 0 else "infinity",
         "shares": [
             {
                 "colour": "#{:02x}{:02x}{:02x}".format(*_COLOURS[origin]),
