@@ -172,6 +172,13 @@ class ContinuousMotion(Motion):
         (R, t), spin, speed = evaluate(self.curve, tau)
         return spin, so3.cross(spin, t) - (R @ speed[..., None])[..., 0]
 
+    def seen(self, axes: FloatArray, scale: float = 1.0) -> ContinuousMotion:
+        """In other axes (3, 3), a mirror's too, and another unit of length, of which the old one is so many."""
+        turns, places = self.controls[:, :3], self.controls[:, 3:]
+        rows = np.concatenate([np.linalg.det(axes) * turns @ axes.T, scale * places @ axes.T], axis=1)
+        own = {"first": self.first, "interval": self.interval, "controls": rows}
+        return ContinuousMotion(*self.endpoint(own), **own)
+
     @property
     def parameters(self) -> dict[str, Any]:
         return {"first": self.first, "interval": self.interval, "controls": self.controls.tolist()}

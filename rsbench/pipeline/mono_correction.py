@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, final
 
 import cv2
@@ -100,6 +100,13 @@ def find_own_motion(
 
     Of laws of constant speed, and one that accelerates: two frames do not tell a vibration.
     """
+    return by_asked_law(find_steady_motion(flows, rig, shutter, side, robust, seed), flows, robust, seed)
+
+
+def find_steady_motion(
+    flows: Flows, rig: StereoRig, shutter: RollingShutter, side: Side, robust: RobustOptions, seed: int = 0
+) -> FoundOwnMotion:
+    """As of ``find_own_motion``, by the law ``inertial`` whatever the flow asks for."""
     own = rig.about(side)
     nothing = OwnMotion(rig=own, shutter=shutter, side=side, motion=None)
     matches = flow_matches(flows, np.random.default_rng(seed))
@@ -112,9 +119,19 @@ def find_own_motion(
     estimate, length = found.estimate, float(np.linalg.norm(found.estimate.d))
     if not (estimate.success and length > 0.0):
         return FoundOwnMotion(own=nothing, robust=found, reason=estimate.reason or "no translation is found")
-    found, motion = asked_for(found, matches, own.about("left"), shutter, robust, seed)
-    motion = motion.with_endpoint(motion.w, motion.d / np.linalg.norm(motion.d))
+    motion = InertialMotion(estimate.w, estimate.d / length)
     return FoundOwnMotion(own=OwnMotion(rig=own, shutter=shutter, side=side, motion=motion), robust=found)
+
+
+def by_asked_law(found: FoundOwnMotion, flows: Flows, robust: RobustOptions, seed: int = 0) -> FoundOwnMotion:
+    """A steady motion by the law that the flow asks for, if another one; what else is found stays."""
+    own = found.own
+    if found.robust is None or own.motion is None:
+        return found
+    matches = flow_matches(flows, np.random.default_rng(seed))
+    told, motion = asked_for(found.robust, matches, own.rig.about("left"), own.shutter, robust, seed)
+    motion = motion.with_endpoint(motion.w, motion.d / np.linalg.norm(motion.d))
+    return FoundOwnMotion(own=replace(own, motion=motion), robust=told)
 
 
 @final

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import AcceleratedMotion
+from rsbench.core.motion import AcceleratedMotion, InertialMotion
 from rsbench.core.rig import FRAMES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -28,20 +28,27 @@ from rsbench.pipeline.mono_correction import (
     STILL,
     FoundOwnMotion,
     MonoFusionCorrector,
+    by_asked_law,
     find_own_motion,
+    find_steady_motion,
     refusal,
 )
 from rsbench.pipeline.mono_focal import find_camera
 from rsbench.pipeline.mono_gyro import NOT_COVERED, around, rotation_alone, with_gyro
 from rsbench.pipeline.mono_shutter import find_shutter
+from rsbench.pipeline.mono_ways import SeenPair, group_of, on_ways, way_matches
 from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.pipeline.turned_frames import Turned, turned
 from rsbench.vision.closing import close_narrow
 from rsbench.vision.fusion import Fused
-from rsbench.vision.mono_fusion import Beyond, MonoFusion, MonoFusionOptions, find_flows
+from rsbench.vision.mono_fusion import Beyond, Flows, MonoFusion, MonoFusionOptions, find_flows
 
 _AT_ONCE = 2
 """Pairs that are worked on at once: the rest of a pair's work fills the second of two cores."""
+_HELD, _HELD_BYTES = 14, 4e8
+"""Pairs that wait for those after them, and what their flow may take."""
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,6 +91,21 @@ class _Pair:
     found: FoundOwnMotion | None
     reason: str
     """Why they cannot be; empty where they can."""
+
+
+class _Seen(NamedTuple):
+    """Two successive frames as they came, and what their flow shows."""
+
+    number: int
+    """Of the first one."""
+    images: tuple[NDArray[Any], NDArray[Any]]
+    flows: Flows | None
+    """None where they are large: then they are found again."""
+    found: FoundOwnMotion | None
+    reason: str
+    """Why they cannot be corrected; empty where they can."""
+    matches: FloatArray
+    """See ``way_matches``."""
 
 
 def correct_frames(
@@ -157,40 +179,53 @@ def _pairs(
     frames: Iterable[NDArray[Any]], turn: Turned, options: MonoOptions, done: int, gyro: FloatArray | None
 ) -> Iterator[tuple[int, NDArray[Any], NDArray[Any], _Pair | None]]:
     """Number of the second frame, both frames, and what is known of them, of all pairs in order; None: done."""
-    turned_gyro = None if gyro is None else turn.gyro(gyro)
+    first = max(done - 1, 0)
+    begin = group_of(first)[0] if gyro is None else first
+    turned_gyro, waiting = None if gyro is None else turn.gyro(gyro), deque[_Seen]()
 
-    def ready(before: NDArray[Any], image: NDArray[Any], first: int) -> _Pair:
-        samples = None
-        if turned_gyro is not None:
-            samples = around(turned_gyro, first, first + 1.0 + turn.shutter.readout_ratio)
-        local = None if samples is None else samples - [first, 0.0, 0.0, 0.0]
-        pair = _ready([turn.image(before), turn.image(image)], turn, options, local)
-        if gyro is None or samples is not None or pair.found is None:
-            return pair
-        return replace(pair, found=replace(pair.found, unused=NOT_COVERED))
+    def look(at: tuple[int, tuple[NDArray[Any], NDArray[Any]]]) -> _Seen:
+        return _seen(*at, turn, options, turned_gyro)
 
-    waiting: deque[tuple[int, NDArray[Any], NDArray[Any], Future[_Pair] | None]] = deque()
-    with ThreadPoolExecutor(_AT_ONCE) as pool:
-        try:
-            for number, (before, image) in enumerate(itertools.pairwise(frames), start=1):
-                check_alike({f"frame {number - 1}": before, f"frame {number}": image})
-                future = None if number < done else pool.submit(ready, before, image, number - 1)
-                waiting.append((number, before, image, future))
-                if len(waiting) > _AT_ONCE:
-                    yield _result(waiting.popleft())
-            while waiting:
-                yield _result(waiting.popleft())
-        finally:
-            for *_, future in waiting:
-                if future is not None:
-                    future.cancel()
+    def kept(seen: Iterable[_Seen]) -> Iterator[SeenPair]:
+        for each in seen:
+            waiting.append(each)
+            yield SeenPair(found=each.found, matches=each.matches)
+
+    def ready(at: tuple[_Seen, FoundOwnMotion | None]) -> tuple[_Seen, _Pair | None]:
+        seen, found = at
+        return seen, None if seen.number < first else _ready(seen, found, turn, options)
+
+    def found_in_order(ways: Iterator[FoundOwnMotion | None]) -> Iterator[tuple[_Seen, FoundOwnMotion | None]]:
+        for found in ways:
+            while waiting[0].number < first:
+                yield waiting.popleft(), None
+            yield waiting.popleft(), found
+        while waiting:
+            yield waiting.popleft(), None
+
+    pairs = enumerate(itertools.pairwise(frames))
+    for number, (before, image) in itertools.islice(pairs, begin):
+        yield number + 1, before, image, None
+    with ThreadPoolExecutor(_AT_ONCE) as pool, ThreadPoolExecutor(_AT_ONCE) as looking:
+        seen = kept(_ahead(looking, look, pairs))
+        ways = (each.found for each in seen) if gyro is not None else on_ways(seen, begin, first)
+        for each, pair in _ahead(pool, ready, found_in_order(ways)):
+            yield each.number + 1, *each.images, pair
 
 
-def _result(
-    each: tuple[int, NDArray[Any], NDArray[Any], Future[_Pair] | None],
-) -> tuple[int, NDArray[Any], NDArray[Any], _Pair | None]:
-    number, before, image, future = each
-    return number, before, image, None if future is None else future.result()
+def _ahead(pool: ThreadPoolExecutor, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """The function of each, in order, a few ahead of what is asked for."""
+    waiting = deque[Future[R]]()
+    try:
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            if len(waiting) > _AT_ONCE:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        for future in waiting:
+            future.cancel()
 
 
 def correct_all(
@@ -220,18 +255,55 @@ def correct_all(
     return [moment.fused for moment in moments]
 
 
-def _ready(images: Sequence[NDArray[Any]], turn: Turned, options: MonoOptions, gyro: FloatArray | None) -> _Pair:
-    """``gyro``: samples (n, 4) as this camera turns, tau 0 the first row of the first of both frames."""
-    flows = find_flows(images)
-    rig, corrector, shutter = StereoRig(camera=turn.camera, baseline=1.0), options.corrector, turn.shutter
+def _seen(
+    number: int,
+    images: tuple[NDArray[Any], NDArray[Any]],
+    turn: Turned,
+    options: MonoOptions,
+    gyro: FloatArray | None,
+) -> _Seen:
+    """``gyro``: samples (n, 4) of the sequence, as this camera turns."""
+    check_alike({f"frame {number + place}": image for place, image in enumerate(images)})
+    given = [turn.image(image) for image in images]
+    flows, corrector = find_flows(given), options.corrector
+    samples = None
+    if gyro is not None:
+        samples = around(gyro, number, number + 1.0 + turn.shutter.readout_ratio)
+    local = None if samples is None else samples - [number, 0.0, 0.0, 0.0]
+    found, reason = _found(given, flows, turn, corrector, local)
+    if gyro is not None and samples is None and found is not None:
+        found = replace(found, unused=NOT_COVERED)
+    matches = way_matches(flows, corrector.seed) if gyro is None else np.zeros((0, 4))
+    small = _HELD * sum(each.nbytes for each in (*flows.flow, *flows.returns)) <= _HELD_BYTES
+    return _Seen(number, images, flows if small else None, found, reason, matches)
+
+
+def _found(
+    images: Sequence[NDArray[Any]],
+    flows: Flows,
+    turn: Turned,
+    corrector: MonoFusionCorrector,
+    gyro: FloatArray | None,
+) -> tuple[FoundOwnMotion | None, str]:
+    """The motion over two frames, or why they cannot be corrected."""
+    rig, shutter = StereoRig(camera=turn.camera, baseline=1.0), turn.shutter
     if reason := refusal(images, flows):
         if gyro is None or reason in (STILL, CUT):
-            return _Pair(fusion=None, found=None, reason=reason)
-        found = rotation_alone(rig, shutter, "left", gyro)
-    else:
-        found = find_own_motion(flows, rig, shutter, "left", corrector.robust, corrector.seed)
-        if gyro is not None:
-            found = with_gyro(found, flows, gyro, corrector.robust, corrector.seed)
+            return None, reason
+        return rotation_alone(rig, shutter, "left", gyro), ""
+    known = rig, shutter, "left", corrector.robust, corrector.seed
+    if gyro is None:
+        return find_steady_motion(flows, *known), ""
+    return with_gyro(find_own_motion(flows, *known), flows, gyro, corrector.robust, corrector.seed), ""
+
+
+def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: MonoOptions) -> _Pair:
+    if found is None:
+        return _Pair(fusion=None, found=None, reason=seen.reason)
+    images = [turn.image(image) for image in seen.images]
+    flows, corrector = seen.flows or find_flows(images), options.corrector
+    if isinstance(found.own.motion, InertialMotion):  # on no way
+        found = by_asked_law(found, flows, corrector.robust, corrector.seed)
     return _Pair(fusion=MonoFusion(images, found.own, flows, corrector.fusion), found=found, reason="")
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.gyro_motion import GyroMotion
@@ -59,6 +60,8 @@ class Turned:
         w, d = np.linalg.det(P) * P.T @ motion.w, P.T @ motion.d
         if isinstance(motion, GyroMotion):
             real: Motion = GyroMotion(_axial(motion.samples, P.T), d)
+        elif isinstance(motion, ContinuousMotion):
+            real = motion.seen(P.T)
         else:
             real = make_motion(motion.name, w, d, motion.parameters)
         return replace(found, own=replace(found.own, motion=real))

@@ -1,0 +1,137 @@
+"""One way of a camera through neighbouring pairs of frames, in place of a law of motion for each.
+
+Two frames do not show what both shake alike; several do, for each frame is in two pairs. Pairs are worked on in
+groups with some on both sides that help: what is found of a pair does not depend on where a run began, and memory
+does not grow with the number of frames.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rsbench.capture.trajectory_alone import trajectory_alone
+from rsbench.core.epipolar import rs_sampson_error
+from rsbench.core.motion import Motion
+from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.mono_correction import FoundOwnMotion
+from rsbench.vision.mono_fusion import Flows, OwnMotion
+
+_TOLD, _BESIDE = 10, 2
+"""Pairs of a group, and those on either side that help."""
+_FEWEST = 3
+"""Pairs in a row, from which on they show a way."""
+_PIXELS = 600
+"""Of each frame, at random and the same in all, that are followed to the frames before and after it."""
+_RETURNS_PX = 0.3
+"""As of ``flow_matches``."""
+_LEAST = 50
+"""Matches."""
+_LARGEST_PX = 1.25
+"""Errors count up to here."""
+_FLOW_PX = 0.15
+"""Root mean square of what dense flow errs by: up to here a way explains a pair, and where it explains it as well as
+a motion of its own."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SeenPair:
+    """Two successive frames."""
+
+    found: FoundOwnMotion | None
+    """None where they show none at all."""
+    matches: FloatArray
+    """(n, 4) x0, y0, x1, y1, px, see ``way_matches``."""
+
+    @property
+    def motion(self) -> Motion | None:
+        return None if self.found is None or self.found.own.far else self.found.own.motion
+
+
+def way_matches(flows: Flows, seed: int) -> FloatArray:
+    """Matches (n, 4) by the flow, from the same random pixels of both frames; in random order.
+
+    One that ends at such a pixel goes on in the next pair with the one that begins there.
+    """
+    height, width = flows.returns[0].shape
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(height * width, min(_PIXELS, height * width), replace=False)
+    y, x = np.divmod(chosen, width)
+    here, out = np.stack([x, y], axis=-1).astype(np.float64), list[FloatArray]()
+    for frame, (flow, returns) in enumerate(zip(flows.flow, flows.returns, strict=True)):
+        there = here + flow[y, x]
+        good = (returns[y, x] < _RETURNS_PX) & np.all((there >= 0.0) & (there <= [width - 1, height - 1]), axis=-1)
+        out.append(np.concatenate([there, here] if frame else [here, there], axis=-1)[good])
+    return rng.permutation(np.concatenate(out))
+
+
+def group_of(pair: int) -> tuple[int, int]:
+    """First pair that decides what is found of a pair, and the one after the last."""
+    return max(_next_group(pair) - _TOLD - _BESIDE, 0), _next_group(pair) + _BESIDE
+
+
+def on_ways(pairs: Iterable[SeenPair], begin: int = 0, first: int = 0) -> Iterator[FoundOwnMotion | None]:
+    """What is found of pairs, in order: by the way through their neighbours, where it explains them as well.
+
+    Args:
+        pairs: in order, from number ``begin`` on: ``group_of(first)[0]`` at the latest.
+        first: number of the first pair that is asked for.
+    """
+    held, told, number = dict[int, SeenPair](), first, begin - 1
+    for number, pair in enumerate(pairs, start=begin):
+        held[number] = pair
+        if number + 1 == group_of(told)[1]:
+            yield from _told(held, told)
+            told = _next_group(told)
+            held = {k: each for k, each in held.items() if k >= group_of(told)[0]}
+    while told <= number:
+        yield from _told(held, told)
+        told = _next_group(told)
+
+
+def _next_group(pair: int) -> int:
+    return pair // _TOLD * _TOLD + _TOLD
+
+
+def _told(held: dict[int, SeenPair], first: int) -> list[FoundOwnMotion | None]:
+    """Of the group of one pair, from that pair on."""
+    low, high = group_of(first)
+    numbers = [k for k in range(low, high) if k in held]
+    found = {k: held[k].found for k in numbers}
+    for shows, run in itertools.groupby(numbers, lambda k: _shows(held[k])):
+        found |= _along([(k, held[k]) for k in run]) if shows else {}
+    return [found[k] for k in range(first, _next_group(first)) if k in found]
+
+
+def _shows(pair: SeenPair) -> bool:
+    return pair.motion is not None and len(pair.matches) >= _LEAST
+
+
+def _along(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundOwnMotion]:
+    """Of pairs in a row that show motions: those that go the way which all show together."""
+    if len(run) < _FEWEST:
+        return {}
+    motions = [pair.motion for _, pair in run if pair.motion is not None]
+    owns = [pair.found.own for _, pair in run if pair.found is not None]
+    ways = trajectory_alone([pair.matches for _, pair in run], motions, owns[0].rig.about("left"), owns[0].shutter)
+    out = dict[int, FoundOwnMotion]()
+    for (number, pair), own, steady, way in zip(run, owns, motions, ways or [], strict=False):
+        if pair.found is not None and _miss_px(way, pair, own) <= max(_miss_px(steady, pair, own), _FLOW_PX):
+            out[number] = _told_by(pair.found, way)
+    return out
+
+
+def _told_by(found: FoundOwnMotion, way: Motion) -> FoundOwnMotion:
+    robust = found.robust
+    if robust is not None:
+        estimate = replace(robust.estimate, w=way.w, d=way.d, covariance=None)
+        robust = replace(robust, estimate=estimate, motion_model=way.name)
+    return replace(found, own=replace(found.own, motion=way), robust=robust)
+
+
+def _miss_px(motion: Motion, pair: SeenPair, own: OwnMotion) -> float:
+    errors = np.abs(rs_sampson_error(own.rig, own.shutter, motion, own.side, pair.matches))
+    return float(np.sqrt(np.mean(np.minimum(np.nan_to_num(errors, nan=np.inf), _LARGEST_PX) ** 2)))
