@@ -66,7 +66,7 @@ def _fitted(
     tracks = packed(windows)
     trust = right_tracks(first, tracks)
     tracks = packed(windows, [trust[each] for each in tracks.members])
-    return fit(first.curve, tracks, first.prior, False, first.tails, right_tracks(first, tracks))
+    return fit(first.curve, tracks, first.prior, False, first.tails)
 
 
 def _window(curve: Curve, number: int, shutter: RollingShutter) -> ContinuousMotion | None:

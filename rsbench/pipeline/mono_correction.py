@@ -131,7 +131,7 @@ def by_asked_law(found: FoundOwnMotion, flows: Flows, robust: RobustOptions, see
     matches = flow_matches(flows, np.random.default_rng(seed))
     told, motion = asked_for(found.robust, matches, own.rig.about("left"), own.shutter, robust, seed)
     motion = motion.with_endpoint(motion.w, motion.d / np.linalg.norm(motion.d))
-    return FoundOwnMotion(own=replace(own, motion=motion), robust=told)
+    return replace(found, own=replace(own, motion=motion), robust=told)
 
 
 @final

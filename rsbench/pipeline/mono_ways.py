@@ -33,8 +33,8 @@ _LEAST = 50
 _LARGEST_PX = 1.25
 """Errors count up to here."""
 _FLOW_PX = 0.15
-"""Root mean square of what dense flow errs by: up to here a way explains a pair, and where it explains it as well as
-a motion of its own."""
+"""Root mean square of what dense flow errs by: up to here a way explains a pair, and where it explains it as well
+as a motion of its own."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
