@@ -16,11 +16,12 @@ from rsbench.capture.hypotheses import Known
 from rsbench.capture.scans import GLOBAL, Scans
 from rsbench.capture.settle import NoMotionError, reversed_scans, shutter_of
 from rsbench.capture.start import COARSE
+from rsbench.capture.trajectory_shutter import capture_of_sequence, nothing_of
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import LinearMotion, Motion
 from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter, Scan
+from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
@@ -79,6 +80,21 @@ def fits_backwards(
         found = estimate_motion(given, rig_of(camera), seen, solver, options, rng)
         noise.append(found.estimate.noise_px or np.inf if found.estimate.success else np.inf)
     return noise[1] < _CLEARLY_LESS * noise[0]
+
+
+def capture_along(
+    windows: Sequence[FloatArray], camera: PinholeCamera, scan: Scan | None, seed: int = 0
+) -> Capture | None:
+    """What successive frames say along one way, however they shake; None where no way explains the matches.
+
+    Args:
+        windows: matches (n, 4) x0, y0, x1, y1, px, of the frames 0 and 1, 1 and 2, ...; with outliers.
+        scan: as of ``known_alone``.
+    """
+    given, said = [Correspondences(left=each) for each in windows], scan or "top"
+    scannings = Scanning(scan=said), Scanning(scan=_OPPOSITE[said])
+    found = capture_of_sequence(nothing_of(given), given, rig_of(camera), scannings, seed)
+    return found if found.candidates else None
 
 
 def conclude_alone(windows: Sequence[Window]) -> Capture:

@@ -83,9 +83,16 @@ class TimedTracks:
 
 
 def thinned(windows: Sequence[Correspondences], count: int) -> list[Correspondences]:
-    """About so many tracks of each window, and no pairs where there are as many as that."""
+    """About so many tracks of each window, and no pairs where there are as many as that; of one camera, pairs."""
+    if is_of_one_camera(windows):
+        return [Correspondences(left=each.left[:: max(len(each.left) // count, 1)]) for each in windows]
     few = [Correspondences(tracks=each.tracks[:: max(len(each.tracks) // count, 1)]) for each in windows]
     return [some if len(some.tracks) >= count else each for some, each in zip(few, windows, strict=True)]
+
+
+def is_of_one_camera(windows: Sequence[Correspondences]) -> bool:
+    """Whether there are matches of the left camera alone."""
+    return not any(len(each.tracks) or len(each.right) for each in windows)
 
 
 def telling(window: Correspondences) -> Correspondences:

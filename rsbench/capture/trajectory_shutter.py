@@ -10,6 +10,7 @@ import numpy as np
 from rsbench.capture.estimate import CERTAIN, MAX_SIGMA, Candidate, Capture, nearly_global
 from rsbench.capture.scans import scans_of
 from rsbench.capture.settle import shutter_found
+from rsbench.capture.trajectory_data import is_of_one_camera
 from rsbench.capture.trajectory_ratio import SequenceRatio, ratio_of_sequence
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
@@ -24,7 +25,7 @@ def capture_of_sequence(
     capture: Capture,
     windows: Sequence[Correspondences],
     rig: StereoRig,
-    scanning: Scanning | None = None,
+    scannings: Sequence[Scanning] | None = None,
     seed: int = 0,
 ) -> Capture:
     """The shutter from one trajectory through successive windows; motion models then have no part in it.
@@ -32,11 +33,10 @@ def capture_of_sequence(
     Args:
         capture: what the motion models say, which is kept where no trajectory explains the tracks.
         windows: of the frames 0 and 1, 1 and 2, ...
-        scanning: how the cameras read, where that is known; None: both alike, at once, from one of four sides, or
-            as the motion models have it.
+        scannings: how the cameras may read; None: both alike, at once, from one of four sides, or as the motion
+            models have it.
     """
-    scannings = _scannings(capture) if scanning is None else (scanning,)
-    found = ratio_of_sequence(windows, rig, scannings, seed)
+    found = ratio_of_sequence(windows, rig, scannings or _scannings(capture), seed)
     if found is None:
         return capture
     candidate = _candidate(found, rig)
@@ -46,7 +46,7 @@ def capture_of_sequence(
     doubt = ""
     if candidate.probability < CERTAIN or candidate.sigma > MAX_SIGMA:
         text = f"{candidate.ratio:.2f} +- {candidate.sigma:.2f}"
-        doubt = f"the rig shakes, and {len(windows) + 1} frames of it do not determine how fast: {text}"
+        doubt = f"{len(windows) + 1} frames in a row do not determine how fast: {text}"
     return replace(
         capture,
         candidates=(candidate,),
@@ -55,8 +55,8 @@ def capture_of_sequence(
         reason=doubt,
         named=candidate.probability >= CERTAIN,
         windows=len(windows),
-        matches=sum(2 * len(each.tracks) for each in windows),
-        used=2 * found.used,
+        matches=_matches(windows),
+        used=found.used if is_of_one_camera(windows) else 2 * found.used,
         noise_px=found.noise_px,
     )
 
@@ -67,9 +67,15 @@ def shutter_of_sequence(windows: Sequence[Correspondences], rig: StereoRig, seed
     Raises:
         NoMotionError: the matches do not tell it.
     """
-    pairs = np.concatenate([np.concatenate([each.tracks[:, [0, 1, 4, 5]] for each in windows]), np.zeros((0, 4))])
-    moved = float(np.median(np.linalg.norm(pairs[:, 2:] - pairs[:, :2], axis=1))) if len(pairs) else 0.0
-    nothing = Capture(
+    return shutter_found(capture_of_sequence(nothing_of(windows), windows[:LONGEST], rig, None, seed), rig)
+
+
+def nothing_of(windows: Sequence[Correspondences]) -> Capture:
+    """What is known of a shutter before anything is looked at."""
+    pairs = [each.left if len(each.left) else each.tracks[:, [0, 1, 4, 5]] for each in windows]
+    every = np.concatenate([*pairs, np.zeros((0, 4))])
+    moved = float(np.median(np.linalg.norm(every[:, 2:] - every[:, :2], axis=1))) if len(every) else 0.0
+    return Capture(
         candidates=(),
         models={},
         peaks={},
@@ -81,7 +87,10 @@ def shutter_of_sequence(windows: Sequence[Correspondences], rig: StereoRig, seed
         noise_px=float("nan"),
         moved_px=moved,
     )
-    return shutter_found(capture_of_sequence(nothing, windows[:LONGEST], rig, None, seed), rig)
+
+
+def _matches(windows: Sequence[Correspondences]) -> int:
+    return sum(len(each.left) if is_of_one_camera(windows) else 2 * len(each.tracks) for each in windows)
 
 
 def _scannings(capture: Capture) -> tuple[Scanning, ...]:

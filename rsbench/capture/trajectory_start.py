@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rsbench.capture.trajectory_data import TimedTracks, thinned
+from rsbench.capture.trajectory_data import TimedTracks, is_of_one_camera, thinned
 from rsbench.capture.trajectory_fit import squared_errors
 from rsbench.capture.trajectory_spline import (
     ContinuousMotion,
@@ -35,11 +35,11 @@ def window_motions(
     windows: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter, seed: int
 ) -> list[Motion | None]:
     """The paper's motion in each window, of some of its tracks; None where they show none."""
-    out: list[Motion | None] = []
+    out, solver = list[Motion | None](), RefinedSolver(one_camera=is_of_one_camera(windows))
     for window in thinned(windows, _SOME):
         rng = np.random.default_rng(seed)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            found = estimate_motion(window, rig, shutter, RefinedSolver(), RobustOptions(), rng).estimate
+            found = estimate_motion(window, rig, shutter, solver, RobustOptions(), rng).estimate
         out.append(LinearMotion(found.w, found.d) if found.success else None)
     return out
 

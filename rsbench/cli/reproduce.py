@@ -31,6 +31,8 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench reproduce handheld --out results --data data     [dim](footage from hands: an hour of a core)[/dim]
 
+  rsbench reproduce footage --out results --data data      [dim](one camera's frames: half an hour of a core)[/dim]
+
   rsbench reproduce everything                             [dim](hours; goes on where it stopped)[/dim]"""
 
 
@@ -51,6 +53,7 @@ class Target(StrEnum):
     laws = "laws"
     boards = "boards"
     handheld = "handheld"
+    footage = "footage"
     everything = "everything"
 
 
@@ -61,6 +64,7 @@ _ORDER = (
 """Of everything: claims make Figure 3 on their way, and those about images judge what the others have stored."""
 _SEEDS = {Target.images: 20, Target.real: 10}
 """Runs of each solver in what is committed."""
+_TRACKS = (Target.leaderboard, Target.laws, Target.boards, Target.handheld, Target.footage)
 _FOLDERS = {
     Target.claims: ("fig3", "claims"),
     Target.image_claims: ("claims",),
@@ -84,6 +88,7 @@ def reproduce(
             "laws: points and frames under several laws of motion, with the predictions of solvers. "
             "boards: the same of the tracks of frames, on the dataset standard. "
             "handheld: trajectories of whole sequences from hands. "
+            "footage: what one camera's correctors make of pairs of frames. "
             "everything: all of these, one after the other, with the time that each took."
         ),
     ],
@@ -130,7 +135,7 @@ def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds
             _correction(out, data, workers)
         elif target is Target.real:
             _real(out, data, seeds, width)
-        elif target in (Target.leaderboard, Target.laws, Target.boards, Target.handheld):
+        elif target in _TRACKS:
             _leaderboard(target, out, data, workers)
         elif target in (Target.fig4, Target.sgm):
             _depth(target, out, data)

@@ -1,4 +1,5 @@
-"""``rsbench reproduce leaderboard``, ``laws``, ``boards``, ``handheld``: what comes with rsbench, on tracks."""
+"""``rsbench reproduce leaderboard``, ``laws``, ``boards``, ``handheld``, ``footage``: what comes with rsbench, on
+tracks."""
 
 from __future__ import annotations
 
@@ -8,8 +9,10 @@ from typing import Any
 
 import typer
 
-BOARD, LAWS, HANDHELD = "leaderboard", "laws", "handheld"
+BOARD, LAWS, HANDHELD, FOOTAGE = "leaderboard", "laws", "handheld", "footage"
 """Folders of the boards below ``--data``."""
+_ON_FOOTAGE = ("mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu-layers", "gyro", "fusion")
+"""Correctors of one camera, and that of a rig for what a second one is worth."""
 
 
 def leaderboard(out: Path, data: Path, workers: int | None) -> None:
@@ -104,6 +107,18 @@ def handheld(out: Path, data: Path, workers: int | None) -> None:
     generate("handheld", str(frames), None, workers=count)
     run("trajectory", list(METHODS), str(board), frames, workers=count)
     publish(board, out / HANDHELD, "rsbench reproduce handheld")
+
+
+def footage(out: Path, data: Path, workers: int | None) -> None:
+    """The track of one camera, on pairs of frames of the dataset ``footage``, rendered where it is missing."""
+    from rsbench.cli.generate import generate
+    from rsbench.cli.leaderboard import oracles, run
+
+    board, frames, count = data / f"{FOOTAGE}-board", data / FOOTAGE, workers or os.cpu_count() or 1
+    generate("footage", str(frames), None, workers=count)
+    run("correction-mono", list(_ON_FOOTAGE), str(board), frames, workers=count)
+    oracles("correction-mono", board, frames)
+    publish(board, out / FOOTAGE, "rsbench reproduce footage")
 
 
 def publish(board: Path, out: Path, command: str = "rsbench reproduce leaderboard") -> None:

@@ -10,17 +10,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.camera_alone import conclude_alone, examine_alone, fits_backwards, known_alone, shutter_alone
+from rsbench.capture.camera_alone import (
+    capture_along,
+    conclude_alone,
+    examine_alone,
+    fits_backwards,
+    known_alone,
+    shutter_alone,
+)
 from rsbench.capture.estimate import Capture, Window
 from rsbench.capture.rectification import RefusedFramesError
 from rsbench.capture.scans import scans_of
 from rsbench.capture.settle import LEAST_BACKWARDS, NoMotionError, runs_backwards
+from rsbench.capture.trajectory_shutter import LONGEST
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import check_alike
 from rsbench.pipeline.mono_correction import flow_matches, refusal
+from rsbench.pipeline.mono_ways import way_matches
 from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.mono_fusion import find_flows
@@ -30,6 +39,9 @@ WINDOWS = 8
 IN_ORDER = 5
 """First pairs that must all fit better backwards before frames of a known shutter are called so. One that trembles
 may look like either: 14 of 50 pairs of ten rendered sequences did, four of these chosen because one pair did."""
+_LEAST_IN_A_ROW, _LOOKED_AT = 6, 60
+"""Pairs in a row that show a way, and so many are looked at for such a row."""
+TOO_FEW = "frames: fewer than two; one camera shows its motion in at least two"
 BACKWARDS = (
     "time runs backwards in them: they are in the reverse order, or lines are read from the side opposite to what "
     "is said (scan in the camera's card)"
@@ -104,7 +116,11 @@ def _found(
     seed: int,
     advance: Callable[[str], None],
 ) -> FoundShutter:
-    """The shutter that the frames show."""
+    """The shutter that the frames show: many in a row along one way, else each two under laws of motion."""
+    run, camera = _in_a_row(frames, card, seed, advance)
+    along = capture_along(run, camera, card.scan, seed) if len(run) >= _LEAST_IN_A_ROW else None
+    if along is not None:
+        return _settled(along, camera, card)
     known, windows, camera, why = known_alone(card.scan), list[Window](), None, ""
     for matches, reason, camera in matched_pairs(frames, card, max((count - 1) // WINDOWS, 1), WINDOWS, seed):
         why = why or reason
@@ -114,10 +130,39 @@ def _found(
     assert camera is not None
     if not windows:
         raise NoMotionError(f"cannot tell the readout ratio: {why}. Give readout_ratio in the camera's card")
-    capture = conclude_alone(windows)
+    return _settled(conclude_alone(windows), camera, card)
+
+
+def _settled(capture: Capture, camera: PinholeCamera, card: OneCameraCard) -> FoundShutter:
     if card.scan is not None:
         _refuse_backwards(capture, Scanning(scan=card.scan).shutter_of(camera.width, camera.height, 1.0))
     return FoundShutter(shutter=shutter_alone(capture, camera), capture=capture)
+
+
+def _in_a_row(
+    frames: Iterable[NDArray[Any]], card: OneCameraCard, seed: int, advance: Callable[[str], None]
+) -> tuple[list[FloatArray], PinholeCamera]:
+    """Matches of the first pairs in a row that can be judged, as of ``way_matches``, ``LONGEST`` at most.
+
+    Raises RsbenchError as of ``matched_pairs``.
+    """
+    run, number, camera = list[FloatArray](), 0, None
+    for number, (before, image) in enumerate(itertools.pairwise(frames), start=1):
+        check_alike({f"frame {number - 1}": before, f"frame {number}": image})
+        camera = card.camera_of(image.shape[1], image.shape[0])
+        flows = find_flows([before, image])
+        if not refusal([before, image], flows):
+            run.append(way_matches(flows, seed))
+            advance(f"pair {number}")
+        elif len(run) >= _LEAST_IN_A_ROW:
+            break
+        else:
+            run.clear()
+        if len(run) == LONGEST or number >= _LOOKED_AT:
+            break
+    if camera is None:
+        raise RsbenchError(TOO_FEW)
+    return run, camera
 
 
 def matched_pairs(
@@ -141,4 +186,4 @@ def matched_pairs(
         if found >= most:
             return
     if number == 0:
-        raise RsbenchError("frames: fewer than two; one camera shows its motion in at least two")
+        raise RsbenchError(TOO_FEW)

@@ -170,7 +170,8 @@ class _Look:
         if self._ratio is not None or len(self._first) + 1 < FEWEST_FRAMES:
             return capture
         if self.shaken or shakes(capture, self._first, self._rig, self._options.seed):
-            return capture_of_sequence(capture, self._first, self._rig, self._scanning, self._options.seed)
+            said = None if self._scanning is None else (self._scanning,)
+            return capture_of_sequence(capture, self._first, self._rig, said, self._options.seed)
         return capture
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rsbench.capture.camera_alone import capture_along
 from rsbench.capture.trajectory_alone import trajectory_alone
 from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.core import so3
@@ -79,6 +80,29 @@ def test_a_way_follows_what_a_camera_trembles(shake: float) -> None:
         last = place(np.array([k + 1.0]), shake).R[0] @ -V
         assert np.linalg.norm(way.d) == pytest.approx(1.0, abs=1e-9)
         assert way.d @ last / np.linalg.norm(V) > np.cos(np.deg2rad(1.0))
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_a_video_of_a_hand_tells_how_its_lines_are_read(backwards: bool) -> None:
+    """And frames in reverse look as if they were read from the bottom. Its ratio is within three deviations."""
+    windows = windows_of(7, 0.01, 0.1, np.random.default_rng(4))
+    if backwards:
+        windows = [each[:, [2, 3, 0, 1]] for each in windows[::-1]]
+    capture = capture_along(windows, RIG.camera, None)
+    assert capture is not None and capture.likeliest is not None
+    best = capture.likeliest
+    assert best.scans.left == ("bottom" if backwards else "top") and best.probability > 0.99
+    assert best.sigma < 0.05 and abs(best.ratio - 0.8) < 3.0 * best.sigma
+    assert capture.matches == sum(map(len, windows)) > capture.used > 0.5 * capture.matches / 4
+
+
+def test_matches_of_no_way_tell_nothing() -> None:
+    rng = np.random.default_rng(5)
+    noise = [rng.uniform(0.0, 480.0, (60, 4)) for _ in range(6)]
+    capture = capture_along(noise, RIG.camera, "top")
+    best = None if capture is None else capture.likeliest
+    assert best is None or best.probability < 0.99 or best.sigma > 0.1
+    assert capture_along([np.zeros((0, 4))] * 6, RIG.camera, "top") is None
 
 
 def test_a_motion_is_the_same_in_other_axes_and_units() -> None:

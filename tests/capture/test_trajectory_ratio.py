@@ -39,10 +39,10 @@ def test_a_sequence_shows_the_ratio_that_its_windows_do_not() -> None:
 def test_few_frames_say_that_they_are_few() -> None:
     rng = np.random.default_rng(103)
     windows, _ = matches(sines(rng, *SHAKES["walk"]), 4, rng, count=60, noise=1.0)
-    capture = capture_of_sequence(NOTHING, windows, RIG, Scanning())
+    capture = capture_of_sequence(NOTHING, windows, RIG, [Scanning()])
     best = capture.likeliest
     assert best is not None and abs(best.ratio - RATIO) < 3.0 * best.sigma
-    assert not capture.told and "4 frames of it do not determine" in capture.reason
+    assert not capture.told and "4 frames in a row do not determine" in capture.reason
 
 
 def test_nothing_is_told_where_nothing_is_seen() -> None:
@@ -53,5 +53,5 @@ def test_a_shaken_rig_that_reads_all_lines_at_once_is_known(monkeypatch: pytest.
     monkeypatch.setattr(shaken_rig, "RATIO", 0.0)
     rng = np.random.default_rng(104)
     windows, _ = matches(sines(rng, *SHAKES["strong"]), 6, rng, count=80)
-    best = capture_of_sequence(NOTHING, windows, RIG, Scanning()).likeliest
+    best = capture_of_sequence(NOTHING, windows, RIG, [Scanning()]).likeliest
     assert best is not None and best.scans == GLOBAL and best.ratio == 0.0 and best.probability == 1.0
