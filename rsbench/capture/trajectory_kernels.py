@@ -92,7 +92,7 @@ def _scratch(ends: int, size: int) -> Scratch:
         np.zeros((ends, 3)),
         np.zeros((3, 3)),
         np.zeros((3, 3)),
-        np.zeros((6, 3, 3)),
+        np.zeros((5, 3, 3)),
         np.zeros((2, 24)),
         np.zeros((3, size)),
         np.zeros((size, size)),
@@ -127,7 +127,7 @@ def add_tracks(
     most = 0
     for k in range(len(starts) - 1):
         most = max(most, starts[k + 1] - starts[k])
-    scratch = _scratch(most, band.shape[1])
+    scratch = _scratch(int(most), band.shape[1])  # without int(), compiled for the literal 0 as well
     total = 0.0
     for k in range(len(starts) - 1):
         track = ends[starts[k] : starts[k + 1]]

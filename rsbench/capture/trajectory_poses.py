@@ -50,14 +50,14 @@ def blank_views(count: int) -> Views:
 @compiled(error_model="numpy")
 def fill_views(curve: Curve, taus: FloatArray, views: Views) -> None:
     """The poses at times (n,)."""
-    work = np.zeros((6, 3, 3))
+    work = np.zeros((5, 3, 3))
     for k in range(len(taus)):
         fill_view(curve, taus[k], views, k, work)
 
 
 @compiled(error_model="numpy")
 def fill_view(curve: Curve, tau: float, views: Views, k: int, work: FloatArray) -> None:
-    """The pose at one time, as number ``k``; work (6, 3, 3)."""
+    """The pose at one time, as number ``k``; work (5, 3, 3)."""
     count = len(curve.p)
     place = (tau - curve.first) / curve.interval
     i = min(max(math.floor(place), 0), count - 4)
@@ -79,21 +79,19 @@ def fill_view(curve: Curve, tau: float, views: Views, k: int, work: FloatArray) 
 @compiled(error_model="numpy")
 def _fill_turn(curve: Curve, i: int, b: Vector, rates: Vector, views: Views, k: int, work: FloatArray) -> None:
     """Rotation, its rate and its derivatives: from the last factor to the first."""
-    before, factor, jacobian, product, by_step, inverse = work[0], work[1], work[2], work[3], work[4], work[5]
+    before, factor, jacobian, product, by_step = work[0], work[1], work[2], work[3], work[4]
     turn, spin = views.turn[k], (0.0, 0.0, 0.0)
     for m in range(3):
         for n in range(3):
-            before[m, n] = 1.0 if m == n else 0.0
-    turn[3, :, :] = 0.0
+            before[m, n], turn[3, m, n] = 1.0 if m == n else 0.0, 0.0
     for j in range(2, -1, -1):
-        step = _row(curve.steps, i + j)
+        step, inverse = _row(curve.steps, i + j), curve.inverse_left[i + j]
         spin = plus(spin, rates[j] / curve.interval, apply(before, step))
         phi = times(b[j], step)
         one, half, sixth, _, _ = coefficients(dot(phi, phi))
         fill_rotation(phi, 1.0 - half * dot(phi, phi), one, half, factor)
         fill_rotation(phi, one, half, sixth, jacobian)
         _multiply(before, jacobian, product)
-        inverse[:, :] = curve.inverse_left[i + j]
         _multiply(product, inverse, by_step)
         for m in range(3):
             for n in range(3):
@@ -103,7 +101,7 @@ def _fill_turn(curve: Curve, i: int, b: Vector, rates: Vector, views: Views, k: 
             for n in range(3):
                 turn[j, m, n] = -b[j] * by_step[m, n]
         _multiply(before, factor, product)
-        before[:, :] = product
+        before, product = product, before  # to copy one takes seconds to compile, for the error of unlike shapes
     for m in range(3):
         for n in range(3):
             turn[0, m, n] += before[m, n]

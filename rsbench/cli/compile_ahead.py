@@ -1,11 +1,14 @@
-"""The first use of an installation: a second process compiles what ``correct`` needs, the last of it first.
+"""The first use of an installation: a second process compiles what ``correct`` needs, beginning elsewhere.
 
-The command itself compiles in the order in which it comes to its functions, so both meet in the middle. What one
-of them compiled the other loads from the cache on disk (``rsbench.components.compiled``).
+The command compiles in the order in which it comes to its functions. Half of their time is the motion's, and the
+spline is the last of it, so the process begins there, goes on to depth and correction, and takes the rest when
+both are through with their halves. What one of them compiled the other loads from the cache on disk
+(``rsbench.components.compiled``).
 """
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -46,17 +49,19 @@ def compiling_ahead() -> Iterator[None]:
 
 
 def compile_all(line: int) -> None:
-    """Run the parts of the chain on small images, from its end to its beginning; end with the parent."""
+    """Run the parts of the chain on small images; end with the parent."""
     if _POSIX:
         end_with(line)
+    gc.disable()  # compiling makes much that lasts, and looking for garbage among it takes a twentieth
     for part in parts():
         with suppress(Exception):  # whatever it is, the command meets it too, and says so
             part()
 
 
 def parts() -> list[Callable[[], object]]:
-    """What compiles correction, depth, motion and matching, in this order."""
+    """What compiles the spline, depth, correction, motion and matching, in this order."""
     from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
+    from rsbench.capture.shaken import shaken_motion
     from rsbench.core.camera import PinholeCamera
     from rsbench.core.motion import LinearMotion
     from rsbench.core.rig import FRAMES, StereoRig
@@ -78,12 +83,18 @@ def parts() -> list[Callable[[], object]]:
     )
     wall = [np.full((_HEIGHT, _WIDTH), 9.0, dtype=np.float32)] * 2
     wall[0][40:60, 40:60] = np.nan
-    first, second = (
-        depth_of_pair(images["left", frame], images["right", frame], wall, rig, find_sky=False) for frame in FRAMES
-    )
+
+    def corrected() -> object:
+        first, second = (
+            depth_of_pair(images["left", frame], images["right", frame], wall, rig, find_sky=False)
+            for frame in FRAMES
+        )
+        return correct_frames(images, (first, second), rig, shutter, motion, options)
+
     return [
-        lambda: correct_frames(images, (first, second), rig, shutter, motion, options),
+        lambda: shaken_motion(data.correspondences, rig, shutter, motion),
         lambda: find_depth(images, rig, shutter, motion, options),
+        corrected,
         lambda: solve_frames(data.correspondences, rig, shutter.readout_ratio, options),
         lambda: match_frames(images, rig, options),
     ]

@@ -49,7 +49,7 @@ def compiled(function: F | None = None, **options: Any) -> F | Callable[[F], F]:
 
 
 def _compiled(function: F, options: dict[str, Any]) -> F:
-    dispatcher = njit(nogil=True, **options)(function)
+    dispatcher = njit(nogil=True, no_cfunc_wrapper=True, **options)(function)
     dispatcher._cache = _KernelCache(function)
     out: F = dispatcher
     return out

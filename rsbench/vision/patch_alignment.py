@@ -164,11 +164,12 @@ def _align(b: F32, J: F32, weights: FloatArray, place: FloatArray) -> bool:
         H[p, p] *= 1.0 + 1e-9
         for q in range(p):
             H[q, p] = H[p, q]
-    if not np.all(np.diag(H) > 0.0):
-        return False
+        if not H[p, p] > 0.0:
+            return False
     inverse = np.linalg.inv(H)
     x, y, gain, bias = place[0], place[1], 1.0, 0.0
-    A = np.eye(2)
+    A = np.zeros((2, 2))
+    A[0, 0] = A[1, 1] = 1.0
     residuals = np.zeros(count)
     for _ in range(_ROUNDS):
         if not _residuals(b, J, A, x, y, gain, bias, residuals):
