@@ -37,6 +37,8 @@ _SIDE = VIEW[0]
 _LAST = {"key": "psnr_last", "title": "PSNR last", "hint": "of the last row's time, common pixels"}
 _GYRO = "imu"
 """The channel that has its samples."""
+_BESIDE = 1.0
+"""Frame periods before the first frame and after the last one of which samples are given."""
 
 
 class MonoCorrectionTrack(CorrectionTrack):
@@ -117,7 +119,10 @@ def _alone(making: Making, chain: CorrectionOptions) -> Given:
 
 
 def _with_gyro(problem: Problem, sequence: Sequence) -> Problem:
-    if _GYRO not in sequence.channels:
+    """With the samples that lie over the frames of a pair, at its own times."""
+    if _GYRO not in sequence.manifest.get("channels", ()):
         return problem
-    samples = gyro_samples(sequence.inertial(), sequence.frame_period_s)
-    return replace(problem, correspondences=replace(problem.correspondences, gyro=samples))
+    whole = replace(sequence, channels=(_GYRO,))  # a pair of many frames has no channel of them all
+    samples = gyro_samples(whole.inertial(), sequence.frame_period_s) - [sequence.first, 0.0, 0.0, 0.0]
+    near = (samples[:, 0] > -_BESIDE) & (samples[:, 0] < len(FRAMES) + _BESIDE)
+    return replace(problem, correspondences=replace(problem.correspondences, gyro=samples[near]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,14 @@ from leaderboards import PLANES, lines_of
 
 from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.board import entries_of
+from rsbench.benchmark.leaderboard.mono_track import _with_gyro
 from rsbench.benchmark.leaderboard.picture_running import Making
 from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.track_list import TRACKS
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
+from rsbench.dataset.sequence import read_dataset
 
 TRACK = TRACKS["correction-mono"]
 CARD = """
@@ -106,6 +109,19 @@ def test_a_gyroscope_is_given_where_there_is_one(rendered: Path, tmp_path: Path)
     # The tracks that do not give it are as they were.
     other = dataset_split(TRACKS["correction"], rendered).truths[0].pictures
     assert other is not None and "imu/measured.csv" not in other.files
+
+
+def test_samples_of_a_pair_of_many_frames_have_its_own_times(rendered: Path) -> None:
+    """As those of the sequence, from its frame on; the pair before it is one period earlier."""
+    sequence = next(iter(read_dataset(rendered)))
+    (problem,) = TRACK.problems(rendered, None, 1)
+    later = replace(sequence, first=1, channels=())
+    given, shifted = (_with_gyro(problem, each).correspondences.gyro for each in (sequence, later))
+    both = np.isin(np.round(shifted[:, 0] + 1.0, 9), np.round(given[:, 0], 9))
+    assert np.count_nonzero(both) > 10
+    rows = {round(float(row[0]), 9): row[1:] for row in given}
+    for row in shifted[both]:
+        np.testing.assert_array_equal(row[1:], rows[round(float(row[0] + 1.0), 9)])
 
 
 @pytest.mark.parametrize("name", ["mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu-layers"])
