@@ -368,7 +368,7 @@ def test_results_tell_the_bound_and_rows_of_the_committed_board() -> None:
     root = Path(__file__).parents[2]
     tables = {
         path.name.partition("--")[0]: path.read_text("utf-8").splitlines()
-        for folder in ("leaderboard", "laws")
+        for folder in ("leaderboard", "laws", "footage")
         for path in (root / "results" / folder / "site").glob("*.md")
     }
     page = (root / "docs" / "results-leaderboard.md").read_text("utf-8")
@@ -387,6 +387,7 @@ def test_results_tell_the_bound_and_rows_of_the_committed_board() -> None:
         "pose-1",
         "depth-1",
         "correction-1",
+        "correction-mono-1",
     )
     for rows, protocol in zip(shown, protocols, strict=True):
         assert set(rows) <= set(tables[protocol]) and len(rows) > 5
