@@ -17,7 +17,7 @@ import numpy as np
 from rsbench.capture import trajectory_banded as banded
 from rsbench.capture.trajectory_choice import choose
 from rsbench.capture.trajectory_data import TimedTracks, is_of_one_camera, pack_windows, thinned
-from rsbench.capture.trajectory_estimate import TrajectoryOptions, noise_px
+from rsbench.capture.trajectory_estimate import MOST_NOISE_PX, TrajectoryOptions, noise_px
 from rsbench.capture.trajectory_fit import Fit, fit, log_evidence
 from rsbench.capture.trajectory_kernels import Tails
 from rsbench.capture.trajectory_spline import span_of
@@ -40,6 +40,8 @@ _SHARES_ALONE = 0.5, 0.15
 """What a match of one camera's dense flow counts, to tell the scanning, and the ratio: neighbours err alike.
 Counted for one each, ratios of ten pieces of rendered video were off by 2.6 of their deviations (root of the mean
 square)."""
+_LEAST_SHARE = 0.2
+"""Of the tracks must be right."""
 _PRECISION = 1e12
 _STEP, _STEPS, _ROUGH_STEPS = 0.05, 6, 2
 _NODES = np.array([-2.5, -1.2, 0.0, 1.2, 2.5])
@@ -98,9 +100,11 @@ def ratio_of_sequence(
     try:
         profile.begin(ratio, seed)
         profile.settle(_peak(profile, ratio, _ROUGH_STEPS)[0])
-        return _told(profile, *_peak(profile, profile.settled), 1.0 / float(others))
+        told = _told(profile, *_peak(profile, profile.settled), 1.0 / float(others))
     except banded.NotDefiniteError:
         return None
+    # Of wrong matches, a way explains two or three exactly, or all of them by a noise that is none.
+    return told if told.used >= _LEAST_SHARE * told.of and told.noise_px <= MOST_NOISE_PX else None
 
 
 class _Profile:

@@ -96,12 +96,10 @@ def test_a_video_of_a_hand_tells_how_its_lines_are_read(backwards: bool) -> None
     assert capture.matches == sum(map(len, windows)) > capture.used > 0.5 * capture.matches / 4
 
 
-def test_matches_of_no_way_tell_nothing() -> None:
-    rng = np.random.default_rng(5)
-    noise = [rng.uniform(0.0, 480.0, (60, 4)) for _ in range(6)]
-    capture = capture_along(noise, RIG.camera, "top")
-    best = None if capture is None else capture.likeliest
-    assert best is None or best.probability < 0.99 or best.sigma > 0.1
+def test_wrong_matches_tell_nothing() -> None:
+    for seed in (5, 6):  # of two ways: few that fit exactly, and all under much noise
+        rng = np.random.default_rng(seed)
+        assert capture_along([rng.uniform(0.0, 480.0, (60, 4)) for _ in range(6)], RIG.camera, "top") is None
     assert capture_along([np.zeros((0, 4))] * 6, RIG.camera, "top") is None
 
 

@@ -46,11 +46,15 @@ def test_scalar_fallback_renders_the_same_frame_and_says_how_to_be_faster(tmp_pa
     assert (slow["depth"] > 0).mean() > 0.2
 
 
-@pytest.mark.parametrize("width", [4, 16])
-def test_another_vector_width_renders_the_same_within_the_documented_tolerance(tmp_path: Path, width: int) -> None:
+@pytest.mark.parametrize("narrow", [True, False])
+def test_another_vector_width_renders_the_same_within_the_documented_tolerance(
+    tmp_path: Path, narrow: bool
+) -> None:
     needs_llvm()
     if sys.platform != "linux" or "avx2" not in llvm.cpu_features():
         pytest.skip("no x86-64 with AVX2 under Linux, on which Dr.Jit's width can be set")
+    # Where there is AVX-512, Dr.Jit is as for 16 by itself, and for that writes what AVX2 has not.
+    width = 4 if narrow else 8 if "avx512f" in llvm.cpu_features() else 16
     other = child(tmp_path, "other", (96, 72), WIDTH=str(width), FEATURES="+avx2,+fma,+bmi,+bmi2,+f16c")
     own = child(tmp_path, "own", (96, 72))
     assert_alike(other, own)
