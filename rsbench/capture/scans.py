@@ -14,9 +14,8 @@ from rsbench.core.correspondences import BoolArray, Correspondences, unlinked_pa
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.any_law import any_law
 from rsbench.solvers.engine.kernel_type import MotionKernel, load_kernel
-from rsbench.solvers.engine.motion_kernels import AcceleratedKernel, LinearKernel
+from rsbench.solvers.engine.motion_kernels import AcceleratedKernel
 from rsbench.solvers.engine.packed import Packed, pack
 
 Start = Literal["global", "top", "bottom", "left", "right"]
@@ -199,7 +198,7 @@ class TimedMatches:
 
     def kernel(self, unknowns: FloatArray) -> MotionKernel:
         """Of the motion model, with the acceleration among some unknowns (17,)."""
-        return _kernel_at(self._base.kernel, float(unknowns[_ACCELERATION]))
+        return _accelerated(self._base.kernel, float(unknowns[_ACCELERATION]))
 
 
 class ReadMatches:
@@ -239,7 +238,7 @@ class ReadMatches:
             ends = self._stretched(pairs[:, 7:15].reshape(-1, 2, 4), self._stretches[0], stretching)
             pairs[:, 7:15] = ends.reshape(-1, 8)
             tracks[:, :, 3:7] = self._stretched(tracks[:, :, 3:7], self._stretches[1], stretching)
-        kernel = _kernel_at(self._base.kernel, acceleration)
+        kernel = _accelerated(self._base.kernel, acceleration)
         return replace(self._base, pairs=pairs, tracks=tracks, h=0.0, kernel=kernel)
 
     def _stretched(self, by_pixel: FloatArray, stretches: FloatArray, errors: list[float]) -> FloatArray:
@@ -279,11 +278,8 @@ class ReadMatches:
         return pairs, tracks
 
 
-def _kernel_at(kernel: MotionKernel, acceleration: float) -> MotionKernel:
-    if isinstance(kernel, AcceleratedKernel):
-        return AcceleratedKernel(acceleration=acceleration)
-    # As one of all laws, whose code the fit needs anyway: another copy takes 3 s to compile.
-    return any_law(kernel) if isinstance(kernel, LinearKernel) else kernel
+def _accelerated(kernel: MotionKernel, acceleration: float) -> MotionKernel:
+    return AcceleratedKernel(acceleration=acceleration) if isinstance(kernel, AcceleratedKernel) else kernel
 
 
 def _late(rig: StereoRig, scan: Scan) -> RollingShutter:
