@@ -72,6 +72,11 @@ def main() -> int:
         parser.error(str(error))
     if not chosen:
         parser.error(f"--only {given.only!r}: is in no sequence's name")
+    if given.frames < 4:
+        parser.error(f"--frames {given.frames}: must be 4 or more")
+    for each in chosen:
+        if each.frames < 4 or each.rig.camera.height // 2 not in each.twins:
+            parser.error(f"{each.name}: needs 4 frames and more, and their truth at the middle row (twins)")
     sys.stdout.write(f"{'sequence':24} {'frames':>6} " + " ".join(f"{way:>12}" for way in WAYS) + "  least gain\n")
     for sequence in chosen:
         found = np.array(list(scores(sequence, given.frames)))

@@ -214,10 +214,11 @@ def _correct_into(
 def _shutter(source: FrameSource, card: OneCameraCard, options: MonoOptions) -> FoundShutter:
     """Exit 1 where the frames do not show it."""
     from rsbench.capture.settle import NoMotionError
+    from rsbench.capture.trajectory_shutter import LONGEST
     from rsbench.cli.console import progress_bar
-    from rsbench.pipeline.mono_shutter import IN_ORDER, WINDOWS, find_shutter
+    from rsbench.pipeline.mono_shutter import IN_ORDER, find_shutter
 
-    corrector, pairs = options.corrector, WINDOWS if card.readout_ratio is None else IN_ORDER
+    corrector, pairs = options.corrector, LONGEST if card.readout_ratio is None else IN_ORDER
     try:
         with progress_bar("looking at the shutter", min(max(source.count - 1, 1), pairs)) as advance:
             return find_shutter(source, source.count, card, corrector.robust, corrector.seed, advance)

@@ -20,6 +20,7 @@ from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.mono_correction import FoundOwnMotion, flow_matches
+from rsbench.pipeline.mono_law import error_px
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.gyro import GyroSolver
 from rsbench.vision.mono_fusion import Flows, OwnMotion
@@ -37,8 +38,6 @@ _NOISE_PX = 0.05
 """Standard deviation of the flow, at least."""
 _PX_PER_SIGMA = 2.5
 """Of the robust loop's threshold."""
-_LARGEST_PX = 1.25
-"""Errors count up to here when two motions are compared."""
 _WORSE, _BIASED, _FAR_WORSE = 1.15, 2.0, 2.0
 """A gyroscope contradicts the frames where it fits them by so much worse than a constant rate of turn does, at a
 bias of so many standard deviations, or by far worse. On shakes of three kinds in a closed-form world, right
@@ -96,8 +95,7 @@ def with_gyro(
     motion = moving(bias_d)
 
     def miss_px(one: Motion) -> float:
-        errors = np.abs(rs_sampson_error(rig, shutter, one, side, matches))
-        return float(np.sqrt(np.mean(np.minimum(errors, _LARGEST_PX) ** 2)))
+        return error_px(one, matches, rig, shutter, side)
 
     worse = _WORSE if float(np.linalg.norm(bias_d[:3])) > _BIASED else _FAR_WORSE
     if own.motion is not None and miss_px(motion) > worse * miss_px(own.motion):

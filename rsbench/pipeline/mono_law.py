@@ -12,7 +12,7 @@ from rsbench.capture.settle import known_of, motion_at
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.motion import AcceleratedMotion, InertialMotion, Motion
-from rsbench.core.rig import StereoRig
+from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MotionEstimate
@@ -57,8 +57,8 @@ def asked_for(
     law = motion_at(capture.peaks[laws[0]])
     if law.name == AcceleratedMotion.name:
         steady = [motion_at(capture.peaks[name]) for name in laws[1:] if name != inertial.name]
-        best = min([inertial, *steady], key=lambda each: _error_px(each, matches, rig, shutter))
-        if _error_px(law, matches, rig, shutter) > _CLEARLY_LESS * _error_px(best, matches, rig, shutter):
+        best = min([inertial, *steady], key=lambda each: error_px(each, matches, rig, shutter))
+        if error_px(law, matches, rig, shutter) > _CLEARLY_LESS * error_px(best, matches, rig, shutter):
             law = best
     return (found, inertial) if law is inertial else _settled(found, law, matches, rig, shutter, capture.noise_px)
 
@@ -89,6 +89,9 @@ def _settled(
     return told, law.with_endpoint(estimate.w, estimate.d)
 
 
-def _error_px(motion: Motion, matches: FloatArray, rig: StereoRig, shutter: RollingShutter) -> float:
-    errors = np.abs(rs_sampson_error(rig, shutter, motion, "left", matches))
-    return float(np.sqrt(np.mean(np.minimum(errors, _LARGEST_PX) ** 2)))
+def error_px(
+    motion: Motion, matches: FloatArray, rig: StereoRig, shutter: RollingShutter, side: Side = "left"
+) -> float:
+    """Root mean square Sampson error, px, of matches (n, 4) with outliers: each counts up to ``_LARGEST_PX``."""
+    errors = np.abs(rs_sampson_error(rig, shutter, motion, side, matches))
+    return float(np.sqrt(np.mean(np.fmin(errors, _LARGEST_PX) ** 2)))

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +39,7 @@ from rsbench.pipeline.mono_ways import SeenPair, group_of, on_ways, way_matches
 from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.pipeline.turned_frames import Turned, turned
 from rsbench.vision.closing import close_narrow
+from rsbench.vision.frame_threads import map_ahead
 from rsbench.vision.fusion import Fused
 from rsbench.vision.mono_fusion import Beyond, Flows, MonoFusion, MonoFusionOptions, find_flows
 
@@ -47,8 +47,6 @@ _AT_ONCE = 2
 """Pairs that are worked on at once: the rest of a pair's work fills the second of two cores."""
 _HELD, _HELD_BYTES = 14, 4e8
 """Pairs that wait for those after them, and what their flow may take."""
-T = TypeVar("T")
-R = TypeVar("R")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -206,26 +204,10 @@ def _pairs(
     pairs = enumerate(itertools.pairwise(frames))
     for number, (before, image) in itertools.islice(pairs, begin):
         yield number + 1, before, image, None
-    with ThreadPoolExecutor(_AT_ONCE) as pool, ThreadPoolExecutor(_AT_ONCE) as looking:
-        seen = kept(_ahead(looking, look, pairs))
-        ways = (each.found for each in seen) if gyro is not None else on_ways(seen, begin, first)
-        for each, pair in _ahead(pool, ready, found_in_order(ways)):
-            yield each.number + 1, *each.images, pair
-
-
-def _ahead(pool: ThreadPoolExecutor, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """The function of each, in order, a few ahead of what is asked for."""
-    waiting = deque[Future[R]]()
-    try:
-        for item in items:
-            waiting.append(pool.submit(function, item))
-            if len(waiting) > _AT_ONCE:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        for future in waiting:
-            future.cancel()
+    seen = kept(map_ahead(look, pairs, _AT_ONCE, _AT_ONCE))
+    ways = (each.found for each in seen) if gyro is not None else on_ways(seen, begin, first)
+    for each, pair in map_ahead(ready, found_in_order(ways), _AT_ONCE, _AT_ONCE):
+        yield each.number + 1, *each.images, pair
 
 
 def correct_all(

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rsbench.capture.trajectory_alone import trajectory_alone
-from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.motion import Motion
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.mono_correction import FoundOwnMotion
-from rsbench.vision.mono_fusion import Flows, OwnMotion
+from rsbench.pipeline.mono_law import error_px
+from rsbench.vision.mono_fusion import Flows
 
 _TOLD, _BESIDE = 10, 2
 """Pairs of a group, and those on either side that help."""
@@ -30,8 +30,6 @@ _RETURNS_PX = 0.3
 """As of ``flow_matches``."""
 _LEAST = 50
 """Matches."""
-_LARGEST_PX = 1.25
-"""Errors count up to here."""
 _FLOW_PX = 0.15
 """Root mean square of what dense flow errs by: up to here a way explains a pair, and where it explains it as well
 as a motion of its own."""
@@ -119,7 +117,8 @@ def _along(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundOwnMotion]:
     ways = trajectory_alone([pair.matches for _, pair in run], motions, owns[0].rig.about("left"), owns[0].shutter)
     out = dict[int, FoundOwnMotion]()
     for (number, pair), own, steady, way in zip(run, owns, motions, ways or [], strict=False):
-        if pair.found is not None and _miss_px(way, pair, own) <= max(_miss_px(steady, pair, own), _FLOW_PX):
+        errors = [error_px(each, pair.matches, own.rig, own.shutter, own.side) for each in (way, steady)]
+        if pair.found is not None and errors[0] <= max(errors[1], _FLOW_PX):
             out[number] = _told_by(pair.found, way)
     return out
 
@@ -130,8 +129,3 @@ def _told_by(found: FoundOwnMotion, way: Motion) -> FoundOwnMotion:
         estimate = replace(robust.estimate, w=way.w, d=way.d, covariance=None)
         robust = replace(robust, estimate=estimate, motion_model=way.name)
     return replace(found, own=replace(found.own, motion=way), robust=robust)
-
-
-def _miss_px(motion: Motion, pair: SeenPair, own: OwnMotion) -> float:
-    errors = np.abs(rs_sampson_error(own.rig, own.shutter, motion, own.side, pair.matches))
-    return float(np.sqrt(np.mean(np.minimum(np.nan_to_num(errors, nan=np.inf), _LARGEST_PX) ** 2)))
