@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.capture.trajectory_alone import way_of_two
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import InertialMotion
+from rsbench.core.motion import InertialMotion, Motion
 from rsbench.core.rig import Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -25,6 +26,8 @@ from rsbench.vision.mono_fusion import Flows, MonoFusion, MonoFusionOptions, Own
 
 _MATCHES = 1500
 """Of the dense flow, drawn at random: what a motion of six unknowns is solved from."""
+_PIXELS = 600
+"""Of each frame, at random and the same in all, that are followed to the frames before and after it, for a way."""
 _FEWEST = 50
 _RETURNS_PX = 0.3
 """Flow there and back ends so near where it began, for a match; DIS errs by about 0.1 px where it does."""
@@ -93,14 +96,31 @@ def flow_matches(flows: Flows, rng: np.random.Generator) -> FloatArray:
     return np.concatenate([here + flow.reshape(-1, 2)[chosen], here], axis=-1)
 
 
+def way_matches(flows: Flows, seed: int) -> FloatArray:
+    """Matches (n, 4) by the flow, from the same random pixels of both frames; in random order.
+
+    One that ends at such a pixel goes on in the next pair with the one that begins there.
+    """
+    height, width = flows.returns[0].shape
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(height * width, min(_PIXELS, height * width), replace=False)
+    y, x = np.divmod(chosen, width)
+    here, out = np.stack([x, y], axis=-1).astype(np.float64), list[FloatArray]()
+    for frame, (flow, returns) in enumerate(zip(flows.flow, flows.returns, strict=True)):
+        there = here + flow[y, x]
+        good = (returns[y, x] < _RETURNS_PX) & np.all((there >= 0.0) & (there <= [width - 1, height - 1]), axis=-1)
+        out.append(np.concatenate([there, here] if frame else [here, there], axis=-1)[good])
+    return rng.permutation(np.concatenate(out))
+
+
 def find_own_motion(
     flows: Flows, rig: StereoRig, shutter: RollingShutter, side: Side, robust: RobustOptions, seed: int = 0
 ) -> FoundOwnMotion:
-    """The motion of one camera, by the law that its flow asks for; its translation has length 1.
+    """The motion of one camera, by the law that its flow asks for, or as it shook; its translation has length 1.
 
-    Of laws of constant speed, and one that accelerates: two frames do not tell a vibration.
+    Of laws of constant speed, and one that accelerates.
     """
-    return by_asked_law(find_steady_motion(flows, rig, shutter, side, robust, seed), flows, robust, seed)
+    return as_asked(find_steady_motion(flows, rig, shutter, side, robust, seed), flows, robust, seed)
 
 
 def find_steady_motion(
@@ -132,6 +152,25 @@ def by_asked_law(found: FoundOwnMotion, flows: Flows, robust: RobustOptions, see
     told, motion = asked_for(found.robust, matches, own.rig.about("left"), own.shutter, robust, seed)
     motion = motion.with_endpoint(motion.w, motion.d / np.linalg.norm(motion.d))
     return replace(found, own=replace(own, motion=motion), robust=told)
+
+
+def as_asked(found: FoundOwnMotion, flows: Flows, robust: RobustOptions, seed: int = 0) -> FoundOwnMotion:
+    """As ``by_asked_law``, or shaken, where two frames show how (``way_of_two``)."""
+    lawful = by_asked_law(found, flows, robust, seed)
+    own = lawful.own
+    if lawful.robust is None or own.motion is None:
+        return lawful
+    way = way_of_two(way_matches(flows, seed), own.motion, own.rig.about("left"), own.shutter)
+    return lawful if way is None else on_way(lawful, way)
+
+
+def on_way(found: FoundOwnMotion, way: Motion) -> FoundOwnMotion:
+    """What is found of two frames, with another motion."""
+    robust = found.robust
+    if robust is not None:
+        estimate = replace(robust.estimate, w=way.w, d=way.d, covariance=None)
+        robust = replace(robust, estimate=estimate, motion_model=way.name)
+    return replace(found, own=replace(found.own, motion=way), robust=robust)
 
 
 @final

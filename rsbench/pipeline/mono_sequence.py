@@ -27,15 +27,16 @@ from rsbench.pipeline.mono_correction import (
     STILL,
     FoundOwnMotion,
     MonoFusionCorrector,
+    as_asked,
     by_asked_law,
-    find_own_motion,
     find_steady_motion,
     refusal,
+    way_matches,
 )
 from rsbench.pipeline.mono_focal import find_camera
 from rsbench.pipeline.mono_gyro import NOT_COVERED, around, rotation_alone, with_gyro
 from rsbench.pipeline.mono_shutter import find_shutter
-from rsbench.pipeline.mono_ways import SeenPair, group_of, on_ways, way_matches
+from rsbench.pipeline.mono_ways import SeenPair, group_of, on_ways
 from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.pipeline.turned_frames import Turned, turned
 from rsbench.vision.closing import close_narrow
@@ -274,9 +275,11 @@ def _found(
             return None, reason
         return rotation_alone(rig, shutter, "left", gyro), ""
     known = rig, shutter, "left", corrector.robust, corrector.seed
+    found = find_steady_motion(flows, *known)
     if gyro is None:
-        return find_steady_motion(flows, *known), ""
-    return with_gyro(find_own_motion(flows, *known), flows, gyro, corrector.robust, corrector.seed), ""
+        return found, ""
+    options = corrector.robust, corrector.seed
+    return with_gyro(by_asked_law(found, flows, *options), flows, gyro, *options), ""
 
 
 def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: MonoOptions) -> _Pair:
@@ -285,7 +288,7 @@ def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: Mon
     images = [turn.image(image) for image in seen.images]
     flows, corrector = seen.flows or find_flows(images), options.corrector
     if isinstance(found.own.motion, InertialMotion):  # on no way
-        found = by_asked_law(found, flows, corrector.robust, corrector.seed)
+        found = as_asked(found, flows, corrector.robust, corrector.seed)
     return _Pair(fusion=MonoFusion(images, found.own, flows, corrector.fusion), found=found, reason="")
 
 

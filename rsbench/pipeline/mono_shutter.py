@@ -28,8 +28,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import check_alike
-from rsbench.pipeline.mono_correction import flow_matches, refusal
-from rsbench.pipeline.mono_ways import way_matches
+from rsbench.pipeline.mono_correction import flow_matches, refusal, way_matches
 from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.mono_fusion import find_flows

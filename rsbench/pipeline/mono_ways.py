@@ -9,25 +9,18 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-
-import numpy as np
+from dataclasses import dataclass
 
 from rsbench.capture.trajectory_alone import trajectory_alone
 from rsbench.core.motion import Motion
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.mono_correction import FoundOwnMotion
+from rsbench.pipeline.mono_correction import FoundOwnMotion, on_way
 from rsbench.pipeline.mono_law import error_px
-from rsbench.vision.mono_fusion import Flows
 
 _TOLD, _BESIDE = 10, 2
 """Pairs of a group, and those on either side that help."""
 _FEWEST = 3
 """Pairs in a row, from which on they show a way."""
-_PIXELS = 600
-"""Of each frame, at random and the same in all, that are followed to the frames before and after it."""
-_RETURNS_PX = 0.3
-"""As of ``flow_matches``."""
 _LEAST = 50
 """Matches."""
 _FLOW_PX = 0.15
@@ -47,23 +40,6 @@ class SeenPair:
     @property
     def motion(self) -> Motion | None:
         return None if self.found is None or self.found.own.far else self.found.own.motion
-
-
-def way_matches(flows: Flows, seed: int) -> FloatArray:
-    """Matches (n, 4) by the flow, from the same random pixels of both frames; in random order.
-
-    One that ends at such a pixel goes on in the next pair with the one that begins there.
-    """
-    height, width = flows.returns[0].shape
-    rng = np.random.default_rng(seed)
-    chosen = rng.choice(height * width, min(_PIXELS, height * width), replace=False)
-    y, x = np.divmod(chosen, width)
-    here, out = np.stack([x, y], axis=-1).astype(np.float64), list[FloatArray]()
-    for frame, (flow, returns) in enumerate(zip(flows.flow, flows.returns, strict=True)):
-        there = here + flow[y, x]
-        good = (returns[y, x] < _RETURNS_PX) & np.all((there >= 0.0) & (there <= [width - 1, height - 1]), axis=-1)
-        out.append(np.concatenate([there, here] if frame else [here, there], axis=-1)[good])
-    return rng.permutation(np.concatenate(out))
 
 
 def group_of(pair: int) -> tuple[int, int]:
@@ -119,13 +95,5 @@ def _along(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundOwnMotion]:
     for (number, pair), own, steady, way in zip(run, owns, motions, ways or [], strict=False):
         errors = [error_px(each, pair.matches, own.rig, own.shutter, own.side) for each in (way, steady)]
         if pair.found is not None and errors[0] <= max(errors[1], _FLOW_PX):
-            out[number] = _told_by(pair.found, way)
+            out[number] = on_way(pair.found, way)
     return out
-
-
-def _told_by(found: FoundOwnMotion, way: Motion) -> FoundOwnMotion:
-    robust = found.robust
-    if robust is not None:
-        estimate = replace(robust.estimate, w=way.w, d=way.d, covariance=None)
-        robust = replace(robust, estimate=estimate, motion_model=way.name)
-    return replace(found, own=replace(found.own, motion=way), robust=robust)

@@ -47,6 +47,9 @@ _SIGMA_PX = 0.3
 """What neither check of a flow sees: its standard deviation on rendered frames where both agree."""
 _RANGE_QUANTILE, _RANGE_MARGIN, _RANGE_PX = 0.999, 1.5, 2.0
 """Range of the search along the curves, from the inverse depths of consistent flow: times, and px of parallax."""
+_SAME_PX = 2.0
+"""Parallax by which a search and a flow that both are believed may differ, for the flow's depth to stand: it is
+finer than planes."""
 _CONFIRMED = 16.0
 """How much less flow counts where the search on the curve is confirmed by the other frame."""
 _SMOOTH_PX = 5
@@ -181,9 +184,10 @@ class MonoFusion:
         offs = [off[np.ix_(*pick)] for off in self.flows.returns]
         greys = [grey_u8(image) for image in self.images]
         known, options = (greys, own.rig, own.shutter, own.motion, own.side), self.options.sweep
-        most = max(_range(offs, met, parallax_gain(own.rig.camera, *maps)), largest_seen(*known, options))
-        swept = sweep_frames(*known, most, options)
-        return [_layer(swept[frame], offs[frame], *met[frame], shape) for frame in FRAMES]
+        gain = parallax_gain(own.rig.camera, *maps)
+        most = max(_range(offs, met, gain), largest_seen(*known, options))
+        swept, same = sweep_frames(*known, most, options), _SAME_PX / max(gain, 1e-9)
+        return [_layer(swept[frame], offs[frame], *met[frame], shape, same) for frame in FRAMES]
 
     def _drawn(self, frame: int, target_tau: float) -> tuple[NDArray[Any], F32, NDArray[np.uint8]]:
         """Image (H, W[, C]), inverse depth and origin (H, W) of one frame at the target.
@@ -296,14 +300,16 @@ def _range(offs: Sequence[F32], met: Sequence[tuple[F32, F32]], gain: float) -> 
     return largest * _RANGE_MARGIN + _RANGE_PX / max(gain, 1e-9)
 
 
-def _layer(swept: Swept, off: F32, rho: F32, miss: F32, shape: tuple[int, ...]) -> _Layer:
+def _layer(swept: Swept, off: F32, rho: F32, miss: F32, shape: tuple[int, ...], same: float) -> _Layer:
     """Depth and weights (H, W) of a frame.
 
-    ``off`` (h, w) says where its flow returns, ``rho`` and ``miss`` (h, w) are those of ``_triangulated``.
+    ``off`` (h, w) says where its flow returns, ``rho`` and ``miss`` (h, w) are those of ``_triangulated``, and
+    ``same`` is a difference of inverse depth.
     """
     full = shape[1::-1]
     still = (off < _RETURNS_PX) & (miss < _ON_CURVE_PX)
-    found = continued(np.where(swept.agrees, swept.rho, np.where(still, rho, np.float32(np.nan))))
+    searched = swept.agrees & ~(still & (np.abs(rho - swept.rho) < same))
+    found = continued(np.where(searched, swept.rho, np.where(still, rho, np.float32(np.nan))))
     filled = cv2.resize(cv2.medianBlur(_filled(found), 5), full, interpolation=cv2.INTER_LINEAR)
     # How far consistent flow ends off the curve says how far geometry is from explaining it, found or not.
     wrong = np.maximum(miss - _ON_CURVE_PX, np.float32(0.0))

@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 
 from rsbench.capture.camera_alone import capture_along
-from rsbench.capture.trajectory_alone import trajectory_alone
+from rsbench.capture.trajectory_alone import trajectory_alone, way_of_two
 from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import InertialMotion, Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.refined import RefinedSolver
 
 SHUTTER = RollingShutter(height=480, readout_ratio=0.8)
 RIG = StereoRig(camera=PinholeCamera.centred(640, 480, 520.0), baseline=1.0).about("left")
@@ -80,6 +83,34 @@ def test_a_way_follows_what_a_camera_trembles(shake: float) -> None:
         last = place(np.array([k + 1.0]), shake).R[0] @ -V
         assert np.linalg.norm(way.d) == pytest.approx(1.0, abs=1e-9)
         assert way.d @ last / np.linalg.norm(V) > np.cos(np.deg2rad(1.0))
+
+
+def law_of(matches: FloatArray) -> InertialMotion:
+    solver = RefinedSolver(motion_model=InertialMotion.name, one_camera=True)
+    given, rng = Correspondences(left=matches), np.random.default_rng(0)
+    found = estimate_motion(given, RIG, SHUTTER, solver, RobustOptions(), rng).estimate
+    return InertialMotion(found.w, found.d / np.linalg.norm(found.d))
+
+
+@pytest.mark.parametrize("shake", [0.0, 0.001, 0.005])
+def test_two_frames_are_believed_that_they_shook_where_they_show_it(shake: float) -> None:
+    """By half a pixel: that way is nearer than the best law. By more, many ways explain them: the law stays."""
+    for seed in range(3):
+        (matches,) = windows_of(1, shake, 0.1, np.random.default_rng(seed))
+        law = law_of(matches)
+        way = way_of_two(matches, law, RIG, SHUTTER)
+        assert (way is not None) == (shake == 0.001)
+        if way is not None:
+            assert np.linalg.norm(way.d) == pytest.approx(1.0, abs=1e-9)
+            assert turned_deg(way, 0, shake) < 0.7 * turned_deg(law, 0, shake)
+            assert way_of_two(matches[:15], law, RIG, SHUTTER) is None
+            assert way_of_two(matches, law, RIG, RollingShutter(height=480, readout_ratio=0.0)) is None
+
+
+def test_wrong_matches_of_two_frames_are_no_way() -> None:
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        assert way_of_two(rng.uniform(0.0, 480.0, (300, 4)), InertialMotion(W, -V), RIG, SHUTTER) is None
 
 
 @pytest.mark.parametrize("backwards", [False, True])
