@@ -38,6 +38,8 @@ GyroOffset = Annotated[
     ),
 ]
 _MOST = 1e9
+_SAME_RATE = 0.01
+"""Relative difference of frame rates, up to which they are one, as 29.97 and 30."""
 _PAGE_FRAMES = 6
 _UNIT = "length of the translation over one frame period"
 
@@ -67,10 +69,29 @@ def correct_one_camera(
         raise RsbenchError("frames: with --camera give FRAME_0 FRAME_1 and so on, or --frames DIR|VIDEO")
     card = OneCameraCard() if camera is None else read_one_camera(camera)
     source = FrameSource.of_files(frames) if frames is not None else FrameSource(footage or Path())
+    _say_other_rate(card, source, gyro.fps)
     samples = gyro.samples(source)
     log = None if samples is None else Gyroscope(samples=samples, farthest=gyro.farthest(source))
     record = _correct(source, card, out, _options(source, target, inpaint, seed), log)
     _say(record, out)
+
+
+def _say_other_rate(card: OneCameraCard, source: FrameSource, said: float | None) -> None:
+    """A line where a ratio is of another frame rate than the frames: it is a share of the frame period."""
+    from rsbench.dataset.corrected_video import said_fps
+
+    fps = said_fps(source.path) if said is None else said
+    if card.frame_period_s is None or card.readout_ratio is None or fps is None or not fps > 0.0:
+        return
+    share = card.frame_period_s * fps
+    if abs(share - 1.0) > _SAME_RATE:
+        ratio, other = card.readout_ratio, card.readout_ratio * share
+        there = f"; the same readout is {other:.3g} of them" if other <= 1.0 else ", which no frame of it lasts"
+        typer.echo(
+            f"rsbench: camera: readout ratio {ratio:.3g} is of {1.0 / card.frame_period_s:.4g} frames a second, and "
+            f"the frames have {fps:.4g}{there}: frame_period_s = {1.0 / fps:.4g} beside shutter says so",
+            err=True,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,10 +239,14 @@ def _shutter(source: FrameSource, card: OneCameraCard, options: MonoOptions) -> 
     from rsbench.cli.console import progress_bar
     from rsbench.pipeline.mono_shutter import IN_ORDER, find_shutter
 
-    corrector, pairs = options.corrector, LONGEST if card.readout_ratio is None else IN_ORDER
+    corrector, looked = options.corrector, card.readout_ratio is None
+    steps = min(max(source.count - 1, 1), LONGEST if looked else IN_ORDER) + looked
     try:
-        with progress_bar("looking at the shutter", min(max(source.count - 1, 1), pairs)) as advance:
-            return find_shutter(source, source.count, card, corrector.robust, corrector.seed, advance)
+        with progress_bar("looking at the shutter", steps) as advance:
+            found = find_shutter(source, source.count, card, corrector.robust, corrector.seed, advance)
+            if looked:
+                advance("all pairs together")
+            return found
     except NoMotionError as error:
         typer.echo(f"rsbench: not corrected: {error}", err=True)
         raise typer.Exit(1) from None

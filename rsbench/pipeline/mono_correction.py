@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +20,7 @@ from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, 
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
 from rsbench.vision.fusion import Fused
-from rsbench.vision.images import eight_bit, grey_u8
+from rsbench.vision.images import eight_bit, local_variance
 from rsbench.vision.mono_fusion import Flows, MonoFusion, MonoFusionOptions, OwnMotion, find_flows
 
 _MATCHES = 1500
@@ -44,7 +43,6 @@ twelve real and rendered pairs with up to 43 px of flow, at most 0.001 in pairs 
 where blurred noise meets other noise."""
 STILL = "nothing moves between the frames: a still camera needs no correction"
 CUT = "shows another scene than the frame before it: a cut, or frames that are missing"
-_WINDOW = 9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,7 +60,7 @@ class FoundOwnMotion:
 
 def refusal(images: Sequence[NDArray[Any]], flows: Flows) -> str:
     """Why two frames (H, W[, 3]) of one camera cannot be corrected; empty when they can."""
-    variances = [_variance(image) for image in eight_bit(list(images))]
+    variances = [local_variance(image) for image in eight_bit(list(images))]
     for name, variance in zip(("first", "second"), variances, strict=True):
         if np.mean(variance > _TEXTURE_LEVELS**2) < _TEXTURED:
             return f"the {name} frame shows no texture: nothing to find its motion by"
@@ -72,13 +70,6 @@ def refusal(images: Sequence[NDArray[Any]], flows: Flows) -> str:
     if float(np.mean(flows.returns[1] < _RETURNS_PX)) < _FOLLOWED:
         return CUT
     return ""
-
-
-def _variance(image: NDArray[Any]) -> NDArray[np.float32]:
-    """(H, W) of the grey levels around each pixel of an 8-bit image (H, W[, 3])."""
-    grey = grey_u8(image).astype(np.float32)
-    mean, square = (cv2.blur(each, (_WINDOW, _WINDOW)) for each in (grey, grey * grey))
-    return np.asarray(square - mean * mean)
 
 
 def flow_matches(flows: Flows, rng: np.random.Generator) -> FloatArray:

@@ -86,10 +86,10 @@ def _shows(pair: SeenPair) -> bool:
 
 def _along(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundOwnMotion]:
     """Of pairs in a row that show motions: those that go the way which all show together."""
-    if len(run) < _FEWEST:
-        return {}
     motions = [pair.motion for _, pair in run if pair.motion is not None]
     owns = [pair.found.own for _, pair in run if pair.found is not None]
+    if len(run) < _FEWEST or owns[0].shutter.readout_ratio == 0.0:
+        return {}
     ways = trajectory_alone([pair.matches for _, pair in run], motions, owns[0].rig.about("left"), owns[0].shutter)
     out = dict[int, FoundOwnMotion]()
     for (number, pair), own, steady, way in zip(run, owns, motions, ways or [], strict=False):

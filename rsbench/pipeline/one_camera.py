@@ -73,7 +73,7 @@ class ZhuangCorrector(Corrector):
         known = problem.matches, problem.rig, problem.shutter
         motions = {side: self.motion(*known, side) for side in dict(views)}
         moved = {view: self._moved(problem, view, motions[view[0]]) for view in views}
-        single = FusionCorrector(use_other_views=False, guess_depth=False, warp=self.warp)
+        single = FusionCorrector(use_other_views=False, guess_depth=False, moving=False, warp=self.warp)
 
         def corrected(view: View, row: float) -> Fused:
             one = moved[view]

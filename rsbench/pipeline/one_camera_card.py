@@ -26,6 +26,9 @@ class OneCameraCard:
 
     readout_ratio: float | None = None
     """Readout time over frame period, 0 to 1. Absent: found from the frames, or the command says why not."""
+    frame_period_s: float | None = None
+    """Seconds from one frame to the next, beside ``shutter`` where it is not that of its mode. A video of another
+    frame rate is told apart."""
     scan: Scan | None = None
     """Side of the image at which the readout begins. Absent: found with the readout ratio, or ``top`` where that
     is given."""
@@ -38,6 +41,8 @@ class OneCameraCard:
     def __post_init__(self) -> None:
         if self.readout_ratio is not None and not 0.0 <= self.readout_ratio <= 1.0:
             raise ValueError(f"readout_ratio = {self.readout_ratio}: must lie in [0, 1]")
+        if self.frame_period_s is not None and not self.frame_period_s > 0.0:
+            raise ValueError(f"frame_period_s = {self.frame_period_s}: must be positive")
         if self.fov_deg is not None and not 0.0 < self.fov_deg <= _WIDEST_DEG:
             raise ValueError(f"fov_deg = {self.fov_deg}: must lie in (0, {_WIDEST_DEG:g}]")
         if self.fov_deg is not None and self.camera is not None:
@@ -70,6 +75,4 @@ def read_one_camera(path: Path) -> OneCameraCard:
         RsbenchError: one line with the file, the field, the value and what is allowed.
     """
     table = read_toml(path)
-    if "shutter" in table:
-        table = {key: value for key, value in with_shutter(table, str(path)).items() if key != "frame_period_s"}
-    return parse_card(OneCameraCard, table, str(path))
+    return parse_card(OneCameraCard, with_shutter(table, str(path)), str(path))

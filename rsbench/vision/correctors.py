@@ -13,9 +13,10 @@ from rsbench.core.rig import VIEWS, Side, View
 from rsbench.core.se3 import Pose
 from rsbench.vision.baseline_depths import plane_depth
 from rsbench.vision.correction import WarpOptions, warp_gain
-from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
+from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec, Depths
 from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.fusion import Fused, Origin, SourceView, fuse
+from rsbench.vision.moving_things import Moving, draw_moving, find_moving
 
 F32 = NDArray[np.float32]
 _NEAREST_SHARE = 0.999
@@ -34,6 +35,8 @@ class FusionCorrector(Corrector):
     """Fill what the frame did not see from the other three."""
     guess_depth: bool = True
     """Where no depth was found, take that of the farther neighbour in the row."""
+    moving: bool = True
+    """Whether what moves by itself is looked for, and goes its flow."""
     warp: WarpOptions = field(default_factory=WarpOptions)
     """How pixels are taken from the source image."""
 
@@ -45,14 +48,22 @@ class FusionCorrector(Corrector):
     )
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
-        poses = {view: problem.row_poses(view) for view in VIEWS}
+        poses, camera, given = {view: problem.row_poses(view) for view in VIEWS}, problem.rig.camera, problem
+        moving = dict[View, Moving]()
+        if self.moving and problem.depth is not None:
+            moving = find_moving(problem.images, problem.depth, poses, camera, problem.shutter)
+            problem = _standing(problem, moving) if moving else problem
 
         def corrected(view: View) -> Fused:
             sources = self._sources(problem, view, poses)
             sources[0] = self._placed(problem, view, sources[0])
-            return fuse(sources, problem.rig.camera, problem.target_pose(view), self.warp)
+            fused = fuse(sources, camera, problem.target_pose(view), self.warp)
+            if not moving:
+                return fused
+            tau = float(problem.shutter.time_after(problem.target_row, view[1], view[0]))
+            known = problem.images[view], moving[view], given.depth[view], view, problem.shutter, tau
+            return draw_moving(fused, *known, self.warp.interpolation)
 
-        camera = problem.rig.camera
         found = map_frames(corrected, views, camera.width * camera.height, _FUSION_BYTES)
         return dict(zip(views, found, strict=True))
 
@@ -84,6 +95,17 @@ class FusionCorrector(Corrector):
         certain = (source.depth == 0.0) & (gain <= self.warp.tear_px * nearest)
         guess = np.where(problem.guess[view] > 0.0, problem.guess[view], np.float32(np.inf))
         return replace(source, depth=np.where(certain, guess, source.depth))
+
+
+def _standing(problem: CorrectionProblem, moving: Mapping[View, Moving]) -> CorrectionProblem:
+    """Without the depth of what moves."""
+
+    def still(depth: Depths | None) -> Depths | None:
+        if depth is None:
+            return None
+        return {view: np.where(moving[view].mask, np.float32(0.0), depth[view]) for view in VIEWS}
+
+    return replace(problem, depth=still(problem.depth), guess=still(problem.guess))
 
 
 def _source(problem: CorrectionProblem, view: View, poses: Pose, origin: Origin) -> SourceView:

@@ -28,6 +28,15 @@ def dense_flow(first: NDArray[Any], second: NDArray[Any]) -> F32:
     return np.asarray(dis.calc(grey_u8(first), grey_u8(second), None), dtype=np.float32)
 
 
+def returns_px(flow: F32, back: F32) -> F32:
+    """Distance (H, W), px, from a pixel to the end of its flow there and back, that of the border beyond it."""
+    height, width = flow.shape[:2]
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    u, v = x + flow[..., 0], y + flow[..., 1]
+    there = cv2.remap(back, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(np.linalg.norm(flow + there, axis=-1), dtype=np.float32)
+
+
 def flow_depth(
     pixels: FloatArray,
     flow: FloatArray | F32,

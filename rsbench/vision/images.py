@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+_WINDOW = 9
 _BRIGHT = 99.9
 """Percentile of a 16-bit image that becomes white for matching."""
 
@@ -36,3 +37,10 @@ def eight_bit(images: list[NDArray[Any]]) -> list[NDArray[np.uint8]]:
     top = max(float(np.percentile(image, _BRIGHT)) for image in images)
     scale = np.float32(255.0 / max(top, 1.0))
     return [np.clip(image * scale + np.float32(0.5), 0.0, 255.0).astype(np.uint8) for image in images]
+
+
+def local_variance(image: NDArray[Any]) -> NDArray[np.float32]:
+    """(H, W) of the grey levels around each pixel of an 8-bit image (H, W[, 3])."""
+    grey = grey_u8(image).astype(np.float32)
+    mean, square = (cv2.blur(each, (_WINDOW, _WINDOW)) for each in (grey, grey * grey))
+    return np.asarray(square - mean * mean)

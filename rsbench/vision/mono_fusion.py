@@ -29,7 +29,7 @@ from rsbench.vision import forward_warp
 from rsbench.vision.border_depth import continued
 from rsbench.vision.correction import WarpOptions, line_maps
 from rsbench.vision.curve_sweep import SweepOptions, Swept, largest_seen, search_size, sweep_frames
-from rsbench.vision.flow import dense_flow
+from rsbench.vision.flow import dense_flow, returns_px
 from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.fusion import Fused, Origin, inpaint
 from rsbench.vision.images import grey_u8
@@ -102,15 +102,7 @@ def find_flows(images: Sequence[NDArray[Any]]) -> Flows:
     """Flow both ways between two frames (H, W[, 3]), uint8 or uint16."""
     height, width = images[0].shape[:2]
     ways = map_frames(lambda i: dense_flow(images[i], images[1 - i]), FRAMES, height * width, _FLOW_BYTES)
-    return Flows((ways[0], ways[1]), (_returns(*ways), _returns(*ways[::-1])))
-
-
-def _returns(flow: F32, back: F32) -> F32:
-    height, width = flow.shape[:2]
-    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    u, v = x + flow[..., 0], y + flow[..., 1]
-    there = cv2.remap(back, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(np.linalg.norm(flow + there, axis=-1), dtype=np.float32)
+    return Flows((ways[0], ways[1]), (returns_px(*ways), returns_px(*ways[::-1])))
 
 
 class _Layer(NamedTuple):

@@ -100,6 +100,26 @@ def test_a_folder_gives_the_same_frames_in_order(folder: Path) -> None:
     ]
 
 
+def test_a_shutter_of_another_frame_rate_is_named(folder: Path) -> None:
+    """The mode reads for 15.64 ms at 59.94 frames a second; of a period of 30 a second that is 0.469."""
+    film = cv2.VideoWriter(str(folder / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, SIZE[::-1])
+    for frame in range(2):
+        film.write(np.ascontiguousarray(_rolling(frame)[..., ::-1]))
+    film.release()
+    ratios = []
+    for more in ("", "frame_period_s = 0.033333\n"):
+        (folder / "camera.toml").write_text(f'shutter = "dji-o4-air-4k60"\nfov_deg = 60.0\n{more}')
+        result = _correct(folder, "--frames", folder / "film.avi")
+        assert result.returncode == 0, result.stderr
+        told = "0.937 is of 59.94 frames a second, and the frames have 30; the same readout is 0.469 of them"
+        assert (told in result.stderr) == (not more)
+        ratios.append(json.loads((folder / "out" / "motion.json").read_text())["readout_ratio"])
+        (folder / "out").rename(folder / f"out-{len(ratios)}")
+    assert ratios == pytest.approx([15.64e-3 * 59.94006, 15.64e-3 / 0.033333])
+    (folder / "camera.toml").write_text("readout_ratio = 1.0\nframe_period_s = 0\n")
+    assert_refused(_correct(folder, folder / "0.png", folder / "1.png"), "frame_period_s = 0", "must be positive")
+
+
 def test_an_interrupted_run_goes_on_where_it_was(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     name = "out"
     (folder / "in").mkdir()

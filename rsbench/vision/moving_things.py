@@ -1,0 +1,178 @@
+"""What moves by itself before a moving rig: found where flow contradicts geometry, drawn where its flow takes it.
+
+Depth comes from two cameras at one time, and holds for what moves; where a row sees it at another time does not
+follow from the motion of the rig. Its flow tells it, scaled by the times of the rows: even motion in the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.rig import VIEWS, View
+from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter
+from rsbench.vision import forward_warp
+from rsbench.vision.correction import inverse_depth
+from rsbench.vision.flow import dense_flow, returns_px
+from rsbench.vision.frame_threads import map_frames
+from rsbench.vision.fusion import Fused, Origin
+from rsbench.vision.images import eight_bit, grey_u8, local_variance
+from rsbench.vision.reprojection import reproject_pixels, reprojection_of
+from rsbench.vision.resample import Interpolation, resample
+
+F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+_RETURNS_PX = 1.0
+"""Distance from a pixel to where flow there and back ends, below which it is believed."""
+_MOVED_PX = 2.0
+"""Distance between the end of the flow and where geometry puts a still point, above which it moved."""
+_TEXTURE_LEVELS = 3.0
+"""Standard deviation of grey levels in a window; in what is smooth, flow stays where it is and returns."""
+_MEDIAN, _CORE, _NEAR_PX = 9, 9, 12
+"""Sides, px, of the windows in which most must move, and all; how far beyond, px, a thing goes on."""
+_LEAST = 0.004
+"""Of the image's area: a smaller thing is left to geometry, which errs in such spots too."""
+_SAME_DEPTH, _SAME_FLOW_PX = 0.06, 3.0
+_STRETCH_PX = 2.5
+_AGREE = 0.03
+_FLOW_BYTES = 100.0
+
+
+class Moving(NamedTuple):
+    """What moves by itself in a frame."""
+
+    mask: Mask
+    """(H, W)."""
+    flow: F32
+    """(H, W, 2) px, to the other frame of the camera."""
+
+
+def find_moving(
+    images: Mapping[View, NDArray[Any]],
+    depth: Mapping[View, F32],
+    poses: Mapping[View, Pose],
+    camera: PinholeCamera,
+    shutter: RollingShutter,
+) -> dict[View, Moving]:
+    """Of all four frames (H, W[, 3]) with their depth (H, W) and the poses of their lines; empty where none is.
+
+    Of most scenes a look at a frame of half the size says that.
+    """
+    size, grid = camera.width * camera.height, camera.pixel_grid().astype(np.float32)
+
+    def stays(view: View) -> F32:
+        """(H, W, 2) px by which a still point goes; NaN where it is unknown."""
+        axis = shutter.axis(view[0])
+        maps = reprojection_of(camera, poses[view], poses[_other(view)], (axis, axis))
+        lines = np.ascontiguousarray(np.indices(depth[view].shape, dtype=np.int32)[1 - axis])
+        return np.asarray(reproject_pixels(maps, inverse_depth(depth[view]), lines)[0] - grid)
+
+    first = VIEWS[0]
+    halves = [cv2.resize(grey_u8(images[view]), None, fx=0.5, fy=0.5) for view in (first, _other(first))]
+    rows, columns = halves[0].shape
+    still = stays(first)[1::2, 1::2][:rows, :columns] / 2.0
+    quick = dense_flow(*halves), dense_flow(*halves[::-1])
+    if not np.any(_large(_moves(*quick, still, 0.5 * _MOVED_PX), halves[0])):
+        return {}
+    ways = map_frames(lambda view: dense_flow(images[view], images[_other(view)]), VIEWS, size, _FLOW_BYTES)
+    flows = dict(zip(VIEWS, ways, strict=True))
+
+    def found(view: View) -> Moving:
+        moved = _moves(flows[view], flows[_other(view)], stays(view), _MOVED_PX)
+        return _outlined(Moving(_large(moved, images[view]), flows[view]), inverse_depth(depth[view]))
+
+    return dict(zip(VIEWS, map_frames(found, VIEWS, size, _FLOW_BYTES), strict=True))
+
+
+def _moves(flow: F32, back: F32, still: F32, least: float) -> Mask:
+    """(H, W) where a flow that is believed leads elsewhere than ``still`` (H, W, 2)."""
+    moved = np.linalg.norm(flow - still, axis=-1) > least  # False of NaN
+    return np.asarray(moved & (returns_px(flow, back) < _RETURNS_PX))
+
+
+def _large(moved: Mask, image: NDArray[Any]) -> Mask:
+    """Large regions, of which the image (H, W[, 3]) shows something."""
+    dense = cv2.medianBlur(moved.astype(np.uint8), _MEDIAN)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(dense, connectivity=8)
+    if count == 1:
+        return np.zeros_like(moved)
+    textured = local_variance(eight_bit([image])[0]) > _TEXTURE_LEVELS**2
+    shown = np.bincount(labels[textured], minlength=count) > 0.5 * stats[:, cv2.CC_STAT_AREA]
+    large = shown & (stats[:, cv2.CC_STAT_AREA] >= _LEAST * moved.size)
+    large[0] = False
+    return np.asarray(large[labels])
+
+
+def _outlined(moving: Moving, rho: F32) -> Moving:
+    """Things as far as their own depth goes, and the flow of what they are near: flow runs over edges."""
+    core = cv2.erode(moving.mask.astype(np.uint8), np.ones((_CORE, _CORE), np.uint8)) & np.isfinite(rho)
+    if not np.any(core):
+        return Moving(np.zeros_like(moving.mask), moving.flow)
+    apart, label = cv2.distanceTransformWithLabels(1 - core, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    y, x = np.nonzero(core)
+    at = np.zeros((label.max() + 1, 2), dtype=np.intp)
+    at[label[y, x]] = np.stack([y, x], axis=-1)
+    v, u = np.moveaxis(at[label], -1, 0)
+    beside, flow = rho[v, u], moving.flow[v, u]
+    mask = (apart <= _NEAR_PX) & (np.abs(rho - beside) <= _SAME_DEPTH * beside)
+    own = moving.mask & (np.linalg.norm(moving.flow - flow, axis=-1) <= _SAME_FLOW_PX)
+    return Moving(np.asarray(mask), np.where(own[..., None], moving.flow, flow))
+
+
+def draw_moving(
+    fused: Fused,
+    image: NDArray[Any],
+    moving: Moving,
+    depth: F32,
+    view: View,
+    shutter: RollingShutter,
+    target_tau: float,
+    interpolation: Interpolation,
+) -> Fused:
+    """A corrected frame with what moves by itself in it, before what is farther.
+
+    ``depth`` (H, W) is that of ``image``; what moves along the axis in the meantime is left out.
+    """
+    mask = moving.mask & (depth > 0.0)
+    if not np.any(mask):
+        return fused
+    y, x = np.nonzero(mask)
+    here = np.stack([x, y], axis=-1).astype(np.float64)
+    flow = moving.flow[y, x]
+    start = shutter.pixel_time(here, view[1], view[0])
+    passed = shutter.pixel_time(here + flow, 1 - view[1], view[0]) - start
+    share = (target_tau - start) / passed
+    moved = np.full((*mask.shape, 3), np.nan)
+    moved[y, x, :2] = here + share[:, None] * flow
+    moved[y, x, 2] = inverse_depth(depth)[y, x]
+    source_map = np.full((*mask.shape, 2), np.nan, dtype=np.float32)
+    buffer = np.full(mask.shape, -1.0, dtype=np.float32)
+    forward_warp.draw_moved(moved, _joined(moved), source_map, buffer)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        behind = np.where(fused.origin == Origin.NOBODY, np.float32(-1.0), np.float32(1.0) / fused.depth)
+    take = (buffer >= 0.0) & ~(behind * (1.0 - _AGREE) > buffer)
+    drawn = resample(image, source_map, interpolation)
+    out, origin, z = fused.image.copy(), fused.origin.copy(), fused.depth.copy()
+    out[take], origin[take] = drawn[take], Origin.HERE
+    z[take] = 1.0 / np.maximum(buffer[take], np.float32(1e-9))
+    return Fused(image=out, origin=origin, depth=z)
+
+
+def _other(view: View) -> View:
+    return view[0], 1 - view[1]
+
+
+def _joined(moved: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Bits of ``forward_warp.connect``."""
+    joined = np.zeros(moved.shape[:2], dtype=np.uint8)
+    right = np.linalg.norm(moved[:, 1:, :2] - moved[:, :-1, :2], axis=-1) <= _STRETCH_PX
+    below = np.linalg.norm(moved[1:, :, :2] - moved[:-1, :, :2], axis=-1) <= _STRETCH_PX
+    joined[:, :-1] = np.where(right, np.uint8(forward_warp.RIGHT), np.uint8(0))
+    joined[:-1] |= np.where(below, np.uint8(forward_warp.BELOW), np.uint8(0))
+    return joined
