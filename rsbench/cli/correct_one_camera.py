@@ -88,8 +88,8 @@ def _say_other_rate(card: OneCameraCard, source: FrameSource, said: float | None
         ratio, other = card.readout_ratio, card.readout_ratio * share
         there = f"; the same readout is {other:.3g} of them" if other <= 1.0 else ", which no frame of it lasts"
         typer.echo(
-            f"rsbench: camera: readout ratio {ratio:.3g} is of {1.0 / card.frame_period_s:.4g} frames a second, and "
-            f"the frames have {fps:.4g}{there}: frame_period_s = {1.0 / fps:.4g} beside shutter says so",
+            f"rsbench: camera: readout ratio {ratio:.3g} is of {1.0 / card.frame_period_s:.4g} frames a second, "
+            f"and the frames have {fps:.4g}{there}: frame_period_s = {1.0 / fps:.4g} beside shutter says so",
             err=True,
         )
 

@@ -6,7 +6,7 @@ follow from the motion of the rig. Its flow tells it, scaled by the times of the
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -22,7 +22,7 @@ from rsbench.vision.correction import inverse_depth
 from rsbench.vision.flow import dense_flow, returns_px
 from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.fusion import Fused, Origin
-from rsbench.vision.images import eight_bit, grey_u8, local_variance
+from rsbench.vision.images import grey_u8
 from rsbench.vision.reprojection import reproject_pixels, reprojection_of
 from rsbench.vision.resample import Interpolation, resample
 
@@ -32,8 +32,8 @@ _RETURNS_PX = 1.0
 """Distance from a pixel to where flow there and back ends, below which it is believed."""
 _MOVED_PX = 2.0
 """Distance between the end of the flow and where geometry puts a still point, above which it moved."""
-_TEXTURE_LEVELS = 3.0
-"""Standard deviation of grey levels in a window; in what is smooth, flow stays where it is and returns."""
+_NOISE_LEVELS, _CLEARLY = 1.0, 0.7
+"""Grey levels that differ anyway, and the part of the difference where geometry leads that must be left."""
 _MEDIAN, _CORE, _NEAR_PX = 9, 9, 12
 """Sides, px, of the windows in which most must move, and all; how far beyond, px, a thing goes on."""
 _LEAST = 0.004
@@ -76,37 +76,45 @@ def find_moving(
     first = VIEWS[0]
     halves = [cv2.resize(grey_u8(images[view]), None, fx=0.5, fy=0.5) for view in (first, _other(first))]
     rows, columns = halves[0].shape
-    still = stays(first)[1::2, 1::2][:rows, :columns] / 2.0
     quick = dense_flow(*halves), dense_flow(*halves[::-1])
-    if not np.any(_large(_moves(*quick, still, 0.5 * _MOVED_PX), halves[0])):
+    if not np.any(_moved(halves, *quick, stays(first)[1::2, 1::2][:rows, :columns] / 2.0, 0.5 * _MOVED_PX)):
         return {}
     ways = map_frames(lambda view: dense_flow(images[view], images[_other(view)]), VIEWS, size, _FLOW_BYTES)
-    flows = dict(zip(VIEWS, ways, strict=True))
+    flows, greys = dict(zip(VIEWS, ways, strict=True)), {view: grey_u8(images[view]) for view in VIEWS}
 
     def found(view: View) -> Moving:
-        moved = _moves(flows[view], flows[_other(view)], stays(view), _MOVED_PX)
-        return _outlined(Moving(_large(moved, images[view]), flows[view]), inverse_depth(depth[view]))
+        other = _other(view)
+        mask = _moved((greys[view], greys[other]), flows[view], flows[other], stays(view), _MOVED_PX)
+        return _outlined(Moving(mask, flows[view]), inverse_depth(depth[view]))
 
     return dict(zip(VIEWS, map_frames(found, VIEWS, size, _FLOW_BYTES), strict=True))
 
 
-def _moves(flow: F32, back: F32, still: F32, least: float) -> Mask:
-    """(H, W) where a flow that is believed leads elsewhere than ``still`` (H, W, 2)."""
+def _moved(greys: Sequence[NDArray[np.uint8]], flow: F32, back: F32, still: F32, least: float) -> Mask:
+    """(H, W) large regions where a flow that is believed leads elsewhere than ``still`` (H, W, 2).
+
+    And where it leads is clearly more like what is there: flow errs too.
+    """
     moved = np.linalg.norm(flow - still, axis=-1) > least  # False of NaN
-    return np.asarray(moved & (returns_px(flow, back) < _RETURNS_PX))
-
-
-def _large(moved: Mask, image: NDArray[Any]) -> Mask:
-    """Large regions, of which the image (H, W[, 3]) shows something."""
+    moved &= returns_px(flow, back) < _RETURNS_PX
     dense = cv2.medianBlur(moved.astype(np.uint8), _MEDIAN)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(dense, connectivity=8)
-    if count == 1:
-        return np.zeros_like(moved)
-    textured = local_variance(eight_bit([image])[0]) > _TEXTURE_LEVELS**2
-    shown = np.bincount(labels[textured], minlength=count) > 0.5 * stats[:, cv2.CC_STAT_AREA]
-    large = shown & (stats[:, cv2.CC_STAT_AREA] >= _LEAST * moved.size)
+    large = stats[:, cv2.CC_STAT_AREA] >= _LEAST * moved.size
     large[0] = False
+    if not np.any(large):
+        return np.zeros_like(moved)
+    chosen = large[labels]
+    unlike = [np.bincount(labels[chosen], _unlike(greys, way)[chosen], count) for way in (flow, still)]
+    large &= (unlike[0] + _NOISE_LEVELS * stats[:, cv2.CC_STAT_AREA]) < _CLEARLY * unlike[1]
     return np.asarray(large[labels])
+
+
+def _unlike(greys: Sequence[NDArray[np.uint8]], way: F32) -> F32:
+    """(H, W) grey levels by which a frame differs from the other one where ``way`` (H, W, 2) px leads."""
+    height, width = greys[0].shape
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    there = cv2.remap(greys[1], x + way[..., 0], y + way[..., 1], cv2.INTER_LINEAR)
+    return np.abs(there.astype(np.float32) - greys[0])
 
 
 def _outlined(moving: Moving, rho: F32) -> Moving:
