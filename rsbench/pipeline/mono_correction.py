@@ -87,14 +87,14 @@ def flow_matches(flows: Flows, rng: np.random.Generator) -> FloatArray:
     return np.concatenate([here + flow.reshape(-1, 2)[chosen], here], axis=-1)
 
 
-def way_matches(flows: Flows, seed: int) -> FloatArray:
+def way_matches(flows: Flows, seed: int, pixels: int = _PIXELS) -> FloatArray:
     """Matches (n, 4) by the flow, from the same random pixels of both frames; in random order.
 
     One that ends at such a pixel goes on in the next pair with the one that begins there.
     """
     height, width = flows.returns[0].shape
     rng = np.random.default_rng(seed)
-    chosen = rng.choice(height * width, min(_PIXELS, height * width), replace=False)
+    chosen = rng.choice(height * width, min(pixels, height * width), replace=False)
     y, x = np.divmod(chosen, width)
     here, out = np.stack([x, y], axis=-1).astype(np.float64), list[FloatArray]()
     for frame, (flow, returns) in enumerate(zip(flows.flow, flows.returns, strict=True)):

@@ -36,7 +36,7 @@ from rsbench.pipeline.mono_correction import (
 from rsbench.pipeline.mono_focal import find_camera
 from rsbench.pipeline.mono_gyro import NOT_COVERED, around, rotation_alone, with_gyro
 from rsbench.pipeline.mono_shutter import find_shutter
-from rsbench.pipeline.mono_ways import SeenPair, group_of, on_ways
+from rsbench.pipeline.mono_ways import PIXELS, SeenPair, group_of, on_ways
 from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.pipeline.turned_frames import Turned, turned
 from rsbench.vision.closing import close_narrow
@@ -256,7 +256,7 @@ def _seen(
     found, reason = _found(given, flows, turn, corrector, local)
     if gyro is not None and samples is None and found is not None:
         found = replace(found, unused=NOT_COVERED)
-    matches = way_matches(flows, corrector.seed) if gyro is None else np.zeros((0, 4))
+    matches = way_matches(flows, corrector.seed, PIXELS) if gyro is None else np.zeros((0, 4))
     small = _HELD * sum(each.nbytes for each in (*flows.flow, *flows.returns)) <= _HELD_BYTES
     return _Seen(number, images, flows if small else None, found, reason, matches)
 

@@ -21,6 +21,8 @@ _TOLD, _BESIDE = 10, 2
 """Pairs of a group, and those on either side that help."""
 _FEWEST = 3
 """Pairs in a row, from which on they show a way."""
+PIXELS = 300
+"""As of ``way_matches``: fewer than of two frames alone do, for each frame is in two pairs."""
 _LEAST = 50
 """Matches."""
 _FLOW_PX = 0.15
