@@ -34,7 +34,8 @@ _SHARE, _SHARE_OF_TWO = 0.5, 0.15
 err together turn what hardly anything else holds."""
 _GAINED = 0.3
 """Logarithm of the likelihood that a match of two frames must gain, in the mean, for a way in place of a law.
-Neighbours err alike in dense flow, so that many of them count for one; of motions by laws it was 0.1 at most."""
+Neighbours err alike in dense flow, so that many of them count for one; of rendered motions by laws of constant
+speed it was 0.1 at most."""
 _OPEN_PX = 0.15
 """Deviation, root mean square, of where turns of the rows of a frame put what is far: above, two frames leave open
 how they shook."""

@@ -43,7 +43,7 @@ class FusionCorrector(Corrector):
     spec = CorrectorSpec(
         needs={"motion", "depth"},
         reference="Wang, Fan, Dai, eq. 11, with the holes filled (rsbench)",
-        assumes="a scene that stands still; sharp edges of depth are as good as the depth",
+        assumes="a scene that stands still, or moves evenly in the image; edges of depth are as good as the depth",
         cameras="any",
     )
 

@@ -39,8 +39,12 @@ _MEDIAN, _CORE, _NEAR_PX = 9, 9, 12
 _LEAST = 0.004
 """Of the image's area: a smaller thing is left to geometry, which errs in such spots too."""
 _SAME_DEPTH, _SAME_FLOW_PX = 0.06, 3.0
+_SMALLEST = 12
+"""Side of an image, px, that dense flow takes (OpenCV 5.0)."""
 _STRETCH_PX = 2.5
+"""Between neighbours at the target, above which what lies between them is not drawn."""
 _AGREE = 0.03
+"""Relative difference of depth, below which what moves lies on what stands, and is seen."""
 _FLOW_BYTES = 100.0
 
 
@@ -74,10 +78,12 @@ def find_moving(
         return np.asarray(reproject_pixels(maps, inverse_depth(depth[view]), lines)[0] - grid)
 
     first = VIEWS[0]
-    halves = [cv2.resize(grey_u8(images[view]), None, fx=0.5, fy=0.5) for view in (first, _other(first))]
-    rows, columns = halves[0].shape
-    quick = dense_flow(*halves), dense_flow(*halves[::-1])
-    if not np.any(_moved(halves, *quick, stays(first)[1::2, 1::2][:rows, :columns] / 2.0, 0.5 * _MOVED_PX)):
+    half = camera.width // 2, camera.height // 2
+    if min(half) < _SMALLEST:
+        return {}
+    small = [np.asarray(cv2.resize(grey_u8(images[view]), half)) for view in (first, _other(first))]
+    quick = dense_flow(*small), dense_flow(*small[::-1])
+    if not np.any(_moved(small, *quick, stays(first)[1::2, 1::2] / 2.0, 0.5 * _MOVED_PX)):
         return {}
     ways = map_frames(lambda view: dense_flow(images[view], images[_other(view)]), VIEWS, size, _FLOW_BYTES)
     flows, greys = dict(zip(VIEWS, ways, strict=True)), {view: grey_u8(images[view]) for view in VIEWS}
@@ -103,9 +109,9 @@ def _moved(greys: Sequence[NDArray[np.uint8]], flow: F32, back: F32, still: F32,
     large[0] = False
     if not np.any(large):
         return np.zeros_like(moved)
-    chosen = large[labels]
+    chosen = large[labels] & np.isfinite(still[..., 0])
     unlike = [np.bincount(labels[chosen], _unlike(greys, way)[chosen], count) for way in (flow, still)]
-    large &= (unlike[0] + _NOISE_LEVELS * stats[:, cv2.CC_STAT_AREA]) < _CLEARLY * unlike[1]
+    large &= unlike[0] + _NOISE_LEVELS * np.bincount(labels[chosen], minlength=count) < _CLEARLY * unlike[1]
     return np.asarray(large[labels])
 
 
@@ -145,7 +151,11 @@ def draw_moving(
 ) -> Fused:
     """A corrected frame with what moves by itself in it, before what is farther.
 
-    ``depth`` (H, W) is that of ``image``; what moves along the axis in the meantime is left out.
+    Args:
+        fused: without it, see ``find_moving``.
+        image, depth: (H, W[, 3]), (H, W) of the frame of the ``view``.
+        moving: in that frame.
+        target_tau: time of the corrected frame, frame periods.
     """
     mask = moving.mask & (depth > 0.0)
     if not np.any(mask):
@@ -155,7 +165,8 @@ def draw_moving(
     flow = moving.flow[y, x]
     start = shutter.pixel_time(here, view[1], view[0])
     passed = shutter.pixel_time(here + flow, 1 - view[1], view[0]) - start
-    share = (target_tau - start) / passed
+    with np.errstate(divide="ignore", invalid="ignore"):  # what ends when it began has no speed, and is not drawn
+        share = (target_tau - start) / passed
     moved = np.full((*mask.shape, 3), np.nan)
     moved[y, x, :2] = here + share[:, None] * flow
     moved[y, x, 2] = inverse_depth(depth)[y, x]

@@ -89,8 +89,7 @@ def test_nothing_is_found_without_depth_or_texture(worlds: tuple[Any, Any], u8: 
     shape = problem.images[VIEW].shape
     grey = {view: np.full(shape, 90, np.uint8) for view in VIEWS}
     blind = {view: np.zeros(shape[:2], np.float32) for view in VIEWS}
-    for changed in ({"images": grey}, {"depth": blind, "guess": blind}):
-        given = replace(problem, **changed)
+    for given in (replace(problem, images=grey), replace(problem, depth=blind, guess=blind)):
         one, other = (FusionCorrector(moving=moving).correct(given, [VIEW])[VIEW] for moving in (False, True))
         np.testing.assert_array_equal(one.image, other.image)
 
