@@ -85,13 +85,14 @@ def way_of_two(
         return None
     theirs = approximated(law.body_from_world, span_of(1, shutter), _INTERVAL)
     each = replace(tracks, share=1.0)
-    ours, costs = found.curve, []
-    for curve in (ours, theirs):
-        costs.append(normal_equations(curve, each, found.tails, _NO_PRIOR, found.trust, want=False).cost)
+    costs = [
+        normal_equations(curve, each, found.tails, _NO_PRIOR, found.trust, want=False).cost
+        for curve in (found.curve, theirs)
+    ]
     gained = (costs[1] - costs[0]) / max(float(np.sum(found.trust)), 1.0)
-    if gained < _GAINED or _open_px(ours, inverse, rig, shutter) > _OPEN_PX:
+    if gained < _GAINED or _open_px(found.curve, inverse, rig, shutter) > _OPEN_PX:
         return None
-    return _window(ours, 0, shutter)
+    return _window(found.curve, 0, shutter)
 
 
 def _open_px(curve: Curve, inverse: FloatArray, rig: StereoRig, shutter: RollingShutter) -> float:

@@ -48,10 +48,10 @@ class FusionCorrector(Corrector):
     )
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
-        poses, camera, given = {view: problem.row_poses(view) for view in VIEWS}, problem.rig.camera, problem
-        moving = dict[View, Moving]()
-        if self.moving and problem.depth is not None:
-            moving = find_moving(problem.images, problem.depth, poses, camera, problem.shutter)
+        poses, camera = {view: problem.row_poses(view) for view in VIEWS}, problem.rig.camera
+        depth, moving = problem.depth or {}, dict[View, Moving]()
+        if self.moving and depth:
+            moving = find_moving(problem.images, depth, poses, camera, problem.shutter)
             problem = _standing(problem, moving) if moving else problem
 
         def corrected(view: View) -> Fused:
@@ -61,7 +61,7 @@ class FusionCorrector(Corrector):
             if not moving:
                 return fused
             tau = float(problem.shutter.time_after(problem.target_row, view[1], view[0]))
-            known = problem.images[view], moving[view], given.depth[view], view, problem.shutter, tau
+            known = problem.images[view], moving[view], depth[view], view, problem.shutter, tau
             return draw_moving(fused, *known, self.warp.interpolation)
 
         found = map_frames(corrected, views, camera.width * camera.height, _FUSION_BYTES)
