@@ -61,12 +61,20 @@ def main() -> int:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--only", default="", help="sequences in whose name this is")
     given = parser.parse_args()
+    try:
+        chosen = [
+            each
+            for each in read_dataset(given.data)
+            if given.only in each.name and each.rig.camera.height // 2 in each.twins
+        ]
+    except RsbenchError as error:
+        parser.error(str(error))
+    if not chosen:
+        parser.error(f"--only {given.only!r}: names no sequence with truth at the middle row (twins)")
     head = " ".join(f"{name:>9}" for name in ("as it is", "still", "moving") * 2)
     sys.stdout.write(f"{'sequence':34} {head}   (all pixels, then what moves)\n")
     rows = dict[str, list[list[float]]]()
-    for sequence in read_dataset(given.data):
-        if given.only not in sequence.name or sequence.rig.camera.height // 2 not in sequence.twins:
-            continue
+    for sequence in chosen:
         try:
             found = scores(sequence)
         except RsbenchError as error:
@@ -75,8 +83,6 @@ def main() -> int:
         rows.setdefault("moving" if sequence.moving else "still", []).append(found)
         sys.stdout.write(f"{sequence.name:34} {' '.join(f'{each:9.2f}' for each in found)}\n")
         sys.stdout.flush()
-    if not rows:
-        parser.error(f"--only {given.only!r}: names no sequence with truth at the middle row (twins)")
     for name, found in rows.items():
         means = np.mean(found, axis=0)
         sys.stdout.write(f"mean of {len(found)} {name:23} {' '.join(f'{each:9.2f}' for each in means)}\n")

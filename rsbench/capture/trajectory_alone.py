@@ -39,7 +39,7 @@ speed it was 0.1 at most."""
 _OPEN_PX = 0.15
 """Deviation, root mean square, of where turns of the rows of a frame put what is far: above, two frames leave open
 how they shook."""
-_ROWS = 24
+_ROWS, _FEWEST = 24, 30
 _NO_PRIOR = Prior(1.0, 1, np.inf, np.inf)
 _JUDGED_BY = 150
 """Matches of a window, about, by which the prior is found, and which of the others are right."""
@@ -76,7 +76,7 @@ def way_of_two(
         law: the motion by the law that fits best.
         rig, shutter: as there.
     """
-    if shutter.readout_ratio == 0.0:
+    if shutter.readout_ratio == 0.0 or len(matches) < _FEWEST:
         return None
     try:
         found, tracks = _fitted([matches], [law], rig, shutter, _SHARE_OF_TWO)

@@ -51,7 +51,7 @@ class FusionCorrector(Corrector):
         poses, camera = {view: problem.row_poses(view) for view in VIEWS}, problem.rig.camera
         depth, moving = problem.depth or {}, dict[View, Moving]()
         if self.moving and depth:
-            moving = find_moving(problem.images, depth, poses, camera, problem.shutter)
+            moving = find_moving(problem.images, depth, poses, problem.rig, problem.shutter)
             problem = _standing(problem, moving) if moving else problem
 
         def corrected(view: View) -> Fused:

@@ -30,11 +30,15 @@ def dense_flow(first: NDArray[Any], second: NDArray[Any]) -> F32:
 
 def returns_px(flow: F32, back: F32) -> F32:
     """Distance (H, W), px, from a pixel to the end of its flow there and back, that of the border beyond it."""
+    there = followed(back, flow, cv2.BORDER_REPLICATE)
+    return np.asarray(np.linalg.norm(flow + there, axis=-1), dtype=np.float32)
+
+
+def followed(image: NDArray[Any], flow: F32, border: int) -> NDArray[Any]:
+    """What an image (H, W[, C]) shows where a flow (H, W, 2), px, leads; ``border``: beyond it, of OpenCV."""
     height, width = flow.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    u, v = x + flow[..., 0], y + flow[..., 1]
-    there = cv2.remap(back, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(np.linalg.norm(flow + there, axis=-1), dtype=np.float32)
+    return np.asarray(cv2.remap(image, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=border))
 
 
 def flow_depth(

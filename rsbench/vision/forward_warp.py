@@ -276,3 +276,30 @@ def draw_moved(moved: F64, joined: U8, source_map: F32, buffer: F32) -> None:
                 _quad(upper, lower, x, x + 1, y - 1, first, second, source_map, buffer)
             if not whole and ((top and right) or (bottom and left)):
                 _quad(upper, lower, x + 1, x, y - 1, top and right, bottom and left, source_map, buffer)
+
+
+def draw_within(moved: F64, stretch: float) -> tuple[F32, F32]:
+    """Source pixel (H, W, 2) and inverse depth (H, W), -1 for none, of the mesh of ``moved`` (H, W, 3).
+
+    Without what joins neighbours that are more than ``stretch`` px apart.
+    """
+    joined = np.zeros(moved.shape[:2], dtype=np.uint8)
+    _join(moved, stretch, joined)
+    source_map = np.full((*joined.shape, 2), np.nan, dtype=np.float32)
+    buffer = np.full(joined.shape, -1.0, dtype=np.float32)
+    draw_moved(moved, joined, source_map, buffer)
+    return source_map, buffer
+
+
+@compiled(error_model="numpy")
+def _join(moved: F64, stretch: float, joined: U8) -> None:
+    """Fill ``joined`` (H, W) with the bits of ``connect``."""
+    height, width = joined.shape
+    for y in range(height):
+        for x in range(width):
+            if x + 1 < width:
+                along = np.hypot(moved[y, x + 1, 0] - moved[y, x, 0], moved[y, x + 1, 1] - moved[y, x, 1])
+                joined[y, x] = RIGHT if along <= stretch else 0
+            if y + 1 < height:
+                along = np.hypot(moved[y + 1, x, 0] - moved[y, x, 0], moved[y + 1, x, 1] - moved[y, x, 1])
+                joined[y, x] |= BELOW if along <= stretch else 0

@@ -187,10 +187,10 @@ class MonoFusion:
         HERE, GUESSED where it is stretched over an edge, and NOBODY, of inverse depth -1, where it shows nothing.
         """
         moved = self.places(frame, target_tau)
-        whole, stretched = _draw(moved, np.inf), np.zeros(moved.shape[:2], dtype=np.bool_)
+        whole, stretched = forward_warp.draw_within(moved, np.inf), np.zeros(moved.shape[:2], dtype=np.bool_)
         source_map, buffer = whole
         if self.own.motion is not None:
-            near, torn = _draw(moved, _STRETCH)
+            near, torn = forward_warp.draw_within(moved, _STRETCH)
             known = torn >= 0.0
             stretched = ~known & (buffer >= 0.0)
             source_map, buffer = np.where(known[..., None], near, source_map), np.where(known, torn, buffer)
@@ -214,33 +214,6 @@ class MonoFusion:
         places = np.zeros((height, width, 3))
         _weigh(flow, layer.rho, weight, moved, target_tau - here, float(1 - 2 * frame), rate, places)
         return places
-
-
-def _draw(moved: FloatArray, stretch: float) -> tuple[F32, F32]:
-    """Source pixel (H, W, 2) and inverse depth (H, W), -1 for none, of the mesh of ``moved`` (H, W, 3).
-
-    Without what joins neighbours that are more than ``stretch`` px apart.
-    """
-    joined = np.zeros(moved.shape[:2], dtype=np.uint8)
-    _join(moved, stretch, joined)
-    source_map = np.full((*joined.shape, 2), np.nan, dtype=np.float32)
-    buffer = np.full(joined.shape, -1.0, dtype=np.float32)
-    forward_warp.draw_moved(moved, joined, source_map, buffer)
-    return source_map, buffer
-
-
-@compiled(error_model="numpy")
-def _join(moved: FloatArray, stretch: float, joined: NDArray[np.uint8]) -> None:
-    """Fill ``joined`` (H, W) with the bits of ``forward_warp.connect``."""
-    height, width = joined.shape
-    for y in range(height):
-        for x in range(width):
-            if x + 1 < width:
-                along = np.hypot(moved[y, x + 1, 0] - moved[y, x, 0], moved[y, x + 1, 1] - moved[y, x, 1])
-                joined[y, x] = forward_warp.RIGHT if along <= stretch else 0
-            if y + 1 < height:
-                along = np.hypot(moved[y + 1, x, 0] - moved[y, x, 0], moved[y + 1, x, 1] - moved[y, x, 1])
-                joined[y, x] |= forward_warp.BELOW if along <= stretch else 0
 
 
 @compiled(error_model="numpy")

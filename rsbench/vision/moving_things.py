@@ -13,13 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.rig import VIEWS, View
+from rsbench.core.rig import VIEWS, StereoRig, View
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
-from rsbench.vision import forward_warp
 from rsbench.vision.correction import inverse_depth
-from rsbench.vision.flow import dense_flow, returns_px
+from rsbench.vision.flow import dense_flow, followed, returns_px
+from rsbench.vision.forward_warp import draw_within
 from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.fusion import Fused, Origin
 from rsbench.vision.images import grey_u8
@@ -32,6 +31,8 @@ _RETURNS_PX = 1.0
 """Distance from a pixel to where flow there and back ends, below which it is believed."""
 _MOVED_PX = 2.0
 """Distance between the end of the flow and where geometry puts a still point, above which it moved."""
+_DISPARITY_PX = 1.0
+"""What depth may err by: a still point may be so much farther or nearer."""
 _NOISE_LEVELS, _CLEARLY = 1.0, 0.7
 """Grey levels that differ anyway, and the part of the difference where geometry leads that must be left."""
 _MEDIAN, _CORE, _NEAR_PX = 9, 9, 12
@@ -39,6 +40,8 @@ _MEDIAN, _CORE, _NEAR_PX = 9, 9, 12
 _LEAST = 0.004
 """Of the image's area: a smaller thing is left to geometry, which errs in such spots too."""
 _SAME_DEPTH, _SAME_FLOW_PX = 0.06, 3.0
+"""Relative difference of inverse depth to the nearest certain pixel of a thing, up to which one is part of it, and
+of flow, up to which its own is kept."""
 _SMALLEST = 12
 """Side of an image, px, that dense flow takes (OpenCV 5.0)."""
 _STRETCH_PX = 2.5
@@ -61,21 +64,25 @@ def find_moving(
     images: Mapping[View, NDArray[Any]],
     depth: Mapping[View, F32],
     poses: Mapping[View, Pose],
-    camera: PinholeCamera,
+    rig: StereoRig,
     shutter: RollingShutter,
 ) -> dict[View, Moving]:
     """Of all four frames (H, W[, 3]) with their depth (H, W) and the poses of their lines; empty where none is.
 
     Of most scenes a look at a frame of half the size says that.
     """
+    camera, baseline = rig.camera, rig.baseline
     size, grid = camera.width * camera.height, camera.pixel_grid().astype(np.float32)
+    off = _DISPARITY_PX / (camera.fx * baseline)
 
-    def stays(view: View) -> F32:
-        """(H, W, 2) px by which a still point goes; NaN where it is unknown."""
+    def stays(view: View) -> tuple[F32, F32]:
+        """(H, W, 2) px by which still points go that are somewhat farther and nearer; NaN where it is unknown."""
         axis = shutter.axis(view[0])
         maps = reprojection_of(camera, poses[view], poses[_other(view)], (axis, axis))
-        lines = np.ascontiguousarray(np.indices(depth[view].shape, dtype=np.int32)[1 - axis])
-        return np.asarray(reproject_pixels(maps, inverse_depth(depth[view]), lines)[0] - grid)
+        lines, rho = np.indices(depth[view].shape, dtype=np.int32)[1 - axis], inverse_depth(depth[view])
+        near, far = rho + np.float32(off), np.maximum(rho - np.float32(off), np.float32(0.0))
+        ends = [reproject_pixels(maps, each, np.ascontiguousarray(lines))[0] for each in (far, near)]
+        return np.asarray(ends[0] - grid), np.asarray(ends[1] - grid)
 
     first = VIEWS[0]
     half = camera.width // 2, camera.height // 2
@@ -83,7 +90,8 @@ def find_moving(
         return {}
     small = [np.asarray(cv2.resize(grey_u8(images[view]), half)) for view in (first, _other(first))]
     quick = dense_flow(*small), dense_flow(*small[::-1])
-    if not np.any(_moved(small, *quick, stays(first)[1::2, 1::2] / 2.0, 0.5 * _MOVED_PX)):
+    still = [way[1::2, 1::2] / 2.0 for way in stays(first)]
+    if not np.any(_moved(small, *quick, still, 0.5 * _MOVED_PX)):
         return {}
     ways = map_frames(lambda view: dense_flow(images[view], images[_other(view)]), VIEWS, size, _FLOW_BYTES)
     flows, greys = dict(zip(VIEWS, ways, strict=True)), {view: grey_u8(images[view]) for view in VIEWS}
@@ -96,12 +104,15 @@ def find_moving(
     return dict(zip(VIEWS, map_frames(found, VIEWS, size, _FLOW_BYTES), strict=True))
 
 
-def _moved(greys: Sequence[NDArray[np.uint8]], flow: F32, back: F32, still: F32, least: float) -> Mask:
-    """(H, W) large regions where a flow that is believed leads elsewhere than ``still`` (H, W, 2).
+def _moved(greys: Sequence[NDArray[np.uint8]], flow: F32, back: F32, still: Sequence[F32], least: float) -> Mask:
+    """(H, W) large regions where a flow that is believed leads beside the ways of still points, two (H, W, 2).
 
     And where it leads is clearly more like what is there: flow errs too.
     """
-    moved = np.linalg.norm(flow - still, axis=-1) > least  # False of NaN
+    far, along = still[0], still[1] - still[0]
+    share = np.sum((flow - far) * along, axis=-1) / np.maximum(np.sum(along * along, axis=-1), np.float32(1e-6))
+    nearest = far + np.clip(share, 0.0, 1.0)[..., None] * along
+    moved = np.linalg.norm(flow - nearest, axis=-1) > least  # False of NaN
     moved &= returns_px(flow, back) < _RETURNS_PX
     dense = cv2.medianBlur(moved.astype(np.uint8), _MEDIAN)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(dense, connectivity=8)
@@ -109,18 +120,15 @@ def _moved(greys: Sequence[NDArray[np.uint8]], flow: F32, back: F32, still: F32,
     large[0] = False
     if not np.any(large):
         return np.zeros_like(moved)
-    chosen = large[labels] & np.isfinite(still[..., 0])
-    unlike = [np.bincount(labels[chosen], _unlike(greys, way)[chosen], count) for way in (flow, still)]
+    chosen = large[labels] & np.isfinite(nearest[..., 0])
+    unlike = [np.bincount(labels[chosen], _unlike(greys, way)[chosen], count) for way in (flow, nearest)]
     large &= unlike[0] + _NOISE_LEVELS * np.bincount(labels[chosen], minlength=count) < _CLEARLY * unlike[1]
     return np.asarray(large[labels])
 
 
 def _unlike(greys: Sequence[NDArray[np.uint8]], way: F32) -> F32:
     """(H, W) grey levels by which a frame differs from the other one where ``way`` (H, W, 2) px leads."""
-    height, width = greys[0].shape
-    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    there = cv2.remap(greys[1], x + way[..., 0], y + way[..., 1], cv2.INTER_LINEAR)
-    return np.abs(there.astype(np.float32) - greys[0])
+    return np.abs(followed(greys[1], way, cv2.BORDER_CONSTANT).astype(np.float32) - greys[0])
 
 
 def _outlined(moving: Moving, rho: F32) -> Moving:
@@ -170,9 +178,7 @@ def draw_moving(
     moved = np.full((*mask.shape, 3), np.nan)
     moved[y, x, :2] = here + share[:, None] * flow
     moved[y, x, 2] = inverse_depth(depth)[y, x]
-    source_map = np.full((*mask.shape, 2), np.nan, dtype=np.float32)
-    buffer = np.full(mask.shape, -1.0, dtype=np.float32)
-    forward_warp.draw_moved(moved, _joined(moved), source_map, buffer)
+    source_map, buffer = draw_within(moved, _STRETCH_PX)
     with np.errstate(divide="ignore", invalid="ignore"):
         behind = np.where(fused.origin == Origin.NOBODY, np.float32(-1.0), np.float32(1.0) / fused.depth)
     take = (buffer >= 0.0) & ~(behind * (1.0 - _AGREE) > buffer)
@@ -185,13 +191,3 @@ def draw_moving(
 
 def _other(view: View) -> View:
     return view[0], 1 - view[1]
-
-
-def _joined(moved: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Bits of ``forward_warp.connect``."""
-    joined = np.zeros(moved.shape[:2], dtype=np.uint8)
-    right = np.linalg.norm(moved[:, 1:, :2] - moved[:, :-1, :2], axis=-1) <= _STRETCH_PX
-    below = np.linalg.norm(moved[1:, :, :2] - moved[:-1, :, :2], axis=-1) <= _STRETCH_PX
-    joined[:, :-1] = np.where(right, np.uint8(forward_warp.RIGHT), np.uint8(0))
-    joined[:-1] |= np.where(below, np.uint8(forward_warp.BELOW), np.uint8(0))
-    return joined
