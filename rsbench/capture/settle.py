@@ -41,7 +41,7 @@ _FROM_GLOBAL = 3.0
 whose calibration errs, gave 0.25 +- 0.09 from the left, at a probability of 0.98."""
 _SAME_DEG, _SAME_PERCENT = 1e-3, 1e-3
 """Differences of motions that say nothing, as between all models under a global shutter."""
-_CLEARLY, LEAST_BACKWARDS = 0.999, 0.25
+_CLEARLY, LEAST_BACKWARDS, _NEAR = 0.999, 0.25, 0.2
 """Probability of the opposite scan at which frames are refused, and the ratio from which their order shows."""
 _AXES = ("tilt", "pan", "roll", "sideways motion", "vertical motion", "forward motion")
 
@@ -201,6 +201,14 @@ def runs_backwards(capture: Capture, scans: Scans) -> bool:
     if best is None or best.scans != reversed_scans(scans) or best.scans == scans:
         return False
     return best.probability > _CLEARLY and best.ratio >= LEAST_BACKWARDS
+
+
+def finds_shutter(capture: Capture, scans: Scans, ratio: float) -> bool:
+    """Whether the matches ask, beyond doubt, for lines that are read so, at a ratio near this one."""
+    best = capture.likeliest
+    if best is None or best.scans != scans or best.probability <= _CLEARLY:
+        return False
+    return best.sigma <= _NEAR and abs(best.ratio - ratio) <= _NEAR
 
 
 def backwards_known(
