@@ -58,8 +58,8 @@ SHAKES = (
     "readout. Give readout_ratio in the rig's card, or four frames and more"
 )
 _BEYOND_DOUBT = 23.0
-"""Logarithm of odds between splines: 7, as of a probability of 0.999, where tracks counted 0.15 as matches that err
-together ask, and not a half."""
+"""Logarithm of odds between splines: 7, as of a probability of 0.999, where tracks counted 0.15 and not a half, as
+those that err together ask."""
 _MOMENTS = 33
 """Of a frame period, at which poses are compared."""
 
