@@ -21,6 +21,7 @@ from rsbench.cli.correct_one_camera import (
 )
 from rsbench.cli.correct_said import readout_words, say_calibration, write_page_of
 from rsbench.cli.correct_sequence import correct_sequence_given
+from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
     from rsbench.cli.correct_input import Given
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     Finish: TypeAlias = Callable[[Fused], Fused]
 
 _INPAINT = "Invent all pixels that no frame shows, or none. Default: specks and slits alone"
+_FAST = "Of a rig: in half the time, with matches and depth at half the size; a tenth of a decibel less."
 _ROW_POSES = "Of a sequence, write the pose at every row too: row_poses.csv, in TUM's format."
 _SOLVER = "rs-stereo-refined"
 _MODEL = "Motion model: auto, which the matches prefer, or a name. Default: auto where the solver takes it"
@@ -60,6 +62,7 @@ def correct(
     features: Annotated[str, named("features", "Matches features: a name or a card.")] = "sift-refined",
     corrector: Annotated[str, named("correctors", "Makes the corrected frames: a name or a card.")] = "fusion",
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
+    fast: Annotated[bool, typer.Option("--fast", help=_FAST)] = False,
     row_poses: Annotated[bool, typer.Option("--row-poses", help=_ROW_POSES)] = False,
     camera: CameraFile = None,
     footage: Footage = None,
@@ -70,12 +73,14 @@ def correct(
     """Correct your own rolling-shutter frames: of a stereo rig or of one camera, two times or a whole sequence."""
     log = GyroGiven(file=gyro, fps=fps, offset_s=gyro_offset)
     if camera is not None or footage is not None:
+        if fast:
+            raise RsbenchError("--fast: is of a rig; leave it out for one camera")
         correct_one_camera(frames, footage, camera, out, target, inpaint, seed, log)
         return
     given = given_frames(frames, rig, out, left, right, log, row_poses)
     others = {"find_sky": sky, "inpaint": bool(inpaint), "seed": seed, "motion_model": motion_model}
     options = _options(features, solver, matcher, corrector, fill, **others)
-    _correct_given(given, target, options, inpaint is None)
+    _correct_given(given, target, options.faster() if fast else options, inpaint is None)
 
 
 def _correct_given(given: Given, target: str, options: CorrectionOptions, close: bool) -> None:
@@ -125,7 +130,6 @@ def _corrector(name: str, fill: bool) -> CorrectorEntry:
     from dataclasses import replace
 
     from rsbench.components.plugins import component_key
-    from rsbench.core.errors import RsbenchError
     from rsbench.vision.corrector import load_corrector
     from rsbench.vision.correctors import FusionCorrector
 

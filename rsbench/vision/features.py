@@ -26,6 +26,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.vision.descriptor_search import best_two
 from rsbench.vision.feature_matcher import FeatureMatcher
 from rsbench.vision.frame_threads import map_frames
+from rsbench.vision.half_size import at_full_size, halved
 from rsbench.vision.images import grey_u8
 from rsbench.vision.patch_alignment import refine_matches
 from rsbench.vision.recent import Recent, content_key
@@ -76,6 +77,8 @@ class MatchOptions:
     """Align the ends of matches by the grey levels around them, see ``patch_alignment``."""
     enough_tracks: int = 0
     """Give tracks alone where there are as many as that, which is sooner done; 0 gives all matches."""
+    half: bool = False
+    """Find features at half the size: sooner, and fewer of them; for ends that are aligned (``refine``)."""
     affine: bool = False
     """Give left matches affine frames: the similarity of the keypoints' sizes and orientations."""
 
@@ -152,7 +155,14 @@ def detect(
     options, grey = options or MatchOptions(), grey_u8(image)
     if not 0 < options.max_features <= _REMEMBERED:
         return _detected(grey, options, camera)
-    key = content_key(grey), options.max_features, options.contrast_threshold, options.edge_threshold, camera
+    key = (
+        content_key(grey),
+        options.max_features,
+        options.contrast_threshold,
+        options.edge_threshold,
+        options.half,
+        camera,
+    )
     return _DETECTED.get(key, lambda: _detected(grey, options, camera))
 
 
@@ -163,11 +173,12 @@ def _detected(grey: NDArray[np.uint8], options: MatchOptions, camera: PinholeCam
         edgeThreshold=options.edge_threshold,
         enable_precise_upscale=True,
     )
-    keypoints, descriptors = sift.detectAndCompute(grey, None)
+    keypoints, descriptors = sift.detectAndCompute(halved(grey) if options.half else grey, None)
     if not keypoints:
         empty = np.zeros((0, 2))
         return Features(points=empty, places=empty, descriptors=np.zeros((0, 128), dtype=np.float32), frames=empty)
     points = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
+    points = at_full_size(points, grey.shape) if options.half else points
     places = points if camera is None else camera.ideal_pixels(points)
     order = np.lexsort((places[:, 0], places[:, 1]))
     order = order[np.all(np.isfinite(places[order]), axis=1)]
