@@ -85,6 +85,14 @@ _Split = Annotated[
         "drawn from this name. Cards of its scenes go to DIR-scenes.",
     ),
 ]
+_Sequences = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="With --split: how many, in place of as many as the card has; beyond these it is drawn again, with "
+        "other scenes.",
+    ),
+]
 _Rehash = Annotated[
     bool, typer.Option("--rehash", help="Read all that is there again, not only what has another size or time.")
 ]
@@ -116,12 +124,14 @@ def generate(
     trajectory: _Trajectory = None,
     seed: _Seed = None,
     split: _Split = None,
+    sequences: _Sequences = None,
     rehash: _Rehash = False,
     estimate: _Estimate = False,
     backend: _Backend = None,
 ) -> None:
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
     from rsbench.cli.console import progress_bar
+    from rsbench.core.errors import RsbenchError
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import generate_dataset, steps_of
     from rsbench.dataset.store_destination import store_for
@@ -131,7 +141,9 @@ def generate(
 
     processes, place = chosen_workers(workers, scheduler), shared_path(path_or_url(out), scheduler)
     own = load_dataset_card(card, trajectory, tuple(seed or ()))
-    whole = own if split is None else _split(card, split, place, bool(trajectory or seed))
+    whole = own if split is None else _split(card, split, place, bool(trajectory or seed), sequences)
+    if sequences is not None and split is None:
+        raise RsbenchError("--sequences: goes with --split; with --sequence or --shard give a part of the card")
     dataset = _chosen(whole, sequence, shard, channels)
     if not estimate:
         _ = check_out(place) if isinstance(place, Path) else store_for(place, processes)
@@ -160,7 +172,7 @@ def _ask_for(backend: str | None, scheduler: str | None) -> None:
     ask_for(backend)
 
 
-def _split(card: str, name: str, place: Path | str, changed: bool) -> DatasetCard:
+def _split(card: str, name: str, place: Path | str, changed: bool, count: int | None) -> DatasetCard:
     """A split of a card, with the cards of its scenes beside the dataset."""
     from rsbench.core.errors import RsbenchError
     from rsbench.dataset.secret_split import open_split, secret_card, write_scenes
@@ -173,8 +185,8 @@ def _split(card: str, name: str, place: Path | str, changed: bool) -> DatasetCar
     if changed or not isinstance(place, Path):
         raise RsbenchError("--split: not with --seed, --trajectory or a URL: it draws both, and writes scenes")
     drawn, scenes = open_split(card, name), place.absolute().with_name(f"{place.name}-scenes")
-    found = secret_card(card, drawn, scenes, split=name)
-    write_scenes(card, drawn, scenes)
+    found = secret_card(card, drawn, scenes, split=name, count=count)
+    write_scenes(card, drawn, scenes, count)
     return found
 
 

@@ -74,7 +74,7 @@ def open_split(name_or_path: str, word: str) -> Secret:
 
 
 def secret_card(
-    name_or_path: str, secret: Secret, scenes: Path | None = None, *, split: str = "test"
+    name_or_path: str, secret: Secret, scenes: Path | None = None, *, split: str = "test", count: int | None = None
 ) -> DatasetCard:
     """A card of which every sequence has a motion and noise of its own, and a name without meaning.
 
@@ -87,6 +87,8 @@ def secret_card(
         scenes: folder of the scenes that ``write_scenes`` wrote; without it the card keeps the names of its own,
             and is good for its motions alone.
         split: what stands behind the name of the card.
+        count: sequences, in place of as many as the card has; beyond these the card is drawn again, with scenes of
+            its own.
 
     Raises:
         RsbenchError: the card cannot be read, or something that a split must hide is fixed in it.
@@ -95,25 +97,32 @@ def secret_card(
     card = read_dataset_card(path)
     if card.trajectory is not None:
         raise RsbenchError(f"{path}: trajectory: everybody who has the file knows the motion; take random axes")
+    made = list[SequenceCard]()
     try:
-        made = [_drawn(each, secret) for each in _single(card, secret)]
+        for number in range(_rounds(card, count)):
+            drawn = [_drawn(each, secret, _again(number)) for each in _single(card, secret, number)]
+            drawn.sort(key=lambda sequence: secret.digest("order", sequence.name, *_again(number)))
+            if scenes is not None:
+                drawn = [replace(each, scene=str(_place(scenes, _scene(each.scene), number))) for each in drawn]
+            made += drawn
     except ValueError as error:
         raise RsbenchError(f"{path}: {error}") from error
-    made.sort(key=lambda sequence: secret.digest("order", sequence.name))
-    if scenes is not None:
-        made = [replace(each, scene=str(scenes / f"{_scene(each.scene).stem}.toml")) for each in made]
+    made = made[:count]
     digits = len(str(len(made) - 1))
     named = tuple(replace(each, name=f"s{number:0{digits}d}") for number, each in enumerate(made))
     return replace(card, name=f"{card.name}-{split}", sequence=named, grid={}, seeds=(), readout_range=None)
 
 
-def write_scenes(name_or_path: str, secret: Secret, folder: Path) -> list[Path]:
+def write_scenes(name_or_path: str, secret: Secret, folder: Path, count: int | None = None) -> list[Path]:
     """Write the scene cards of a dataset card with secret seeds into a folder: other textures and other details.
+
+    ``count``: of sequences, as of ``secret_card``.
 
     Raises:
         RsbenchError: a card cannot be read, or its scene is the same with any seed.
     """
-    cards = {_scene(each.scene) for each in read_dataset_card(card_path("datasets", name_or_path)).sequence}
+    dataset = read_dataset_card(card_path("datasets", name_or_path))
+    cards, rounds = {_scene(each.scene) for each in dataset.sequence}, range(_rounds(dataset, count))
     written = []
     for path in sorted(cards, key=lambda card: card.stem):
         if not read_scene_card(path)[1].closed:
@@ -122,22 +131,37 @@ def write_scenes(name_or_path: str, secret: Secret, folder: Path) -> list[Path]:
             )
         text = _SEED.sub("", read_text(path), count=1)
         folder.mkdir(parents=True, exist_ok=True)
-        written.append(folder / f"{path.stem}.toml")
-        written[-1].write_text(
-            f"seed = {secret.number('scene', path.stem)}\n{text}", encoding="utf-8", newline="\n"
-        )
+        for number in rounds:
+            written.append(_place(folder, path, number))
+            seed = secret.number("scene", path.stem, *_again(number))
+            written[-1].write_text(f"seed = {seed}\n{text}", encoding="utf-8", newline="\n")
     return written
+
+
+def _rounds(card: DatasetCard, count: int | None) -> int:
+    """How often a card is drawn for so many sequences."""
+    return 1 if count is None else -(-count // len(card.expanded().sequence))
+
+
+def _again(number: int) -> tuple[int, ...]:
+    """What tells the draws of a card apart; the first is as if there were no others."""
+    return (number,) if number else ()
+
+
+def _place(folder: Path, scene: Path, number: int) -> Path:
+    return folder / ("-".join((scene.stem, *map(str, _again(number)))) + ".toml")
 
 
 def _scene(name: str) -> Path:
     return card_path("scenes", name)
 
 
-def _single(card: DatasetCard, secret: Secret) -> Iterator[DatasetCard]:
-    """The card with one sequence, combination of the grid and secret seed each."""
+def _single(card: DatasetCard, secret: Secret, again: int) -> Iterator[DatasetCard]:
+    """The card with one sequence, combination of the grid and secret seed each, drawn for the ``again``-th time."""
     for sequence, number in product(card.sequence, range(max(len(card.seeds), 1))):
         for values in product(*(axis.items() for axis in card.grid.values())):
-            seed = secret.number("sequence", sequence.name, *(label for label, _ in values), number)
+            labels = (label for label, _ in values)
+            seed = secret.number("sequence", sequence.name, *labels, number, *_again(again))
             grid: dict[str, dict[str, Variation]] = {
                 name: {label: value} for name, (label, value) in zip(card.grid, values, strict=True)
             }
@@ -151,7 +175,7 @@ def _motion(single: DatasetCard) -> MotionCard | None:
     return own[-1] if own else sequence.motion or single.motion
 
 
-def _drawn(single: DatasetCard, secret: Secret) -> SequenceCard:
+def _drawn(single: DatasetCard, secret: Secret, again: tuple[int, ...]) -> SequenceCard:
     """The one sequence of a card, drawn, of secret size; ValueError for what is not random."""
     stated = _motion(single)
     (sequence,) = single.expanded().sequence
@@ -164,13 +188,13 @@ def _drawn(single: DatasetCard, secret: Secret) -> SequenceCard:
     ratio = single.readout_ratio if sequence.readout_ratio is None else sequence.readout_ratio
 
     def less(name: str, value: float) -> float:
-        return value * (_LEAST + (1.0 - _LEAST) * secret.share(name, sequence.name))
+        return value * (_LEAST + (1.0 - _LEAST) * secret.share(name, sequence.name, *again))
 
     rotation, translation = less("rotation", motion.rotation_deg), less("translation", motion.translation)
     drawn = None
     if single.readout_range is not None:
         low, high = single.readout_range
-        drawn = low + (high - low) * secret.share("readout", sequence.name)
+        drawn = low + (high - low) * secret.share("readout", sequence.name, *again)
     return replace(
         sequence,
         motion=replace(motion, rotation_deg=rotation, translation=translation),

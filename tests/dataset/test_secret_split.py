@@ -119,12 +119,32 @@ def test_train_and_dev_share_no_seed_motion_scene_or_texture(tmp_path: Path) -> 
         assert len(drawn) == len(known) >= 10 and not drawn & known
 
 
+def test_a_split_has_as_many_sequences_as_asked_and_more_have_scenes_of_their_own(tmp_path: Path) -> None:
+    """The first 216 are the split itself; 300 draw the card twice."""
+    train = open_split("standard", "train")
+    first = secret_card("standard", train, tmp_path, split="train")
+    more = secret_card("standard", train, tmp_path, split="train", count=300)
+    assert len(more.sequence) == 300 and more.sequence[0].name == "s000" and more.sequence[-1].name == "s299"
+    assert more.sequence[:216] == first.sequence
+    assert len({each.seed for each in more.sequence}) == len(np.unique(motions(more), axis=0)) == 300
+    assert len({each.readout_ratio for each in more.sequence}) == 300
+    paths = write_scenes("standard", train, tmp_path, 300)
+    assert len(paths) == 18 == len({read_scene_card(path)[0].seed for path in paths})
+    scenes = [{each.scene for each in more.sequence[part]} for part in (slice(216), slice(216, None))]
+    assert scenes[0] | scenes[1] == set(map(str, paths)) and not scenes[0] & scenes[1]
+    few = secret_card("standard", train, tmp_path, split="train", count=10)
+    assert [replace(each, name="x") for each in few.sequence] == [
+        replace(e, name="x") for e in first.sequence[:10]
+    ]
+
+
 def test_splits_of_what_is_not_drawn_are_refused(tmp_path: Path) -> None:
     out = tmp_path / "out"
     for words, said in (
         (["standard", "--split", "test"], "--split test: must be a name"),
         (["standard", "--split", "train", "--seed", "3"], "--split: not with --seed"),
         (["smoke", "--split", "train"], "a secret split needs both axes"),
+        (["standard", "--sequences", "9"], "--sequences: goes with --split"),
     ):
         ran = run_here("generate", *words, "--out", out)
         assert ran.returncode == 2 and said in ran.stderr
