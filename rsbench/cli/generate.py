@@ -32,6 +32,8 @@ EPILOG = """[bold]Examples[/bold]
   rsbench generate smoke --out data/walk --trajectory walk.txt [dim](along your own poses, one pair of frames
   after the other: lines of timestamp tx ty tz qx qy qz qw)[/dim]
 
+  rsbench generate standard --out data/train --split train --sequences 1000 [dim](to train on)[/dim]
+
   rsbench generate standard --out data/test --seed 20271 [dim](a split of the same card that nobody has seen)[/dim]
 
   rsbench generate smoke --out data/stack --full-frames    [dim](keeps every row's whole image)[/dim]"""
@@ -131,8 +133,6 @@ def generate(
 ) -> None:
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
     from rsbench.cli.console import progress_bar
-    from rsbench.core.errors import RsbenchError
-    from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import generate_dataset, steps_of
     from rsbench.dataset.store_destination import store_for
     from rsbench.renderers.backend import start_backend
@@ -140,10 +140,7 @@ def generate(
     from rsbench.storage.object_store import path_or_url, shown
 
     processes, place = chosen_workers(workers, scheduler), shared_path(path_or_url(out), scheduler)
-    own = load_dataset_card(card, trajectory, tuple(seed or ()))
-    whole = own if split is None else _split(card, split, place, bool(trajectory or seed), sequences)
-    if sequences is not None and split is None:
-        raise RsbenchError("--sequences: goes with --split; with --sequence or --shard give a part of the card")
+    whole = _whole(card, trajectory, tuple(seed or ()), place, split, sequences)
     dataset = _chosen(whole, sequence, shard, channels)
     if not estimate:
         _ = check_out(place) if isinstance(place, Path) else store_for(place, processes)
@@ -170,6 +167,26 @@ def _ask_for(backend: str | None, scheduler: str | None) -> None:
     if backend is not None and scheduler is not None:
         raise RsbenchError("--backend: not with --scheduler: set RSBENCH_VARIANT where its workers start")
     ask_for(backend)
+
+
+def _whole(
+    card: str,
+    trajectory: Path | None,
+    seeds: tuple[int, ...],
+    place: Path | str,
+    split: str | None,
+    sequences: int | None,
+) -> DatasetCard:
+    """A card, or a split of it, with all of its sequences."""
+    from rsbench.core.errors import RsbenchError
+    from rsbench.dataset.card import load_dataset_card
+
+    own = load_dataset_card(card, trajectory, seeds)
+    if split is not None:
+        return _split(card, split, place, bool(trajectory or seeds), sequences)
+    if sequences is not None:
+        raise RsbenchError("--sequences: goes with --split; --sequence and --shard give a part of the card")
+    return own
 
 
 def _split(card: str, name: str, place: Path | str, changed: bool, count: int | None) -> DatasetCard:

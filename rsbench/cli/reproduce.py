@@ -134,18 +134,23 @@ def reproduce(
     from rsbench.storage.files import check_out
 
     check_out(out)
-    targets = _ORDER if target is Target.everything else (target,)
+    _make(_ORDER if target is Target.everything else (target,), out, data, workers, seeds, width)
+
+
+def _make(
+    targets: Sequence[Target], out: Path, data: Path, workers: int | None, seeds: int | None, width: int | None
+) -> None:
+    """One after the other, with the time that each took, and of several with what is left."""
     begin, paces = time.monotonic(), list[float]()
     for number, each in enumerate(targets):
         start = time.monotonic()
         if len(targets) > 1:
             say(f"[{number + 1} of {len(targets)}] {each}: {_left(targets[number:], paces)}")
         _reproduce(each, out, data, workers, seeds or _SEEDS.get(each, 1), width)
-        took = (time.monotonic() - start) / 60.0
-        paces.append(took / _MINUTES[each])
-        typer.echo(f"{each}: {took:.1f} minutes")
+        paces.append((time.monotonic() - start) / 60.0 / _MINUTES[each])
+        typer.echo(f"{each}: {paces[-1] * _MINUTES[each]:.1f} minutes")
     if len(targets) > 1:
-        typer.echo(f"{target}: {(time.monotonic() - begin) / 60.0:.1f} minutes")
+        typer.echo(f"{Target.everything}: {(time.monotonic() - begin) / 60.0:.1f} minutes")
 
 
 def _left(targets: Sequence[Target], paces: Sequence[float]) -> str:

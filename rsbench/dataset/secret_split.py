@@ -157,7 +157,7 @@ def _scene(name: str) -> Path:
 
 
 def _single(card: DatasetCard, secret: Secret, again: int) -> Iterator[DatasetCard]:
-    """The card with one sequence, combination of the grid and secret seed each, drawn for the ``again``-th time."""
+    """The card with one sequence, combination of the grid and secret seed each; it was drawn ``again`` times."""
     for sequence, number in product(card.sequence, range(max(len(card.seeds), 1))):
         for values in product(*(axis.items() for axis in card.grid.values())):
             labels = (label for label, _ in values)

@@ -58,8 +58,7 @@ SHAKES = (
     "readout. Give readout_ratio in the rig's card, or four frames and more"
 )
 _BEYOND_DOUBT = 23.0
-"""Logarithm of odds between splines: 7, as of a probability of 0.999, where tracks counted 0.15 and not a half, as
-those that err together ask."""
+"""Logarithm of odds between splines: 7, as of a probability of 0.999, did tracks count 0.15 and not a half."""
 _MOMENTS = 33
 """Of a frame period, at which poses are compared."""
 
@@ -384,22 +383,18 @@ def _runs_backwards(
 ) -> bool:
     """Whether time runs backwards in the frames: their lines then seem to be read from the opposite side.
 
-    At a ratio near 0 there is no order to see. Of a rig that moves by a law, the laws must find the opposite scan
-    beyond doubt, and near the ratio that is said: they find any ratio where none of them holds. Of a rig that
-    shakes no law tells, but splines under both scans do, unless the laws find the very shutter that is said.
+    The laws must find the opposite scan beyond doubt, and near the ratio that is said: they find any where none of
+    them holds. Of a rig that shakes splines under both scans tell, unless the laws find the shutter that is said.
     """
     if shutter.readout_ratio < LEAST_BACKWARDS or not shutter.plain:
         return False
     shakes, said = isinstance(found.motion, ContinuousMotion), scans_of(shutter)
+    opposite = reversed_scans(said)
     if shakes:
-        scans = reversed_scans(said)
-        opposite = Scanning(scan=scans.left, right_scan=scans.right)  # pyrefly: ignore[bad-argument-type]
-        other = opposite.shutter_of(rig.camera.width, rig.camera.height, shutter.readout_ratio)
-        odds = log_odds_of_opposite(matches, rig, shutter, other, found.motion, options.seed)
-        if odds <= _BEYOND_DOUBT:
+        other = replace(shutter, scan=opposite.left, right_scan=opposite.right)  # pyrefly: ignore
+        if log_odds_of_opposite(matches, rig, shutter, other, found.motion, options.seed) <= _BEYOND_DOUBT:
             return False
     known = backwards_known(matches, rig, shutter, models_asked(options.motion_model))
     capture = conclude([examine(matches, rig, known, options.robust, options.seed, found.motion)])
-    if shakes:
-        return not finds_shutter(capture, said, shutter.readout_ratio)
-    return finds_shutter(capture, reversed_scans(said), shutter.readout_ratio)
+    ratio = shutter.readout_ratio
+    return not finds_shutter(capture, said, ratio) if shakes else finds_shutter(capture, opposite, ratio)
