@@ -13,17 +13,10 @@ import pytest
 
 from rsbench.renderers import llvm
 
-RENDER = """
+_START = """
 import ctypes, os, sys, time
 from pathlib import Path
-import numpy as np
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.se3 import Pose
 from rsbench.renderers.backend import start_backend
-from rsbench.renderers.options import RendererOptions
-from rsbench.renderers.render import LinePoses, render
-from rsbench.renderers.scene import MitsubaScene
-from rsbench.scenes.model import Light, Material, Scene, SceneMesh
 
 started = start_backend()
 if "WIDTH" in os.environ:  # as on a processor with other registers; Dr.Jit has this function for C++ alone
@@ -32,6 +25,23 @@ if "WIDTH" in os.environ:  # as on a processor with other registers; Dr.Jit has 
     features = os.environ["FEATURES"].encode()
     core._Z19jit_llvm_set_targetPKcS0_j(b"x86-64", features, ctypes.c_uint32(int(os.environ["WIDTH"])))
     assert core._Z21jit_llvm_vector_widthv() == int(os.environ["WIDTH"])
+"""
+GENERATE = f"""{_START}
+from rsbench.dataset.card import load_dataset_card
+from rsbench.dataset.generation import generate_dataset
+generate_dataset(load_dataset_card("smoke").only(["castle"]), Path(sys.argv[1]))
+"""
+RENDER = (
+    _START
+    + """
+import numpy as np
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.se3 import Pose
+from rsbench.renderers.options import RendererOptions
+from rsbench.renderers.render import LinePoses, render
+from rsbench.renderers.scene import MitsubaScene
+from rsbench.scenes.model import Light, Material, Scene, SceneMesh
+
 texture = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
 meshes = []
 for x, y, z, size in ((-3, -3, 9, 6), (-1, -1, 4, 1.5), (0.2, 0.1, 3, 0.8)):
@@ -61,16 +71,22 @@ exposed = render(scene, camera, LinePoses(R, t), RendererOptions(samples=4, seed
 np.savez(sys.argv[1], sunsky=sunsky.image, exposed=exposed.image, depth=sunsky.depth, path=path.image,
          seconds=seconds, variant=started.variant, message=started.message or "")
 """
+)
 
 
 def child(tmp_path: Path, name: str, size: tuple[int, int], **environ: str) -> Any:
     out = tmp_path / f"{name}.npz"
-    command = [sys.executable, "-c", RENDER, str(out), str(size[0]), str(size[1])]
+    run_child(RENDER, str(out), str(size[0]), str(size[1]), **environ)
+    return np.load(out)
+
+
+def run_child(program: str, *words: str, **environ: str) -> None:
+    """A program in a process of its own, which must end well."""
+    command = [sys.executable, "-c", program, *words]
     done = subprocess.run(
         command, env={**os.environ, **environ}, capture_output=True, text=True, timeout=300, check=False
     )
     assert done.returncode == 0, done.stderr
-    return np.load(out)
 
 
 def needs_llvm() -> None:
