@@ -51,6 +51,8 @@ def build_site(board: Path, out: Path, data: Sequence[Path] = (), *, problem_pag
 
     boards = [read_split(board, protocol, split) for protocol, split in splits_of(board)]
     boards = [replace(each, problem_pages=problem_pages) for each in boards if each.lines]
+    secret, order = {each.track.id for each in boards if each.secret}, [each.track.id for each in boards]
+    boards.sort(key=lambda each: (order.index(each.track.id), not each.secret))
     out.mkdir(parents=True, exist_ok=True)
     for each, album in zip(boards, albums(boards, out, data), strict=True):
         for suffix, text in (
@@ -65,14 +67,16 @@ def build_site(board: Path, out: Path, data: Sequence[Path] = (), *, problem_pag
             write(f"{each.id}--problems.html", "board_problems", matrix_context(each, album))
         for name, context in problem_contexts(each, album):
             write(f"{each.id}/problem/{name}.html", "board_problem", context)
-    write("index.html", "board", {"splits": [_section(each) for each in boards]})
+    write("index.html", "board", {"splits": [_section(each, each.track.id in secret) for each in boards]})
     return out / "index.html"
 
 
-def _section(each: Board) -> dict[str, Any]:
+def _section(each: Board, ranked: bool) -> dict[str, Any]:
+    """Of the first page; ``ranked``: whether the protocol has a secret split, which ranks."""
     used = {name for line in each.lines for name in line.scored.header.uses}
     return {
         **each.named,
+        "word": ("Secret: it ranks." if each.secret else "Its truth is public: for practice.") if ranked else "",
         "count": len(each.problems),
         "scenes": len(set(each.scenes)),
         "given": each.track.given,

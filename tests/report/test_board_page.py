@@ -21,7 +21,7 @@ from browser import CHROMIUM, Browser, started
 from leaderboards import Line, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.splits import dataset_split
+from rsbench.benchmark.leaderboard.splits import Split, dataset_split
 from rsbench.benchmark.leaderboard.track_list import TRACKS
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion
@@ -79,6 +79,24 @@ def test_of_a_secret_split_no_problem_is_told(tmp_path: Path) -> None:
         text = path.read_text("utf-8")
         assert "problems.html" not in text and not any(re.search(rf"\b{name}\b", text) for name in names)
     assert f"{len(names)} problems" in page.read_text("utf-8")
+
+
+def test_where_there_is_a_secret_split_it_comes_first_and_ranks(tmp_path: Path) -> None:
+    words = "Secret: it ranks.", "Its truth is public: for practice."
+
+    def page(split: Split) -> str:
+        add(
+            tmp_path / "board",
+            write(tmp_path / "x.jsonl", named(truth_lines(split), "mine", ("left",))),
+            split,
+            {},
+        )
+        return build_site(tmp_path / "board", tmp_path / "out").read_text("utf-8")
+
+    text = page(SPLIT)
+    assert not any(word in text for word in words)
+    text = page(replace(SPLIT, public=False, label="secret", seed=12))
+    assert 0 < text.index(words[0]) < text.index(words[1])
 
 
 class _Cells(HTMLParser):
