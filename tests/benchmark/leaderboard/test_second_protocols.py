@@ -226,6 +226,29 @@ def test_results_tell_what_laws_cost_on_frames() -> None:
     assert f"the hardest here too**, {own['spline']:.2f}, the next {best['spline']:.2f}." in words
 
 
+@pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
+def test_results_tell_what_laws_cost_readers_of_the_ratio(tmp_path: Path) -> None:
+    """The sentences below the table of ``readout-2``, those about sensors from the stored answers."""
+    (path,) = (LAWS_FOLDER / "site").glob("readout-2--*.csv")
+    table_of = pd.read_csv(path, index_col="method")
+    words = " ".join((ROOT / "docs" / "results-leaderboard.md").read_text("utf-8").split())
+    score = table_of["auc_r10"]
+    laws = sorted((score["rs-stereo-refined-twist"], score["rs-stereo-refined"]), reverse=True)
+    told = f"a constant**, {laws[0]:.2f} and {laws[1]:.2f} to {score['constant']:.2f}: where"
+    assert told in words and f"The one that chooses has {score[CHOOSES]:.2f}." in words
+    assert f"tell the ratio** ({table_of.loc[CHOOSES, 'auc_r10_spline']:.2f})" in words
+    split = _without_frames("readout-2")
+    restore(LAWS_FOLDER / "predictions" / "readout-2", split, tmp_path / "board")
+    (entry,) = (e for e in entries_of(tmp_path / "board", "readout-2", split.name) if e.header.method == CHOOSES)
+    scores = entry.scores.set_index("problem")
+    silent, ideal = ~scores["success"].astype(bool), scores.index.str.contains("-ideal-")
+    shares = [f"{100.0 * share:.0f} %" for share in (silent.mean(), silent[ideal].mean(), silent[~ideal].mean())]
+    assert (
+        f"of {shares[0]} that it cannot tell: {shares[1]} with an ideal sensor, {shares[2]} with a real" in words
+    )
+    assert 0.02 < np.median(scores["e_readout"][~silent]) <= 0.03
+
+
 def test_damaged_predictions_are_named(split: Split, tmp_path: Path) -> None:
     with pytest.raises(RsbenchError, match="holds no predictions"):
         restore(tmp_path, split, tmp_path / "board")
