@@ -103,9 +103,12 @@ def path_integrator(max_depth: int) -> Any:
 def lane_sampler() -> Any:
     """A Mitsuba sampler whose numbers depend on seed, pixel and sample alone, not on the place in the wavefront.
 
-    Mitsuba's own samplers number the lanes of a launch, so a row rendered by itself would draw other numbers than
-    the same row of a whole image. A new one each time: what it would draw next depends on the path so far, and so
-    keeps the whole scene alive.
+    The samples of a pixel are spread evenly in each dimension of a path, and in pairs of them: Sobol' points, of
+    which every pixel and dimension has its own scrambling (S. Laine, T. Karras, Stratified sampling for stochastic
+    transparency, EGSR 2011; B. Burley, Practical hash-based Owen scrambling, JCGT 2020). Mitsuba's own samplers
+    number the lanes of a launch, so a row rendered by itself would draw other numbers than the same row of a whole
+    image. A new one each time: what it would draw next depends on the path so far, and so keeps the whole scene
+    alive.
     """
     import mitsuba as mi
 
@@ -120,22 +123,60 @@ def _register_lane_sampler() -> None:
     class LaneSampler(mi.Sampler):
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
-            self.rng = mi.PCG32()
+            self.pixel, self.place, self.dimension = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
 
         def seed_lanes(self, seed: Any, pixel: Any, sample: Any) -> None:
             """Start the sequences of (pixel, sample) pairs; ``pixel`` is the index in the full frame."""
-            high, low = mi.sample_tea_32(seed, pixel)
-            state, sequence = mi.sample_tea_32(high, (low + sample) & 0xFFFFFFFF)
-            self.rng.seed(mi.UInt64(state), mi.UInt64(sequence))
+            self.pixel, _ = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(pixel))
+            self.place, self.dimension = reversed_bits(mi.UInt32(sample)), mi.UInt32(0)
 
         def next_1d(self, active: Any = True) -> Any:
-            return self.rng.next_float32()
+            return self._next(False)[0]
 
         def next_2d(self, active: Any = True) -> Any:
-            first = self.rng.next_float32()
-            return mi.Point2f(first, self.rng.next_float32())
+            return mi.Point2f(*self._next(True))
+
+        def _next(self, both: bool) -> list[Any]:
+            """Coordinates of the next dimension, or of the next two."""
+            order, first = mi.sample_tea_32(self.pixel, self.dimension)
+            self.dimension += 1
+            shuffled = scrambled(self.place, order)
+            found = [(shuffled, first), (sobol(shuffled), first ^ order)][: 1 + both]
+            return [unit(reversed_bits(scrambled(reversed_bits(bits), key))) for bits, key in found]
 
         def to_string(self) -> str:
             return "LaneSampler[]"
 
     mi.register_sampler("rsbench_lanes", LaneSampler)
+
+
+_WORD = 0xFFFFFFFF
+
+
+def reversed_bits(x: Any) -> Any:
+    """Of 32; as all below, of whole numbers and of Dr.Jit's arrays of them."""
+    for step, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF)):
+        x = ((x >> step) & mask) | ((x & mask) << step)
+    return ((x >> 16) | (x << 16)) & _WORD
+
+
+def scrambled(x: Any, key: Any) -> Any:
+    """A permutation in which a bit changes none below it: of reversed bits, Owen's."""
+    x = (x + key) & _WORD
+    for factor in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):
+        x = x ^ ((x * factor) & _WORD)
+    return x
+
+
+def sobol(x: Any) -> Any:
+    """The second coordinate, as 32 bits, of the Sobol' point whose first coordinate has these."""
+    for step, mask in ((16, 0x0000FFFF), (8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        x = x ^ ((x & mask) << step)
+    return x & _WORD
+
+
+def unit(x: Any) -> Any:
+    """32 bits as a number from 0 to below 1, which 24 of them fill."""
+    import mitsuba as mi
+
+    return mi.Float(x >> 8) * (1.0 / (1 << 24))
