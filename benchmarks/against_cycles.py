@@ -1,9 +1,9 @@
 """The path tracer against Blender's Cycles at equal noise: seconds times squared relative noise, of both.
 
-The scene of boxes of ``render_rs_vs_gs.py`` in one grey, a grey sky and one sun, 400 x 400, 16 samples, paths of at
-most 4 segments, box filter, no denoiser and no adaptive sampling. The noise of each is the RMS difference to its
-own image of 1024 samples, over the mean. The time of Cycles is what 16 samples more take, without its start and its
-export of the scene; ours is of the whole frame. Blender runs in a Python of its own:
+The scene of boxes of ``render_rs_vs_gs.py`` in one grey, a grey sky and one sun, 400 x 400, 16 samples, paths
+of at most 4 segments, box filter, no denoiser and no adaptive sampling. The noise of each is the RMS difference
+to its own image of 1024 samples, over the mean. The time of Cycles is what 16 samples more take, without its
+start and its export of the scene; ours is of the whole frame. Blender runs in a Python of its own:
 
     python3.11 -m venv blender && blender/bin/pip install bpy==4.5.0
     python benchmarks/against_cycles.py --blender blender/bin/python
