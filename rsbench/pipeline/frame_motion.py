@@ -394,7 +394,7 @@ def _runs_backwards(
         other = replace(shutter, scan=opposite.left, right_scan=opposite.right)  # pyrefly: ignore
         if log_odds_of_opposite(matches, rig, shutter, other, found.motion, options.seed) <= _BEYOND_DOUBT:
             return False
-    known = backwards_known(matches, rig, shutter, models_asked(options.motion_model))
-    capture = conclude([examine(matches, rig, known, options.robust, options.seed, found.motion)])
+    known, start = backwards_known(matches, rig, shutter, models_asked(options.motion_model)), found.motion
+    capture = conclude([examine(matches, rig, known, options.robust, options.seed, None if shakes else start)])
     ratio = shutter.readout_ratio
     return not finds_shutter(capture, said, ratio) if shakes else finds_shutter(capture, opposite, ratio)

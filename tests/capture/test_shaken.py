@@ -15,6 +15,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline import frame_motion
 from rsbench.pipeline.answer import solve_problem
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import FoundMotion, chosen_model, find_motion, solve_frames
@@ -124,6 +125,22 @@ def test_exchanged_times_of_a_rig_that_shakes_are_refused_and_right_ones_are_not
         exchanged = Correspondences(tracks=np.roll(window.tracks, 4, axis=1))
         with pytest.raises(RefusedFramesError, match="backwards"):
             solve_frames(exchanged, RIG, RATIO, OPTIONS)
+
+
+def test_where_the_laws_find_the_shutter_that_is_said_no_spline_makes_time_run_backwards(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Matches among trees err together: a spline may be preferred to the law, and the opposite one to it."""
+    rng = np.random.default_rng(0)
+    (window,), _ = matches(sines(rng, *SHAKES["strong"]), 2, rng, noise=0.1, count=100)
+    spline = solve_frames(window, RIG, RATIO, OPTIONS).found
+    motion = make_motion("accelerated", 0.05 * rng.normal(size=3), 0.2 * rng.normal(size=3), {"acceleration": 0.3})
+    data = simulate(RIG, SHUTTER, motion, SimulationOptions(tracks=300, noise_px=0.3), rng).correspondences
+    exchanged = Correspondences(tracks=np.roll(data.tracks, 4, axis=1))
+    monkeypatch.setattr(frame_motion, "log_odds_of_opposite", lambda *given: 100.0)
+    assert spline is not None and spline.motion.name == "continuous"
+    assert not frame_motion._runs_backwards(data, RIG, spline, SHUTTER, OPTIONS)
+    assert frame_motion._runs_backwards(exchanged, RIG, spline, SHUTTER, OPTIONS)
 
 
 def test_a_readout_ratio_of_two_shaken_frames_is_not_told() -> None:
