@@ -1,4 +1,4 @@
-"""Integrators of radiance: ``sunsky``, free of noise, and Mitsuba's ``path`` with its own random numbers."""
+"""Integrators of radiance: ``sunsky``, free of noise, and Mitsuba's ``path`` on points of our own."""
 
 from __future__ import annotations
 
