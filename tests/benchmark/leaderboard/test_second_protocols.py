@@ -220,7 +220,7 @@ def test_results_tell_what_laws_cost_on_frames() -> None:
     first = f"**, with {auto['auc_apart']:.2f}, the next {others['auc_apart'].max():.2f}. It gains most"
     assert first in words and np.all(ranked.loc[CHOOSES, ["rank", "rank_low", "rank_high"]].astype(int) == 1)
     own, best = ({law: row[f"auc_apart_{law}"] for law in LAWS} for row in (auto, others.max(numeric_only=True)))
-    assert f"assumes: {own['accelerated']:.2f} there, the next {best['accelerated']:.2f}." in words
+    assert f"a law that it tries: {own['accelerated']:.2f} there, the next {best['accelerated']:.2f}." in words
     assert f"{best['linear']:.2f} to {own['linear']:.2f} (`linear`) and" in words
     assert f"{best['twist']:.2f} to {own['twist']:.2f} (`twist`)" in words
     assert f"the hardest here too**, {own['spline']:.2f}, the next {best['spline']:.2f}." in words
@@ -247,6 +247,26 @@ def test_results_tell_what_laws_cost_readers_of_the_ratio(tmp_path: Path) -> Non
         f"of {shares[0]} that it cannot tell: {shares[1]} with an ideal sensor, {shares[2]} with a real" in words
     )
     assert 0.02 < np.median(scores["e_readout"][~silent]) <= 0.03
+
+
+@pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
+def test_results_tell_what_a_second_camera_is_worth() -> None:
+    """The sentences below the table of ``correction-2`` that its numbers hold, and no rank that they do not."""
+    (path,) = (LAWS_FOLDER / "site").glob("correction-2--*.csv")
+    ranked = pd.read_csv(path, index_col="method")
+    words = " ".join((ROOT / "docs" / "results-leaderboard.md").read_text("utf-8").split())
+    placed, psnr = ranked["placed"], ranked["psnr"]
+    assert f"`fusion` has {placed['fusion']:.2f}, and `mono-fusion`, which" in words
+    assert f"camera, {placed['mono-fusion']:.2f}; the data do not tell them apart" in words
+    assert "mono-fusion" in str(ranked.loc["fusion", "ties"]) and int(ranked.loc["fusion", "rank_high"]) > 1
+    truth = f"worth {placed['fusion-true']:.2f}** (`fusion-true`)"
+    assert truth in words and placed["fusion-true"] - placed["fusion"] < placed["fusion"] - placed["zhuang"]
+    assert (
+        f"`zhuang` ({placed['zhuang']:.2f})" in words
+        and f"{placed['vasu-layers']:.2f}" == f"{placed['zhuang']:.2f}"
+    )
+    assert f"PSNR counts ({psnr['single-view']:.1f} to {psnr['fusion']:.1f} dB)" in words
+    assert f"worth {placed['rotation-only']:.2f}, the frame as it is {placed['uncorrected']:.2f}." in words
 
 
 def test_damaged_predictions_are_named(split: Split, tmp_path: Path) -> None:
