@@ -41,7 +41,7 @@ class CorrectionOptions:
     seed: int = 0
 
     def faster(self) -> CorrectionOptions:
-        """The same in half the time: matches and depth at half the size, and no depth from the motion.
+        """The same sooner: matches and depth at half the size, and no depth from the motion.
 
         Raises:
             RsbenchError: features or matcher are not ours, which know no other size.
