@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     Finish: TypeAlias = Callable[[Fused], Fused]
 
 _INPAINT = "Invent all pixels that no frame shows, or none. Default: specks and slits alone"
-_FAST = "Of a rig: matches and depth at half the size; four frames in half the time, a video in six sevenths."
+_FAST = "Of a rig: features and depth at half the size, which takes less time and loses little."
 _ROW_POSES = "Of a sequence, write the pose at every row too: row_poses.csv, in TUM's format."
 _SOLVER = "rs-stereo-refined"
 _MODEL = "Motion model: auto, which the matches prefer, or a name. Default: auto where the solver takes it"

@@ -91,6 +91,7 @@ _Sequences = Annotated[
     int | None,
     typer.Option(
         min=1,
+        max=100_000,
         help="With --split: how many, in place of as many as the card has; beyond these it is drawn again, with "
         "other scenes.",
     ),

@@ -83,7 +83,7 @@ class SgmOptions:
     refine_iterations: int = 2
     """Rounds of least squares on the images, see ``refine_disparity``; 0 keeps SGM's own interpolation."""
     half: bool = False
-    """Match at half the size: a third of the time, and borders as sharp as the image's own."""
+    """Match at half the size; borders of depth are then put where the image has its own."""
 
     def __post_init__(self) -> None:
         if self.mode not in _MODES:

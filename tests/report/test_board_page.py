@@ -380,32 +380,3 @@ def test_the_divider_cuts_the_upper_picture(rendered_site: Path, browser: Browse
     assert sources == ["rolling-shutter frame 1", "slip, first row"]
     assert browser.run("document.documentElement.scrollWidth") <= 375
     assert browser.said == []
-
-
-def test_results_tell_the_bound_and_rows_of_the_committed_board() -> None:
-    root = Path(__file__).parents[2]
-    tables = {
-        path.name.partition("--")[0]: path.read_text("utf-8").splitlines()
-        for folder in ("leaderboard", "laws", "footage")
-        for path in (root / "results" / folder / "site").glob("*.md")
-    }
-    page = (root / "docs" / "results-leaderboard.md").read_text("utf-8")
-    words = " ".join(page.split())
-    for protocol, score, column in (("points-1", "an AUC@5", 3), ("points-2", "a `near bound`", 4)):
-        bound = next(line for line in tables[protocol] if line.startswith("| cramer-rao"))
-        assert f"reach {score} of {bound.split(' | ')[column]}." in words
-    ranked = [each for each in page.split("\n\n") if " rank |" in each.partition("\n")[0]]
-    shown = [each.splitlines() for each in ranked]
-    protocols = (
-        "points-2",
-        "pose-2",
-        "readout-2",
-        "correction-2",
-        "points-1",
-        "pose-1",
-        "depth-1",
-        "correction-1",
-        "correction-mono-1",
-    )
-    for rows, protocol in zip(shown, protocols, strict=True):
-        assert set(rows) <= set(tables[protocol]) and len(rows) > 5
