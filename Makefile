@@ -1,6 +1,6 @@
 # make help       this list
 # make demo       render, solve, correct and score one sequence; ends with the path of its report
-# make test       format, lint, types, layers and every test
+# make test       format, lint, types, layers and tests; SLOW=1 adds those marked slow, as CI does
 # make test-extras  install rerun-sdk, torch and datasets (1 GB and more), and run the tests that need them
 # make test-gpu   tests of what renders, on an NVIDIA GPU
 # make attack     kills, failing files, mutated inputs, hostile surroundings, faults for verify: hours
@@ -38,7 +38,7 @@ test: $(STAMP)
 	@echo "== types, beside compiling and the tests"; \
 	$(BIN)/pyrefly check --progress-bar no --python-interpreter-path $(BIN)/python & types=$$!; \
 	$(BIN)/python -c '$(COMPILE)' || { kill $$types; exit 1; }; \
-	PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --no-loadscope-reorder; tests=$$?; \
+	PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --no-loadscope-reorder $(if $(SLOW),,-m "not slow"); tests=$$?; \
 	wait $$types || { echo "types: failed, see above" >&2; exit 1; }; exit $$tests
 
 # Not locked: of these the newest that pyproject.toml allows.

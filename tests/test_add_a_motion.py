@@ -55,6 +55,7 @@ def test_it_is_listed(site: Path) -> None:
     assert "ease" in result.stdout
 
 
+@pytest.mark.slow
 def test_a_simulation_follows_it_and_a_solver_assumes_it(site: Path) -> None:
     result = rsbench(site, "simulate", "mine.toml", "--out", "out", "--workers", "1")
     assert result.returncode == 0, result.stderr
@@ -72,6 +73,7 @@ def test_a_simulation_follows_it_and_a_solver_assumes_it(site: Path) -> None:
     assert plan["card"]["setting"]["motion_model"] == "ease"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("setting", "words"),
     [

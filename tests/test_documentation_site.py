@@ -136,6 +136,7 @@ def page(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Brows
         yield browser
 
 
+@pytest.mark.slow
 def test_no_page_scrolls_sideways(site: Path, page: Browser) -> None:
     wide = []
     for path in _own(site):

@@ -283,6 +283,7 @@ def test_the_documented_solver_works(documented_solver: Path) -> None:
     assert translation_error(estimate.d, motion.d) < 1e-6
 
 
+@pytest.mark.slow
 def test_the_documented_solver_keeps_the_contract(documented_solver: Path) -> None:
     entry = load_solver_entry(documented_solver / "scipy-huber.toml")
     findings = check_solver(entry, isolated=False)

@@ -151,6 +151,7 @@ assert len(plt.get_fignums()) == 2
 """
 
 
+@pytest.mark.slow
 def test_the_notebook_runs(installed: Path, tmp_path: Path) -> None:
     notebook = Path(_run(["rsbench", "docs", "tour.ipynb"], tmp_path, installed).strip())
     cells = json.loads(notebook.read_text("utf-8"))["cells"]
@@ -160,6 +161,7 @@ def test_the_notebook_runs(installed: Path, tmp_path: Path) -> None:
     _run([sys.executable, "-W", "error", str(script)], tmp_path, installed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["rs-stereo-linear", "gs-8pt"])
 def test_the_contract_holds(installed: Path, tmp_path: Path, solver: str) -> None:
     answer = json.loads(_run(["rsbench", "check-solver", solver, "--json"], tmp_path, installed))

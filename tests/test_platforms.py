@@ -28,6 +28,7 @@ def nodes() -> Iterator[tuple[Path, ast.AST]]:
             yield path, node
 
 
+@pytest.mark.slow
 def test_text_is_written_with_line_feeds_and_no_process_is_forked() -> None:
     wrong, texts = list[str](), 0
     for path, node in nodes():

@@ -155,6 +155,7 @@ def test_every_public_motion_can_be_simulated_and_solved_with_its_own_name_in_th
         assert 1e-6 < errors["e_R_deg"] < 1.0, motion
 
 
+@pytest.mark.slow
 def test_the_motion_model_is_chosen_where_that_is_asked_for() -> None:
     """On a twist the linear model's error is of interpolation, the chosen one's of noise alone."""
     motion = rsbench.TwistMotion(np.radians([1.0, 2.0, -1.0]), [0.1, 0.05, 0.3])

@@ -9,6 +9,7 @@ from shaken_rig import RATIO, RIG, SHAKES, SHUTTER, matches, row_errors_deg, sin
 import rsbench
 
 
+@pytest.mark.slow
 def test_a_trajectory_through_matches_with_a_shutter_and_without() -> None:
     rng = np.random.default_rng(104)
     law = sines(rng, *SHAKES["tremor"])
@@ -33,6 +34,7 @@ def test_what_is_no_sequence_is_refused() -> None:
         rsbench.estimate_trajectory([rsbench.Correspondences()], RIG, SHUTTER)
 
 
+@pytest.mark.slow
 def test_random_tracks_show_no_trajectory() -> None:
     rng = np.random.default_rng(0)
     windows = []

@@ -39,6 +39,7 @@ def test_a_dataset_is_read_and_has_no_fault(kept: Path) -> None:
     assert [each.faults for each in report] == [()] * len(report) or not any(each.faults for each in report)
 
 
+@pytest.mark.slow
 def test_a_board_is_read_scored_again_and_built(kept: Path) -> None:
     board, split = kept / "board", points_split(TRACKS["points"])
     assert splits_of(board) == [("points-1", split.name)]

@@ -12,6 +12,7 @@ import pytest
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks, and reads /proc")
 
 
+@pytest.mark.slow
 def test_a_sample_of_the_attack_finds_nothing(tmp_path: Path) -> None:
     tests = Path(__file__).parents[1]
     environment = {**os.environ, "PYTHONPATH": str(tests), "TMPDIR": str(tmp_path)}

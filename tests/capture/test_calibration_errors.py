@@ -67,6 +67,7 @@ def wrong(matches: Correspondences) -> tuple[Correspondences, tuple[float, ...]]
     return recalibrated(matches, RIG, [-e for e in errors]), errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ratio", "seed"), [(0.0, 0), (0.7, 1)])
 def test_errors_as_large_as_real_ones_are_found_with_the_shutter(ratio: float, seed: int) -> None:
     """Within four deviations; taken for none they are errors of 0.5 px and more in matches of 0.1 px."""

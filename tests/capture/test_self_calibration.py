@@ -86,6 +86,7 @@ def test_the_gradient_counts_what_it_does_to_the_size_of_errors(term: int, lens:
     assert gradient == pytest.approx((ends[0] - ends[1]) / (2.0 * h), rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lens", "factor", "k1_too_large"),
     [(None, 1.05, 0.0), (None, 0.93, 0.0), (BARREL, 1.05, 0.03), (FISHEYE, 1.0, -0.02)],
@@ -114,6 +115,7 @@ def test_what_is_left_of_a_lens_is_found_as_one() -> None:
     assert found.rig.camera.fx == CAMERA.fx
 
 
+@pytest.mark.slow
 def test_deviations_are_those_of_the_errors() -> None:
     """Chi-squared with 3 degrees of freedom: 0.024 and 16.3 hold it in 998 of 1000."""
     ratios = []

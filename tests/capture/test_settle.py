@@ -102,6 +102,7 @@ def _shutter_of(scans: Scans) -> RollingShutter:
 # The readout ratio
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "ratio", "degrees"), [(0, 0.35, 1.0), (3, 0.97, 6.0)])
 def test_the_ratio_is_recovered_within_a_fiftieth(seed: int, ratio: float, degrees: float) -> None:
     """|w| >= 1 deg, noise 0.3 px, a fifth outliers; 6000 tracks give 0.010, known to a sixth from 24 tiles."""
@@ -137,6 +138,7 @@ def test_no_motion_leaves_the_ratio_open_in_words() -> None:
         shutter_found(found_in(Correspondences()), RIG)
 
 
+@pytest.mark.slow
 def test_frames_in_the_wrong_order_are_noticed() -> None:
     """Their lines seem to be read from the opposite side; the frames are refused where the side is given."""
     data = simulated(6, 0.8, 2.0, 800)

@@ -44,6 +44,7 @@ def both(law: Law, rng: np.random.Generator) -> tuple[FoundMotion, FoundMotion]:
     return laws, any_
 
 
+@pytest.mark.slow
 def test_a_rig_that_shakes_is_told_from_one_that_follows_a_law() -> None:
     """Strongly shaken by sines, which are no spline of ours: rows err by less than half of what the law does."""
     found = []
@@ -59,6 +60,7 @@ def test_a_rig_that_shakes_is_told_from_one_that_follows_a_law() -> None:
     assert spline < 0.5 * by_law
 
 
+@pytest.mark.slow
 def test_what_two_frames_hardly_show_stays_small() -> None:
     """A spline of 0.15 deg of shake, whose rows shake alike in both frames; tracks err together by 0.2 px.
 
@@ -85,6 +87,7 @@ def test_what_two_frames_hardly_show_stays_small() -> None:
     assert np.max(spline) < 0.3 and np.median(spline) < np.median(by_law)
 
 
+@pytest.mark.slow
 def test_its_covariance_holds_and_the_answer_is_its_pose_at_one() -> None:
     """Squared errors over the covariance are chi-squared of 6: their median is 5.3 where it is exact.
 
@@ -103,6 +106,7 @@ def test_its_covariance_holds_and_the_answer_is_its_pose_at_one() -> None:
     assert 1.5 < np.median(squares) < 8.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_laws_stay_laws(model: str) -> None:
     more = {"acceleration": 0.3} if model == "accelerated" else {}
@@ -114,6 +118,7 @@ def test_laws_stay_laws(model: str) -> None:
         assert found.motion.name in MODELS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shake", list(SHAKES))
 def test_exchanged_times_of_a_rig_that_shakes_are_refused_and_right_ones_are_not(shake: str) -> None:
     """A spline bends to most of a wrong order, too, but needs twice the parameters."""
@@ -143,6 +148,7 @@ def test_where_the_laws_find_the_shutter_that_is_said_no_spline_makes_time_run_b
     assert frame_motion._runs_backwards(exchanged, RIG, spline, SHUTTER, OPTIONS)
 
 
+@pytest.mark.slow
 def test_a_readout_ratio_of_two_shaken_frames_is_not_told() -> None:
     """It would be one under a law that does not hold: whichever of the two refusals comes first."""
     for seed in (0, 1, 3):

@@ -33,6 +33,7 @@ from rsbench.core.motion import LinearMotion
 from rsbench.core.so3 import FloatArray
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shake", "frames"), [("strong", 8), ("tremor", 8), ("walk", 8), ("strong", 60)])
 def test_rows_of_a_shaken_rig(shake: str, frames: int) -> None:
     rng = np.random.default_rng(6)
@@ -47,6 +48,7 @@ def test_rows_of_a_shaken_rig(shake: str, frames: int) -> None:
     assert wrong <= 0.01 * 300 * frames  # wrong ends that lie within ten deviations by chance
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_the_bound_and_of_the_covariances() -> None:
     """Splines drawn from the prior: the bound of H. van Trees holds on average, and covariances do."""
     prior, frames, interval, runs = Prior(0.5, 2, 0.02**2, 0.04**2), 8, 0.5, 12
@@ -142,6 +144,7 @@ def test_pairs_help_where_tracks_are_few() -> None:
     assert errors[1] < errors[0]
 
 
+@pytest.mark.slow
 def test_a_window_without_matches_is_bridged_and_says_so() -> None:
     rng = np.random.default_rng(11)
     law = sines(rng, *SHAKES["walk"])
@@ -171,6 +174,7 @@ def test_a_wrong_motion_of_a_window_is_mended() -> None:
     assert np.median(row_errors_deg(found, law, 8)) < 0.02
 
 
+@pytest.mark.slow
 def test_a_stream_says_what_the_whole_sequence_does() -> None:
     """Windows that have left count as a quadratic cost: the same trajectory, as well as it is known."""
     rng = np.random.default_rng(14)
@@ -201,6 +205,7 @@ def test_a_stream_says_what_the_whole_sequence_does() -> None:
     assert np.linalg.norm(parts[18].body_from_world.t - t) < 3.0 * np.linalg.norm(sigma[3:])
 
 
+@pytest.mark.slow
 def test_a_stream_outlives_frames_that_match_nothing() -> None:
     """The trajectory before and after is as good; what lies between says how far it is from any matches."""
     rng = np.random.default_rng(15)

@@ -113,6 +113,7 @@ def test_wrong_matches_of_two_frames_are_no_way() -> None:
         assert way_of_two(rng.uniform(0.0, 480.0, (300, 4)), InertialMotion(W, -V), RIG, SHUTTER) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backwards", [False, True])
 def test_a_video_of_a_hand_tells_how_its_lines_are_read(backwards: bool) -> None:
     """And frames in reverse look as if they were read from the bottom. Its ratio is within three deviations."""
@@ -127,6 +128,7 @@ def test_a_video_of_a_hand_tells_how_its_lines_are_read(backwards: bool) -> None
     assert capture.matches == sum(map(len, windows)) > capture.used > 0.5 * capture.matches / 4
 
 
+@pytest.mark.slow
 def test_wrong_matches_tell_nothing() -> None:
     for seed in (5, 6):  # of two ways: few that fit exactly, and all under much noise
         rng = np.random.default_rng(seed)

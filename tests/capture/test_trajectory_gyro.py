@@ -163,6 +163,7 @@ def test_windows_that_leave_and_those_that_stay_say_together_what_all_said() -> 
 # Sequences
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shake", "late"), [("strong", 0.0), ("tremor", 0.2), ("walk", -0.2)])
 def test_rows_are_better_with_a_gyroscope_whose_clock_is_off(shake: str, late: float) -> None:
     rng = np.random.default_rng(200)

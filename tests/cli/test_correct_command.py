@@ -108,6 +108,7 @@ def test_four_frames(tmp_path: Path, castle: Sequence, frames: list[Path], rig: 
     assert (out / "corrected" / "left_0.png").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_not_sure_is_looked_for_and_told(
     tmp_path: Path, castle: Sequence, frames: list[Path], rig: Path
 ) -> None:
@@ -188,6 +189,7 @@ def footage(tmp_path: Path, castle: Sequence, rig: Path) -> tuple[object, ...]:
     return (*given, "--row-poses", "--out")
 
 
+@pytest.mark.slow
 def test_a_killed_run_of_footage_goes_on_to_the_same_bytes(
     tmp_path: Path, footage: tuple[object, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -311,6 +313,7 @@ def _without_ratio(rig: Path) -> None:
     rig.write_text("\n".join(line for line in rig.read_text().splitlines() if "readout" not in line))
 
 
+@pytest.mark.slow
 def test_matches_that_leave_the_readout_open_exit_with_1(tmp_path: Path, castle: Sequence, rig: Path) -> None:
     """All moves along the rows, by 9 px: each point is read a period later, however the rows are read."""
     left, right = (castle.folder / "gs" / f"{side}_0.png" for side in ("left", "right"))
@@ -325,6 +328,7 @@ def test_matches_that_leave_the_readout_open_exit_with_1(tmp_path: Path, castle:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_where_nothing_moves_an_unknown_readout_hardly_matters(
     tmp_path: Path, castle: Sequence, rig: Path
 ) -> None:

@@ -81,6 +81,7 @@ def test_two_frames_become_upright(folder: Path) -> None:
     assert re.search(r"yellow [\d.e+]+, violet", (folder / "out" / "report.html").read_text())
 
 
+@pytest.mark.slow
 def test_a_focal_length_that_nothing_shows_is_assumed_and_said_so(folder: Path) -> None:
     (folder / "camera.toml").write_text("readout_ratio = 1.0\n")
     result = _correct(folder, folder / "0.png", folder / "1.png")
@@ -90,6 +91,7 @@ def test_a_focal_length_that_nothing_shows_is_assumed_and_said_so(folder: Path) 
     assert (record["camera"]["fx"], record["focal_length_sigma"]) == (160.0, pytest.approx(56.0))
 
 
+@pytest.mark.slow
 def test_a_folder_gives_the_same_frames_in_order(folder: Path) -> None:
     (folder / "in").mkdir()
     for frame in range(3):
@@ -100,6 +102,7 @@ def test_a_folder_gives_the_same_frames_in_order(folder: Path) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_a_shutter_of_another_frame_rate_is_named(folder: Path) -> None:
     """The mode reads for 15.64 ms at 59.94 frames a second; of a period of 30 a second that is 0.469."""
     film = cv2.VideoWriter(str(folder / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, SIZE[::-1])
@@ -120,6 +123,7 @@ def test_a_shutter_of_another_frame_rate_is_named(folder: Path) -> None:
     assert_refused(_correct(folder, folder / "0.png", folder / "1.png"), "frame_period_s = 0", "must be positive")
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_where_it_was(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     name = "out"
     (folder / "in").mkdir()
@@ -171,6 +175,7 @@ def test_a_video_may_come_out(folder: Path) -> None:
     assert_refused(run_here(*given, folder / "out.avi"), "was not written by")
 
 
+@pytest.mark.slow
 def test_bad_input_is_refused_in_one_line_and_nothing_is_left(folder: Path) -> None:
     write_png(folder / "small.png", _rolling(1)[:100])
     write_png(folder / "flat.png", np.full((*SIZE, 3), 90, np.uint8))
@@ -196,6 +201,7 @@ def test_bad_input_is_refused_in_one_line_and_nothing_is_left(folder: Path) -> N
     assert not (folder / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_still_pair_among_others_is_a_mark_on_its_frame() -> None:
     frames = [_rolling(0), _rolling(1), _rolling(1)]
     moments = _moments(frames)
@@ -230,6 +236,7 @@ def test_of_many_marked_frames_the_first_are_told(folder: Path) -> None:
     assert [each["number"] for each in record["frames"] if "reason" in each] == list(range(2, 12))
 
 
+@pytest.mark.slow
 def test_a_frame_after_a_cut_is_corrected_with_the_one_after_it() -> None:
     other = [np.ascontiguousarray(_rolling(frame)[::-1, :, ::-1]) for frame in (5, 6)]
     moments = _moments([_rolling(0), _rolling(1), *other])
@@ -245,6 +252,7 @@ def test_a_frame_after_a_cut_is_corrected_with_the_one_after_it() -> None:
     np.testing.assert_array_equal(last.fused.image, other[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scan", ["bottom", "right"])
 def test_lines_may_be_read_from_any_side(scan: Scan) -> None:
     """Frames turned like their camera, whose truth is turned alike."""
@@ -279,6 +287,7 @@ def _accelerated(row: float) -> tuple[list[np.ndarray], np.ndarray]:
     return frames, _seen(_place(np.full(SIZE[0], 1.0 + row / SIZE[0]))).astype(float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("last", [False, True])
 def test_a_frame_is_corrected_with_the_neighbour_nearer_in_time(last: bool) -> None:
     row = SIZE[0] - 1.0 if last else 0.0
@@ -308,6 +317,7 @@ def test_what_a_frame_and_its_neighbour_do_not_show_is_taken_from_the_other_one(
     assert 0.7 < ratio < 1.4
 
 
+@pytest.mark.slow
 def test_a_camera_may_be_intrinsics_a_field_of_view_or_nothing() -> None:
     frames, focal = [_rolling(0), _rolling(1)], 80.0 / np.tan(np.deg2rad(30.0))
     camera = PinholeCamera.centred(SIZE[1], SIZE[0], focal)

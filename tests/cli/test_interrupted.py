@@ -82,6 +82,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths if path.name != "provenance.json"}
 
 
+@pytest.mark.slow
 def test_stopped_and_a_worker_killed_it_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
     (tmp_path / "slow_plugin.py").write_text(SLOW)
     (tmp_path / "slow.toml").write_text('class = "slow_plugin:Slow"')
@@ -106,6 +107,7 @@ def test_stopped_and_a_worker_killed_it_goes_on_to_the_same_bytes(tmp_path: Path
     assert contents(out) == contents(undisturbed)
 
 
+@pytest.mark.slow
 def test_rendering_by_several_processes_ends_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     card = write_small_card(tmp_path, [write_box_scene(tmp_path, name) for name in "abcd"])
     # Large enough for a minute, and larger than frames may be without being asked for.

@@ -21,6 +21,7 @@ from rsbench.report import fig3
 from rsbench.report.fig3 import SWEEPS
 
 
+@pytest.mark.slow
 def test_claims_and_figure_come_from_the_stored_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     complete = sweep_card.load_sweep
 

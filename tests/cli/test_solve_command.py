@@ -77,6 +77,7 @@ def test_the_sample_is_printed_and_solved_away_from_the_checkout(
     assert "of 80 matches" in result.stdout
 
 
+@pytest.mark.slow
 def test_a_readout_ratio_that_is_not_said_is_found_or_refused() -> None:
     """Good tracks of a rig that turns tell it, 80 matches of the sample do not; global solvers need none."""
     rig = StereoRig(camera=PinholeCamera.centred(640, 480, 520.0), baseline=0.2)
@@ -161,6 +162,7 @@ def test_no_problem_is_refused() -> None:
     assert result.returncode == 2 and "--example" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_solver_that_misbehaves_fails_alone_and_leaves_the_answers_clean(tmp_path: Path) -> None:
     cards = [odd_card(tmp_path, what) for what in ("print", "exit", "crash")]
     cards.append(odd_card(tmp_path, "hang", "time_limit_s = 1.0"))

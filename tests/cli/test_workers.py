@@ -39,6 +39,7 @@ def evaluated(folder: Path, out: Path, *options: object) -> dict[str, bytes]:
     return contents(out)
 
 
+@pytest.mark.slow
 def test_two_processes_evaluate_to_the_same_bytes(smoke_dataset: Path, tmp_path: Path) -> None:
     """With repeats: tests/benchmark/images/test_sequence_jobs.py."""
     one = evaluated(smoke_dataset, tmp_path / "one")
@@ -61,6 +62,7 @@ def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     assert ("no such file" in run.stderr) == (find_spec("distributed") is not None)
 
 
+@pytest.mark.slow
 @NEEDS_DASK
 def test_a_cluster_generates_evaluates_and_simulates_the_same_bytes(
     smoke_dataset: Path, tmp_path: Path, address: str

@@ -78,6 +78,7 @@ def _frames(folder: Path) -> int:
     return sum(name.endswith((".png", ".exr")) for _, _, names in os.walk(folder) for name in names)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("files", [1, 20])
 def test_killed_run_resumes_to_the_bytes_of_an_undisturbed_one(small: Small, tmp_path: Path, files: int) -> None:
     """Killed in its first sequence, of 8 images and 8 depths, and in its second."""
@@ -111,6 +112,7 @@ def test_damaged_sequence_is_rendered_again_and_sound_ones_are_kept(small: Small
     assert bytes_of(out) == bytes_of(small.dataset)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_scenes(tmp_path: Path) -> None:
     """Resident memory while each of four scenes is rendered, with textures of equal count but other shapes."""
     if not Path("/proc/self/statm").exists():

@@ -125,6 +125,7 @@ def test_versions_that_know_no_lens_refuse_the_sequence(made: dict[str, Path]) -
         assert manifest["conventions"] == 2, "version 1 is read by those who would take the lens for none"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CARDS)
 def test_the_whole_way(made: dict[str, Path], tmp_path: Path, name: str) -> None:
     """A late camera, and opposite columns through a fisheye, find depth with the motion that they estimate."""
@@ -191,6 +192,7 @@ def _rig_apart(sequence: Sequence, told: str, path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", APART)
 def test_correct_takes_a_rig_of_cameras_apart(made: dict[str, Path], tmp_path: Path, name: str) -> None:
     """Motion, depth and frames, against those of the dataset; a rig.toml that does not say so corrects worse."""

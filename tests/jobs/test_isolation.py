@@ -207,6 +207,7 @@ def test_whatever_goes_wrong_is_a_failure_with_its_reason(
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.slow
 def test_a_process_that_ends_is_a_failure_of_that_problem_alone(
     tmp_path: Path, simulation: Simulation, runner: SolverRunner
 ) -> None:
@@ -298,6 +299,7 @@ with SolverRunner() as runner:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
 def test_nothing_outlives_its_parent(tmp_path: Path, end: signal.Signals) -> None:

@@ -155,6 +155,7 @@ def test_sequences_of_different_lengths_are_refused(folders: Folders, castle: Se
         list(correct_sequence(left, FrameSource(right.path), castle.rig, 0.8, CorrectionOptions()))
 
 
+@pytest.mark.slow
 def test_the_readout_of_a_sequence_is_that_of_its_windows(folders: Folders, castle: Sequence) -> None:
     try:
         capture, shutter = estimate_sequence_capture(*folders, castle.rig, CorrectionOptions())

@@ -59,6 +59,7 @@ def whole() -> list[MonoMoment]:
     return moments(COUNT)
 
 
+@pytest.mark.slow
 def test_frames_of_a_shaken_video_stand_where_they_should(whole: list[MonoMoment]) -> None:
     """Much better than two frames at a time, which do not show what both shake alike."""
 
@@ -74,6 +75,7 @@ def test_frames_of_a_shaken_video_stand_where_they_should(whole: list[MonoMoment
     assert np.mean(together) < 0.6 * np.mean(apart)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("done", [1, 9, 11, COUNT - 1, COUNT])
 def test_a_run_that_goes_on_writes_the_same_frames(whole: list[MonoMoment], done: int) -> None:
     later = moments(COUNT, done)

@@ -329,6 +329,7 @@ def test_a_failure_has_no_motion() -> None:
     json.dumps(answer, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_seconds_hold_no_compilation() -> None:
     """In a fresh process the first problem takes about as long as the second one, and not what loading takes."""
     code = (

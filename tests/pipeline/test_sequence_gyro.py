@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 from shaken_rig import RIG, SHAKES, SHUTTER, matches, sines, times
 
@@ -13,6 +14,7 @@ from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.sequence_trajectory import BRIDGED, TURNED, Window, on_one_trajectory
 
 
+@pytest.mark.slow
 def test_a_gyroscope_turns_frames_far_from_any_that_match() -> None:
     rng = np.random.default_rng(5)
     law = sines(rng, *SHAKES["walk"])

@@ -132,6 +132,7 @@ def test_facets_are_spread_evenly_and_one_is_the_middle() -> None:
     assert len({tuple(cell) for cell in np.floor(4 * points).astype(int).tolist()}) == 16
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"sky_rays": 2}, {"integrator": "path"}], ids=str)
 def test_single_pass_is_stitched_with_gloss(town: Scene, row_poses: Any, options: dict[str, Any]) -> None:
     """Bit for bit, image, depth and mask; and the mask is that of the instances."""

@@ -30,6 +30,7 @@ from rsbench.storage.files import read_depth, read_png
 from rsbench.verification import verify_dataset
 
 
+@pytest.mark.slow
 def test_scalar_fallback_renders_the_same_frame_and_says_how_to_be_faster(tmp_path: Path) -> None:
     library = "/nonexistent/libLLVM.so"
     slow = child(
@@ -61,6 +62,7 @@ def other_width(*, narrow: bool) -> int:
     return 4 if narrow else 8 if "avx512f" in llvm.cpu_features() else 16
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("narrow", [True, False])
 def test_another_vector_width_renders_the_same_within_the_documented_tolerance(
     tmp_path: Path, narrow: bool
@@ -70,6 +72,7 @@ def test_another_vector_width_renders_the_same_within_the_documented_tolerance(
     assert_alike(other, own)
 
 
+@pytest.mark.slow
 def test_a_dataset_made_with_another_vector_width_is_read_as_alike(tmp_path: Path, smoke_dataset: Path) -> None:
     """All frames, depths and twins of a sequence within the documented tolerance; and no file of it fails."""
     width = other_width(narrow=True)

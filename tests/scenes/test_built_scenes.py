@@ -56,6 +56,7 @@ def test_the_example_of_a_mesh_card_asks_for_its_file() -> None:
         load_scene("mesh")
 
 
+@pytest.mark.slow
 def test_meshes_are_sound(scene: Scene) -> None:
     assert len({mesh.name for mesh in scene.meshes}) == len(scene.meshes)
     for mesh in scene.meshes:
@@ -153,6 +154,7 @@ def pixel_rays(across: int) -> NDArray[np.float64]:
     return np.stack([*(axis.ravel() for axis in np.meshgrid(steps, steps)), np.ones(across * across)], axis=1)
 
 
+@pytest.mark.slow
 def test_viewpoints_are_several_and_leave_room_for_the_rig(scene: Scene) -> None:
     assert "default" in scene.viewpoints and len(scene.viewpoints) >= 3
     # Cameras stand 0.25 m left and right and move 0.3 m.
@@ -179,6 +181,7 @@ def unpainted(names: Iterable[str], seed: int) -> dict[str, Surface]:
     return {n: Surface(Material(name=n), None if size is None else (size, size)) for n, size in sizes.items()}
 
 
+@pytest.mark.slow
 def test_the_seed_decides_the_arrays(scene: Scene, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     card, builder = read_scene_card(card_path("scenes", name))
     monkeypatch.setattr(sys.modules[type(builder).__module__], "paint_palette", unpainted)

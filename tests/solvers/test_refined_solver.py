@@ -116,6 +116,7 @@ def test_yaw_and_forward_of_pairs_has_no_length() -> None:
     assert np.linalg.norm(estimate.d) <= RefinedSolver().max_translation_m * 1.001
 
 
+@pytest.mark.slow
 def test_pairs_on_a_plane_are_solved_from_the_motions_of_their_homography() -> None:
     """Exact pairs always; with noise a plane that turns seldom leaves another motion of lower cost."""
     lost = 0
@@ -216,6 +217,7 @@ def normalised_square(estimate: MotionEstimate, motion: Motion, noise_px: float)
     return float(error @ np.linalg.solve(covariance, error))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_px", [0.1, 1.0])
 @pytest.mark.parametrize("sets", ["pairs", "tracks"])
 def test_covariance_predicts_the_errors(sets: str, noise_px: float) -> None:

@@ -84,6 +84,7 @@ def test_a_sweep_goes_to_a_store(memory: Any, tmp_path: Path) -> None:
     assert_refused(other, f"{URL}: holds another sweep (differs in trials); choose another --out")
 
 
+@pytest.mark.slow
 def test_an_evaluation_goes_to_a_store(memory: Any, tmp_path: Path) -> None:
     card = load_dataset_card(str(write_small_card(tmp_path, [write_box_scene(tmp_path, "a")])))
     generate_dataset(card, tmp_path / "data")
@@ -106,6 +107,7 @@ def _here(serve: Any, jobs: Any, workers: int, environment: object, *arguments: 
     yield from ((job, run(job)) for job in jobs)
 
 
+@pytest.mark.slow
 def test_a_board_goes_to_a_store(memory: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(running, "finished_jobs", _here)
     monkeypatch.setattr("rsbench.cli.leaderboard.split_of", lambda *options: small_split(3))
@@ -202,6 +204,7 @@ def _others(memory: Any, cache: Path) -> dict[str, bytes]:
     return theirs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["here", "elsewhere", "overtaken"])
 def test_stopped_before_any_operation_it_goes_on_to_the_same_bytes(
     where: str, memory: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, open_mirrors: queue.Queue[Any]

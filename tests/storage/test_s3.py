@@ -78,6 +78,7 @@ def stored(bucket: Any, folder: str) -> dict[str, bytes]:
     return {path.partition(f"{folder}/")[2]: bucket.cat_file(path) for path in bucket.find(f"data/{folder}")}
 
 
+@pytest.mark.slow
 def test_processes_send_the_same_bytes(card: Path, dataset: dict[str, bytes], bucket: Any) -> None:
     run = run_here("generate", card, "--out", "s3://data/two", "--workers", 2)
     assert run.returncode == 0 and "s3://data/two: 3 sequences, 3 rendered now" in run.stdout, run.stderr
@@ -86,6 +87,7 @@ def test_processes_send_the_same_bytes(card: Path, dataset: dict[str, bytes], bu
     assert "3 sequences, 0 rendered now" in run.stdout, run.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec("distributed") is None, reason="needs rsbench[cluster]")
 def test_a_cluster_sends_the_same_bytes(
     card: Path, dataset: dict[str, bytes], bucket: Any, tmp_path: Path
@@ -99,6 +101,7 @@ def test_a_cluster_sends_the_same_bytes(
     assert not [path for path in tmp_path.rglob("*.png")], "workplaces of the cluster's processes are empty"
 
 
+@pytest.mark.slow
 def test_killed_at_any_time_it_goes_on_to_the_same_bytes(
     card: Path, dataset: dict[str, bytes], bucket: Any, tmp_path: Path
 ) -> None:
@@ -123,6 +126,7 @@ _EAGER = "from rsbench.storage import mirror; mirror._BEAT_S = 0.02; from rsbenc
 """``rsbench`` that sends what there is at once."""
 
 
+@pytest.mark.slow
 def test_a_sweep_that_is_killed_goes_on_elsewhere(
     bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -153,6 +157,7 @@ def test_a_sweep_that_is_killed_goes_on_elsewhere(
     assert {path: data for path, data in there.items() if not path.startswith("seconds/")} == here
 
 
+@pytest.mark.slow
 def test_an_evaluation_that_is_killed_goes_on_elsewhere(
     card: Path, bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -77,6 +77,7 @@ def test_a_card_with_the_file_beside_it_is_enough(
     sys.modules.pop(module.removesuffix(".py"))
 
 
+@pytest.mark.slow
 def test_a_scene_builder(run: Run, data: Path) -> None:
     work = all_lines(run, "A scene builder")
     manifest = json.loads((work / "data" / "street" / "sequence.json").read_text("utf-8"))
@@ -84,6 +85,7 @@ def test_a_scene_builder(run: Run, data: Path) -> None:
     assert "1 sequences, 0 faults" in run("rsbench verify data")
 
 
+@pytest.mark.slow
 def test_a_solver(run: Run) -> None:
     work = all_lines(run, "A solver")
     assert "0 of 8 checks failed" in run("rsbench check-solver aligned")
@@ -93,6 +95,7 @@ def test_a_solver(run: Run) -> None:
     assert table.e_R_median.between(0.001, 1.0).all()
 
 
+@pytest.mark.slow
 def test_a_motion_model(run: Run) -> None:
     work = all_lines(run, "A motion model")
     manifest = json.loads((work / "shaken" / "street" / "sequence.json").read_text("utf-8"))
@@ -120,6 +123,7 @@ def installed_class(installed: Path, module: str, name: str, monkeypatch: pytest
     return getattr(importlib.import_module(module), name)
 
 
+@pytest.mark.slow
 def test_a_stereo_matcher(run: Run, data: Path, installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     work = all_lines(run, "A stereo matcher")
     found = np.load(work / "scored" / "predictions" / "street" / "depth" / "blocks.npz")["left_0"]

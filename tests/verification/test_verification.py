@@ -165,6 +165,7 @@ def _update_checksum(folder: Path, relative: str) -> None:
     path.write_text(json.dumps(manifest))
 
 
+@pytest.mark.slow
 def test_two_processes_find_the_same(smoke_dataset: Path, tmp_path: Path) -> None:
     data = Path(shutil.copytree(smoke_dataset, tmp_path / "data"))
     path = data / "castle/rs_depth/left_0.exr"

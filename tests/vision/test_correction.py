@@ -39,6 +39,7 @@ def _flat(depth: np.ndarray, step: float = 0.01, reach: int = 2) -> np.ndarray:
     return cv2.dilate(near, kernel) <= cv2.erode(near, kernel) * (1 + step * reach)
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(
     tilt=st.tuples(st.floats(-0.7, 0.7), st.floats(-0.7, 0.7)),
@@ -63,6 +64,7 @@ def test_slanted_planes_are_exact_and_whole(
     np.testing.assert_allclose(got.depth[both], expected.depth[both], rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["left", "right"])
 @pytest.mark.parametrize("frame", [0, 1])
 def test_spheres_before_a_wall(world: Build, shapes: Any, truth: Build, side: str, frame: int) -> None:

@@ -53,6 +53,7 @@ def _gain(scene: Any, problem: CorrectionProblem, corrector: Corrector, view: Vi
     return psnr(fused.image, truth, here) - psnr(problem.images[view], truth, here)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("view", "row"), [(("left", 0), 0.0), (("right", 1), 100.0)])
 def test_each_is_right_in_the_scene_that_it_assumes(world: Build, shapes: Any, view: View, row: float) -> None:
     """A world at infinity, one plane, and a plane with a ball before it; each sees 10 dB and more beyond."""

@@ -59,6 +59,7 @@ def psnr(moment: MonoMoment, scene: Any, truth: Any) -> float:
     return float(10.0 * np.log10(255.0**2 / np.mean(error**2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "seed", "scan", "gain"),
     [
@@ -83,6 +84,7 @@ def test_a_gyroscope_tells_what_two_frames_do_not(
     assert np.rad2deg(np.linalg.norm(motion.w - scene.motion.w)) < 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [-1.0, 50.0])
 def test_a_gyroscope_of_another_sign_or_unit_is_not_believed(
     world: Any, shapes: Any, u8: Any, factor: float
@@ -192,6 +194,7 @@ def test_tables_that_are_none_are_refused(tmp_path: Path, rows: list[str], words
         read_gyro_log(tmp_path / "log.csv")
 
 
+@pytest.mark.slow
 def test_the_command_takes_a_log(tmp_path: Path, world: Any, shapes: Any, u8: Any) -> None:
     scene = shaken(world, shapes, "handheld")
     for frame in (0, 1):

@@ -141,6 +141,7 @@ SOLVER_FAULTS = {
 }
 
 
+@pytest.mark.slow
 def test_solvers_that_break_the_contract_fail_alone(
     smoke_dataset: Path, copy: Path, strangers: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -162,6 +163,7 @@ def test_solvers_that_break_the_contract_fail_alone(
     assert "must not reach" not in capfd.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["raises", "exits", "answers nonsense"])
 def test_other_components_that_break_the_contract_fail_alone(
     smoke_dataset: Path, tmp_path: Path, strangers: Path, how: str
@@ -264,6 +266,7 @@ def test_a_metric_whose_column_is_taken_is_refused(smoke_dataset: Path, tmp_path
         evaluate(smoke_dataset, tmp_path, metrics=(str(strangers / "twin.toml"),))
 
 
+@pytest.mark.slow
 def test_flip_is_a_metric_that_comes_along(smoke_dataset: Path, copy: Path) -> None:
     pytest.importorskip("flip_evaluator")
     evaluate(smoke_dataset, copy, metrics=("flip",))

@@ -62,6 +62,7 @@ def test_scores_are_made_where_a_death_costs_nothing(smoke_dataset: Path, evalua
     assert one == two
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [1, 2])
 def test_all_is_scored_and_hashes_of_what_children_read_are_kept(
     smoke_dataset: Path, evaluated: Path, tmp_path: Path, seeds: int

@@ -291,6 +291,7 @@ def test_cards_that_cannot_be_entries_are_refused_before_they_run(tmp_path: Path
         SPLIT.track.run([str(card)], SPLIT, tmp_path / "in", tmp_path / "work")
 
 
+@pytest.mark.slow
 def test_runs_are_the_same_however_they_are_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With two workers, and in this process after the loss of half of it."""
     write_inputs(SPLIT, (simulated_problem(1, number) for number in range(12)), tmp_path / "in")

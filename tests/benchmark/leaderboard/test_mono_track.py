@@ -65,6 +65,7 @@ def _here(serve: Any, jobs: Any, workers: int, environment: object, *arguments: 
     yield from ((job, run(job)) for job in jobs)
 
 
+@pytest.mark.slow
 def test_methods_are_ranked_by_the_cameras_that_they_see(
     rendered: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,6 +125,7 @@ def test_samples_of_a_pair_of_many_frames_have_its_own_times(rendered: Path) -> 
         np.testing.assert_array_equal(row[1:], rows[round(float(row[0] + 1.0), 9)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu-layers"])
 def test_nobody_looks_to_the_right(name: str, rendered: Path) -> None:
     """Black images of the right camera give the same frames."""

@@ -70,6 +70,7 @@ def _here(
         yield job, Outcome(value=run(job), reason="", output="")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mood", MOODS)
 @pytest.mark.parametrize("track", ASK_PICTURES)
 def test_a_method_that_takes_too_much_fails_alone(

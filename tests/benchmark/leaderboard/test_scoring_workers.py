@@ -41,6 +41,7 @@ def test_two_processes_give_the_bytes_of_one(splits: dict[str, Split], tmp_path:
     assert rescore(tmp_path / "2", split) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("track", ["depth", "correction"])
 def test_entries_that_are_scored_together_score_as_alone(
     track: str, splits: dict[str, Split], tmp_path: Path

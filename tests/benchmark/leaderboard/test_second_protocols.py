@@ -169,6 +169,7 @@ def _without_frames(protocol: str) -> Split:
     return Split(track=TRACKS[protocol], label=card.name, public=True, truths=tuple(map(truth_of, pairs)))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
 @pytest.mark.parametrize("protocol", ["points-2", "pose-2", "readout-2"])
 def test_stored_predictions_give_the_committed_table(protocol: str, split: Split, tmp_path: Path) -> None:

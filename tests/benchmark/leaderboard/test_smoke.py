@@ -66,6 +66,7 @@ def corridor(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not STORED.is_dir(), reason="needs the committed results")
 def test_the_stored_scores_of_frames_are_those_of_this_code(corridor: Path) -> None:
     """All tracks, with what costs least of each: both kinds of cards, and oracles."""

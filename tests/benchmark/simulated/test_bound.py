@@ -171,6 +171,7 @@ def test_no_translation_and_no_matches() -> None:
     assert np.isinf(nothing.rotation) and nothing.covariance is None and not nothing.scale_observable
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pairs", "tracks"), [(100, 0), (0, 100)])
 def test_the_default_solver_reaches_it(pairs: int, tracks: int) -> None:
     """Root mean squares over 150 motions scatter by 6 %; 1.10 is the target."""
