@@ -56,7 +56,9 @@ def run(wait: Wait) -> tuple[float, float, float]:
         shutil.rmtree(wait.fresh, ignore_errors=True)
     before, began, most = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter(), 0.0
     command = [sys.executable, "-m", "rsbench", "--quiet", *wait.words]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, env={**os.environ, **wait.variables}) as process:
+    # Compiled Python is kept, as it is by default: without, each command compiles all that it imports.
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, env={**kept, **wait.variables}) as process:
         while process.poll() is None:
             most = max(most, *map(resident_mb, [process.pid, *children(process.pid)]))
             time.sleep(EVERY_S)
