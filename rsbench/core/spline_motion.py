@@ -292,17 +292,6 @@ def _interval(parameters: Mapping[str, Any]) -> float:
     return float(value)
 
 
-def blending(tau: ArrayLike, interval: float, count: int) -> FloatArray:
-    """Shares (..., count) of the control poses in the pose at times (...); each row adds up to 1."""
-    tau = np.asarray(tau, dtype=np.float64)
-    i, u = _place(tau, interval, count)
-    b1, b2, b3 = _cumulative(u)
-    out = np.zeros((*tau.shape, count))
-    for j, share in enumerate((1 - b1, b1 - b2, b2 - b3, b3)):
-        np.put_along_axis(out, (i + j)[..., None], share[..., None], axis=-1)
-    return out
-
-
 def _place(tau: FloatArray, interval: float, count: int) -> tuple[NDArray[np.int64], FloatArray]:
     """Interval (...) of times (...), and where in it they are, from 0 to 1."""
     i = np.clip(np.floor(tau / interval), 0, count - 4).astype(np.int64)
