@@ -68,7 +68,7 @@ class MonoCorrectionTrack(CorrectionTrack):
         made = super().chain(card)
         spec = made.options.corrector.component.spec
         if _of_a_rig(spec):
-            return made
+            return made.choosing()
         others = [name for name, there in (("time", "time" in spec.sees), ("gyro", "gyro" in spec.needs)) if there]
         return made._replace(uses=("readout", "images", *others))
 

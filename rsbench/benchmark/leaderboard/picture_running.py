@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,6 +22,7 @@ from rsbench.benchmark.leaderboard.submissions import submission_text
 from rsbench.benchmark.leaderboard.track import Limits
 from rsbench.benchmark.leaderboard.true_pictures import Asked
 from rsbench.benchmark.provenance import numeric_version, processor
+from rsbench.capture.settle import AUTO
 from rsbench.components.plugins import Entry
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import use_one_thread
@@ -51,6 +53,11 @@ class CardChain(NamedTuple):
     """Of ``KNOWLEDGE``."""
     reference: str = ""
     """Where the method is published."""
+
+    def choosing(self) -> CardChain:
+        """With the motion model that the matches prefer: what ``rsbench correct`` does."""
+        options = replace(self.options, motion_model=AUTO)
+        return self._replace(options=options, key=options.key)
 
 
 class _Job(NamedTuple):

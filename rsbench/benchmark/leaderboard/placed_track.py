@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from itertools import product
 from typing import ClassVar
 
@@ -27,7 +26,6 @@ from rsbench.benchmark.leaderboard.splits import Truth
 from rsbench.benchmark.leaderboard.submissions import Submission
 from rsbench.benchmark.leaderboard.track import Score
 from rsbench.benchmark.leaderboard.true_pictures import TruePictures
-from rsbench.capture.settle import AUTO
 
 LIMIT_PX = 2.0
 """A window that stands farther off has no part in the score."""
@@ -61,10 +59,7 @@ class PlacedCorrection(CorrectionTrack):
     smoke: ClassVar[tuple[str, ...]] = ()
 
     def chain(self, card: str) -> CardChain:
-        """With the motion model that the matches prefer: what ``rsbench correct`` does."""
-        found = super().chain(card)
-        options = replace(found.options, motion_model=AUTO)
-        return found._replace(options=options, key=options.key)
+        return super().chain(card).choosing()
 
     def scorer(self, truth: Truth, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
         others, true = super().scorer(truth, pictures), TrueFrame.all_of(pictures)
