@@ -162,6 +162,7 @@ def shaken(tmp_path_factory: pytest.TempPathFactory) -> TrueTrajectory:
     return TrueTrajectory.of(read_dataset(folder)[0])
 
 
+@pytest.mark.slow
 def test_methods_in_the_order_of_what_they_know(shaken: TrueTrajectory, rng: np.random.Generator) -> None:
     """Exact matches: what fits the shake is near it, what assumes another motion is not."""
     motion = shaken.sequence.motion

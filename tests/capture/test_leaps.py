@@ -41,6 +41,7 @@ def test_a_leap_is_a_perfect_match_at_some_ratio_and_is_left_out(ratio: float) -
     assert len(without_leaps(wrong, RIG).left) == 0
 
 
+@pytest.mark.slow
 def test_leaps_do_not_hold_the_ratio() -> None:
     options = SimulationOptions(noise_px=0.05, pairs=300, tracks=300, depth=(3.0, 12.0))
     made = simulate(

@@ -104,6 +104,7 @@ def test_a_card_that_errs_is_put_right(lens: Lens | None, factor: float, k1_too_
         assert abs(found.rig.camera.lens.k1 - lens.k1) < min(4.0 * found.sigma.k1, 0.01)
 
 
+@pytest.mark.slow
 def test_what_is_left_of_a_lens_is_found_as_one() -> None:
     """Of a distant scene, whose row differences say nothing of it."""
     true = replace(CAMERA, lens=Lens(model="brown-conrady", k1=0.02))

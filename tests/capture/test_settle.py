@@ -110,6 +110,7 @@ def test_the_ratio_is_recovered_within_a_fiftieth(seed: int, ratio: float, degre
     assert abs(shutter.readout_ratio - ratio) < 0.02
 
 
+@pytest.mark.slow
 def test_the_uncertainty_is_honest() -> None:
     """Errors over their standard deviations have a root mean square of 1: here of 12 draws, 1 +- 3 / sqrt(24)."""
     scores = []

@@ -77,6 +77,7 @@ def test_errors_are_those_of_the_bound_and_of_the_covariances() -> None:
     assert low < sum(nees) < high
 
 
+@pytest.mark.slow
 def test_a_bound_is_the_scatter_of_linearised_estimates() -> None:
     """Without a prior, and without ours: the scatter of fits to many draws of the noise of one scene."""
     rng = np.random.default_rng(8)
@@ -127,6 +128,7 @@ def test_keypoints_that_meet_are_one_track() -> None:
     assert np.median(row_errors_deg(found, law, 6)) < 0.02
 
 
+@pytest.mark.slow
 def test_pairs_help_where_tracks_are_few() -> None:
     rng = np.random.default_rng(10)
     law = sines(rng, *SHAKES["tremor"])
@@ -160,6 +162,7 @@ def test_a_window_without_matches_is_bridged_and_says_so() -> None:
     assert np.all(np.abs(errors) < 4.0 * sigma)
 
 
+@pytest.mark.slow
 def test_a_wrong_motion_of_a_window_is_mended() -> None:
     rng = np.random.default_rng(12)
     law = sines(rng, *SHAKES["walk"])

@@ -67,6 +67,7 @@ def turned_deg(motion: Motion, number: int, shake: float) -> float:
     return float(np.rad2deg(np.sqrt(np.mean(angles**2))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shake", [0.0, 0.01])
 def test_a_way_follows_what_a_camera_trembles(shake: float) -> None:
     """The search begins from even speeds, which are wrong by more than ten times as much where it trembles."""
@@ -92,6 +93,7 @@ def law_of(matches: FloatArray) -> InertialMotion:
     return InertialMotion(found.w, found.d / np.linalg.norm(found.d))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shake", [0.0, 0.001, 0.005])
 def test_two_frames_are_believed_that_they_shook_where_they_show_it(shake: float) -> None:
     """By half a pixel: that way is nearer than the best law. By more, many ways explain them: the law stays."""

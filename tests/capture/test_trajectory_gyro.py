@@ -217,6 +217,7 @@ def rotation_errors_deg(parts: list[StreamedWindow], law: Law) -> FloatArray:
     return np.rad2deg(off)
 
 
+@pytest.mark.slow
 def test_silent_windows_of_a_stream_are_bridged() -> None:
     """Four windows without matches, over a border of the sliding window: 0.1 to 1 deg without a gyroscope."""
     rng = np.random.default_rng(300)

@@ -63,6 +63,7 @@ def rsbench(site: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
 
 
+@pytest.mark.slow
 def test_listing_names_them(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RSBENCH_IMPORT_LIMIT_S", "4")
     result = rsbench(site, "list", "solvers", "--json")
@@ -82,6 +83,7 @@ def test_listing_names_them(site: Path, monkeypatch: pytest.MonkeyPatch) -> None
         assert rows[name]["broken"] is None
 
 
+@pytest.mark.slow
 def test_built_in_solvers_and_a_good_package_simulate(site: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(CARD)
     chosen = ("--solver", "gs-8pt", "--solver", "hasty", "--workers", 1)

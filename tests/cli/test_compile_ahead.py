@@ -33,6 +33,7 @@ assert loaded == ahead, loaded - ahead
 """
 
 
+@pytest.mark.slow
 def test_everything_that_correct_compiles_is_compiled_ahead(tmp_path: Path, smoke_dataset: Path) -> None:
     castle = read_dataset(smoke_dataset)[0]
     c, rig = castle.rig.camera, tmp_path / "rig.toml"

@@ -243,6 +243,7 @@ def _log(path: Path, rate: float) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_gyroscope_that_contradicts_the_frames_is_told_and_left_out(
     tmp_path: Path, footage: tuple[object, ...]
 ) -> None:

@@ -172,6 +172,7 @@ def test_single_files_with_their_cards_beside_them(castle: Sequence, strangers: 
     assert {name: record["components"][name]["name"] for name in names} == names
 
 
+@pytest.mark.slow
 def test_an_installed_package(castle: Sequence, strangers: Path, tmp_path: Path) -> None:
     # A copy, for this process has the other folder on its path, where later tests would find the package.
     site = Path(shutil.copytree(strangers, tmp_path / "site"))

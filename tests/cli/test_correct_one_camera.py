@@ -161,6 +161,7 @@ def test_an_interrupted_run_goes_on_where_it_was(folder: Path, monkeypatch: pyte
     assert bytes_below(folder / "halves") == bytes_below(folder / "whole")
 
 
+@pytest.mark.slow
 def test_a_video_may_come_out(folder: Path) -> None:
     given = ("correct", folder / "0.png", folder / "1.png", "--camera", folder / "camera.toml", "--out")
     result = run_here(*given, folder / "out.avi", "--target", "middle")
@@ -224,6 +225,7 @@ def test_a_still_camera_is_known_by_its_clear_texture() -> None:
         np.testing.assert_array_equal(moments[1].fused.image, frames[1])
 
 
+@pytest.mark.slow
 def test_of_many_marked_frames_the_first_are_told(folder: Path) -> None:
     (folder / "in").mkdir()
     for frame in range(12):
@@ -300,6 +302,7 @@ def test_a_frame_is_corrected_with_the_neighbour_nearer_in_time(last: bool) -> N
     assert errors[0] < 0.7 * errors[2 - last]
 
 
+@pytest.mark.slow
 def test_what_a_frame_and_its_neighbour_do_not_show_is_taken_from_the_other_one() -> None:
     """The texture comes in from the left: what the second frame lacks there, only the third one shows."""
     row = (SIZE[0] - 1) / 2

@@ -99,6 +99,7 @@ def test_the_second_process_loads_what_the_first_compiled(tmp_path: Path) -> Non
     assert child(use, NUMBA_CACHE_DIR=str(tmp_path / "cache")).stdout == "1.5 0"
 
 
+@pytest.mark.slow
 def test_two_processes_may_compile_at_once(tmp_path: Path) -> None:
     """One signature each: with one index for both, the second would call the first one's code."""
     (tmp_path / "adds.py").write_text(textwrap.dedent(ADDS))
@@ -152,6 +153,7 @@ def signatures() -> set[tuple[str, str]]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list_solvers())
 def test_a_warm_solver_compiles_nothing(name: str) -> None:
     from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate

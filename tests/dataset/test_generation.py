@@ -271,6 +271,7 @@ def test_dataset_manifest_lists_every_file(smoke_dataset: Path) -> None:
     assert set(manifest["files"]) == set(bytes_of(smoke_dataset)) - {"dataset.json", "croissant.json"}
 
 
+@pytest.mark.slow
 def test_full_frames_keep_the_stack_that_the_frame_is_stitched_from(small: Small, tmp_path: Path) -> None:
     card = load_dataset_card(str(small.card)).only(["a"])
     tiny = replace(card, camera=CameraCard(width=20, height=12, focal=17.0))

@@ -164,6 +164,7 @@ def _correct(sequence: Sequence, rig: Path, out: Path) -> subprocess.CompletedPr
     return run_here("correct", *frames, "--rig", rig, "--out", out, "--solver", "rs-stereo-refined-twist")
 
 
+@pytest.mark.slow
 def test_correct_takes_frames_with_distortion(made: dict[str, Path], tmp_path: Path) -> None:
     sequence, rig = read_sequence(made["barrel"] / "room-twist"), tmp_path / "rig.toml"
     rig.write_text(RIG.format(baseline=sequence.rig.baseline, ratio=sequence.shutter.readout_ratio))

@@ -172,6 +172,7 @@ def test_a_pair_of_later_frames_has_the_objects_where_they_are(sequence: Sequenc
     np.testing.assert_array_equal(pair.labels("rs", "left", 1), sequence.labels("rs", "left", 2))
 
 
+@pytest.mark.slow
 def test_verify_finds_nothing_and_renders_again_where_the_meshes_are_named(fair: Path, tmp_path: Path) -> None:
     scene, kite, slab = fair.parent / "hall.toml", *(fair.parent / f"meshes/{n}" for n in ("kite.glb", "slab.ply"))
     (report,) = verify_dataset(fair, rerender="auto", scenes=[scene, kite, slab])

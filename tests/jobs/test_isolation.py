@@ -221,6 +221,7 @@ def test_a_process_that_ends_is_a_failure_of_that_problem_alone(
         assert not estimate.success and estimate.reason.startswith(reasons), act
 
 
+@pytest.mark.slow
 def test_a_limit_of_time_ends_it_with_its_children(tmp_path: Path, simulation: Simulation) -> None:
     note = tmp_path / "pids"
     entry = mischief(tmp_path, *SLOW, note=str(note))

@@ -220,6 +220,7 @@ def test_equal_keys_mean_equal_options() -> None:
     assert len({key, *(options.key for options in others)}) == 1 + len(others)
 
 
+@pytest.mark.slow
 def test_an_unknown_readout_ratio_is_estimated_or_declared_open(castle: Sequence) -> None:
     """The small frames do not determine it well: the answer is near the truth by its own uncertainty, or none."""
     try:

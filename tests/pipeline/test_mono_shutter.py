@@ -19,6 +19,7 @@ from rsbench.solvers.engine.robust_motion import RobustOptions
 CAMERA = PinholeCamera.centred(640, 480, 500.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ways", "refused"), [("bb", True), ("b", True), ("bf", False), ("fb", False)])
 def test_frames_are_reversed_where_each_pair_looks_so(
     ways: str, refused: bool, monkeypatch: pytest.MonkeyPatch

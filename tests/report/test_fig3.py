@@ -37,6 +37,7 @@ def write_summaries(folder: Path) -> None:
         pd.DataFrame(rows).to_csv(folder / f"{name}.csv", index=False)
 
 
+@pytest.mark.slow
 def test_equal_summaries_give_equal_bytes_without_dates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fig3, "READINGS", {"1e-3 px": 1e-3})  # each figure takes seconds
     monkeypatch.setattr(fig3, "CENTRES", ("mean",))

@@ -164,6 +164,7 @@ def test_viewpoints_are_several_and_leave_room_for_the_rig(scene: Scene) -> None
         assert first_hits(scene, view, pixel_rays(3)).min() > 1.0, view
 
 
+@pytest.mark.slow
 def test_default_views_have_depths_a_stereo_rig_can_use(scene: Scene, name: str) -> None:
     nearest, middle, farthest = DEPTHS[name]
     depths = first_hits(scene, "default", pixel_rays(9))

@@ -130,6 +130,7 @@ def test_pairs_on_a_plane_are_solved_from_the_motions_of_their_homography() -> N
     assert lost <= 3
 
 
+@pytest.mark.slow
 def test_a_second_motion_that_a_plane_allows_is_told() -> None:
     """Pure translation before a plane: two motions fit as well, and half of the time the other one fits better."""
     wrong = 0

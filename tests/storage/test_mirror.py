@@ -70,6 +70,7 @@ def without_times(files: Mapping[str, bytes]) -> dict[str, bytes]:
 # Commands
 
 
+@pytest.mark.slow
 def test_a_sweep_goes_to_a_store(memory: Any, tmp_path: Path) -> None:
     card = tmp_path / "mine.toml"
     card.write_text(SWEEP, "utf-8")

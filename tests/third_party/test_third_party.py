@@ -43,6 +43,7 @@ def test_every_kind_of_component_has_a_section() -> None:
     assert {kind for kind, _ in KINDS.values()} == set(COMPONENTS) and set(KINDS) == set(SECTIONS)
 
 
+@pytest.mark.slow
 def test_all_are_listed_and_one_is_shown(run: Run) -> None:
     listed = {row["kind"]: row["names"] for row in json.loads(run("rsbench list --json").partition("\n")[2])}
     for kind, name in KINDS.values():

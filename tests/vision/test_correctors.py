@@ -99,6 +99,7 @@ def test_what_the_other_camera_fills_counts_the_disparity_offset(world: Build, s
     assert psnr(untold.image, expected.image, both) < 30.0
 
 
+@pytest.mark.slow
 def test_each_is_wrong_in_the_scene_of_the_next(world: Build, shapes: Any) -> None:
     plane = shapes[0]((0.1, 0.1, 1.0), 5.0)
     near = world((plane, shapes[1]((0.3, 0.2, 2.0), 0.4)))
@@ -108,6 +109,7 @@ def test_each_is_wrong_in_the_scene_of_the_next(world: Build, shapes: Any) -> No
     assert gains[0] < gains[1] < best - 3.0
 
 
+@pytest.mark.slow
 def test_the_single_view_is_the_fusion_without_what_it_fills(world: Build, shapes: Any) -> None:
     scene = world((shapes[0]((0.1, 0.1, 1.0), 5.0), shapes[1]((0.3, 0.2, 2.0), 0.4)))
     problem = problem_of(scene)
@@ -129,6 +131,7 @@ def test_the_default_card_states_the_defaults() -> None:
     assert load_corrector("fusion").component == FusionCorrector()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", ["motion", "depth"])
 def test_what_is_not_known_is_not_guessed(world: Build, shapes: Any, field: str) -> None:
     scene = world((shapes[0]((0.0, 0.0, 1.0), 5.0),))

@@ -114,6 +114,7 @@ def test_what_cannot_be_corrected_says_why() -> None:
     assert refusal([textured, moved], find_flows([textured, moved])) == ""
 
 
+@pytest.mark.slow
 def test_the_corrector_is_found_by_name_and_keeps_cameras_apart(scene: Any, u8: Any) -> None:
     corrector = load_corrector("mono-fusion").component
     assert isinstance(corrector, MonoFusionCorrector)

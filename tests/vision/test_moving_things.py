@@ -57,6 +57,7 @@ def _rms(a: Any, b: Any, mask: Any) -> float:
     return float(np.sqrt(np.mean((np.asarray(a, dtype=np.float64) - b)[mask] ** 2)))
 
 
+@pytest.mark.slow
 def test_a_ball_goes_its_own_flow_and_the_wall_is_seen_beside_it(worlds: tuple[Any, Any], u8: Any) -> None:
     problem = _problem(worlds, u8)
     tau = float(problem.shutter.time_after(ROW, 1, "left"))
@@ -72,6 +73,7 @@ def test_a_ball_goes_its_own_flow_and_the_wall_is_seen_beside_it(worlds: tuple[A
     np.testing.assert_array_equal(found[True].image[~rim], found[False].image[~rim])
 
 
+@pytest.mark.slow
 def test_where_everything_stands_nothing_changes(
     worlds: tuple[Any, Any], world: Build, shapes: Any, u8: Any
 ) -> None:
@@ -94,6 +96,7 @@ def test_nothing_is_found_without_depth_or_texture(worlds: tuple[Any, Any], u8: 
         np.testing.assert_array_equal(one.image, other.image)
 
 
+@pytest.mark.slow
 def test_columns_have_times_too(worlds: tuple[Any, Any], u8: Any) -> None:
     """The same frames, said to be read by columns: at the time of a column, what it shows of the ball stays."""
     problem = _problem(worlds, u8)

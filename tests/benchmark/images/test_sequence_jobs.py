@@ -48,6 +48,7 @@ def scored(
     return contents(out)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 def test_scores_are_made_where_a_death_costs_nothing(smoke_dataset: Path, evaluated: Path, tmp_path: Path) -> None:
     mark, card = tmp_path / "killed", tmp_path / "deadly.toml"

@@ -89,6 +89,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
+@pytest.mark.slow
 def test_hostile_ones_are_refused(keeper: Path, tmp_path: Path) -> None:
     for branch, (change, words) in HOSTILE.items():
         hand_in(tmp_path, branch, change)

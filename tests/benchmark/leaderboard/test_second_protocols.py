@@ -227,6 +227,7 @@ def test_results_tell_what_laws_cost_on_frames() -> None:
     assert f"the hardest here too**, {own['spline']:.2f}, the next {best['spline']:.2f}." in words
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
 def test_results_tell_what_laws_cost_readers_of_the_ratio(tmp_path: Path) -> None:
     """The sentences below the table of ``readout-2``, those about sensors from the stored answers."""

@@ -159,6 +159,7 @@ def test_a_secret_split_needs_its_rendered_truth() -> None:
         drawn_split(TRACK, "handheld", Secret("a text that nobody can guess"))
 
 
+@pytest.mark.slow
 def test_methods_run_and_make_a_board(data: Path, split: Split, tmp_path: Path) -> None:
     board = ("--board", tmp_path / "board", "--data", data)
     entries = [word for name in ("no-motion", "gs-vo", "gyro-integrated") for word in ("--entry", name)]

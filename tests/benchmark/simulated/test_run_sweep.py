@@ -142,6 +142,7 @@ def serve(limit):
 """
 
 
+@pytest.mark.slow
 def test_a_worker_killed_twice_is_one_line_that_names_its_trials(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

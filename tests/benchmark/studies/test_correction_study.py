@@ -176,6 +176,7 @@ def test_a_failed_method_scores_the_worst_and_the_study_goes_on(
         ] * 6
 
 
+@pytest.mark.slow
 def test_methods_in_no_published_table_take_part_when_they_are_asked_for(
     smoke_dataset: Path, tables: Tables, tmp_path: Path
 ) -> None:
