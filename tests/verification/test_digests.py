@@ -13,6 +13,7 @@ import pytest
 from commands import run_here
 
 from rsbench.core.errors import RsbenchError
+from rsbench.dataset.card import load_dataset_card
 from rsbench.storage.files import read_json, write_json
 from rsbench.verification.digests import digests, read_digests
 
@@ -104,3 +105,9 @@ def test_what_is_missing_or_no_digest_is_refused(copy: Path) -> None:
     ran = run_here("digest", copy)
     assert ran.returncode == 2 and "left_0.png: is in sequence.json and not in the folder" in ran.stderr
     assert not ran.stdout
+
+
+def test_those_of_standard_are_of_all_its_sequences() -> None:
+    stored = Path(__file__).parents[2] / "results/standard/digests.txt"
+    card = load_dataset_card("standard")
+    assert list(read_digests(stored)) == [each.name for each in card.sequence]
