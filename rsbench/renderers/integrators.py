@@ -38,7 +38,7 @@ def sunsky_radiance(
     on_surface = hit.is_valid() & active
     if not dr.is_jit_v(on_surface) and not on_surface:
         return sky.seen_along(ray.d)
-    albedo = hit.bsdf().eval_diffuse_reflectance(hit, on_surface)
+    albedo = scene.reflectance(hit, on_surface)
     normal = hit.sh_frame.n
     normal = dr.select(dr.dot(normal, ray.d) > 0, -normal, normal)
     facing = dr.maximum(dr.dot(normal, sky.sun_direction), 0)

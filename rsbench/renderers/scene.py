@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import sys
 from collections.abc import Sequence
-from functools import cache
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rsbench.core.errors import RsbenchError
 from rsbench.renderers.backend import VARIANTS, start_backend
+from rsbench.renderers.reflectance import Reflectances, checked_texture, linear_codes, srgb_to_linear
 from rsbench.scenes.environment import irradiance_map
 from rsbench.scenes.model import Environment, Light, Material, Scene, SceneMesh
 
@@ -35,6 +36,7 @@ class MitsubaScene:
 
     def __init__(self, scene: Scene) -> None:
         variant = start_backend().variant
+        import drjit as dr
         import mitsuba as mi
 
         self.name = scene.name
@@ -45,26 +47,26 @@ class MitsubaScene:
             raise RsbenchError(
                 f"scene {scene.name}: objects that move are not rendered on a GPU: choose backend llvm"
             )
-        content: dict[str, Any] = {"type": "scene"}
+        content: dict[str, Any] = {"type": "scene", **_lights(scene.light)}
         moved: list[dict[str, Any]] = [{"type": "scene"} for _ in range(max((m.mover for m in drawn), default=0))]
-        # `path` picks one emitter at random for each shadow ray: black ones would only add noise.
-        if any(scene.light.sun_irradiance):
-            content["sun"] = _sun(scene.light)
-        if scene.light.environment is not None:
-            content["sky"] = _mapped(scene.light.environment.radiance, scene.light.environment)
-        elif any((*scene.light.sky_zenith, *scene.light.sky_horizon)):
-            content["sky"] = _sky(scene.light)
         self.glossy = scene.glossy
         """Whether any surface is."""
-        materials: dict[int, Any] = {}
+        bare = dr.is_jit_v(mi.Float)
+        materials: dict[int, tuple[Material, Any]] = {}
+        surfaces, self._bare = list[tuple[Any, Material]](), list[tuple[Any, Material]]()
         self.instances = [{"name": mesh.name, "material": mesh.material.name} for mesh in drawn]
         """Of the meshes with faces; the shapes of the renderer are called mesh00000 and so on."""
         for number, mesh in enumerate(drawn):
             key = id(mesh.material)
             if key not in materials:
-                materials[key] = _loaded(mesh.material)
+                own = _without_texture(mesh.material) if bare else mesh.material
+                materials[key] = own, _loaded(own)
+            own, bsdf = materials[key]
             of = moved[mesh.mover - 1] if mesh.mover else content
-            of[f"mesh{number:05d}"] = _mesh(mesh, materials[key])
+            of[f"mesh{number:05d}"] = shape = _mesh(mesh, bsdf)
+            surfaces.append((shape, mesh.material))
+            self._bare.append((shape, own))
+        self._reflectances = Reflectances(surfaces) if bare else None
         # Merging shapes of equal material, the default, depends on the order of a parallel loader.
         self.scene = mi.load_dict(content, optimize=False)
         self.objects = [mi.load_dict(each, optimize=False) for each in moved]
@@ -72,6 +74,24 @@ class MitsubaScene:
         self.balls = [_ball([m.vertices for m in drawn if m.mover == k + 1]) for k in range(len(moved))]
         self.sky = Sky(scene.light, self.scene.environment())
         gc.collect()  # `mi.traverse` leaves cyclic garbage that holds its shape, and so the textures
+
+    def reflectance(self, hit: Any, active: Any) -> Any:
+        """Diffuse reflectance (RGB) where Mitsuba's interactions are."""
+        if self._reflectances is None:
+            return hit.bsdf().eval_diffuse_reflectance(hit, active)
+        return self._reflectances.at(hit, active)
+
+    def textured(self) -> Any:
+        """Mitsuba's scene with the textures of its materials, which are loaded at the first call: for ``path``."""
+        if self._reflectances is not None:
+            materials: dict[int, Any] = {}
+            for shape, material in self._bare:
+                if id(material) not in materials:
+                    texture = self._reflectances.texture(shape)
+                    materials[id(material)] = _loaded(replace(material, texture=texture))
+                shape.set_bsdf(materials[id(material)])
+            self._bare.clear()
+        return self.scene
 
     def __del__(self) -> None:
         # Dr.Jit keeps freed memory for arrays of the same size, which another scene hardly has: hundreds of MB.
@@ -152,18 +172,22 @@ def mean_sky(light: Light) -> NDArray[np.float64]:
     return np.asarray(light.sky_horizon) / 3.0 + 2.0 * np.asarray(light.sky_zenith) / 3.0
 
 
-def srgb_to_linear(value: Any) -> NDArray[np.float64]:
-    """Linear intensity of sRGB values in [0, 1] (IEC 61966-2-1)."""
-    value = np.asarray(value, dtype=np.float64)
-    return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.0) + 0.055) / 1.055) ** 2.4)
-
-
 def _unit(vector: Any, field: str) -> NDArray[np.float64]:
     vector = np.asarray(vector, dtype=np.float64)
     norm = float(np.linalg.norm(vector))
     if not (np.isfinite(norm) and norm > 0.0):
         raise RsbenchError(f"light {field} = {tuple(vector.tolist())}: a direction is needed")
     return vector / norm
+
+
+def _lights(light: Light) -> dict[str, Any]:
+    """Sun and sky for `path`, which picks one at random for each shadow ray: black ones would only add noise."""
+    found: dict[str, Any] = {"sun": _sun(light)} if any(light.sun_irradiance) else {}
+    if light.environment is not None:
+        found["sky"] = _mapped(light.environment.radiance, light.environment)
+    elif any((*light.sky_zenith, *light.sky_horizon)):
+        found["sky"] = _sky(light)
+    return found
 
 
 def _ball(vertices: Sequence[NDArray[np.float64]]) -> tuple[Any, Any]:
@@ -213,6 +237,11 @@ def _mapped(radiance: NDArray[np.float32], environment: Environment) -> dict[str
     }
 
 
+def _without_texture(material: Material) -> Material:
+    """Unless it is glossy: of its coat Mitsuba is asked, and what is below."""
+    return replace(material, texture=None) if material.roughness is None else material
+
+
 def _loaded(material: Material) -> Any:
     """Mitsuba's twosided BSDF of a material: diffuse, or diffuse below a clear coat.
 
@@ -247,34 +276,15 @@ def _loaded(material: Material) -> Any:
 def _texture(material: Material) -> dict[str, Any]:
     import mitsuba as mi
 
-    texture = np.asarray(material.texture)
-    if texture.dtype != np.uint8 or texture.ndim != 3 or texture.shape[2] != 3 or texture.size == 0:
-        raise RsbenchError(
-            f"material {material.name!r}: texture of shape {texture.shape}, {texture.dtype}: "
-            "(h, w, 3) uint8 is needed"
-        )
     return {
         "type": "bitmap",
-        "data": mi.TensorXf(_linear_codes()[texture]),
+        "data": mi.TensorXf(linear_codes()[checked_texture(material)]),
         "raw": True,
         "filter_type": "bilinear",
         "wrap_mode": "repeat",
         "format": "variant",
         "accel": False,  # graphics hardware interpolates with 8-bit weights
     }
-
-
-@cache
-def _linear_codes() -> NDArray[np.float32]:
-    """Linear intensity (256,) of each 8-bit sRGB code, with the rounding of Mitsuba's own conversion.
-
-    Looking them up is several times faster than letting Mitsuba convert whole textures, and bit for bit the same.
-    """
-    import mitsuba as mi
-
-    codes = mi.Bitmap(np.arange(256, dtype=np.uint8).reshape(1, 256, 1).repeat(3, axis=2))
-    linear = codes.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
-    return np.array(linear)[0, :, 0]
 
 
 def _check(mesh: SceneMesh) -> None:

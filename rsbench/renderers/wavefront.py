@@ -194,6 +194,7 @@ def _path_band(
     import drjit as dr
     import mitsuba as mi
 
+    world = scene.textured()  # which evaluates what is recorded so far
     offsets = mi.Float(subpixel_grid(options.samples).ravel())
     integrator, sampler = path_integrator(options.max_depth), lane_sampler()
     pixels = _Lanes.of(rows, camera.width)
@@ -210,7 +211,7 @@ def _path_band(
         pixel = lanes.row * dr.opaque(mi.UInt32, camera.width) + lanes.column
         sampler.seed_lanes(dr.opaque(mi.UInt32, options.seed), pixel, sample)
         ray = mi.RayDifferential3f(origin, dr.normalize(direction))
-        radiance, _, _ = integrator.sample(scene.scene, sampler, ray, active=lanes.active)
+        radiance, _, _ = integrator.sample(world, sampler, ray, active=lanes.active)
         total = _added(total, radiance, copies)
     return pixels.image([*total], camera.width)[0] / np.float32(options.samples)
 

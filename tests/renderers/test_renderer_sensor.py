@@ -64,7 +64,7 @@ def test_plugin_row_equals_global_shutter_row_in_mitsubas_own_loop(scene: Mitsub
 
     def image(R: Any, t: Any) -> Any:
         sensor = make_sensor(CAMERA, R, t)
-        return np.array(mi.render(scene.scene, sensor=sensor, integrator=integrator, spp=4, seed=11))
+        return np.array(mi.render(scene.textured(), sensor=sensor, integrator=integrator, spp=4, seed=11))
 
     rolling = image(R, t)
     for row in (0, 9, 23):
@@ -82,7 +82,9 @@ def test_plugin_and_renderer_see_the_same_scene(scene: MitsubaScene, row_poses: 
         scene, CAMERA, LinePoses(R, t), RendererOptions(integrator="path", samples=1024, max_depth=3)
     ).image
     integrator = mi.load_dict({"type": "path", "max_depth": 3})
-    theirs = np.array(mi.render(scene.scene, sensor=make_sensor(CAMERA, R, t), integrator=integrator, spp=1024))
+    theirs = np.array(
+        mi.render(scene.textured(), sensor=make_sensor(CAMERA, R, t), integrator=integrator, spp=1024)
+    )
     # Deviation of a sample is about the mean radiance (0.5), of a pixel 0.5 / 32, of the difference 1.4 times it.
     assert np.sqrt(np.mean((ours - theirs) ** 2)) < 0.03
     np.testing.assert_allclose(ours.mean(axis=(0, 1)), theirs.mean(axis=(0, 1)), rtol=5e-3)
