@@ -65,7 +65,7 @@ def test_scenes_are_given_back_and_hold_no_texture_twice() -> None:
         pytest.skip("no usable LLVM on this machine")
     assert done.returncode == 0, done.stderr
     first, *later = json.loads(done.stdout.splitlines()[-1])
-    # For `sunsky` four bytes a texel, for `path` four float32 channels beside them. A quarter of the latter is four
+    # For `sunsky` four bytes a texel, for `path` four float32 channels beside them. A quarter of that is four
     # times what images, meshes and ray tracing take here, and a third of the second copy (three channels) that
     # Mitsuba keeps of a texture whose tensor was looked at. Such a copy would be in every scene; in one, on a busy
     # machine, what is about to be freed may still be there.
