@@ -1,6 +1,6 @@
 """The textures of all materials as bytes in one array, looked up by one piece of code: what ``sunsky`` asks.
 
-Mitsuba keeps a texture as four floats a pixel, five times as much, and has code for each material. The arithmetic
+Mitsuba keeps a texture as four floats a pixel, four times as much, and has code for each material. The arithmetic
 here is that of Dr.Jit's bilinear, repeated textures, bit for bit.
 """
 
@@ -96,10 +96,12 @@ def _between(coordinate: Any, size: Any) -> list[tuple[Any, Any]]:
     place = dr.fma(coordinate, mi.Float(size), -0.5)
     whole, count = dr.floor(place), mi.Int32(dr.maximum(size, 1))
     share, at = place - whole, mi.Int32(whole)
-    # Division of integers is slow; the quotient of floats may be one off.
-    at -= mi.Int32(dr.floor(whole / mi.Float(count))) * count
+    # Division of integers is slow. A quotient of floats may be off, the second one by one; what is larger than a
+    # whole number can be ends at some texel.
+    for _ in range(2):
+        at -= mi.Int32(dr.floor(mi.Float(at) / mi.Float(count))) * count
     at = dr.select(at < 0, at + count, at)
-    at = dr.select(at >= count, at - count, at)
+    at = dr.clip(dr.select(at >= count, at - count, at), 0, count - 1)
     return [(at, 1.0 - share), (dr.select(at + 1 == count, 0, at + 1), share)]
 
 

@@ -54,7 +54,7 @@ def hits(shape: Any, reach: float, size: tuple[int, int]) -> Any:
     return found
 
 
-@pytest.mark.parametrize("reach", [1.0, 40.0, 3000.0])
+@pytest.mark.parametrize("reach", [1.0, 40.0, 3000.0, 3e5])
 def test_reflectances_have_the_bits_of_mitsubas(
     scene: MitsubaScene, materials: list[Material], reach: float
 ) -> None:
@@ -76,3 +76,11 @@ def test_textures_come_back_from_their_bytes(scene: MitsubaScene, materials: lis
             assert texture is None
         else:
             np.testing.assert_array_equal(texture, material.texture)
+
+
+def test_coordinates_beyond_all_measure_end_within_the_texture(scene: MitsubaScene) -> None:
+    shapes = {shape.id(): shape for shape in scene.scene.shapes()}
+    for number in range(1, 1 + len(SIZES)):
+        for reach in (1e8, 1e20):
+            found = np.array(scene.reflectance(hits(shapes[f"mesh{number:05d}"], reach, (1, 1)), True))
+            assert np.all((found >= 0.0) & (found <= 1.0))
