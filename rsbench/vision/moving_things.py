@@ -42,6 +42,8 @@ _LEAST = 0.004
 _SAME_DEPTH, _SAME_FLOW_PX = 0.06, 3.0
 """Relative difference of inverse depth to the nearest certain pixel of a thing, up to which one is part of it, and
 of flow, up to which its own is kept."""
+_EDGE = 7
+"""Side, px, of the window in which what is nearest may hide a point: depth errs at edges."""
 _SMALLEST = 12
 """Side of an image, px, that dense flow takes (OpenCV 5.0)."""
 _STRETCH_PX = 2.5
@@ -49,6 +51,20 @@ _STRETCH_PX = 2.5
 _AGREE = 0.03
 """Relative difference of depth, below which what moves lies on what stands, and is seen."""
 _FLOW_BYTES = 100.0
+
+
+class _Still(NamedTuple):
+    """Where a still point goes: (H, W, 2) px, NaN where that is unknown, and (H, W) whether it is hidden there."""
+
+    far: F32
+    """Of a point that is somewhat farther."""
+    near: F32
+    hidden: Mask
+    """By something nearer, so that what is seen there tells nothing of the point."""
+
+    def half(self) -> _Still:
+        """Of an image of half the size."""
+        return _Still(self.far[1::2, 1::2] / 2.0, self.near[1::2, 1::2] / 2.0, self.hidden[1::2, 1::2])
 
 
 class Moving(NamedTuple):
@@ -75,14 +91,17 @@ def find_moving(
     size, grid = camera.width * camera.height, camera.pixel_grid().astype(np.float32)
     off = _DISPARITY_PX / (camera.fx * baseline)
 
-    def stays(view: View) -> tuple[F32, F32]:
-        """(H, W, 2) px by which still points go that are somewhat farther and nearer; NaN where it is unknown."""
-        axis = shutter.axis(view[0])
-        maps = reprojection_of(camera, poses[view], poses[_other(view)], (axis, axis))
+    def stays(view: View) -> _Still:
+        axis, other = shutter.axis(view[0]), _other(view)
+        maps = reprojection_of(camera, poses[view], poses[other], (axis, axis))
         lines, rho = np.indices(depth[view].shape, dtype=np.int32)[1 - axis], inverse_depth(depth[view])
-        near, far = rho + np.float32(off), np.maximum(rho - np.float32(off), np.float32(0.0))
-        ends = [reproject_pixels(maps, each, np.ascontiguousarray(lines))[0] for each in (far, near)]
-        return np.asarray(ends[0] - grid), np.asarray(ends[1] - grid)
+        both = np.maximum(rho - np.float32(off), np.float32(0.0)), rho + np.float32(off)
+        (far, first), (near, second) = (reproject_pixels(maps, each, np.ascontiguousarray(lines)) for each in both)
+        there = cv2.dilate(np.nan_to_num(inverse_depth(depth[other])), np.ones((_EDGE, _EDGE), np.uint8))
+        before = np.float32(1.0 + _SAME_DEPTH) * np.maximum(both[0] * first, both[1] * second) + np.float32(off)
+        far, near = np.asarray(far - grid), np.asarray(near - grid)
+        between = np.asarray((far + near) / 2.0, dtype=np.float32)
+        return _Still(far, near, np.asarray(followed(there, between, cv2.BORDER_CONSTANT) > before))
 
     first = VIEWS[0]
     half = camera.width // 2, camera.height // 2
@@ -90,8 +109,7 @@ def find_moving(
         return {}
     small = [np.asarray(cv2.resize(grey_u8(images[view]), half)) for view in (first, _other(first))]
     quick = dense_flow(*small), dense_flow(*small[::-1])
-    still = [way[1::2, 1::2] / 2.0 for way in stays(first)]
-    if not np.any(_moved(small, *quick, still, 0.5 * _MOVED_PX)):
+    if not np.any(_moved(small, *quick, stays(first).half(), 0.5 * _MOVED_PX)):
         return {}
     ways = map_frames(lambda view: dense_flow(images[view], images[_other(view)]), VIEWS, size, _FLOW_BYTES)
     flows, greys = dict(zip(VIEWS, ways, strict=True)), {view: grey_u8(images[view]) for view in VIEWS}
@@ -104,23 +122,23 @@ def find_moving(
     return dict(zip(VIEWS, map_frames(found, VIEWS, size, _FLOW_BYTES), strict=True))
 
 
-def _moved(greys: Sequence[NDArray[np.uint8]], flow: F32, back: F32, still: Sequence[F32], least: float) -> Mask:
-    """(H, W) large regions where a flow that is believed leads beside the ways of still points, two (H, W, 2).
+def _moved(greys: Sequence[NDArray[np.uint8]], flow: F32, back: F32, still: _Still, least: float) -> Mask:
+    """(H, W) large regions where a flow that is believed leads beside the ways of still points.
 
     And where it leads is clearly more like what is there: flow errs too.
     """
-    far, along = still[0], still[1] - still[0]
+    far, along = still.far, still.near - still.far
     share = np.sum((flow - far) * along, axis=-1) / np.maximum(np.sum(along * along, axis=-1), np.float32(1e-6))
     nearest = far + np.clip(share, 0.0, 1.0)[..., None] * along
     moved = np.linalg.norm(flow - nearest, axis=-1) > least  # False of NaN
-    moved &= returns_px(flow, back) < _RETURNS_PX
+    moved &= (returns_px(flow, back) < _RETURNS_PX) & ~still.hidden
     dense = cv2.medianBlur(moved.astype(np.uint8), _MEDIAN)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(dense, connectivity=8)
     large = stats[:, cv2.CC_STAT_AREA] >= _LEAST * moved.size
     large[0] = False
     if not np.any(large):
         return np.zeros_like(moved)
-    chosen = large[labels] & np.isfinite(nearest[..., 0])
+    chosen = large[labels] & np.isfinite(nearest[..., 0]) & ~still.hidden
     unlike = [np.bincount(labels[chosen], _unlike(greys, way)[chosen], count) for way in (flow, nearest)]
     large &= unlike[0] + _NOISE_LEVELS * np.bincount(labels[chosen], minlength=count) < _CLEARLY * unlike[1]
     return np.asarray(large[labels])

@@ -86,6 +86,22 @@ def test_where_everything_stands_nothing_changes(
         np.testing.assert_array_equal(images[0][view].image, images[1][view].image)
 
 
+def test_what_passes_before_a_plain_wall_does_not_set_it_in_motion(world: Build, shapes: Any, u8: Any) -> None:
+    """Flow runs from an edge into what has no texture, and fits there: the edge hides where geometry leads."""
+    plane, sphere = shapes
+    wall = world((plane((0.0, 0.0, 1.0), 30.0),), d=(0.4, 0.0, 0.0), **SIZE)
+    ball = world((sphere((0.0, 0.0, 4.0), 1.3),), d=(0.4, 0.0, 0.0), **SIZE)
+    seen = {view: _both((wall, ball), lambda each, view=view: each.rolling(*view)) for view in VIEWS}
+    problem = _problem((wall, ball), u8)
+    shaded = {
+        view: np.where(hit[..., None], problem.images[view], np.uint8(190)) for view, (*_, hit) in seen.items()
+    }
+    problem = replace(problem, images=shaded)
+    images = [FusionCorrector(moving=moving).correct(problem, VIEWS) for moving in (False, True)]
+    for view in VIEWS:
+        np.testing.assert_array_equal(images[0][view].image, images[1][view].image)
+
+
 def test_nothing_is_found_without_depth_or_texture(worlds: tuple[Any, Any], u8: Any) -> None:
     problem = _problem(worlds, u8)
     shape = problem.images[VIEW].shape
