@@ -1,9 +1,10 @@
 """The path tracer against Blender's Cycles at equal noise: seconds times squared relative noise, of both.
 
-The scene of boxes of ``render_rs_vs_gs.py`` in one grey, a grey sky and one sun, 400 x 400, 16 samples, paths
-of at most 4 segments, box filter, no denoiser and no adaptive sampling. The noise of each is the RMS difference
-to its own image of 1024 samples, over the mean. The time of Cycles is what 16 samples more take, without its
-start and its export of the scene; ours is of the whole frame. Blender runs in a Python of its own:
+The boxes of ``render_rs_vs_gs.py``, or the meshes of a scene (``--scene castle``), in one grey, a grey sky and one
+sun, 400 x 400, 16 samples, paths of at most 4 segments, box filter, no denoiser and no adaptive sampling. The
+noise of each is the RMS difference to its own image of 1024 samples, over the mean. The time of Cycles is what 16
+samples more take, without its start and its export of the scene; ours is of the whole frame. Blender runs in a
+Python of its own:
 
     python3.11 -m venv blender && blender/bin/pip install bpy==4.5.0
     python benchmarks/against_cycles.py --blender blender/bin/python
@@ -21,6 +22,7 @@ from typing import Any
 
 SIZE, FOCAL, SAMPLES, SEGMENTS, GREY, SKY, SUN = 400, 360.0, 16, 4, 0.5, 0.6, 2.4
 MANY, RUNS = 1024, 3
+BOXES = "boxes"
 FLIP = (1.0, -1.0, -1.0)
 
 
@@ -111,20 +113,27 @@ def ours(scene: Any) -> tuple[float, Any, Any]:
     return float(np.median(spent)), few, image(MANY, 7)
 
 
-def grey_boxes() -> Any:
-    """The scene of boxes without its textures."""
+def grey_scene(name: str) -> Any:
+    """A scene without its textures, seen by the camera at the origin."""
     from dataclasses import replace
 
     import render_rs_vs_gs
 
+    from rsbench.scenes.load import load_scene
     from rsbench.scenes.model import Light, Material
 
     grey = Material(name="grey", colour=(1.055 * GREY ** (1 / 2.4) - 0.055,) * 3)
-    boxes = render_rs_vs_gs.boxes()
-    light = Light(sun_direction=(0.5, -0.7, -0.5), up=(0, -1, 0), sun_irradiance=(SUN,) * 3)
+    sun, up = (0.5, -0.7, -0.5), (0.0, -1.0, 0.0)
+    if name == BOXES:
+        scene = render_rs_vs_gs.boxes()
+    else:
+        loaded = load_scene(name)
+        scene = loaded.seen_from(next(iter(loaded.viewpoints.values())))
+        sun, up = scene.light.sun_direction, scene.light.up
+    light = Light(sun_direction=sun, up=up, sun_irradiance=(SUN,) * 3)
     light = replace(light, sky_zenith=(SKY,) * 3, sky_horizon=(SKY,) * 3)
     return replace(
-        boxes, meshes=tuple(replace(mesh, material=grey, uv=None) for mesh in boxes.meshes), light=light
+        scene, meshes=tuple(replace(mesh, material=grey, uv=None) for mesh in scene.meshes), light=light
     )
 
 
@@ -158,8 +167,9 @@ def main() -> int:
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--blender", type=Path, required=True, help="a Python that has bpy")
+    parser.add_argument("--scene", default=BOXES, help="boxes, or a scene's card (default: %(default)s)")
     given = parser.parse_args()
-    scene = grey_boxes()
+    scene = grey_scene(given.scene)
     try:
         rows = {"Cycles": theirs(given.blender, scene), "rsbench": ours(scene)}
     except (OSError, ValueError) as error:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from rsbench.benchmark.studies.sgm_timing import Timing
 
+LAWS_FRAMES = "laws-frames"
+"""Folder of the card ``laws``."""
 STRATA = ("mild", "moderate", "aggressive", "poles")
 SCENES = ("castle", "old-town", "room")
 _FIG4 = (("paper", ""), ("moderate", "-2"), ("aggressive", "-2"))
@@ -49,41 +54,57 @@ def fig4(out: Path, data: Path) -> None:
 
 
 def correction(out: Path, data: Path, workers: int | None = None) -> None:
-    """Baselines, ours and oracles on the strata; ``workers`` processes, one per core for None."""
+    """Baselines, ours and oracles on the strata and under several laws of motion.
+
+    ``workers`` processes share the sequences, one per core for None.
+    """
     import pandas as pd
 
     from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.studies.correction_study import study_dataset
-    from rsbench.benchmark.studies.correction_summary import by_scene, summarise, summarise_bands
-    from rsbench.cli.console import progress_bar
-    from rsbench.dataset.sequence import read_dataset
+    from rsbench.benchmark.studies.correction_summary import by_law, by_scene, summarise, summarise_bands
     from rsbench.report.correction_page import write_study
     from rsbench.storage.files import write_json, write_table
 
     folder = out / "correction"
     folder.mkdir(parents=True, exist_ok=True)
-    tables: list[list[pd.DataFrame]] = [[], [], []]
-    for card in STRATA:
-        _generate(card, data)
-        with progress_bar(f"correcting {card}", len(read_dataset(data / card))) as advance:
-            kept = data / "correction" / card
-            study = study_dataset(data / card, advance, workers=workers, kept=kept)
-            for table, rows in zip(tables, study, strict=True):
-                frame = pd.DataFrame(rows)
-                frame.insert(0, "stratum", card)
-                table.append(frame)
-    images, bands, motions = (pd.concat(table, ignore_index=True) for table in tables)
+    studies = [_studied(card, card, data, workers) for card in STRATA]
+    images, bands, motions = (pd.concat(table, ignore_index=True) for table in zip(*studies, strict=True))
+    # One law in each of the strata above; of the card of all laws, the sequences without a sensor's noise.
+    laws, _, laws_motions = _studied("laws", LAWS_FRAMES, data, workers, lambda name: "-ideal-" in name)
     write_table(folder / "views.csv", images)
-    write_table(folder / "motions.csv", motions)
+    write_table(folder / "motions.csv", pd.concat([motions, laws_motions], ignore_index=True))
+    write_table(folder / "laws-views.csv", laws)
     # Of the stored figures, so that whoever has the file can make the summary again to the last digit.
     stored = pd.read_csv(folder / "views.csv")
     write_table(folder / "summary.csv", summarise(stored))
     write_table(folder / "scenes.csv", by_scene(stored))
+    write_table(folder / "laws.csv", by_law(pd.read_csv(folder / "laws-views.csv")))
     write_table(folder / "rows.csv", summarise_bands(bands))
-    records = [dataset_record(data / card) for card in STRATA]
+    records = [dataset_record(data / name) for name in (*STRATA, LAWS_FRAMES)]
     write_json(folder / "provenance.json", provenance("rsbench reproduce correction", datasets=records))
     for path in write_study(folder):
         typer.echo(f"written: {path}")
+
+
+def _studied(
+    card: str, name: str, data: Path, workers: int | None, among: Callable[[str], bool] = bool
+) -> list[pd.DataFrame]:
+    """Views, bands of rows and motions, of sequences ``among`` those of a card whose folder is ``name``."""
+    import pandas as pd
+
+    from rsbench.benchmark.studies.correction_study import study_dataset
+    from rsbench.cli.console import progress_bar
+    from rsbench.dataset.sequence import read_dataset
+
+    _generate(card, data, name)
+    folder, kept = data / name, data / "correction" / name
+    count = sum(among(sequence.name) for sequence in read_dataset(folder))
+    with progress_bar(f"correcting {card}", count) as advance:
+        study = study_dataset(folder, advance, workers=workers, kept=kept, among=among)
+    tables = [pd.DataFrame(rows) for rows in study]
+    for table in tables:
+        table.insert(0, "stratum", card)
+    return tables
 
 
 def sgm(out: Path, data: Path) -> None:
@@ -186,11 +207,11 @@ def _draw_real(places: dict[str, Path], folder: Path) -> Path:
     return draw_frames(frames, folder / "frames.jpg")
 
 
-def _generate(card: str, data: Path) -> None:
+def _generate(card: str, data: Path, name: str = "") -> None:
     """Render what is missing of a card: all its sequences, so that every target finds the same dataset."""
     from rsbench.cli.generate import generate
 
-    generate(card, str(data / card), None, workers=1)
+    generate(card, str(data / (name or card)), None, workers=1)
 
 
 def _render_right(card: str, name: str, timing: Timing, path: Path) -> None:

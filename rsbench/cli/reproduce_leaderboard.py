@@ -9,9 +9,11 @@ from typing import Any
 
 import typer
 
+from rsbench.cli.reproduce_correction import LAWS_FRAMES
+
 BOARD, LAWS, HANDHELD, FOOTAGE = "leaderboard", "laws", "handheld", "footage"
 """Folders of the boards below ``--data``."""
-_ON_FOOTAGE = ("mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu-layers", "gyro", "fusion")
+_OF_ONE_CAMERA = ("mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu-layers", "gyro", "fusion")
 """Correctors of one camera, and that of a rig for what a second one is worth."""
 
 
@@ -38,7 +40,7 @@ def laws(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.cli.generate import generate
     from rsbench.cli.leaderboard import oracles, run
 
-    board, frames, folder, count = data / LAWS, data / "laws-frames", out / LAWS, workers or os.cpu_count() or 1
+    board, frames, folder, count = data / LAWS, data / LAWS_FRAMES, out / LAWS, workers or os.cpu_count() or 1
     generate("laws", str(frames), None, workers=count)
     for track, entries in entries_of_laws().items():
         given = frames if track_of_id(track).rendered else None
@@ -110,14 +112,19 @@ def handheld(out: Path, data: Path, workers: int | None) -> None:
 
 
 def footage(out: Path, data: Path, workers: int | None) -> None:
-    """The track of one camera, on pairs of frames of the dataset ``footage``, rendered where it is missing."""
+    """The track of one camera, on frames of ``footage`` and ``standard``, rendered where they are missing."""
     from rsbench.cli.generate import generate
     from rsbench.cli.leaderboard import oracles, run
 
-    board, frames, count = data / f"{FOOTAGE}-board", data / FOOTAGE, workers or os.cpu_count() or 1
-    generate("footage", str(frames), None, workers=count)
-    run("correction-mono", list(_ON_FOOTAGE), str(board), frames, workers=count)
-    oracles("correction-mono", board, frames)
+    board, count = data / f"{FOOTAGE}-board", workers or os.cpu_count() or 1
+    # Frames of standard come without a gyroscope.
+    for name, entries in (
+        (FOOTAGE, _OF_ONE_CAMERA),
+        ("standard", [each for each in _OF_ONE_CAMERA if each != "gyro"]),
+    ):
+        generate(name, str(data / name), None, workers=count)
+        run("correction-mono", list(entries), str(board), data / name, workers=count)
+        oracles("correction-mono", board, data / name)
     publish(board, out / FOOTAGE, "rsbench reproduce footage")
 
 

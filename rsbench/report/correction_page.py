@@ -15,6 +15,8 @@ from rsbench.report import pages
 _TITLES = {method.key: method.title for method in (*METHODS, *ON_REQUEST)}
 _BOUNDED = 6
 """Sequences of a stratum below which a median has no interval, so that nothing is judged by one."""
+SIZES = ("moderate", "aggressive")
+"""Of the motions of the card ``laws``."""
 _LINES = {
     "none": ("#000000", "--", "x"),
     "gyro": ("#CC79A7", "-.", "+"),
@@ -30,22 +32,46 @@ _LINES = {
 def write_study(folder: Path) -> list[Path]:
     """README.md and rows.svg from the tables in ``folder``; returns the files."""
     images, summary = pd.read_csv(folder / "views.csv"), pd.read_csv(folder / "summary.csv")
-    page = folder / "README.md"
-    page.write_text(study_page(images, summary), "utf-8", newline="\n")
+    page, laws = folder / "README.md", pd.read_csv(folder / "laws.csv")
+    page.write_text(study_page(images, summary, laws), "utf-8", newline="\n")
     return [page, _draw_rows(pd.read_csv(folder / "rows.csv"), folder / "rows.svg")]
 
 
-def study_page(images: pd.DataFrame, summary: pd.DataFrame) -> str:
-    """The page as Markdown."""
+def study_page(images: pd.DataFrame, summary: pd.DataFrame, laws: pd.DataFrame | None = None) -> str:
+    """The page as Markdown; ``laws`` as of ``correction_summary.by_law``."""
     strata = list(dict.fromkeys(summary["stratum"]))
     return pages.markdown(
         "correction.md.j2",
         strata=", ".join(strata),
         methods=methods_among(set(summary["method"])),
         tables=[_sections(images, summary, stratum) for stratum in strata],
+        laws=[] if laws is None else [law_table(laws, size) for size in SIZES],
         findings=_findings(images, summary),
         bands=ROW_BANDS,
     )
+
+
+def law_table(laws: pd.DataFrame, size: str) -> str:
+    """By law of motion: covered PSNR, dB, of motions of one size, and in brackets what ours gains, paired."""
+    own = laws[laws["stratum"].str.endswith(f", {size}")]
+    strata = list(dict.fromkeys(own["stratum"]))
+    names = [stratum.partition(",")[0] for stratum in strata]
+    lines = [f"| {size} | " + " | ".join(names) + " |", "|" + "---|" * (1 + len(names))]
+    for method in methods_among(set(own["method"])):
+        rows = own[own["method"] == method.key].set_index("stratum")
+        cells = [_with_gain(rows.loc[stratum]) for stratum in strata]
+        lines.append(
+            "| " + " | ".join([f"**{method.title}**" if method.key == "ours" else method.title, *cells]) + " |"
+        )
+    return "\n".join(lines)
+
+
+def _with_gain(row: pd.Series) -> str:
+    score = f"{row['psnr_covered']:.1f}" + (f" ({row['failures']:.0f} failed)" if row["failures"] else "")
+    if row["method"] == "ours":
+        return score
+    low, high = (round(float(row[f"gain_{end}"]), 1) + 0.0 for end in ("low", "high"))
+    return f"{score} [{low:.1f}, {high:.1f}]"
 
 
 def _sections(images: pd.DataFrame, summary: pd.DataFrame, stratum: str) -> dict[str, str]:

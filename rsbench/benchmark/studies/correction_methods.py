@@ -13,7 +13,7 @@ class Method:
     key: str
     title: str
     kind: str
-    """``none``, ``baseline``, ``ours`` or ``oracle``."""
+    """``none``, ``baseline``, ``ours``, ``law`` (ours, told a law of motion) or ``oracle``."""
     knows: str
     """What it assumes or is given."""
     slow_scores: bool = False
@@ -64,9 +64,12 @@ METHODS = (
         key="ours",
         title="ours",
         kind="ours",
-        knows="estimated motion; SGM depth, and depth from the motion where SGM finds none",
+        knows="estimated motion, of the law that the matches prefer; SGM depth, and depth from the motion where "
+        "SGM finds none",
         slow_scores=True,
     ),
+    Method(key="linear", title="ours, linear", kind="law", knows="the same, told that the motion is `linear`"),
+    Method(key="twist", title="ours, twist", kind="law", knows="the same, told that the motion is a `twist`"),
     Method(key="true-motion", title="true motion, SGM depth", kind="oracle", knows="true motion; depth as ours"),
     Method(key="true-depth", title="our motion, true depth", kind="oracle", knows="true depth"),
     Method(key="truth", title="true motion, true depth", kind="oracle", knows="true motion and depth"),

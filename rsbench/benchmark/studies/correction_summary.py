@@ -85,6 +85,15 @@ def by_scene(images: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
+def by_law(images: pd.DataFrame) -> pd.DataFrame:
+    """``summarise`` of sequences of the card ``laws``, a stratum for each law and size of its motions.
+
+    A sequence is named after its scene, law, size, sensor and seed: ``old-town-twist-moderate-ideal-1``.
+    """
+    names = images["sequence"].str.rsplit("-", n=4, expand=True)
+    return summarise(images.assign(stratum=names[1] + ", " + names[2]))
+
+
 def _interval(name: str, values: FloatArray) -> dict[str, float]:
     """Median and its interval; NaN where nothing is known."""
     known = values[np.isfinite(values)]

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.benchmark.studies.correction_study import WORST, Bench
+from rsbench.benchmark.studies.correction_bench import Bench
+from rsbench.benchmark.studies.correction_study import WORST
 from rsbench.core.geometry import GivenGeometry
 from rsbench.core.rig import Side
 from rsbench.dataset.sequence import Sequence

@@ -1,0 +1,217 @@
+"""What the methods of the correction study share on one sequence: frames, matches, motions and depths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.benchmark.scoring import pose_errors
+from rsbench.benchmark.seeds import generator
+from rsbench.benchmark.studies.correction_methods import ON_REQUEST
+from rsbench.benchmark.studies.layer_methods import asked_layers
+from rsbench.benchmark.studies.resumable_rows import Row
+from rsbench.benchmark.studies.rotation_methods import asked_rotation
+from rsbench.capture.settle import NoMotionError
+from rsbench.core.geometry import GivenGeometry
+from rsbench.core.motion import Motion
+from rsbench.core.rig import SIDES, VIEWS, Side, View
+from rsbench.dataset.sequence import Sequence
+from rsbench.pipeline.baseline_motions import global_shutter_motion, kept_matches, monocular_motion, solved_alone
+from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import Pairs, frame_pairs, known_depth
+from rsbench.pipeline.frame_matches import find_matches
+from rsbench.pipeline.frame_motion import FoundMotion, find_motion, model_to_use
+from rsbench.pipeline.one_camera import ZhuangCorrector, depth_alone
+from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.vision.baseline_depths import plane_depth
+from rsbench.vision.correction import correction_flow
+from rsbench.vision.corrector import load_corrector
+from rsbench.vision.fusion import Fused, Origin
+
+Depth = NDArray[np.float32]
+_SCALED, _MONOCULAR = "gs-stereo-tracks-scaled", "gs-poselib-scaled"
+_OF_LAW = {"linear": "rs-stereo-refined", "twist": "rs-stereo-refined-twist"}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Attempt:
+    """What a method made of one view."""
+
+    image: NDArray[Any]
+    """(H, W, C), every pixel."""
+    covered: NDArray[np.bool_]
+    """(H, W) pixels drawn from the frame itself at a depth that was not guessed."""
+    flow: NDArray[np.float32]
+    """(H, W, 2) where it moves the pixels of the rolling-shutter frame, px; NaN where it does not know."""
+
+
+class Bench:
+    """Everything the methods share on one sequence."""
+
+    def __init__(self, sequence: Sequence, seed: int, solver: str = "rs-stereo-refined") -> None:
+        self.sequence = sequence
+        entry = load_solver_entry(solver)
+        self.options = CorrectionOptions(inpaint=True, solver=entry, motion_model=model_to_use(None, entry))
+        self.images = {view: sequence.image("rs", *view) for view in VIEWS}
+        self.rig, self.shutter = sequence.rig, sequence.shutter
+        self.matches = find_matches(self.images, self.options)
+        self._seed = seed
+        self.found = self._found("rs", self.options)
+        self.scaled = self._found("gs-scaled", self._told(_SCALED))
+        self.of_law = {law: self._found("rs", self._told(name)) for law, name in _OF_LAW.items()}
+        rng = generator(seed, "study", sequence.name, "gs")
+        self.gs_motion = global_shutter_motion(self.matches, self.rig, self.options.robust, rng)
+        self.sgm = frame_pairs(self.images, self.rig, self.options)
+        true = {view: sequence.depth("rs", *view) for view in VIEWS}
+        self.true = known_depth(
+            self.images, {view: np.where(z > 0, z, np.float32(np.inf)) for view, z in true.items()}
+        )
+
+    def _told(self, solver: str) -> CorrectionOptions:
+        """With a solver that takes its own law of motion, whatever the matches prefer."""
+        return replace(self.options, solver=load_solver_entry(solver), motion_model=None)
+
+    def _found(self, name: str, options: CorrectionOptions) -> FoundMotion | None:
+        rng = generator(self._seed, "study", self.sequence.name, name)
+        try:
+            return find_motion(self.matches, self.rig, self.shutter, options, rng)
+        except NoMotionError:
+            return None
+
+    @property
+    def motion(self) -> Motion | None:
+        """Ours, of the law that the matches prefer; None when there is none."""
+        return _motion(self.found)
+
+    def motion_errors(self) -> Row:
+        """e_R and e_T, degrees, of our motion and of the global-shutter ones; a failure scores the worst."""
+        true, nothing = self.sequence.motion, np.full(3, np.nan)
+        row: Row = {}
+        motions = {"ours": self.motion, "gs": self.gs_motion, "gs_scaled": _motion(self.scaled)}
+        for name, motion in (motions | {law: _motion(found) for law, found in self.of_law.items()}).items():
+            w, d = (nothing, nothing) if motion is None else (motion.w, motion.d)
+            errors = pose_errors(w, d, true_w=true.w, true_d=true.d, rig=self.rig)
+            row |= {f"{error}_{name}": float(errors[error]) for error in ("e_R_deg", "e_T_deg")}
+        return row
+
+    def attempt(self, key: str) -> dict[View, Attempt] | None:
+        """What one method makes of the views, but those in which it found no motion; None when in none."""
+        true = self.sequence.motion
+        if key == "none":
+            return self._nothing()
+        alone = {"mono": self._velocity, "gs-mono": self._scaled_monocular, "zhuang": self._zhuang}
+        if key in alone:
+            return self._mono(alone[key])
+        if key == "vasu-layers":
+            layered = asked_layers(key, self.sequence, self.images, self.matches, self._seed)
+            return {view: _attempt(fused, flow) for view, (fused, flow) in layered.items()}
+        if key in _ASKED:
+            return self._turned(key)
+        motions = {"gs": self.gs_motion, "gyro": true, "true-motion": true, "truth": true}
+        motions |= {"gs-scaled": _motion(self.scaled), **{law: _motion(each) for law, each in self.of_law.items()}}
+        motion = motions.get(key, self.motion)
+        if motion is None:
+            return None
+        pairs = self.true if key in ("true-depth", "truth") else self.sgm
+        frames, pairs = self.corrected(pairs, motion, _CORRECTORS.get(key, "fusion"))
+        out = {}
+        for (side, frame), fused in frames.items():
+            depth = _DEPTHS.get(key, _as_it_is)(pairs[frame].depth[side])
+            flow = correction_flow(depth, GivenGeometry(self.rig, self.shutter, motion), (side, frame))
+            out[side, frame] = _attempt(fused, flow)
+        return out
+
+    def corrected(
+        self, pairs: Pairs, motion: Motion, corrector: str = "fusion", views: tuple[View, ...] = VIEWS
+    ) -> tuple[dict[View, Fused], Pairs]:
+        """Frames by the chain from a depth and a motion, and the depth that the corrector was given."""
+        # Simpler corrections know one camera's frame, and no depth from two of them.
+        options = replace(
+            self.options, corrector=load_corrector(corrector), depth_from_motion=corrector == "fusion"
+        )
+        given = Given(matches=self.matches, motion=motion, pairs=pairs)
+        ratio = self.shutter.readout_ratio
+        result = correct_four(self.images, self.rig, ratio, options, given=given, views=views)
+        return result.frames, result.pairs or pairs
+
+    def _nothing(self) -> dict[View, Attempt]:
+        flow = np.zeros((self.rig.camera.height, self.rig.camera.width, 2), dtype=np.float32)
+        return {view: _attempt(fused, flow) for view, fused in uncorrected(self.images).items()}
+
+    def _velocity(self, side: Side) -> Motion | None:
+        start = self.of_law["linear"]
+        if start is None:
+            return None
+        inliers = kept_matches(self.matches, start.robust)
+        return monocular_motion(inliers, self.rig, self.shutter, side, start.motion)
+
+    def _scaled_monocular(self, side: Side) -> Motion | None:
+        rng = generator(self._seed, "study", self.sequence.name, "gs-mono", side)
+        solver = load_solver_entry(_MONOCULAR).solver
+        return solved_alone(self.matches, self.rig, self.shutter, side, solver, self.options.robust, rng)
+
+    def _zhuang(self, side: Side) -> Motion | None:
+        return ZhuangCorrector(seed=self._seed).motion(self.matches, self.rig, self.shutter, side)
+
+    def _turned(self, key: str) -> dict[View, Attempt]:
+        """By a rotation that may be another one in each view."""
+        out: dict[View, Attempt] = {}
+        far = _infinitely_far(self.true[0].depth["left"])
+        for view in VIEWS:
+            motion = asked_rotation(key, self.sequence, self.images, view)
+            if motion is not None:
+                frames, _ = self.corrected(self.sgm, motion, "rotation-only", (view,))
+                flow = correction_flow(far, GivenGeometry(self.rig, self.shutter, motion), view)
+                out[view] = _attempt(frames[view], flow)
+        return out
+
+    def _mono(self, motion_of: Callable[[Side], Motion | None]) -> dict[View, Attempt] | None:
+        """Each camera by itself: its motion from its own matches, depth from its own flow in the same unit."""
+        motions: dict[str, Motion] = {}
+        for side in SIDES:
+            motion = motion_of(side)
+            if motion is None:
+                return None
+            motions[side] = motion
+        depth = {}
+        for side, frame in VIEWS:
+            about = self.rig.about(side)
+            depth[side, frame] = depth_alone(self.images, about, self.shutter, motions[side], (side, frame))
+        options = replace(self.options, corrector=load_corrector("single-view"))
+        out: dict[View, Attempt] = {}
+        for view in VIEWS:
+            geometry = self.rig.about(view[0]), self.shutter, motions[view[0]]
+            frames = correct_frames(self.images, known_depth(self.images, depth), *geometry, options, (view,))
+            out[view] = _attempt(frames[view], correction_flow(depth[view], GivenGeometry(*geometry), view))
+        return out
+
+
+def _motion(found: FoundMotion | None) -> Motion | None:
+    return None if found is None else found.motion
+
+
+def _infinitely_far(depth: Depth) -> Depth:
+    return np.full_like(depth, np.inf)
+
+
+def _as_it_is(depth: Depth) -> Depth:
+    return depth
+
+
+_ASKED = {method.key for method in ON_REQUEST}
+_CORRECTORS = {"gyro": "rotation-only", "rotation": "rotation-only", "plane": "one-plane"}
+_DEPTHS: dict[str, Callable[[Depth], Depth]] = {
+    "gyro": _infinitely_far,
+    "rotation": _infinitely_far,
+    "plane": plane_depth,
+}
+"""The depth with which a method's corrector moves pixels, from the depth that it is given."""
+
+
+def _attempt(fused: Fused, flow: NDArray[np.float32]) -> Attempt:
+    return Attempt(image=fused.image, covered=fused.origin == Origin.HERE, flow=flow)
