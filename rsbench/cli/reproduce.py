@@ -51,6 +51,7 @@ class Target(StrEnum):
     sweeps = "sweeps"
     fig4 = "fig4"
     correction = "correction"
+    laws_correction = "laws-correction"
     sgm = "sgm"
     real = "real"
     leaderboard = "leaderboard"
@@ -75,6 +76,7 @@ _MINUTES = {
     Target.sweeps: 9,
     Target.fig4: 9,
     Target.correction: 67,
+    Target.laws_correction: 90,
     Target.sgm: 1,
     Target.real: 19,
     Target.leaderboard: 20,
@@ -105,7 +107,8 @@ def reproduce(
             "solver. readings: the claims in settings that it does not state. image-claims: those about images, "
             "from stored results. sweeps: the other simulations. "
             "fig4: its Figure 4 in every scene, for three motions. correction: baselines, ours and oracles on "
-            "mild, moderate, aggressive and poles. sgm: stereo matching when the cameras' rows are not in step. "
+            "mild, moderate, aggressive and poles. laws-correction: the same under five laws of motion. "
+            "sgm: stereo matching when the cameras' rows are not in step. "
             "real: the default pipeline on rendered frames with lens, blur and noise, beside an ideal camera's. "
             "leaderboard: our solvers on the public split of points, its site, and the scores of the smoke run. "
             "laws: points and frames under several laws of motion, with the predictions of solvers. "
@@ -170,8 +173,8 @@ def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds
             stack.enter_context(work_folder(out / name))
         if target is Target.images:
             _images(out, data, seeds)
-        elif target is Target.correction:
-            _correction(out, data, workers)
+        elif target in (Target.correction, Target.laws_correction):
+            _correction(target, out, data, workers)
         elif target is Target.real:
             _real(out, data, seeds, width)
         elif target in _TRACKS:
@@ -182,10 +185,10 @@ def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds
             _simulated(target, out, data, workers)
 
 
-def _correction(out: Path, data: Path, workers: int | None) -> None:
-    from rsbench.cli.reproduce_correction import correction
+def _correction(target: Target, out: Path, data: Path, workers: int | None) -> None:
+    from rsbench.cli.reproduce_correction import correction, laws_correction
 
-    correction(out, data, workers)
+    (correction if target is Target.correction else laws_correction)(out, data, workers)
 
 
 def _leaderboard(target: Target, out: Path, data: Path, workers: int | None) -> None:

@@ -32,20 +32,35 @@ _LINES = {
 def write_study(folder: Path) -> list[Path]:
     """README.md and rows.svg from the tables in ``folder``; returns the files."""
     images, summary = pd.read_csv(folder / "views.csv"), pd.read_csv(folder / "summary.csv")
-    page, laws = folder / "README.md", pd.read_csv(folder / "laws.csv")
-    page.write_text(study_page(images, summary, laws), "utf-8", newline="\n")
+    page = folder / "README.md"
+    page.write_text(study_page(images, summary), "utf-8", newline="\n")
     return [page, _draw_rows(pd.read_csv(folder / "rows.csv"), folder / "rows.svg")]
 
 
-def study_page(images: pd.DataFrame, summary: pd.DataFrame, laws: pd.DataFrame | None = None) -> str:
-    """The page as Markdown; ``laws`` as of ``correction_summary.by_law``."""
+def write_laws(folder: Path) -> Path:
+    """README.md from the table ``by_law`` in ``folder``."""
+    page = folder / "README.md"
+    page.write_text(laws_page(pd.read_csv(folder / "summary.csv")), "utf-8", newline="\n")
+    return page
+
+
+def laws_page(summary: pd.DataFrame) -> str:
+    """The page of frames under several laws of motion, as Markdown; ``summary`` as of ``by_law``."""
+    return pages.markdown(
+        "laws-correction.md.j2",
+        methods=methods_among(set(summary["method"])),
+        tables=[law_table(summary, size) for size in SIZES],
+    )
+
+
+def study_page(images: pd.DataFrame, summary: pd.DataFrame) -> str:
+    """The page as Markdown."""
     strata = list(dict.fromkeys(summary["stratum"]))
     return pages.markdown(
         "correction.md.j2",
         strata=", ".join(strata),
         methods=methods_among(set(summary["method"])),
         tables=[_sections(images, summary, stratum) for stratum in strata],
-        laws=[] if laws is None else [law_table(laws, size) for size in SIZES],
         findings=_findings(images, summary),
         bands=ROW_BANDS,
     )
