@@ -18,6 +18,7 @@ from rsbench.capture.evidence import Peak
 from rsbench.capture.hypotheses import ACCELERATION, CALIBRATION, MODELS, Known
 from rsbench.capture.rectification import row_pattern
 from rsbench.capture.scans import ALL_SCANS, GLOBAL, Scans, scans_of
+from rsbench.capture.trajectory_data import thinned
 from rsbench.components.motion_models import make_motion
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
@@ -26,6 +27,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.kernel_type import load_kernel
+from rsbench.solvers.engine.robust_motion import RobustOptions
 
 AUTO = "auto"
 _MAX_SIGMA, _HARMLESS_PX = 0.1, 1.0
@@ -43,6 +45,8 @@ _SAME_DEG, _SAME_PERCENT = 1e-3, 1e-3
 """Differences of motions that say nothing, as between all models under a global shutter."""
 _CLEARLY, LEAST_BACKWARDS, _NEAR = 0.999, 0.25, 0.2
 """Probability of the opposite scan at which frames are refused, and the ratio from which their order shows."""
+_FEW = 600
+"""Tracks, or matches of one camera, that tell of most frames that time runs forward."""
 _AXES = ("tilt", "pan", "roll", "sideways motion", "vertical motion", "forward motion")
 
 
@@ -203,20 +207,29 @@ def runs_backwards(capture: Capture, scans: Scans) -> bool:
     return best.probability > _CLEARLY and best.ratio >= LEAST_BACKWARDS
 
 
-def finds_shutter(capture: Capture, scans: Scans, ratio: float) -> bool:
-    """Whether the matches ask, beyond doubt, for lines that are read so, at a ratio near this one."""
-    best = capture.likeliest
-    if best is None or best.scans != scans or best.probability <= _CLEARLY:
-        return False
-    return best.sigma <= _NEAR and abs(best.ratio - ratio) <= _NEAR
+def scans_by_laws(
+    matches: Correspondences,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    models: tuple[str, ...],
+    options: RobustOptions,
+    seed: int,
+    start: Motion | None = None,
+) -> Scans | None:
+    """How lines are read, as is said or from the opposite side, by laws of motion, beyond doubt; None: unknown.
 
-
-def backwards_known(
-    matches: Correspondences, rig: StereoRig, shutter: RollingShutter, models: tuple[str, ...]
-) -> Known:
-    """What is known of a shutter whose lines may be read from the opposite side, at any ratio."""
-    known = known_of(matches, rig, None, shutter.scanning, None, models)
-    return replace(known, delay=shutter.right_delay)
+    Near the ratio that is said: where none of them holds, laws find any. Of most frames a part of the matches
+    tells that they are as is said; all are asked where it does not. ``start`` is as in ``examine``.
+    """
+    few, found = thinned([matches], _FEW)[0], None
+    for part in (matches,) if few is matches else (few, matches):
+        known = replace(known_of(part, rig, None, shutter.scanning, None, models), delay=shutter.right_delay)
+        best = conclude([examine(part, rig, known, options, seed, start)]).likeliest
+        certain = best is not None and best.probability > _CLEARLY and best.sigma <= _NEAR
+        found = best.scans if best and certain and abs(best.ratio - shutter.readout_ratio) <= _NEAR else None
+        if found == scans_of(shutter):
+            break
+    return found
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

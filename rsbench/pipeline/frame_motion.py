@@ -17,12 +17,11 @@ from rsbench.capture.settle import (
     ModelChoice,
     NoMotionError,
     as_global,
-    backwards_known,
     choose_model,
-    finds_shutter,
     known_of,
     reversed_scans,
     runs_backwards,
+    scans_by_laws,
     shutter_found,
     spline_choice,
     spread_by_unknowns,
@@ -388,13 +387,11 @@ def _runs_backwards(
     """
     if shutter.readout_ratio < LEAST_BACKWARDS or not shutter.plain:
         return False
-    shakes, said = isinstance(found.motion, ContinuousMotion), scans_of(shutter)
-    opposite = reversed_scans(said)
+    shakes, opposite = isinstance(found.motion, ContinuousMotion), reversed_scans(scans_of(shutter))
     if shakes:
         other = replace(shutter, scan=opposite.left, right_scan=opposite.right)  # pyrefly: ignore
         if log_odds_of_opposite(matches, rig, shutter, other, found.motion, options.seed) <= _BEYOND_DOUBT:
             return False
-    known, start = backwards_known(matches, rig, shutter, models_asked(options.motion_model)), found.motion
-    capture = conclude([examine(matches, rig, known, options.robust, options.seed, None if shakes else start)])
-    ratio = shutter.readout_ratio
-    return not finds_shutter(capture, said, ratio) if shakes else finds_shutter(capture, opposite, ratio)
+    models, start = models_asked(options.motion_model), None if shakes else found.motion
+    scans = scans_by_laws(matches, rig, shutter, models, options.robust, options.seed, start)
+    return scans != scans_of(shutter) if shakes else scans == opposite
