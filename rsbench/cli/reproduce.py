@@ -35,7 +35,7 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench reproduce handheld --out results --data data     [dim](footage from hands: an hour of a core)[/dim]
 
-  rsbench reproduce footage --out results --data data      [dim](one camera's frames: half an hour of a core)[/dim]
+  rsbench reproduce footage --out results --data data      [dim](one camera's frames: 2 hours)[/dim]
 
   rsbench reproduce everything                             [dim](hours; goes on where it stopped)[/dim]"""
 
@@ -76,14 +76,14 @@ _MINUTES = {
     Target.sweeps: 9,
     Target.fig4: 9,
     Target.correction: 67,
-    Target.laws_correction: 90,
+    Target.laws_correction: 30,
     Target.sgm: 1,
     Target.real: 19,
     Target.leaderboard: 20,
     Target.laws: 240,
     Target.boards: 180,
     Target.handheld: 45,
-    Target.footage: 30,
+    Target.footage: 110,
     Target.image_claims: 1,
 }
 """Of two cores, as measured in November 2026: for the time that is left of everything, not as a promise."""
