@@ -34,7 +34,7 @@ from rsbench.pipeline.array_correction import of_rig, options_of
 from rsbench.pipeline.chain import uncorrected
 from rsbench.pipeline.mono_correction import MonoFusionCorrector
 from rsbench.renderers.backend import start_backend
-from rsbench.vision.closing import close_narrow
+from rsbench.vision.closing import finished
 from rsbench.vision.corrector import CorrectionProblem
 from rsbench.vision.fusion import Fused
 from rsbench.vision.published_quality import flip
@@ -83,7 +83,7 @@ def edge_rows(sequence: recorded.Sequence) -> list[dict[str, object]]:
     methods: dict[str, Mapping[View, Fused]] = {
         "uncorrected": uncorrected(images),
         "fusion": of_rig(frames, known[0], known[1].readout_ratio, options, close=True).frames,
-        "mono-fusion": {view: close_narrow(fused) for view, fused in alone.items()},
+        "mono-fusion": {view: finished(fused) for view, fused in alone.items()},
     }
     rows = []
     for view in VIEWS:

@@ -27,7 +27,7 @@ from rsbench.pipeline.array_correction import options_of
 from rsbench.pipeline.footage import FrameSource
 from rsbench.pipeline.mono_sequence import MonoMoment, MonoOptions, correct_frames
 from rsbench.pipeline.sequence_correction import correct_sequence
-from rsbench.vision.closing import close_narrow
+from rsbench.vision.closing import finished
 
 WAYS = ("uncorrected", "two frames", "video", "both cameras")
 
@@ -55,7 +55,7 @@ def scores(sequence: Sequence, most: int) -> Iterator[list[float]]:
         if k == 0:
             continue
         two = alone(frames[k - 1 : k + 1])[1].fused.image
-        both = close_narrow(moment.frames["left"]).image if "left" in moment.frames else frames[k]
+        both = finished(moment.frames["left"]).image if "left" in moment.frames else frames[k]
         truth = sequence.image("gs", "left", k, row)
         yield [psnr(image, truth) for image in (frames[k], two, video[k].fused.image, both)]
 

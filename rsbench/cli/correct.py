@@ -88,10 +88,10 @@ def _correct_given(given: Given, target: str, options: CorrectionOptions, close:
     from rsbench.capture.settle import NoMotionError
     from rsbench.cli.compile_ahead import compiling_ahead
     from rsbench.pipeline.isolated_parts import Isolation
-    from rsbench.vision.closing import close_narrow
+    from rsbench.vision.closing import finished
     from rsbench.vision.corrector import NotCorrectedError
 
-    finish: Finish = close_narrow if close else lambda fused: fused
+    finish: Finish = finished if close else lambda fused: fused
     try:
         with compiling_ahead(), Isolation() as isolation:
             options = isolation.chain(options)

@@ -138,9 +138,9 @@ def _write(folder: Path, moment: CorrectedMoment, close: bool, rows: RollingShut
     import numpy as np
 
     from rsbench.dataset.corrected_frames import motion_record, write_entry, write_frame, write_poses
-    from rsbench.vision.closing import close_narrow
+    from rsbench.vision.closing import finished
 
-    finish: Callable[[Fused], Fused] = close_narrow if close else lambda fused: fused
+    finish: Callable[[Fused], Fused] = finished if close else lambda fused: fused
     entry: dict[str, Any] = {"number": moment.number}
     for side, fused in moment.frames.items():
         finished = finish(fused)

@@ -20,7 +20,7 @@ from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.pipeline.mono_sequence import correct_all
 from rsbench.solvers.engine.base import Solver
 from rsbench.solvers.engine.registry import entry_of
-from rsbench.vision.closing import close_narrow
+from rsbench.vision.closing import finished
 from rsbench.vision.corrector import demand_corrected, load_corrector
 from rsbench.vision.feature_matcher import load_features
 from rsbench.vision.fusion import Fused
@@ -67,7 +67,7 @@ def of_rig(
     demand_corrected(found.frames, options.corrector.name)
     if not close:
         return found
-    return replace(found, frames={view: close_narrow(fused) for view, fused in found.frames.items()})
+    return replace(found, frames={view: finished(fused) for view, fused in found.frames.items()})
 
 
 def of_one_camera(

@@ -39,7 +39,7 @@ from rsbench.pipeline.mono_shutter import find_shutter
 from rsbench.pipeline.mono_ways import PIXELS, SeenPair, group_of, on_ways
 from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.pipeline.turned_frames import Turned, turned
-from rsbench.vision.closing import close_narrow
+from rsbench.vision.closing import finished
 from rsbench.vision.frame_threads import map_ahead
 from rsbench.vision.fusion import Fused
 from rsbench.vision.mono_fusion import Beyond, Flows, MonoFusion, MonoFusionOptions, find_flows
@@ -73,7 +73,7 @@ class MonoOptions:
     target_row: float | None = None
     """The time of this row of a frame is that of its corrected image; None: of the middle one."""
     close: bool = True
-    """Whether narrow holes that the corrector leaves are closed (``close_narrow``)."""
+    """Whether frames are ``finished`` for a person: narrow holes closed, seams even."""
 
     @classmethod
     def of(cls, inpaint: bool | None, seed: int, target_row: float | None) -> MonoOptions:
@@ -316,7 +316,7 @@ def _moment(each: _Frame, turn: Turned, options: MonoOptions) -> MonoMoment:
     fusion, place, found = good[0]
     beyond = Beyond(good[1][0], good[1][1], times[good[1][1]]) if len(good) > 1 else None
     fused = fusion.corrected(place, times[place], beyond)
-    fused = turn.back(close_narrow(fused) if options.close else fused)
+    fused = turn.back(finished(fused) if options.close else fused)
     return MonoMoment(number=each.number, image=each.image, fused=fused, found=turn.found(found), skipped=why)
 
 

@@ -43,7 +43,7 @@ class Origin(IntEnum):
     OTHER_FRAME = 4
     """A frame of the other time, of either camera."""
     INVENTED = 5
-    """No frame: a hole so narrow that it was closed from its surroundings (``close_narrow``)."""
+    """No frame: a hole so narrow that it was closed from its surroundings."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

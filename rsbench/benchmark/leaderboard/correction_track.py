@@ -34,7 +34,7 @@ from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.storage.files import write_bytes
-from rsbench.vision.closing import close_narrow
+from rsbench.vision.closing import finished
 from rsbench.vision.corrector import demand_corrected, load_corrector
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.fusion import Fused, Origin
@@ -186,7 +186,7 @@ class CorrectionTrack(PictureTrack):
             frames, seconds = self.corrected(making, chain)
             for each, found in zip(making.asked, frames, strict=True):
                 demand_corrected(found, chain.corrector.name)
-                fused = close_narrow(found[VIEW])
+                fused = finished(found[VIEW])
                 drawn[each.stem] = frame_png(fused.image, fused.origin != Origin.NOBODY)
         except RsbenchError as error:
             return {"success": False, "reason": str(error)[:300]}
