@@ -84,16 +84,16 @@ def laws_correction(out: Path, data: Path, workers: int | None = None) -> None:
     import pandas as pd
 
     from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.studies.correction_summary import by_law
+    from rsbench.benchmark.studies.correction_summary import by_law, by_sequence
     from rsbench.report.correction_page import write_laws
     from rsbench.storage.files import write_json, write_table
 
     folder = out / "laws-correction"
     folder.mkdir(parents=True, exist_ok=True)
     images, _, motions = _studied("laws", LAWS_FRAMES, data, workers, lambda name: "-ideal-" in name)
-    write_table(folder / "views.csv", images)
+    write_table(folder / "sequences.csv", by_sequence(images))
     write_table(folder / "motions.csv", motions)
-    write_table(folder / "summary.csv", by_law(pd.read_csv(folder / "views.csv")))
+    write_table(folder / "summary.csv", by_law(pd.read_csv(folder / "sequences.csv")))
     records = [dataset_record(data / LAWS_FRAMES)]
     write_json(folder / "provenance.json", provenance("rsbench reproduce laws-correction", datasets=records))
     typer.echo(f"written: {write_laws(folder)}")
