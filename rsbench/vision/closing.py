@@ -23,7 +23,7 @@ _RADIUS_PX = 3.0
 _SEAM_PX, _JUMP = 0.5, 0.05
 """Deviation of the blur along seams, and relative difference of depths from which they are borders of things."""
 _FAR = 1e6
-"""Metres, in place of infinite and unknown depth."""
+"""Metres, or what else depth is in, in place of infinite and unknown depth."""
 
 
 def narrow(holes: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -61,7 +61,8 @@ def _closed(fused: Fused) -> Fused:
 
 def _even_seams(fused: Fused) -> Fused:
     """Blurred by half a pixel where one source ends and another begins, at a jump of the depth."""
-    distance = np.log(np.where(np.isfinite(fused.depth), fused.depth, np.float32(_FAR)))
+    known = np.isfinite(fused.depth) & (fused.depth > 0.0)
+    distance = np.log(np.where(known, fused.depth, np.float32(_FAR)))
     sources, jumps = (
         _beside([np.abs(np.diff(each, axis=axis)) > least for axis in (0, 1)])
         for each, least in ((fused.origin.astype(np.int16), 0), (distance, np.log1p(_JUMP)))
