@@ -165,11 +165,16 @@ def theirs(blender: Path, scene: Any) -> tuple[float, Any, Any]:
 def main() -> int:
     import numpy as np
 
+    from rsbench.core.errors import RsbenchError
+
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--blender", type=Path, required=True, help="a Python that has bpy")
     parser.add_argument("--scene", default=BOXES, help="boxes, or a scene's card (default: %(default)s)")
     given = parser.parse_args()
-    scene = grey_scene(given.scene)
+    try:
+        scene = grey_scene(given.scene)
+    except RsbenchError as error:
+        parser.error(f"--scene: {error}")
     try:
         rows = {"Cycles": theirs(given.blender, scene), "rsbench": ours(scene)}
     except (OSError, ValueError) as error:
