@@ -35,7 +35,7 @@ METHODS = (
         title="GS motion of scaled matches, SGM depth",
         kind="baseline",
         knows="`gs-stereo-tracks-scaled`: motion as if the shutter was global, of matches scaled to one "
-        "frame period by their rows, which suits a twist (the data are linear); depth as ours, with that motion",
+        "frame period by their rows, which suits a twist; depth as ours, with that motion",
         slow_scores=True,
     ),
     Method(
