@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from rsbench.benchmark.metric_plugins import METRICS, Case, MetricEntry
 from rsbench.components import plugins
 from rsbench.core.errors import RsbenchError
+from rsbench.core.given import LARGEST
 from rsbench.core.pose_errors import (
     WORST_ANGLE,
     WORST_SCALE,
@@ -31,8 +32,9 @@ WORST_POSE = {"e_R_deg": 180.0, "e_T_deg": 180.0, "e_s": WORST_SCALE}
 
 
 def answered(w: ArrayLike, d: ArrayLike, success: ArrayLike = True) -> NDArray[np.bool_]:
-    """Whether estimates (..., 3), (..., 3) are answers: successful (...) by their own word, and finite."""
-    finite = np.all(np.isfinite(w), axis=-1) & np.all(np.isfinite(d), axis=-1)
+    """Whether estimates (..., 3), (..., 3) are answers: marked as successful (...), finite, and with a ``w`` whose
+    square does not overflow."""
+    finite = np.all(np.abs(w) <= LARGEST, axis=-1) & np.all(np.isfinite(d), axis=-1)
     return np.asarray(success, dtype=np.bool_) & finite
 
 

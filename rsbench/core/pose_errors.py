@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core import so3
 from rsbench.core.so3 import FloatArray
@@ -21,9 +21,10 @@ def rotation_error(w_est: ArrayLike, w_gt: ArrayLike) -> FloatArray:
 def translation_error(d_est: ArrayLike, d_gt: ArrayLike) -> FloatArray:
     """e_T in radians, in [0, pi]: signed angle between translations (..., 3) of the same point of the rig.
 
-    NaN when the true translation is zero (the direction does not exist); pi when only the estimate is zero.
+    It does not depend on the lengths, however small or large they are. NaN when the true translation is zero (the
+    direction does not exist); pi when only the estimate is zero.
     """
-    d_est, d_gt = np.asarray(d_est, dtype=np.float64), np.asarray(d_gt, dtype=np.float64)
+    (d_est, _), (d_gt, _) = _scaled(d_est), _scaled(d_gt)
     sine = np.linalg.norm(so3.cross(d_est, d_gt), axis=-1)
     cosine = np.sum(d_est * d_gt, axis=-1)
     error = np.arctan2(sine, cosine)
@@ -33,11 +34,26 @@ def translation_error(d_est: ArrayLike, d_gt: ArrayLike) -> FloatArray:
 
 def scale_error(d_est: ArrayLike, d_gt: ArrayLike) -> FloatArray:
     """e_s = abs(log(norm(d_est) / norm(d_gt))); infinite when the estimate is zero, NaN when the truth is."""
-    est = np.linalg.norm(np.asarray(d_est, dtype=np.float64), axis=-1)
-    gt = np.linalg.norm(np.asarray(d_gt, dtype=np.float64), axis=-1)
-    ratio = est / np.where(gt > 0.0, gt, 1.0)
-    error = np.where(est > 0.0, np.abs(np.log(np.where(ratio > 0.0, ratio, 1.0))), WORST_SCALE)
+    (d_est, power_est), (d_gt, power_gt) = _scaled(d_est), _scaled(d_gt)
+    est, gt = np.linalg.norm(d_est, axis=-1), np.linalg.norm(d_gt, axis=-1)
+    ratio, power = est / np.where(gt > 0.0, gt, 1.0), power_est - power_gt
+    # The part of the power of two that no float holds is added to the logarithm; it is 0 but for extreme lengths.
+    near = np.clip(power, -1000, 1000)
+    logarithm = np.log(np.ldexp(np.where(ratio > 0.0, ratio, 1.0), near)) + (power - near) * np.log(2.0)
+    error = np.where(est > 0.0, np.abs(logarithm), WORST_SCALE)
     return np.where(gt > 0.0, error, np.nan)
+
+
+def _scaled(d: ArrayLike) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Vectors (..., 3) over powers of two (...) that bring their largest component into [0.5, 1), and the powers.
+
+    Products of the scaled vectors neither overflow nor underflow; where those of the vectors themselves do not
+    either, they differ by the power alone, without rounding. A zero vector stays.
+    """
+    d = np.asarray(d, dtype=np.float64)
+    _, power = np.frexp(np.max(np.abs(d), axis=-1, initial=0.0))
+    half = power // 2  # in two steps, for 2**1074 itself overflows
+    return np.ldexp(np.ldexp(d, -half[..., None]), (half - power)[..., None]), np.asarray(power, dtype=np.int64)
 
 
 def translation_of_offset(w: ArrayLike, d: ArrayLike, offset: ArrayLike) -> FloatArray:

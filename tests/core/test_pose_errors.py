@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -77,3 +77,31 @@ def test_batches_match_single_calls() -> None:
     for metric in (pose_errors.rotation_error, pose_errors.translation_error, pose_errors.scale_error):
         singles = [metric(x, y) for x, y in zip(a, b, strict=True)]
         np.testing.assert_allclose(metric(a, b), singles, rtol=1e-14)
+
+
+@settings(max_examples=300)
+@given(vectors, vectors, st.integers(-1074, 1023), st.floats(0.5, 1.0))
+def test_a_direction_has_one_error_at_every_length(
+    d_est: FloatArray, d_gt: FloatArray, power: int, factor: float
+) -> None:
+    # A length below 2^-1022 keeps fewer than 53 bits of each component; the direction is then another one.
+    longer = np.ldexp(factor * d_est, power)
+    assume(np.max(np.abs(d_est)) > 1e-3 and np.max(np.abs(d_gt)) > 1e-3)
+    kept = np.ldexp(longer, -power) / factor if power > -1000 else d_est
+    assume(np.max(np.abs(longer)) > 1e-290 and np.max(np.abs(kept - d_est)) < 1e-12)
+    expected = pose_errors.translation_error(d_est, d_gt)
+    assert pose_errors.translation_error(longer, d_gt) == pytest.approx(expected, abs=1e-12)
+    assert pose_errors.translation_error(d_gt, longer) == pytest.approx(expected, abs=1e-12)
+    # e_s by logarithms alone, which no length takes out of range; of about 700, it rounds at 1e-13.
+    lengths = [np.log(np.linalg.norm(d / np.max(np.abs(d)))) + np.log(np.max(np.abs(d))) for d in (longer, d_gt)]
+    assert pose_errors.scale_error(longer, d_gt) == pytest.approx(abs(lengths[0] - lengths[1]), abs=1e-11)
+
+
+@pytest.mark.parametrize("length", [5e-324, 1e-320, 1e-170, 1e-30, 1e30, 1e200, 1.7e308])
+def test_extreme_lengths_lie_at_their_angle(length: float) -> None:
+    along = [length, 0.0, 0.0]
+    assert np.degrees(pose_errors.translation_error(along, [1.0, 2.0, 0.0])) == pytest.approx(
+        np.degrees(np.arctan(2.0)), rel=1e-15
+    )
+    assert np.degrees(pose_errors.translation_error([-1.0, 0.0, 0.0], along)) == 180.0
+    assert pose_errors.scale_error(along, [1.0, 0.0, 0.0]) == pytest.approx(abs(np.log(length)), rel=1e-14)

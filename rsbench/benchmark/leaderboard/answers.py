@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Literal
 
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 
 LARGEST = 1e9
 """Number of w and d: larger ones are no motions, and their squares overflow."""
+LEAST_D = 1e-9
+"""Length of ``d`` in metres or units of the method's own; a shorter one is no direction, but for zero."""
 _TEXT_CHARACTERS = 300
 Vector = tuple[float, float, float]
 
@@ -106,6 +109,10 @@ class Answer:
         for name in ("w", "d"):
             if np.any(np.abs(np.array(getattr(self, name) or (0.0, 0.0, 0.0))) > LARGEST):
                 raise ValueError(f"{name}: numbers must lie within {LARGEST:g} of 0")
+        if self.d is not None and any(self.d) and not LEAST_D <= math.hypot(*self.d) <= LARGEST:
+            raise ValueError(
+                f"d: has length {math.hypot(*self.d):g}: must be 0, or from {LEAST_D:g} to {LARGEST:g}; scale it"
+            )
         if ratio is not None and not 0.0 <= ratio <= 1.0:
             raise ValueError(f"readout_ratio = {ratio}: must lie in [0, 1]: readout time / frame period")
         if self.seconds is not None and self.seconds < 0.0:

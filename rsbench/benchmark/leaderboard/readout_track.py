@@ -70,7 +70,7 @@ class ReadoutTrack(FrameTrack, SolverTrack):
     given = "matches of the frames by rsbench's SIFT, without the readout ratio"
     scores = _READOUT
     error, error_title = "e_readout", "error of the readout ratio"
-    exact = ("e_readout", 1e-9)
+    exact = MappingProxyType({"e_readout": 1e-9})
     answers = _Readout
     smoke = ("rs-stereo-refined", "rs-stereo-refined-pairs", ORACLE)
     smoke_metrics = ("e_readout",)

@@ -21,7 +21,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import pandas as pd
 
 from rsbench.benchmark.images.store import identity_of, read_record
-from rsbench.benchmark.leaderboard.answers import LARGEST
+from rsbench.benchmark.leaderboard.answers import LARGEST, LEAST_D
 from rsbench.benchmark.leaderboard.exporting import write_inputs
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import Submission, submission_text, template_text, truth_text
@@ -352,6 +352,10 @@ def answer_problem(problem: Problem, entry: SolverEntry, runner: SolverRunner) -
     seed, model = seed_of_answer(problem, entry), AUTO if entry.name == CHOOSES else None
     found = solve_problem(problem, entry, RobustOptions(), runner, seed, _EXTRAS, model)
     kept = {key: found[key] for key in _KEPT}
-    if found["success"] and max(map(abs, (*found["w"], *found["d"]))) > LARGEST:
-        return {"name": problem.name, "success": False, "reason": f"w or d goes beyond {LARGEST:g}"}
+    if found["success"]:
+        length = math.hypot(*found["d"])
+        if max(length, *map(abs, found["w"])) > LARGEST:
+            return {"name": problem.name, "success": False, "reason": f"w or d goes beyond {LARGEST:g}"}
+        if length < LEAST_D:
+            kept["d"] = [0.0, 0.0, 0.0]  # the rig stands still
     return {**kept, "seconds": round(found["seconds"], 6), "reason": str(found["reason"])[:300]}

@@ -102,8 +102,9 @@ class Track(ABC):
     """The column of scores.csv that decides about the primary score."""
     error_title: ClassVar[str]
     """What figures call it."""
-    exact: ClassVar[tuple[str, float]]
-    """A column of scores.csv, and below which value it is that of the truth handed in: no method is so near."""
+    exact: ClassVar[Mapping[str, float]]
+    """Errors of scores.csv, each with the value below which the truth itself was submitted: no method is so near.
+    Each is judged alone, so that a false part of an answer does not hide a true one."""
     answers: ClassVar[type[Answer]]
     """What a line of a file of predictions must hold."""
     pictures: ClassVar[bool] = False

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -143,7 +144,12 @@ class TrajectoryTrack(FrameTrack):
     )
     scores = _SCORES
     error, error_title = "error", "1 - AUC way"
-    exact = ("way_95_deg", 1e-6)
+    exact = MappingProxyType(
+        {
+            **dict.fromkeys(("way_median_deg", "way_95_deg", "rows_median_deg", "rows_95_deg", "rpe_deg"), 1e-6),
+            **dict.fromkeys(("ate_mm", "rpe_mm"), 1e-5),
+        }
+    )
     answers = TrajectoryAnswer
     whole = True
     smoke: ClassVar[tuple[str, ...]] = ()

@@ -17,6 +17,7 @@ from rsbench.benchmark.leaderboard.splits import points_split
 from rsbench.benchmark.leaderboard.standings import standings, table
 from rsbench.benchmark.leaderboard.track_list import TRACKS
 from rsbench.core.errors import RsbenchError
+from rsbench.core.pose_errors import translation_of_offset
 from rsbench.report.board_page import build_site
 
 SPLIT, SMALL = small_split(60), small_split()
@@ -59,7 +60,7 @@ def test_a_method_at_its_bound_is_believed_and_one_below_it_is_not(tmp_path: Pat
 def test_the_truth_under_another_name_is_in_doubt(tmp_path: Path) -> None:
     lines = handed(truth_lines(SMALL), "mine", "left")
     scored = add(tmp_path / "board", write(tmp_path / "a.jsonl", lines), SMALL, {})
-    assert scored.doubt.startswith("error_deg is below 1e-05, exact but for rounding, in 1.00 ")
+    assert scored.doubt.startswith("e_R_deg is below 1e-05, exact but for rounding, in 1.00 ")
     numbers = table(standings(entries_of(tmp_path / "board", "points-1", SMALL.name)))
     assert numbers["rank"].isna().all() and numbers["handed_in"].all() and numbers["doubt"].notna().all()
 
@@ -79,13 +80,53 @@ def test_names_of_rsbench_are_its_own(tmp_path: Path, name: str) -> None:
     assert not add(tmp_path / "own", write(tmp_path / "a.jsonl", lines), SMALL, {"command": RUN}).handed_in
 
 
+def _erring(lines: list[Line], name: str, size: float, share: float = 1.0) -> list[Line]:
+    """The answers with a random error of ``w`` or ``d``, in a share of the problems."""
+    random = np.random.default_rng(3)
+    changed = [line | {name: (np.array(line[name]) + size * random.normal(size=3)).tolist()} for line in lines[1:]]
+    keep = random.random(len(changed)) < share
+    return [lines[0], *(new if use else old for new, old, use in zip(changed, lines[1:], keep, strict=True))]
+
+
+@pytest.mark.parametrize("point", ["left", "body"])
+def test_a_true_translation_is_found_beside_a_rotation_that_errs(tmp_path: Path, point: str) -> None:
+    """As attacked: exact directions of "left", with an error of the rotation of some 0.1 deg."""
+    lines = handed(truth_lines(SPLIT), "mine", "left")
+    if point == "left":
+        for line, truth in zip(lines[1:], SPLIT.truths, strict=True):
+            d = translation_of_offset(truth.motion.w, truth.motion.d, truth.rig.offset("left"))
+            line |= {"d": d.tolist(), "reference_point": "left", "metric": False}
+    exact = _erring(lines, "w", 2e-3)
+    scored = add(tmp_path / "board", write(tmp_path / "a.jsonl", exact), SPLIT, {})
+    assert scored.scores["auc_5"].mean() > 0.9 and scored.doubt.startswith("e_T_deg is below 1e-05")
+    # With 1e-5 of noise nothing is exact, but no camera alone is so near.
+    nearly = handed(_erring(exact, "d", 1e-6), "other", "left")
+    scored = add(tmp_path / "board", write(tmp_path / "b.jsonl", nearly), SPLIT, {})
+    assert scored.doubt.startswith("e_T_deg is below the median at the Cramer-Rao bound of left in 1.00")
+
+
+def test_every_error_is_judged_and_a_tenth_is_enough(tmp_path: Path) -> None:
+    uses = ("left", "right", "links", "readout")
+    lines = handed(truth_lines(SPLIT), "mine", *uses)
+    directions = np.random.default_rng(4).normal(size=(len(lines) - 1, 3))
+    for line, direction in zip(lines[1:], directions, strict=True):
+        line["w"] = (np.array(line["w"]) + 0.01 * direction).tolist()
+        line["d"] = (np.linalg.norm(line["d"]) * direction / np.linalg.norm(direction)).tolist()
+    scored = add(tmp_path / "board", write(tmp_path / "a.jsonl", lines), SPLIT, {})
+    assert scored.doubt.startswith("e_s is below 1e-07, exact but for rounding, in 1.00")
+    few = _erring(handed(truth_lines(SPLIT), "few", *uses), "w", 0.03, share=0.8)
+    few = _erring(few, "d", 0.03)
+    scored = add(tmp_path / "board", write(tmp_path / "b.jsonl", few), SPLIT, {})
+    assert scored.doubt.startswith("e_R_deg is below 1e-05, exact but for rounding, in 0.")
+
+
 def test_the_commands_say_it(tmp_path: Path) -> None:
     file = write(tmp_path / "a.jsonl", named(truth_lines(points_split(TRACKS["points"])), "mine"))
     text = file.read_text("utf-8").replace('"truth"', '"left"', 1)
     file.write_text(text, "utf-8")
     board = tmp_path / "board"
     ran = run_here("leaderboard", "submit", file, "--board", board)
-    assert ran.returncode == 0 and "in doubt, and not ranked: error_deg is below 1e-05" in ran.stdout, ran.stderr
+    assert ran.returncode == 0 and "in doubt, and not ranked: e_R_deg is below 1e-05" in ran.stdout, ran.stderr
     words = [
         "leaderboard",
         "accept",
@@ -99,4 +140,4 @@ def test_the_commands_say_it(tmp_path: Path) -> None:
     ]
     assert_refused(run_here(*words, "--reason", " "), "--reason")
     ran = run_here(*words, "--reason", "a test of ours")
-    assert ran.returncode == 0 and ran.stdout.startswith("mine: ranked all the same: error_deg")
+    assert ran.returncode == 0 and ran.stdout.startswith("mine: ranked all the same: e_R_deg")

@@ -9,11 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from leaderboards import Line, named, small_split, truth_lines, write
 
-from rsbench.benchmark.leaderboard.motion_tracks import PointsTrack
+from rsbench.benchmark.leaderboard.motion_tracks import PointsTrack, motion_row
 from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission, template_text
+from rsbench.components.cards import parse_card
 from rsbench.core.errors import RsbenchError
 
 SPLIT = small_split()
@@ -68,6 +71,12 @@ FAULTS: dict[str, tuple[str, str]] = {
     "number for a problem": (_text(_changed(name=7)), ":2: name = 7"),
     "the same problem twice": (_text([*TRUTH, FIRST]), ":14: name = 'p000': is that of line 2 too"),
     "what overflows": (_text(_changed(d=[0.0, 1e300, 0.0])), ":2: d: numbers must lie within 1e+09 of 0"),
+    "a denormal direction": (
+        _text(_changed(d=[5e-324, 0.0, 0.0])),
+        ":2: d: has length 4.94066e-324: must be 0, or",
+    ),
+    "a direction too short": (_text(_changed(d=[0.0, 9e-10, 0.0])), ":2: d: has length 9e-10: must be 0, or"),
+    "a direction too long": (_text(_changed(d=[9e8, 9e8, 0.0])), ":2: d: has length 1.27279e+09: must be 0, or"),
     "NaN": (_text(_changed(w=[float("nan"), 0.0, 0.0])), ":2: w.0 = nan: numbers must be finite"),
     "infinity": (_text(_changed(d=[0.0, float("inf"), 0.0])), ":2: d.1 = inf"),
     "beyond infinity": (_text(TRUTH[:1]) + '{"name": "p000", "w": [0, 0, 1e999], "d": [0, 0, 1]}\n', "w.2 = inf"),
@@ -101,6 +110,23 @@ def test_faults_are_lines_that_name_the_place(case: str, tmp_path: Path) -> None
     assert any(words in fault and str(path) in fault for fault in found.faults), found.faults
     with pytest.raises(RsbenchError, match=r"mine\.jsonl"):
         read_submission(path, SPLIT)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-9.0, 9.0), st.sampled_from(["left", "body"]), st.integers(0, 9))
+def test_the_length_of_a_direction_changes_no_score(exponent: float, point: str, number: int) -> None:
+    random = np.random.default_rng(number)
+    direction = random.normal(size=3)
+    direction /= np.linalg.norm(direction) * (1.0 + 1e-12)  # within the limits at both ends
+    answer = {"name": FIRST["name"], "w": FIRST["w"], "reference_point": point}
+    rows = [
+        motion_row(
+            SPLIT.truths[0], parse_card(SPLIT.track.answers, {**answer, "d": (length * direction).tolist()}, "")
+        )
+        for length in (1.0, max(10.0**exponent, 1e-9 * (1.0 + 1e-9)))
+    ]
+    # The product itself rounds, by 1e-16 of 180 deg.
+    assert rows[0] == pytest.approx(rows[1], abs=1e-12, nan_ok=True)
 
 
 def _huge(path: Path) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rsbench.benchmark.simulated.bound import Bound, Views, motion_bound, root_information
+from rsbench.benchmark.simulated.bound import Bound, Views, bound_of_point, motion_bound, root_information
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
 from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import LinearMotion, Motion
-from rsbench.core.pose_errors import rotation_error, translation_error
+from rsbench.core.pose_errors import rotation_error, translation_error, translation_of_offset
 from rsbench.core.projection import ProjectionStatus, back_project, rs_project
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -161,6 +161,31 @@ def test_the_order_of_matches_does_not_matter() -> None:
     assert other.scale == pytest.approx(one.scale, rel=1e-6)
     np.testing.assert_allclose(other.direction_axes, one.direction_axes, rtol=1e-6)
     np.testing.assert_allclose(other.rotation_axes, one.rotation_axes, rtol=1e-6)
+
+
+def test_the_bound_of_a_camera_is_that_of_its_translation() -> None:
+    """From the covariance of the body by a numeric Jacobian of ``translation_of_offset``."""
+    motion, offset, step = LinearMotion(W, D), RIG.offset("left"), 1e-6
+    bound = motion_bound(exact(motion, tracks=40), RIG, SHUTTER, motion, 1.0)
+    assert bound.covariance is not None
+
+    def left(x: FloatArray) -> FloatArray:
+        return translation_of_offset(x[:3], x[3:], offset)
+
+    at = np.concatenate([W, D])
+    J = np.stack([(left(at + step * e) - left(at - step * e)) / (2 * step) for e in np.eye(6)], axis=-1)
+    d, covariance = left(at), J @ bound.covariance @ J.T
+    across = np.linalg.svd(d[None])[2][1:] / np.linalg.norm(d)
+    expected = np.sqrt(np.linalg.eigvalsh(across @ covariance @ across.T))[::-1]
+    found = bound_of_point(bound, motion, offset)
+    np.testing.assert_allclose(found.direction_axes, expected, rtol=1e-7)  # differences round at 1e-10
+    np.testing.assert_allclose(found.rotation_axes, bound.rotation_axes, rtol=1e-10)
+
+
+def test_one_camera_knows_its_own_direction_alone() -> None:
+    c, motion = one_camera(0.1)
+    found = motion_bound(c, RIG, SHUTTER, motion, 0.1)
+    assert bound_of_point(found, motion, RIG.offset("left")).direction < 0.1 * found.direction
 
 
 def test_no_translation_and_no_matches() -> None:
