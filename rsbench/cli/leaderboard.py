@@ -348,7 +348,7 @@ def _cells(line: Standing) -> dict[str, str]:
     cells = {"method": line.scored.header.method, "rank": line.rank_words}
     cells[primary.title] = in_words(*line.means[primary.key])
     for score in line.track.scores:
-        if score.key in ("flip", "failure"):
+        if score.key in ("flip", *line.track.beside):
             cells[score.title] = f"{100.0 * line.means[score.key][0]:.1f} %"
         elif score.key in _SHOWN:
             cells[score.title.removesuffix(" (deg)")] = _number(line.medians[score.key])

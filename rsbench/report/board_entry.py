@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.leaderboard.calibration import LEVELS, UNKNOWNS
+from rsbench.benchmark.leaderboard.calibration import LEVELS
 from rsbench.benchmark.leaderboard.ranking import score_interval
 from rsbench.benchmark.leaderboard.standings import Standing
 from rsbench.benchmark.statistics import in_words
@@ -63,7 +63,7 @@ def _oracles(each: Board, line: Standing) -> list[Standing]:
 def _scores(line: Standing) -> list[dict[str, str]]:
     found = [{"title": "rank", "text": line.rank_words, "hint": "among those that use no more"}]
     for score in line.track.scores:
-        if score.kind == "share":
+        if score.kind != "median":
             text = in_words(*line.means[score.key])
         else:
             value = line.medians[score.key]
@@ -75,7 +75,8 @@ def _scores(line: Standing) -> list[dict[str, str]]:
 def _by(each: Board, line: Standing, name: str, kinds: pd.Series) -> dict[str, Any]:
     scores, track, rows = line.scored.scores, each.track, list[list[object]]()
     for kind, part in scores.groupby(kinds.astype(str).to_numpy()):
-        value, low, high = score_interval(part[track.primary.key].to_numpy(), list(part["scene"]))
+        primary = part[track.primary.key].to_numpy()
+        value, low, high = score_interval(primary, list(part["scene"]), track.primary.kind == "share")
         # One scene bounds nothing: an interval of it would only round its value away.
         share = f"{value:.3g}" if part["scene"].nunique() == 1 else in_words(value, low, high)
         medians = (part[key].median() for key in track.of_kind("median")[:BRIEF])
@@ -122,7 +123,7 @@ def _calibration(line: Standing) -> dict[str, Any] | None:
         "of": len(line.scored.scores),
         "spread": in_words(*found.spread),
         "mean": f"{found.mean:.3g}",
-        "unknowns": UNKNOWNS,
+        "unknowns": line.track.unknowns,
         "rows": rows,
         "figure": reliability(found.covers),
     }

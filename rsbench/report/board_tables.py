@@ -39,12 +39,16 @@ def brief_medians(track: Track) -> list[str]:
 def _brief(lines: Sequence[Standing]) -> list[list[str]]:
     track = lines[0].track
     assumes = ["assumes"] if track.parting else []
-    head = ["method", *assumes, "uses", "rank", track.primary.title, *lines[0].parts, "failed"]
-    rows = [[*head, *brief_medians(track)]]
+    titles = {score.key: score.title for score in track.scores}
+    stated = ["in 95 %"] if any(line.calibration for line in lines) else []
+    head = ["method", *assumes, "uses", "rank", track.primary.title, *lines[0].parts]
+    rows = [[*head, *(titles[key] for key in track.beside), *brief_medians(track), *stated]]
     for line in lines:
-        shares = [in_words(*line.means[key]) for key in (track.primary.key, "failure")]
+        primary, *beside = [in_words(*line.means[key]) for key in (track.primary.key, *track.beside)]
         parts = [f"{triple[0]:.2f}" for triple in line.parts.values()]
         medians = [f"{line.medians[key]:.3g}" for key in track.of_kind("median")[:BRIEF]]
         assumed = [line.assumes] if track.parting else []
-        rows.append([line.name, *assumed, line.uses, line.rank_words, shares[0], *parts, shares[1], *medians])
+        covers = [in_words(*line.calibration.covers[-1]) if line.calibration else "-"] if stated else []
+        cells = [line.name, *assumed, line.uses, line.rank_words, primary, *parts, *beside, *medians, *covers]
+        rows.append(cells)
     return rows

@@ -99,6 +99,8 @@ class Answer:
     """Whether the direction of ``d`` means anything."""
     readout_ratio: float | None = None
     """Estimated readout ratio, 0 to 1, where the track asks it instead of a motion."""
+    readout_sigma: float | None = None
+    """Standard deviation of ``readout_ratio``, where it is stated."""
     covariance: tuple[tuple[float, ...], ...] | None = None
     """6 x 6 covariance of ``w`` and ``d``, symmetric."""
     seconds: float | None = None
@@ -115,6 +117,8 @@ class Answer:
             )
         if ratio is not None and not 0.0 <= ratio <= 1.0:
             raise ValueError(f"readout_ratio = {ratio}: must lie in [0, 1]: readout time / frame period")
+        if self.readout_sigma is not None and not 0.0 <= self.readout_sigma <= 1.0:
+            raise ValueError(f"readout_sigma = {self.readout_sigma}: must lie in [0, 1]")
         if self.seconds is not None and self.seconds < 0.0:
             raise ValueError(f"seconds = {self.seconds}: must not be negative")
         if self.covariance is not None and (

@@ -1,9 +1,9 @@
 """Calibration of the covariances that methods state (NEES): shown beside scores, and never ranked.
 
-The squared error of a motion by its covariance (NEES) is chi-squared with six degrees of freedom where that is
-right (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4):
-the ellipsoid of a level then holds the truth in that share of problems. One wild error decides about a mean, so
-what has an interval is the median.
+The squared error by the stated covariance (NEES) is chi-squared where that is right, with six degrees of freedom
+for a motion and one for a readout ratio (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and
+Navigation, 2001, section 5.4): the ellipsoid of a level then holds the truth in that share of problems. One wild
+error decides about a mean, so what has an interval is the median.
 """
 
 from __future__ import annotations
@@ -16,9 +16,7 @@ from scipy.special import gammaincinv
 
 from rsbench.benchmark.leaderboard.ranking import score_interval
 from rsbench.benchmark.statistics import median_interval, typical_interval
-from rsbench.core.so3 import FloatArray
 
-UNKNOWNS = 6
 LEVELS = (0.5, 0.9, 0.95)
 _SEED = 0
 Triple = tuple[float, float, float]
@@ -35,35 +33,33 @@ class Calibration:
     covers: tuple[Triple, ...]
     """For each of ``LEVELS``, the share of truths within the ellipsoid that should hold so many."""
     mean: float
-    """NEES by ``UNKNOWNS``, without an interval."""
+    """NEES over its degrees of freedom, without an interval."""
 
 
-def calibration(scores: pd.DataFrame) -> Calibration | None:
-    """Of the scores of an entry; None where nothing was stated."""
+def calibration(scores: pd.DataFrame, unknowns: int) -> Calibration | None:
+    """Of the scores of an entry, whose answers have so many unknowns; None where no covariance was stated."""
     if "nees" not in scores:
         return None
     told = scores[scores["nees"].notna()]
     if told.empty:
         return None
     nees, scenes = told["nees"].to_numpy(dtype=np.float64), list(told["scene"])
-    ratio = nees / _chi_squared(0.5)
+    ratio = nees / _chi_squared(0.5, unknowns)
     alone = len(set(scenes)) == len(scenes)
     low, high = median_interval(ratio) if alone else typical_interval(ratio, _SEED, scenes)
     return Calibration(
         stated=len(told),
         spread=(float(np.median(ratio)), low, high),
-        covers=tuple(score_interval(_inside(nees, level), scenes) for level in LEVELS),
-        mean=float(np.mean(nees)) / UNKNOWNS,
+        covers=tuple(
+            score_interval((nees <= _chi_squared(level, unknowns)).astype(np.float64), scenes) for level in LEVELS
+        ),
+        mean=float(np.mean(nees)) / unknowns,
     )
 
 
-def _chi_squared(level: float) -> float:
-    """Below which a share ``level`` of a chi-squared variable of ``UNKNOWNS`` degrees of freedom lies."""
-    return 2.0 * float(gammaincinv(0.5 * UNKNOWNS, level))
-
-
-def _inside(nees: FloatArray, level: float) -> FloatArray:
-    return (nees <= _chi_squared(level)).astype(np.float64)
+def _chi_squared(level: float, unknowns: int) -> float:
+    """Below which a share ``level`` of a chi-squared variable of so many degrees of freedom lies."""
+    return 2.0 * float(gammaincinv(0.5 * unknowns, level))
 
 
 def named_numbers(found: Calibration | None) -> dict[str, Triple]:

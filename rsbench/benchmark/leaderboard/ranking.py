@@ -50,14 +50,17 @@ def mean_interval(means: FloatArray) -> Interval:
     return Interval(middle - half, middle + half)
 
 
-def score_interval(values: FloatArray, scenes: Sequence[str]) -> tuple[float, float, float]:
-    """The mean over scenes of values (n,) in [0, 1], and the ends of its interval.
+def score_interval(values: FloatArray, scenes: Sequence[str], share: bool = True) -> tuple[float, float, float]:
+    """The mean over scenes of values (n,), and the ends of its interval.
 
-    Nothing lies outside [0, 1]. Of yes or no of problems that are independent the interval is exact; of those that
-    share scenes it has that one inside: scenes that all say no do not bound the share to 0.
+    A ``share`` lies in [0, 1], and so does its interval. Of yes or no of problems that are independent the
+    interval is exact; of those that share scenes it has that one inside: scenes that all say no do not bound the
+    share to 0.
     """
     means = scene_means(values, scenes)
     low, high = mean_interval(means)
+    if not share:
+        return float(np.mean(means)), low, high
     if np.all((values == 0.0) | (values == 1.0)):
         exact = share_interval(int(np.sum(values)), len(values))
         if len(means) == len(values):

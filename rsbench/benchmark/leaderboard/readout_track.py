@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 from rsbench.benchmark.leaderboard.answers import Answer
 from rsbench.benchmark.leaderboard.frame_inputs import FrameTrack
@@ -72,6 +72,8 @@ class ReadoutTrack(FrameTrack, SolverTrack):
     error, error_title = "e_readout", "error of the readout ratio"
     exact = MappingProxyType({"e_readout": 1e-9})
     answers = _Readout
+    states_sigma: ClassVar[bool] = False
+    """Whether entries of ours state the deviation of their ratio."""
     smoke = ("rs-stereo-refined", "rs-stereo-refined-pairs", ORACLE)
     smoke_metrics = ("e_readout",)
     example = MappingProxyType({"readout_ratio": 0.5})
@@ -109,7 +111,8 @@ class ReadoutTrack(FrameTrack, SolverTrack):
         if best is None or not best.sigma <= _MAX_SIGMA:
             reason = f"cannot tell the readout ratio: {capture.reason}"[:300]
             return {"name": problem.name, "success": False, "reason": reason, "seconds": seconds}
-        return {"name": problem.name, "readout_ratio": best.ratio, "seconds": seconds}
+        found = {"name": problem.name, "readout_ratio": best.ratio, "seconds": seconds}
+        return found | ({"readout_sigma": best.sigma} if self.states_sigma else {})
 
     def rows(self, submission: Submission, split: Split) -> list[Row]:
         return [readout_row(truth, submission.answers.get(truth.name)) for truth in split.truths]

@@ -41,6 +41,8 @@ _DECADES = 2.0
 _AUC_DEG = (0.1, 1.0)
 """Of e_R and of e_T: a rotation is known ten times as well."""
 CONSTANT = "constant"
+RIGHT = 0.1
+"""Error of a readout ratio that counts as right."""
 _GUESS = "The one ratio that, said of all sequences, has the best score"
 _KEPT = ("within", "flip", "failure", "e_R_deg", "e_T_deg", "e_s", "seconds")
 """Scores of points-1 that are shown too."""
@@ -194,6 +196,73 @@ class DrawnReadout(SeveralLaws, ReadoutTrack):
     def rows(self, submission: Submission, split: Split) -> list[Row]:
         rows = super().rows(submission, split)
         return [row | {"motion": truth.motion.name} for row, truth in zip(rows, split.truths, strict=True)]
+
+
+class SkilledReadout(DrawnReadout):
+    """The readout ratio with its deviation, scored so that a refusal is never worse than a guess."""
+
+    name, id = "readout-3", "readout-3"
+    title = "Readout ratio with its deviation, drawn for each sequence, from given matches of rendered frames"
+    scores = (
+        Score(
+            key="skill",
+            title="skill",
+            hint="1 - CRPS over that of knowing only how the ratios are spread: 1 exact, 0 a refusal",
+            kind="mean",
+            better="higher",
+        ),
+        Score(
+            key="right",
+            title="right",
+            hint="share of problems with a ratio within 0.1",
+            kind="share",
+            better="higher",
+        ),
+        Score(
+            key="wrong", title="wrong", hint="share of problems with a ratio off by more than 0.1", kind="share"
+        ),
+        *(score for score in ReadoutTrack.scores if score.key != "auc_r02"),
+    )
+    beside = ("right", "wrong", "failure")
+    states_sigma = True
+    unknowns = 1
+
+    def rows(self, submission: Submission, split: Split) -> list[Row]:
+        spread = spread_of([truth.shutter.readout_ratio for truth in split.truths])
+        rows = super().rows(submission, split)
+        for row, truth in zip(rows, split.truths, strict=True):
+            answer = submission.answers.get(truth.name)
+            row |= dict.fromkeys(("skill", "right", "wrong"), 0.0) | {"nees": math.nan}
+            if answer is None or not answer.success or answer.readout_ratio is None:
+                continue
+            off, sigma = answer.readout_ratio - truth.shutter.readout_ratio, answer.readout_sigma
+            row["skill"] = 1.0 - crps(off, sigma or 0.0) / spread
+            row["right" if abs(off) <= RIGHT else "wrong"] = 1.0
+            if sigma is not None:
+                row["nees"] = (off / sigma) ** 2 if sigma > 0.0 else math.inf
+        return rows
+
+
+def crps(error: float, sigma: float) -> float:
+    """Continuous ranked probability score of a Gaussian; ``abs(error)`` at ``sigma`` 0.
+
+    It is the integrated squared distance of the Gaussian's distribution function from the step at the truth, by
+    the closed form of Gneiting and Raftery (JASA 2007, section 4.2).
+    """
+    if sigma == 0.0:
+        return abs(error)
+    z = error / sigma
+    density = math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+    return sigma * (z * math.erf(z / math.sqrt(2.0)) + 2.0 * density - 1.0 / math.sqrt(math.pi))
+
+
+def spread_of(ratios: Sequence[float]) -> float:
+    """The mean CRPS of the distribution of all ``ratios`` for each of them: half of their mean distance.
+
+    No distribution that is stated for all of them alike has a lower mean.
+    """
+    known = np.array(ratios)
+    return 0.5 * float(np.mean(np.abs(known[:, None] - known)))
 
 
 def best_constant(ratios: Sequence[float]) -> float:

@@ -29,7 +29,7 @@ class Standing:
     ties: tuple[str, ...]
     """Of those, the ones that the data do not tell from it."""
     means: dict[str, tuple[float, float, float]]
-    """Of the shares of its protocol: the mean over scenes, and the ends of its interval."""
+    """Of the shares and means of its protocol: the mean over scenes, and the ends of its interval."""
     medians: dict[str, float]
     """Of the other scores: over problems; NaN where the entry gives none."""
     calibration: Calibration | None
@@ -120,16 +120,22 @@ def _standing(
         rank=rank,
         peers=peers,
         ties=tied,
-        means={name: score_interval(scores[name].to_numpy(), scenes) for name in track.of_kind("share")},
+        means={
+            score.key: score_interval(scores[score.key].to_numpy(), scenes, score.kind == "share")
+            for score in track.scores
+            if score.kind != "median"
+        },
         medians={name: _median(scores[name].to_numpy()) for name in track.of_kind("median")},
-        calibration=calibration(scores),
+        calibration=calibration(scores, track.unknowns),
         parts={} if not track.parting else _parts(scores, track),
     )
 
 
 def _parts(scores: pd.DataFrame, track: Track) -> dict[str, tuple[float, float, float]]:
     return {
-        str(name): score_interval(part[track.primary.key].to_numpy(), list(part["scene"]))
+        str(name): score_interval(
+            part[track.primary.key].to_numpy(), list(part["scene"]), track.primary.kind == "share"
+        )
         for name, part in scores.groupby(track.parting)
     }
 

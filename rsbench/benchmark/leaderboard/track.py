@@ -45,7 +45,7 @@ KNOWLEDGE = {
 ORACLE = "truth"
 CHUNK = 10
 """Problems of one job."""
-Kind = Literal["share", "median"]
+Kind = Literal["share", "mean", "median"]
 Row = dict[str, Any]
 Step = Callable[[str], None]
 
@@ -59,7 +59,8 @@ class Score:
     hint: str
     """What it is, in a line."""
     kind: Kind
-    """A share lies in [0, 1]: its mean over scenes has an interval. Of others the median over problems is told."""
+    """How problems are summed up: a ``share`` lies in [0, 1], a ``mean`` anywhere; both are means over scenes with
+    an interval. A ``median`` is one over problems."""
     better: Literal["lower", "higher"] = "lower"
 
     @property
@@ -117,6 +118,10 @@ class Track(ABC):
     """Whether problems are rendered frames."""
     whole: ClassVar[bool] = False
     """Whether a problem is a whole sequence, of whose true depth scores are made."""
+    beside: ClassVar[tuple[str, ...]] = ("failure",)
+    """Shares and means that short tables show beside the primary score."""
+    unknowns: ClassVar[int] = 6
+    """Degrees of freedom of the column ``nees``, where answers state deviations."""
     parting: ClassVar[str] = ""
     """A column of scores.csv by whose values tables divide the primary score; empty: by none."""
     smoke: ClassVar[tuple[str, ...]] = ()
@@ -229,9 +234,9 @@ class Track(ABC):
         """
         return {}
 
-    def of_kind(self, kind: Kind) -> tuple[str, ...]:
-        """Keys of the scores of a kind."""
-        return tuple(score.key for score in self.scores if score.kind == kind)
+    def of_kind(self, *kinds: Kind) -> tuple[str, ...]:
+        """Keys of the scores of these kinds."""
+        return tuple(score.key for score in self.scores if score.kind in kinds)
 
     def check_uses(self, uses: Collection[str]) -> None:
         """Raises ValueError when a method uses what does not exist, or what this protocol does not give."""

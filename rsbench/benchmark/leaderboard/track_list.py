@@ -9,7 +9,7 @@ from rsbench.benchmark.leaderboard.motion_tracks import PointsTrack, PoseTrack
 from rsbench.benchmark.leaderboard.own_pose_track import OwnPoseTrack
 from rsbench.benchmark.leaderboard.placed_track import PlacedCorrection
 from rsbench.benchmark.leaderboard.readout_track import ReadoutTrack
-from rsbench.benchmark.leaderboard.second_protocols import DrawnReadout, LawsOfPoints, LawsOfPoses
+from rsbench.benchmark.leaderboard.second_protocols import DrawnReadout, LawsOfPoints, LawsOfPoses, SkilledReadout
 from rsbench.benchmark.leaderboard.track import Track
 from rsbench.benchmark.leaderboard.trajectory_track import TrajectoryTrack
 from rsbench.components.cards import choices
@@ -23,6 +23,7 @@ TRACKS: dict[str, Track] = {
         LawsOfPoses(),
         PoseTrack(),
         OwnPoseTrack(),
+        SkilledReadout(),
         DrawnReadout(),
         ReadoutTrack(),
         DepthTrack(),

@@ -19,7 +19,7 @@ def test_right_covariances_are_told_right() -> None:
     """Intervals hold in 95 % of boards: exact ones in at least so many; 150 boards."""
     rng = np.random.default_rng(0)
     errors = rng.standard_normal((150, 40, 6))
-    found = [calibration(_scores(nees)) for nees in np.sum(errors**2, axis=2)]
+    found = [calibration(_scores(nees), 6) for nees in np.sum(errors**2, axis=2)]
     held = np.zeros(4)
     for each in found:
         assert each is not None and each.stated == 40
@@ -32,7 +32,7 @@ def test_right_covariances_are_told_right() -> None:
 def test_wrong_covariances_are_told_wrong(factor: float) -> None:
     """Errors that are ``factor`` times as large as stated: shares are those of chi-squared."""
     nees = factor**2 * np.sum(np.random.default_rng(1).standard_normal((500, 6)) ** 2, axis=1)
-    found = calibration(_scores(nees))
+    found = calibration(_scores(nees), 6)
     assert found is not None
     assert found.spread[0] == pytest.approx(factor**2, rel=0.15)
     assert found.mean == pytest.approx(factor**2, rel=0.1)  # 500 values: standard deviation 2.6 %
@@ -42,9 +42,9 @@ def test_wrong_covariances_are_told_wrong(factor: float) -> None:
 
 
 def test_nothing_stated_is_nothing_told() -> None:
-    assert calibration(_scores(np.full(5, np.nan))) is None
-    assert calibration(pd.DataFrame({"scene": ["a"]})) is None
+    assert calibration(_scores(np.full(5, np.nan)), 6) is None
+    assert calibration(pd.DataFrame({"scene": ["a"]}), 6) is None
     assert all(np.isnan(triple).all() for triple in named_numbers(None).values())
-    some = calibration(_scores(np.array([np.nan, 1.0, np.inf]), scenes=2))
+    some = calibration(_scores(np.array([np.nan, 1.0, np.inf]), scenes=2), 6)
     assert some is not None and some.stated == 2 and some.mean == np.inf
     assert list(named_numbers(some)) == ["nees_ratio", "covers_50", "covers_90", "covers_95"]

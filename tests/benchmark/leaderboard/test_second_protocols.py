@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import lzma
 import math
 from collections import Counter
 from dataclasses import replace
@@ -12,7 +13,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from commands import assert_refused, run_here
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from leaderboards import named, truth_lines, write
+from scipy.integrate import quad
+from scipy.stats import norm
 
 from rsbench.benchmark.leaderboard import publishing
 from rsbench.benchmark.leaderboard.board import entries_of
@@ -20,7 +25,7 @@ from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.motion_tracks import smooth
 from rsbench.benchmark.leaderboard.points_draws import KINDS, LAWS, POINTS_2
 from rsbench.benchmark.leaderboard.running import CHOOSES
-from rsbench.benchmark.leaderboard.second_protocols import SAME_METHOD, rounded
+from rsbench.benchmark.leaderboard.second_protocols import SAME_METHOD, crps, rounded, spread_of
 from rsbench.benchmark.leaderboard.splits import Split, exact_problem, points_split, simulated_problem, truth_of
 from rsbench.benchmark.leaderboard.standings import standings, table
 from rsbench.benchmark.leaderboard.stored_predictions import SUFFIX, restore
@@ -159,6 +164,76 @@ def test_protocols_are_found_by_their_numbers() -> None:
     assert points_split(TRACKS["points"]).truths[0].facts.keys().isdisjoint({"motion", "rig"})
 
 
+# Readout ratios with their deviations
+
+
+@pytest.mark.parametrize(("error", "sigma"), [(0.1, 0.02), (-0.3, 0.1), (0.0, 0.5), (0.01, 0.2)])
+def test_the_crps_is_its_integral(error: float, sigma: float) -> None:
+    def apart(x: float) -> float:
+        return float((norm.cdf(x, error, sigma) - (x >= 0.0)) ** 2)
+
+    low, high = min(error, 0.0) - 9.0 * sigma, max(error, 0.0) + 9.0 * sigma
+    expected = sum(quad(apart, *ends, limit=200)[0] for ends in ((low, 0.0), (0.0, high)))
+    assert crps(error, sigma) == pytest.approx(expected, rel=1e-7)  # the integral is known to 1e-8
+    assert crps(error, 0.0) == abs(error) == pytest.approx(crps(error, 1e-9), abs=1e-9)
+
+
+@settings(max_examples=200)
+@given(
+    st.lists(st.floats(0.0, 1.0), min_size=2, max_size=30),
+    st.floats(0.0, 1.0),
+    st.just(0.0) | st.floats(1e-3, 1.0),
+)
+def test_nothing_that_is_stated_of_all_ratios_alike_beats_a_refusal(
+    ratios: list[float], value: float, sigma: float
+) -> None:
+    blind = np.mean([crps(value - ratio, sigma) for ratio in ratios])
+    assert blind >= spread_of(ratios) - 1e-12  # a refusal scores 0: 1 - spread / spread
+
+
+def _read_out(split: Split, answers: dict[str, dict[str, object]], folder: Path) -> pd.DataFrame:
+    lines = [{"name": truth.name, **answers[truth.name]} for truth in split.truths]
+    header = {"protocol": split.track.id, "split": split.name, "method": "mine", "uses": ["left"]}
+    return mark(read_submission(write(folder / "a.jsonl", [header, *lines]), split), split)
+
+
+@pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
+def test_a_guess_in_place_of_a_refusal_gains_nothing(tmp_path: Path) -> None:
+    """What raised every entry of ``readout-2`` lowers each of them on ``readout-3``."""
+    old, new = _without_frames("readout-2"), _without_frames("readout-3")
+    for file in sorted((LAWS_FOLDER / "predictions" / "readout-2").glob(f"rs-*{SUFFIX}")):
+        lines = map(json.loads, lzma.decompress(file.read_bytes()).splitlines()[1:])
+        honest = {line.pop("name"): line for line in lines}
+        blind = {"success": True, "readout_ratio": 0.525}
+        guessed = {name: line if line.get("success", True) else blind for name, line in honest.items()}
+        scores = [[_read_out(split, answers, tmp_path) for answers in (honest, guessed)] for split in (old, new)]
+        assert scores[0][0]["auc_r10"].mean() < scores[0][1]["auc_r10"].mean(), file.name
+        assert scores[1][0]["skill"].mean() > scores[1][1]["skill"].mean(), file.name
+        assert np.all(scores[1][0]["skill"][~scores[1][0]["success"]] == 0.0)
+
+
+def test_a_wrong_ratio_with_a_small_deviation_is_the_worst_answer(tmp_path: Path) -> None:
+    split = _without_frames("readout-3")
+    true = {truth.name: truth.shutter.readout_ratio for truth in split.truths}
+    kinds = {
+        "sure and right": {name: {"readout_ratio": y, "readout_sigma": 0.01} for name, y in true.items()},
+        "refused": {name: {"success": False} for name in true},
+        "a blind guess with its deviation": {key: {"readout_ratio": 0.525, "readout_sigma": 0.25} for key in true},
+        "a blind guess": {key: {"readout_ratio": 0.525} for key in true},
+        "sure and wrong": {
+            name: {"readout_ratio": y + (0.4 if y < 0.5 else -0.4), "readout_sigma": 0.01}
+            for name, y in true.items()
+        },
+    }
+    scores = {kind: _read_out(split, answers, tmp_path) for kind, answers in kinds.items()}
+    means = [scores[kind]["skill"].mean() for kind in kinds]
+    assert means == sorted(means, reverse=True) and means[1] == 0.0 and means[0] > 0.98
+    assert scores["sure and wrong"]["wrong"].mean() == 1.0 and scores["sure and right"]["right"].mean() == 1.0
+    # Squared errors over the stated variance: 0, and (0.4 / 0.01)^2.
+    assert scores["sure and wrong"]["nees"].to_numpy() == pytest.approx(1600.0)
+    assert scores["a blind guess"]["nees"].isna().all()
+
+
 # What is committed
 
 
@@ -171,7 +246,7 @@ def _without_frames(protocol: str) -> Split:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
-@pytest.mark.parametrize("protocol", ["points-2", "pose-2", "readout-2"])
+@pytest.mark.parametrize("protocol", ["points-2", "pose-2", "readout-2", "readout-3"])
 def test_stored_predictions_give_the_committed_table(protocol: str, split: Split, tmp_path: Path) -> None:
     split = split if protocol == TRACK.id else _without_frames(protocol)
     restore(LAWS_FOLDER / "predictions" / protocol, split, tmp_path / "board")
