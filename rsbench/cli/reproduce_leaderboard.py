@@ -61,7 +61,7 @@ def entries_of_laws() -> dict[str, list[str]]:
     solvers, readers = (
         [name for name in first[track] if name not in SAME_METHOD] + [CHOOSES] for track in ("pose", "readout")
     )
-    return {"points-2": solvers, "pose-2": solvers, "readout-2": readers, "correction-2": first["correction"]}
+    return {"points-2": solvers, "pose-2": solvers, "readout-3": readers, "correction-3": first["correction"]}
 
 
 def boards(out: Path, data: Path, workers: int | None) -> None:

@@ -83,6 +83,9 @@ class DatasetCard(Scanning):
     twins: tuple[int | Twin, ...] = ()
     """Rows, counted in the order of the readout, at whose poses global-shutter images are rendered too; that of
     the first row always is."""
+    exposed_twins: bool = False
+    """Whether global-shutter images are rendered as the sensor exposes them too: with its exposure time, fall-off
+    and brightness, and without noise, mosaic and JPEG. A corrected frame of that sensor is compared with them."""
     imu: Imu | None = None
     """Rates and errors of the channel ``imu``. Absent: the defaults."""
     matches: Matching | None = None
@@ -214,6 +217,7 @@ class DatasetCard(Scanning):
         )
         own = self.sensor_of(sequence)
         sensor = {} if own is None else {"sensor": own.record}
+        sensor |= {"exposed_twins": True} if own is not None and self.exposed_twins else {}
         channels = {"channels": list(self.channels)} if self.channels else {}
         imu = {"imu": asdict(self.imu or Imu())} if "imu" in self.channels else {}
         matches = {"matches": asdict(self.matches or Matching())} if "matches" in self.channels else {}

@@ -257,6 +257,10 @@ def render_camera(
         if kind == "rs" and sensor:
             own, period = sensor.of(side, frame), card.period_of(sequence)
             write_png(folder / view.image, sensed_rows(scene, geometry, (side, frame), own, period, options))
+        if kind == "gs" and sensor and card.exposed_twins:
+            own, period = sensor.of(side, frame).noiseless, card.period_of(sequence)
+            exposed = sensed_rows(scene, geometry, (side, frame), own, period, options, twin=view.row)
+            write_png(folder / view.exposed, exposed)
         if kind == "rs":
             write_channels(folder, card.channels, geometry, view, rendered, SceneRays(scene, things), later, twins)
         if view.row == 0:

@@ -20,7 +20,7 @@ _KINDS = (("rs", "png"), ("rs_depth", "exr"), ("gs", "png"), ("gs_depth", "exr")
 _VIEW = re.compile(r"(left|right)_(0|[1-9][0-9]*)(?=[./])")
 _STACK = re.compile(r"gs_stack/left_0/[0-9]{4,}\.png")
 _MATCHES = re.compile(r"matches/(0|[1-9][0-9]*)\.npz")
-_TWIN = re.compile(r"gs_twin(|_depth|_flow|_flow_mask|_moving|_gloss)/[0-9]{4,}/left_0\.(png|exr)")
+_TWIN = re.compile(r"gs_twin(|_depth|_exposed|_flow|_flow_mask|_moving|_gloss)/[0-9]{4,}/left_0\.(png|exr)")
 
 
 def relative_files(frames: int) -> tuple[str, ...]:
@@ -59,6 +59,11 @@ def gloss_file(shutter: Shutter, side: str, frame: int, row: int = 0) -> str:
     return _beside("gloss", shutter, side, frame, row)
 
 
+def exposed_file(side: str, frame: int, row: int = 0) -> str:
+    """A global-shutter image as the sensor exposes it, without noise; only where ``exposed_twins`` is set."""
+    return _beside("exposed", "gs", side, frame, row)
+
+
 def _beside(kind: str, shutter: Shutter, side: str, frame: int, row: int) -> str:
     return f"gs_twin_{kind}/{row:04d}/{side}_{frame}.png" if row else f"{shutter}_{kind}/{side}_{frame}.png"
 
@@ -88,7 +93,9 @@ def files_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
     every = [("rs", *view, 0) for view in views] + [("gs", *view, row) for row in (0, *rows) for view in views]
     labels = tuple(moving_file(*each) for each in every if manifest.get("moving"))  # pyrefly: ignore[bad-argument-type]
     gloss = tuple(gloss_file(*each) for each in every if manifest.get("glossy"))  # pyrefly: ignore[bad-argument-type]
-    own = relative_files(frames) + clean + stacks + twins + labels + gloss
+    shown = manifest.get("sensor") and manifest.get("exposed_twins") is True
+    exposed = tuple(exposed_file(*view, row) for row in (0, *rows) for view in views if shown)
+    own = relative_files(frames) + clean + stacks + twins + exposed + labels + gloss
     return own + channel_files(channels_of(manifest), rows, frames)
 
 
@@ -119,6 +126,7 @@ _KNOWN = {"sequence.json"} | {
     for name in (
         *relative_files(1),
         clean_file("left", 0),
+        exposed_file("left", 0),
         *(file(shutter, "left", 0) for file in (moving_file, gloss_file) for shutter in SHUTTERS),
         *channel_files(CHANNELS, frames=len(FRAMES) + 1),
     )

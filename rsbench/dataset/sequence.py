@@ -30,6 +30,7 @@ from rsbench.dataset.layout import (
     MOST_TWINS,
     Shutter,
     clean_file,
+    exposed_file,
     gloss_file,
     moving_file,
     picture_file,
@@ -91,6 +92,7 @@ class SequenceManifest(Scanning):
     imu: Imu | None = None
     matches: Matching | None = None
     twins: tuple[int, ...] = ()
+    exposed_twins: bool = False
     channels: tuple[str, ...] = ()
     moving: tuple[MovingManifest, ...] = ()
     glossy: bool = False
@@ -172,6 +174,8 @@ class Sequence(ChannelReader):
     """Of the channel ``matches``."""
     twins: tuple[int, ...] = ()
     """Rows, counted as they are read, from whose poses there are global-shutter twins beside those of row 0."""
+    exposed_twins: bool = False
+    """Whether it has the global-shutter images as the sensor exposes them."""
     channels: tuple[str, ...] = ()
     """Names of those that it has beside images, depth and poses; later versions know more."""
     frames: int = len(FRAMES)
@@ -231,6 +235,21 @@ class Sequence(ChannelReader):
     def image(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.uint8]:
         """(H, W, 3) sRGB; ``gs`` is the global-shutter image at the pose of a row: 0, or one of ``twins``."""
         return read_png(inside(self.folder, picture_file(shutter, side, frame + self.first, row)), self._size)
+
+    def exposed_image(self, side: Side, frame: int, row: int = 0) -> NDArray[np.uint8]:
+        """(H, W, 3) sRGB: what the sensor expects under a global shutter at the pose of a row, without noise.
+
+        Raises:
+            RsbenchError: the dataset has a sensor, and was made without ``exposed_twins``.
+        """
+        if self.sensor is None:
+            return self.image("gs", side, frame, row)
+        if not self.exposed_twins:
+            raise RsbenchError(
+                f"{self.folder}: has no global-shutter images of its sensor; render it again with "
+                "exposed_twins = true in the dataset card"
+            )
+        return read_png(inside(self.folder, exposed_file(side, frame + self.first, row)), self._size)
 
     def clean_image(self, side: Side, frame: int) -> NDArray[np.uint8]:
         """(H, W, 3) sRGB: the rolling-shutter frame of an ideal sensor, sharp and without noise."""
@@ -337,6 +356,7 @@ def sequence_of(content: dict[str, Any], path: Path) -> Sequence:
             imu=manifest.imu,
             matching=manifest.matches,
             twins=manifest.twins,
+            exposed_twins=manifest.exposed_twins,
             frames=manifest.frames,
             channels=manifest.channels,
             moving=manifest.moving,

@@ -43,7 +43,9 @@ def with_gloss(plan: Plan, glossy: bool) -> Plan:
 
 def check_same(place: object, manifest: Plan, plan: Plan, scene_sha256: str) -> None:
     """Raise RsbenchError unless the sequence.json of a place was made from this plan and scene."""
-    expected = dict.fromkeys(("sensor", "channels", "imu", "matches", "twins", "frames", "moving", "meshes"))
+    expected = dict.fromkeys(
+        ("sensor", "channels", "imu", "matches", "twins", "exposed_twins", "frames", "moving", "meshes")
+    )
     expected |= of_scene(plan, scene_sha256)
     other = [key for key, value in expected.items() if manifest.get(key) != value]
     if other:

@@ -16,7 +16,7 @@ from rsbench.core.projection import back_project, rs_project_near
 from rsbench.core.rig import FRAMES, SIDES, Side
 from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.layout import SHUTTERS, Shutter, gloss_file, moving_file, picture_file
+from rsbench.dataset.layout import SHUTTERS, Shutter, exposed_file, gloss_file, moving_file, picture_file
 
 _NEAREST = 32
 FAR = 1e7
@@ -56,6 +56,11 @@ class ImageView(NamedTuple):
     def gloss(self) -> str:
         """Of glossy surfaces, where any is."""
         return gloss_file(*self)
+
+    @property
+    def exposed(self) -> str:
+        """Of a global shutter as the sensor exposes it, where the dataset has that."""
+        return exposed_file(*self[1:])
 
     @property
     def other_shutter(self) -> ImageView:

@@ -91,6 +91,14 @@ class Sensor:
         if not all(math.isfinite(value) and low <= value <= high for value in self.brightness):
             raise ValueError(f"sensor brightness = {list(self.brightness)}: allowed is {low:g} to {high:g}")
 
+    @property
+    def noiseless(self) -> Sensor:
+        """The same exposure, fall-off and brightness without noise, rounding, mosaic and compression."""
+        clean: dict[str, Any] = {"photon_noise": False, "read_noise": 0.0, "dark_current": 0.0, "bit_depth": 0}
+        alike: dict[str, Any] = {"mosaic": "none", "jpeg_quality": 0}
+        right: dict[str, Any] = {"right_mosaic": None, "right_jpeg_quality": None}
+        return replace(self, **clean, **alike, **right)
+
     def of(self, side: str, frame: int) -> Sensor:
         """The sensor of one camera at one time, both of whose frames and cameras are alike."""
         right = side == "right"

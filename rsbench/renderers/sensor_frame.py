@@ -28,6 +28,7 @@ def sensed_rows(
     frame_period_s: float,
     options: RendererOptions,
     rows: Sequence[int] | None = None,
+    twin: int | None = None,
 ) -> NDArray[np.uint8]:
     """Rows (rows, width, 3) of a frame, all by default; 8-bit sRGB.
 
@@ -39,9 +40,12 @@ def sensed_rows(
         frame_period_s: seconds of a frame period, in which the motion counts.
         options: how to render; their seed is that of the image, of the noise too.
         rows: these only, with the bits that they have in the whole frame.
+        twin: all rows are exposed about the time of this row, counted as rows are read, as by a global shutter.
     """
     rig, shutter, (side, frame) = geometry.rig, geometry.shutter, view
     tau = shutter.line_times(frame, side)
+    if twin is not None:
+        tau = np.full(tau.shape, tau[abs(shutter.first_line(side) - twin)])
 
     def poses(tau: FloatArray) -> LinePoses:
         camera = rig.cam_from_world(geometry.motion, tau, side)

@@ -92,6 +92,11 @@ def _matcher(state: State) -> list[Finding]:
     return findings
 
 
+def _sensor(state: State) -> Iterator[Finding]:
+    content = with_twins(state.fresh, state.twins)
+    return sensor_faults(state.sequence, content.maps, content.pictures, state.missing)
+
+
 def _render_rows(state: State) -> tuple[Finding, ...]:
     if state.rerendered is not None:
         state.rerendered.add(with_twins(state.fresh, state.twins), state.reported)
@@ -220,12 +225,12 @@ CHECKS = (
     Check(
         name="sensor",
         stage="frames",
-        reads="`rs/*.png` of a `[sensor]`, their clean twins",
+        reads="`rs/*.png` of a `[sensor]`, their clean twins; `gs_exposed/*.png` beside `gs/*.png`",
         finds="blur and noise that the sensor does not make of the clean twin, which stands for the frame in all "
         "other checks; with a `mosaic`, values that are neither read nor the mean of their neighbours of that "
         "colour; with `jpeg_quality`, blocks that are not of whole steps of that quality",
         costs="filters over the whole frame",
-        run=lambda state: sensor_faults(state.sequence, state.fresh.maps, state.fresh.pictures, state.missing),
+        run=_sensor,
     ),
     Check(
         name="depth and colours",

@@ -245,9 +245,9 @@ def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: Seque
     """sequence.json against what the card would make, as far as that is known without building the scene."""
     made = manifest.get("made_by")
     same_version = isinstance(made, dict) and made.get("rsbench") == __version__
-    planned = dict.fromkeys(("sensor", "channels", "imu", "twins", "frames", "moving")) | card.manifest_of(
-        sequence
-    )
+    planned = dict.fromkeys(
+        ("sensor", "channels", "imu", "twins", "exposed_twins", "frames", "moving")
+    ) | card.manifest_of(sequence)
     planned["seed"] = card.seed_of(sequence)
     start = None if sequence.start is None else asdict(sequence.start)
     scene: dict[str, Any] = {"viewpoint": sequence.viewpoint, "start": start}

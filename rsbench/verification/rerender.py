@@ -257,6 +257,8 @@ def _checks(
             yield from (Check(*check) for check in again)
         if view.shutter == "rs":
             yield from _frame_checks(content, scene, options, view, rows, reported)
+        elif content.sequence.exposed_twins:
+            yield from _exposed_check(content, scene, options, view, rows, reported)
 
 
 def _picture_check(
@@ -297,6 +299,27 @@ def _frame_checks(
     with contextlib.suppress(RsbenchError):
         if whole_frames(sequence.manifest):
             yield _stack_check(content, scene, chosen, view, rows)
+
+
+def _exposed_check(
+    content: Content,
+    scene: MitsubaScene,
+    options: RendererOptions,
+    view: ImageView,
+    rows: list[int],
+    reported: set[str],
+) -> Iterator[Check]:
+    """The global-shutter image as the sensor exposes it."""
+    from rsbench.renderers.sensor_frame import sensed_rows
+
+    sequence, chosen = content.sequence, _of_image(content, options, view)
+    if sequence.sensor is None or view.exposed in reported:
+        return
+    with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
+        seen = Picture.of(view, sequence.exposed_image(*view[1:]), noisy=False)
+        sensor, place = sequence.sensor.of(view.side, view.frame).noiseless, (view.side, view.frame)
+        made = sensed_rows(scene, sequence, place, sensor, sequence.frame_period_s, chosen, rows, view.row)
+        yield image_check(view.exposed, seen, made, rows, not _made_here(content), _by_gpu(content))
 
 
 def _stack_check(

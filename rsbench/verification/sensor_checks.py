@@ -1,4 +1,8 @@
-"""Frames of a sensor that is not ideal, against clean twins: no more blur and noise than the sensor makes."""
+"""Frames of a sensor that is not ideal, against clean twins: no more blur and noise than the sensor makes.
+
+Rolling-shutter frames have a clean twin of their own; global-shutter images as the sensor exposes them, without
+noise, stand beside those of an ideal sensor.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.errors import RsbenchError
-from rsbench.core.projection import back_project, project_at
+from rsbench.core.projection import project_at
+from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
+from rsbench.dataset.layout import clean_file
 from rsbench.dataset.object_records import SHADED, numbers_of
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import FAR, ImageView, seen_from
@@ -49,17 +55,19 @@ def sensor_faults(
     pictures: Mapping[ImageView, Picture],
     missing: Collection[str],
 ) -> Iterator[Finding]:
-    """What the rolling-shutter frames of a sequence show that their sensor cannot have made of the clean twins."""
+    """What the frames of a sequence show that their sensor cannot have made of the clean twins."""
     sensor = sequence.sensor
     size = sequence.rig.camera.width, sequence.rig.camera.height
     for view in pictures:
-        if sensor is None or view.shutter != "rs" or view.image in missing or view not in maps:
+        rolling, file = view.shutter == "rs", _file(view)
+        if sensor is None or file in missing or view not in maps or not (rolling or sequence.exposed_twins):
             continue
         try:
-            fault = png_fault(inside(sequence.folder, view.image), view.image, size)
+            fault = png_fault(inside(sequence.folder, file), file, size)
             if fault is None:
-                seen = sequence.image(*view[:3])
+                seen = sequence.image(*view[:3]) if rolling else sequence.exposed_image(*view[1:])
                 own, spacing = sensor.of(view.side, view.frame), _spacing(sequence)
+                own = own if rolling else own.noiseless
                 window = _window(sequence, own, maps[view], spacing)
                 changing = _changing(sequence, own, maps[view], spacing)
                 fault = _fault(own, seen, pictures[view], window, spacing, changing)
@@ -116,9 +124,13 @@ def _window(
         return 0, 0
     depth, grid = depth_map.depth[::4, ::4][own].astype(np.float64), grid[own]
     rig, shutter, motion = seen_from(sequence, number)[:3]
-    X = back_project(rig, shutter, motion, view.side, view.frame, grid, np.where(depth > 0, depth, FAR))
-    half = 0.5 * sensor.exposure_s / sequence.frame_period_s
     tau = shutter.pixel_time(grid, view.frame, view.side)
+    if view.shutter == "gs":
+        line = shutter.line_times(view.frame, view.side)[abs(shutter.first_line(view.side) - view.row)]
+        tau = np.full(tau.shape, line)
+    rays = rig.camera.unproject(grid) * np.where(depth > 0, depth, FAR)[:, None]
+    X = transform(inverse(rig.cam_from_world(motion, tau, view.side)), rays)
+    half = 0.5 * sensor.exposure_s / sequence.frame_period_s
     moved = [
         np.abs(project_at(rig, motion, view.side, tau + sign * half, X)[..., :2] - grid) for sign in (-1.0, 1.0)
     ]
@@ -143,7 +155,7 @@ def _fault(
     judged = np.ones((*image.shape[:2], 1), np.bool_) if changing is None else ~changing[..., None]
     return (
         _beyond(bounds, image, picture.view, spacing, judged)
-        or processing_fault(image, sensor, picture.view.image)
+        or processing_fault(image, sensor, _file(picture.view))
         or _noise_fault(bounds, sensor, image, picture, judged)
     )
 
@@ -205,7 +217,7 @@ def _beyond(
     if many <= _BEYOND_SHARE * max(1.0, 2.0 * spacing) and not np.any(rows):
         return None
     what = f"{100 * many:.2f} % of the values are beyond {_BEYOND_SIGMA:g} sigma of what {_twin(view)} allows"
-    return Finding(view.image, what, rows_of(rows))
+    return Finding(_file(view), what, rows_of(rows))
 
 
 def _noise_fault(
@@ -226,7 +238,7 @@ def _noise_fault(
     beside = ((linear_of_codes(image) - 0.5 * (low + high)) / sigma)[smooth]
     if abs(bias := float(np.mean(beside))) > _MOST_BIAS:
         way = "brighter" if bias > 0 else "darker"
-        return Finding(view.image, f"is {way} than its sensor shows {_twin(view)}, by {abs(bias):.2f} sigma")
+        return Finding(_file(view), f"is {way} than its sensor shows {_twin(view)}, by {abs(bias):.2f} sigma")
     ratio, (least, most) = float(np.var(beside)), _VARIANCE_RANGE
     if sensor.jpeg_quality:
         made = linear_of_codes(_made_of(picture.colours, sensor))
@@ -235,11 +247,16 @@ def _noise_fault(
     if least < ratio < most:
         return None
     what = f"its noise has {ratio:.2f} times the variance of the sensor's, seen beside {_twin(view)}"
-    return Finding(view.image, what)
+    return Finding(_file(view), what)
+
+
+def _file(view: ImageView) -> str:
+    """What the sensor made."""
+    return view.image if view.shutter == "rs" else view.exposed
 
 
 def _twin(view: ImageView) -> str:
-    return f"rs_clean/{view.side}_{view.frame}.png"
+    return clean_file(view.side, view.frame) if view.shutter == "rs" else view.image
 
 
 def _made_of(clean: NDArray[np.uint8] | NDArray[np.float32], sensor: Sensor) -> NDArray[np.uint8]:

@@ -15,15 +15,22 @@ from attack.planting import rehash
 from numpy.typing import NDArray
 from small_scenes import write_box_scene, write_small_card
 
-from rsbench.components.cards import parse_card
+from rsbench.components.cards import load_card, parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.generation import generate_dataset
+from rsbench.dataset.posed_scenes import seen_scene
 from rsbench.dataset.sequence import read_sequence
 from rsbench.dataset.views import ImageView
-from rsbench.renderers.electrons import Sensor
+from rsbench.renderers.electrons import Sensor, fall_off
+from rsbench.renderers.image import to_srgb8
+from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.processing import compressed
+from rsbench.renderers.render import LinePoses, render
+from rsbench.renderers.scene import MitsubaScene
+from rsbench.renderers.sensor_frame import sensed_rows
+from rsbench.scenes.model import Scene
 from rsbench.storage.files import read_png, write_png
 from rsbench.verification import sensor_checks, verify_dataset
 from rsbench.verification.content import read_content
@@ -156,6 +163,74 @@ def test_rows_of_a_sensor_are_made_again(made: dict[str, Path], tmp_path: Path) 
     rehash(copy)
     (report,) = verify_dataset(copy, 4, rerender="auto")
     assert any(fault.startswith("rs/left_1.png: ") and "rendered again" in fault for fault in report.faults)
+
+
+# Global-shutter images as the sensor exposes them
+
+
+@pytest.fixture(scope="module")
+def twins(tmp_path_factory: pytest.TempPathFactory, scenes_once: None) -> Path:
+    """A dataset of a sensor with exposure, fall-off and no noise; exposed twins of the first and middle row."""
+    sensor = Sensor(exposure_s=0.02, vignetting=0.3, brightness=(1.0, 0.7))
+    folder = tmp_path_factory.mktemp("twins") / "data"
+    generate_dataset(_card(sensor, exposed_twins=True, twins=("middle",)), folder)
+    return folder
+
+
+def test_a_row_of_an_exposed_twin_is_that_of_the_rolling_frame(twins: Path) -> None:
+    """Where both are exposed about one time, by the same samples, the bits are the same; elsewhere not."""
+    sequence = read_sequence(twins / "room-twist")
+    for (side, frame), row in product(VIEWS, (0, 36)):
+        seen, twin = sequence.image("rs", side, frame), sequence.exposed_image(side, frame, row)
+        np.testing.assert_array_equal(seen[row], twin[row])
+        assert np.any(seen[71 - row] != twin[71 - row])
+
+
+def test_an_exposed_twin_is_the_mean_of_the_images_of_its_instants(built_scene: Callable[[str], Scene]) -> None:
+    """Frames of an ideal global shutter at the 64 times of the exposure, averaged as light."""
+    card, sensor, row = _card(None), Sensor(exposure_s=0.1, vignetting=0.3), 36
+    options = replace(load_card(RendererOptions, "renderers", "preview"), samples=64, seed=1)
+    scene = MitsubaScene(seen_scene(built_scene("room"), card.sequence[0]))
+    geometry = card.geometry_of(card.sequence[0])
+    found = sensed_rows(scene, geometry, ("left", 0), sensor, card.frame_period_s, options, twin=row)
+    at, light = geometry.shutter.row_time(row, 0), fall_off(sensor, 96, 72, range(72))[..., None]
+
+    def seen(tau: float) -> NDArray[np.float32]:
+        poses = geometry.rig.cam_from_world(geometry.motion, np.full(72, tau), "left")
+        return render(scene, geometry.rig.camera, LinePoses(*poses), replace(options, samples=4)).image
+
+    instants = at + sensor.exposure_s / card.frame_period_s * ((np.arange(64) + 0.5) / 64 - 0.5)
+    whole = [np.mean([seen(float(tau)) for tau in instants], axis=0), seen(float(at))]
+    errors = [
+        found.astype(float) - to_srgb8((each * light).astype(np.float32), options.exposure) for each in whole
+    ]
+    blurred, sharp = (float(np.sqrt(np.mean(error**2))) for error in errors)
+    # Each instant is seen once in a pixel, at another place of it: what is left is Monte Carlo error.
+    assert blurred < 0.5 * sharp and abs(np.mean(errors[0])) < 0.2
+
+
+def test_exposed_twins_are_verified(twins: Path, tmp_path: Path) -> None:
+    (report,) = verify_dataset(twins, 4, rerender="auto")
+    assert report.faults == () and report.notes[0].endswith("the same bits")
+    for number, file in enumerate(("gs_exposed/left_1.png", "gs_twin_exposed/0036/right_0.png")):
+        copy = tmp_path / str(number) / "data"
+        shutil.copytree(twins, copy)
+        path = copy / "room-twist" / file
+        write_png(path, np.ascontiguousarray(read_png(path)[::-1]))
+        rehash(copy)
+        (report,) = verify_dataset(copy)
+        assert any(fault.startswith(f"{file}: ") and "beyond 5 sigma" in fault for fault in report.faults)
+        path.unlink()
+        (report,) = verify_dataset(copy)
+        assert any(file in fault for fault in report.faults)
+
+
+def test_without_exposed_twins_there_is_one_line(made: dict[str, Path]) -> None:
+    with pytest.raises(RsbenchError, match="has no global-shutter images of its sensor; render it again with"):
+        read_sequence(made["exposed"]).exposed_image("left", 0)
+    ideal = read_sequence(made["ideal"])
+    np.testing.assert_array_equal(ideal.exposed_image("left", 0), ideal.image("gs", "left", 0))
+    assert "exposed_twins" not in ideal.manifest, "an ideal sensor exposes no instant"
 
 
 # A blur of a fine texture hides how much noise and light there is; rows that are rendered again tell.

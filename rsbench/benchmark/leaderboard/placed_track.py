@@ -9,7 +9,8 @@ a corrected frame is off; nor phase correlation, which undoes the blur.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from collections.abc import Sequence as Series
 from itertools import product
 from typing import ClassVar
 
@@ -25,7 +26,11 @@ from rsbench.benchmark.leaderboard.picture_running import CardChain
 from rsbench.benchmark.leaderboard.splits import Truth
 from rsbench.benchmark.leaderboard.submissions import Submission
 from rsbench.benchmark.leaderboard.track import Score
-from rsbench.benchmark.leaderboard.true_pictures import TruePictures
+from rsbench.benchmark.leaderboard.true_pictures import VIEW, Asked, TruePictures
+from rsbench.core.errors import RsbenchError
+from rsbench.dataset.layout import exposed_file
+from rsbench.dataset.sequence import Sequence
+from rsbench.vision.quality import GAUSSIAN, Picture, ssim_map, to_unit, window_mask
 
 LIMIT_PX = 2.0
 """A window that stands farther off has no part in the score."""
@@ -33,6 +38,8 @@ WINDOW_PX, _STEP_PX, _REACH_PX = 64, 32, 4
 """Side of a window, from one to the next, and how far it is looked for."""
 _BLUR_PX = 3.0
 """Standard deviation of the blur of both pictures."""
+_LOOK_PX = 2.0
+"""Standard deviation of the blur under which pictures are compared: white noise is left with a seventh."""
 _TEXTURE = 5.0
 """Grey levels by which the truth must deviate around a pixel that counts: elsewhere nothing tells where it is."""
 _LEAST = 0.25
@@ -73,7 +80,83 @@ class PlacedCorrection(CorrectionTrack):
         return scores_of
 
 
-def placed(truths: Sequence[TrueFrame], frames: Sequence[Frame]) -> float:
+class SeenCorrection(PlacedCorrection):
+    """Rolling-shutter frames as a global shutter of the same sensor would have taken them."""
+
+    name, id = "correction-3", "correction-3"
+    title = "Corrected frames, by where things stand and how they look"
+    scores = (
+        Score(
+            key="corrected",
+            title="placed x picture",
+            hint="the product of the two: what stands in its place and looks like the scene there",
+            kind="share",
+            better="higher",
+        ),
+        *(score for score in PlacedCorrection.scores if score.key == "placed"),
+        Score(
+            key="picture",
+            title="picture",
+            hint="SSIM, both blurred by 2 px, to a global shutter of the same sensor; 0 where nothing is drawn",
+            kind="share",
+            better="higher",
+        ),
+        *(score for score in PlacedCorrection.scores if score.key != "placed"),
+    )
+    error, error_title = "uncorrected", "1 - placed x picture"
+    beside = ("placed", "picture", "failure")
+
+    def asked(self, sequence: Sequence) -> tuple[Asked, ...]:
+        """The truth is what the same sensor expects under a global shutter, without noise.
+
+        Raises:
+            RsbenchError: the dataset has a sensor and no such images.
+        """
+        asked = super().asked(sequence)
+        if sequence.sensor is None:
+            return asked
+        if not sequence.exposed_twins:
+            raise RsbenchError(
+                f"{sequence.folder}: has no global-shutter images of its sensor, which {self.id} compares with; "
+                "render the dataset again with exposed_twins = true in its card"
+            )
+        side, frame = VIEW
+        return tuple(each._replace(file=exposed_file(side, frame + sequence.first, each.row)) for each in asked)
+
+    def scorer(self, truth: Truth, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
+        others, true = super().scorer(truth, pictures), TrueFrame.all_of(pictures)
+
+        def scores_of(submission: Submission, success: bool) -> Numbers:
+            folder, found = submission.folder / FOLDER, others(submission, success)
+            drawn = [read_answer_frame(folder, truth, each) for each in pictures.asked] if success else None
+            looks = 0.0 if drawn is None else seen_alike(true, drawn)
+            both = found["placed"] * looks
+            return {**found, "picture": looks, "corrected": both, "uncorrected": 1.0 - both}
+
+        return scores_of
+
+
+def seen_alike(truths: Series[TrueFrame], frames: Series[Frame]) -> float:
+    """The mean over frames of the SSIM to their truth, both blurred, over their common pixels; at least 0.
+
+    What is not drawn counts 0. The blur leaves a sensor's noise without weight, so that a filter gains nothing;
+    contrast, colour, strong noise and holes that were filled with anything keep theirs.
+    """
+    return float(np.mean([_alike(*frame, true) for true, frame in zip(truths, frames, strict=True)]))
+
+
+def _alike(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame) -> float:
+    seen, wanted = (
+        Picture(cv2.GaussianBlur(to_unit(each), (0, 0), _LOOK_PX)) for each in (image, true.picture.image)
+    )
+    windows = window_mask(drawn.shape, true.common)
+    if not np.any(windows):
+        return 1.0
+    scores = np.mean(ssim_map(seen, wanted, GAUSSIAN), axis=-1)
+    return max(0.0, float(np.mean(np.where(drawn, scores, 0.0)[windows])))
+
+
+def placed(truths: Series[TrueFrame], frames: Series[Frame]) -> float:
     """The mean over frames of the share of their textured common pixels that are drawn, each by its window's
     distance from its place: 1 at 0, 0 from ``LIMIT_PX`` on; 1 where no window has enough texture."""
     return float(np.mean([_placed(*frame, true) for true, frame in zip(truths, frames, strict=True)]))

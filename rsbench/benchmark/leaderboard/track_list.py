@@ -7,7 +7,7 @@ from rsbench.benchmark.leaderboard.depth_track import DepthTrack
 from rsbench.benchmark.leaderboard.mono_track import MonoCorrectionTrack
 from rsbench.benchmark.leaderboard.motion_tracks import PointsTrack, PoseTrack
 from rsbench.benchmark.leaderboard.own_pose_track import OwnPoseTrack
-from rsbench.benchmark.leaderboard.placed_track import PlacedCorrection
+from rsbench.benchmark.leaderboard.placed_track import PlacedCorrection, SeenCorrection
 from rsbench.benchmark.leaderboard.readout_track import ReadoutTrack
 from rsbench.benchmark.leaderboard.second_protocols import DrawnReadout, LawsOfPoints, LawsOfPoses, SkilledReadout
 from rsbench.benchmark.leaderboard.track import Track
@@ -27,6 +27,7 @@ TRACKS: dict[str, Track] = {
         DrawnReadout(),
         ReadoutTrack(),
         DepthTrack(),
+        SeenCorrection(),
         PlacedCorrection(),
         CorrectionTrack(),
         MonoCorrectionTrack(),

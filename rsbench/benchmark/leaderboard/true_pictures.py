@@ -22,7 +22,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, View
 from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence, read_dataset_manifest
-from rsbench.storage.files import sha256
+from rsbench.storage.files import read_png, sha256
 from rsbench.storage.untrusted_files import inside
 from rsbench.vision.stereo_depth import seen_by_other
 
@@ -73,8 +73,9 @@ class TruePictures:
         return self.sequence.depth("rs", *VIEW)
 
     def frame(self, row: int) -> NDArray[np.uint8]:
-        """(H, W, 3) what a global shutter sees from the pose of a row."""
-        return self.sequence.image("gs", *VIEW, row)
+        """(H, W, 3) what a global shutter sees from the pose of a row that is asked for."""
+        (file,) = (each.file for each in self.asked if each.row == row)
+        return read_png(inside(self.sequence.folder, file), self.size)
 
     def rolling(self) -> NDArray[np.uint8]:
         """(H, W, 3) the frame as it is."""
