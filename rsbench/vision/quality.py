@@ -141,13 +141,14 @@ def window_mask(size: tuple[int, ...], mask: NDArray[np.bool_] | None) -> NDArra
     return cv2.erode(covered, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0).astype(np.bool_)
 
 
-def ssim_map(a: Picture, b: Picture, window: Window) -> FloatArray:
-    """Local SSIM (H, W[, C]) of images."""
+def ssim_map(a: Picture, b: Picture, window: Window, constants: float = 1.0) -> FloatArray:
+    """Local SSIM (H, W[, C]) of images; ``constants`` scales the two that keep its quotients from 0 / 0."""
+    c1, c2 = constants * _C1, constants * _C2
     first, second = a.moments(window), b.moments(window)
     product = first.mean * second.mean
     covariance = window.factor * (window.mean(a.unit * b.unit) - product)
-    luminance = (2.0 * product + _C1) / (first.mean * first.mean + second.mean * second.mean + _C1)
-    return luminance * (2.0 * covariance + _C2) / (first.variance + second.variance + _C2)
+    luminance = (2.0 * product + c1) / (first.mean * first.mean + second.mean * second.mean + c1)
+    return luminance * (2.0 * covariance + c2) / (first.variance + second.variance + c2)
 
 
 def _blur(image: FloatArray) -> FloatArray:

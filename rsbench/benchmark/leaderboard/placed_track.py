@@ -40,6 +40,8 @@ _BLUR_PX = 3.0
 """Standard deviation of the blur of both pictures."""
 _LOOK_PX = 2.0
 """Standard deviation of the blur under which pictures are compared: white noise is left with a seventh."""
+_LOOK_CONSTANTS = 0.1
+"""Factor of SSIM's constants: the blur takes contrast away, and beside the whole ones a tenth of it would do."""
 _TEXTURE = 5.0
 """Grey levels by which the truth must deviate around a pixel that counts: elsewhere nothing tells where it is."""
 _LEAST = 0.25
@@ -97,7 +99,7 @@ class SeenCorrection(PlacedCorrection):
         Score(
             key="picture",
             title="picture",
-            hint="SSIM, both blurred by 2 px, to a global shutter of the same sensor; 0 where nothing is drawn",
+            hint="SSIM of blurred images to what a global shutter of the same sensor shows, 0 where not drawn",
             kind="share",
             better="higher",
         ),
@@ -152,7 +154,7 @@ def _alike(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame) 
     windows = window_mask(drawn.shape, true.common)
     if not np.any(windows):
         return 1.0
-    scores = np.mean(ssim_map(seen, wanted, GAUSSIAN), axis=-1)
+    scores = np.mean(ssim_map(seen, wanted, GAUSSIAN, _LOOK_CONSTANTS), axis=-1)
     return max(0.0, float(np.mean(np.where(drawn, scores, 0.0)[windows])))
 
 

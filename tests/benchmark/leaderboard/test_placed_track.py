@@ -14,7 +14,7 @@ from leaderboards import lines_of
 from rsbench.benchmark.leaderboard.correction_track import TrueFrame
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.picture_parts import parts_within
-from rsbench.benchmark.leaderboard.placed_track import placed
+from rsbench.benchmark.leaderboard.placed_track import placed, seen_alike
 from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.submissions import read_submission
 from rsbench.benchmark.leaderboard.track_list import TRACKS
@@ -116,3 +116,63 @@ def test_correctors_have_the_motion_whose_model_the_matches_prefer() -> None:
     assert first.key == CorrectionOptions().key
     assert second.key == CorrectionOptions(motion_model="auto").key != first.key
     assert (second.entry.key, second.uses) == (first.entry.key, first.uses)
+
+
+# A second number: how it looks
+
+
+def _noise(image: Image, sigma: float) -> Image:
+    return _u8(image + sigma * np.random.default_rng(2).standard_normal(image.shape))
+
+
+def _holes(image: Image) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Half of the pixels, at random, in squares of 4 px."""
+    coarse = np.random.default_rng(5).random((SHAPE[0] // 4, SHAPE[1] // 4)) < 0.5
+    return np.kron(coarse, np.ones((4, 4))).astype(np.bool_)
+
+
+def test_what_is_no_picture_has_no_score() -> None:
+    """What keeps its place and not its looks: each loses most of what ``placed`` alone would leave it."""
+    true, right = _true(), _u8(_seen(0.0))
+    holes, mean = _holes(right), np.mean(right, axis=(0, 1))
+    pale = _u8(mean + 0.1 * (right - mean))
+    filled = right.copy()
+    filled[holes] = _u8(mean)
+    black = right.copy()
+    black[holes] = 0
+    assert seen_alike([true], [(right, ALL)]) == pytest.approx(1.0, abs=1e-12)
+    grey = np.repeat(np.mean(right, axis=-1, keepdims=True), 3, axis=-1).astype(np.uint8)
+    for name, image, drawn, place, most in (
+        ("contrast of a tenth", pale, ALL, 0.95, 0.3),
+        ("noise of 60 levels", _noise(right, 60.0), ALL, 0.8, 0.75),
+        ("filled holes", filled, ALL, 0.7, 0.5),
+        ("filled holes that count as such", filled, ~holes, 0.3, 0.15),
+        ("black holes", black, ~holes, 0.0, 0.02),
+        ("without colours", grey, ALL, 0.6, 0.35),
+        ("red and blue exchanged", right[..., ::-1].copy(), ALL, 0.7, 0.3),
+    ):
+        where, looks = (score([true], [(image, drawn)]) for score in (placed, seen_alike))
+        assert where >= place and where * looks < most, name
+
+
+def test_filters_gain_next_to_nothing_in_looks() -> None:
+    """On the noise of a real sensor, some 10 of 255 levels."""
+    true = _true()
+    frame = _noise(cv2.GaussianBlur(_u8(_seen(0.0)), (0, 0), 1.0), 10.0)
+    before = seen_alike([true], [(frame, ALL)])
+    after = {name: seen_alike([true], [(made(frame), ALL)]) for name, made in FILTERS.items()}
+    assert before > 0.97 and max(after.values()) < before + 0.02, (before, after)
+    assert max(ssim(made(frame), true.picture) for made in FILTERS.values()) > ssim(frame, true.picture) + 0.02
+
+
+def test_the_score_is_the_product_and_the_truth_has_it_all(planes: Path, tmp_path: Path) -> None:
+    split = dataset_split(TRACKS["correction-3"], planes)
+    found = {
+        path.parent.name: mark(read_submission(path, split), split)
+        for path in split.track.oracles(split, tmp_path)
+    }
+    for scores in found.values():
+        np.testing.assert_allclose(scores["corrected"], scores["placed"] * scores["picture"], rtol=1e-12)
+        np.testing.assert_allclose(scores["uncorrected"], 1.0 - scores["corrected"], atol=1e-12)
+    assert np.all(found["truth"]["picture"] > 1.0 - 1e-9)
+    assert np.all(found["fusion-true"]["corrected"] > found["uncorrected"]["corrected"])
