@@ -9,7 +9,13 @@ import pandas as pd
 
 from rsbench.benchmark.studies.correction_methods import METHODS, ON_REQUEST, methods_among
 from rsbench.benchmark.studies.correction_study import ROW_BANDS
-from rsbench.benchmark.studies.correction_summary import by_scene, loss_to_true_motion, masks, verdict
+from rsbench.benchmark.studies.correction_summary import (
+    by_scene,
+    law_and_size,
+    loss_to_true_motion,
+    masks,
+    verdict,
+)
 from rsbench.report import pages
 
 _TITLES = {method.key: method.title for method in (*METHODS, *ON_REQUEST)}
@@ -38,19 +44,43 @@ def write_study(folder: Path) -> list[Path]:
 
 
 def write_laws(folder: Path) -> Path:
-    """README.md from the table ``by_law`` in ``folder``."""
+    """README.md from the tables in ``folder``: ``by_law``, ``by_sequence``, and the errors of motions."""
     page = folder / "README.md"
-    page.write_text(laws_page(pd.read_csv(folder / "summary.csv")), "utf-8", newline="\n")
+    tables = [pd.read_csv(folder / f"{name}.csv") for name in ("summary", "sequences", "motions")]
+    page.write_text(laws_page(*tables), "utf-8", newline="\n")
     return page
 
 
-def laws_page(summary: pd.DataFrame) -> str:
-    """The page of frames under several laws of motion, as Markdown; ``summary`` as of ``by_law``."""
+def laws_page(summary: pd.DataFrame, sequences: pd.DataFrame, motions: pd.DataFrame) -> str:
+    """The page of frames under several laws of motion, as Markdown.
+
+    Args:
+        summary, sequences: as of ``by_law`` and ``by_sequence``.
+        motions: errors of the estimated motions, a row for each sequence.
+    """
     return pages.markdown(
         "laws-correction.md.j2",
         methods=methods_among(set(summary["method"])),
         tables=[law_table(summary, size) for size in SIZES],
+        worst=worst_table(sequences, motions),
     )
+
+
+def worst_table(sequences: pd.DataFrame, motions: pd.DataFrame) -> str:
+    """A row for each law and size: the sequence that ours corrects worst, and the one with its largest e_T."""
+    wide = sequences.pivot(index="sequence", columns="method", values="psnr_covered")
+    errors = motions.set_index("sequence")
+    lines = [
+        "| law, size | least PSNR of ours | uncorrected | sequence | largest e_T (e_R there), deg | sequence |",
+        "|" + "---|" * 6,
+    ]
+    for stratum, names in sequences.drop_duplicates("sequence").groupby(law_and_size(sequences), sort=False):
+        own = list(names["sequence"])
+        dark, off = wide.loc[own, "ours"].idxmin(), errors.loc[own, "e_T_deg_ours"].idxmax()
+        error = f"{errors.loc[off, 'e_T_deg_ours']:.3g} ({errors.loc[off, 'e_R_deg_ours']:.2g})"
+        psnrs = [f"{wide.loc[dark, method]:.1f}" for method in ("ours", "none")]
+        lines.append(f"| {stratum} | " + " | ".join([*psnrs, str(dark), error, str(off)]) + " |")
+    return "\n".join(lines)
 
 
 def study_page(images: pd.DataFrame, summary: pd.DataFrame) -> str:

@@ -36,6 +36,8 @@ class Standing:
     """Of the covariances that it states."""
     parts: dict[str, tuple[float, float, float]]
     """Of the primary score in the parts of the problems that its track tells apart, by their names."""
+    worst: dict[str, tuple[str, float]]
+    """The problem of each part with the largest error, and that error; "all" where there are no parts."""
 
     @property
     def track(self) -> Track:
@@ -128,7 +130,18 @@ def _standing(
         medians={name: _median(scores[name].to_numpy()) for name in track.of_kind("median")},
         calibration=calibration(scores, track.unknowns),
         parts={} if not track.parting else _parts(scores, track),
+        worst=_worst(scores, track),
     )
+
+
+def _worst(scores: pd.DataFrame, track: Track) -> dict[str, tuple[str, float]]:
+    parts = scores.groupby(track.parting) if track.parting else [("all", scores)]
+    found: dict[str, tuple[str, float]] = {}
+    for name, part in parts:
+        errors = part[track.error].to_numpy(dtype=np.float64)
+        at = int(np.argmax(np.where(np.isnan(errors), -np.inf, errors)))
+        found[str(name)] = str(part["problem"].iloc[at]), float(errors[at])
+    return found
 
 
 def _parts(scores: pd.DataFrame, track: Track) -> dict[str, tuple[float, float, float]]:
@@ -157,6 +170,8 @@ def table(lines: Sequence[Standing]) -> pd.DataFrame:
         row |= {"assumes": line.assumes or None} if line.parts else {}
         row |= _ends(line.means) | line.medians
         row |= _ends({f"{line.track.primary.key}_{name}": triple for name, triple in line.parts.items()})
+        for name, (problem, error) in line.worst.items():
+            row |= {f"worst_{name}": error, f"worst_{name}_problem": problem}
         if "nees" in line.scored.scores:
             row |= _ends(named_numbers(line.calibration))
         rows.append(row | {"ties": " ".join(line.ties)})

@@ -86,12 +86,17 @@ def by_scene(images: pd.DataFrame) -> pd.DataFrame:
 
 
 def by_law(images: pd.DataFrame) -> pd.DataFrame:
-    """``summarise`` of sequences of the card ``laws``, a stratum for each law and size of its motions.
+    """``summarise`` of sequences of the card ``laws``, a stratum for each law and size of its motions."""
+    return summarise(images.assign(stratum=law_and_size(images)))
+
+
+def law_and_size(table: pd.DataFrame) -> pd.Series:
+    """Such as ``twist, moderate`` for each row of a table of sequences of the card ``laws``.
 
     A sequence is named after its scene, law, size, sensor and seed: ``old-town-twist-moderate-ideal-1``.
     """
-    names = images["sequence"].str.rsplit("-", n=4, expand=True)
-    return summarise(images.assign(stratum=names[1] + ", " + names[2]))
+    names = table["sequence"].str.rsplit("-", n=4, expand=True)
+    return names[1] + ", " + names[2]
 
 
 def _interval(name: str, values: FloatArray) -> dict[str, float]:
