@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -16,7 +17,14 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning, StatedShutter
-from rsbench.storage.untrusted_files import FILE_BYTES, check_amount, load_arrays, parse_json, read_text
+from rsbench.storage.untrusted_files import (
+    FILE_BYTES,
+    check_amount,
+    load_arrays,
+    open_regular,
+    parse_json,
+    read_text,
+)
 
 COLUMNS = {
     "left": "x0, y0, x1, y1",
@@ -143,7 +151,7 @@ def _read_file(path: Path) -> Iterator[Problem | RsbenchError]:
         if path.suffix not in _LINES:
             yield _attempt(read_text(path), str(path), path.stem)
             return
-        with path.open(encoding="utf-8") as file:
+        with io.TextIOWrapper(open_regular(path), encoding="utf-8") as file:
             yield from _parsed(file, str(path), path.stem, lines=True)
     except OSError as error:
         yield RsbenchError(f"{path}: cannot be read: {error.strerror}")

@@ -22,7 +22,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
-from rsbench.storage.untrusted_files import check_image_size, check_size, read_bytes, read_text
+from rsbench.storage.untrusted_files import check_image_size, check_size, open_regular, read_bytes, read_text
 from rsbench.storage.untrusted_files import load_arrays as load_arrays
 from rsbench.storage.untrusted_files import read_json as read_json
 from rsbench.storage.work_folder import refuse_url
@@ -37,7 +37,7 @@ POSE_COLUMNS = "row,tau,qw,qx,qy,qz,tx,ty,tz"
 
 
 def sha256(path: Path) -> str:
-    with path.open("rb") as stream:
+    with open_regular(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 

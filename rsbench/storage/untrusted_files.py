@@ -7,11 +7,13 @@ A small file can unfold to more than a machine holds. What no dataset states has
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import json
 import math
 import os
 import re
+import stat
 import zipfile
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -93,6 +95,31 @@ def inside(folder: Path, relative: str) -> Path:
 # Content
 
 
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file, or what a process has open already (below /dev and /proc), for reading bytes.
+
+    Raises:
+        OSError: it cannot be opened, or is a named pipe, a socket or a device, on which a read may never end.
+    """
+    file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  the caller closes it
+    mode = os.fstat(file.fileno()).st_mode
+    if not stat.S_ISREG(mode):
+        if not os.path.abspath(path).startswith(("/dev/", "/proc/")):
+            file.close()
+            raise OSError(errno.EINVAL, f"it is {_kind_of(mode)}; give a regular file")
+        os.set_blocking(file.fileno(), True)
+    return file
+
+
+def _without_waiting(name: str, flags: int) -> int:
+    return os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def _kind_of(mode: int) -> str:
+    kinds = {stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket", stat.S_IFDIR: "a folder"}
+    return kinds.get(stat.S_IFMT(mode), "a device")
+
+
 def read_bytes(path: Path, limit: int = FILE_BYTES) -> bytes:
     """The content of a file of at most ``limit`` bytes.
 
@@ -100,7 +127,7 @@ def read_bytes(path: Path, limit: int = FILE_BYTES) -> bytes:
         RsbenchError: it cannot be read or is larger.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size  # 0 of a pipe
             check_amount(path, "bytes", size, limit)
             data = file.read(size + 1 if size else round(limit * _factor()) + 1)
@@ -161,7 +188,7 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
         RsbenchError: it cannot be read, is damaged, holds objects, or more bytes than ``FILE_BYTES``.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return unpack_arrays(file, path)
     except OSError as error:
         raise RsbenchError(f"{path}: cannot be read: {error.strerror or error}") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,8 @@ def verify_dataset(
         workers: processes that check a sequence each; 1 is this one, with all its threads.
 
     Returns:
-        One report per sequence; before them one named dataset.json where that has faults of its own.
+        One report per sequence; before them one named dataset.json where that has faults of its own, and one for
+        each of the first ``MOST_MISSING`` sequences that have no folder.
 
     Raises:
         ValueError: ``stride``, ``rerender`` or ``workers`` is none of the allowed.
@@ -66,15 +68,18 @@ def verify_dataset(
     run_stage(state, "dataset")
     reports = [SequenceReport(name=state.name, findings=tuple(state.findings))] if state.findings else []
     options = stride, rerender, *_cards_and_files(scenes)
-    if workers == 1 or len(listing.names) < 2:
+    missing = dict(manifest_checks.missing_sequences(listing))
+    reports += [SequenceReport(name=name, findings=(finding,)) for name, finding in missing.items()]
+    names = [name for name in listing.names if os.path.isdir(folder / name)]
+    if workers == 1 or len(names) < 2:
         check = _checker(folder, *options, step)
-        return reports + [check(name) for name in listing.names]
+        return reports + [check(name) for name in names]
     found = {}
-    for report in reports_apart(_checker, list(listing.names), workers, rerender != "no", folder, *options):
+    for report in reports_apart(_checker, names, workers, rerender != "no", folder, *options):
         found[report.name] = report
         for _ in range(_steps(listing)):
             step(report.name)
-    return reports + [found[name] for name in listing.names]
+    return reports + [found[name] for name in names]
 
 
 def _checker(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -28,6 +29,8 @@ from rsbench.verification.findings import MISSING, Finding
 _TEXTS = ("name", "description", "rsbench", "mitsuba")
 _MOST_NAMES = 5
 """Files that one finding names."""
+MOST_MISSING = 100
+"""Sequences without a folder that are reported one by one."""
 _SAME = 1e-12
 """Relative difference of two numbers that were computed from the same card: a thousand roundings."""
 
@@ -96,12 +99,21 @@ def _name_faults(names: object) -> Iterator[Finding]:
     if not isinstance(names, list) or not names:
         yield Finding(DATASET, f"sequences = {names!r}: a list of names is needed")
         return
-    for name in names:
-        if not is_name(name):
-            yield Finding(DATASET, f"sequences: {name!r} is not the name of a folder in it")
-    for name, count in Counter(map(str, names)).items():
-        if count > 1:
-            yield Finding(DATASET, f"sequences: {name!r} stands there twice")
+    wrong = [shortened(name) for name in names if not is_name(name)]
+    if wrong:
+        yield Finding(DATASET, f"sequences: not the name of a folder in it: {_some(wrong)}")
+    twice = [shortened(name) for name, count in Counter(map(str, names)).items() if count > 1]
+    if twice:
+        yield Finding(DATASET, f"sequences: named twice: {_some(twice)}")
+
+
+def missing_sequences(listing: Listing) -> Iterator[tuple[str, Finding]]:
+    """Sequences without a folder, a finding each for the first of them, and the last one with how many more."""
+    missing = [name for name in listing.names if not os.path.isdir(listing.folder / name)]
+    for number, name in enumerate(missing[:MOST_MISSING], start=1):
+        more = len(missing) - MOST_MISSING if number == MOST_MISSING else 0
+        rest = f"; {more} more sequences of {DATASET} are missing likewise" if more > 0 else ""
+        yield name, Finding(f"{name}/", f"{MISSING}: no such folder in the dataset{rest}")
 
 
 def _listing_faults(listing: Listing) -> Iterator[Finding]:

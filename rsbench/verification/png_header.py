@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
+from rsbench.storage.untrusted_files import open_regular
 from rsbench.verification.findings import Finding
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -14,7 +15,7 @@ _COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGB
 def png_fault(path: Path, name: str, size: tuple[int, int]) -> Finding | None:
     """What keeps a file from being an 8-bit RGB image of ``size`` (width, height); only its header is read."""
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             head = stream.read(26)
     except OSError as error:
         return Finding(name, f"cannot be read: {error.strerror}")

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
+import os
+import socket
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +17,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from analytic_dataset import write_analytic_dataset
+from commands import run_here
 from PIL import Image
 
 from rsbench.core.camera import PinholeCamera
@@ -21,6 +27,8 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.sequence import read_dataset, read_dataset_manifest
 from rsbench.storage.files import read_depth, write_bytes, write_depth, write_json
+from rsbench.storage.untrusted_files import read_bytes
+from rsbench.verification import verify_dataset
 
 RIG = StereoRig(camera=PinholeCamera.centred(24, 16, 20.0), baseline=0.3)
 
@@ -96,6 +104,72 @@ def test_links_that_lead_out_of_the_dataset_are_refused(dataset: Path, name: str
     inner.symlink_to(outer)
     found = refusal(lambda: read_dataset(dataset)[0].image("rs", "left", 0))
     assert "leads out of the folder; copy there" in found
+
+
+def _as_pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def _as_link_to_a_pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path.with_name("pipe"))
+    path.symlink_to("pipe")
+
+
+def _as_socket(path: Path) -> None:
+    path.unlink()
+    with contextlib.chdir(path.parent), socket.socket(socket.AF_UNIX) as bound:  # a name of 108 bytes at most
+        bound.bind(path.name)
+
+
+def _as_folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+@pytest.mark.parametrize("make", [_as_pipe, _as_link_to_a_pipe, _as_socket, _as_folder])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("dataset.json", "planes/sequence.json", "planes/poses/left_0.csv", "planes/rs/left_0.png"),
+        *("planes/rs_depth/left_0.exr", "planes/gs/right_1.png"),
+    ],
+)
+def test_files_of_a_dataset_are_regular(dataset: Path, name: str, make: Callable[[Path], None]) -> None:
+    """A named pipe that nobody writes to ends no read, and a test that waits for it ends at no time."""
+    make(dataset / name)
+    ran = run_here("verify", str(dataset), "--rerender", "no")
+    assert ran.returncode in (1, 2) and name.rpartition("/")[2] in ran.stdout + ran.stderr
+    assert "Traceback" not in ran.stdout + ran.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/stdin").exists(), reason="needs /dev/stdin")
+def test_what_a_process_has_open_is_read(dataset: Path) -> None:
+    """Problems come through pipes of a shell as before; a named pipe is refused in one line."""
+    answer = subprocess.run(
+        [sys.executable, "-c", "import sys, pathlib as p, rsbench.storage.untrusted_files as u;"
+         "sys.stdout.buffer.write(u.read_bytes(p.Path('/dev/stdin')))"],
+        input=b"x" * 300_000, capture_output=True, check=True,
+    )  # fmt: skip
+    assert answer.stdout == b"x" * 300_000
+    os.mkfifo(dataset / "pipe")
+    assert "it is a named pipe; give a regular file" in refusal(lambda: read_bytes(dataset / "pipe"))
+
+
+@pytest.mark.slow
+def test_sequences_that_are_not_there_are_counted(dataset: Path) -> None:
+    """As many lines for 300 000 names as for 300, in a time that does not grow with their square."""
+    names = [f"s{number}" for number in range(300_000)]
+    change(dataset / "dataset.json", "sequences", ["planes", *names])
+    lines = [line for report in verify_dataset(dataset) for line in report.faults]
+    missing = [line for line in lines if "missing: no such folder in the dataset" in line]
+    assert len(missing) == 100 and missing[0].startswith("s0/: ") and len(lines) < 110
+    assert missing[-1].endswith("; 299900 more sequences of dataset.json are missing likewise")
+    change(dataset / "dataset.json", "sequences", ["planes", *(f"../{name}" for name in names)])
+    lines = [line for report in verify_dataset(dataset) for line in report.faults]
+    assert any("not the name of a folder in it: '../s0', '../s1'" in line for line in lines) and len(lines) < 10
 
 
 def test_links_within_a_dataset_are_followed(dataset: Path) -> None:
